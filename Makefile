@@ -87,7 +87,7 @@ mutants: $(VENV)/dev ## mutate guard, tunnel and store, list the mutants that te
 # In this order; each part runs even if an earlier one has failed. The part on a cluster needs Docker,
 # kind, helm and kubectl.
 NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults.json \
-	search-adversarial.json search-random.json link.json) \
+	search-adversarial.json search-random.json link.json mujoco-oldest.json mujoco-newest.json) \
 	mutants night-netem e2e-full $(EVIDENCE)/index.md
 
 nightly: export CLOUDRC_EVIDENCE = $(CURDIR)/$(EVIDENCE)
@@ -112,6 +112,14 @@ $(EVIDENCE)/search-random.json:
 
 $(EVIDENCE)/link.json:
 	$(bin)/python -m tools.bench_link $(BENCH_LINK) -o json > $@
+
+# The paper's mission on the oldest and on the newest MuJoCo that pyproject.toml allows.
+$(EVIDENCE)/mujoco-oldest.json: MUJOCO = mujoco==$(shell sed -n 's/.*"mujoco>=\([0-9.]*\),.*/\1/p' pyproject.toml)
+$(EVIDENCE)/mujoco-newest.json: MUJOCO = mujoco
+$(EVIDENCE)/mujoco-%.json:
+	rm -rf build/mujoco-$* && $(PYTHON) -m venv build/mujoco-$*
+	build/mujoco-$*/bin/pip install --quiet '.[world,record,report]' '$(MUJOCO)'
+	build/mujoco-$*/bin/cloudrc run paper --mode virtual --out build/mujoco-$*/run -o json > $@
 
 $(EVIDENCE)/index.md:
 	$(bin)/python -m tools.evidence $(EVIDENCE)

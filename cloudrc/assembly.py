@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cloudrc.cloud.compute import ComputeTime
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
@@ -33,6 +34,10 @@ if TYPE_CHECKING:
     from cloudrc.world.endpoint import WorldEndpoint
 
 MS_TO_NS = 1_000_000
+SECOND_NS = 1_000_000_000
+CLOUD_CLOCK = b"cloud".ljust(16)
+"""Identity of cloud's clock in virtual time, if it is not world's."""
+MEASURED = "Not repeatable: cloud.compute_measured uses the processor time of this machine."
 CRUISE_SPEED = 1.0
 """Expected speed between two waypoints, if the guard allows this speed [m/s]."""
 SETTLE_TIME = 4.0
@@ -52,11 +57,23 @@ FENCE_SPAN = dist(fence.LOW, fence.HIGH)
 
 def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:
     """Build world and cloud, and connect them for a flight in virtual time; do not fly yet."""
-    from cloudrc.drivers.virtual import VirtualRun
+    from cloudrc.drivers.virtual import CPU_CLOCK, Clock, VirtualRun
 
+    own = Clock(round(experiment.cloud.clock_offset_s * 1e9), experiment.cloud.clock_drift_ppm)
+    identity = VIRTUAL_CLOCK if own == Clock() else CLOUD_CLOCK
     world = build_world(experiment, Identity(VIRTUAL_CLOCK, b"world".ljust(16)))
-    cloud = build_cloud(experiment, Identity(VIRTUAL_CLOCK, b"cloud".ljust(16)))
-    return world, cloud, VirtualRun(world, cloud, *build_links(experiment))
+    cloud = build_cloud(
+        experiment,
+        Identity(identity, b"cloud".ljust(16)),
+        lambda: own.at(0),
+        cpu_clock=CPU_CLOCK,
+    )
+    return world, cloud, VirtualRun(world, cloud, *build_links(experiment), cloud_clock=own)
+
+
+def virtual_notes(experiment: ResolvedExperiment) -> tuple[str, ...]:
+    """Return sentences for the reader of the report of a flight in virtual time."""
+    return (MEASURED,) if experiment.cloud.compute_measured else ()
 
 
 def flight_limit(experiment: ResolvedExperiment) -> float:
@@ -76,11 +93,12 @@ def build_world(
     from cloudrc.world.guard.limits import Limits
     from cloudrc.world.guard.state import Guard
     from cloudrc.world.low_level import LowLevel
+    from cloudrc.world.plant import Wind
     from cloudrc.world.robot import Robot
-    from cloudrc.world.sensors import Sensors
+    from cloudrc.world.sensors import Errors, Sensors
     from cloudrc.world.simulator import Simulator
 
-    world, guard = experiment.world, experiment.guard
+    world, guard, seed = experiment.world, experiment.guard, experiment.seed
     limits = Limits(
         fence_low=fence.LOW,
         fence_high=fence.HIGH,
@@ -90,17 +108,27 @@ def build_world(
         yaw_rate_max=guard.yaw_rate_max_radps,
         hold_max_ns=round(guard.hold_max_s * 1e9),
     )
-    robot = Robot(
-        Simulator(world.robot, world.scene), LowLevel(**world.low_level.model_dump()), Guard(limits)
+    air, seen, wind = world.wind, world.sensors, None
+    if any(air.velocity_mps) or air.gust_mps:
+        wind = Wind(air.velocity_mps, air.gust_mps, air.gust_time_s, _generator(seed, "wind"))
+    simulator = Simulator(world.robot, world.scene, world.plant, wind)
+    robot = Robot(simulator, LowLevel(**world.low_level.model_dump()), Guard(limits))
+    roll, pitch, yaw = map(radians, seen.attitude_bias_deg)
+    sensors = Sensors(
+        seen.position_noise_m,
+        seen.velocity_noise_mps,
+        _generator(seed, "odometry noise"),
+        Errors(radians(seen.attitude_noise_deg), (roll, pitch, yaw)),
+        Errors(seen.rate_noise_radps, seen.rate_bias_radps),
+        _generator(seed, "attitude noise"),
     )
-    noise = np.random.Generator(np.random.PCG64([experiment.seed, _stream("odometry noise")]))
-    sensors = Sensors(world.sensors.position_noise_m, world.sensors.velocity_noise_mps, noise)
     return WorldEndpoint(
         robot,
         sensors,
         identity,
         newest_wins=experiment.tunnel.order == "newest",
         command_age_max_ns=limits.command_age_max_ns,
+        odometry_period_ns=SECOND_NS // world.odometry_rate_hz,
         start_ns=clock(),
     )
 
@@ -111,6 +139,7 @@ def build_cloud(
     clock: Callable[[], int] = lambda: 0,
     teleop: Operator | None = None,
     *,
+    cpu_clock: Callable[[], int] | None = None,
     make_loop: Callable[..., ControlLoop] = ControlLoop,
 ) -> CloudEndpoint:
     """Build cloud: plug-ins, teleoperation, and cloud's end of the tunnel.
@@ -120,6 +149,8 @@ def build_cloud(
         identity: Identity of cloud's clock and process in the tunnel, with the keys.
         clock: Cloud's monotonic clock [ns].
         teleop: Source of setpoints. None: a new `Teleop`, which flies the mission at once.
+        cpu_clock: Clock of the processor time of this thread [ns], for `cloud.compute_measured`.
+            None in real time, where the computation takes its time anyway.
         make_loop: Makes the control loop from the arguments of `ControlLoop`.
     """
     cloud = experiment.cloud
@@ -129,13 +160,22 @@ def build_cloud(
         build_plugin("controllers", cloud.controller),
         horizon_max=cloud.horizon_max_s,
         freeze_after=cloud.freeze_after_s,
+        period_ns=round(SECOND_NS / cloud.command_rate_hz),
     )
+    cpu_clock = cpu_clock if cloud.compute_measured else None
+    compute = None
+    if cloud.compute_ms or cpu_clock:
+        rng = _generator(experiment.seed, "compute time")
+        times = cloud.compute_ms * MS_TO_NS, cloud.compute_deviation_ms * MS_TO_NS
+        compute = ComputeTime(*times, rng, cpu_clock)
     start_ns = clock()
     if teleop is None:
         teleop = Teleop()
         teleop.start(start_ns, build_plan(experiment), ONLY_MISSION)
     newest_wins = experiment.tunnel.order == "newest"
-    return CloudEndpoint(loop, teleop, identity, newest_wins=newest_wins, start_ns=start_ns)
+    return CloudEndpoint(
+        loop, teleop, identity, newest_wins=newest_wins, compute=compute, start_ns=start_ns
+    )
 
 
 def build_links(experiment: ResolvedExperiment) -> tuple[LinkDirection, LinkDirection]:
@@ -206,7 +246,7 @@ def _leg(start: schema.Waypoint | None, waypoint: schema.Waypoint, speed_max: fl
 
 def _step_legs(steps: schema.Steps, seed: int) -> tuple[Leg, ...]:
     """Make random setpoints. Each lasts one period, even if the robot does not arrive."""
-    rng = np.random.Generator(np.random.PCG64([seed, _stream("steps")]))
+    rng = _generator(seed, "steps")
     offsets = rng.uniform(-1.0, 1.0, (steps.count, 3)) * steps.range_m + steps.centre_m
     limit = 10 * steps.period_s
     return tuple(
@@ -236,6 +276,6 @@ def _scaled(value: float | None, factor: float) -> float | None:
     return None if value is None else value * factor
 
 
-def _stream(name: str) -> int:
-    """Return the number of the stream of random numbers with this name."""
-    return int.from_bytes(name.encode(), "little")
+def _generator(seed: int, stream: str) -> np.random.Generator:
+    """Make the generator of the stream of random numbers with this name."""
+    return np.random.Generator(np.random.PCG64([seed, int.from_bytes(stream.encode(), "little")]))

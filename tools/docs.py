@@ -40,12 +40,14 @@ PARTS = {
 }
 """Key of an experiment that has its own section on the page -> link to the section."""
 ENDS = {"world": "world", "cloud": "cloud", "either": "world and cloud"}
-_PERIOD = "100 Hz, while there is telemetry and a setpoint"
+_PERIOD = "once per command (100 Hz by default), while there is telemetry and a setpoint"
 _LINK = "once per change; again when a session, a mission or a state of the guard begins"
 _STAMPS = {
-    ("instant of the measurement, when the telemetry leaves", "100 Hz, in a session"):
+    ("instant of the measurement, when the telemetry leaves",
+     "100 Hz by default, in a session"):
         "/odometry /telemetry",
-    ("instant of the physics step", "100 Hz"): "/ground_truth /contact_force /reference",
+    ("instant of the physics step", "100 Hz, or the rate of the odometry if it is higher"):
+        "/ground_truth /contact_force /reference",
     ("arrival at cloud", "once per telemetry that arrives"): "/uplink_delay",
     ("arrival at world", "once per command that arrives"): "/downlink_delay",
     ("first physics step that follows the command", "once per command applied"): "/command_applied",
@@ -59,7 +61,7 @@ _STAMPS = {
     ("when the counters are read", "1 Hz per counter; counters of a relay 0.5 Hz"): "/count",
     ("when this end notices the change", _LINK): "/link",
     ("end of the interval that is judged", "every 5 s per quantity"): "/link_check",
-    ("when the loop handles the deadline", "100 Hz per end"): "/lateness",
+    ("when the loop handles the deadline", "once per wake, 100 Hz per end by default"): "/lateness",
 }  # fmt: skip
 SAMPLING = {name: about for about, names in _STAMPS.items() for name in names.split()}
 """Topic -> meaning of a row's stamp, and when a row is written."""

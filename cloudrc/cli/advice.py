@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from heapq import heappop, heappush
+from itertools import pairwise
 from math import ceil
 from typing import TYPE_CHECKING, Any
 
@@ -17,10 +18,13 @@ from cloudrc.cli.output import print_line
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
 
-PERIOD_NS = 10_000_000
-"""Time between two telemetry datagrams, and between two commands [ns]."""
-PERIODS = 2000
-"""Number of simulated periods: 20 s."""
+DURATION_NS = 20_000_000_000
+"""Length of the simulation [ns]."""
+SAG_MAX = 0.05
+"""Largest steady error of the position that needs no warning [m]."""
+WIND_FORCE = 0.24
+"""Force against which a hovering robot has to fly, per wind speed [N s/m]: two thirds are the drag
+of the rotors, one third comes from the tilt by which this drag turns the robot."""
 
 
 def warn(experiment: ResolvedExperiment) -> None:
@@ -31,6 +35,7 @@ def warn(experiment: ResolvedExperiment) -> None:
 
 def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     """Describe the settings of an experiment that do not fit together."""
+    yield from _hover(experiment)
     ages, echoes = simulate_ages(experiment)
     if ages:
         yield from _long_link(experiment, ages, echoes)
@@ -41,8 +46,8 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
     """Exchange telemetry and commands over the link, without its blackouts.
 
     Returns:
-        Ages at the end of each period: of the odometry behind the command in force [s], and of
-        the newest command that telemetry has echoed to cloud [s].
+        Ages just before each telemetry and each command: of the odometry behind the command in
+        force [s], and of the newest command that telemetry has echoed to cloud [s].
     """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection
@@ -59,8 +64,11 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
     arrived: list[tuple[int, int] | None] = [None, None]
     pending: list[tuple[int, int, tuple[int, int]]] = []
     ages, echoes = list[float](), list[float]()
-    for period in range(PERIODS):
-        now_ns = period * PERIOD_NS
+    compute_ns = round(experiment.cloud.compute_ms * 1e6)
+    rates = experiment.world.odometry_rate_hz, experiment.cloud.command_rate_hz
+    periods_ns = [round(1e9 / rate) for rate in rates]
+    times_ns = sorted({t for period_ns in periods_ns for t in range(0, DURATION_NS, period_ns)})
+    for now_ns, next_ns in pairwise(times_ns):
         while pending and pending[0][0] <= now_ns:
             _, way, datagram = heappop(pending)
             newest = arrived[way]
@@ -68,15 +76,42 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
                 arrived[way] = datagram
         telemetry, command = arrived
         if command is not None:
-            ages.append((now_ns + PERIOD_NS - command[1]) * 1e-9)
+            ages.append((next_ns - command[1]) * 1e-9)
         if telemetry is not None and telemetry[1] >= 0:
-            echoes.append((now_ns + PERIOD_NS - telemetry[1]) * 1e-9)
+            echoes.append((next_ns - telemetry[1]) * 1e-9)
         sent = [(0, Kind.TELEMETRY, command), (1, Kind.COMMAND, telemetry)]
         for way, kind, last in sent if telemetry is not None else sent[:1]:
-            datagram = now_ns, -1 if last is None else last[0]
-            for at_ns in links[way].send(1, kind, period, SIZES[kind], now_ns):
-                heappush(pending, (at_ns, way, datagram))
+            period, early_ns = divmod(now_ns, periods_ns[way])
+            if early_ns == 0:
+                datagram = now_ns, -1 if last is None else last[0]
+                leaves_ns = now_ns + way * compute_ns
+                for at_ns in links[way].send(1, kind, period, SIZES[kind], leaves_ns):
+                    heappush(pending, (at_ns, way, datagram))
     return ages, echoes
+
+
+def _hover(experiment: ResolvedExperiment) -> Iterator[str]:
+    """Compare the force that a hover lacks with the largest integral of the velocity loop."""
+    from cloudrc.config.schema import GRAVITY_MPS2, MASS_KG
+    from cloudrc.world.low_level import GRAVITY, MASS
+
+    plant, loop, wind = experiment.world.plant, experiment.world.low_level, experiment.world.wind
+    weight = (MASS_KG * plant.mass_factor + plant.payload_kg) * GRAVITY_MPS2
+    heavy = abs(weight * 4 / sum(plant.thrust_factor) - MASS * GRAVITY)
+    drag = WIND_FORCE * max(map(abs, wind.velocity_mps))
+    controller = experiment.cloud.controller
+    gains = (controller.model_extra or {})["gain_p"] if controller.name == "pid" else (0.0, 0, 0.0)
+    for name, axis, force in (("wind", 0, drag), ("plant", 2, heavy)):
+        key = "integral_limit_z" if axis else "integral_limit_xy"
+        gain, gain_i = loop.gain_p[axis] * gains[axis], loop.gain_i[axis]
+        rest = force - gain_i * getattr(loop, key)
+        if rest > SAG_MAX * gain > 0.0 and gain_i:
+            yield (
+                f"the onboard controller does not know world.{name}, so the robot hovers about "
+                f"{rest / gain:.2f} m from its setpoint; a value that fits: "
+                f"--set world.low_level.{key}={_round_up(force / gain_i, 0.1):g}"
+                + ("" if axis else " (above 0.3 a hostile cloud can leave the fence)")
+            )
 
 
 def _long_link(

@@ -374,7 +374,10 @@ def link_monitor(
     # Without --link, the link is a container. It is not trusted: limit its files to a smaller size.
     file_max = TRACE_MAX if options.link is None else SIZE_MAX
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
-    check = LinkMonitor(uplink=uplink, flow=Flow(experiment.seed, uplink, kind, SIZES[kind]))
+    rate = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz
+    flow = Flow(experiment.seed, uplink, kind, SIZES[kind])
+    computes = experiment.cloud.compute_ms > 0
+    check = LinkMonitor(uplink=uplink, flow=flow, period=1.0 / rate, computes=computes)
     requested = link_profile(experiment.uplink), link_profile(experiment.downlink)
     check.begin(requested, _link_state(options), load)
     return check

@@ -109,6 +109,11 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     from cloudrc.metrics.verdict import exit_code
 
     experiment = load(options.experiment, options.set, options.seed)
+    if mode != "virtual" and (experiment.cloud.clock_offset_s or experiment.cloud.clock_drift_ppm):
+        raise BadInputError(
+            "cloud.clock_offset_s and cloud.clock_drift_ppm act in virtual time only, elsewhere "
+            "the machine's clock counts; use --mode virtual, or leave them out"
+        )
     warn(experiment)
     in_cluster, for_programs = mode == "cluster", options.output != "table"
     stream = sys.stderr if for_programs else sys.stdout
@@ -277,6 +282,7 @@ def _record_virtual(
     with McapWriter(folder / "mission.mcap", clock="world") as writer:
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
+            from_cloud = flight.on_world_clock(from_cloud)
             for log_time_ns, row in merged(from_world, from_cloud):
                 writer.write_row(row, log_time_ns)
             store.add(from_world, from_cloud)
@@ -290,7 +296,8 @@ def _record_virtual(
         except KeyboardInterrupt:
             interrupted = True
         try:
-            run = Run("virtual", "virtual", store.hexdigest(), interrupted)
+            notes = assembly.virtual_notes(experiment)
+            run = Run("virtual", "virtual", store.hexdigest(), interrupted, notes)
             yield store.recording(), run
         finally:
             for name, data in attachments(folder).items():

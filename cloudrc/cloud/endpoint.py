@@ -1,4 +1,4 @@
-"""Cloud's end of the tunnel: receive telemetry and send a command every 10 ms.
+"""Cloud's end of the tunnel: receive telemetry and send a command in every period.
 
 Cloud asks for a session with HELLO datagrams, and uses the epoch (session number) that world
 assigns. While there is no command, cloud sends ALIVE datagrams, so that world does not give the
@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import Counter
 from math import nan
 
+from cloudrc.cloud.compute import ComputeTime
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import (
     EmergencyStopRepeater,
@@ -30,38 +31,39 @@ from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake
 from cloudrc.tunnel.keys import Key
 from cloudrc.tunnel.session import NO_EPOCH
 
-MISSED_MAX = 50
-"""Cloud reports a fault when this many missed periods of 10 ms are not yet forgiven."""
-FORGIVEN_NS = 200_000_000
-"""One missed period is forgiven per this time [ns], so 5 % of all periods may be missed."""
+MISSED_NS = 500_000_000
+"""Cloud reports a fault when missed periods of this length in all are not yet forgiven [ns]."""
+FORGIVEN_PERIODS = 20
+"""One missed period is forgiven in the time of this many, so 5 % of all periods may be missed."""
 
 
 class MissedPeriods:
     """Report a fault when cloud misses many periods; report again after all were forgiven."""
 
-    def __init__(self) -> None:
-        self._missed, self._reported = 0, False
+    def __init__(self, period_ns: int) -> None:
+        """Set the time between two commands, `period_ns` [ns]."""
+        self._period_ns, self._missed, self._reported = period_ns, 0, False
         self._forgiven_ns = NEVER_NS  # when all missed periods will be forgiven
 
     def miss(self, count: int, now_ns: int) -> list[Fault]:
-        """Count missed periods of 10 ms at `now_ns` [ns]; return the fault to report, if any."""
-        full_ns = now_ns + MISSED_MAX * FORGIVEN_NS
+        """Count missed periods at `now_ns` [ns]; return the fault to report, if any."""
+        full_ns = now_ns + MISSED_NS * FORGIVEN_PERIODS
         if self._forgiven_ns <= now_ns:
             self._missed, self._reported, self._forgiven_ns = 0, False, now_ns
         self._missed += count
-        self._forgiven_ns = min(self._forgiven_ns + count * FORGIVEN_NS, full_ns)
+        self._forgiven_ns = min(
+            self._forgiven_ns + count * FORGIVEN_PERIODS * self._period_ns, full_ns
+        )
         if self._reported or self._forgiven_ns < full_ns:
             return []
         self._reported = True
         text = (
-            f"cloud sent no command in {self._missed} periods of 10 ms: "
+            f"cloud sent no command in {self._missed} periods of {self._period_ns * 1e-6:g} ms: "
             "a plug-in is slow or the machine is busy"
         )
         return [Fault(now_ns, "late", text)]
 
 
-PERIOD_NS = 10_000_000
-"""Time between two commands [ns]. Source: docs/reference/plant.md, "Commands"."""
 HELLO_PERIOD_NS = 100_000_000
 """Shortest time between two periodic hellos [ns]."""
 KEY_PERIOD_NS = 5_000_000_000
@@ -96,6 +98,7 @@ class CloudEndpoint(TunnelEnd):
         identity: Identity,
         *,
         newest_wins: bool,
+        compute: ComputeTime | None = None,
         start_ns: int = 0,
     ) -> None:
         """Connect the parts; there is no session yet.
@@ -105,6 +108,7 @@ class CloudEndpoint(TunnelEnd):
             teleop: Source of setpoints and operator requests.
             identity: Identity and keys of this end.
             newest_wins: Whether to drop telemetry that arrives after newer telemetry.
+            compute: The simulated time between computation and departure of a command; None: 0.
             start_ns: The present time on cloud's monotonic clock [ns].
         """
         super().__init__(identity, Direction.DOWNLINK, newest_wins)
@@ -115,7 +119,11 @@ class CloudEndpoint(TunnelEnd):
         self._world = ""  # identifies the world process of the session
         self.guard = GuardState.GROUND
         self._delays = (nan, nan, nan)  # horizon, round trip and loop delay of the last command [s]
-        self._alarm, self._missed_periods = EmergencyStopRepeater(), MissedPeriods()
+        self._alarm = EmergencyStopRepeater()
+        self._period_ns = loop.period_ns
+        self._missed_periods = MissedPeriods(loop.period_ns)
+        self._compute = compute
+        self._unsent: tuple[int, bytes] | None = None  # departure [ns] and command
         self._asked = 0  # highest number of an operator request in this session
         self._tick_ns = start_ns
         self._hello_ns = start_ns - KEY_PERIOD_NS  # time of the last periodic hello
@@ -137,18 +145,23 @@ class CloudEndpoint(TunnelEnd):
         return done and self.teleop.outcome is not None
 
     def next_deadline_ns(self) -> int:
-        """Return when the next command is due [ns]."""
-        return self._tick_ns
+        """Return when the next command leaves or begins to be computed [ns]."""
+        return self._tick_ns if self._unsent is None else self._unsent[0]
 
     def handle_deadline(self, now_ns: int) -> None:
         """Send the datagrams that are due at `now_ns` [ns]; skip missed periods."""
-        if now_ns < self._tick_ns:
+        if now_ns < self.next_deadline_ns():
             return
-        missed = (now_ns - self._tick_ns) // PERIOD_NS
+        if self._unsent is not None:
+            self._queue([self._unsent[1]])
+            self._unsent = None
+            if now_ns < self._tick_ns:
+                return
+        missed = (now_ns - self._tick_ns) // self._period_ns
         if missed:
             self._counts["missed_periods"] += missed
             self._records += self._missed_periods.miss(missed, now_ns)
-        self._tick_ns += (missed + 1) * PERIOD_NS
+        self._tick_ns += (missed + 1) * self._period_ns
         self._session.follow_keys()
         if self._wants_session(now_ns):
             self._say_hello_if_due(now_ns)
@@ -297,11 +310,18 @@ class CloudEndpoint(TunnelEnd):
             self._send(Kind.OPERATOR, codec.encode_operator(stamped))
 
     def _send_command(self, setpoint: Setpoint, now_ns: int) -> None:
-        elapsed_ns = now_ns - self._commanded_ns if self._commanded_ns >= 0 else PERIOD_NS
+        elapsed_ns = now_ns - self._commanded_ns if self._commanded_ns >= 0 else self._period_ns
         self._commanded_ns = now_ns
         epoch, counter = self._session.epoch, self._session.next_counter(COMMAND)
+        compute = self._compute
+        if compute is not None:
+            compute.begin()
         command, control = self._loop.command(setpoint, now_ns, elapsed_ns * 1e-9, epoch, counter)
-        self._send(COMMAND, codec.encode_command(command))
+        if compute is None:
+            self._send(COMMAND, codec.encode_command(command))
+        else:
+            data = self._session.seal(COMMAND, codec.encode_command(command))
+            self._unsent = now_ns + compute.end(), data
         self._records.append(control)
         self._delays = (control.horizon, control.rtt, control.loop_delay)
 

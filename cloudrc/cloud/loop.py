@@ -29,11 +29,15 @@ from cloudrc.errors import describe_error
 from cloudrc.messages import NEVER_NS, ZERO, Command, Odometry, Setpoint, Telemetry, Vector
 from cloudrc.records import Control, Fault
 
-FRESH_ECHO_NS = 50_000_000
-"""An echo gives a delay sample only up to this hold time [ns]: five command periods. While no
+PERIOD_NS = 10_000_000
+"""Time between two commands, unless an experiment sets another rate [ns].
+Source: docs/reference/plant.md, "Commands"."""
+FRESH_ECHO_PERIODS = 5
+"""An echo gives a delay sample only up to a hold time of this many command periods. While no
 commands arrive at world, the hold time grows although the delay of the link does not change."""
-ECHOES = 32
-"""Number of echoes that cloud remembers, so that `add_applied` is called once per command."""
+ECHOES, ECHOES_NS = 32, 320_000_000
+"""Cloud remembers at least ECHOES echoes, and those of the commands of ECHOES_NS [ns], so that
+`add_applied` is called once per command."""
 STAND_STILL = ControlOutput(ZERO, 0.0)
 INSTEAD = {
     "estimator": "cloud uses the last good horizon",
@@ -62,11 +66,17 @@ class DelayMeter:
             clock.
     """
 
-    def __init__(self, estimator: Estimator, counts: Counter[str], horizon_max: float) -> None:
-        """Use `estimator`, and count horizons outside of 0 to `horizon_max` [s] in `counts`."""
+    def __init__(
+        self, estimator: Estimator, counts: Counter[str], horizon_max: float, period_ns: int
+    ) -> None:
+        """Use `estimator`, and count horizons outside of 0 to `horizon_max` [s] in `counts`.
+
+        `period_ns` is the time between two commands [ns].
+        """
         self._estimator, self._counts, self._horizon_max = estimator, counts, horizon_max
         self._stamp_ns, self.newest_echo_ns = 0, NEVER_NS
-        self._echoes: deque[int] = deque(maxlen=ECHOES)
+        self._fresh_ns = FRESH_ECHO_PERIODS * period_ns
+        self._echoes: deque[int] = deque(maxlen=max(ECHOES, ECHOES_NS // period_ns))
         self.rtt = self.loop_delay = nan
 
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
@@ -80,7 +90,7 @@ class DelayMeter:
         self._stamp_ns = telemetry.stamp_ns
         echo_ns, hold_ns = telemetry.echo_stamp_ns, telemetry.echo_hold_ns
         self.observe_echo(telemetry)
-        if echo_ns == NEVER_NS or hold_ns > FRESH_ECHO_NS:
+        if echo_ns == NEVER_NS or hold_ns > self._fresh_ns:
             return
         loop_ns = now_ns - echo_ns
         self.loop_delay, self.rtt = loop_ns * 1e-9, (loop_ns - hold_ns) * 1e-9
@@ -119,6 +129,7 @@ class ControlLoop:
     """Runs estimator, predictor and controller in the sessions of one cloud.
 
     Attributes:
+        period_ns: Time between two commands [ns].
         faults: Faults since the last `take_faults`.
         counts: How often each failure happened.
     """
@@ -131,17 +142,19 @@ class ControlLoop:
         *,
         horizon_max: float,
         freeze_after: float,
+        period_ns: int = PERIOD_NS,
     ) -> None:
         """Connect three plug-ins; every session gets a new estimator.
 
         `horizon_max` is the longest horizon [s]. The loop freezes if no new echo arrives for the
-        horizon and `freeze_after` [s].
+        horizon and `freeze_after` [s]. `period_ns` is the time between two commands [ns].
 
         An exception of a plug-in is not caught here, because nothing flies yet.
         """
         self._build_estimator, self._predictor = build_estimator, predictor
         self._controller = controller
         self._horizon_max, self._freeze_after_ns = horizon_max, freeze_after * 1e9
+        self.period_ns = period_ns
         self.faults: list[Fault] = []
         self.counts: Counter[str] = Counter()
         self._undated: list[Fault] = []
@@ -162,7 +175,7 @@ class ControlLoop:
         self._begin(estimator)
 
     def _begin(self, estimator: Estimator) -> None:
-        self._delays = DelayMeter(estimator, self.counts, self._horizon_max)
+        self._delays = DelayMeter(estimator, self.counts, self._horizon_max, self.period_ns)
         self._basis: Odometry | None = None
         self._basis_arrival_ns = 0
         self._horizon, self._echoed_ns = 0.0, NEVER_NS

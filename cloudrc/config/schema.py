@@ -39,6 +39,11 @@ DURATION_MAX = 1_000_000
 Dwell = Annotated[float, Field(ge=0, le=DURATION_MAX)]
 TimeLimit = Annotated[float, Field(gt=0, le=DURATION_MAX)]
 Probability = Annotated[float, Field(ge=0, le=1)]
+Factor = Annotated[float, Field(ge=0.2, le=5)]
+Factors = tuple[Factor, Factor, Factor, Factor]
+Offset = Annotated[float, Field(ge=-1, le=1)]
+WindSpeed = Annotated[float, Field(ge=-20, le=20)]
+Bias = Annotated[float, Field(ge=-90, le=90)]
 
 
 class Section(BaseModel):
@@ -263,12 +268,75 @@ class LowLevel(Section):
 
 
 class Sensors(Section):
-    """White noise on the odometry for cloud; the onboard controller sees the true state."""
+    """Errors of the odometry for cloud."""
 
     position_noise_m: NotNegative = 0.0
     """Standard deviation of the position noise per axis [m]"""
     velocity_noise_mps: NotNegative = 0.0
     """Standard deviation of the velocity noise per axis [m/s]"""
+    attitude_bias_deg: tuple[Bias, Bias, Bias] = (0.0, 0.0, 0.0)
+    """Constant error of the orientation: a rotation about the body's x, y, z [deg]"""
+    attitude_noise_deg: Annotated[float, Field(ge=0, le=90)] = 0.0
+    """Standard deviation of the orientation noise per body axis [deg]"""
+    rate_bias_radps: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
+    """Constant error of the angular velocity about the body's x, y, z [rad/s]"""
+    rate_noise_radps: NotNegative = 0.0
+    """Standard deviation of the angular velocity noise per body axis [rad/s]"""
+
+
+THRUST_MAX_N = 33.737
+"""Largest thrust of one rotor [N]. Source: docs/reference/plant.md, "Thrust and torque"."""
+MASS_KG, GRAVITY_MPS2 = 1.06, 9.8066
+"""Mass of the shipped robot [kg] and gravity [m/s^2].
+Source: docs/reference/plant.md, "Total mass", "Gravity"."""
+THRUST_TO_WEIGHT_MIN = 1.5
+"""Smallest ratio of the largest thrust to the weight [1]: a tilted robot still climbs."""
+
+
+class Plant(Section):
+    """How the true robot differs from its model."""
+
+    mass_factor: Factor = 1.0
+    """True mass of the robot, as a multiple of the model's mass"""
+    inertia_factor: Factor = 1.0
+    """True inertia of the robot about each axis, as a multiple of the model's inertia"""
+    payload_kg: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Mass of a payload, a point that is fixed to the robot [kg]"""
+    payload_offset_m: tuple[Offset, Offset, Offset] = (0.0, 0.0, -0.1)
+    """Position of the payload in the body frame, from the origin of the base [m]"""
+    thrust_factor: Factors = (1.0, 1.0, 1.0, 1.0)
+    """True thrust and torque of the front, left, back and right rotor, as a multiple of the
+    model's; a single number counts for all four"""
+
+    @field_validator("thrust_factor", mode="before")
+    @classmethod
+    def _repeat(cls, value: Any) -> Any:
+        if isinstance(value, list):
+            return tuple(value)
+        return (value,) * 4 if isinstance(value, int | float) else value
+
+    @model_validator(mode="after")
+    def _check_thrust(self) -> Plant:
+        weight = (MASS_KG * self.mass_factor + self.payload_kg) * GRAVITY_MPS2
+        ratio = THRUST_MAX_N * sum(self.thrust_factor) / weight
+        if ratio < THRUST_TO_WEIGHT_MIN:
+            raise ValueError(
+                f"the thrust-to-weight ratio is {ratio:.2f}, so the robot cannot lift off safely; "
+                f"it must be at least {THRUST_TO_WEIGHT_MIN:g}: lower mass_factor or payload_kg, "
+                "or raise thrust_factor"
+            )
+        return self
+
+
+class Wind(Section):
+    """Horizontal wind: a mean velocity and gusts."""
+
+    velocity_mps: tuple[WindSpeed, WindSpeed] = (0.0, 0.0)
+    """Mean velocity of the air in x and y, world frame [m/s]"""
+    gust_mps: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Standard deviation of the gusts in x and in y [m/s]"""
+    gust_time_s: Annotated[float, Field(ge=0.01, le=100)] = 1.0
+    """Time constant of the gusts: their correlation falls to 37 % after this time [s]"""
 
 
 class World(Section):
@@ -281,6 +349,15 @@ class World(Section):
     """Name of a shipped scene, or path of an MJCF file (.xml)"""
     low_level: LowLevel = LowLevel()
     sensors: Sensors = Sensors()
+    """Errors of the odometry for cloud; guard and onboard controller see the true state"""
+    plant: Plant = Plant()
+    """How the true robot differs from its model; guard, onboard controller and cloud do not know.
+    A heavy or weak robot brakes worse, so that the guard may stop it too late"""
+    wind: Wind = Wind()
+    """Horizontal wind. It acts by the drag of the rotors, the only drag of the robot, and not on a
+    robot with stopped rotors"""
+    odometry_rate_hz: Literal[20, 25, 50, 100, 125, 250, 500] = 100
+    """Rate of the odometry for cloud [Hz]. The recorded true state has at least 100 Hz"""
 
 
 class Guard(Section):
@@ -331,6 +408,8 @@ class PlugIn(Section):
 
 
 PlugInChoice = NameOr[PlugIn]
+COMMAND_RATE_MIN_HZ, COMMAND_RATE_MAX_HZ = 20, 500
+"""Smallest and largest value of cloud.command_rate_hz [Hz]; the guard runs at 500 Hz."""
 
 
 class Cloud(Section):
@@ -348,6 +427,39 @@ class Cloud(Section):
     freeze_after_s: CloudTime | None = None
     """Time without the echo of a new command, beyond the horizon, after which cloud commands zero
     velocity [s]. null: the link profile's value, else 0.4"""
+    command_rate_hz: Annotated[int, Field(ge=COMMAND_RATE_MIN_HZ, le=COMMAND_RATE_MAX_HZ)] = 100
+    """Rate of the commands [Hz]. At less than 20 Hz the guard would never leave HOLD, which takes
+    10 commands within 500 ms"""
+    compute_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    """Mean time that cloud computes before each command leaves [ms], in real time in addition to
+    the true time. While cloud computes, it begins no other command. Reports count this time in
+    the delay of the downlink"""
+    compute_deviation_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
+    """Standard deviation of this time [ms], which then has a gamma distribution; needs compute_ms
+    above 0"""
+    compute_measured: bool = False
+    """Whether a command in virtual time leaves only after the processor time that this machine
+    needed for it, in addition to compute_ms. Such a flight is not repeatable"""
+    clock_offset_s: Annotated[float, Field(ge=0, le=1_000_000)] = 0.0
+    """By how much cloud's clock is ahead of world's at the start [s]; virtual time only"""
+    clock_drift_ppm: Annotated[int, Field(ge=-1000, le=1000)] = 0
+    """By how much cloud's clock is faster than world's [ppm]; virtual time only"""
+
+    @field_validator("command_rate_hz", mode="before")
+    @classmethod
+    def _check_rate(cls, rate: Any) -> Any:
+        if isinstance(rate, int) and rate < COMMAND_RATE_MIN_HZ:
+            raise ValueError(
+                f"must be a whole number >= {COMMAND_RATE_MIN_HZ} and <= {COMMAND_RATE_MAX_HZ} "
+                "[Hz]: the guard leaves HOLD only after 10 commands within 500 ms"
+            )
+        return rate
+
+    @model_validator(mode="after")
+    def _check_compute(self) -> Cloud:
+        if self.compute_deviation_ms > 0 and self.compute_ms == 0:
+            raise ValueError("compute_deviation_ms needs compute_ms, the mean, above 0")
+        return self
 
 
 class Criteria(Section):
@@ -382,7 +494,7 @@ class Experiment(Section):
     description: str = ""
     """One line about the experiment, for lists and reports"""
     seed: Annotated[int, Field(ge=0, lt=2**53)] = 1
-    """Seed of all random numbers: link, sensor noise and random steps"""
+    """Seed of all random numbers: link, sensor noise, wind, compute time and random steps"""
     mission: NameOr[Mission] = "pipes"
     """Name of a shipped mission, a path, or the mission itself"""
     world: World = World()

@@ -8,7 +8,9 @@ world's deadline, then cloud's deadline. Therefore equal inputs give bitwise equ
 from __future__ import annotations
 
 import gc
+import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from heapq import heappop, heappush
 
 from cloudrc.endpoint import Endpoint
@@ -18,12 +20,36 @@ from cloudrc.tunnel.codec import peek
 
 Sink = Callable[[list[Record], list[Record]], None]
 """Function that is called with the new records of world and the new records of cloud."""
+CPU_CLOCK = time.thread_time_ns
+"""Clock of the processor time of this thread [ns], which makes a flight not repeatable."""
 PERIOD_NS = 100_000_000
 """Virtual time between two calls of `sink` and of `until` [ns]."""
 
 
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """Monotonic clock of a machine, which may differ from virtual time."""
+
+    offset_ns: int = 0  # what the clock shows at virtual time 0 [ns]
+    drift_ppm: int = 0  # how much faster than virtual time the clock is [ppm]
+
+    def at(self, now_ns: int) -> int:
+        """Return the time that this clock shows [ns] at the virtual time `now_ns` [ns]."""
+        return now_ns + self.offset_ns + now_ns * self.drift_ppm // 1_000_000
+
+    def when(self, own_ns: int) -> int:
+        """Return the first virtual time [ns] at which this clock shows `own_ns` [ns] or more."""
+        now_ns = own_ns - self.offset_ns
+        if self.drift_ppm:
+            now_ns = -(-now_ns * 1_000_000 // (1_000_000 + self.drift_ppm))
+        return now_ns
+
+
 class VirtualRun:
-    """Runs world, cloud and both directions of the link, in virtual time that starts at 0."""
+    """Runs world, cloud and both directions of the link, in virtual time that starts at 0.
+
+    World's clock is virtual time, and so is `cloud_clock` by default.
+    """
 
     def __init__(
         self,
@@ -32,12 +58,11 @@ class VirtualRun:
         uplink: LinkDirection,
         downlink: LinkDirection,
         *,
-        cloud_clock_offset_ns: int = 0,
+        cloud_clock: Clock = Clock(),
     ) -> None:
-        """Connect the parts; cloud's clock is ahead of world's by `cloud_clock_offset_ns` [ns]."""
         self._world, self._cloud = world, cloud
         self._uplink, self._downlink = uplink, downlink
-        self._offset_ns = cloud_clock_offset_ns
+        self.cloud_clock = cloud_clock
         self._arrivals: list[tuple[int, int, bool, bytes]] = []
         self._sent = 0
         self.now_ns = 0
@@ -59,11 +84,18 @@ class VirtualRun:
             if gc_was_on:
                 gc.enable()
 
+    def on_world_clock(self, from_cloud: list[Record]) -> list[Record]:
+        """Convert the stamps of cloud's records [ns] to virtual time, which is world's clock."""
+        if self.cloud_clock == Clock():
+            return from_cloud
+        when = self.cloud_clock.when
+        return [record._replace(stamp_ns=when(record.stamp_ns)) for record in from_cloud]
+
     def _advance(self, end_ns: int) -> None:
         """Handle all events up to and including `end_ns` [ns]."""
-        world, cloud, offset_ns = self._world, self._cloud, self._offset_ns
-        arrivals = self._arrivals
-        world_ns, cloud_ns = world.next_deadline_ns(), cloud.next_deadline_ns() - offset_ns
+        world, cloud, arrivals = self._world, self._cloud, self._arrivals
+        at, when = self.cloud_clock.at, self.cloud_clock.when
+        world_ns, cloud_ns = world.next_deadline_ns(), when(cloud.next_deadline_ns())
         while True:
             deadline_ns = world_ns if world_ns <= cloud_ns else cloud_ns
             if arrivals and arrivals[0][0] <= deadline_ns:
@@ -73,7 +105,7 @@ class VirtualRun:
                 if to_world:
                     world.receive_datagram(data, self.now_ns)
                 else:
-                    cloud.receive_datagram(data, self.now_ns + offset_ns)
+                    cloud.receive_datagram(data, at(self.now_ns))
             elif deadline_ns > end_ns:
                 break
             else:
@@ -81,13 +113,13 @@ class VirtualRun:
                 if to_world := world_ns <= cloud_ns:
                     world.handle_deadline(deadline_ns)
                 else:
-                    cloud.handle_deadline(deadline_ns + offset_ns)
+                    cloud.handle_deadline(at(deadline_ns))
             if to_world:
                 world_ns = world.next_deadline_ns()
                 if datagrams := world.take_datagrams():
                     self._send(datagrams, self._uplink, to_world=False)
             else:
-                cloud_ns = cloud.next_deadline_ns() - offset_ns
+                cloud_ns = when(cloud.next_deadline_ns())
                 if datagrams := cloud.take_datagrams():
                     self._send(datagrams, self._downlink, to_world=True)
         self.now_ns = end_ns

@@ -16,11 +16,11 @@ from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.teleop import PERIOD_NS as WAKE_NS
-from cloudrc.drivers.virtual import VirtualRun
+from cloudrc.drivers.virtual import Clock, VirtualRun
 from cloudrc.endpoint import Endpoint
 from cloudrc.faults.adversary import DishonestLoop, HostileOperator, Lie, Words
 from cloudrc.faults.invariants import Limits, Watch
-from cloudrc.faults.models import Clock, EndpointGroup, RestartableEndpoint, TeleopModel
+from cloudrc.faults.models import EndpointGroup, RestartableEndpoint, TeleopModel
 from cloudrc.faults.scenario import generator
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, DirectionProfile

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from heapq import heappop, heappush
 from typing import TypeAlias, TypeVar
 
 from cloudrc.cloud.operator import Operator
 from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, RemoteTeleop, UnixPeer, send, turn
+from cloudrc.drivers.virtual import Clock
 from cloudrc.endpoint import Endpoint
 from cloudrc.messages import NEVER_NS
 from cloudrc.records import Fault, Lateness, MissionEvent, Record
@@ -41,27 +41,6 @@ Tamper: TypeAlias = Callable[[bytes, int], list[bytes]]
 """Function that replaces an arriving datagram by others, at a virtual time [ns]."""
 Call: TypeAlias = Callable[[MissionService, int], object]
 """Function that calls teleop's API; takes the service and the time on teleop's clock [ns]."""
-
-
-@dataclass(frozen=True, slots=True)
-class Clock:
-    """Monotonic clock of a machine, which may differ from virtual time."""
-
-    offset_ns: int = 0  # what the clock shows at virtual time 0 [ns]
-    drift_ppm: int = 0  # how much faster than virtual time the clock is [ppm]
-
-    def at(self, now_ns: int) -> int:
-        """Return the time that this clock shows [ns] at the virtual time `now_ns` [ns]."""
-        return now_ns + self.offset_ns + now_ns * self.drift_ppm // 1_000_000
-
-    def when(self, own_ns: int) -> int:
-        """Return the first virtual time [ns] at which this clock shows `own_ns` [ns] or more."""
-        now_ns = own_ns - self.offset_ns
-        if self.drift_ppm:
-            now_ns = now_ns * 1_000_000 // (1_000_000 + self.drift_ppm) - 1
-            while self.at(now_ns) < own_ns:
-                now_ns += 1
-        return now_ns
 
 
 class RestartableEndpoint:

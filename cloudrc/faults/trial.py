@@ -17,11 +17,12 @@ from math import inf, nan
 
 import numpy as np
 
+from cloudrc.drivers.virtual import Clock
 from cloudrc.faults.adversary import Lie, dishonesty
 from cloudrc.faults.flight import SECRET, Flight
 from cloudrc.faults.invariants import LATCHED, Breach
 from cloudrc.faults.measures import events_of_missions, held
-from cloudrc.faults.models import Action, Call, Clock, RestartableEndpoint, Tamper
+from cloudrc.faults.models import Action, Call, RestartableEndpoint, Tamper
 from cloudrc.faults.scenario import generator
 from cloudrc.faults.schedule import Event, Schedule, shaped
 from cloudrc.messages import Command, GuardState

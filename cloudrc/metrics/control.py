@@ -106,6 +106,6 @@ add_metrics(
      "simulation was late.", _slip),
     ("real_time_factor", "1", "Simulated time divided by time on the machine's clock; real time "
      "only.", _real_time_factor),
-    ("missed_periods", "1", "Number of 10 ms periods without a command because cloud was late; "
+    ("missed_periods", "1", "Number of periods without a command because cloud was late; "
      "real time only.", _missed_periods),
 )  # fmt: skip

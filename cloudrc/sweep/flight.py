@@ -9,6 +9,7 @@ from cloudrc.config.load import ResolvedExperiment
 from cloudrc.errors import describe_error
 from cloudrc.metrics import Number
 from cloudrc.record.columns import RecordStore
+from cloudrc.records import Record
 from cloudrc.report.document import Assessment, Run
 from cloudrc.report.write import assess
 
@@ -52,6 +53,11 @@ def fly_in_memory(experiment: ResolvedExperiment) -> Assessment:
     store = RecordStore()
     _, cloud, flight = assembly.assemble(experiment)
     limit_ns = round(assembly.flight_limit(experiment) * 1e9)
-    flight.fly(lambda: cloud.mission_over, limit_ns, store.add)
-    run = Run("virtual", "virtual", store.hexdigest())
+
+    def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
+        store.add(from_world, flight.on_world_clock(from_cloud))
+
+    flight.fly(lambda: cloud.mission_over, limit_ns, sink)
+    notes = assembly.virtual_notes(experiment)
+    run = Run("virtual", "virtual", store.hexdigest(), notes=notes)
     return assess(store.recording(), experiment, run, experiment.report.metrics)

@@ -152,7 +152,8 @@ class PaceMonitor:
 
 
 ODOMETRY_PERIOD_NS = 10_000_000
-"""Time between two odometry samples [ns]. Source: docs/reference/plant.md, "Odometry"."""
+"""Time between two odometry samples, unless an experiment sets another rate, and longest time
+between two records of the true state [ns]. Source: docs/reference/plant.md, "Odometry"."""
 CATCH_UP_NS = 50_000_000
 """Largest lag of world's clock that world makes up after a stall [ns]; further lag stays."""
 COUNT_PERIOD_NS = 1_000_000_000
@@ -172,13 +173,15 @@ class WorldEndpoint(TunnelEnd):
         *,
         newest_wins: bool,
         command_age_max_ns: int,
+        odometry_period_ns: int = ODOMETRY_PERIOD_NS,
         start_ns: int = 0,
     ) -> None:
         """Connect a robot with stopped rotors to the tunnel; there is no session yet.
 
         With `newest_wins`, a command that arrives after a newer command is dropped.
-        `command_age_max_ns` is the largest accepted age of a command [ns]. `start_ns` is the
-        present time on the monotonic clock [ns].
+        `command_age_max_ns` is the largest accepted age of a command [ns], `odometry_period_ns` the
+        time between two odometry samples [ns], a multiple of the step. `start_ns` is the present
+        time on the monotonic clock [ns].
         """
         super().__init__(identity, Direction.UPLINK, newest_wins)
         self.robot, self._sensors = robot, sensors
@@ -189,7 +192,9 @@ class WorldEndpoint(TunnelEnd):
         )
         self._command_age_max_ns = command_age_max_ns
         self._stalled_wake_ns = NEVER_NS
-        self._odometry_ns = start_ns
+        self._sample_ns = self._odometry_ns = start_ns
+        self._odometry_period_ns = odometry_period_ns
+        self._sample_period_ns = min(odometry_period_ns, ODOMETRY_PERIOD_NS)
         self._count_ns = start_ns + COUNT_PERIOD_NS
         self._waiting: tuple[int, int, Command] | None = None
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
@@ -206,8 +211,8 @@ class WorldEndpoint(TunnelEnd):
         return self._slip_ns
 
     def next_deadline_ns(self) -> int:
-        """Return when the next odometry sample is due [ns], monotonic clock."""
-        return self._odometry_ns + self._slip_ns
+        """Return when the next sample of the true state is due [ns], monotonic clock."""
+        return self._sample_ns + self._slip_ns
 
     def handle_deadline(self, now_ns: int) -> None:
         """Simulate up to and including `now_ns` [ns]; send the telemetry that is due."""
@@ -255,10 +260,10 @@ class WorldEndpoint(TunnelEnd):
         if tick_ns < until_ns and self._waiting is not None:
             self._apply(tick_ns)
         while tick_ns < until_ns:
-            if tick_ns >= self._odometry_ns:
-                self._send_telemetry(tick_ns)
-            odometry_ns = self._odometry_ns
-            stop_ns = odometry_ns if odometry_ns < until_ns else until_ns
+            if tick_ns >= self._sample_ns:
+                self._sample(tick_ns)
+            sample_ns = self._sample_ns
+            stop_ns = sample_ns if sample_ns < until_ns else until_ns
             tick_ns = self._tick_ns = self.robot.run(tick_ns, stop_ns)
 
     def _apply(self, now_ns: int) -> None:
@@ -271,7 +276,8 @@ class WorldEndpoint(TunnelEnd):
         self._echo_stamp_ns, self._applied_ns = echo_ns, now_ns
         self._records.append(_new(CommandApplied, (now_ns, epoch, counter, basis_ns, velocity)))
 
-    def _send_telemetry(self, now_ns: int) -> None:
+    def _sample(self, now_ns: int) -> None:
+        """Record the true state and the events before it; send telemetry if it is due."""
         simulator, guard, records = self.robot.simulator, self.robot.guard, self._records
         orders = self._orders
         tip_force = simulator.tip_force()
@@ -285,7 +291,10 @@ class WorldEndpoint(TunnelEnd):
             for touch in simulator.take_contacts():
                 records.append(touch._replace(stamp_ns=now_ns))
                 orders.note_touch(touch)
-        if epoch := self._session.epoch:
+        is_due = now_ns >= self._odometry_ns
+        if is_due:
+            self._odometry_ns += self._odometry_period_ns
+        if is_due and (epoch := self._session.epoch):
             known = (
                 now_ns,
                 self._sensors.measure(truth),
@@ -311,7 +320,7 @@ class WorldEndpoint(TunnelEnd):
             for name, count in sorted((self._counts | guard.counts).items()):
                 records.append(Counted(now_ns, "world", name, count))
             records += self._pace.check(now_ns, self._slip_ns)
-        self._odometry_ns += ODOMETRY_PERIOD_NS
+        self._sample_ns += self._sample_period_ns
 
     def _receive_hello(self, hello: Hello, counter: int, now_ns: int) -> None:
         if now_ns == self._stalled_wake_ns:

@@ -10,13 +10,16 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterable
+from math import nan
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from cloudrc.config.schema import Plant
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.world.low_level import GRAVITY, MASS, THRUST_MAX
+from cloudrc.world.plant import Array, Inertia, point_inertia, true_inertia
 from cloudrc.world.rotors import ARM, HEIGHT, TORQUE_RATIO
 
 ROBOT_PREFIX = "robot/"
@@ -56,6 +59,8 @@ def import_mujoco() -> Any:
 
 
 mujoco = import_mujoco()
+FUSES_WRONG = tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 11)
+"""Whether MuJoCo computes a wrong inertia when it fuses static bodies, as it does up to 3.10."""
 # Otherwise MuJoCo writes its warnings to MUJOCO_LOG.TXT in the working directory.
 mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
 
@@ -72,15 +77,32 @@ def model_path(kind: str, name: str) -> Path:
     return path
 
 
-def compile_model(robot: str, scene: str) -> Any:
+def compile_model(robot: str, scene: str, plant: Plant | None = None) -> Any:
     """Attach the robot to the scene's frame `spawn` and compile both into an `MjModel`.
 
-    Both arguments are names of shipped models or paths of files. In the result, names of the robot
-    begin with `robot/`. Static bodies are fused, so that a step takes half the time. Fused bodies
-    lose their names; therefore each geom of the scene gets the name BODY/NUMBER. Raise a
+    `robot` and `scene` are names of shipped models or paths of files. In the result, names of the
+    robot begin with `robot/`. Static bodies are fused, so that a step takes half the time. Fused
+    bodies lose their names; therefore each geom of the scene gets the name BODY/NUMBER. Raise a
     BadInputError if a file is missing, does not compile or does not fit the onboard controller.
+
+    With `plant`, the result is the true robot; the files have to fit the controller without it.
     """
-    robot_path, scene_path = model_path("robots", robot), model_path("scenes", scene)
+    paths = model_path("robots", robot), model_path("scenes", scene)
+    model = _compile(*paths)
+    _check_parts(model, *paths)
+    if FUSES_WRONG:
+        model = _compile(*paths, _inertia(_compile(*paths, fuse=False)))
+    _check_numbers(model, *paths)
+    if plant is not None and plant != Plant():
+        model = _compile(*paths, true_inertia(plant, _inertia(model)))
+        model.actuator_gainprm[:, 0] *= plant.thrust_factor
+    return model
+
+
+def _compile(
+    robot_path: Path, scene_path: Path, inertia: Inertia | None = None, *, fuse: bool = True
+) -> Any:
+    """Compile the robot in the scene, with another `inertia` of the robot if it is given."""
     try:
         spec = mujoco.MjSpec.from_file(str(scene_path))
         for number, geom in enumerate(spec.geoms):
@@ -93,16 +115,43 @@ def compile_model(robot: str, scene: str) -> Any:
             )
         # An empty prefix would make MuJoCo write MUJOCO_LOG.TXT into the working directory.
         spec.attach(mujoco.MjSpec.from_file(str(robot_path)), prefix=ROBOT_PREFIX, frame="spawn")
-        spec.compiler.fusestatic = True
-        model = spec.compile()
+        spec.compiler.fusestatic = fuse
+        if inertia is not None:
+            _set_inertia(spec.joints[0].parent, *inertia)
+        return spec.compile()
     except (ValueError, KeyError) as error:
         reason = " ".join(str(error).split())
         raise BadInputError(f"{robot_path} in {scene_path} does not compile: {reason}") from None
-    _check(model, robot_path, scene_path)
-    return model
 
 
-def _check(model: Any, robot_path: Path, scene_path: Path) -> None:
+def _inertia(model: Any) -> Inertia:
+    """Compute the inertia of the robot, which may have several bodies."""
+    data, base = mujoco.MjData(model), model.jnt_bodyid[0]
+    mujoco.mj_forward(model, data)
+    frame, bodies = data.xmat[base].reshape(3, 3), np.flatnonzero(model.body_rootid == base)
+    masses, places = model.body_mass[bodies], (data.xipos[bodies] - data.xpos[base]) @ frame
+    centre, inertia = masses @ places / masses.sum(), np.zeros((3, 3))
+    for body, mass, place in zip(bodies, masses, places, strict=True):
+        axes = frame.T @ data.ximat[body].reshape(3, 3)
+        inertia += axes @ np.diag(model.body_inertia[body]) @ axes.T
+        inertia += point_inertia(mass, place - centre)
+    return masses.sum(), centre, inertia
+
+
+def _set_inertia(base: Any, mass: float, centre: Array, inertia: Array) -> None:
+    """Give the base of an `MjSpec` the inertia of the whole robot, and its other bodies none."""
+    for geom in base.find_all("geom"):
+        geom.mass = 0.0
+    for body in base.find_all("body"):
+        body.mass, body.inertia, body.fullinertia = 0.0, np.zeros(3), np.full(6, nan)
+    moments, axes = np.linalg.eigh(inertia)
+    axes[:, 0] *= np.linalg.det(axes)  # a rotation, not a mirror image
+    base.iquat, base.fullinertia = np.empty(4), np.full(6, nan)
+    mujoco.mju_mat2Quat(base.iquat, axes.ravel())
+    base.mass, base.ipos, base.inertia, base.explicitinertial = mass, centre, moments, True
+
+
+def _check_parts(model: Any, robot_path: Path, scene_path: Path) -> None:
     actuators = [model.actuator(number).name for number in range(model.nu)]
     if actuators != [f"{ROBOT_PREFIX}{rotor}" for rotor in ROTORS]:
         raise BadInputError(f"{robot_path}: needs the actuators {', '.join(ROTORS)}, in this order")
@@ -120,6 +169,9 @@ def _check(model: Any, robot_path: Path, scene_path: Path) -> None:
         raise BadInputError(
             f"{scene_path}: option timestep is {model.opt.timestep}, not {TIMESTEP}"
         )
+
+
+def _check_numbers(model: Any, robot_path: Path, scene_path: Path) -> None:
     gravity = _compare("gravity [m/s^2]", -model.opt.gravity[2:], [GRAVITY], 0.02 * GRAVITY)
     for path, differs in ((robot_path, _robot_differences(model)), (scene_path, gravity)):
         if differs:
@@ -147,7 +199,7 @@ def _robot_differences(model: Any) -> list[str]:
     weight that differs by 1 N, and the attitude gains work for an inertia that differs by 50 %.
     """
     base = model.jnt_bodyid[0]
-    turned, centre = _axes(model.body_iquat[base]), model.body_ipos[base]
+    turned, centre = rotation(model.body_iquat[base]), model.body_ipos[base]
     inertia = np.diag(turned @ np.diag(model.body_inertia[base]) @ turned.T)
     differs = _compare("mass [kg]", model.body_mass[[base]], [MASS], 0.1 * MASS)
     differs += _compare("centre of mass, AXIS [m]", centre[:2], (0.0, 0.0), 0.01)
@@ -173,7 +225,7 @@ def _rotor_differences(
     if model.actuator_trntype[number] != mujoco.mjtTrn.mjTRN_SITE:
         return [f"{name} transmission is {model.actuator_trntype[number]}, not a site"]
     site, gear = model.actuator_trnid[number, 0], model.actuator_gear[number]
-    axes, torque = _axes(model.site_quat[site]), (0.0, 0.0, sign * TORQUE_RATIO)
+    axes, torque = rotation(model.site_quat[site]), (0.0, 0.0, sign * TORQUE_RATIO)
     differs = [
         *_compare(f"{name} place, AXIS [m]", model.site_pos[site], place, 0.01),
         *_compare(f"{name} gear, thrust along AXIS", axes @ gear[:3], (0.0, 0.0, 1.0), 0.01),
@@ -194,7 +246,8 @@ def _rotor_differences(
     return differs
 
 
-def _axes(quaternion: Any) -> Any:
+def rotation(quaternion: Any) -> Any:
+    """Return the rotation matrix of a unit quaternion (wxyz), shape (3, 3)."""
     axes = np.empty(9)
     mujoco.mju_quat2Mat(axes, quaternion)
     return axes.reshape(3, 3)

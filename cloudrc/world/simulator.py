@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from cloudrc.config.schema import Plant
 from cloudrc.messages import Vector
 from cloudrc.records import Contact
+from cloudrc.world.plant import Wind
 from cloudrc.world.readings import Readings, RotorSpeeds
 from cloudrc.world.rotors import STOPPED, Controls, Rotors
 from cloudrc.world.scene import ROBOT_PREFIX, compile_model, mujoco
@@ -47,12 +49,20 @@ class Simulator:
             a list.
     """
 
-    def __init__(self, robot: str = "pelican", scene: str = "pipes") -> None:
+    def __init__(
+        self,
+        robot: str = "pelican",
+        scene: str = "pipes",
+        plant: Plant | None = None,
+        wind: Wind | None = None,
+    ) -> None:
         """Compile `robot` in `scene` (names or paths) and put the robot at its spawn.
 
-        Raise a BadInputError if a file is missing or does not fit the onboard controller.
+        Without `plant`, the true robot equals the model. Raise a BadInputError if a file is missing
+        or does not fit the onboard controller.
         """
-        self.model = model = compile_model(robot, scene)
+        self.model = model = compile_model(robot, scene, plant)
+        self._wind = wind
         self.dt: float = model.opt.timestep
         self.tape: list[Controls] | None = None
         self._data = data = mujoco.MjData(model)
@@ -89,10 +99,11 @@ class Simulator:
         """Advance by `dt` with these commanded rotor speeds [rad/s], shape (4,).
 
         Thrust and drag use the rotor speeds at the end of the step. The drag uses the velocity at
-        the beginning of the step.
+        the beginning of the step, relative to the air.
         """
-        before, data = self.readings, self._data
-        controls = self._rotors.step(rotor_speeds, before)
+        before, data, wind = self.readings, self._data, self._wind
+        in_air = before if wind is None else wind.seen_from(before, self.dt)
+        controls = self._rotors.step(rotor_speeds, in_air)
         front, left, back, right, fx, fy, fz, tx, ty, tz = controls
         _pack_ctrl(self._ctrl, 0, front, left, back, right)
         _pack_applied(self._applied, 0, fx, fy, fz, tx, ty, tz)

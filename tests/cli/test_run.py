@@ -36,6 +36,7 @@ def no_page(monkeypatch):
         ("--set cloud.predictr=last_sample", "predictor"),
         ("--set report.metrics=./no.py", "no.py': there is no such file"),
         ("--set nonsense", "key=value"),
+        ("--mode local --set cloud.clock_offset_s=5", "virtual time only"),
     ],
 )
 def test_bad_input_gives_one_line_and_writes_nothing(line, words, folder, capsys):

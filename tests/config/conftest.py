@@ -18,6 +18,7 @@ SPECIAL = {
     "mission.steps.centre_m": [0.1, 0.2, 1.1],
     "mission.steps.range_m": [0.5, 0.5, 0.5],
     "guard.command_age_max_ms": 300,
+    "cloud.command_rate_hz": 50,
     "world.robot": "pelican",
     "world.scene": "empty",
     "link.profile": "paper-p3",
@@ -52,7 +53,8 @@ def valid(key):
     field = LEAVES[key]
     if get_origin(field.annotation) is Literal:
         return get_args(field.annotation)[-1]
-    known = {"list of 3": [0.25, 0.5, 0.75], "whole number": 7, "number": 0.5,
+    known = {"list of 2": [0.25, 0.5], "list of 3": [0.25, 0.5, 0.75],
+             "list of 4": [1.0, 0.5, 0.75, 2.0], "whole number": 7, "number": 0.5,
              "true or false": not field.default}  # fmt: skip
     return next((value for word, value in known.items() if word in words(key)), "some text")
 
@@ -64,6 +66,8 @@ def beside(key):
         needed = {"bad_start": 0.1, "bad_end": 0.5}
         found = [f"{above}.{name}={value}" for name, value in needed.items() if name != last]
         return [*found, *beside(above)]
+    if last == "compute_deviation_ms":
+        return ["cloud.compute_ms=5"]
     if above.endswith("changes.0") and last != "at_s":
         return [f"{above}.at_s=3"]
     if above.endswith("blackouts.0"):

@@ -54,7 +54,11 @@ def test_wrong_type_is_refused(key):
 @pytest.mark.parametrize("key", RANGED)
 def test_out_of_range_is_refused(key):
     above = [1.001 * float(limit) for limit in re.findall(r"<= ([\d.]+)", words(key))]
-    for value in (-1, *((int(limit) + 1 for limit in above) if "whole" in words(key) else above)):
+    below = [int(limit) - 1 for limit in re.findall(r">= (-\d+)", words(key))] or [-1]
+    for value in (
+        *below,
+        *((int(limit) + 1 for limit in above) if "whole" in words(key) else above),
+    ):
         text = refusal(key, value)
         assert f"--set: {key}: " in text
         assert words(key) in text

@@ -5,8 +5,8 @@ from functools import partial
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cloudrc.drivers.virtual import Clock
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.models import Clock
 from cloudrc.faults.schedule import Event, Schedule
 from cloudrc.faults.trial import inject
 from cloudrc.messages import GuardState

@@ -7,7 +7,7 @@ from unittest.mock import Mock
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.config.load import load_experiment
-from cloudrc.drivers.virtual import VirtualRun
+from cloudrc.drivers.virtual import Clock, VirtualRun
 from cloudrc.messages import (
     UPRIGHT,
     ZERO,
@@ -216,7 +216,7 @@ def join(experiment, *, offset_ns=0, keys=None):
     identity = Identity(SHARED_CLOCK, b"cloud".ljust(16), keys)
     cloud = assembly.build_cloud(experiment, identity, lambda: offset_ns)
     links = assembly.build_links(experiment)
-    return Ends(world, cloud, VirtualRun(world, cloud, *links, cloud_clock_offset_ns=offset_ns))
+    return Ends(world, cloud, VirtualRun(world, cloud, *links, cloud_clock=Clock(offset_ns)))
 
 
 def fly_on(run, until_ns, over=lambda: False):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cloudrc.messages import Odometry
-from cloudrc.world.sensors import Sensors
+from cloudrc.world.sensors import Errors, Sensors
 
 TRUTH = Odometry(5, (1.0, 2.0, 3.0), (0.6, 0.0, 0.8, 0.0), (4.0, 5.0, 6.0), (7.0, 8.0, 9.0))
 
@@ -23,3 +23,32 @@ def test_noise_has_the_configured_deviation_per_axis():
     noisy = samples[-1]
     assert noisy._replace(position=TRUTH.position, velocity=TRUTH.velocity) == TRUTH
     assert {type(x) for x in (*noisy.position, *noisy.velocity)} == {float}
+
+
+def test_attitude_and_rate_have_their_bias_about_the_body_axes():
+    turn = (0.0, 0.0, np.pi / 2)
+    biased = Sensors(
+        0.0, 0.0, np.random.default_rng(1),
+        attitude=Errors(bias=turn), rate=Errors(bias=(0.1, -0.2, 0.3)),
+    ).measure(TRUTH)  # fmt: skip
+    half = np.sqrt(0.5)  # (.6 + .8 j) (half + half k) = .6 half + .8 half i + .8 half j + .6 half k
+    assert biased.orientation_wxyz == pytest.approx(
+        (0.6 * half, 0.8 * half, 0.8 * half, 0.6 * half)
+    )
+    assert biased.angular_velocity_body == pytest.approx((7.1, 7.8, 9.3))
+    same = TRUTH.position, TRUTH.velocity
+    assert (biased.position, biased.velocity) == same
+
+
+def test_noise_of_attitude_and_rate_changes_no_other_noise():
+    def sensors(**errors):
+        first, second = np.random.default_rng(1), np.random.default_rng(2)
+        return Sensors(0.005, 0.02, first, turn_rng=second, **errors)
+
+    plain, noisy = sensors(), sensors(attitude=Errors(0.01), rate=Errors(0.05))
+    pairs = [(plain.measure(TRUTH), noisy.measure(TRUTH)) for _ in range(2000)]
+    assert all(a.position == b.position and a.velocity == b.velocity for a, b in pairs)
+    products = [2 * np.dot(TRUTH.orientation_wxyz, b.orientation_wxyz) ** 2 - 1 for _, b in pairs]
+    assert np.sqrt(np.mean(np.arccos(products) ** 2)) == pytest.approx(0.01 * np.sqrt(3), rel=0.05)
+    rates = np.array([b.angular_velocity_body for _, b in pairs])
+    assert rates.std(axis=0) == pytest.approx([0.05] * 3, rel=0.05)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from math import isnan, nan
 
+from cloudrc.drivers.virtual import Clock
 from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight, conditions
 from cloudrc.faults.measures import fly_safely, moves
-from cloudrc.faults.models import Clock
 from cloudrc.faults.scenario import Outcome, scenario
 from cloudrc.link.profile import Change
 from cloudrc.records import Arrival, Control

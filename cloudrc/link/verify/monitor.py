@@ -37,7 +37,7 @@ from cloudrc.link.verify.judge import (
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 
 PERIOD = 0.01
-"""Period of telemetry and of commands [s]."""
+"""Default period of telemetry and of commands [s]."""
 CHECK_NS, SETTLE_NS = 5_000_000_000, 2_000_000_000
 """Period of the verdicts [ns]; pause after a change of session or profile [ns]."""
 KEPT, FINAL = 6000, 128
@@ -61,9 +61,16 @@ Load: TypeAlias = Callable[[object], Asked]
 class LinkMonitor:
     """Judges one direction of the link from the records of the program that receives it."""
 
-    def __init__(self, *, uplink: bool, flow: Flow) -> None:
-        """Monitor the received `flow`: telemetry at cloud (`uplink`), or commands at world."""
+    def __init__(
+        self, *, uplink: bool, flow: Flow, period: float = PERIOD, computes: bool = False
+    ) -> None:
+        """Monitor the received `flow`: telemetry at cloud (`uplink`), or commands at world.
+
+        `period` is that of the flow [s]. If cloud `computes` for a simulated time, delays that
+        contain this time are not judged.
+        """
         self._uplink, self._flow = uplink, flow
+        self._period, self._computes = period, computes
         self._arrivals = deque[Arrival](maxlen=KEPT)
         self._trips, self._lates = (deque[float](maxlen=KEPT) for _ in range(2))
         self._asked: Asked | None = None
@@ -84,7 +91,8 @@ class LinkMonitor:
     def follow(self, asked: Asked | None) -> None:
         """Replace the requested profiles; None means unknown, so nothing is judged."""
         if asked != self._asked:
-            self._asked, self._fresh, sent = asked, True, np.arange(float(RUN_LENGTH)) * PERIOD
+            self._asked, self._fresh = asked, True
+            sent = np.arange(float(RUN_LENGTH)) * self._period
             ways = () if asked is None else asked if self._uplink else asked[::-1]
             self._plans = [
                 Plan(settled(profile), self._flow, sent, pause=self._pause) for profile in ways
@@ -178,14 +186,15 @@ class LinkMonitor:
 
     def _rows(self) -> list[Row]:
         """Judge all quantities, including the round trip and properties that are only reported."""
-        stream, first, timed = _in_order(self._arrivals)
-        rows, skipped = list[Row](), UNJUDGED if timed else UNJUDGED | DELAYS
+        stream, first, timed = _in_order(self._arrivals, self._period)
+        judged = timed and (self._uplink or not self._computes)
+        rows, skipped = list[Row](), UNJUDGED if judged else UNJUDGED | DELAYS
         if len(stream.sent) >= FEWEST:
             rows = self._plans[0].judge(stream, self._epoch, first)
         elif self._arrivals:  # a new session or profile ends the old verdict
             rows = [told("loss", nan)._replace(verdict="open")]
         rows = [row for row in rows if row.name not in skipped]
-        if not timed and len(self._trips) >= FEWEST:
+        if not timed and not self._computes and len(self._trips) >= FEWEST:
             rows.append(self._round_trip())
         rows = [self._excuse(row) for row in rows]
         timelines = [Timeline(one) for one in self._asked or ()]
@@ -208,12 +217,12 @@ class LinkMonitor:
         square of the added delay grows with the third power of t.
         """
         late = np.array(self._lates or [0.0])
-        added = 2.0 * max((late**2).mean(), (late**3).mean() / (3.0 * PERIOD)) ** 0.5
+        added = 2.0 * max((late**2).mean(), (late**3).mean() / (3.0 * self._period)) ** 0.5
         slow = row.verdict == "off" and row.unit == "s" and row.measured > row.low
         return row._replace(verdict="open") if slow and row.measured <= row.high + added else row
 
 
-def _in_order(arrivals: Sequence[Arrival]) -> tuple[Stream, int, bool]:
+def _in_order(arrivals: Sequence[Arrival], period: float) -> tuple[Stream, int, bool]:
     """Sort arrivals by counter, and mark missing counters between them as lost.
 
     Also return the first counter, and whether world and cloud share a clock. Without a shared
@@ -235,7 +244,7 @@ def _in_order(arrivals: Sequence[Arrival]) -> tuple[Stream, int, bool]:
     stamps_ns = [one.stamp_ns - begin_ns + place for place, one in enumerate(arrivals)]
     stamps = np.array(stamps_ns)[index] * 1e-9
     known = np.array([one.delay for one in arrivals])[index]
-    delays[numbers] = known if timed else stamps - numbers * PERIOD
+    delays[numbers] = known if timed else stamps - numbers * period
     copies[numbers] = times
     sent = np.interp(np.arange(count), numbers, stamps - delays[numbers])
     return Stream(sent, delays, copies), first, timed

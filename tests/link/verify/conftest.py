@@ -67,10 +67,10 @@ def arrivals(profile, seconds=60.0, *, seed=SEED, overhead=5e-4, uplink=False):
     return sorted(found)
 
 
-def hearing(up, down, *, uplink=False):
+def hearing(up, down, *, uplink=False, **options):
     """Return the monitor of the end that receives a direction."""
     flow = Flow(SEED, uplink, KINDS[uplink], SIZES[KINDS[uplink]])
-    monitor = LinkMonitor(uplink=uplink, flow=flow)
+    monitor = LinkMonitor(uplink=uplink, flow=flow, **options)
     monitor.follow((up, down))
     return monitor
 

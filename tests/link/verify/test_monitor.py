@@ -70,6 +70,27 @@ def test_without_a_common_clock_one_way_delays_are_not_judged():
     assert len(faults) == 1
 
 
+def test_simulated_compute_time_is_no_delay_of_the_link():
+    heard = arrivals(PAPER, overhead=0.008)
+    assert checked(hearing(PAPER, PAPER), heard)[1] != []
+    moments, faults = checked(hearing(PAPER, PAPER, computes=True), heard)
+    assert faults == []
+    assert "loss" in moments[-1]
+    assert not {"mean", "deviation"} & moments[-1].keys()
+
+
+def test_a_slower_flow_has_its_own_period():
+    """Without a common clock, the period gives the times of sending."""
+    ways = {"up": PAPER, "down": PAPER, "uplink": True}
+    slow = [
+        one._replace(stamp_ns=one.stamp_ns + one.counter * PERIOD_NS, delay=nan)
+        for one in arrivals(PAPER, uplink=True)
+    ]
+    moments, faults = checked(hearing(**ways, period=2 * PERIOD_NS * 1e-9), sorted(slow))
+    assert faults == []
+    assert moments[-1]["reordered"].verdict == "ok"
+
+
 def test_a_new_session_starts_undecided():
     monitor = hearing(PAPER, PAPER)
     assert is_believed(checked(monitor, arrivals(PAPER, 20.0))[0][-1])

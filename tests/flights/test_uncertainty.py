@@ -1,0 +1,138 @@
+"""Each uncertainty changes the flight as it should, and its default changes nothing."""
+
+import json
+
+import numpy as np
+import pytest
+
+from cloudrc.cli.run import assemble, fly
+from cloudrc.config import schema
+from cloudrc.config.load import load_experiment
+from cloudrc.record.columns import Recording
+from tests.flights.conftest import digest, fly_on
+
+POINT = (0.5, 0.0, 0.9)
+
+
+def waiting(*settings, seconds=1.0):
+    """An experiment in which the robot flies to POINT and waits."""
+    way = {"position_m": POINT, "tolerance_m": 0.5, "dwell_s": seconds}
+    keys = f"mission={json.dumps({'waypoints': [way]})}", "world.scene=empty"
+    link = () if any("link." in setting for setting in settings) else ("link.profile=ideal",)
+    return load_experiment("paper", [*keys, *link, *settings])
+
+
+def flown(*settings, seconds=1.0):
+    _, cloud, run = assemble(waiting(*settings, seconds=seconds))
+    return Recording.from_records(*fly_on(run, 30_000_000_000, lambda: cloud.mission_over))
+
+
+def numbers(folder, *settings):
+    """Fly and return the numbers of the report."""
+    folder.mkdir()
+    report = fly(waiting(*settings), "virtual", folder, page=False)
+    assert report["verdict"] == "success"
+    return {name: number["value"] for name, number in report["numbers"].items()}, report
+
+
+def test_defaults_fly_as_if_the_keys_did_not_exist():
+    plant, wind, cloud = schema.Plant(), schema.Wind(), schema.Cloud()
+    keys = [f"world.plant={plant.model_dump_json()}", f"world.wind={wind.model_dump_json()}"]
+    keys += [f"world.sensors={schema.Sensors().model_dump_json()}", "world.odometry_rate_hz=100"]
+    own = [key for key in schema.Cloud.model_fields if key.startswith(("compute", "clock", "comm"))]
+    keys += [f"cloud.{key}={json.dumps(getattr(cloud, key))}" for key in own]
+    assert len(own) == 6
+    link = "link.profile=paper-p3"
+    assert digest(waiting(link, *keys)) == digest(waiting(link))
+    assert digest(waiting(link, "world.plant.mass_factor=1.001")) != digest(waiting(link))
+
+
+WEIGHT, ASSUMED = 1.06 * 9.8066, 1.05 * 9.81
+
+
+@pytest.mark.parametrize(
+    ("key", "axis", "lacks"),
+    [
+        ("world.plant.mass_factor=1.2", 2, 1.2 * WEIGHT - ASSUMED),
+        ("world.plant.payload_kg=0.25", 2, WEIGHT + 0.25 * 9.8066 - ASSUMED),
+        ("world.plant.thrust_factor=0.8", 2, WEIGHT / 0.8 - ASSUMED),
+        # The drag of four rotors at 510 rad/s, .0454 m above the centre of mass, also tilts the
+        # robot: by the torque in N m (k_R = 1), and this tilts its thrust.
+        ("world.wind.velocity_mps=[0, 3]", 1, 3 * 4 * 8.06428e-5 * 510.1 * (1 + 0.0454 * WEIGHT)),
+    ],
+)
+def test_the_robot_hovers_where_the_forces_balance(key, axis, lacks):
+    """Velocity loop: Kp v + Ki s, with s at its limit; cloud's P turns v into a distance."""
+    gain_p, integral, gain = (4.0, 0.1, 0.8) if axis < 2 else (10.0, 1.0, 1.5)
+    away = (lacks - integral) / gain_p / gain * (1 if axis < 2 else -1)
+    found = flown(key, seconds=8.0)["/ground_truth"]["position"][-1]
+    assert found[axis] - POINT[axis] == pytest.approx(away, rel=0.02)
+
+
+def test_gusts_are_seeded_and_shake_the_robot():
+    def sway(*settings):
+        return flown("world.wind.gust_mps=2", *settings, seconds=4.0)["/ground_truth"]["position"]
+
+    first = sway()
+    assert np.array_equal(first, sway())
+    assert not np.array_equal(first, sway("seed=2"))
+    still = flown(seconds=4.0)["/ground_truth"]["position"]
+    assert first[-300:, 1].std() > 10 * still[-300:, 1].std()
+
+
+def test_bias_and_noise_are_in_the_odometry_and_not_in_the_truth():
+    keys = "attitude_bias_deg: [0, 0, 10], rate_bias_radps: [0.5, 0, 0], rate_noise_radps: 0.1"
+    recording = flown(f"world.sensors={{{keys}}}")
+    seen, true = recording["/odometry"], recording["/ground_truth"]
+    rows = np.searchsorted(true["stamp_ns"], seen["stamp_ns"])
+    errors = seen["angular_velocity_body"] - true["angular_velocity_body"][rows]
+    assert errors.mean(axis=0) == pytest.approx((0.5, 0.0, 0.0), abs=0.02)
+    assert errors.std(axis=0) == pytest.approx([0.1] * 3, rel=0.1)
+    turned = np.sum(seen["orientation_wxyz"] * true["orientation_wxyz"][rows], axis=1)
+    assert turned == pytest.approx(np.cos(np.radians(5.0)), abs=1e-6)
+    assert np.array_equal(seen["position"], true["position"][rows])
+
+
+def test_the_estimator_sees_compute_time_as_loop_delay():
+    delays = {
+        keys: flown("link.profile=paper-p1", *keys)["/delay_estimate"]["horizon"][-1]
+        for keys in ((), ("cloud.compute_ms=8",), ("cloud.compute_ms=8", "seed=2"))
+    }
+    first, computed, _ = delays.values()
+    assert computed - first == pytest.approx(0.008, abs=0.003)
+
+
+def test_measured_compute_time_marks_the_run(tmp_path):
+    _, report = numbers(tmp_path / "run", "cloud.compute_measured=true", "cloud.compute_ms=1")
+    assert report["notes"][0].startswith("Not repeatable: ")
+
+
+def test_no_number_depends_on_the_clocks(tmp_path):
+    link = "link.profile=paper-p2"
+    same, _ = numbers(tmp_path / "same", link)
+    later, _ = numbers(tmp_path / "later", link, "cloud.clock_offset_s=86400.5")
+    of_one_clock = {"uplink_delay_mean", "downlink_delay_mean", "age_of_information_mean"}
+    assert same.keys() - later.keys() == of_one_clock, "unknown, not wrong"
+    assert later == {name: same[name] for name in later}
+    drift, _ = numbers(tmp_path / "drift", link, "cloud.clock_drift_ppm=-1000")
+    assert drift.keys() == later.keys()
+    for name in ("rtt_mean", "loop_delay_mean", "duration", "tracking_rms_measured"):
+        assert drift[name] == pytest.approx(later[name], rel=0.03), name
+
+
+@pytest.mark.parametrize(
+    ("odometry", "commands"), [(20, 100), (50, 500), (125, 30), (500, 100), (100, 20)]
+)
+def test_rates_are_those_of_the_experiment(odometry, commands):
+    keys = f"world.odometry_rate_hz={odometry}", f"cloud.command_rate_hz={commands}"
+    recording = flown("link.profile=paper-p1", *keys)
+    for topic, rate in (("/odometry", odometry), ("/cmd_vel", commands)):
+        stamps = recording[topic]["stamp_ns"]
+        gaps = np.diff(stamps[len(stamps) // 2 :])  # after the beginning of the mission
+        assert set(gaps) == {round(1e9 / rate)}, topic
+    truth = np.diff(recording["/ground_truth"]["stamp_ns"])
+    assert set(truth) == {min(1_000_000_000 // odometry, 10_000_000)}
+    estimate = recording["/delay_estimate"]
+    # Uplink and downlink 20 ms each, and on average half a period of wait on each side.
+    assert 0.03 < estimate["horizon"][-1] < 0.05 + 1 / commands + 1 / odometry
+    assert recording["/mission"]["event"][-1] == "done"
