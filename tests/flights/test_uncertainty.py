@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from cloudrc.cli.run import assemble, fly
+from cloudrc.assembly import assemble
+from cloudrc.cli.run import fly
 from cloudrc.config import schema
 from cloudrc.config.load import load_experiment
 from cloudrc.record.columns import Recording
