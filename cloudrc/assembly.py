@@ -144,7 +144,8 @@ def mission_plan(
     else:
         starts = (None, *mission.waypoints)
         ways = zip(starts, mission.waypoints, strict=False)  # no way starts at the last waypoint
-        legs = tuple(_leg(start, waypoint, speed_max) for start, waypoint in ways)
+        carrot = mission.carrot
+        legs = tuple(_leg(start, waypoint, speed_max, carrot) for start, waypoint in ways)
     return Plan(legs, Start.SPAWN if mission.start == "spawn" else Start.HERE, time_limit)
 
 
@@ -174,15 +175,25 @@ def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> Direc
     )
 
 
-def _leg(start: schema.Waypoint | None, waypoint: schema.Waypoint, speed_max: float) -> Leg:
+def _leg(
+    start: schema.Waypoint | None,
+    waypoint: schema.Waypoint,
+    speed_max: float,
+    carrot: schema.Carrot | None,
+) -> Leg:
     limit = waypoint.time_limit_s
+    speed, acceleration = 0.0, 1.0
+    if carrot is not None:
+        speed, acceleration = waypoint.speed_mps or carrot.speed_mps, carrot.acceleration_mps2
+        speed = min(speed, speed_max)
+        speed_max = min(speed_max, speed)
     if limit is None:
         # Where the robot starts is unknown: assume the longest way.
         way = FENCE_SPAN if start is None else dist(start.position_m, waypoint.position_m)
         expected = way / min(CRUISE_SPEED, speed_max) + SETTLE_TIME + waypoint.dwell_s
         limit = round(LEG_FACTOR * expected, 1)
-    yaw = radians(waypoint.yaw_deg)
-    return Leg(waypoint.position_m, yaw, waypoint.tolerance_m, waypoint.dwell_s, limit)
+    yaw, tolerance, dwell = radians(waypoint.yaw_deg), waypoint.tolerance_m, waypoint.dwell_s
+    return Leg(waypoint.position_m, yaw, tolerance, dwell, limit, speed, acceleration)
 
 
 def _step_legs(steps: schema.Steps, seed: int) -> tuple[Leg, ...]:

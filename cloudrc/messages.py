@@ -192,17 +192,37 @@ class OperatorRequest(NamedTuple):
     epoch: int = 0
 
 
+class Motion(NamedTuple):
+    """Straight motion of a setpoint, from rest to rest; `teleop.carrot` computes it.
+
+    Attributes:
+        start: Position at the beginning [m], world frame, shape (3,).
+        begin_ns: Time of the beginning [ns], the monotonic clock of cloud's machine.
+        speed: Largest speed [m/s], > 0.
+        acceleration: Acceleration and deceleration [m/s^2], > 0.
+    """
+
+    start: Vector
+    begin_ns: int
+    speed: float
+    acceleration: float
+
+
 class Setpoint(NamedTuple):
     """Target that teleop gives to the controller.
 
     Attributes:
-        position: Target position [m], world frame, shape (3,).
+        position: Target position [m], world frame, shape (3,); the end of `motion`.
         yaw: Target heading [rad].
         waypoint: Index of the waypoint in the mission; -1 for none.
         epoch: Session for which teleop made the setpoint; 0 for none.
+        velocity: Velocity of the target [m/s], world frame, shape (3,).
+        motion: How the target moves; None: it rests.
     """
 
     position: Vector
     yaw: float = 0.0
     waypoint: int = -1
     epoch: int = 0
+    velocity: Vector = ZERO
+    motion: Motion | None = None

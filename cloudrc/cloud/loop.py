@@ -28,6 +28,7 @@ from cloudrc.cloud.predictors import Predictor
 from cloudrc.errors import describe_error
 from cloudrc.messages import NEVER_NS, ZERO, Command, Odometry, Setpoint, Telemetry, Vector
 from cloudrc.records import Control, Fault
+from cloudrc.teleop.carrot import setpoint_at
 
 FRESH_ECHO_NS = 50_000_000
 """An echo gives a delay sample only up to this hold time [ns]: five command periods. While no
@@ -222,7 +223,7 @@ class ControlLoop:
             epoch: Number of the session, for the record.
             counter: Counter of the command's datagram, for the record.
         """
-        basis, delays = self._basis, self._delays
+        basis, delays, setpoint = self._basis, self._delays, setpoint_at(setpoint, now_ns)
         assert basis is not None, "check `ready` first"
         try:
             self._horizon = delays.horizon(now_ns)

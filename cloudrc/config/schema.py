@@ -32,6 +32,7 @@ CommandAge = Annotated[float, Field(ge=COMMAND_AGE_MS[0], le=COMMAND_AGE_MS[1])]
 Speed = Annotated[float, Field(ge=0.01, le=10)]
 Acceleration = Annotated[float, Field(ge=0.1, le=100)]
 YawRate = Annotated[float, Field(ge=0.01, le=10)]
+CarrotSpeed = Annotated[float, Field(ge=0.01, le=10)]
 CloudTime = Annotated[float, Field(gt=0, le=10)]
 HoldTime = Annotated[float, Field(ge=0.1, le=3600)]
 DURATION_MAX = 1_000_000
@@ -217,6 +218,20 @@ class Waypoint(Section):
     time_limit_s: TimeLimit | None = None
     """Time limit for the flight to this point [s], not counting time in HOLD; after it the
     mission fails. null: 3 times the expected time"""
+    speed_mps: CarrotSpeed | None = None
+    """Speed of the carrot on the way to this point [m/s]; only with carrot. null: the carrot's"""
+
+
+class Carrot(Section):
+    """A setpoint that moves straight from waypoint to waypoint and rests at each for its dwell_s.
+
+    It moves by time alone, so that delays do not prolong the mission.
+    """
+
+    speed_mps: CarrotSpeed = 2.0
+    """Largest speed of the setpoint [m/s]"""
+    acceleration_mps2: Annotated[float, Field(ge=0.1, le=10)] = 2.0
+    """Acceleration and deceleration of the setpoint [m/s^2]"""
 
 
 class Steps(Section):
@@ -245,6 +260,8 @@ class Mission(Section):
     """Points to fly to, in this order"""
     steps: Steps | None = None
     """Random setpoints in place of waypoints"""
+    carrot: Carrot | None = None
+    """Lets the setpoint move along the ways; null: the setpoint jumps to the next waypoint"""
 
 
 class LowLevel(Section):

@@ -51,7 +51,9 @@ odometry = st.builds(
 commands = st.builds(
     Command, st.integers(0, 10**15), st.integers(0, 10**15), st.just(0), vectors, numbers
 )
-setpoints = st.builds(Setpoint, vectors, st.floats(-10 * pi, 10 * pi))
+setpoints = st.builds(
+    Setpoint, vectors, st.floats(-10 * pi, 10 * pi), velocity=vectors, motion=st.none()
+)
 
 
 def are_finite(*values):

@@ -89,7 +89,7 @@ def test_an_invalid_file_is_one_line(mine, text, reason):
     ("name", "reason"),
     [
         ("./", "./: cannot be read: "),
-        ("nosuch.yaml", "nosuch.yaml; names of shipped experiments: hover, paper"),
+        ("nosuch.yaml", "nosuch.yaml; names of shipped experiments: fast, hover"),
         ("no/papper.yaml", "did you mean paper?"),
         ("latin.yaml", "is not UTF-8 text"),
     ],
@@ -109,6 +109,8 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ("seed=[1], [2]", "--set seed: [1], [2]: text behind the value"),
         ("mission.waypoints.9.dwell_s=1", "entries 0 to 6; use one of these, or 7 to append"),
         ("mission.waypoints.2.yaw_deg=90", "holds yaw at 0"),
+        ("mission.waypoints.2.speed_mps=1", "waypoints.2.speed_mps: 1: is the speed of a carrot;"),
+        ('mission={"steps": {}, "carrot": {}}', "mission.carrot: random steps jump"),
         ("world.robot=./no.xml", "no.xml; names of shipped robots: pelican"),
         ("world.robot=/x/q", "world.robot: not an .xml file: /x/q"),
         # A limit of the guard cannot be switched off.

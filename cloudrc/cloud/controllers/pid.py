@@ -23,7 +23,9 @@ class Pid(Controller):
 
     - Here error = setpoint - estimate. Eq. (4) as printed has estimate - setpoint, which diverges
       with positive gains.
-    - The derivative acts on the measurement, so that a new setpoint causes no kick.
+    - The derivative acts on the velocity of the setpoint minus that of the robot. A setpoint that
+      jumps has the velocity 0, so that it causes no kick.
+    - The velocity of the setpoint is added to the output (feed-forward).
     - The integral term, the velocity per axis and the speed are limited; the published code has no
       limits. While the output of an axis is limited, the axis does not integrate an error that
       would push the output further (conditional anti-windup).
@@ -51,7 +53,9 @@ class Pid(Controller):
         self._integral = ZERO
 
     def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
-        """Compute one command: u = P · e + I · (integral of e) - D · v, limited.
+        """Compute one command: u = P · e + I · (integral of e) + D · (v_s - v) + v_s, limited.
+
+        Here v is the robot's velocity and v_s the setpoint's, in [m/s].
 
         The returned terms are not limited. The integral has the errors of earlier updates only; the
         present error is integrated over `dt` [s] for the next update. Source: the paper, eq. (5).
@@ -64,9 +68,13 @@ class Pid(Controller):
         integral, derivative = self._integral, ZERO
         if not self._proportional_only:
             vx, vy, vz = estimate.velocity
+            rx, ry, rz = setpoint.velocity
             gx, gy, gz = self._gain_d
-            derivative = (-gx * vx, -gy * vy, -gz * vz)
+            derivative = (gx * (rx - vx), gy * (ry - vy), gz * (rz - vz))
             x, y, z = map(add, map(add, proportional, integral), derivative)
+            wanted = (x, y, z)
+        if setpoint.velocity is not ZERO:
+            x, y, z = map(add, wanted, setpoint.velocity)
             wanted = (x, y, z)
         velocity = self._limit(wanted) if self._limited else wanted
         if not self._proportional_only:
