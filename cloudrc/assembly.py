@@ -70,6 +70,7 @@ def build_world(
         acceleration_max=guard.acceleration_max_mps2,
         yaw_rate_max=guard.yaw_rate_max_radps,
         hold_max_ns=round(guard.hold_max_s * 1e9),
+        plan_max_ns=round(guard.plan_max_s * 1e9),
     )
     robot = Robot(
         Simulator(world.robot, world.scene), LowLevel(**world.low_level.model_dump()), Guard(limits)

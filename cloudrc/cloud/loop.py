@@ -238,7 +238,8 @@ class ControlLoop:
             output = self._steer(estimate, setpoint, dt, now_ns)
         velocity, yaw_rate, proportional, integral, derivative = output
         hold_ns = now_ns - self._basis_arrival_ns
-        command = _new(Command, (now_ns, basis.stamp_ns, hold_ns, velocity, yaw_rate))
+        basis_ns = basis.stamp_ns
+        command = _new(Command, (now_ns, basis_ns, hold_ns, velocity, yaw_rate, (), NEVER_NS))
         try:
             self._predictor.commanded(command)
         except BaseException as error:

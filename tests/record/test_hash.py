@@ -20,7 +20,7 @@ def digest(*records):
 
 def test_the_bytes_are_those_that_the_module_promises():
     applied = rec.CommandApplied(1, 2, 3, -4, (0.5, 1.0, 2.0))
-    data = b"\x0eCommandApplied" + struct.pack("<4q3d", 1, 2, 3, -4, 0.5, 1.0, 2.0)
+    data = b"\x0eCommandApplied" + struct.pack("<5q3d", 1, 2, 3, -4, -1, 0.5, 1.0, 2.0)
     change = rec.GuardChange(5, GuardState.HOLD, "né")
     data += b"\x0bGuardChange" + struct.pack("<2qI", 5, 2, 3) + b"n\xc3\xa9"
     arrival = rec.Arrival(6, True, 7, 8, 0.25, False)
