@@ -63,9 +63,19 @@ class DelayMeter:
             clock.
     """
 
-    def __init__(self, estimator: Estimator, counts: Counter[str], horizon_max: float) -> None:
-        """Use `estimator`, and count horizons outside of 0 to `horizon_max` [s] in `counts`."""
+    def __init__(
+        self,
+        estimator: Estimator,
+        counts: Counter[str],
+        horizon_max: float,
+        tell_applied: Callable[[int, int], None],
+    ) -> None:
+        """Use `estimator`, and count horizons outside of 0 to `horizon_max` [s] in `counts`.
+
+        `tell_applied` gets stamp and application time of each command that an echo shows, once.
+        """
         self._estimator, self._counts, self._horizon_max = estimator, counts, horizon_max
+        self._tell_applied = tell_applied
         self._stamp_ns, self.newest_echo_ns = 0, NEVER_NS
         self._echoes: deque[int] = deque(maxlen=ECHOES)
         self.rtt = self.loop_delay = nan
@@ -99,6 +109,7 @@ class DelayMeter:
         self._echoes.append(echo_ns)
         self.newest_echo_ns = max(self.newest_echo_ns, echo_ns)
         applied_ns = telemetry.stamp_ns - telemetry.echo_hold_ns
+        self._tell_applied(echo_ns, applied_ns)
         self._estimator.add_applied((applied_ns - echo_ns) * 1e-9)
 
     def horizon(self, now_ns: int) -> float:
@@ -163,7 +174,7 @@ class ControlLoop:
         self._begin(estimator)
 
     def _begin(self, estimator: Estimator) -> None:
-        self._delays = DelayMeter(estimator, self.counts, self._horizon_max)
+        self._delays = DelayMeter(estimator, self.counts, self._horizon_max, self._tell_applied)
         self._basis: Odometry | None = None
         self._basis_arrival_ns = 0
         self._horizon, self._echoed_ns = 0.0, NEVER_NS
@@ -210,6 +221,13 @@ class ControlLoop:
             self._delays.observe_echo(telemetry)
         except BaseException as error:
             self._note("estimator", error, now_ns)
+
+    def _tell_applied(self, command_stamp_ns: int, applied_ns: int) -> None:
+        """Tell the predictor that world applied a command; a failure is not the estimator's."""
+        try:
+            self._predictor.applied(command_stamp_ns, applied_ns)
+        except BaseException as error:
+            self._note("predictor", error, NEVER_NS)
 
     def command(
         self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
