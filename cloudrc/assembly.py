@@ -111,6 +111,7 @@ def build_cloud(
         build_plugin("controllers", cloud.controller),
         horizon_max=cloud.horizon_max_s,
         freeze_after=cloud.freeze_after_s,
+        plan=cloud.plan_s,
     )
     start_ns = clock()
     if teleop is None:

@@ -24,9 +24,19 @@ from typing import NoReturn
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
+from cloudrc.cloud.plan import make_plan
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.errors import describe_error
-from cloudrc.messages import NEVER_NS, ZERO, Command, Odometry, Setpoint, Telemetry, Vector
+from cloudrc.messages import (
+    NEVER_NS,
+    PLAN_STEP_NS,
+    ZERO,
+    Command,
+    Odometry,
+    Setpoint,
+    Telemetry,
+    Vector,
+)
 from cloudrc.records import Control, Fault
 from cloudrc.teleop.carrot import setpoint_at
 
@@ -143,17 +153,19 @@ class ControlLoop:
         *,
         horizon_max: float,
         freeze_after: float,
+        plan: float = 0.0,
     ) -> None:
         """Connect three plug-ins; every session gets a new estimator.
 
         `horizon_max` is the longest horizon [s]. The loop freezes if no new echo arrives for the
-        horizon and `freeze_after` [s].
+        horizon and `freeze_after` [s]. `plan` is the length of the plan in each command [s].
 
         An exception of a plug-in is not caught here, because nothing flies yet.
         """
         self._build_estimator, self._predictor = build_estimator, predictor
         self._controller = controller
         self._horizon_max, self._freeze_after_ns = horizon_max, freeze_after * 1e9
+        self._planned = round(plan * 1e9) // PLAN_STEP_NS  # velocities per plan
         self.faults: list[Fault] = []
         self.counts: Counter[str] = Counter()
         self._undated: list[Fault] = []
@@ -241,7 +253,8 @@ class ControlLoop:
             epoch: Number of the session, for the record.
             counter: Counter of the command's datagram, for the record.
         """
-        basis, delays, setpoint = self._basis, self._delays, setpoint_at(setpoint, now_ns)
+        basis, delays, moving = self._basis, self._delays, setpoint
+        setpoint = setpoint_at(moving, now_ns)
         assert basis is not None, "check `ready` first"
         try:
             self._horizon = delays.horizon(now_ns)
@@ -249,15 +262,18 @@ class ControlLoop:
             self._note("estimator", error, now_ns)
         horizon = self._horizon
         estimate = self._predict(basis, horizon, now_ns)
+        plan: tuple[Vector, ...] = ()
         if self._is_echo_silent(now_ns, horizon):
             self.counts["frozen"] += 1
             output = STAND_STILL
         else:
             output = self._steer(estimate, setpoint, dt, now_ns)
+            plan = self._plan(moving, output.velocity, now_ns)
         velocity, yaw_rate, proportional, integral, derivative = output
         hold_ns = now_ns - self._basis_arrival_ns
-        basis_ns = basis.stamp_ns
-        command = _new(Command, (now_ns, basis_ns, hold_ns, velocity, yaw_rate, (), NEVER_NS))
+        planned_ns = basis.stamp_ns + round(horizon * 1e9) if plan else NEVER_NS
+        fields = (now_ns, basis.stamp_ns, hold_ns, velocity, yaw_rate, plan, planned_ns)
+        command = _new(Command, fields)
         try:
             self._predictor.commanded(command)
         except BaseException as error:
@@ -309,6 +325,18 @@ class ControlLoop:
         except BaseException as error:
             self._note("controller", error, now_ns)
             return STAND_STILL
+
+    def _plan(self, setpoint: Setpoint, velocity: Vector, now_ns: int) -> tuple[Vector, ...]:
+        """Plan the commands after `velocity` [m/s]; a predictor without a model gives no plan."""
+        try:
+            model = self._predictor.model() if self._planned else None
+            if model is None:
+                return ()
+            count = self._planned
+            return make_plan(model, self._controller, setpoint, velocity, now_ns, count)
+        except BaseException as error:
+            self._note("predictor", error, now_ns, "cloud sends this command without a plan")
+            return ()
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
         """Whether no new echo has come for the `horizon` [s] and `freeze_after`."""

@@ -48,9 +48,9 @@ quaternions = axes.map(lambda q: tuple(c / sqrt(sum(c * c for c in q)) for c in 
 odometry = st.builds(
     Odometry, st.integers(0, 10**15), vectors, quaternions, vectors, st.tuples(*[numbers] * 3)
 )
-commands = st.builds(
-    Command, st.integers(0, 10**15), st.integers(0, 10**15), st.just(0), vectors, numbers
-)
+stamps = st.integers(0, 10**15)
+plans = st.lists(vectors, max_size=5).map(tuple)
+commands = st.builds(Command, stamps, stamps, st.just(0), vectors, numbers, plans, stamps)
 setpoints = st.builds(
     Setpoint, vectors, st.floats(-10 * pi, 10 * pi), velocity=vectors, motion=st.none()
 )

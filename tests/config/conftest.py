@@ -60,6 +60,8 @@ def valid(key):
 def beside(key):
     """List the settings that the key needs."""
     above, _, last = key.rpartition(".")
+    if key == "cloud.plan_s":
+        return ["cloud.predictor=model_based"]
     if key == "mission.waypoints.0.speed_mps":
         return ["mission.carrot={}"]
     if above.endswith(".loss"):

@@ -109,6 +109,10 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ("seed=[1], [2]", "--set seed: [1], [2]: text behind the value"),
         ("mission.waypoints.9.dwell_s=1", "entries 0 to 6; use one of these, or 7 to append"),
         ("mission.waypoints.2.yaw_deg=90", "holds yaw at 0"),
+        (
+            "cloud.plan_s=0.4",
+            "cloud.predictor: 'constant_velocity' has no model of the",
+        ),
         ("mission.waypoints.2.speed_mps=1", "waypoints.2.speed_mps: 1: is the speed of a carrot;"),
         ('mission={"steps": {}, "carrot": {}}', "mission.carrot: random steps jump"),
         ("world.robot=./no.xml", "no.xml; names of shipped robots: pelican"),

@@ -41,9 +41,10 @@ class Pid(Controller):
         velocity_max: Vector,
         speed_max: float,
     ) -> None:
-        self._gain_p, self._gain_i, self._gain_d = gain_p, gain_i, gain_d
+        self._gain_p, self._gain_d = gain_p, gain_d
         self._gain_yaw, self._integral_limit = gain_yaw, integral_limit
         self._velocity_max, self._speed_max = velocity_max, speed_max
+        self._gain_i = ZERO if gain_i == ZERO else gain_i
         self._proportional_only = gain_i == ZERO and gain_d == ZERO
         self._limited = velocity_max != UNLIMITED or speed_max != inf
         self._integral = ZERO
@@ -77,7 +78,7 @@ class Pid(Controller):
             x, y, z = map(add, wanted, setpoint.velocity)
             wanted = (x, y, z)
         velocity = self._limit(wanted) if self._limited else wanted
-        if not self._proportional_only:
+        if self._gain_i is not ZERO:
             self._integrate((ex, ey, ez), wanted, velocity, dt)
         yaw_rate = 0.0
         if self._gain_yaw:
