@@ -1,0 +1,303 @@
+"""Predictor: replay the sent commands through a model of the robot and its onboard controller.
+
+The model is a white box: guard's limits, velocity PID, attitude loop, rotors, drag. Its hidden
+states (reference, integral, thrust, torque) follow the commands that the echoes show. Measured
+states replace the model's at each odometry. What the model misses is estimated as a constant
+acceleration and a constant torque, for example from wind, a payload or the arm's weight.
+
+Source: docs/reference/control.md, "Predictors", (e2); docs/reference/plant.md, "Robot", "Low-level
+controller".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import ceil, inf, sqrt
+from typing import NamedTuple
+
+from cloudrc.cloud.parameters import not_negative, positive, vector
+from cloudrc.cloud.predictors import Model, Predictor
+from cloudrc.cloud.predictors._history import History, approach, limit_speed, moved
+from cloudrc.messages import ZERO, Command, Odometry, Vector
+
+STEP = 0.005
+"""Longest time step of the model [s]."""
+MASS, ASSUMED_MASS = 1.06, 1.05
+"""Mass of the robot, and the mass that the onboard controller assumes [kg].
+Source: docs/reference/plant.md, "Total mass"."""
+GRAVITY, ASSUMED_WEIGHT = 9.8066, 1.05 * 9.81
+"""Gravity [m/s^2], and the weight that the onboard controller assumes [N].
+Source: docs/reference/plant.md, "Gravity"."""
+INERTIA_X, INERTIA_Y = 0.0116, 0.0121
+"""Inertia of the whole robot about its centre of mass [kg m^2].
+Source: docs/reference/plant.md, "Total inertia"."""
+RATE_GAIN = 0.22
+"""Torque per angular velocity [N m s]; the torque per attitude error is 1 N m.
+Source: docs/reference/plant.md, "Low-level controller"."""
+LAG_UP, LAG_DOWN = 0.0125, 0.025
+"""Time constants of the rotors [s]; a torque needs both. Source: docs/reference/plant.md,
+"Rotor speed"."""
+LAG = 0.5 * (LAG_UP + LAG_DOWN)
+DRAG = 0.155
+"""Deceleration per velocity across the thrust axis, with the rotors at hover speed [1/s].
+Source: docs/reference/plant.md, "Rotor drag"."""
+SINK_LEAD_MAX = 0.5
+"""The guard's reference sinks at most this much faster than the robot [m/s].
+Source: docs/reference/plant.md, "Sinking"."""
+THRUST_MAX = 134.9
+"""Largest thrust of the four rotors [N]. Source: docs/reference/plant.md, "Rotor speed"."""
+GAIN_ACCELERATION, GAIN_TORQUE = 0.3, 1.0
+"""Rates at which the estimates of unmodelled acceleration and torque follow the errors [1/s]."""
+GAP_NS = 500_000_000
+"""After a longer time without odometry the model begins anew [ns]."""
+
+
+class Loop(NamedTuple):
+    """The onboard velocity loop.
+
+    Attributes:
+        gains: P, I and D gains and limits of the integral, x, y and z of each, shape (12,).
+        acceleration_max: The guard's cap on the acceleration [m/s^2].
+        speed_max: The guard's cap on the speed [m/s].
+    """
+
+    gains: tuple[float, ...]
+    acceleration_max: float
+    speed_max: float
+
+
+class WhiteBox(Model):
+    """The robot and its onboard controller.
+
+    The thrust axis is (nx, ny, nz); the body rates turn it. The yaw is 0, as the onboard controller
+    holds it.
+
+    Attributes:
+        position: Of the base [m], world frame.
+        velocity: Of the base [m/s], world frame.
+    """
+
+    def __init__(self, loop: Loop, odometry: Odometry) -> None:
+        """Begin with a measured state, in a steady flight."""
+        self._loop = loop
+        self._reference = odometry.velocity
+        self._integral = self._missed = ZERO
+        self._thrust = ASSUMED_WEIGHT
+        self._torque = self._trim = (0.0, 0.0)
+        self._basis, self.horizon = odometry, 0.0
+        self._take(odometry)
+
+    def copy(self, horizon: float = 0.0) -> WhiteBox:
+        """Return a copy, whose next step begins `horizon` [s] after the odometry."""
+        copy = WhiteBox.__new__(WhiteBox)
+        copy.__dict__.update(self.__dict__)
+        copy.horizon = horizon
+        return copy
+
+    def step(self, velocity: Vector, dt: float) -> Odometry:
+        """Advance the state by `dt` [s] under a velocity command [m/s]; return the odometry."""
+        self.advance(velocity, dt)
+        self.horizon += dt
+        return moved(self._basis, self.horizon, self.position, self.velocity)
+
+    def correct(self, odometry: Odometry) -> None:
+        """Replace the measured states by those of `odometry`, and learn from the differences."""
+        (ax, ay, az), (vx, vy, vz) = odometry.velocity, self.velocity
+        bx, by, bz = self._missed
+        k = GAIN_ACCELERATION
+        self._missed = (bx + k * (ax - vx), by + k * (ay - vy), bz + k * (az - vz))
+        before_x, before_y = self._rate
+        self._take(odometry)
+        (qx, qy), (cx, cy), k = self._rate, self._trim, GAIN_TORQUE
+        self._trim = (
+            cx + k * INERTIA_Y * (qx - before_x),
+            cy + k * INERTIA_X * (qy - before_y),
+        )
+
+    def _take(self, odometry: Odometry) -> None:
+        self._basis = odometry
+        self.position, self.velocity = odometry.position, odometry.velocity
+        w, x, y, z = odometry.orientation_wxyz
+        p, q, _ = odometry.angular_velocity_body
+        self._axis = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x))
+        self._rate = (q, -p)  # of the thrust axis towards x and y
+
+    def advance(self, velocity: Vector, dt: float) -> None:
+        """Advance the state by `dt` [s] under a velocity command [m/s]."""
+        loop = self._loop
+        velocity = limit_speed(velocity, loop.speed_max)
+        steps = ceil(dt / STEP - 1e-9)
+        h = dt / steps
+        change_max, lag, up, down = _rates(loop.acceleration_max, h)
+        (x, y, z), (vx, vy, vz), (bx, by, bz) = self.position, self.velocity, self._missed
+        (nx, ny), (qx, qy), (tx, ty), (cx, cy) = self._axis, self._rate, self._torque, self._trim
+        thrust, last = self._thrust, self._reference
+        for _ in range(steps):
+            reference = approach(last, velocity, change_max)
+            if reference[2] < vz - SINK_LEAD_MAX:
+                lowest = min(last[2], vz - SINK_LEAD_MAX)
+                reference = (*reference[:2], max(reference[2], lowest))
+            # The thrust pushes along its axis, the drag acts across it.
+            if (across := nx * nx + ny * ny) > 1.0:
+                nx, ny, across = nx / sqrt(across), ny / sqrt(across), 1.0
+            nz = sqrt(1.0 - across)
+            along = thrust / MASS + DRAG * (vx * nx + vy * ny + vz * nz)
+            ax = along * nx - DRAG * vx + bx
+            ay = along * ny - DRAG * vy + by
+            az = along * nz - DRAG * vz + bz - GRAVITY
+            fx, fy, fz = self._force(last, reference, (vx, vy, vz), (ax, ay, az), h)
+            last = reference
+            # Thrust and torques follow with the lag of the rotors; the torques turn the axis.
+            wanted = min(max(fx * nx + fy * ny + fz * nz, 0.0), THRUST_MAX)
+            thrust += (wanted - thrust) * (up if wanted > thrust else down)
+            size = sqrt(fx * fx + fy * fy + fz * fz) or 1.0
+            tx += lag * ((fx * nz - fz * nx) / size - RATE_GAIN * qx - tx)
+            ty += lag * ((fy * nz - fz * ny) / size - RATE_GAIN * qy - ty)
+            qx += h * (tx + cx) / INERTIA_Y
+            qy += h * (ty + cy) / INERTIA_X
+            nx += h * qx * nz
+            ny += h * qy * nz
+            x += h * (vx + 0.5 * h * ax)
+            y += h * (vy + 0.5 * h * ay)
+            z += h * (vz + 0.5 * h * az)
+            vx += h * ax
+            vy += h * ay
+            vz += h * az
+        self.position, self.velocity = (x, y, z), (vx, vy, vz)
+        self._axis, self._rate, self._torque = (nx, ny), (qx, qy), (tx, ty)
+        self._thrust, self._reference = thrust, last
+
+    def _force(
+        self, last: Vector, reference: Vector, velocity: Vector, acceleration: Vector, h: float
+    ) -> Vector:
+        """Compute the force that the onboard PID asks for [N], and advance its integral by `h`.
+
+        Source: docs/reference/plant.md, "Low-level controller".
+        """
+        px, py, pz, ix, iy, iz, dx, dy, dz, limit_x, limit_y, limit_z = self._loop.gains
+        (rx, ry, rz), (vx, vy, vz), (ax, ay, az) = reference, velocity, acceleration
+        last_x, last_y, last_z = last
+        ex, ey, ez = rx - vx, ry - vy, rz - vz
+        sx, sy, sz = self._integral
+        sx += ex * h
+        sy += ey * h
+        sz += ez * h
+        sx = limit_x if sx > limit_x else -limit_x if sx < -limit_x else sx
+        sy = limit_y if sy > limit_y else -limit_y if sy < -limit_y else sy
+        sz = limit_z if sz > limit_z else -limit_z if sz < -limit_z else sz
+        self._integral = (sx, sy, sz)
+        return (
+            px * ex + ix * sx + dx * ((rx - last_x) / h - ax),
+            py * ey + iy * sy + dy * ((ry - last_y) / h - ay),
+            pz * ez + iz * sz + dz * ((rz - last_z) / h - az) + ASSUMED_WEIGHT,
+        )
+
+
+def _rates(acceleration_max: float, h: float) -> tuple[float, float, float, float]:
+    """Return the reference's largest change, and the shares of three lags, in a step `h` [s]."""
+    return acceleration_max * h, h / (h + LAG), h / (h + LAG_UP), h / (h + LAG_DOWN)
+
+
+class ModelBased(Predictor):
+    """Rolls the model from the newest odometry through the commands of the horizon."""
+
+    def __init__(self, loop: Loop) -> None:
+        """Set the onboard velocity loop."""
+        self._loop = loop
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the model's state, all commands and echoes."""
+        self._history = History()
+        self._model: WhiteBox | None = None  # at the newest odometry
+        self._stamp_ns = 0
+        self._last: WhiteBox | None = None  # after the last prediction
+
+    def commanded(self, command: Command) -> None:
+        """Remember the command."""
+        self._history.add(command)
+
+    def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
+        """Remember from when on the robot followed the command."""
+        self._history.note_applied(command_stamp_ns, applied_ns)
+
+    def forecast(self, stamp_ns: int) -> tuple[Vector, Vector] | None:
+        """Return position [m] and velocity [m/s] by the model at `stamp_ns` [ns]; None at first."""
+        model = self._until(stamp_ns)
+        return None if model is None else (model.position, model.velocity)
+
+    def _until(self, stamp_ns: int) -> WhiteBox | None:
+        """Return the model at `stamp_ns` [ns], before the odometry corrects it; None at first."""
+        if self._model is None or not 0 < stamp_ns - self._stamp_ns < GAP_NS:
+            return None
+        model = self._model.copy()
+        for velocity, duration in self._history.past(self._stamp_ns, stamp_ns):
+            model.advance(velocity, duration)
+        return model
+
+    def observe(self, odometry: Odometry) -> None:
+        """Correct the model with a new sample."""
+        model = self._until(odometry.stamp_ns)
+        if model is None:
+            model = WhiteBox(self._loop, odometry)
+        else:
+            model.correct(odometry)
+        self._model, self._stamp_ns = model, odometry.stamp_ns
+
+    def predict(self, odometry: Odometry, horizon: float) -> Odometry:
+        """Roll a copy of the model for `horizon` [s] from the newest sample.
+
+        Source: docs/reference/control.md, "Predictors", (e2).
+        """
+        if self._model is None or self._stamp_ns != odometry.stamp_ns:
+            self.observe(odometry)
+        assert self._model is not None
+        self._last = model = self._model.copy(horizon)
+        if horizon == 0.0:
+            return odometry
+        start_ns, end_ns = odometry.stamp_ns, odometry.stamp_ns + round(horizon * 1e9)
+        shift_ns = self._history.shift_ns(odometry, horizon)
+        for velocity, duration in self._history.ahead(start_ns, end_ns, shift_ns):
+            model.advance(velocity, duration)
+        return moved(odometry, horizon, model.position, model.velocity)
+
+    def model(self) -> Model | None:
+        """Return a copy of the model in the state of the last prediction."""
+        return None if self._last is None else self._last.copy(self._last.horizon)
+
+
+def build(
+    gain_p: Sequence[float] = (4.0, 4.0, 10.0),
+    gain_i: Sequence[float] = (1.0, 1.0, 2.5),
+    gain_d: Sequence[float] = (0.30, 0.30, 0.50),
+    integral_limit_xy: float = 0.10,
+    integral_limit_z: float = 0.40,
+    acceleration_max: float = 12.0,
+    speed_max: float | None = None,
+) -> ModelBased:
+    """Make the predictor; the defaults are those of `world.low_level` and `guard`.
+
+    Source: docs/reference/plant.md, "Low-level controller".
+
+    Args:
+        gain_p: Proportional gain of the onboard velocity loop [N s/m], shape (3,).
+        gain_i: Its integral gain [N/m], shape (3,).
+        gain_d: Its derivative gain [N s^2/m], shape (3,).
+        integral_limit_xy: Limit of its integrated velocity error in x and y [m].
+        integral_limit_z: The same limit in z [m].
+        acceleration_max: The guard's cap on the acceleration [m/s^2].
+        speed_max: The guard's cap on the commanded speed [m/s]; None: no cap.
+
+    Raises:
+        ValueError: If a value is infinite, NaN or negative, or a cap is 0; the message names it.
+    """
+    gains = vector("gain_p", gain_p) + vector("gain_i", gain_i) + vector("gain_d", gain_d)
+    limit_xy = not_negative("integral_limit_xy", integral_limit_xy)
+    limit_z = not_negative("integral_limit_z", integral_limit_z)
+    return ModelBased(
+        Loop(
+            (*gains, limit_xy, limit_xy, limit_z),
+            positive("acceleration_max", acceleration_max),
+            inf if speed_max is None else positive("speed_max", speed_max),
+        )
+    )
