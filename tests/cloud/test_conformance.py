@@ -114,7 +114,7 @@ def test_a_prediction_is_finite_later_and_a_rotation(module, history, command, h
     predictor = module.build()
     for sample in sorted(history, key=lambda sample: sample.stamp_ns):
         predictor.observe(sample)
-    predictor.commanded(command)
+    predictor.commanded(command._replace(planned_ns=sample.stamp_ns))
     predictor.applied(command.stamp_ns, sample.stamp_ns)
     assert predictor.predict(sample, 0.0) == sample
     prediction = predictor.predict(sample, horizon)

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from typing import TypeAlias
 
 from cloudrc.cloud.predictors import rotate_ahead
-from cloudrc.messages import ZERO, Command, Odometry, Vector
+from cloudrc.messages import PLAN_STEP_NS, ZERO, Command, Odometry, Vector
 
 PERIOD_NS = 10_000_000
 """Time between two commands [ns]. Source: docs/reference/plant.md, "Commands"."""
@@ -24,6 +24,7 @@ COUNT = 2048
 """Smallest number of commands that are remembered: 20 s, twice the longest horizon."""
 GAIN = 0.05
 """Weight of a command that lasts one period in the mean shift."""
+NO_COMMAND = Command(0, 0, 0, ZERO, 0.0)
 Segment: TypeAlias = tuple[Vector, float]
 """A velocity command [m/s], and how long the robot follows it [s]."""
 
@@ -33,24 +34,24 @@ class History:
 
     Attributes:
         stamps: Stamps of the sent commands [ns], cloud's clock, rising.
-        velocities: Their velocities [m/s], world frame.
+        commands: The commands.
     """
 
     def __init__(self) -> None:
         self.stamps: list[int] = []
-        self.velocities: list[Vector] = []
+        self.commands: list[Command] = []
         self._applied: deque[tuple[int, int]] = deque(maxlen=COUNT)  # beginning, stamp
         self._shift_ns = 0.0
 
     def add(self, command: Command) -> bool:
         """Remember a command that cloud has just sent; return False if it is not the newest."""
-        stamps, velocities = self.stamps, self.velocities
+        stamps, commands = self.stamps, self.commands
         if stamps and command.stamp_ns <= stamps[-1]:
             return False
         stamps.append(command.stamp_ns)
-        velocities.append(command.velocity)
+        commands.append(command)
         if len(stamps) == 2 * COUNT:
-            del stamps[:COUNT], velocities[:COUNT]
+            del stamps[:COUNT], commands[:COUNT]
         return True
 
     def note_applied(self, command_stamp_ns: int, applied_ns: int) -> None:
@@ -70,7 +71,12 @@ class History:
         applied.append((applied_ns, command_stamp_ns))
 
     def shift_ns(self, odometry: Odometry, horizon: float) -> int:
-        """Return the shift [ns]; before the first echo, the one that `horizon` [s] implies."""
+        """Return the shift [ns]; before the first echo, the one that `horizon` [s] implies.
+
+        A plan begins at its own time, however late it arrives.
+        """
+        if self.commands and self.commands[-1].plan:
+            return self.commands[-1].planned_ns - self.stamps[-1]
         if self._applied or not self.stamps:
             return round(self._shift_ns)
         return odometry.stamp_ns + round(horizon * 1e9) - self.stamps[-1] - PERIOD_NS
@@ -84,7 +90,7 @@ class History:
         for began_ns, stamp_ns in reversed(self._applied):
             begin_ns = max(began_ns, start_ns)
             if begin_ns < end_ns:
-                parts.append((self._velocity(stamp_ns), (end_ns - begin_ns) * 1e-9))
+                parts += reversed(played(self._command(stamp_ns), begin_ns, end_ns))
                 end_ns = begin_ns
             if began_ns <= start_ns:
                 break
@@ -95,7 +101,7 @@ class History:
 
         Both are on world's clock [ns], and `start_ns` is the stamp of the newest telemetry.
         """
-        stamps, velocities = self.stamps, self.velocities
+        stamps, commands = self.stamps, self.commands
         if not stamps:
             yield ZERO, (end_ns - start_ns) * 1e-9
             return
@@ -105,13 +111,29 @@ class History:
             until_ns = stamps[index] + shift_ns if index < len(stamps) else end_ns
             until_ns = min(until_ns, end_ns)
             if until_ns > start_ns:
-                yield velocities[index - 1], (until_ns - start_ns) * 1e-9
+                yield from played(commands[index - 1], start_ns, until_ns)
                 start_ns = until_ns
             index += 1
 
-    def _velocity(self, stamp_ns: int) -> Vector:
+    def _command(self, stamp_ns: int) -> Command:
         index = bisect_right(self.stamps, stamp_ns)
-        return self.velocities[index - 1] if index else ZERO
+        return self.commands[index - 1] if index else NO_COMMAND
+
+
+def played(command: Command, start_ns: int, end_ns: int) -> list[Segment]:
+    """List the velocities of a command, with its plan, from `start_ns` to `end_ns` [ns].
+
+    Both are on world's clock.
+    """
+    if not command.plan:
+        return [(command.velocity, (end_ns - start_ns) * 1e-9)]
+    parts = list[Segment]()
+    while start_ns < end_ns:
+        until_ns = start_ns + PLAN_STEP_NS - (start_ns - command.planned_ns) % PLAN_STEP_NS
+        until_ns = min(until_ns, end_ns)
+        parts.append((command.velocity_at(start_ns), (until_ns - start_ns) * 1e-9))
+        start_ns = until_ns
+    return parts
 
 
 def moved(basis: Odometry, horizon: float, position: Vector, velocity: Vector) -> Odometry:

@@ -137,7 +137,9 @@ class CommandHistory(Predictor):
             return REST
         dt = (time_ns - self._history.stamps[index]) * 1e-9
         state = self._states[index]
-        return advance(self._loop, state, self._history.velocities[index], dt) if dt else state
+        return (
+            advance(self._loop, state, self._history.commands[index].velocity, dt) if dt else state
+        )
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Return the newest sample, moved by the commands of the next `horizon` [s].
