@@ -46,9 +46,11 @@ def _simulate(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]
     """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection
-    from cloudrc.tunnel.codec import SIZES, Kind
+    from cloudrc.tunnel.codec import PLAN_SIZES, SIZES, Kind
 
-    newest_wins = experiment.tunnel.order == "newest"
+    plan = round(experiment.cloud.plan_s * 1e9) // PERIOD_NS
+    newest_wins = experiment.tunnel.order == "newest" or plan > 0
+    sizes = {**SIZES, Kind.COMMAND: SIZES[Kind.COMMAND] + PLAN_SIZES[plan]}
     links = [
         LinkDirection(
             link_profile(way.model_copy(update={"blackouts": ()})), experiment.seed, uplink=uplink
@@ -74,7 +76,7 @@ def _simulate(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]
         sent = [(0, Kind.TELEMETRY, command), (1, Kind.COMMAND, telemetry)]
         for way, kind, last in sent if telemetry is not None else sent[:1]:
             datagram = now_ns, -1 if last is None else last[0]
-            for at_ns in links[way].send(1, kind, period, SIZES[kind], now_ns):
+            for at_ns in links[way].send(1, kind, period, sizes[kind], now_ns):
                 heappush(pending, (at_ns, way, datagram))
     return ages, echoes
 
@@ -85,8 +87,9 @@ def _long_link(
     """Compare ages of odometry and of echoes [s] with the limits of guard and cloud."""
     age_max, cloud = experiment.guard.command_age_max_ms * 1e-3, experiment.cloud
     mean, longest = sum(ages) / len(ages), max(ages)
+    lasts = max(age_max, min(ages) + min(cloud.plan_s, experiment.guard.plan_max_s))
     delay = f"commands follow their odometry after {mean * 1e3:.0f} ms on average"
-    if longest > age_max:
+    if min(ages) > age_max or longest > lasts:
         how = "never flies" if min(ages) > age_max else "holds again and again"
         yield (
             f"{delay}, after {longest * 1e3:.0f} ms at most, and the guard refuses commands after "

@@ -121,9 +121,9 @@ SIZES = {int(kind): HEADER_SIZE + size + TAG_SIZE for kind, size in BODY_SIZES.i
 _GUARD_STATES, _CAUSES = tuple(GuardState), tuple(Cause)
 _new = tuple.__new__  # makes a named tuple four times as fast as its class does
 _PLANNED, _VELOCITY = struct.Struct("<q"), struct.Struct("<3f")
-_PLAN_SIZES = {
-    SIZES[Kind.COMMAND] + _PLANNED.size + n * _VELOCITY.size for n in range(1, PLAN_MAX + 1)
-}
+PLAN_SIZES = (0, *(_PLANNED.size + n * _VELOCITY.size for n in range(1, PLAN_MAX + 1)))
+"""Number of velocities in a plan -> what the plan adds to the size of a command [bytes]."""
+_COMMAND_SIZES = {SIZES[Kind.COMMAND] + size for size in PLAN_SIZES}
 _size_of = SIZES.get
 _unpack_header: Callable[[bytes], Header] = _HEADER.unpack_from
 
@@ -146,7 +146,7 @@ def check(data: bytes) -> Header:
         raise DecodeError("version")
     if header[1] > 1:
         raise DecodeError("malformed")
-    if _size_of(header[3]) != size and (header[3] != Kind.COMMAND or size not in _PLAN_SIZES):
+    if _size_of(header[3]) != size and (header[3] != Kind.COMMAND or size not in _COMMAND_SIZES):
         raise DecodeError("malformed")
     return header
 
