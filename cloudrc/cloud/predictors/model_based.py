@@ -43,6 +43,9 @@ Source: docs/reference/plant.md, "Rotor drag"."""
 SINK_LEAD_MAX = 0.5
 """The guard's reference sinks at most this much faster than the robot [m/s].
 Source: docs/reference/plant.md, "Sinking"."""
+LOW_HEIGHT, LOW_SPEED, FLOOR_MARGIN = 0.25, 1.0, 0.35
+"""Below the first height [m] the guard limits the horizontal speed [m/s]; below the second it
+refuses to descend. Source: docs/safety.md, "Limits"."""
 THRUST_MAX = 134.9
 """Largest thrust of the four rotors [N]. Source: docs/reference/plant.md, "Rotor speed"."""
 GAIN_ACCELERATION, GAIN_TORQUE = 0.3, 1.0
@@ -103,9 +106,8 @@ class WhiteBox(Body):
         thrust, last = self._thrust, self._reference
         for _ in range(steps):
             reference = approach(last, command, self._acceleration_max * h)
-            if reference[2] < vz - SINK_LEAD_MAX:
-                lowest = min(last[2], vz - SINK_LEAD_MAX)
-                reference = (*reference[:2], max(reference[2], lowest))
+            if z < LOW_HEIGHT or reference[2] < 0.0:
+                reference = _limit(reference, last, z, vz)
             # The thrust pushes along its axis, the drag acts across it.
             if (across := nx * nx + ny * ny) > 1.0:
                 nx, ny, across = nx / sqrt(across), ny / sqrt(across), 1.0
@@ -160,6 +162,22 @@ class WhiteBox(Body):
             py * ey + iy * sy + dy * ((ry - last_y) / h - ay),
             pz * ez + iz * sz + dz * ((rz - last_z) / h - az) + ASSUMED_WEIGHT,
         )
+
+
+def _limit(reference: Vector, last: Vector, height: float, climb: float) -> Vector:
+    """Limit a velocity reference [m/s] near the floor and in a descent, as the guard does.
+
+    `last` is the reference of the last step [m/s]. The robot is at `height` [m] above the floor and
+    climbs at `climb` [m/s]. Source: docs/safety.md, "Limits".
+    """
+    x, y, z = reference
+    z = max(z, min(last[2], climb - SINK_LEAD_MAX))
+    if z < 0.0:
+        room = max(height - FLOOR_MARGIN, 0.0)
+        z = max(z, -2.0 * room / (0.2 + sqrt(0.04 + room / 1.5)))
+    speed = sqrt(x * x + y * y)
+    scale = LOW_SPEED / speed if height < LOW_HEIGHT and speed > LOW_SPEED else 1.0
+    return (scale * x, scale * y, z)
 
 
 class ModelBased(Replay):
