@@ -45,7 +45,7 @@ def test_commands_ahead_begin_at_their_stamps_and_the_last_stays():
     history = History()
     for k in range(3):
         history.add(command(10 * k, float(k + 1)))
-    parts = history.ahead(AHEAD - 5 * MS, AHEAD + 45 * MS)
+    parts = history.ahead(45 * MS, 95 * MS, 50 * MS - AHEAD)
     assert in_ms(parts) == [(0, 5), (1, 10), (2, 10), (3, 25)]
 
 
@@ -181,7 +181,6 @@ def fly(predictor, push=0.0, noise=0.0, seconds=6.0, speed=0.5):
         states.append((x, v))
         truth.velocity = (v + push * 0.01, *truth.velocity[1:])
         truth.step((u, 0.0, 0.0), 0.01)
-        # The model has no body rates to show: the axis follows from its acceleration.
         measured = sample(10 * k, x + noise * rng.normal(), v + 4 * noise * rng.normal())
         predictor.observe(measured)
         later = predictor.predict(measured, 0.1)

@@ -78,11 +78,15 @@ class History:
                 break
         return reversed(parts)
 
-    def ahead(self, start_ns: int, end_ns: int) -> Iterator[tuple[Vector, float]]:
-        """Yield velocity [m/s] and duration [s] of the commands in an interval, cloud's clock."""
-        index = bisect_right(self.stamps, start_ns)
+    def ahead(self, start_ns: int, end_ns: int, shift_ns: int) -> Iterator[tuple[Vector, float]]:
+        """Yield velocity [m/s] and duration [s] of the commands that are expected to be followed.
+
+        The interval from `start_ns` to `end_ns` is on world's clock [ns].
+        """
+        index = bisect_right(self.stamps, start_ns - shift_ns)
         while start_ns < end_ns:
-            until_ns = min(self.stamps[index], end_ns) if index < len(self.stamps) else end_ns
+            more = index < len(self.stamps)
+            until_ns = min(self.stamps[index] + shift_ns, end_ns) if more else end_ns
             yield self.velocities[index - 1] if index else ZERO, (until_ns - start_ns) * 1e-9
             start_ns, index = until_ns, index + 1
 

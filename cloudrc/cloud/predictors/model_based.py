@@ -213,8 +213,9 @@ class ModelBased(Replay):
             self.observe(odometry)
         assert self._body is not None
         body = copy(self._body)
-        start_ns = odometry.stamp_ns - self.history.shift_ns(odometry, horizon)
-        for velocity, duration in self.history.ahead(start_ns, start_ns + round(horizon * 1e9)):
+        start_ns, shift_ns = odometry.stamp_ns, self.history.shift_ns(odometry, horizon)
+        end_ns = start_ns + round(horizon * 1e9)
+        for velocity, duration in self.history.ahead(start_ns, end_ns, shift_ns):
             body.advance(velocity, duration)
         body.horizon = horizon
         return body
