@@ -18,6 +18,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "run": "fly an experiment and write its report",
         "mission": "start, steer and stop missions, here or in a cluster",
         "report": "write the report of a recorded run again",
+        "identify": "fit the model of the velocity loop to a recorded flight",
         "recover": "write a clean copy of a damaged recording",
         "bench": "measure how fast the simulation runs here",
         "faults": "inject faults and check that the system handles them",

@@ -71,6 +71,7 @@ class DelayMeter:
         loop_delay: Newest round-trip time, with the hold time [s]; NaN before the first.
         newest_echo_ns: Stamp of the newest command that telemetry shows as applied [ns], cloud's
             clock.
+        expected: Horizon while there is no echo and no estimate [s].
     """
 
     def __init__(
@@ -88,6 +89,7 @@ class DelayMeter:
         self._tell_applied = tell_applied
         self._stamp_ns, self.newest_echo_ns = 0, NEVER_NS
         self._echoes: deque[int] = deque(maxlen=ECHOES)
+        self.expected = 0.0
         self.rtt = self.loop_delay = nan
 
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
@@ -129,6 +131,8 @@ class DelayMeter:
             InvalidResultError: If the estimator's horizon is not finite.
         """
         horizon = float(self._estimator.horizon((now_ns - self._stamp_ns) * 1e-9))
+        if horizon == 0.0 and self.newest_echo_ns == NEVER_NS:
+            horizon = self.expected
         if 0.0 <= horizon <= self._horizon_max:
             return horizon
         if not isfinite(horizon):
@@ -226,6 +230,10 @@ class ControlLoop:
             self._predictor.observe(telemetry.odometry)
         except BaseException as error:
             self._note("predictor", error, now_ns)
+
+    def expect(self, round_trip: float) -> None:
+        """Use a round trip [s] as the horizon until a command has been echoed."""
+        self._delays.expected = round_trip
 
     def observe_late(self, telemetry: Telemetry, now_ns: int) -> None:
         """Process telemetry that arrived after newer telemetry; only its echo is used."""

@@ -50,10 +50,10 @@ def vector(name: str, value: object) -> Vector:
     return (x, y, z)
 
 
-def read_model(path: Path, wanted: Iterable[str]) -> dict[str, Any]:
+def read_model(path: Path | str, wanted: Iterable[str]) -> dict[str, Any]:
     """Return the `wanted` values of a file from `cloudrc identify`; raise ValueError otherwise."""
     try:
-        tree = read_document(path, str(path)).tree
+        tree = read_document(Path(path), str(path)).tree
     except CloudrcError as error:
         raise ValueError(f"model: {error}; 'cloudrc identify' writes such a file") from error
     if missing := [name for name in wanted if name not in tree]:

@@ -112,6 +112,13 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
             name = str(document.source((*path, "name")).absolute(name))
         try:
             if build:
+                for parameter in plugins.signature(kind, name).parameters.values():
+                    place = (*path, parameter.name)
+                    if parameter.annotation == Path | None and isinstance(
+                        document.get(*place), str
+                    ):
+                        file = document.source(place).absolute(parameters[parameter.name])
+                        parameters[parameter.name] = str(file)
                 checked = _check(kind, name, parameters)
                 plugin = plugins.load(kind, name, **dict(checked))
                 if key == "predictor" and document.get("cloud", "plan_s"):

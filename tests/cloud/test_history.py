@@ -2,7 +2,7 @@
 
 import pytest
 
-from cloudrc.cloud.predictors._history import History, played
+from cloudrc.cloud.predictors._history import History
 from cloudrc.messages import UPRIGHT, ZERO, Command, Odometry
 
 MS = 1_000_000
@@ -16,16 +16,6 @@ def planned(stamp_ms, planned_ms, *speeds):
 
 def along_x(segments):
     return [(velocity[0], pytest.approx(duration)) for velocity, duration in segments]
-
-
-def test_a_plan_is_replayed_step_by_step():
-    sent = planned(0, 100, 1.0, 2.0, 3.0)
-    assert along_x(played(sent, 95 * MS, 125 * MS)) == [
-        *((1.0, 0.005), (1.0, 0.01), (2.0, 0.01), (3.0, 0.005)),
-    ]
-    assert along_x(played(sent, 125 * MS, 142 * MS)) == [(3.0, 0.005), (3.0, 0.01), (3.0, 0.002)]
-    plain = Command(0, 0, 0, (4.0, 0.0, 0.0), 0.0)
-    assert along_x(played(plain, 0, 50 * MS)) == [(4.0, 0.05)]
 
 
 def test_the_past_has_the_steps_of_the_applied_plans():

@@ -12,17 +12,14 @@ from typing import Any, Literal
 
 from cloudrc.cloud.parameters import positive
 from cloudrc.cloud.predictors import Model, Predictor, command_history, model_based
-from cloudrc.cloud.predictors.command_history import CommandHistory
-from cloudrc.cloud.predictors.model_based import ModelBased
+from cloudrc.cloud.predictors._history import Body, Replay
 from cloudrc.messages import Command, Odometry, Vector
 
 
 class Kalman(Predictor):
     """Filters position and velocity, and gives the filtered samples to another predictor."""
 
-    def __init__(
-        self, replay: CommandHistory | ModelBased, position: float, velocity: float, model: float
-    ) -> None:
+    def __init__(self, replay: Replay, position: float, velocity: float, model: float) -> None:
         """Set the predictor of the replay, and standard deviations.
 
         Args:
@@ -60,7 +57,7 @@ class Kalman(Predictor):
             self._begin()
         else:
             gains = self._update((odometry.stamp_ns - before.stamp_ns) * 1e-9)
-            position, velocity = _blend(forecast, (odometry.position, odometry.velocity), gains)
+            position, velocity = _blend(forecast, odometry, gains)
             estimate = odometry._replace(position=position, velocity=velocity)
         self._estimate = estimate
         self._replay.observe(estimate)
@@ -110,19 +107,18 @@ class Kalman(Predictor):
 
 
 def _blend(
-    forecast: tuple[Vector, Vector],
-    measured: tuple[Vector, Vector],
-    gains: tuple[float, float, float, float],
+    forecast: Body, measured: Odometry, gains: tuple[float, float, float, float]
 ) -> tuple[Vector, Vector]:
     """Correct a forecast by gains times the difference of measured position and velocity."""
     aa, ab, ba, bb = gains
-    (px, py, pz), (vx, vy, vz) = forecast
-    (mx, my, mz), (ux, uy, uz) = measured
-    ex, ey, ez, gx, gy, gz = mx - px, my - py, mz - pz, ux - vx, uy - vy, uz - vz
-    return (
-        (px + aa * ex + ab * gx, py + aa * ey + ab * gy, pz + aa * ez + ab * gz),
-        (vx + ba * ex + bb * gx, vy + ba * ey + bb * gy, vz + ba * ez + bb * gz),
-    )
+    axes = []
+    for p, v, measured_p, measured_v in zip(
+        forecast.position, forecast.velocity, measured.position, measured.velocity, strict=True
+    ):
+        far, fast = measured_p - p, measured_v - v
+        axes.append((p + aa * far + ab * fast, v + ba * far + bb * fast))
+    position, velocity = zip(*axes, strict=True)
+    return position, velocity
 
 
 REPLAYS: dict[str, Any] = {

@@ -12,13 +12,12 @@ controller".
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import ceil, inf, sqrt
-from typing import NamedTuple
+from copy import copy
+from math import ceil, sqrt
 
 from cloudrc.cloud.parameters import not_negative, positive, vector
-from cloudrc.cloud.predictors import Model, Predictor
-from cloudrc.cloud.predictors._history import History, approach, limit_speed, moved
-from cloudrc.messages import ZERO, Command, Odometry, Vector
+from cloudrc.cloud.predictors._history import Body, Replay, approach
+from cloudrc.messages import ZERO, Odometry, Vector
 
 STEP = 0.005
 """Longest time step of the model [s]."""
@@ -44,6 +43,9 @@ Source: docs/reference/plant.md, "Rotor drag"."""
 SINK_LEAD_MAX = 0.5
 """The guard's reference sinks at most this much faster than the robot [m/s].
 Source: docs/reference/plant.md, "Sinking"."""
+LOW_HEIGHT, LOW_SPEED, FLOOR_MARGIN = 0.25, 1.0, 0.35
+"""Below the first height [m] the guard limits the horizontal speed [m/s]; below the second it
+refuses to descend. Source: docs/safety.md, "Limits"."""
 THRUST_MAX = 134.9
 """Largest thrust of the four rotors [N]. Source: docs/reference/plant.md, "Rotor speed"."""
 GAIN_ACCELERATION, GAIN_TORQUE = 0.3, 1.0
@@ -52,53 +54,25 @@ GAP_NS = 500_000_000
 """After a longer time without odometry the model begins anew [ns]."""
 
 
-class Loop(NamedTuple):
-    """The onboard velocity loop.
+class WhiteBox(Body):
+    """The robot and its onboard controller, which holds the yaw at 0.
 
-    Attributes:
-        gains: P, I and D gains and limits of the integral, x, y and z of each, shape (12,).
-        acceleration_max: The guard's cap on the acceleration [m/s^2].
-        speed_max: The guard's cap on the speed [m/s].
+    The thrust axis is (nx, ny, nz) in the world frame; the body rates turn it.
     """
 
-    gains: tuple[float, ...]
-    acceleration_max: float
-    speed_max: float
+    def __init__(self, gains: tuple[float, ...], acceleration_max: float, basis: Odometry) -> None:
+        """Begin at a measured state, in a steady flight.
 
-
-class WhiteBox(Model):
-    """The robot and its onboard controller.
-
-    The thrust axis is (nx, ny, nz); the body rates turn it. The yaw is 0, as the onboard controller
-    holds it.
-
-    Attributes:
-        position: Of the base [m], world frame.
-        velocity: Of the base [m/s], world frame.
-    """
-
-    def __init__(self, loop: Loop, odometry: Odometry) -> None:
-        """Begin with a measured state, in a steady flight."""
-        self._loop = loop
-        self._reference = odometry.velocity
-        self._integral = self._missed = ZERO
-        self._thrust = ASSUMED_WEIGHT
-        self._torque = self._trim = (0.0, 0.0)
-        self._basis, self.horizon = odometry, 0.0
-        self._take(odometry)
-
-    def copy(self, horizon: float = 0.0) -> WhiteBox:
-        """Return a copy, whose next step begins `horizon` [s] after the odometry."""
-        copy = WhiteBox.__new__(WhiteBox)
-        copy.__dict__.update(self.__dict__)
-        copy.horizon = horizon
-        return copy
-
-    def step(self, velocity: Vector, dt: float) -> Odometry:
-        """Advance the state by `dt` [s] under a velocity command [m/s]; return the odometry."""
-        self.advance(velocity, dt)
-        self.horizon += dt
-        return moved(self._basis, self.horizon, self.position, self.velocity)
+        Args:
+            gains: P, I and D gains and integral limits of the velocity loop, x, y, z of each.
+            acceleration_max: The guard's cap on the acceleration [m/s^2].
+            basis: The measured state.
+        """
+        self._gains, self._acceleration_max = gains, acceleration_max
+        self._reference, self._thrust = basis.velocity, ASSUMED_WEIGHT
+        self._integral = self._missed = ZERO  # _missed: acceleration that the model lacks [m/s^2]
+        self._torque = self._trim = (0.0, 0.0)  # _trim: torque that the model lacks [N m]
+        self._take(basis)
 
     def correct(self, odometry: Odometry) -> None:
         """Replace the measured states by those of `odometry`, and learn from the differences."""
@@ -115,28 +89,25 @@ class WhiteBox(Model):
         )
 
     def _take(self, odometry: Odometry) -> None:
-        self._basis = odometry
+        self.basis, self.horizon = odometry, 0.0
         self.position, self.velocity = odometry.position, odometry.velocity
         w, x, y, z = odometry.orientation_wxyz
         p, q, _ = odometry.angular_velocity_body
         self._axis = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x))
         self._rate = (q, -p)  # of the thrust axis towards x and y
 
-    def advance(self, velocity: Vector, dt: float) -> None:
+    def advance(self, command: Vector, dt: float) -> None:
         """Advance the state by `dt` [s] under a velocity command [m/s]."""
-        loop = self._loop
-        velocity = limit_speed(velocity, loop.speed_max)
         steps = ceil(dt / STEP - 1e-9)
         h = dt / steps
-        change_max, lag, up, down = _rates(loop.acceleration_max, h)
+        lag, up, down = h / (h + LAG), h / (h + LAG_UP), h / (h + LAG_DOWN)
         (x, y, z), (vx, vy, vz), (bx, by, bz) = self.position, self.velocity, self._missed
         (nx, ny), (qx, qy), (tx, ty), (cx, cy) = self._axis, self._rate, self._torque, self._trim
         thrust, last = self._thrust, self._reference
         for _ in range(steps):
-            reference = approach(last, velocity, change_max)
-            if reference[2] < vz - SINK_LEAD_MAX:
-                lowest = min(last[2], vz - SINK_LEAD_MAX)
-                reference = (*reference[:2], max(reference[2], lowest))
+            reference = approach(last, command, self._acceleration_max * h)
+            if z < LOW_HEIGHT or reference[2] < 0.0:
+                reference = _limit(reference, last, z, vz)
             # The thrust pushes along its axis, the drag acts across it.
             if (across := nx * nx + ny * ny) > 1.0:
                 nx, ny, across = nx / sqrt(across), ny / sqrt(across), 1.0
@@ -174,7 +145,7 @@ class WhiteBox(Model):
 
         Source: docs/reference/plant.md, "Low-level controller".
         """
-        px, py, pz, ix, iy, iz, dx, dy, dz, limit_x, limit_y, limit_z = self._loop.gains
+        px, py, pz, ix, iy, iz, dx, dy, dz, limit_x, limit_y, limit_z = self._gains
         (rx, ry, rz), (vx, vy, vz), (ax, ay, az) = reference, velocity, acceleration
         last_x, last_y, last_z = last
         ex, ey, ez = rx - vx, ry - vy, rz - vz
@@ -193,77 +164,61 @@ class WhiteBox(Model):
         )
 
 
-def _rates(acceleration_max: float, h: float) -> tuple[float, float, float, float]:
-    """Return the reference's largest change, and the shares of three lags, in a step `h` [s]."""
-    return acceleration_max * h, h / (h + LAG), h / (h + LAG_UP), h / (h + LAG_DOWN)
+def _limit(reference: Vector, last: Vector, height: float, climb: float) -> Vector:
+    """Limit a velocity reference [m/s] near the floor and in a descent, as the guard does.
+
+    `last` is the reference of the last step [m/s]. The robot is at `height` [m] above the floor and
+    climbs at `climb` [m/s]. Source: docs/safety.md, "Limits".
+    """
+    x, y, z = reference
+    z = max(z, min(last[2], climb - SINK_LEAD_MAX))
+    if z < 0.0:
+        room = max(height - FLOOR_MARGIN, 0.0)
+        z = max(z, -2.0 * room / (0.2 + sqrt(0.04 + room / 1.5)))
+    speed = sqrt(x * x + y * y)
+    scale = LOW_SPEED / speed if height < LOW_HEIGHT and speed > LOW_SPEED else 1.0
+    return (scale * x, scale * y, z)
 
 
-class ModelBased(Predictor):
-    """Rolls the model from the newest odometry through the commands of the horizon."""
+class ModelBased(Replay):
+    """Rolls the white box from the newest odometry through the commands of the horizon."""
 
-    def __init__(self, loop: Loop) -> None:
-        """Set the onboard velocity loop."""
-        self._loop = loop
-        self.reset()
+    def __init__(self, gains: tuple[float, ...], acceleration_max: float) -> None:
+        """Set the onboard velocity loop, as in `WhiteBox`."""
+        self._loop = gains, acceleration_max
+        super().__init__()
 
     def reset(self) -> None:
-        """Forget the model's state, all commands and echoes."""
-        self._history = History()
-        self._model: WhiteBox | None = None  # at the newest odometry
-        self._stamp_ns = 0
-        self._last: WhiteBox | None = None  # after the last prediction
+        """Forget all samples, commands and echoes."""
+        super().reset()
+        self._body: WhiteBox | None = None  # at the newest sample
 
-    def commanded(self, command: Command) -> None:
-        """Remember the command."""
-        self._history.add(command)
-
-    def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
-        """Remember from when on the robot followed the command."""
-        self._history.note_applied(command_stamp_ns, applied_ns)
-
-    def forecast(self, stamp_ns: int) -> tuple[Vector, Vector] | None:
-        """Return position [m] and velocity [m/s] by the model at `stamp_ns` [ns]; None at first."""
-        model = self._until(stamp_ns)
-        return None if model is None else (model.position, model.velocity)
-
-    def _until(self, stamp_ns: int) -> WhiteBox | None:
-        """Return the model at `stamp_ns` [ns], before the odometry corrects it; None at first."""
-        if self._model is None or not 0 < stamp_ns - self._stamp_ns < GAP_NS:
+    def forecast(self, stamp_ns: int) -> WhiteBox | None:
+        """Return a body at the stamp of the next sample [ns]; None without a recent sample."""
+        body = copy(self._body)
+        if body is None or not 0 < stamp_ns - body.basis.stamp_ns < GAP_NS:
             return None
-        model = self._model.copy()
-        for velocity, duration in self._history.past(self._stamp_ns, stamp_ns):
-            model.advance(velocity, duration)
-        return model
+        for velocity, duration in self.history.past(body.basis.stamp_ns, stamp_ns):
+            body.advance(velocity, duration)
+        return body
 
     def observe(self, odometry: Odometry) -> None:
         """Correct the model with a new sample."""
-        model = self._until(odometry.stamp_ns)
-        if model is None:
-            model = WhiteBox(self._loop, odometry)
-        else:
-            model.correct(odometry)
-        self._model, self._stamp_ns = model, odometry.stamp_ns
+        self._body = self.forecast(odometry.stamp_ns) or WhiteBox(*self._loop, odometry)
+        self._body.correct(odometry)
 
-    def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Roll a copy of the model for `horizon` [s] from the newest sample.
-
-        Source: docs/reference/control.md, "Predictors", (e2).
-        """
-        if self._model is None or self._stamp_ns != odometry.stamp_ns:
+    def roll(self, odometry: Odometry, horizon: float) -> WhiteBox:
+        """Return a body that has moved from the newest sample for `horizon` [s]."""
+        if self._body is None or self._body.basis.stamp_ns != odometry.stamp_ns:
             self.observe(odometry)
-        assert self._model is not None
-        self._last = model = self._model.copy(horizon)
-        if horizon == 0.0:
-            return odometry
-        start_ns, end_ns = odometry.stamp_ns, odometry.stamp_ns + round(horizon * 1e9)
-        shift_ns = self._history.shift_ns(odometry, horizon)
-        for velocity, duration in self._history.ahead(start_ns, end_ns, shift_ns):
-            model.advance(velocity, duration)
-        return moved(odometry, horizon, model.position, model.velocity)
-
-    def model(self) -> Model | None:
-        """Return a copy of the model in the state of the last prediction."""
-        return None if self._last is None else self._last.copy(self._last.horizon)
+        assert self._body is not None
+        body = copy(self._body)
+        start_ns, shift_ns = odometry.stamp_ns, self.history.shift_ns(odometry, horizon)
+        end_ns = start_ns + round(horizon * 1e9)
+        for velocity, duration in self.history.ahead(start_ns, end_ns, shift_ns):
+            body.advance(velocity, duration)
+        body.horizon = horizon
+        return body
 
 
 def build(
@@ -273,11 +228,8 @@ def build(
     integral_limit_xy: float = 0.10,
     integral_limit_z: float = 0.40,
     acceleration_max: float = 12.0,
-    speed_max: float | None = None,
 ) -> ModelBased:
     """Make the predictor; the defaults are those of `world.low_level` and `guard`.
-
-    Source: docs/reference/plant.md, "Low-level controller".
 
     Args:
         gain_p: Proportional gain of the onboard velocity loop [N s/m], shape (3,).
@@ -286,18 +238,11 @@ def build(
         integral_limit_xy: Limit of its integrated velocity error in x and y [m].
         integral_limit_z: The same limit in z [m].
         acceleration_max: The guard's cap on the acceleration [m/s^2].
-        speed_max: The guard's cap on the commanded speed [m/s]; None: no cap.
 
     Raises:
-        ValueError: If a value is infinite, NaN or negative, or a cap is 0; the message names it.
+        ValueError: If a value is infinite, NaN or negative, or the cap is 0; the message names it.
     """
     gains = vector("gain_p", gain_p) + vector("gain_i", gain_i) + vector("gain_d", gain_d)
-    limit_xy = not_negative("integral_limit_xy", integral_limit_xy)
-    limit_z = not_negative("integral_limit_z", integral_limit_z)
-    return ModelBased(
-        Loop(
-            (*gains, limit_xy, limit_xy, limit_z),
-            positive("acceleration_max", acceleration_max),
-            inf if speed_max is None else positive("speed_max", speed_max),
-        )
-    )
+    xy = not_negative("integral_limit_xy", integral_limit_xy)
+    z = not_negative("integral_limit_z", integral_limit_z)
+    return ModelBased((*gains, xy, xy, z), positive("acceleration_max", acceleration_max))
