@@ -77,9 +77,11 @@ def test_a_command_has_the_plan_and_its_time():
     assert sent.velocity_at(221 * MS) == sent.plan[2]
 
 
-def test_a_frozen_loop_plans_nothing():
+def test_a_frozen_loop_or_a_predictor_without_a_model_plans_nothing():
     a_loop = loop(predictor=Modelled(), heard_ms=1100, echo_ms=1000, plan=0.05)
     assert command(a_loop, 1600)[0][3:] == (ZERO, 0.0, (), -1)
+    sent, _ = command(loop(heard_ms=1090, echo_ms=1000, plan=0.05), 1094)
+    assert (sent.plan, sent.planned_ns) == ((), -1)
 
 
 def test_a_failing_model_is_reported_and_the_command_goes_out():
@@ -91,12 +93,6 @@ def test_a_failing_model_is_reported_and_the_command_goes_out():
     sent, _ = command(a_loop, 1094)
     assert (sent.plan, sent.velocity) == ((), pytest.approx((0.8, 0.0, 0.0)))
     assert "cloud sends this command without a plan" in a_loop.faults[0].text
-
-
-def test_without_a_model_or_a_length_there_is_no_plan():
-    for predictor, plan in ((LastSample(), 0.4), (Modelled(), 0.0)):
-        sent, _ = command(loop(predictor=predictor, heard_ms=1090, echo_ms=1000, plan=plan), 1094)
-        assert (sent.plan, sent.planned_ns) == ((), -1)
 
 
 def test_the_earliest_command_sets_the_horizon():

@@ -64,13 +64,6 @@ def follow(flight, seconds):
         flight.step(reference(flight).position)
 
 
-def test_the_carrot_starts_where_the_robot_is():
-    flight = led()
-    assert setpoint_at(flight.setpoints[-1], 0).position == START
-    follow(flight, 1.0)
-    assert reference(flight).position == pytest.approx((1.0, 0.0, 1.0), abs=0.25)
-
-
 def test_it_rests_and_leaves_by_time_alone():
     """A robot that is behind, but within the tolerance, does not delay the mission."""
     left = []
@@ -109,7 +102,7 @@ def test_it_waits_at_a_robot_that_holds_and_starts_from_there():
     assert flight.teleop.leg == 1
 
 
-def test_it_starts_again_from_the_robot_after_a_silence():
+def test_it_starts_again_from_the_robot_after_a_silence_and_in_a_new_session():
     flight = led()
     follow(flight, 1.0)
     flight.uplink = False
@@ -117,11 +110,7 @@ def test_it_starts_again_from_the_robot_after_a_silence():
     flight.uplink = True
     flight.step((1.2, 0.0, 1.0))
     assert reference(flight).position == (1.2, 0.0, 1.0)
-
-
-def test_a_new_session_starts_it_again():
-    flight = led()
-    follow(flight, 1.0)
+    follow(flight, 0.5)
     flight.epoch += 1
     flight.step((1.0, 0.0, 1.0))
     assert flight.setpoints[-1].motion == Motion((1.0, 0.0, 1.0), flight.now_ns, 2.0, 2.0)
