@@ -34,6 +34,8 @@ OUTPUTS = {"/ground_truth": "velocity", "/odometry": "velocity"}
 """Topic -> column with velocities; the first topic that has rows is used."""
 DT = 0.01
 """Time between two samples of the fit [s]."""
+START = 100
+"""Number of samples at the start that the fit leaves out: the input before them is unknown."""
 TAKE_OFF = 2.0
 """Time after the beginning of TRACK that is left out [s]."""
 BLOCKS, T_QUANTILE = 10, 2.262
@@ -158,7 +160,7 @@ def identify(given: Array, measured: Array, name: str) -> Fit:
         )
 
     def residuals(theta: Array) -> Array:
-        return measured - simulate(given, theta, measured[0])
+        return (measured - simulate(given, theta, measured[0]))[START:]
 
     starts = [np.array([t, d, 1.0]) for t in (0.1, 0.3, 0.8) for d in (0.0, 0.1, 0.3)]
     theta = min(starts, key=lambda start: float((residuals(start) ** 2).sum()))
@@ -167,7 +169,7 @@ def identify(given: Array, measured: Array, name: str) -> Fit:
         change = np.linalg.lstsq(slopes, -error, rcond=None)[0]
         if theta[1] == 0.0 and change[1] < 0.0:  # the dead time stays at its limit
             change[[0, 2]] = np.linalg.lstsq(slopes[:, [0, 2]], -error, rcond=None)[0]
-        tries = [np.maximum(theta + share * change, (DT, 0.0, 0.0)) for share in (1.0, 0.5, 0.1)]
+        tries = [np.maximum(theta + share * change, (2.0 * DT, 0.0, 0.0)) for share in (1.0, 0.5, 0.2, 0.05)]
         best = min([theta, *tries], key=lambda each: float((residuals(each) ** 2).sum()))
         if np.abs(best - theta).max() < 1e-5:
             break
@@ -198,6 +200,6 @@ def simulate(given: Array, theta: Array, start: float) -> Array:
 
 def _slopes(residuals: Any, theta: Array) -> Array:
     """Return the derivatives of the residuals with respect to T, d and K, shape (n, 3)."""
-    step = 1e-3
-    steps = np.eye(3) * step
-    return np.stack([(residuals(theta + s) - residuals(theta)) / step for s in steps], axis=1)
+    step = 0.5 * DT
+    pairs = [(theta + change, theta - change) for change in np.eye(3) * step]
+    return np.stack([(residuals(a) - residuals(b)) / (2.0 * step) for a, b in pairs], axis=1)

@@ -19,7 +19,7 @@ from cloudrc.cloud.parameters import not_negative, positive, vector
 from cloudrc.cloud.predictors._history import Body, Replay, approach
 from cloudrc.messages import ZERO, Odometry, Vector
 
-STEP = 0.005
+STEP = 0.010
 """Longest time step of the model [s]."""
 MASS, ASSUMED_MASS = 1.06, 1.05
 """Mass of the robot, and the mass that the onboard controller assumes [kg].
