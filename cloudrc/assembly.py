@@ -32,6 +32,7 @@ from cloudrc.tunnel.end import Identity
 if TYPE_CHECKING:
     from cloudrc.drivers.virtual import VirtualRun
     from cloudrc.world.endpoint import WorldEndpoint
+    from cloudrc.world.sensors import Sensors
 
 MS_TO_NS = 1_000_000
 SECOND_NS = 1_000_000_000
@@ -95,7 +96,6 @@ def build_world(
     from cloudrc.world.low_level import LowLevel
     from cloudrc.world.plant import Wind
     from cloudrc.world.robot import Robot
-    from cloudrc.world.sensors import Errors, Sensors
     from cloudrc.world.simulator import Simulator
 
     world, guard, seed = experiment.world, experiment.guard, experiment.seed
@@ -107,29 +107,35 @@ def build_world(
         acceleration_max=guard.acceleration_max_mps2,
         yaw_rate_max=guard.yaw_rate_max_radps,
         hold_max_ns=round(guard.hold_max_s * 1e9),
+        plan_max_ns=round(guard.plan_max_s * 1e9),
     )
-    air, seen, wind = world.wind, world.sensors, None
+    air, wind = world.wind, None
     if any(air.velocity_mps) or air.gust_mps:
         wind = Wind(air.velocity_mps, air.gust_mps, air.gust_time_s, _generator(seed, "wind"))
     simulator = Simulator(world.robot, world.scene, world.plant, wind)
     robot = Robot(simulator, LowLevel(**world.low_level.model_dump()), Guard(limits))
+    return WorldEndpoint(
+        robot,
+        _sensors(world.sensors, seed),
+        identity,
+        newest_wins=experiment.tunnel.order == "newest",
+        command_age_max_ns=limits.command_age_max_ns,
+        odometry_period_ns=SECOND_NS // world.odometry_rate_hz,
+        start_ns=clock(),
+    )
+
+
+def _sensors(seen: schema.Sensors, seed: int) -> Sensors:
+    from cloudrc.world.sensors import Errors, Sensors
+
     roll, pitch, yaw = map(radians, seen.attitude_bias_deg)
-    sensors = Sensors(
+    return Sensors(
         seen.position_noise_m,
         seen.velocity_noise_mps,
         _generator(seed, "odometry noise"),
         Errors(radians(seen.attitude_noise_deg), (roll, pitch, yaw)),
         Errors(seen.rate_noise_radps, seen.rate_bias_radps),
         _generator(seed, "attitude noise"),
-    )
-    return WorldEndpoint(
-        robot,
-        sensors,
-        identity,
-        newest_wins=experiment.tunnel.order == "newest",
-        command_age_max_ns=limits.command_age_max_ns,
-        odometry_period_ns=SECOND_NS // world.odometry_rate_hz,
-        start_ns=clock(),
     )
 
 
@@ -161,6 +167,7 @@ def build_cloud(
         horizon_max=cloud.horizon_max_s,
         freeze_after=cloud.freeze_after_s,
         period_ns=round(SECOND_NS / cloud.command_rate_hz),
+        plan=cloud.plan_s,
     )
     cpu_clock = cpu_clock if cloud.compute_measured else None
     compute = None
@@ -203,7 +210,8 @@ def mission_plan(
     else:
         starts = (None, *mission.waypoints)
         ways = zip(starts, mission.waypoints, strict=False)  # no way starts at the last waypoint
-        legs = tuple(_leg(start, waypoint, speed_max) for start, waypoint in ways)
+        carrot = mission.carrot
+        legs = tuple(_leg(start, waypoint, speed_max, carrot) for start, waypoint in ways)
     return Plan(legs, Start.SPAWN if mission.start == "spawn" else Start.HERE, time_limit)
 
 
@@ -233,15 +241,25 @@ def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> Direc
     )
 
 
-def _leg(start: schema.Waypoint | None, waypoint: schema.Waypoint, speed_max: float) -> Leg:
+def _leg(
+    start: schema.Waypoint | None,
+    waypoint: schema.Waypoint,
+    speed_max: float,
+    carrot: schema.Carrot | None,
+) -> Leg:
     limit = waypoint.time_limit_s
+    speed, acceleration = 0.0, 1.0
+    if carrot is not None:
+        speed, acceleration = waypoint.speed_mps or carrot.speed_mps, carrot.acceleration_mps2
+        speed = min(speed, speed_max)
+        speed_max = min(speed_max, speed)
     if limit is None:
         # Where the robot starts is unknown: assume the longest way.
         way = FENCE_SPAN if start is None else dist(start.position_m, waypoint.position_m)
         expected = way / min(CRUISE_SPEED, speed_max) + SETTLE_TIME + waypoint.dwell_s
         limit = round(LEG_FACTOR * expected, 1)
-    yaw = radians(waypoint.yaw_deg)
-    return Leg(waypoint.position_m, yaw, waypoint.tolerance_m, waypoint.dwell_s, limit)
+    yaw, tolerance, dwell = radians(waypoint.yaw_deg), waypoint.tolerance_m, waypoint.dwell_s
+    return Leg(waypoint.position_m, yaw, tolerance, dwell, limit, speed, acceleration)
 
 
 def _step_legs(steps: schema.Steps, seed: int) -> tuple[Leg, ...]:

@@ -147,8 +147,15 @@ class Telemetry(NamedTuple):
     cause: Cause = Cause.SPAWN
 
 
+PLAN_STEP_NS = 10_000_000
+"""Time between two velocities of a plan [ns]."""
+
+
 class Command(NamedTuple):
-    """Message from cloud to world, at 100 Hz.
+    """Message from cloud to world, at 100 Hz; it may contain a plan of future velocities.
+
+    The plan belongs to the time for which cloud predicted the robot's state. World plays it on this
+    time line, however late the command arrives.
 
     Attributes:
         stamp_ns: Time of the computation [ns], cloud's clock.
@@ -156,6 +163,8 @@ class Command(NamedTuple):
         basis_hold_ns: Time from the arrival of this odometry at cloud to the computation [ns].
         velocity: Commanded velocity [m/s], world frame, shape (3,).
         yaw_rate: Commanded yaw rate [rad/s].
+        plan: Velocities [m/s] after `velocity`, one per PLAN_STEP_NS, world frame, shape (n, 3).
+        planned_ns: Time for which `velocity` was computed [ns], world's clock; used with a plan.
     """
 
     stamp_ns: int
@@ -163,6 +172,18 @@ class Command(NamedTuple):
     basis_hold_ns: int
     velocity: Vector
     yaw_rate: float
+    plan: tuple[Vector, ...] = ()
+    planned_ns: int = NEVER_NS
+
+    def velocity_at(self, now_ns: int) -> Vector:
+        """Return the commanded velocity at `now_ns` [ns], world's clock; after the plan, its last.
+
+        Before `planned_ns`, it is the first.
+        """
+        step = (now_ns - self.planned_ns) // PLAN_STEP_NS
+        if step <= 0 or not self.plan:
+            return self.velocity
+        return self.plan[min(step, len(self.plan)) - 1]
 
 
 MISSION_OVER = 0xFFFF
@@ -192,17 +213,37 @@ class OperatorRequest(NamedTuple):
     epoch: int = 0
 
 
+class Motion(NamedTuple):
+    """Straight motion of a setpoint, from rest to rest; `teleop.carrot` computes it.
+
+    Attributes:
+        start: Position at the beginning [m], world frame, shape (3,).
+        begin_ns: Time of the beginning [ns], the monotonic clock of cloud's machine.
+        speed: Largest speed [m/s], > 0.
+        acceleration: Acceleration and deceleration [m/s^2], > 0.
+    """
+
+    start: Vector
+    begin_ns: int
+    speed: float
+    acceleration: float
+
+
 class Setpoint(NamedTuple):
     """Target that teleop gives to the controller.
 
     Attributes:
-        position: Target position [m], world frame, shape (3,).
+        position: Target position [m], world frame, shape (3,); the end of `motion`.
         yaw: Target heading [rad].
         waypoint: Index of the waypoint in the mission; -1 for none.
         epoch: Session for which teleop made the setpoint; 0 for none.
+        velocity: Velocity of the target [m/s], world frame, shape (3,).
+        motion: How the target moves; None: it rests.
     """
 
     position: Vector
     yaw: float = 0.0
     waypoint: int = -1
     epoch: int = 0
+    velocity: Vector = ZERO
+    motion: Motion | None = None

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple, TypeAlias
 
-from cloudrc.messages import GuardState, Odometry, Quaternion, Telemetry, Vector
+from cloudrc.messages import NEVER_NS, GuardState, Odometry, Quaternion, Telemetry, Vector
 
 
 class LinkChanged(NamedTuple):
@@ -136,6 +136,8 @@ class CommandApplied(NamedTuple):
     Attributes:
         basis_stamp_ns: Stamp of the odometry that the command is based on [ns], world's clock.
         velocity: Commanded velocity before the guard limits it [m/s], shape (3,).
+        planned_ns: Time for which the command was computed [ns], world's clock, if it has a plan;
+            else `NEVER_NS`.
     """
 
     stamp_ns: int
@@ -143,6 +145,7 @@ class CommandApplied(NamedTuple):
     counter: int
     basis_stamp_ns: int
     velocity: Vector
+    planned_ns: int = NEVER_NS
 
 
 class GuardChange(NamedTuple):

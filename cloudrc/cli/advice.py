@@ -51,9 +51,12 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
     """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection
-    from cloudrc.tunnel.codec import SIZES, Kind
+    from cloudrc.messages import PLAN_STEP_NS
+    from cloudrc.tunnel.codec import PLAN_SIZES, SIZES, Kind
 
-    newest_wins = experiment.tunnel.order == "newest"
+    plan = round(experiment.cloud.plan_s * 1e9) // PLAN_STEP_NS
+    newest_wins = experiment.tunnel.order == "newest" or plan > 0
+    sizes = {**SIZES, Kind.COMMAND: SIZES[Kind.COMMAND] + PLAN_SIZES[plan]}
     links = [
         LinkDirection(
             link_profile(way.model_copy(update={"blackouts": ()})), experiment.seed, uplink=uplink
@@ -85,7 +88,7 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
             if early_ns == 0:
                 datagram = now_ns, -1 if last is None else last[0]
                 leaves_ns = now_ns + way * compute_ns
-                for at_ns in links[way].send(1, kind, period, SIZES[kind], leaves_ns):
+                for at_ns in links[way].send(1, kind, period, sizes[kind], leaves_ns):
                     heappush(pending, (at_ns, way, datagram))
     return ages, echoes
 
@@ -120,8 +123,9 @@ def _long_link(
     """Compare ages of odometry and of echoes [s] with the limits of guard and cloud."""
     age_max, cloud = experiment.guard.command_age_max_ms * 1e-3, experiment.cloud
     mean, longest = sum(ages) / len(ages), max(ages)
+    lasts = max(age_max, min(ages) + min(cloud.plan_s, experiment.guard.plan_max_s))
     delay = f"commands follow their odometry after {mean * 1e3:.0f} ms on average"
-    if longest > age_max:
+    if min(ages) > age_max or longest > lasts:
         how = "never flies" if min(ages) > age_max else "holds again and again"
         yield (
             f"{delay}, after {longest * 1e3:.0f} ms at most, and the guard refuses commands after "

@@ -125,6 +125,7 @@ class CloudEndpoint(TunnelEnd):
         self._compute = compute
         self._unsent: tuple[int, bytes] | None = None  # departure [ns] and command
         self._asked = 0  # highest number of an operator request in this session
+        self._start: tuple[int, int] | None = None  # number and time [ns] of the newest START
         self._tick_ns = start_ns
         self._hello_ns = start_ns - KEY_PERIOD_NS  # time of the last periodic hello
         self._alive_ns = start_ns
@@ -270,6 +271,9 @@ class CloudEndpoint(TunnelEnd):
         if used:
             self.guard = telemetry.guard
             self._alarm.see(telemetry.guard, telemetry.mission)
+            if self._start is not None and telemetry.mission >= self._start[0]:
+                self._loop.expect((now_ns - self._start[1]) * 1e-9)
+                self._start = None
             self._loop.observe(telemetry, now_ns)
             self._asked = max(self._asked, telemetry.mission)
             self.teleop.see(make_robot_status(telemetry, epoch, self._world, self._delays), now_ns)
@@ -305,6 +309,8 @@ class CloudEndpoint(TunnelEnd):
         elif self._session.epoch and (may_start or request.request is not Request.START):
             if request.request is Request.ACKNOWLEDGE:
                 self._alarm.acknowledge()
+            elif request.request is Request.START and request.number > self._asked:
+                self._start = request.number, self._tick_ns
             self._asked = max(self._asked, request.number)
             stamped = request._replace(basis_stamp_ns=self._loop.basis_stamp_ns)
             self._send(Kind.OPERATOR, codec.encode_operator(stamped))

@@ -24,10 +24,21 @@ from typing import NoReturn
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
+from cloudrc.cloud.plan import make_plan
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.errors import describe_error
-from cloudrc.messages import NEVER_NS, ZERO, Command, Odometry, Setpoint, Telemetry, Vector
+from cloudrc.messages import (
+    NEVER_NS,
+    PLAN_STEP_NS,
+    ZERO,
+    Command,
+    Odometry,
+    Setpoint,
+    Telemetry,
+    Vector,
+)
 from cloudrc.records import Control, Fault
+from cloudrc.teleop.carrot import setpoint_at
 
 PERIOD_NS = 10_000_000
 """Time between two commands, unless an experiment sets another rate [ns].
@@ -64,19 +75,28 @@ class DelayMeter:
         loop_delay: Newest round-trip time, with the hold time [s]; NaN before the first.
         newest_echo_ns: Stamp of the newest command that telemetry shows as applied [ns], cloud's
             clock.
+        expected: Horizon while there is no echo and no estimate [s].
     """
 
     def __init__(
-        self, estimator: Estimator, counts: Counter[str], horizon_max: float, period_ns: int
+        self,
+        estimator: Estimator,
+        counts: Counter[str],
+        horizon_max: float,
+        period_ns: int,
+        tell_applied: Callable[[int, int], None],
     ) -> None:
         """Use `estimator`, and count horizons outside of 0 to `horizon_max` [s] in `counts`.
 
-        `period_ns` is the time between two commands [ns].
+        `period_ns` is the time between two commands [ns]. `tell_applied` gets stamp and application
+        time of each command that an echo shows, once.
         """
         self._estimator, self._counts, self._horizon_max = estimator, counts, horizon_max
+        self._tell_applied = tell_applied
         self._stamp_ns, self.newest_echo_ns = 0, NEVER_NS
         self._fresh_ns = FRESH_ECHO_PERIODS * period_ns
         self._echoes: deque[int] = deque(maxlen=max(ECHOES, ECHOES_NS // period_ns))
+        self.expected = 0.0
         self.rtt = self.loop_delay = nan
 
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
@@ -108,6 +128,7 @@ class DelayMeter:
         self._echoes.append(echo_ns)
         self.newest_echo_ns = max(self.newest_echo_ns, echo_ns)
         applied_ns = telemetry.stamp_ns - telemetry.echo_hold_ns
+        self._tell_applied(echo_ns, applied_ns)
         self._estimator.add_applied((applied_ns - echo_ns) * 1e-9)
 
     def horizon(self, now_ns: int) -> float:
@@ -117,6 +138,8 @@ class DelayMeter:
             InvalidResultError: If the estimator's horizon is not finite.
         """
         horizon = float(self._estimator.horizon((now_ns - self._stamp_ns) * 1e-9))
+        if horizon == 0.0 and self.newest_echo_ns == NEVER_NS:
+            horizon = self.expected
         if 0.0 <= horizon <= self._horizon_max:
             return horizon
         if not isfinite(horizon):
@@ -143,11 +166,13 @@ class ControlLoop:
         horizon_max: float,
         freeze_after: float,
         period_ns: int = PERIOD_NS,
+        plan: float = 0.0,
     ) -> None:
         """Connect three plug-ins; every session gets a new estimator.
 
         `horizon_max` is the longest horizon [s]. The loop freezes if no new echo arrives for the
-        horizon and `freeze_after` [s]. `period_ns` is the time between two commands [ns].
+        horizon and `freeze_after` [s]. `period_ns` is the time between two commands [ns]. `plan` is
+        the length of the plan in each command [s].
 
         An exception of a plug-in is not caught here, because nothing flies yet.
         """
@@ -155,6 +180,7 @@ class ControlLoop:
         self._controller = controller
         self._horizon_max, self._freeze_after_ns = horizon_max, freeze_after * 1e9
         self.period_ns = period_ns
+        self._planned = round(plan * 1e9) // PLAN_STEP_NS  # velocities per plan
         self.faults: list[Fault] = []
         self.counts: Counter[str] = Counter()
         self._undated: list[Fault] = []
@@ -175,7 +201,9 @@ class ControlLoop:
         self._begin(estimator)
 
     def _begin(self, estimator: Estimator) -> None:
-        self._delays = DelayMeter(estimator, self.counts, self._horizon_max, self.period_ns)
+        self._delays = DelayMeter(
+            estimator, self.counts, self._horizon_max, self.period_ns, self._tell_applied
+        )
         self._basis: Odometry | None = None
         self._basis_arrival_ns = 0
         self._horizon, self._echoed_ns = 0.0, NEVER_NS
@@ -216,12 +244,23 @@ class ControlLoop:
         except BaseException as error:
             self._note("predictor", error, now_ns)
 
+    def expect(self, round_trip: float) -> None:
+        """Use a round trip [s] as the horizon until a command has been echoed."""
+        self._delays.expected = round_trip
+
     def observe_late(self, telemetry: Telemetry, now_ns: int) -> None:
         """Process telemetry that arrived after newer telemetry; only its echo is used."""
         try:
             self._delays.observe_echo(telemetry)
         except BaseException as error:
             self._note("estimator", error, now_ns)
+
+    def _tell_applied(self, command_stamp_ns: int, applied_ns: int) -> None:
+        """Tell the predictor that world applied a command; a failure is not the estimator's."""
+        try:
+            self._predictor.applied(command_stamp_ns, applied_ns)
+        except BaseException as error:
+            self._note("predictor", error, NEVER_NS)
 
     def command(
         self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
@@ -235,7 +274,8 @@ class ControlLoop:
             epoch: Number of the session, for the record.
             counter: Counter of the command's datagram, for the record.
         """
-        basis, delays = self._basis, self._delays
+        basis, delays, moving = self._basis, self._delays, setpoint
+        setpoint = setpoint_at(moving, now_ns)
         assert basis is not None, "check `ready` first"
         try:
             self._horizon = delays.horizon(now_ns)
@@ -243,14 +283,18 @@ class ControlLoop:
             self._note("estimator", error, now_ns)
         horizon = self._horizon
         estimate = self._predict(basis, horizon, now_ns)
+        plan: tuple[Vector, ...] = ()
         if self._is_echo_silent(now_ns, horizon):
             self.counts["frozen"] += 1
             output = STAND_STILL
         else:
             output = self._steer(estimate, setpoint, dt, now_ns)
+            plan = self._plan(moving, output.velocity, now_ns)
         velocity, yaw_rate, proportional, integral, derivative = output
         hold_ns = now_ns - self._basis_arrival_ns
-        command = _new(Command, (now_ns, basis.stamp_ns, hold_ns, velocity, yaw_rate))
+        planned_ns = basis.stamp_ns + round(horizon * 1e9) if plan else NEVER_NS
+        fields = (now_ns, basis.stamp_ns, hold_ns, velocity, yaw_rate, plan, planned_ns)
+        command = _new(Command, fields)
         try:
             self._predictor.commanded(command)
         except BaseException as error:
@@ -302,6 +346,18 @@ class ControlLoop:
         except BaseException as error:
             self._note("controller", error, now_ns)
             return STAND_STILL
+
+    def _plan(self, setpoint: Setpoint, velocity: Vector, now_ns: int) -> tuple[Vector, ...]:
+        """Plan the commands after `velocity` [m/s]; a predictor without a model gives no plan."""
+        try:
+            model = self._predictor.model() if self._planned else None
+            if model is None:
+                return ()
+            count = self._planned
+            return make_plan(model, self._controller, setpoint, velocity, now_ns, count)
+        except BaseException as error:
+            self._note("predictor", error, now_ns, "cloud sends this command without a plan")
+            return ()
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
         """Whether no new echo has come for the `horizon` [s] and `freeze_after`."""

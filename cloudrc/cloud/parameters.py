@@ -5,9 +5,13 @@ The message of a ValueError names the parameter, the value and the reason in one
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from math import isfinite
+from pathlib import Path
+from typing import Any
 
+from cloudrc.config.document import read_document
+from cloudrc.errors import CloudrcError
 from cloudrc.messages import Vector
 
 
@@ -44,3 +48,16 @@ def vector(name: str, value: object) -> Vector:
         not_negative(f"{name}[{axis}]", item) for axis, item in zip("xyz", value, strict=True)
     )
     return (x, y, z)
+
+
+def read_model(path: Path | str, wanted: Iterable[str]) -> dict[str, Any]:
+    """Return the `wanted` values of a file from `cloudrc identify`; raise ValueError otherwise."""
+    try:
+        tree = read_document(Path(path), str(path)).tree
+    except CloudrcError as error:
+        raise ValueError(f"model: {error}; 'cloudrc identify' writes such a file") from error
+    if missing := [name for name in wanted if name not in tree]:
+        raise ValueError(
+            f"model: {path} has no {missing[0]}; 'cloudrc identify' writes a file that has it"
+        )
+    return {name: tree[name] for name in wanted}

@@ -42,6 +42,7 @@ from cloudrc.config.schema import (
     Experiment,
     Guard,
     Mission,
+    PlanMax,
     PlugIn,
     Profile,
     Speed,
@@ -57,20 +58,24 @@ FREEZE_AFTER_S = 0.4
 COMMAND_AGE_MAX_MS = 250.0
 """Default of guard.command_age_max_ms if experiment and link profile give no value [ms].
 Source: docs/reference/plant.md, "Command age"."""
+PLAN_MAX_S = 0.8
+"""Default of guard.plan_max_s if cloud sends plans [s].
+Source: docs/reference/plant.md, "Plan"."""
 DIRECTIONS = ("uplink", "downlink")
 FILE_READERS: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
 """Key of a direction whose value is the path of a file -> function that reads this file."""
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
-def speed_cap(command_age_max_ms: float) -> float:
+def speed_cap(command_age_max_ms: float, plan_max_s: float = 0.0) -> float:
     """Compute the largest speed v [m/s] from which the robot stops within 8.7 m.
 
-    If commands stop arriving, the robot keeps its speed for T + 0.2 s, where T is
-    `command_age_max_ms` [ms], and then brakes at 3 m/s^2: v · (T + 0.2 s) + v^2 / 6 = 8.7 m.
+    If commands stop arriving, the robot keeps its speed for T + 0.2 s, where T is the sum of
+    `command_age_max_ms` [ms] and `plan_max_s` [s], and then brakes at 3 m/s^2:
+    v · (T + 0.2 s) + v^2 / 6 = 8.7 m.
     Source: docs/reference/plant.md, "Speed cap".
     """
-    delay = command_age_max_ms * 1e-3 + 0.2
+    delay = command_age_max_ms * 1e-3 + plan_max_s + 0.2
     return round(3.0 * (sqrt(delay * delay + 8.7 / 1.5) - delay), 6)
 
 
@@ -78,6 +83,7 @@ class ResolvedGuard(Guard):
     """The section `guard` with a value for each limit."""
 
     command_age_max_ms: CommandAge = COMMAND_AGE_MAX_MS
+    plan_max_s: PlanMax = 0.0
     speed_max_mps: Speed = Field(None, validate_default=True)
 
     @field_validator("speed_max_mps", mode="wrap")
@@ -86,12 +92,14 @@ class ResolvedGuard(Guard):
         cls, given: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo
     ) -> float:
         age_max = info.data.get("command_age_max_ms", COMMAND_AGE_MAX_MS)
-        cap = speed_cap(age_max)
+        plan_max = info.data.get("plan_max_s", 0.0)
+        cap = speed_cap(age_max, plan_max)
         speed_max: float = cap if given is None else check(given)
         if speed_max > cap + 1e-6:
+            plan = f" and plans of {plan_max:g} s" if plan_max else ""
             raise ValueError(
                 f"must be at most {cap:g} m/s: above it the robot does not stop in time with "
-                f"commands {age_max:g} ms old; lower it, or guard.command_age_max_ms"
+                f"commands {age_max:g} ms old{plan}; lower it, or guard.command_age_max_ms"
             )
         return speed_max
 
@@ -142,6 +150,8 @@ def load_experiment(
     _default(document, ("name",), Path(name).stem)
     if changes.keys() & {("link",), ("link", "profile")}:
         _remove_profile_values(document)
+    if ("cloud", "plan_s") in changes:
+        _remove_plan_values(document)
     outer = {path: value for path, value in changes.items() if path not in inner}
     overrides.apply_overrides(document, outer)
     for key in ("world", "guard", "link", "cloud", "report"):
@@ -152,6 +162,9 @@ def load_experiment(
     with _collect(found, ("link", "profile")):
         _inline_profile(document)
     overrides.apply_overrides(document, inner)
+    plans = document.get("cloud", "plan_s")
+    has_plans = isinstance(plans, float | int) and plans > 0
+    _default(document, ("guard", "plan_max_s"), PLAN_MAX_S if has_plans else 0.0)
     for key in overrides.KINDS:
         _default(document, ("cloud", key), getattr(Cloud(), key))
     found += overrides.resolve_plugins(document, build=build)
@@ -301,10 +314,25 @@ def _remove_profile_values(document: Document) -> None:
     with suppress(BadInputError):  # the profile's file may no longer exist
         profile = load_profile(str(document.get("link", "profile")))
     implied = _implied(profile)
-    implied["guard", "speed_max_mps"] = speed_cap(implied["guard", "command_age_max_ms"])
+    _remove_cap(document, implied["guard", "command_age_max_ms"])
     for path, value in implied.items():
         if document.get(*path) == value:
             del document.tree[path[0]][path[1]]
+
+
+def _remove_plan_values(document: Document) -> None:
+    """Remove the guard's limits that follow from cloud.plan_s, before this key changes."""
+    if document.get("guard", "plan_max_s") in (0.0, PLAN_MAX_S):
+        _remove_cap(document, document.get("guard", "command_age_max_ms"))
+        del document.tree["guard"]["plan_max_s"]
+
+
+def _remove_cap(document: Document, age_max: object) -> None:
+    """Remove the guard's speed limit if it follows from the age [ms] and the plans."""
+    plan_max = document.get("guard", "plan_max_s") or 0.0
+    if isinstance(age_max, float | int) and isinstance(plan_max, float | int):
+        if document.get("guard", "speed_max_mps") == speed_cap(age_max, plan_max):
+            del document.tree["guard"]["speed_max_mps"]
 
 
 def _resolve_traces(document: Document, above: KeyPath) -> list[Problem]:

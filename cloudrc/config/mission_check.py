@@ -34,6 +34,14 @@ _INNER = ", ".join(f"{name} {low:g} to {high:g}" for name, low, high in _SPANS) 
 
 def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
     """List the problems of a mission in a scene; their paths start at the mission."""
+    if mission.carrot is None:
+        for index, waypoint in enumerate(mission.waypoints):
+            if waypoint.speed_mps is not None:
+                reason = "is the speed of a carrot; give the mission a carrot, or leave it out"
+                path = ("waypoints", str(index), "speed_mps")
+                return [Problem(path, f"{waypoint.speed_mps:g}", reason)]
+    elif mission.steps is not None:
+        return [Problem(("carrot",), "", "random steps jump; leave it out, or give waypoints")]
     if mission.steps is not None:
         if mission.waypoints:
             reason = "a mission has waypoints or steps, not both; delete one"

@@ -28,6 +28,7 @@ from cloudrc.config.document import SET_LABEL, Document, KeyPath, Source, child,
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Experiment, PlugIn
 from cloudrc.errors import BadInputError
+from cloudrc.messages import UPRIGHT, ZERO, Odometry
 
 KINDS = {"estimator": "estimators", "predictor": "predictors", "controller": "controllers"}
 """Key under `cloud` -> kind of plug-in."""
@@ -143,8 +144,17 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
             name = str(document.source((*path, "name")).absolute(name))
         try:
             if build:
+                for parameter in plugins.signature(kind, name).parameters.values():
+                    place = (*path, parameter.name)
+                    if parameter.annotation == Path | None and isinstance(
+                        document.get(*place), str
+                    ):
+                        file = document.source(place).absolute(parameters[parameter.name])
+                        parameters[parameter.name] = str(file)
                 checked = _check(kind, name, parameters)
-                plugins.load(kind, name, **dict(checked))
+                plugin = plugins.load(kind, name, **dict(checked))
+                if key == "predictor" and document.get("cloud", "plan_s"):
+                    _check_model(plugin, name)
                 parameters = checked.model_dump(mode="json")
         except ValidationError as error:
             found += problems.from_pydantic(error, parameter_model(kind, name), path)
@@ -154,6 +164,16 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
             # Not by `set_value`: the parameters keep their sources.
             document.tree["cloud"][key] = {"name": name, **parameters}
     return found
+
+
+def _check_model(predictor: Any, name: str) -> None:
+    """Raise a BadInputError if a predictor cannot plan, because it has no model of the robot."""
+    predictor.predict(Odometry(0, ZERO, UPRIGHT, ZERO, ZERO), 0.0)
+    if predictor.model() is None:
+        raise BadInputError(
+            f"'{name}' has no model of the robot, which cloud.plan_s above 0 needs; choose "
+            "model_based or command_history, or set cloud.plan_s to 0"
+        )
 
 
 def build_plugin(kind: str, choice: PlugIn) -> Any:

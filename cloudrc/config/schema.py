@@ -32,7 +32,10 @@ CommandAge = Annotated[float, Field(ge=COMMAND_AGE_MS[0], le=COMMAND_AGE_MS[1])]
 Speed = Annotated[float, Field(ge=0.01, le=10)]
 Acceleration = Annotated[float, Field(ge=0.1, le=100)]
 YawRate = Annotated[float, Field(ge=0.01, le=10)]
+CarrotSpeed = Annotated[float, Field(ge=0.01, le=10)]
 CloudTime = Annotated[float, Field(gt=0, le=10)]
+PlanTime = Annotated[float, Field(ge=0, le=0.8)]
+PlanMax = Annotated[float, Field(ge=0, le=2)]
 HoldTime = Annotated[float, Field(ge=0.1, le=3600)]
 DURATION_MAX = 1_000_000
 """Largest value of a time limit, or of a dwell time in a mission [s]: eleven days."""
@@ -222,6 +225,20 @@ class Waypoint(Section):
     time_limit_s: TimeLimit | None = None
     """Time limit for the flight to this point [s], not counting time in HOLD; after it the
     mission fails. null: 3 times the expected time"""
+    speed_mps: CarrotSpeed | None = None
+    """Speed of the carrot on the way to this point [m/s]; only with carrot. null: the carrot's"""
+
+
+class Carrot(Section):
+    """A setpoint that moves straight from waypoint to waypoint and rests at each for its dwell_s.
+
+    It moves by time alone, so that delays do not prolong the mission.
+    """
+
+    speed_mps: CarrotSpeed = 2.0
+    """Largest speed of the setpoint [m/s]"""
+    acceleration_mps2: Annotated[float, Field(ge=0.1, le=10)] = 2.0
+    """Acceleration and deceleration of the setpoint [m/s^2]"""
 
 
 class Steps(Section):
@@ -250,6 +267,8 @@ class Mission(Section):
     """Points to fly to, in this order"""
     steps: Steps | None = None
     """Random setpoints in place of waypoints"""
+    carrot: Carrot | None = None
+    """Lets the setpoint move along the ways; null: the setpoint jumps to the next waypoint"""
 
 
 class LowLevel(Section):
@@ -367,9 +386,12 @@ class Guard(Section):
     """Largest age of the odometry from which a command was computed [ms]. If this age of the
     newest command is larger, the robot holds its position. null: the link
     profile's value, else 250"""
+    plan_max_s: PlanMax | None = None
+    """Longest time for which the robot flies a command's plan after its arrival [s]; 0: no plan
+    outlasts command_age_max_ms. null: 0.8 if cloud.plan_s is above 0, else 0"""
     speed_max_mps: Speed | None = None
     """Cap on the commanded speed [m/s]; a faster command is shortened. null: the largest speed
-    from which the robot stops within 8.7 m, 6 m/s if command_age_max_ms is 250"""
+    from which the robot stops within 8.7 m, 6 m/s if command_age_max_ms is 250 and plan_max_s 0"""
     acceleration_max_mps2: Acceleration = 12.0
     """Cap on the acceleration that the guard lets the onboard controller follow [m/s^2]"""
     yaw_rate_max_radps: YawRate = 1.0
@@ -422,6 +444,9 @@ class Cloud(Section):
     parameters"""
     controller: PlugInChoice = "pid"
     """Tracks the setpoint: a name, or a mapping with parameters"""
+    plan_s: PlanTime = 0.0
+    """Length of the plan of future velocities in each command [s], in steps of 10 ms. The robot
+    follows it while newer commands are late or lost. Needs a predictor with a model. 0: no plan"""
     horizon_max_s: CloudTime | None = None
     """Longest horizon of the prediction [s]. null: the link profile's value, else 1"""
     freeze_after_s: CloudTime | None = None

@@ -311,6 +311,31 @@ def _stop_and_go(rng: Generator) -> Lie:
     return lie
 
 
+def _hostile_plans(rng: Generator) -> Lie:
+    """Send plans of random lengths for wrong times, with jumps and now and then NaN.
+
+    Some clouds alternate plans with plain commands, and some state a wrong odometry stamp.
+    """
+    shift, share = float(rng.choice([0.0, 0.1, 1.0, 20.0])), float(rng.choice([0.0, 0.5, 1.0]))
+    absurd, old_ns = float(rng.choice([0.0, 0.003])), int(rng.choice([0, 150_000_000]))
+    jumps, fly = int(rng.choice([1, 5, 80])), _operators_voice(rng)
+
+    def lie(command: Command, control: Control) -> Command:
+        command = fly(command, control)
+        if rng.random() < share:
+            return command
+        basis_ns = command.basis_stamp_ns - old_ns * (rng.random() < 0.5)
+        planned_ns = basis_ns + int(rng.normal(0.05, shift) * 1e9)
+        corners = rng.uniform(-2.0 * FAST, 2.0 * FAST, (80 // jumps + 1, 3)).tolist()
+        plan = [tuple(corners[n // jumps]) for n in range(int(rng.integers(1, 81)))]
+        if rng.random() < absurd:
+            plan[-1] = tuple(rng.choice((nan, inf, -inf, 1e30, 1e3, -1e3), 3).tolist())
+        command = command._replace(basis_stamp_ns=basis_ns, planned_ns=planned_ns)
+        return command._replace(plan=tuple(plan))
+
+    return lie
+
+
 def _operators_voice(rng: Generator) -> Lie:
     """Fly as one of the policies in `FASTEST`, while `at_bad_moments` makes requests."""
     return FASTEST[int(rng.integers(len(FASTEST)))](rng)
@@ -332,7 +357,7 @@ SPEAKING = ("operators-voice", "refused-and-released")
 POLICIES: dict[str, Policy] = {
     policy.__name__[1:].replace("_", "-"): policy
     for policy in (
-        *(*FASTEST, _false_basis, _operators_voice, _refused_and_released),
+        *(*FASTEST, _false_basis, _hostile_plans, _operators_voice, _refused_and_released),
         *(_shaking, _stop_and_go, _strange_numbers),
     )
 }

@@ -7,8 +7,8 @@ cap, stop  The reference velocity stays within its limits, and the robot can alw
            fence. During LAND the robot may fly down to the floor. After a HOLD the reference
            velocity grows slowly at first.
 stale      World rejects a command that is based on too old odometry. TRACK ends before the odometry
-           of the last command is too old. HOLD changes to TRACK only after `RESUME_COMMANDS` fresh
-           commands within `RESUME_NS`.
+           of the last command is too old, or when its plan ends. HOLD changes to TRACK only after
+           `RESUME_COMMANDS` fresh commands within `RESUME_NS`.
 rest       After TRACK the robot stops within its stopping distance. The rotors stop only on a
            request, after a collision, or if the robot does not move.
 collision  If the cloud is honest, only the arm's tip touches something, and it touches only the
@@ -35,6 +35,7 @@ from typing import NamedTuple
 from cloudrc.config.load import ResolvedGuard
 from cloudrc.geometry.fence import HIGH, LOW, inside
 from cloudrc.messages import (
+    PLAN_STEP_NS,
     ZERO,
     Cause,
     Command,
@@ -93,6 +94,7 @@ class Limits(NamedTuple):
     yaw_rate: float = 1.0  # [rad/s]
     age_ns: int = 250_000_000  # age of a command's odometry [ns]
     hold_ns: int = 60_000_000_000  # time in a mission after which HOLD becomes LAND [ns]
+    plan_ns: int = 0  # longest time for which a plan is flown after its arrival [ns]
 
     @classmethod
     def of(cls, guard: ResolvedGuard) -> Limits:
@@ -103,6 +105,7 @@ class Limits(NamedTuple):
             guard.yaw_rate_max_radps,
             round(guard.command_age_max_ms * 1e6),
             round(guard.hold_max_s * 1e9),
+            round(guard.plan_max_s * 1e9),
         )
 
 
@@ -137,6 +140,7 @@ class RobotInvariants:
         self._next_ns, self._steps = start_ns, 0
         self._before = ZERO  # the last reference [m/s]
         self._newest_ns = -1  # newest odometry stamp of accepted commands [ns]
+        self._plan_end_ns = -1  # latest end of accepted plans [ns]
         # Motion after a stop or a collision, and after TRACK.
         self._comes_down = False  # whether it lands, or fell after an emergency stop
         self._falls = False  # after a stop or a collision, until it flies again
@@ -183,7 +187,7 @@ class RobotInvariants:
                 self._check_caps(reference, state is TRACK, now_ns)
             if state is TRACK:
                 age_ns = now_ns - self._newest_ns
-                if age_ns > self._limits.age_ns:
+                if age_ns > self._limits.age_ns and now_ns > self._plan_end_ns:
                     self._note(now_ns, "stale", f"TRACK on a command {age_ns * 1e-9:.3f} s old")
             elif any(rotor_speeds):
                 self._check_rest(position, now_ns)
@@ -202,6 +206,10 @@ class RobotInvariants:
                 age = (now_ns - basis_ns) * 1e-9
                 self._note(now_ns, "stale", f"accepted a command {age:.3f} s old")
             self._newest_ns = max(self._newest_ns, basis_ns)
+            if command.plan:
+                end_ns = command.planned_ns + (len(command.plan) + 1) * PLAN_STEP_NS
+                end_ns = min(end_ns, now_ns + self._limits.plan_ns)
+                self._plan_end_ns = max(self._plan_end_ns, end_ns)
             if self._armed:
                 self._goes_back = basis_ns < self._basis_ns
                 self._basis_ns = max(self._basis_ns, basis_ns)

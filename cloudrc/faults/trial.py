@@ -129,7 +129,9 @@ def _prepare(schedule: Schedule, settings: tuple[str, ...], keep: bool) -> Fligh
         lies.append(lie)
     if schedule.of(*BUGS):
         lies.append(_bugs(schedule, clock))
+    plans = ["guard.plan_max_s=0.8"] if schedule.policy == "hostile-plans" else []
     return Flight(
+        *plans,
         f"link.profile={schedule.profile}",
         f"guard.hold_max_s={schedule.hold_max:g}",
         *settings,

@@ -146,9 +146,12 @@ class Flight:
     def applied(self) -> Columns:
         """Commands that world applied in the flight, with what cloud recorded when it sent them.
 
-        `stamp_ns` is the time of application [ns], `position` the predicted position [m].
+        `stamp_ns` is the time of application [ns], `position` the predicted position [m]. A plan is
+        played on its own time line, so `stamp_ns` is then the time for which it was computed.
         """
-        return self.join_control(self.during("/command_applied"))
+        columns = self.join_control(self.during("/command_applied"))
+        planned, stamp = columns["planned_ns"], columns["stamp_ns"]
+        return columns | {"stamp_ns": np.where(planned >= 0, planned, stamp)}
 
     def join_control(self, commands: Columns) -> Columns:
         """Add to each command (`epoch`, `counter`) the values of its control period.

@@ -67,8 +67,11 @@ def _waypoints_reached(flight: Flight) -> float | None:
 
 
 def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
-    """Return whether the robot truly stayed at a waypoint for its dwell time before an instant."""
-    truth = flight.truth
+    """Return whether the robot truly stayed at a waypoint for its dwell time before an instant.
+
+    With a carrot, the dwell time is that of the carrot, and the robot has to come near only.
+    """
+    truth, dwell = flight.truth, 0.0 if flight.mission.carrot else waypoint.dwell_s
     rows = truth["stamp_ns"] <= until_ns
     distance = np.linalg.norm(truth["position"][rows] - waypoint.position_m, axis=1)
     near = np.append(distance <= waypoint.tolerance_m, [False])
@@ -76,7 +79,7 @@ def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
     stamps = np.append(truth["stamp_ns"][rows], until_ns)
     stays_ns = stamps[edges[1::2] - 1] - stamps[edges[::2]]
     # The dwell time may lie between two samples.
-    return bool((stays_ns >= waypoint.dwell_s * 1e9 - ODOMETRY_NS).any())
+    return bool((stays_ns >= dwell * 1e9 - ODOMETRY_NS).any())
 
 
 def _contact_time(flight: Flight) -> float | None:

@@ -131,7 +131,8 @@ _TABLE = (
     Topic("/command_applied", "cloudrc_msgs/msg/CommandApplied", rec.CommandApplied, "world",
         "The robot began to follow a command, world's clock", (
         *(_EPOCH, _COUNTER, _BASIS),
-        Field("velocity", "vector", "m/s", "before the guard's caps, world frame"))),
+        Field("velocity", "vector", "m/s", "before the guard's caps, world frame"),
+        Field("planned_ns", "int", "ns", "time for which a plan was computed; -1 without a plan"))),
     Topic("/guard", "cloudrc_msgs/msg/GuardChange", rec.GuardChange, "world",
         "The guard changed its state, world's clock", (
         Field("state", "int", "", _GUARD), Field("cause", "string", "", "why, in words"))),

@@ -10,6 +10,10 @@ The command cancel leads from STARTING, FLYING and HELD to CANCELLED. A time lim
 world, a guard in LAND or an emergency stop leads to FAILED. At the end of a mission teleop asks the
 robot to hold. Until the robot gets this request, it flies to the setpoint; therefore teleop also
 makes the robot's position the setpoint.
+
+In a mission with a carrot the setpoint moves along the way by time alone, so that the duration of
+the mission does not depend on the network. The carrot waits at the robot while the guard does not
+follow cloud's commands, and leaves a waypoint only if telemetry shows the robot near it.
 """
 
 from __future__ import annotations
@@ -20,8 +24,18 @@ from typing import TYPE_CHECKING
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry import fence
-from cloudrc.messages import MISSION_OVER, NEVER_NS, GuardState, Request, Setpoint, Start
+from cloudrc.messages import (
+    MISSION_OVER,
+    NEVER_NS,
+    GuardState,
+    Motion,
+    Request,
+    Setpoint,
+    Start,
+    Vector,
+)
 from cloudrc.records import MissionEvent
+from cloudrc.teleop.carrot import arrival_ns
 from cloudrc.teleop.requests import REPEAT_NS, RequestSender
 from cloudrc.teleop.wire import (
     ALARM,
@@ -48,11 +62,20 @@ NO_WAYPOINT = -1
 UNDER_WAY = FLYING, STARTING, HELD
 """States of a mission that has begun and has not ended."""
 GAP_MAX_NS = 500_000_000
-"""If telemetry was missing for longer, only this time counts as time of flight [ns]."""
+"""If telemetry was missing for longer, only this time counts as time of flight [ns], and the carrot
+starts again from the robot."""
+PROMPT_NS = 100_000_000
+"""The carrot leaves a waypoint at the planned time if telemetry shows at most this time later that
+the robot is there [ns]; else it leaves at that later time."""
 UNSEEN_MAX_NS = 2_000_000_000
 """Time without telemetry after which the dwell time at a waypoint starts again [ns]."""
 # Looking up a member of an enum is slow.
-GROUND, HOLD, ESTOP = GuardState.GROUND, GuardState.HOLD, GuardState.ESTOP
+GROUND, TRACK, HOLD, ESTOP = (
+    GuardState.GROUND,
+    GuardState.TRACK,
+    GuardState.HOLD,
+    GuardState.ESTOP,
+)
 
 
 class LegWatch:
@@ -127,6 +150,9 @@ class Teleop:
         self._setpoint: Setpoint | None = None
         self._is_pending = False  # whether the mission's first setpoint has not been sent yet
         self._stays = False  # whether waypoints are ignored
+        self._seen_ns = NEVER_NS
+        # Whether the robot has followed commands in this mission, and whether the carrot waits.
+        self._followed = self._waits = False
 
     @property
     def settled(self) -> bool:
@@ -181,7 +207,7 @@ class Teleop:
         """Continue a held mission; raise BadInputError unless the mission is held."""
         self._check("resume", HELD)
         self._watch.pause()
-        self._select_leg(self.leg)
+        self._select_leg(self.leg, now_ns)
         self._report("resumed", self.leg, f"resumed {self.where}", now_ns)
 
     def cancel(self, now_ns: int) -> None:
@@ -230,13 +256,16 @@ class Teleop:
         elif started:
             self._begin(seen, now_ns)
         elif self._is_pending:
-            self._select_early()
+            self._select_early(now_ns)
         while self.leg < onboard and self.state in (FLYING, HELD):
             self._advance("reached, as the robot reports,", now_ns)  # the event was lost
-        while self.state == FLYING and self._watch.is_reached(legs[self.leg], seen, now_ns):
+        if self.state == FLYING and legs[self.leg].speed:
+            self._lead(seen, now_ns)
+        while self.state == FLYING and self._is_reached(legs[self.leg], seen, now_ns):
             self._advance("reached", now_ns)
         if new_session and last is self._setpoint:
-            self._repeat_setpoint()
+            self._repeat_setpoint(now_ns)
+        self._seen_ns = now_ns
 
     def handle_deadline(self, now_ns: int) -> None:
         """Check the time limits and repeat the request that is due."""
@@ -292,7 +321,7 @@ class Teleop:
     def _order(self, plan: Plan, mission_id: int, began_ns: int) -> None:
         self.state, self.outcome, self.leg = STARTING, None, 0
         self._plan, self._mission_id, self._began_ns = plan, mission_id, began_ns
-        self._continued = self._was_held = False
+        self._continued = self._was_held = self._followed = self._waits = False
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
         """Begin the mission and its time, once telemetry shows the start."""
@@ -302,7 +331,7 @@ class Teleop:
             self._began_ns = now_ns
             if self._is_pending:
                 self._is_pending = False
-                self._select_leg(self.leg)
+                self._select_leg(self.leg, now_ns)
             place = "the spawn" if self._plan.start is Start.SPAWN else "here"
             count = f"waypoints: {len(self._plan.legs)}, judged by the measured position"
             text = f"mission started from {place}, {count}"
@@ -316,14 +345,46 @@ class Teleop:
     def _advance(self, how: str, now_ns: int) -> None:
         text = f"{self._leg_name} {how} at {self.elapsed(now_ns):.2f} s"
         self._report("reached", self.leg, text, now_ns)
+        leaves_ns = self._leaves_ns(self.leg)
+        start = None if leaves_ns is None else self._plan.legs[self.leg].position
         self.leg += 1
         self.requests.report(self._mission_id, self.leg)
         if self.leg < len(self._plan.legs):
             self._watch = LegWatch()
             if self.state == FLYING and self.leg >= self._onboard:  # never fly back
-                self._select_leg(self.leg)
+                if leaves_ns is None or now_ns - leaves_ns > PROMPT_NS:
+                    leaves_ns = now_ns
+                self._select_leg(self.leg, leaves_ns, start)
         else:
             self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
+
+    def _lead(self, seen: RobotStatus, now_ns: int) -> None:
+        """Let the carrot wait at the robot, or start it again from there, if that is necessary.
+
+        Before the robot has taken off, the carrot does not wait: a round trip would be lost.
+        """
+        self._followed = self._followed or seen.guard is TRACK
+        if seen.guard is not TRACK and (self._followed or seen.guard is not GROUND):
+            self._waits = True
+            self._select_here()
+        elif self._waits or (self._seen_ns >= 0 and now_ns - self._seen_ns > GAP_MAX_NS):
+            self._waits = False
+            self._select_leg(self.leg, now_ns)
+
+    def _is_reached(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
+        rested = self._watch.is_reached(leg, seen, now_ns)
+        if not leg.speed:
+            return rested
+        leaves_ns = self._leaves_ns(self.leg)
+        near = dist(seen.position, leg.position) <= leg.tolerance
+        return near and leaves_ns is not None and now_ns >= leaves_ns
+
+    def _leaves_ns(self, leg: int) -> int | None:
+        """Return when the carrot has rested at a waypoint [ns]; None if it is not on this way."""
+        setpoint = self._setpoint
+        if setpoint is None or setpoint.motion is None or setpoint.waypoint != leg:
+            return None
+        return arrival_ns(setpoint) + round(self._plan.legs[leg].dwell * 1e9)
 
     def _hold(self, now_ns: int) -> None:
         self._select_here()
@@ -358,7 +419,7 @@ class Teleop:
         """Whether the robot may still fly an earlier mission while this mission has not begun."""
         return self._from_spawn and not self.requests.waits
 
-    def _select_early(self) -> None:
+    def _select_early(self, now_ns: int) -> None:
         """Select the first waypoint before telemetry shows the start, to save a round trip.
 
         While the robot may move, select nothing, because the robot would fly there at once.
@@ -368,9 +429,9 @@ class Teleop:
         self._is_pending = False
         leg = 0 if self._from_spawn else max(self.leg, self._onboard)
         if leg < len(self._plan.legs):
-            self._select_leg(leg)
+            self._select_leg(leg, now_ns)
 
-    def _repeat_setpoint(self) -> None:
+    def _repeat_setpoint(self, now_ns: int) -> None:
         """Send the setpoint again in a new session, for which cloud does not have it.
 
         If the mission has not started and the robot may move, the setpoint is the robot's position.
@@ -378,13 +439,18 @@ class Teleop:
         if self.state == STARTING and self._may_move:
             self._is_pending = True
             self._select_here()
+        elif self._setpoint is not None and self._setpoint.motion is not None:
+            self._select_leg(self._setpoint.waypoint, now_ns)
         elif self._setpoint is not None:
             self._select(self._setpoint)
 
-    def _select_leg(self, leg: int) -> None:
-        to = self._plan.legs[leg]
+    def _select_leg(self, leg: int, begin_ns: int, start: Vector | None = None) -> None:
+        """Make a waypoint the setpoint; a carrot moves there from `start`, or from the robot."""
+        to, motion = self._plan.legs[leg], None
+        if to.speed and self.seen is not None:
+            motion = Motion(start or self.seen.position, begin_ns, to.speed, to.acceleration)
         if not self._stays:
-            self._select(Setpoint(to.position, to.yaw, leg))
+            self._select(Setpoint(to.position, to.yaw, leg, motion=motion))
 
     def _select_here(self) -> None:
         if self.seen is not None:

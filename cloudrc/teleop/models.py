@@ -17,7 +17,15 @@ from pydantic_core import PydanticCustomError, from_json
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem as ConfigProblem
 from cloudrc.config.problems import from_pydantic
-from cloudrc.config.schema import MAX_WAYPOINTS, Finite, Mission, Section, TimeLimit, Waypoint
+from cloudrc.config.schema import (
+    MAX_WAYPOINTS,
+    Carrot,
+    Finite,
+    Mission,
+    Section,
+    TimeLimit,
+    Waypoint,
+)
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import ARM_HEIGHT, ARM_LENGTH
 from cloudrc.geometry.scene import Scene
@@ -51,6 +59,9 @@ class MissionRequest(Section):
     )
     waypoints: tuple[Waypoint, ...] = Field(
         (), max_length=MAX_WAYPOINTS, description="Points, in order"
+    )
+    carrot: Carrot | None = Field(
+        None, description="Lets the setpoint move along the ways; null: the setpoint jumps"
     )
     contact: bool | None = Field(
         None, description="Whether the arm has to touch the board; default: as in the experiment, "
@@ -248,7 +259,7 @@ def read_order(
     request = _parse(body, MissionRequest)
     if not request.waypoints:  # only an experiment may have steps instead
         raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
-    mission = Mission(start=request.start, waypoints=request.waypoints)
+    mission = Mission(start=request.start, waypoints=request.waypoints, carrot=request.carrot)
     if problems := check_mission(mission, scene):
         raise RefusedError(problems)
     contact = contact and leads_to_board(mission, scene)

@@ -30,6 +30,8 @@ class Leg:
     """A waypoint, and the conditions under which it counts as reached.
 
     With an infinite `tolerance` (for random steps) the waypoint is reached after the time `dwell`.
+    With a `speed` the waypoint is reached when the setpoint has rested there for the time `dwell`
+    and the robot is within the tolerance.
     """
 
     position: Vector  # [m], world frame, shape (3,)
@@ -37,6 +39,8 @@ class Leg:
     tolerance: float = 0.10  # largest distance from the waypoint that counts as reached [m]
     dwell: float = 0.5  # time to stay within the tolerance without interruption [s]
     time_limit: float = 60.0  # for reaching the waypoint, without holds [s]
+    speed: float = 0.0  # of the setpoint on its way to the waypoint [m/s]; 0: the setpoint jumps
+    acceleration: float = 1.0  # of the setpoint [m/s^2]
 
 
 @dataclass(frozen=True, slots=True)

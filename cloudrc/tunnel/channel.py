@@ -37,8 +37,11 @@ class Channel:
         """
         return self._repeats > self._newest + 1
 
-    def take(self, counter: int) -> str:
-        """Classify the datagram with this counter as USED, LATE or REPEATED."""
+    def take(self, counter: int, newest_wins: bool = False) -> str:
+        """Classify the datagram with this counter as USED, LATE or REPEATED.
+
+        With `newest_wins` this datagram is not used if it is late, whatever the channel's rule is.
+        """
         ahead = counter - self._newest
         if ahead > 0:
             self._newest = counter
@@ -48,4 +51,4 @@ class Channel:
             self._repeats += 1
             return REPEATED
         self._seen |= 1 << -ahead
-        return LATE if self._newest_wins else USED
+        return LATE if newest_wins or self._newest_wins else USED

@@ -1,7 +1,8 @@
 """Encode messages as datagrams and decode them, with a fixed little-endian layout per kind.
 
 A datagram has a 16-byte header (version, direction, epoch, kind, counter), a body with a fixed
-length for each kind, and a 16-byte authentication tag, which `session` adds and verifies. The epoch
+length for each kind, and a 16-byte authentication tag, which `session` adds and verifies. Only a
+command may be longer, by a plan. The epoch
 is the number of the session. The functions raise no exception except DecodeError.
 
 The header is authenticated but not encrypted, because the link reads it. Its last 12 bytes are the
@@ -18,6 +19,7 @@ from enum import IntEnum
 from typing import NamedTuple, TypeAlias
 
 from cloudrc.messages import (
+    NEVER_NS,
     Cause,
     Command,
     GuardState,
@@ -26,12 +28,15 @@ from cloudrc.messages import (
     Request,
     Start,
     Telemetry,
+    Vector,
 )
 
 VERSION = 6
 """Version of the wire format. Each release of cloudrc uses one version and refuses all others."""
-DATAGRAM_MAX = 512
-"""Size of the receive buffer [bytes]; every valid datagram is shorter."""
+PLAN_MAX = 80
+"""Largest number of velocities in a command's plan."""
+DATAGRAM_MAX = 1200
+"""Size of the receive buffer [bytes]; every valid datagram is shorter, and fits into a packet."""
 NUMBER_MAX = 2**32 - 1
 """Highest number of an operator request."""
 
@@ -115,6 +120,10 @@ SIZES = {int(kind): HEADER_SIZE + size + TAG_SIZE for kind, size in BODY_SIZES.i
 
 _GUARD_STATES, _CAUSES = tuple(GuardState), tuple(Cause)
 _new = tuple.__new__  # makes a named tuple four times as fast as its class does
+_PLANNED, _VELOCITY = struct.Struct("<q"), struct.Struct("<3f")
+PLAN_SIZES = (0, *(_PLANNED.size + n * _VELOCITY.size for n in range(1, PLAN_MAX + 1)))
+"""Number of velocities in a plan -> what the plan adds to the size of a command [bytes]."""
+_COMMAND_SIZES = {SIZES[Kind.COMMAND] + size for size in PLAN_SIZES}
 _size_of = SIZES.get
 _unpack_header: Callable[[bytes], Header] = _HEADER.unpack_from
 
@@ -135,7 +144,9 @@ def check(data: bytes) -> Header:
     header = _unpack_header(data)
     if header[0] != VERSION:
         raise DecodeError("version")
-    if _size_of(header[3]) != size or header[1] > 1:
+    if header[1] > 1:
+        raise DecodeError("malformed")
+    if _size_of(header[3]) != size and (header[3] != Kind.COMMAND or size not in _COMMAND_SIZES):
         raise DecodeError("malformed")
     return header
 
@@ -190,14 +201,23 @@ def decode_telemetry(body: bytes) -> Telemetry:
 
 def encode_command(command: Command) -> bytes:
     """Encode the body of a COMMAND datagram."""
-    stamp_ns, basis_stamp_ns, basis_hold_ns, (x, y, z), yaw_rate = command
-    return _COMMAND.pack(stamp_ns, basis_stamp_ns, basis_hold_ns, x, y, z, yaw_rate)
+    stamp_ns, basis_stamp_ns, basis_hold_ns, (x, y, z), yaw_rate, plan, planned_ns = command
+    body = _COMMAND.pack(stamp_ns, basis_stamp_ns, basis_hold_ns, x, y, z, yaw_rate)
+    if not plan:
+        return body
+    return body + _PLANNED.pack(planned_ns) + b"".join([_VELOCITY.pack(*each) for each in plan])
 
 
 def decode_command(body: bytes) -> Command:
     """Decode the body of a COMMAND datagram; its floats may have any value, even NaN."""
-    stamp_ns, basis_stamp_ns, basis_hold_ns, x, y, z, yaw_rate = _COMMAND.unpack(body)
-    return _new(Command, (stamp_ns, basis_stamp_ns, basis_hold_ns, (x, y, z), yaw_rate))
+    stamp_ns, basis_stamp_ns, basis_hold_ns, x, y, z, yaw_rate = _COMMAND.unpack_from(body)
+    plan: tuple[Vector, ...] = ()
+    planned_ns, size = NEVER_NS, _COMMAND.size
+    if len(body) > size:
+        (planned_ns,) = _PLANNED.unpack_from(body, size)
+        plan = tuple(_VELOCITY.iter_unpack(body[size + _PLANNED.size :]))
+    fields = (stamp_ns, basis_stamp_ns, basis_hold_ns, (x, y, z), yaw_rate, plan, planned_ns)
+    return _new(Command, fields)
 
 
 def encode_operator(request: OperatorRequest) -> bytes:

@@ -272,9 +272,12 @@ class WorldEndpoint(TunnelEnd):
         self._waiting = None
         if self.robot.guard.state is not TRACK:  # the mission has just ended or stopped
             return
-        echo_ns, basis_ns, _, velocity, _ = command
+        echo_ns, basis_ns, _, velocity, _, plan, planned_ns = command
+        if plan:
+            velocity = command.velocity_at(now_ns)
         self._echo_stamp_ns, self._applied_ns = echo_ns, now_ns
-        self._records.append(_new(CommandApplied, (now_ns, epoch, counter, basis_ns, velocity)))
+        applied = (now_ns, epoch, counter, basis_ns, velocity, planned_ns)
+        self._records.append(_new(CommandApplied, applied))
 
     def _sample(self, now_ns: int) -> None:
         """Record the true state and the events before it; send telemetry if it is due."""
@@ -362,7 +365,7 @@ class WorldEndpoint(TunnelEnd):
         self, epoch: int, counter: int, body: bytes, now_ns: int, world_ns: int
     ) -> None:
         command, guard = codec.decode_command(body), self.robot.guard
-        outcome = self._channel.take(counter)
+        outcome = self._channel.take(counter, bool(command.plan))
         if outcome != REPEATED:
             self._door.hear(now_ns)
         if outcome == USED:

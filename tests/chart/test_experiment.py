@@ -92,7 +92,7 @@ def test_a_change_restarts_only_what_it_must():
     ("values", "said"),
     [
         ({"link": {"profile": "wify"}}, "link.profile: no profile 'wify' ships.*choose one of 5g"),
-        ({"mission": {"enabled": True, "plan": "pipe"}}, "no mission 'pipe'.*one of hover, pipes"),
+        ({"mission": {"enabled": True, "plan": "pipe"}}, "no mission 'pipe'.*one of carrot, hover"),
         (
             {"experiment": {"link": {"profile": "./mine.yaml"}}},
             "experiment.link.profile: no profile './mine.yaml'.*profile under link.profile",

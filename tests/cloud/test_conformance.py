@@ -48,10 +48,12 @@ quaternions = axes.map(lambda q: tuple(c / sqrt(sum(c * c for c in q)) for c in 
 odometry = st.builds(
     Odometry, st.integers(0, 10**15), vectors, quaternions, vectors, st.tuples(*[numbers] * 3)
 )
-commands = st.builds(
-    Command, st.integers(0, 10**15), st.integers(0, 10**15), st.just(0), vectors, numbers
+stamps = st.integers(0, 10**15)
+plans = st.lists(vectors, max_size=5).map(tuple)
+commands = st.builds(Command, stamps, stamps, st.just(0), vectors, numbers, plans, stamps)
+setpoints = st.builds(
+    Setpoint, vectors, st.floats(-10 * pi, 10 * pi), velocity=vectors, motion=st.none()
 )
-setpoints = st.builds(Setpoint, vectors, st.floats(-10 * pi, 10 * pi))
 
 
 def are_finite(*values):
@@ -112,7 +114,8 @@ def test_a_prediction_is_finite_later_and_a_rotation(module, history, command, h
     predictor = module.build()
     for sample in sorted(history, key=lambda sample: sample.stamp_ns):
         predictor.observe(sample)
-    predictor.commanded(command)
+    predictor.commanded(command._replace(planned_ns=sample.stamp_ns))
+    predictor.applied(command.stamp_ns, sample.stamp_ns)
     assert predictor.predict(sample, 0.0) == sample
     prediction = predictor.predict(sample, horizon)
     assert prediction.stamp_ns == sample.stamp_ns + round(horizon * 1e9)
@@ -127,6 +130,7 @@ def test_a_predictor_forgets_everything_when_it_is_reset(module):
     for k in range(20):
         used.observe(Odometry(k * 10**7, ZERO, UPRIGHT, (0.1 * k * k, -k, 2.0), (1.0, 2.0, 3.0)))
         used.commanded(Command(k, k, 0, (1.0, 2.0, 3.0), 0.5))
+        used.applied(k, k * 10**7)
     used.reset()
     # The stamps of a new session may begin anywhere, even earlier.
     for k in range(5):
@@ -134,6 +138,27 @@ def test_a_predictor_forgets_everything_when_it_is_reset(module):
         used.observe(sample)
         fresh.observe(sample)
         assert used.predict(sample, 0.1) == fresh.predict(sample, 0.1)
+
+
+@every_predictor
+def test_a_model_continues_from_the_last_prediction(module):
+    predictor = module.build()
+    sample = Odometry(10**9, (1.0, 2.0, 3.0), UPRIGHT, (1.0, 0.0, 0.0), ZERO)
+    predictor.observe(sample)
+    predictor.commanded(Command(10**8, 10**9, 0, (2.0, 0.0, 0.0), 0.0))
+    predictor.applied(10**8, 10**9)
+    prediction, model = predictor.predict(sample, 0.2), predictor.model()
+    if model is None:
+        return
+    still = model.step((2.0, 0.0, 0.0), 0.01)
+    assert still.stamp_ns == prediction.stamp_ns + 10**7
+    assert still.position == pytest.approx(prediction.position, abs=0.03)
+    for _ in range(500):
+        end = model.step((0.0, 1.0, 0.0), 0.01)
+    assert end.velocity == pytest.approx((0.0, 1.0, 0.0), abs=0.05)
+    # A new model begins anew, and predictions do not change.
+    assert predictor.model().step((2.0, 0.0, 0.0), 0.01) == still
+    assert predictor.predict(sample, 0.2) == prediction
 
 
 @every_controller

@@ -57,6 +57,33 @@ def test_each_applied_command_counts_once_also_in_late_telemetry():
     assert applied == [-900, -902, -896]
 
 
+def test_the_predictor_is_told_each_applied_command_once():
+    told = []
+
+    class Told(LastSample):
+        def applied(self, command_stamp_ns, applied_ns):
+            told.append((command_stamp_ns // MS, applied_ns // MS))
+
+    a_loop = loop(predictor=Told(), heard_ms=1090, echo_ms=1000)
+    a_loop.observe(telemetry(120, echo_ms=1020, hold_ms=2), 1110 * MS)
+    a_loop.observe_late(telemetry(110, echo_ms=1005, hold_ms=1), 1115 * MS)
+    a_loop.observe(telemetry(130, echo_ms=1020, hold_ms=12), 1120 * MS)
+    assert told == [(1000, 100), (1020, 118), (1005, 109)]
+
+
+def test_a_predictor_that_fails_when_told_is_named():
+    class Deaf(LastSample):
+        def applied(self, command_stamp_ns, applied_ns):
+            raise RuntimeError
+
+    a_loop = loop(predictor=Deaf(), heard_ms=1090, echo_ms=1000)
+    a_loop.observe(telemetry(110), 1100 * MS)
+    assert a_loop.counts == {"predictor_failed": 1}
+    assert [(fault.code, fault.stamp_ns) for fault in a_loop.faults] == [
+        ("predictor_failed", 1100 * MS)
+    ]
+
+
 @pytest.mark.parametrize(
     ("horizon", "limit", "clamped"), [(3.0, 1.0, 1.0), (3.0, 2.0, 2.0), (-0.5, 1.0, 0.0)]
 )
@@ -81,7 +108,7 @@ def test_a_silent_echo_freezes_after_horizon_plus_400_ms():
     controller = Integrating()
     a_loop = loop(controller=controller, heard_ms=1100, echo_ms=1000)
     assert command(a_loop, 1500)[0].velocity == ONE  # a horizon of 100 ms
-    assert command(a_loop, 1501)[0][3:] == (ZERO, 0.0)
+    assert command(a_loop, 1501)[0][3:5] == (ZERO, 0.0)
     assert (a_loop.counts["frozen"], controller.asked) == (1, 1)
     # Telemetry alone does not help, an echo does.
     a_loop.observe(telemetry(500, echo_ms=1000, hold_ms=400), 1510 * MS)

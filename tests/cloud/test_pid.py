@@ -43,6 +43,17 @@ def test_integral_and_derivative_are_those_of_the_equation_and_limited():
     assert fly(controller, wanted=ONES).integral == ZERO
 
 
+def test_a_moving_setpoint_is_fed_forward_and_damps_relative_to_it():
+    controller = pid.build(gain_p=ONES, gain_d=(0.5, 0.5, 0.0), velocity_max=(9.0, 2.0, 9.0))
+    estimate = Odometry(0, (1.0, 0.0, 0.0), UPRIGHT, (1.0, 0.0, 1.0), ZERO)
+    output = controller.update(estimate, Setpoint((2.0, 0.0, 0.0), velocity=(2.0, 3.0, 0.5)), DT)
+    assert output.derivative == (0.5, 1.5, 0.0)
+    assert output.velocity == (1.0 + 0.5 + 2.0, 2.0, 0.5)
+    # With the published gains, too.
+    output = pid.build().update(estimate, Setpoint((2.0, 0.0, 0.0), velocity=(2.0, 0.0, 0.0)), DT)
+    assert output.velocity == (2.8, 0.0, 0.0)
+
+
 def test_only_a_saturated_axis_stops_integrating_and_goes_on_backwards():
     controller = pid.build(gain_p=ONES, gain_i=ONES, gain_d=ONES, velocity_max=ONES)
     output = fly(controller, wanted=(10.0, 0.05, 0.0), times=1000)

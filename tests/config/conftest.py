@@ -62,6 +62,10 @@ def valid(key):
 def beside(key):
     """List the settings that the key needs."""
     above, _, last = key.rpartition(".")
+    if key == "cloud.plan_s":
+        return ["cloud.predictor=model_based"]
+    if key == "mission.waypoints.0.speed_mps":
+        return ["mission.carrot={}"]
     if above.endswith(".loss"):
         needed = {"bad_start": 0.1, "bad_end": 0.5}
         found = [f"{above}.{name}={value}" for name, value in needed.items() if name != last]

@@ -38,8 +38,8 @@ def test_all_problems_are_listed_with_their_lines(mine):
         "mine.yaml:2: guard.speed_max: unknown key; did you mean speed_max_mps [m/s]?",
         "mine.yaml:3: link.uplink.delay_ms: -3: must be a number >= 0 [ms]",
         "mine.yaml:5: cloud.predictor: no predictor named 'last_sampel'; available: "
-        "commanded_velocity, constant_acceleration, constant_velocity, last_sample; "
-        "did you mean last_sample?",
+        "command_history, commanded_velocity, constant_acceleration, constant_velocity, kalman, "
+        "last_sample, model_based; did you mean last_sample?",
         "mine.yaml:6: cloud.controller.sped_max: unknown key; did you mean speed_max?",
         "mine.yaml:7: world.scene: no scene named 'pipe'; available: empty, pipes; "
         "did you mean pipes?",
@@ -89,7 +89,7 @@ def test_an_invalid_file_is_one_line(mine, text, reason):
     ("name", "reason"),
     [
         ("./", "./: cannot be read: "),
-        ("nosuch.yaml", "nosuch.yaml; names of shipped experiments: hover, paper"),
+        ("nosuch.yaml", "nosuch.yaml; names of shipped experiments: fast, hover"),
         ("no/papper.yaml", "did you mean paper?"),
         ("latin.yaml", "is not UTF-8 text"),
     ],
@@ -109,6 +109,12 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ("seed=[1], [2]", "--set seed: [1], [2]: text behind the value"),
         ("mission.waypoints.9.dwell_s=1", "entries 0 to 6; use one of these, or 7 to append"),
         ("mission.waypoints.2.yaw_deg=90", "holds yaw at 0"),
+        (
+            "cloud.plan_s=0.4",
+            "cloud.predictor: 'constant_velocity' has no model of the",
+        ),
+        ("mission.waypoints.2.speed_mps=1", "waypoints.2.speed_mps: 1: is the speed of a carrot;"),
+        ('mission={"steps": {}, "carrot": {}}', "mission.carrot: random steps jump"),
         ("world.robot=./no.xml", "no.xml; names of shipped robots: pelican"),
         ("world.robot=/x/q", "world.robot: not an .xml file: /x/q"),
         # A limit of the guard cannot be switched off.

@@ -98,7 +98,7 @@ def test_no_short_interleaving_reverts_a_command(figure):
 
 
 def test_the_check_finds_reverted_commands(monkeypatch):
-    monkeypatch.setattr("cloudrc.tunnel.channel.Channel.take", lambda channel, counter: "used")
+    monkeypatch.setattr("cloudrc.tunnel.channel.Channel.take", lambda *_: "used")
     with pytest.raises(AssertionError):
         explore(BASIC, 4)
 

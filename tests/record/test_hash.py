@@ -27,8 +27,8 @@ def test_the_bytes_are_those_that_the_module_promises(monkeypatch):
     """Two records of one type in one block: column by column; the types in order of their names."""
     monkeypatch.setattr("cloudrc.record.hash.BLOCK", 2)
     applied = [rec.CommandApplied(n, 2, 3, -4, (0.5, 1.0, 2.0 + n)) for n in range(3)]
-    pair = struct.pack("<8q", 0, 1, 2, 2, 3, 3, -4, -4), struct.pack("<6d", 0.5, 1, 2, 0.5, 1, 3)
-    single = struct.pack("<4q3d", 2, 2, 3, -4, 0.5, 1.0, 4.0)
+    pair = struct.pack("<8q6d2q", 0, 1, 2, 2, 3, 3, -4, -4, 0.5, 1, 2, 0.5, 1, 3, -1, -1)
+    single = struct.pack("<4q3dq", 2, 2, 3, -4, 0.5, 1.0, 4.0, -1)
     arrival = rec.Arrival(6, True, 7, 8, 0.25, False)
     arrived = struct.pack("<q?2qd?", 6, True, 7, 8, 0.25, False)
     vectors = [tuple(float(10 * n + axis) for axis in range(3 + (n == 1))) for n in range(5)]
@@ -38,7 +38,7 @@ def test_the_bytes_are_those_that_the_module_promises(monkeypatch):
     change = rec.GuardChange(5, GuardState.HOLD, "né")
     changed = struct.pack("<2qI", 5, 2, 3) + b"n\xc3\xa9"
     total = b"Arrival 1 %s\n" % sha256(arrived)
-    total += b"CommandApplied 3 %s\n" % sha256(*pair, single)
+    total += b"CommandApplied 3 %s\n" % sha256(pair, single)
     total += b"GroundTruth 1 %s\n" % sha256(true) + b"GuardChange 1 %s\n" % sha256(changed)
     assert digest(truth, *applied, change, arrival) == sha256(total).hex()
 

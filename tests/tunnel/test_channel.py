@@ -26,6 +26,14 @@ def test_the_window_ends_where_it_says(ahead):
     compare((3, 3 + ahead, 3, 4, 3 + ahead), newest_wins=True)
 
 
+def test_a_plan_is_late_after_a_newer_command_in_any_order():
+    channel = Channel(newest_wins=False)
+    assert [channel.take(n, newest_wins=True) for n in (3, 2, 2, 4)] == [
+        *("used", "late", "repeated", "used"),
+    ]
+    assert channel.take(1) == "used"
+
+
 @given(st.lists(st.integers(0, 40) | st.integers(1000, 1070), max_size=60), st.booleans())
 @settings(max_examples=200, deadline=None)
 def test_the_window_agrees_with_a_set(counters, newest_wins):

@@ -28,7 +28,12 @@ telemetries = st.builds(
     *(st.sampled_from(GuardState), unsigned[32], floats, unsigned[64], unsigned[16]),
     st.sampled_from(Cause),
 ).map(lambda t: t._replace(odometry=t.odometry._replace(stamp_ns=t.stamp_ns)))
-commands = st.builds(Command, stamps, stamps, stamps, vectors, floats)
+singles = st.floats(allow_nan=False, width=32)
+plans = st.lists(st.tuples(singles, singles, singles), min_size=1, max_size=codec.PLAN_MAX)
+commands = st.one_of(
+    st.builds(Command, stamps, stamps, stamps, vectors, floats, st.just(()), st.just(-1)),
+    st.builds(Command, stamps, stamps, stamps, vectors, floats, plans.map(tuple), stamps),
+)
 requests = st.builds(
     OperatorRequest,
     *(unsigned[32], st.sampled_from(Request), st.sampled_from(Start), unsigned[63], unsigned[16]),
@@ -77,8 +82,12 @@ def test_every_wrong_length_direction_and_version_is_refused(kind):
     body = bytes(codec.BODY_SIZES[kind] + codec.TAG_SIZE)
     whole = codec.encode_header(kind, 0, 1, 2) + body
     assert outcome(codec.check, whole) == "fine"
-    for length in (*range(len(whole)), len(whole) + 1, 2048):
+    plans = {len(whole) + 8 + 12 * n for n in range(1, 81)} if kind == Kind.COMMAND else set()
+    assert max(plans, default=0) <= codec.DATAGRAM_MAX <= 1200
+    for length in {*range(1300), 2048} - plans - {len(whole)}:
         assert outcome(codec.check, whole[:length].ljust(length, b"\0")) == "malformed"
+    for length in plans:
+        assert outcome(codec.check, whole.ljust(length, b"\0")) == "fine"
     assert outcome(codec.check, bytes([whole[0], 2]) + whole[2:]) == "malformed"
     for version in {*range(256)} - {codec.VERSION}:
         assert outcome(codec.check, bytes([version]) + whole[1:]) == "version"

@@ -83,6 +83,9 @@ def test_the_tunnel_is_as_described_and_as_it_was():
     cloud.begin(epoch, nonces)
     body = codec.encode_command(Command(1, 2, 3, (4.0, 5.0, 6.0), 7.0))
     assert body == struct.pack("<qqqdddd", 1, 2, 3, 4.0, 5.0, 6.0, 7.0)
+    plan = Command(1, 2, 3, (4.0, 5.0, 6.0), 7.0, ((1.0, 2.0, 3.0), (4.0, 5.0, 6.5)), 8)
+    more = struct.pack("<q6f", 8, 1.0, 2.0, 3.0, 4.0, 5.0, 6.5)
+    assert codec.encode_command(plan) == body + more
     cloud.seal(Kind.COMMAND, body)
     command, alive = cloud.seal(Kind.COMMAND, body), world.seal(Kind.ALIVE, b"")
     assert [command, alive] == [sealed(1, 7, 6, 1, body), sealed(0, 7, 8, 0, b"")]

@@ -40,7 +40,7 @@ class Controller:
 
         Args:
             estimate: Predicted pose and twist of the robot, in the units and frames of `Odometry`.
-            setpoint: Wanted position [m], world frame, and yaw [rad].
+            setpoint: Wanted position [m] and velocity [m/s], world frame, and yaw [rad].
             dt: Time since the last call [s], > 0.
         """
         raise NotImplementedError

@@ -23,7 +23,9 @@ class Pid(Controller):
 
     - Here error = setpoint - estimate. Eq. (4) as printed has estimate - setpoint, which diverges
       with positive gains.
-    - The derivative acts on the measurement, so that a new setpoint causes no kick.
+    - The derivative acts on the velocity of the setpoint minus that of the robot. A setpoint that
+      jumps has the velocity 0, so that it causes no kick.
+    - The velocity of the setpoint is added to the output (feed-forward).
     - The integral term, the velocity per axis and the speed are limited; the published code has no
       limits. While the output of an axis is limited, the axis does not integrate an error that
       would push the output further (conditional anti-windup).
@@ -39,9 +41,10 @@ class Pid(Controller):
         velocity_max: Vector,
         speed_max: float,
     ) -> None:
-        self._gain_p, self._gain_i, self._gain_d = gain_p, gain_i, gain_d
+        self._gain_p, self._gain_d = gain_p, gain_d
         self._gain_yaw, self._integral_limit = gain_yaw, integral_limit
         self._velocity_max, self._speed_max = velocity_max, speed_max
+        self._gain_i = ZERO if gain_i == ZERO else gain_i
         self._proportional_only = gain_i == ZERO and gain_d == ZERO
         self._limited = velocity_max != UNLIMITED or speed_max != inf
         self._integral = ZERO
@@ -51,7 +54,9 @@ class Pid(Controller):
         self._integral = ZERO
 
     def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
-        """Compute one command: u = P · e + I · (integral of e) - D · v, limited.
+        """Compute one command: u = P · e + I · (integral of e) + D · (v_s - v) + v_s, limited.
+
+        Here v is the robot's velocity and v_s the setpoint's, in [m/s].
 
         The returned terms are not limited. The integral has the errors of earlier updates only; the
         present error is integrated over `dt` [s] for the next update. Source: the paper, eq. (5).
@@ -64,12 +69,16 @@ class Pid(Controller):
         integral, derivative = self._integral, ZERO
         if not self._proportional_only:
             vx, vy, vz = estimate.velocity
+            rx, ry, rz = setpoint.velocity
             gx, gy, gz = self._gain_d
-            derivative = (-gx * vx, -gy * vy, -gz * vz)
+            derivative = (gx * (rx - vx), gy * (ry - vy), gz * (rz - vz))
             x, y, z = map(add, map(add, proportional, integral), derivative)
             wanted = (x, y, z)
+        if setpoint.velocity is not ZERO:
+            x, y, z = map(add, wanted, setpoint.velocity)
+            wanted = (x, y, z)
         velocity = self._limit(wanted) if self._limited else wanted
-        if not self._proportional_only:
+        if self._gain_i is not ZERO:
             self._integrate((ex, ey, ez), wanted, velocity, dt)
         yaw_rate = 0.0
         if self._gain_yaw:

@@ -18,6 +18,14 @@ from math import cos, sin, sqrt
 from cloudrc.messages import Command, Odometry, Quaternion, Vector
 
 
+class Model:
+    """A state of the robot that commands move, for a plan of future commands."""
+
+    def step(self, velocity: Vector, dt: float) -> Odometry:
+        """Advance the state by `dt` [s], > 0, under a velocity command [m/s]; return the state."""
+        raise NotImplementedError
+
+
 class Predictor:
     """Extrapolates odometry; a plug-in has to define `predict` only."""
 
@@ -27,12 +35,25 @@ class Predictor:
     def commanded(self, command: Command) -> None:
         """Note a command that cloud has just sent."""
 
+    def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
+        """Note that world applied a command; called once per command whose echo arrives.
+
+        Args:
+            command_stamp_ns: Stamp of the command [ns], cloud's clock. A command may be older than
+                that of the last call, because telemetry may arrive late.
+            applied_ns: Time when world applied the command [ns], world's clock.
+        """
+
     def reset(self) -> None:
         """Reset the predictor at the start of a session."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Return the newest sample extrapolated by `horizon` [s], >= 0, with a later stamp."""
         raise NotImplementedError
+
+    def model(self) -> Model | None:
+        """Return a new model in the state of the last prediction, or None without a model."""
+        return None
 
 
 def rotate_ahead(

@@ -8,6 +8,7 @@ otherwise; for this, comparisons are written so that NaN leads to the safe branc
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import copysign, inf, isfinite, sqrt
 
@@ -137,6 +138,11 @@ def limit_length(a: Vector, length_max: float) -> Vector:
     return (x * scale, y * scale, z * scale)
 
 
+def within(velocities: Iterable[Vector], most: float) -> bool:
+    """Tell whether no component of any velocity is above `most` [m/s], infinite or NaN."""
+    return all(abs(x) <= most and abs(y) <= most and abs(z) <= most for x, y, z in velocities)
+
+
 def step_towards(start: Vector, end: Vector, step: float) -> Vector:
     """Move a velocity from `start` towards `end` by at most `step`, all in [m/s]."""
     (ax, ay, az), (bx, by, bz) = start, end
@@ -187,6 +193,8 @@ def limit_sink(reference: Vector, before: Vector, climb: float, speed_max: float
 
 AGE_MAX_NS = 10_000_000_000
 """Largest value of `Limits.command_age_max_ns` that an experiment may set [ns]."""
+PLAN_MAX_NS = 2_000_000_000
+"""Largest value of `Limits.plan_max_ns` that an experiment may set [ns]."""
 GROUND_WAIT_MIN_NS = 10_000_000_000
 """Shortest time for which a robot on the ground waits for the first command of its mission [ns]."""
 RAMP_MIN = 1.0
@@ -210,6 +218,8 @@ class Limits:
         acceleration_max: Largest rate of change of the velocity reference [m/s^2].
         yaw_rate_max: Largest yaw rate [rad/s].
         hold_max_ns: Longest HOLD in a mission before LAND begins [ns]; see `alone_max_ns`.
+        plan_max_ns: Longest time for which a command's plan is flown after its arrival [ns]; 0: the
+            age of the command's odometry alone counts.
     """
 
     fence_low: Vector
@@ -219,20 +229,25 @@ class Limits:
     acceleration_max: float = 12.0
     yaw_rate_max: float = 1.0
     hold_max_ns: int = 60_000_000_000
+    plan_max_ns: int = 0
 
     def __post_init__(self) -> None:
         """Check the limits; raise a ValueError that names the first invalid limit.
 
-        Each limit has to be finite and above 0. The robot has to stop in time from `speed_max` with
-        a command as old as `command_age_max_ns`. The fence has to be larger than its margins.
+        Each limit has to be finite and above 0, `plan_max_ns` may be 0. The robot has to stop in
+        time from `speed_max` with a command as old as `command_age_max_ns` and the rest of a plan.
+        The fence has to be larger than its margins.
         """
-        for name in self.__slots__[2:]:
+        for name in self.__slots__[2:-1]:
             value = getattr(self, name)
             if not (isfinite(value) and value > 0):
                 raise ValueError(f"guard: {name} is {value}; it must be finite and above 0")
         if self.command_age_max_ns > AGE_MAX_NS:
             raise ValueError(f"guard: command_age_max_ns is {self.command_age_max_ns}, above 10 s")
-        way = stopping_distance(self.speed_max, self.command_age_max_ns * 1e-9 + REACTION)
+        if not 0 <= self.plan_max_ns <= PLAN_MAX_NS:
+            raise ValueError(f"guard: plan_max_ns is {self.plan_max_ns}; allowed are 0 to 2 s")
+        delay = (self.command_age_max_ns + self.plan_max_ns) * 1e-9 + REACTION
+        way = stopping_distance(self.speed_max, delay)
         if way > STOPPING_DISTANCE + 1e-4:
             raise ValueError(
                 f"guard: speed_max is {self.speed_max:g} m/s; with this command age the robot needs"

@@ -15,7 +15,9 @@ the cloud is hostile.
           +------------------------ LAND <----------------------------------+
 
 The *basis* of a command is the odometry from which cloud computed the command. A command is fresh
-while its basis is at most `command_age_max` old.
+while its basis is at most `command_age_max` old. A command with a plan stays fresh until the plan
+ends, at most for `plan_max` after its arrival. In each step the guard limits the velocity that the
+plan has for this time, as if it had just arrived; it trusts nothing of the plan.
 
 - Every state can change to ESTOP: by the operator's request, or when the robot has turned over,
   because its rotors would then push it in any direction. An acknowledgement leads to GROUND.
@@ -35,11 +37,19 @@ from __future__ import annotations
 from collections import Counter, deque
 from math import inf
 
-from cloudrc.messages import NEVER_NS, ZERO, Cause, Command, GuardState, Vector
+from cloudrc.messages import (
+    NEVER_NS,
+    PLAN_STEP_NS,
+    ZERO,
+    Cause,
+    Command,
+    GuardState,
+    Vector,
+)
 from cloudrc.records import GuardChange
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.hold import Descent, PositionHold, TakeOff
-from cloudrc.world.guard.limits import COMMAND_MAX, Limits
+from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX, Limits
 from cloudrc.world.readings import Readings
 
 OVERTURNED_COSINE = 0.2
@@ -60,6 +70,9 @@ IMPOSSIBLE = f"{INVALID_COMMANDS} impossible commands within 1 s"
 INVALID_NS = 1_000_000_000
 """INVALID_COMMANDS impossible commands within INVALID_NS [ns] lead to LAND.
 Source: docs/reference/faults.md, "F23"."""
+FOREVER_NS = 1 << 62
+"""Stamp after all others [ns]: the commanded velocity does not change."""
+NO_COMMAND = Command(NEVER_NS, NEVER_NS, 0, ZERO, 0.0)
 
 
 class Guard:
@@ -92,6 +105,8 @@ class Guard:
         self.reference = self._wanted = ZERO
         self._track_until_ns = self._steady_until_ns = self._ramp_until_ns = NEVER_NS
         self._tracked_ns = self._held_ns = -SETTLE_NS
+        self._played = NO_COMMAND  # the newest command of a mission
+        self._next_ns = FOREVER_NS  # when the plan's next velocity is due
         self._fresh_ns: deque[int] = deque(maxlen=RESUME_COMMANDS)
         self._invalid_ns: deque[int] = deque(maxlen=INVALID_COMMANDS)
 
@@ -151,7 +166,7 @@ class Guard:
         self._track_until_ns = self._steady_until_ns = NEVER_NS
         self._fresh_ns.clear()
         self._invalid_ns.clear()
-        self._wanted, self.yaw_rate = ZERO, 0.0
+        self._wanted, self.yaw_rate, self._next_ns = ZERO, 0.0, FOREVER_NS
 
     def accept_command(self, command: Command, now_ns: int) -> str | None:
         """Accept a command at `now_ns` [ns] and return None, or return the reason to reject it.
@@ -172,12 +187,13 @@ class Guard:
             return "future"
         if age_ns > limits.command_age_max_ns:
             return "stale"
+        if command.plan and not self._is_plan_possible(command):
+            self._note_invalid(now_ns)
+            return "range"
         if self.armed:
             fresh_until_ns = command.basis_stamp_ns + limits.command_age_max_ns
-            self._wanted = rules.limit_length(velocity, self._speed_max)
+            self._play(command, now_ns)
             self.yaw_rate = rules.clamp(yaw_rate, -limits.yaw_rate_max, limits.yaw_rate_max)
-            if self._wanted is not velocity:
-                self.counts["limited_speed"] += 1
             if self.yaw_rate != yaw_rate:
                 self.counts["limited_yaw_rate"] += 1
             if self.state is GROUND:
@@ -187,8 +203,33 @@ class Guard:
             elif self.state is HOLD:
                 self._leave_hold(now_ns, fresh_until_ns)
             if self.state is TRACK:
-                self._track_until_ns = fresh_until_ns
+                self._track_until_ns = max(fresh_until_ns, self._plan_end_ns(command, now_ns))
         return None
+
+    def _is_plan_possible(self, command: Command) -> bool:
+        ahead_ns = command.planned_ns - command.basis_stamp_ns
+        return 0 <= ahead_ns <= AGE_MAX_NS and rules.within(command.plan, COMMAND_MAX)
+
+    def _plan_end_ns(self, command: Command, now_ns: int) -> int:
+        """Return until when a plan that arrives at `now_ns` [ns] is flown without other commands.
+
+        The rest of the plan cannot make a command fresh that is too old when it arrives.
+        """
+        if not command.plan:
+            return NEVER_NS
+        end_ns = command.planned_ns + (len(command.plan) + 1) * PLAN_STEP_NS
+        return min(end_ns, now_ns + self._limits.plan_max_ns)
+
+    def _play(self, command: Command, now_ns: int) -> None:
+        """Follow the velocity that a command has for `now_ns` [ns]; note when its next is due."""
+        velocity = command.velocity_at(now_ns)
+        self._wanted = rules.limit_length(velocity, self._speed_max)
+        if self._wanted is not velocity:
+            self.counts["limited_speed"] += 1
+        self._played, self._next_ns = command, FOREVER_NS
+        step = max(now_ns - command.planned_ns, 0) // PLAN_STEP_NS
+        if step < len(command.plan):
+            self._next_ns = command.planned_ns + (step + 1) * PLAN_STEP_NS
 
     def _leave_hold(self, now_ns: int, fresh_until_ns: int) -> None:
         self._fresh_ns.append(now_ns)
@@ -217,6 +258,8 @@ class Guard:
         Return the velocity reference for the low-level controller [m/s], world frame, shape (3,).
         Return None while the rotors are stopped.
         """
+        if now_ns >= self._next_ns:
+            self._play(self._played, now_ns)
         # The usual case: the same command as in the last step, far from the fence.
         if now_ns <= self._steady_until_ns and self.reference is self._wanted:
             return self.reference
@@ -261,9 +304,9 @@ class Guard:
         if state is TRACK and self._track_until_ns == NEVER_NS:
             self._enter(HOLD, now_ns, Cause.SESSION)
         elif state is TRACK:
-            most_ns = limits.command_age_max_ns
-            age_ns = most_ns + now_ns - self._track_until_ns
-            text = f"command age {age_ns * 1e-9:.3f} s above {most_ns * 1e-9:.3f} s"
+            age_ns = now_ns - self._played.basis_stamp_ns
+            limit = limits.command_age_max_ns * 1e-9
+            text = f"command age {age_ns * 1e-9:.3f} s above {limit:.3f} s"
             self._enter(HOLD, now_ns, Cause.SILENCE, text)
         elif self.armed and now_ns - self._alone_ns > limits.alone_max_ns(self._flies):
             text = f"held for {limits.alone_max_ns(self._flies) * 1e-9:g} s without the cloud"

@@ -25,7 +25,8 @@ def limits(**values):
 @pytest.mark.promise("commands-within-caps")
 @pytest.mark.parametrize("name", NUMBERS)
 def test_a_limit_cannot_be_switched_off_or_changed(name):
-    for value in (0, -1, inf, nan):
+    # Without plans, the age of commands alone counts.
+    for value in (2 * SECOND + 1 if name == "plan_max_ns" else 0, -1, inf, nan):
         with pytest.raises(ValueError, match=f"guard: {name} is"):
             limits(**{name: value})
     with pytest.raises(FrozenInstanceError):
@@ -41,6 +42,8 @@ def test_a_speed_beyond_the_stop_rule_is_refused(age_ms, fastest):
     limits(command_age_max_ns=10 * SECOND, speed_max=0.5)
     with pytest.raises(ValueError, match="above 10 s"):
         limits(command_age_max_ns=10 * SECOND + 1, speed_max=0.5)
+    later = min(age_ms, 300)
+    limits(command_age_max_ns=(age_ms - later) * MS + 1, plan_max_ns=later * MS, speed_max=fastest)
 
 
 @pytest.mark.parametrize(("hold_s", "waited_s"), [(0.1, 10), (11, 11)])

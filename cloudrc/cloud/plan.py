@@ -1,0 +1,51 @@
+"""Plan future commands: roll the predictor's model forward under a copy of the controller."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from math import isfinite
+
+from cloudrc.cloud.controllers import Controller
+from cloudrc.cloud.predictors import Model
+from cloudrc.messages import PLAN_STEP_NS, Setpoint, Vector
+from cloudrc.teleop.carrot import setpoint_at
+
+STEP = PLAN_STEP_NS * 1e-9
+"""Time between two velocities of a plan [s]."""
+SPEED_MAX = 1000.0
+"""Largest component of a planned velocity [m/s]; the guard refuses a plan with a larger one.
+Source: docs/reference/faults.md, "F23"."""
+
+
+def make_plan(
+    model: Model,
+    controller: Controller,
+    setpoint: Setpoint,
+    velocity: Vector,
+    now_ns: int,
+    count: int,
+) -> tuple[Vector, ...]:
+    """Compute the velocities [m/s] that follow a command, one per STEP; at most `count`.
+
+    Args:
+        model: Model of the robot, at the time for which the command was computed; it is advanced.
+        controller: Controller after the command; it is copied, not changed.
+        setpoint: Setpoint, with its motion.
+        velocity: Velocity of the command [m/s].
+        now_ns: Time of the command [ns], cloud's clock.
+        count: Number of velocities.
+
+    Returns:
+        The plan; it ends before a velocity that the guard would refuse.
+    """
+    controller, plan = deepcopy(controller), list[Vector]()
+    for k in range(1, count + 1):
+        state = model.step(velocity, STEP)
+        output = controller.update(state, setpoint_at(setpoint, now_ns + k * PLAN_STEP_NS), STEP)
+        x, y, z = output.velocity
+        velocity = (float(x), float(y), float(z))
+        largest = max(map(abs, velocity))
+        if not (isfinite(sum(velocity)) and largest <= SPEED_MAX):
+            break
+        plan.append(velocity)
+    return tuple(plan)

@@ -1,0 +1,198 @@
+"""What predictors share that replay the sent commands through a model of the robot.
+
+World follows the newest command that has arrived. A command begins at its stamp on cloud's clock,
+plus a shift to world's clock. The echoes give the shift, so the clocks need no synchronisation.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Iterator
+from copy import copy
+
+from cloudrc.cloud.predictors import Model, Predictor, rotate_ahead
+from cloudrc.messages import PLAN_STEP_NS, ZERO, Command, Odometry, Vector
+
+PERIOD_NS = 10_000_000
+"""Time between two commands [ns]. Source: docs/reference/plant.md, "Commands"."""
+COUNT = 2048
+"""Number of commands that are remembered at least: 20 s, twice the longest horizon."""
+GAIN = 0.05
+"""Weight of a command that lasts one period in the mean shift."""
+NO_COMMAND = Command(0, 0, 0, ZERO, 0.0)
+
+
+class History:
+    """The `commands` of a session, and their `stamps` [ns], cloud's clock, rising."""
+
+    def __init__(self) -> None:
+        self.stamps: list[int] = []
+        self.commands: list[Command] = []
+        self._applied: deque[tuple[int, int]] = deque(maxlen=COUNT)  # beginning and stamp [ns]
+        self._shift_ns = 0.0
+
+    def add(self, command: Command) -> bool:
+        """Remember a command that has just been sent; return False if it is not the newest."""
+        if self.stamps and command.stamp_ns <= self.stamps[-1]:
+            return False
+        self.stamps.append(command.stamp_ns)
+        self.commands.append(command)
+        if len(self.stamps) == 2 * COUNT:
+            del self.stamps[:COUNT], self.commands[:COUNT]
+        return True
+
+    def note_applied(self, stamp_ns: int, began_ns: int) -> None:
+        """Note when the robot began to follow the command with this stamp, world's clock [ns]."""
+        if not self._applied:
+            self._shift_ns = began_ns - stamp_ns
+        else:
+            last_began_ns, last_stamp_ns = self._applied[-1]
+            lasted_ns = began_ns - last_began_ns
+            if lasted_ns <= 0 or stamp_ns <= last_stamp_ns:
+                return  # from late telemetry
+            # A command lasts longer if the next ones are lost. So half of this time counts, too.
+            shift_ns = last_began_ns - last_stamp_ns + 0.5 * (lasted_ns - PERIOD_NS)
+            share = min(1.0, GAIN * lasted_ns / PERIOD_NS)
+            self._shift_ns += share * (shift_ns - self._shift_ns)
+        self._applied.append((began_ns, stamp_ns))
+
+    def shift_ns(self, odometry: Odometry, horizon: float) -> int:
+        """Return the shift [ns]; before the first echo, the one that `horizon` [s] implies.
+
+        A plan begins at its own time, however late it arrives.
+        """
+        if self.commands and self.commands[-1].plan:
+            return self.commands[-1].planned_ns - self.stamps[-1]
+        if self._applied or not self.stamps:
+            return round(self._shift_ns)
+        return odometry.stamp_ns + round(horizon * 1e9) - self.stamps[-1] - PERIOD_NS
+
+    def past(self, start_ns: int, end_ns: int) -> Iterator[tuple[Vector, float]]:
+        """Yield velocity [m/s] and duration [s] of the commands that the echoes have shown.
+
+        The interval from `start_ns` to `end_ns` is on world's clock [ns].
+        """
+        parts = list[tuple[Vector, float]]()
+        for began_ns, stamp_ns in reversed(self._applied):
+            if began_ns < end_ns:
+                index = bisect_right(self.stamps, stamp_ns)
+                followed = self._followed(index, max(began_ns, start_ns), end_ns)
+                parts += reversed(followed)
+                end_ns = began_ns
+            if began_ns <= start_ns:
+                break
+        return reversed(parts)
+
+    def ahead(self, start_ns: int, end_ns: int, shift_ns: int) -> Iterator[tuple[Vector, float]]:
+        """Yield velocity [m/s] and duration [s] of the commands that are expected to be followed.
+
+        The interval from `start_ns` to `end_ns` is on world's clock [ns].
+        """
+        index = bisect_right(self.stamps, start_ns - shift_ns)
+        while start_ns < end_ns:
+            more = index < len(self.stamps)
+            until_ns = min(self.stamps[index] + shift_ns, end_ns) if more else end_ns
+            yield from self._followed(index, start_ns, until_ns)
+            start_ns, index = until_ns, index + 1
+
+    def _followed(self, count: int, start_ns: int, end_ns: int) -> list[tuple[Vector, float]]:
+        """List velocity [m/s] and duration [s] of the last of `count` commands, with its plan."""
+        command = self.commands[count - 1] if count else NO_COMMAND
+        if not command.plan:
+            return [(command.velocity, (end_ns - start_ns) * 1e-9)]
+        parts = list[tuple[Vector, float]]()
+        while start_ns < end_ns:
+            left_ns = PLAN_STEP_NS - (start_ns - command.planned_ns) % PLAN_STEP_NS
+            until_ns = min(start_ns + left_ns, end_ns)
+            parts.append((command.velocity_at(start_ns), (until_ns - start_ns) * 1e-9))
+            start_ns = until_ns
+        return parts
+
+
+class Body(Model):
+    """A model whose state is `horizon` [s] later than the odometry `basis`.
+
+    `position` [m] and `velocity` [m/s] are those of the base, world frame.
+    """
+
+    basis: Odometry
+    horizon: float
+    position: Vector
+    velocity: Vector
+
+    def advance(self, command: Vector, dt: float) -> None:
+        """Advance the state by `dt` [s] under a velocity command [m/s]."""
+        raise NotImplementedError
+
+    def step(self, velocity: Vector, dt: float) -> Odometry:
+        """Advance the state as `advance` does, and return it."""
+        self.advance(velocity, dt)
+        self.horizon += dt
+        return self.odometry()
+
+    def odometry(self) -> Odometry:
+        """Return the state; the orientation turns at the measured rate."""
+        _, _, orientation, _, rate = self.basis
+        return Odometry(
+            self.basis.stamp_ns + round(self.horizon * 1e9),
+            self.position,
+            rotate_ahead(orientation, rate, self.horizon),
+            self.velocity,
+            rate,
+        )
+
+
+class Replay(Predictor):
+    """A predictor that replays commands through a `Body`; a subclass defines `roll`."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all samples, commands and echoes."""
+        self.history = History()
+        self.newest: Odometry | None = None
+        self._last: Body | None = None
+
+    def commanded(self, command: Command) -> None:
+        """Remember the command."""
+        self.history.add(command)
+
+    def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
+        """Remember from when on the robot follows the command."""
+        self.history.note_applied(command_stamp_ns, applied_ns)
+
+    def observe(self, odometry: Odometry) -> None:
+        """Remember the newest sample."""
+        self.newest = odometry
+
+    def roll(self, odometry: Odometry, horizon: float) -> Body:
+        """Return a body that has moved from the newest sample for `horizon` [s]."""
+        raise NotImplementedError
+
+    def forecast(self, stamp_ns: int) -> Body | None:
+        """Return a body at the stamp of the next sample [ns]; None if there was none before."""
+        if self.newest is None or stamp_ns <= self.newest.stamp_ns:
+            return None
+        return self.roll(self.newest, (stamp_ns - self.newest.stamp_ns) * 1e-9)
+
+    def predict(self, odometry: Odometry, horizon: float) -> Odometry:
+        """Return the newest sample, moved by the commands of the next `horizon` [s]."""
+        self._last = self.roll(odometry, horizon)
+        return self._last.odometry() if horizon else odometry
+
+    def model(self) -> Model | None:
+        """Return a copy of the body in the state of the last prediction."""
+        return copy(self._last)
+
+
+def approach(reference: Vector, wanted: Vector, change_max: float) -> Vector:
+    """Change a velocity by at most `change_max` [m/s] towards `wanted`, as the guard does."""
+    (ax, ay, az), (bx, by, bz) = reference, wanted
+    x, y, z = bx - ax, by - ay, bz - az
+    square = x * x + y * y + z * z
+    if square <= change_max * change_max:
+        return wanted
+    share = change_max / square**0.5
+    return (ax + share * x, ay + share * y, az + share * z)

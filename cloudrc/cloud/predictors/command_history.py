@@ -1,0 +1,144 @@
+"""Predictor: replay the sent commands through a first-order velocity loop.
+
+Source: docs/reference/control.md, "Predictors", (e1).
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from copy import copy
+from math import ceil, exp
+from pathlib import Path
+from typing import NamedTuple
+
+from cloudrc.cloud.parameters import positive, read_model, vector
+from cloudrc.cloud.predictors._history import COUNT, PERIOD_NS, Body, Replay, approach
+from cloudrc.messages import ZERO, Command, Odometry, Vector
+
+STEPS_MAX = 200
+"""Largest number of steps from one command to the next."""
+
+
+class Loop(NamedTuple):
+    """Per axis: time constant [s], dead time [s] and gain [1]; the acceleration limit [m/s^2]."""
+
+    time_constant: Vector
+    dead_time: Vector
+    gain: Vector
+    acceleration_max: float
+
+
+class FirstOrder(Body):
+    """The guard's acceleration limit, a dead time as a lag, and a first-order lag per axis."""
+
+    def __init__(self, loop: Loop) -> None:
+        """Begin at rest."""
+        self._loop = loop
+        self._reference = self._delayed = self.velocity = self.position = ZERO
+
+    def advance(self, command: Vector, dt: float) -> None:
+        """Advance the state by `dt` [s] under a velocity command [m/s].
+
+        In each step of about one period, the reference is constant and the lags are exact.
+        """
+        steps = min(ceil(dt * 1e9 / PERIOD_NS - 0.5), STEPS_MAX) or 1
+        for _ in range(steps):
+            self._step(command, dt / steps)
+
+    def _step(self, command: Vector, dt: float) -> None:
+        before, loop = self._reference, self._loop
+        self._reference = approach(before, command, loop.acceleration_max * dt)
+        axes = []
+        for a, b, late, v, p, constant, dead, gain in zip(
+            before, self._reference, self._delayed, self.velocity, self.position, *loop[:3],
+            strict=True,
+        ):  # fmt: skip
+            given = 0.5 * (a + b)
+            rest = exp(-dt / dead) if dead else 0.0
+            goal = gain * (given + (late - given) * (1.0 - rest) * dead / dt)  # mean of the step
+            decay = exp(-dt / constant)
+            way = goal * dt + (v - goal) * constant * (1.0 - decay)
+            axes.append((given + (late - given) * rest, goal + (v - goal) * decay, p + way))
+        self._delayed, self.velocity, self.position = zip(*axes, strict=True)
+
+
+class CommandHistory(Replay):
+    """Adds the effect of the commands in the horizon to the measured position and velocity.
+
+    The loop is linear behind the acceleration limit. So one replay of all commands, from rest, is
+    enough: the measured velocity differs from the replayed one by an error that decays.
+    """
+
+    def __init__(self, loop: Loop) -> None:
+        """Set the model of the velocity loop."""
+        self._loop = loop
+        super().__init__()
+
+    def reset(self) -> None:
+        """Forget all samples, commands and echoes."""
+        super().reset()
+        self._bodies: list[FirstOrder] = []  # at the stamp of each command
+
+    def commanded(self, command: Command) -> None:
+        """Replay until the stamp of this command."""
+        body = self._at(command.stamp_ns)
+        if self.history.add(command):
+            if len(self._bodies) >= len(self.history.stamps):
+                del self._bodies[:COUNT]
+            self._bodies.append(body)
+
+    def _at(self, time_ns: int) -> FirstOrder:
+        """Return the replayed body at a time on cloud's clock [ns]."""
+        index = bisect_right(self.history.stamps, time_ns) - 1
+        if index < 0:
+            return FirstOrder(self._loop)
+        body, dt = copy(self._bodies[index]), (time_ns - self.history.stamps[index]) * 1e-9
+        if dt:
+            body.advance(self.history.commands[index].velocity, dt)
+        return body
+
+    def roll(self, odometry: Odometry, horizon: float) -> FirstOrder:
+        """Return a body that has moved from a sample for `horizon` [s]."""
+        start_ns = odometry.stamp_ns - self.history.shift_ns(odometry, horizon)
+        start, body = self._at(start_ns), self._at(start_ns + round(horizon * 1e9))
+        axes = []
+        for v, p, v0, p0, v1, p1, constant in zip(
+            odometry.velocity, odometry.position, start.velocity, start.position,
+            body.velocity, body.position, self._loop.time_constant, strict=True,
+        ):  # fmt: skip
+            decay = exp(-horizon / constant)
+            axes.append((v1 + (v - v0) * decay, p + p1 - p0 + (v - v0) * constant * (1.0 - decay)))
+        body.velocity, body.position = zip(*axes, strict=True)
+        body.basis, body.horizon = odometry, horizon
+        return body
+
+
+def build(
+    time_constant: Sequence[float] = (0.25, 0.25, 0.12),
+    dead_time: Sequence[float] = (0.10, 0.10, 0.01),
+    gain: Sequence[float] = (1.0, 1.0, 1.0),
+    acceleration_max: float = 12.0,
+    model: Path | None = None,
+) -> CommandHistory:
+    """Make the predictor; the defaults fit the shipped robot.
+
+    Args:
+        time_constant: Time constant of the velocity loop per axis [s], shape (3,).
+        dead_time: Time until the robot reacts to a command, per axis [s], shape (3,).
+        gain: Velocity per commanded velocity, per axis [1], shape (3,).
+        acceleration_max: The guard's cap on the acceleration [m/s^2].
+        model: File from `cloudrc identify`, whose values replace the first three parameters.
+
+    Raises:
+        ValueError: If a value is infinite, NaN or negative, if a time constant or the cap is 0, or
+            if the file is not a model; the message names it.
+    """
+    values = {"time_constant": time_constant, "dead_time": dead_time, "gain": gain}
+    if model is not None:
+        values = read_model(model, values)
+    constants, deads, gains = (vector(name, value) for name, value in values.items())
+    positive("time_constant", min(constants))
+    return CommandHistory(
+        Loop(constants, deads, gains, positive("acceleration_max", acceleration_max))
+    )

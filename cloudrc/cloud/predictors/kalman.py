@@ -1,0 +1,160 @@
+"""Predictor: a Kalman filter against noise of the odometry, then a replay of the sent commands.
+
+The filter's model is that of `model_based` or of `command_history`. All axes have the same noise,
+so one covariance of position and velocity is enough.
+
+Source: docs/reference/control.md, "Predictors", (f).
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from cloudrc.cloud.parameters import positive
+from cloudrc.cloud.predictors import Model, Predictor, command_history, model_based
+from cloudrc.cloud.predictors._history import Body, Replay
+from cloudrc.messages import Command, Odometry, Vector
+
+
+class Kalman(Predictor):
+    """Filters position and velocity, and gives the filtered samples to another predictor."""
+
+    def __init__(self, replay: Replay, position: float, velocity: float, model: float) -> None:
+        """Set the predictor of the replay, and standard deviations.
+
+        Args:
+            replay: Predictor that forecasts the next sample, and replays the commands.
+            position: Of the noise of the position [m].
+            velocity: Of the noise of the velocity [m/s].
+            model: Of the error of the model's acceleration [m/s^2].
+        """
+        self._replay = replay
+        self._noise = (position * position, velocity * velocity, model * model)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._estimate: Odometry | None = None
+        self._covariance = (self._noise[0], 0.0, self._noise[1])
+
+    def reset(self) -> None:
+        """Forget the estimate, all commands and echoes."""
+        self._begin()
+        self._replay.reset()
+
+    def commanded(self, command: Command) -> None:
+        """Pass the command on to the replay."""
+        self._replay.commanded(command)
+
+    def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
+        """Pass the echo on to the replay."""
+        self._replay.applied(command_stamp_ns, applied_ns)
+
+    def observe(self, odometry: Odometry) -> None:
+        """Update the estimate with a new sample."""
+        before, forecast = self._estimate, self._replay.forecast(odometry.stamp_ns)
+        estimate = odometry
+        if before is None or forecast is None:
+            self._begin()
+        else:
+            gains = self._update((odometry.stamp_ns - before.stamp_ns) * 1e-9)
+            position, velocity = _blend(forecast, odometry, gains)
+            estimate = odometry._replace(position=position, velocity=velocity)
+        self._estimate = estimate
+        self._replay.observe(estimate)
+
+    def _update(self, dt: float) -> tuple[float, float, float, float]:
+        """Advance the covariance by `dt` [s] and one sample; return the gains K, row by row.
+
+        With F = (1 dt; 0 1) and an acceleration error that is constant during `dt`:
+            P = F P F' + q · (dt^2/2, dt)' (dt^2/2, dt);  K = P (P + R)^-1;  P = (1 - K) P.
+        Source: R. E. Kalman, "A New Approach to Linear Filtering and Prediction Problems", 1960.
+        """
+        r, s, q = self._noise
+        a, b, c = self._covariance
+        half = 0.5 * dt * dt
+        a += dt * (2.0 * b + dt * c) + q * half * half
+        b += dt * c + q * half * dt
+        c += q * dt * dt
+        scale = 1.0 / ((a + r) * (c + s) - b * b)
+        gains = (
+            (a * (c + s) - b * b) * scale,
+            b * r * scale,
+            b * s * scale,
+            (c * (a + r) - b * b) * scale,
+        )
+        aa, ab, ba, bb = gains
+        self._covariance = (
+            (1.0 - aa) * a - ab * b,
+            (1.0 - aa) * b - ab * c,
+            (1.0 - bb) * c - ba * b,
+        )
+        return gains
+
+    def predict(self, odometry: Odometry, horizon: float) -> Odometry:
+        """Return the filtered newest sample, moved by the commands of the next `horizon` [s].
+
+        With a horizon of 0 the result is the sample as measured.
+        """
+        if self._estimate is None or self._estimate.stamp_ns != odometry.stamp_ns:
+            self.observe(odometry)
+        assert self._estimate is not None
+        prediction = self._replay.predict(self._estimate, horizon)
+        return prediction if horizon else odometry
+
+    def model(self) -> Model | None:
+        """Return the replay's model in the state of the last prediction."""
+        return self._replay.model()
+
+
+def _blend(
+    forecast: Body, measured: Odometry, gains: tuple[float, float, float, float]
+) -> tuple[Vector, Vector]:
+    """Correct a forecast by gains times the difference of measured position and velocity."""
+    aa, ab, ba, bb = gains
+    axes = []
+    for p, v, measured_p, measured_v in zip(
+        forecast.position, forecast.velocity, measured.position, measured.velocity, strict=True
+    ):
+        far, fast = measured_p - p, measured_v - v
+        axes.append((p + aa * far + ab * fast, v + ba * far + bb * fast))
+    position, velocity = zip(*axes, strict=True)
+    return position, velocity
+
+
+REPLAYS: dict[str, Any] = {
+    "white_box": model_based.build,
+    "first_order": command_history.build,
+}
+"""Value of the parameter `model` -> function that builds the replay."""
+
+
+def build(
+    model: Literal["white_box", "first_order"] = "white_box",
+    parameters: dict[str, Any] | None = None,
+    position_noise: float = 0.005,
+    velocity_noise: float = 0.02,
+    acceleration_error: float = 0.5,
+) -> Kalman:
+    """Make the predictor; the default noise is that of a good motion capture system.
+
+    Args:
+        model: `white_box`, as in `model_based`, or `first_order`, as in `command_history`.
+        parameters: Parameters of that predictor; None: its defaults.
+        position_noise: Standard deviation of the measured position per axis [m].
+        velocity_noise: Standard deviation of the measured velocity per axis [m/s].
+        acceleration_error: Standard deviation of the model's acceleration [m/s^2]. A larger value
+            trusts the odometry more.
+
+    Raises:
+        ValueError: If a standard deviation is not above 0, or the predictor refuses a parameter.
+    """
+    try:
+        replay = REPLAYS[model](**(parameters or {}))
+    except TypeError as error:
+        raise ValueError(f"parameters: {error}; see 'cloudrc list predictors'") from error
+    return Kalman(
+        replay,
+        positive("position_noise", position_noise),
+        positive("velocity_noise", velocity_noise),
+        positive("acceleration_error", acceleration_error),
+    )

@@ -1,0 +1,248 @@
+"""Predictor: replay the sent commands through a model of the robot and its onboard controller.
+
+The model is a white box: guard's limits, velocity PID, attitude loop, rotors, drag. Its hidden
+states (reference, integral, thrust, torque) follow the commands that the echoes show. Measured
+states replace the model's at each odometry. What the model misses is estimated as a constant
+acceleration and a constant torque, for example from wind, a payload or the arm's weight.
+
+Source: docs/reference/control.md, "Predictors", (e2); docs/reference/plant.md, "Robot", "Low-level
+controller".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from math import ceil, sqrt
+
+from cloudrc.cloud.parameters import not_negative, positive, vector
+from cloudrc.cloud.predictors._history import Body, Replay, approach
+from cloudrc.messages import ZERO, Odometry, Vector
+
+STEP = 0.010
+"""Longest time step of the model [s]."""
+MASS, ASSUMED_MASS = 1.06, 1.05
+"""Mass of the robot, and the mass that the onboard controller assumes [kg].
+Source: docs/reference/plant.md, "Total mass"."""
+GRAVITY, ASSUMED_WEIGHT = 9.8066, 1.05 * 9.81
+"""Gravity [m/s^2], and the weight that the onboard controller assumes [N].
+Source: docs/reference/plant.md, "Gravity"."""
+INERTIA_X, INERTIA_Y = 0.0116, 0.0121
+"""Inertia of the whole robot about its centre of mass [kg m^2].
+Source: docs/reference/plant.md, "Total inertia"."""
+RATE_GAIN = 0.22
+"""Torque per angular velocity [N m s]; the torque per attitude error is 1 N m.
+Source: docs/reference/plant.md, "Low-level controller"."""
+LAG_UP, LAG_DOWN = 0.0125, 0.025
+"""Time constants of the rotors [s]; a torque needs both. Source: docs/reference/plant.md,
+"Rotor speed"."""
+LAG = 0.5 * (LAG_UP + LAG_DOWN)
+DRAG = 0.155
+"""Deceleration per velocity across the thrust axis, with the rotors at hover speed [1/s].
+Source: docs/reference/plant.md, "Rotor drag"."""
+SINK_LEAD_MAX = 0.5
+"""The guard's reference sinks at most this much faster than the robot [m/s].
+Source: docs/reference/plant.md, "Sinking"."""
+LOW_HEIGHT, LOW_SPEED, FLOOR_MARGIN = 0.25, 1.0, 0.35
+"""Below the first height [m] the guard limits the horizontal speed [m/s]; below the second it
+refuses to descend. Source: docs/safety.md, "Limits"."""
+THRUST_MAX = 134.9
+"""Largest thrust of the four rotors [N]. Source: docs/reference/plant.md, "Rotor speed"."""
+GAIN_ACCELERATION, GAIN_TORQUE = 0.3, 1.0
+"""Rates at which the estimates of unmodelled acceleration and torque follow the errors [1/s]."""
+GAP_NS = 500_000_000
+"""After a longer time without odometry the model begins anew [ns]."""
+
+
+class WhiteBox(Body):
+    """The robot and its onboard controller, which holds the yaw at 0.
+
+    The thrust axis is (nx, ny, nz) in the world frame; the body rates turn it.
+    """
+
+    def __init__(self, gains: tuple[float, ...], acceleration_max: float, basis: Odometry) -> None:
+        """Begin at a measured state, in a steady flight.
+
+        Args:
+            gains: P, I and D gains and integral limits of the velocity loop, x, y, z of each.
+            acceleration_max: The guard's cap on the acceleration [m/s^2].
+            basis: The measured state.
+        """
+        self._gains, self._acceleration_max = gains, acceleration_max
+        self._reference, self._thrust = basis.velocity, ASSUMED_WEIGHT
+        self._integral = self._missed = ZERO  # _missed: acceleration that the model lacks [m/s^2]
+        self._torque = self._trim = (0.0, 0.0)  # _trim: torque that the model lacks [N m]
+        self._take(basis)
+
+    def correct(self, odometry: Odometry) -> None:
+        """Replace the measured states by those of `odometry`, and learn from the differences."""
+        (ax, ay, az), (vx, vy, vz) = odometry.velocity, self.velocity
+        bx, by, bz = self._missed
+        k = GAIN_ACCELERATION
+        self._missed = (bx + k * (ax - vx), by + k * (ay - vy), bz + k * (az - vz))
+        before_x, before_y = self._rate
+        self._take(odometry)
+        (qx, qy), (cx, cy), k = self._rate, self._trim, GAIN_TORQUE
+        self._trim = (
+            cx + k * INERTIA_Y * (qx - before_x),
+            cy + k * INERTIA_X * (qy - before_y),
+        )
+
+    def _take(self, odometry: Odometry) -> None:
+        self.basis, self.horizon = odometry, 0.0
+        self.position, self.velocity = odometry.position, odometry.velocity
+        w, x, y, z = odometry.orientation_wxyz
+        p, q, _ = odometry.angular_velocity_body
+        self._axis = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x))
+        self._rate = (q, -p)  # of the thrust axis towards x and y
+
+    def advance(self, command: Vector, dt: float) -> None:
+        """Advance the state by `dt` [s] under a velocity command [m/s]."""
+        steps = ceil(dt / STEP - 1e-9)
+        h = dt / steps
+        lag, up, down = h / (h + LAG), h / (h + LAG_UP), h / (h + LAG_DOWN)
+        (x, y, z), (vx, vy, vz), (bx, by, bz) = self.position, self.velocity, self._missed
+        (nx, ny), (qx, qy), (tx, ty), (cx, cy) = self._axis, self._rate, self._torque, self._trim
+        thrust, last = self._thrust, self._reference
+        for _ in range(steps):
+            reference = approach(last, command, self._acceleration_max * h)
+            if z < LOW_HEIGHT or reference[2] < 0.0:
+                reference = _limit(reference, last, z, vz)
+            # The thrust pushes along its axis, the drag acts across it.
+            if (across := nx * nx + ny * ny) > 1.0:
+                nx, ny, across = nx / sqrt(across), ny / sqrt(across), 1.0
+            nz = sqrt(1.0 - across)
+            along = thrust / MASS + DRAG * (vx * nx + vy * ny + vz * nz)
+            ax = along * nx - DRAG * vx + bx
+            ay = along * ny - DRAG * vy + by
+            az = along * nz - DRAG * vz + bz - GRAVITY
+            fx, fy, fz = self._force(last, reference, (vx, vy, vz), (ax, ay, az), h)
+            last = reference
+            # Thrust and torques follow with the lag of the rotors; the torques turn the axis.
+            wanted = min(max(fx * nx + fy * ny + fz * nz, 0.0), THRUST_MAX)
+            thrust += (wanted - thrust) * (up if wanted > thrust else down)
+            size = sqrt(fx * fx + fy * fy + fz * fz) or 1.0
+            tx += lag * ((fx * nz - fz * nx) / size - RATE_GAIN * qx - tx)
+            ty += lag * ((fy * nz - fz * ny) / size - RATE_GAIN * qy - ty)
+            qx += h * (tx + cx) / INERTIA_Y
+            qy += h * (ty + cy) / INERTIA_X
+            nx += h * qx * nz
+            ny += h * qy * nz
+            x += h * (vx + 0.5 * h * ax)
+            y += h * (vy + 0.5 * h * ay)
+            z += h * (vz + 0.5 * h * az)
+            vx += h * ax
+            vy += h * ay
+            vz += h * az
+        self.position, self.velocity = (x, y, z), (vx, vy, vz)
+        self._axis, self._rate, self._torque = (nx, ny), (qx, qy), (tx, ty)
+        self._thrust, self._reference = thrust, last
+
+    def _force(
+        self, last: Vector, reference: Vector, velocity: Vector, acceleration: Vector, h: float
+    ) -> Vector:
+        """Compute the force that the onboard PID asks for [N], and advance its integral by `h`.
+
+        Source: docs/reference/plant.md, "Low-level controller".
+        """
+        px, py, pz, ix, iy, iz, dx, dy, dz, limit_x, limit_y, limit_z = self._gains
+        (rx, ry, rz), (vx, vy, vz), (ax, ay, az) = reference, velocity, acceleration
+        last_x, last_y, last_z = last
+        ex, ey, ez = rx - vx, ry - vy, rz - vz
+        sx, sy, sz = self._integral
+        sx += ex * h
+        sy += ey * h
+        sz += ez * h
+        sx = limit_x if sx > limit_x else -limit_x if sx < -limit_x else sx
+        sy = limit_y if sy > limit_y else -limit_y if sy < -limit_y else sy
+        sz = limit_z if sz > limit_z else -limit_z if sz < -limit_z else sz
+        self._integral = (sx, sy, sz)
+        return (
+            px * ex + ix * sx + dx * ((rx - last_x) / h - ax),
+            py * ey + iy * sy + dy * ((ry - last_y) / h - ay),
+            pz * ez + iz * sz + dz * ((rz - last_z) / h - az) + ASSUMED_WEIGHT,
+        )
+
+
+def _limit(reference: Vector, last: Vector, height: float, climb: float) -> Vector:
+    """Limit a velocity reference [m/s] near the floor and in a descent, as the guard does.
+
+    `last` is the reference of the last step [m/s]. The robot is at `height` [m] above the floor and
+    climbs at `climb` [m/s]. Source: docs/safety.md, "Limits".
+    """
+    x, y, z = reference
+    z = max(z, min(last[2], climb - SINK_LEAD_MAX))
+    if z < 0.0:
+        room = max(height - FLOOR_MARGIN, 0.0)
+        z = max(z, -2.0 * room / (0.2 + sqrt(0.04 + room / 1.5)))
+    speed = sqrt(x * x + y * y)
+    scale = LOW_SPEED / speed if height < LOW_HEIGHT and speed > LOW_SPEED else 1.0
+    return (scale * x, scale * y, z)
+
+
+class ModelBased(Replay):
+    """Rolls the white box from the newest odometry through the commands of the horizon."""
+
+    def __init__(self, gains: tuple[float, ...], acceleration_max: float) -> None:
+        """Set the onboard velocity loop, as in `WhiteBox`."""
+        self._loop = gains, acceleration_max
+        super().__init__()
+
+    def reset(self) -> None:
+        """Forget all samples, commands and echoes."""
+        super().reset()
+        self._body: WhiteBox | None = None  # at the newest sample
+
+    def forecast(self, stamp_ns: int) -> WhiteBox | None:
+        """Return a body at the stamp of the next sample [ns]; None without a recent sample."""
+        body = copy(self._body)
+        if body is None or not 0 < stamp_ns - body.basis.stamp_ns < GAP_NS:
+            return None
+        for velocity, duration in self.history.past(body.basis.stamp_ns, stamp_ns):
+            body.advance(velocity, duration)
+        return body
+
+    def observe(self, odometry: Odometry) -> None:
+        """Correct the model with a new sample."""
+        self._body = self.forecast(odometry.stamp_ns) or WhiteBox(*self._loop, odometry)
+        self._body.correct(odometry)
+
+    def roll(self, odometry: Odometry, horizon: float) -> WhiteBox:
+        """Return a body that has moved from the newest sample for `horizon` [s]."""
+        if self._body is None or self._body.basis.stamp_ns != odometry.stamp_ns:
+            self.observe(odometry)
+        assert self._body is not None
+        body = copy(self._body)
+        start_ns, shift_ns = odometry.stamp_ns, self.history.shift_ns(odometry, horizon)
+        end_ns = start_ns + round(horizon * 1e9)
+        for velocity, duration in self.history.ahead(start_ns, end_ns, shift_ns):
+            body.advance(velocity, duration)
+        body.horizon = horizon
+        return body
+
+
+def build(
+    gain_p: Sequence[float] = (4.0, 4.0, 10.0),
+    gain_i: Sequence[float] = (1.0, 1.0, 2.5),
+    gain_d: Sequence[float] = (0.30, 0.30, 0.50),
+    integral_limit_xy: float = 0.10,
+    integral_limit_z: float = 0.40,
+    acceleration_max: float = 12.0,
+) -> ModelBased:
+    """Make the predictor; the defaults are those of `world.low_level` and `guard`.
+
+    Args:
+        gain_p: Proportional gain of the onboard velocity loop [N s/m], shape (3,).
+        gain_i: Its integral gain [N/m], shape (3,).
+        gain_d: Its derivative gain [N s^2/m], shape (3,).
+        integral_limit_xy: Limit of its integrated velocity error in x and y [m].
+        integral_limit_z: The same limit in z [m].
+        acceleration_max: The guard's cap on the acceleration [m/s^2].
+
+    Raises:
+        ValueError: If a value is infinite, NaN or negative, or the cap is 0; the message names it.
+    """
+    gains = vector("gain_p", gain_p) + vector("gain_i", gain_i) + vector("gain_d", gain_d)
+    xy = not_negative("integral_limit_xy", integral_limit_xy)
+    z = not_negative("integral_limit_z", integral_limit_z)
+    return ModelBased((*gains, xy, xy, z), positive("acceleration_max", acceleration_max))

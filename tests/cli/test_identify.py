@@ -1,0 +1,130 @@
+"""`cloudrc identify`: known models are found, bad recordings are refused by name."""
+
+import json
+from itertools import accumulate
+from math import exp
+
+import numpy as np
+import pytest
+
+from cloudrc.cli.identify import DT, identify, series
+from cloudrc.cli.main import main
+from cloudrc.config.document import parse_yaml
+from cloudrc.errors import BadInputError
+from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
+from cloudrc.record.columns import Recording
+from cloudrc.record.writer import McapWriter
+from cloudrc.records import GroundTruth, GuardChange
+
+TRUE = (0.3, 0.1, 0.95)  # time constant [s], dead time [s], gain
+
+
+def steps(rng, count=3000):
+    """Return a velocity that jumps every second, shape (count,)."""
+    return np.repeat(rng.uniform(-1, 1, count // 100 + 1), 100)[:count]
+
+
+def respond(given, constant, dead, gain):
+    """Return the exact response of a first-order lag with a dead time of whole samples."""
+    late = np.concatenate([np.zeros(round(dead / DT)), given])[: len(given)] * gain
+    decay = exp(-DT / constant)
+    lag = lambda v, u: decay * v + (1.0 - decay) * u  # noqa: E731
+    return np.array(list(accumulate(late[:-1], lag, initial=0.0)))
+
+
+def correlated(rng, count, deviation):
+    """Return noise that stays alike for about half a second."""
+    white = rng.normal(size=count) * deviation * np.sqrt(1.0 - 0.98**2)
+    return np.array(list(accumulate(white, lambda a, b: 0.98 * a + b)))
+
+
+def test_a_model_is_recovered_within_its_interval():
+    """At least 80 % of the intervals hold the truth although the residuals are correlated."""
+    inside = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        given = steps(rng)
+        measured = respond(given, *TRUE) + correlated(rng, len(given), 0.03)
+        fit = identify(given, measured, "x")
+        inside.append(np.abs(fit.values - TRUE) <= fit.half_widths)
+        assert fit.values == pytest.approx(TRUE, abs=0.08)
+        assert np.all(fit.half_widths < 0.15)
+        assert fit.share > 0.95
+    assert np.mean(inside) >= 0.8
+
+
+def test_a_robot_without_dead_time_is_recovered():
+    given = steps(np.random.default_rng(1))
+    fit = identify(given, respond(given, 0.12, 0.0, 1.0), "z")
+    assert fit.values == pytest.approx((0.12, 0.0, 1.0), abs=1e-3)
+
+
+def test_an_axis_without_excitation_is_refused_by_name():
+    still = np.full(3000, 0.5)
+    with pytest.raises(BadInputError, match=r"m.mcap: y: the commanded velocity hardly changes"):
+        identify(still, still, "m.mcap: y")
+
+
+def test_a_velocity_that_does_not_follow_is_refused():
+    rng = np.random.default_rng(1)
+    with pytest.raises(BadInputError, match=r"x: a first-order model explains -?\d+% of"):
+        identify(steps(rng), steps(rng), "x")
+
+
+def records(seconds=30.0, track_s=(1.0, None)):
+    """Yield world's records of a robot that follows steps on all axes, with the guard's states."""
+    rng = np.random.default_rng(1)
+    given = np.stack([steps(rng, round(seconds / DT)) for _ in range(3)], axis=1)
+    flown = np.stack([respond(column, *TRUE) for column in given.T], axis=1)
+    begin, end = track_s
+    changes = [(begin, GuardState.TRACK)] + [(end, GuardState.HOLD)] * (end is not None)
+    for k, (u, v) in enumerate(zip(given.tolist(), flown.tolist(), strict=True)):
+        stamp_ns = round(k * DT * 1e9)
+        for at_s, state in changes:
+            if stamp_ns == round(at_s * 1e9):
+                yield GuardChange(stamp_ns, state, "")
+        truth = Odometry(stamp_ns, ZERO, UPRIGHT, tuple(v), ZERO)
+        yield GroundTruth(stamp_ns, truth, 0.0, 0.0, 0.0, tuple(u))
+
+
+def test_only_the_flight_under_commands_counts():
+    given, measured, topics = series(Recording.from_records(records(track_s=(1.0, 28.0))), "m")
+    assert topics == ("/reference", "/ground_truth")
+    assert given.shape == measured.shape == (2500, 3)
+
+
+@pytest.mark.parametrize(
+    ("recording", "text"),
+    [
+        ([], "m: has no /reference or /command_applied or /cmd_vel; record one"),
+        (records(track_s=(1.0, 15.0)), "m: 12.0 s of flight under commands after.*needs 20 s"),
+    ],
+)
+def test_a_recording_that_is_not_enough_is_refused(recording, text):
+    with pytest.raises(BadInputError, match=text):
+        series(Recording.from_records(recording), "m")
+
+
+def test_the_command_writes_a_model_that_a_predictor_takes(tmp_path, capsys):
+    from cloudrc.config.load import load_experiment
+
+    with McapWriter(tmp_path / "mission.mcap", clock="world") as writer:
+        writer.write(records())
+    assert main(["identify", str(tmp_path), "--out", "model.yaml"]) == 0
+    shown = capsys.readouterr().out
+    assert "input /reference, output /ground_truth" in shown
+    assert shown.splitlines()[-1] == "model.yaml"
+    model = parse_yaml((tmp_path / "model.yaml").read_text(), "")[0]
+    assert model["time_constant"] == pytest.approx([TRUE[0]] * 3, abs=0.01)
+    assert model["dead_time"] == pytest.approx([TRUE[1]] * 3, abs=0.01)
+    file = tmp_path / "own.yaml"
+    file.write_text("mission: steps\nworld: {scene: empty}\n" + PREDICTOR)
+    predictor = load_experiment(file).cloud.predictor
+    assert predictor.model_extra["model"] == str(tmp_path / "model.yaml")
+    assert main(["identify", str(tmp_path)]) == 2
+    assert "model.yaml: already there; name another file with --out" in capsys.readouterr().err
+    assert main(["identify", str(tmp_path), "--out", "second.yaml", "-o", "json"]) == 0
+    assert json.loads(capsys.readouterr().out) == model
+
+
+PREDICTOR = "cloud: {predictor: {name: command_history, model: model.yaml}}\n"

@@ -1,0 +1,107 @@
+"""Plans: the controller's future commands, by the predictor's model and the future setpoints."""
+
+import pytest
+
+from cloudrc.cloud.controllers import Controller, ControlOutput
+from cloudrc.cloud.controllers.pid import build as pid
+from cloudrc.cloud.estimators.earliest import build as earliest
+from cloudrc.cloud.plan import make_plan
+from cloudrc.cloud.predictors import Model
+from cloudrc.cloud.predictors.last_sample import LastSample
+from cloudrc.messages import UPRIGHT, ZERO, Motion, Odometry, Setpoint
+from tests.cloud.conftest import HERE, MS, Integrating, command, loop, telemetry
+
+
+class Obedient(Model):
+    """A robot that has the commanded velocity at once."""
+
+    def __init__(self, position=ZERO):
+        self.position = position
+
+    def step(self, velocity, dt):
+        self.position = tuple(p + v * dt for p, v in zip(self.position, velocity, strict=True))
+        return Odometry(0, self.position, UPRIGHT, velocity, ZERO)
+
+
+class Modelled(LastSample):
+    def model(self):
+        return Obedient(HERE)
+
+
+def along_x(plan):
+    return [velocity[0] for velocity in plan]
+
+
+def test_a_plan_is_what_the_controller_would_command():
+    controller = pid(gain_p=(10.0, 1.0, 1.0))
+    plan = make_plan(Obedient(), controller, Setpoint((1.0, 0.0, 0.0)), (10.0, 0.0, 0.0), 0, 3)
+    assert along_x(plan) == pytest.approx([9.0, 8.1, 7.29])
+
+
+def test_a_plan_knows_where_the_carrot_will_be():
+    carrot = Setpoint((9.0, 0.0, 0.0), motion=Motion(ZERO, 0, 1.0, 100.0))
+    controller = pid(gain_p=(1e-9,) * 3)
+    plan = make_plan(Obedient(), controller, carrot, ZERO, -20 * MS, 4)
+    assert along_x(plan) == pytest.approx([0.0, 0.0, 1.0, 1.0], abs=1e-6)
+
+
+def test_a_plan_does_not_change_the_controller():
+    class Memory(Controller):
+        def __init__(self):
+            self.seen = []
+
+        def update(self, estimate, setpoint, dt):
+            self.seen.append(estimate)
+            return ControlOutput((float(len(self.seen)), 0.0, 0.0), 0.0)
+
+    controller = Memory()
+    assert along_x(make_plan(Obedient(), controller, Setpoint(ZERO), ZERO, 0, 3)) == [1.0, 2.0, 3.0]
+    assert controller.seen == []
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1000.1])
+def test_a_plan_ends_before_a_velocity_that_the_guard_refuses(bad):
+    class Breaking(Integrating):
+        def update(self, estimate, setpoint, dt):
+            self.asked += 1
+            return ControlOutput((1.0, bad if self.asked == 3 else 0.0, 0.0), 0.0)
+
+    assert len(make_plan(Obedient(), Breaking(), Setpoint(ZERO), ZERO, 0, 9)) == 2
+
+
+def test_a_command_has_the_plan_and_its_time():
+    a_loop = loop(predictor=Modelled(), heard_ms=1090, echo_ms=1000, plan=0.05)
+    sent, control = command(a_loop, 1094)
+    assert sent.planned_ns == 100 * MS + round(control.horizon * 1e9) == 190 * MS
+    assert along_x(sent.plan) == pytest.approx([0.8 * 0.992**k for k in range(1, 6)])
+    assert sent.velocity_at(221 * MS) == sent.plan[2]
+
+
+def test_a_frozen_loop_or_a_predictor_without_a_model_plans_nothing():
+    a_loop = loop(predictor=Modelled(), heard_ms=1100, echo_ms=1000, plan=0.05)
+    assert command(a_loop, 1600)[0][3:] == (ZERO, 0.0, (), -1)
+    sent, _ = command(loop(heard_ms=1090, echo_ms=1000, plan=0.05), 1094)
+    assert (sent.plan, sent.planned_ns) == ((), -1)
+
+
+def test_a_failing_model_is_reported_and_the_command_goes_out():
+    class Broken(LastSample):
+        def model(self):
+            raise ZeroDivisionError
+
+    a_loop = loop(predictor=Broken(), heard_ms=1090, echo_ms=1000, plan=0.05)
+    sent, _ = command(a_loop, 1094)
+    assert (sent.plan, sent.velocity) == ((), pytest.approx((0.8, 0.0, 0.0)))
+    assert "cloud sends this command without a plan" in a_loop.faults[0].text
+
+
+def test_the_earliest_command_sets_the_horizon():
+    a_loop = loop(estimator=lambda: earliest(2), heard_ms=1090, echo_ms=1000)
+    horizons = []
+    for k, applied_ms in enumerate((60, 30, 95, 95)):
+        stamp_ms = 110 + 10 * k
+        now_ms = 1000 + stamp_ms
+        seen = telemetry(stamp_ms, echo_ms=1000 + stamp_ms - applied_ms, hold_ms=0)
+        a_loop.observe(seen, now_ms * MS)
+        horizons.append(command(a_loop, now_ms)[1].horizon)
+    assert horizons == pytest.approx([0.06, 0.03, 0.03, 0.095])

@@ -1,0 +1,239 @@
+"""Predictors that replay commands: the times of the commands, and numbers worked by hand."""
+
+from itertools import pairwise
+from math import exp
+
+import numpy as np
+import pytest
+
+from cloudrc.cloud.predictors import command_history, kalman, model_based
+from cloudrc.cloud.predictors._history import History
+from cloudrc.messages import UPRIGHT, ZERO, Command, Odometry
+
+MS = 1_000_000
+AHEAD = 1234 * MS  # cloud's clock minus world's clock [ns]
+
+
+def command(sent_ms, x):
+    """Return a command along x that leaves at `sent_ms`, world's clock."""
+    return Command(sent_ms * MS + AHEAD, 0, 0, (x, 0.0, 0.0), 0.0)
+
+
+def sample(at_ms, x=0.0, v=0.0):
+    return Odometry(at_ms * MS, (x, 0.0, 0.0), UPRIGHT, (v, 0.0, 0.0), ZERO)
+
+
+def in_ms(parts):
+    return [(velocity[0], round(duration * 1e3)) for velocity, duration in parts]
+
+
+# When the robot follows which command
+
+
+def test_the_echoes_show_the_past():
+    history = History()
+    for k in range(10):
+        history.add(command(10 * k, float(k)))
+    for k, at_ms in ((1, 60), (3, 75), (4, 95)):
+        history.note_applied(command(10 * k, 0).stamp_ns, at_ms * MS)
+    assert in_ms(history.past(60 * MS, 100 * MS)) == [(1, 15), (3, 20), (4, 5)]
+    assert in_ms(history.past(70 * MS, 80 * MS)) == [(1, 5), (3, 5)]
+    assert in_ms(history.past(50 * MS, 65 * MS)) == [(1, 5)]
+
+
+def test_commands_ahead_begin_at_their_stamps_and_the_last_stays():
+    history = History()
+    for k in range(3):
+        history.add(command(10 * k, float(k + 1)))
+    parts = history.ahead(45 * MS, 95 * MS, 50 * MS - AHEAD)
+    assert in_ms(parts) == [(0, 5), (1, 10), (2, 10), (3, 25)]
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_the_shift_gives_commands_their_mean_age(every):
+    """A command that loses its successors is older, on average, while it is in force."""
+    history = History()
+    for k in range(0, 400, every):
+        history.add(command(10 * k, 0.0))
+        history.note_applied(command(10 * k, 0).stamp_ns, (10 * k + 50) * MS)
+    expected_ms = 50 + 5 * (every - 1)
+    assert history.shift_ns(sample(0), 0.1) + AHEAD == pytest.approx(expected_ms * MS, abs=MS)
+
+
+def test_echoes_of_late_telemetry_change_no_shift():
+    history = History()
+    history.add(command(0, 0.0))
+    history.note_applied(command(20, 0).stamp_ns, 70 * MS)
+    history.note_applied(command(10, 0).stamp_ns, 65 * MS)
+    assert history.shift_ns(sample(0), 0.1) + AHEAD == 50 * MS
+
+
+def test_before_the_first_echo_the_horizon_gives_the_shift():
+    history = History()
+    history.add(command(100, 0.0))
+    assert history.shift_ns(sample(60), 0.090) + AHEAD == 40 * MS
+
+
+def test_a_history_forgets_the_oldest_commands():
+    predictor = command_history.build()
+    for k in range(5000):
+        predictor.commanded(command(10 * k, 1.0))
+    assert len(predictor.history.stamps) < 4096
+    predictor.applied(command(49_940, 0).stamp_ns, 49_990 * MS)
+    at_speed = predictor.predict(sample(49_990, v=1.0), 0.05)
+    assert at_speed.position[0] == pytest.approx(0.05, abs=1e-6)
+
+
+# command_history
+
+
+def after_a_step(horizon, **parameters):
+    """Return a prediction at rest, 50 ms before a step to 1 m/s begins; commands take 50 ms."""
+    predictor = command_history.build(**{"acceleration_max": 1e9, **parameters})
+    for k in range(60):
+        predictor.commanded(command(10 * k, float(k >= 50)))
+        predictor.applied(command(10 * k, 0).stamp_ns, (10 * k + 50) * MS)
+    return predictor.predict(sample(500, x=2.0), horizon)
+
+
+def test_a_step_is_a_first_order_response_after_its_delay():
+    predicted = after_a_step(0.25, dead_time=(0, 0, 0), time_constant=(0.2, 0.2, 0.2))
+    # 200 ms of the step act; the middle of a 10 ms step is where its command begins.
+    assert predicted.velocity[0] == pytest.approx(1.0 - exp(-1.0), abs=0.02)
+    assert predicted.position[0] == pytest.approx(2.0 + 0.2 - 0.2 * (1.0 - exp(-1.0)), abs=0.004)
+    assert predicted.velocity[1:] == predicted.position[1:] == (0.0, 0.0)
+
+
+def test_dead_time_gain_and_acceleration_limit_act():
+    plain = after_a_step(0.25).velocity[0]
+    assert after_a_step(0.25, dead_time=(0.2, 0.2, 0.2)).velocity[0] < 0.7 * plain
+    assert after_a_step(0.25, gain=(0.5, 1, 1)).velocity[0] == pytest.approx(0.5 * plain)
+    assert after_a_step(0.25, acceleration_max=2.0).velocity[0] < 0.5 * plain
+
+
+def test_a_measured_velocity_that_no_command_explains_decays():
+    predictor = command_history.build(time_constant=(0.5, 0.5, 0.5))
+    predictor.commanded(command(0, 0.0))
+    predictor.applied(command(0, 0).stamp_ns, 50 * MS)
+    predicted = predictor.predict(sample(100, v=1.0), 0.5)
+    assert predicted.velocity[0] == pytest.approx(exp(-1.0))
+    assert predicted.position[0] == pytest.approx(0.5 * (1.0 - exp(-1.0)))
+
+
+def test_commands_after_an_hour_of_silence_cost_no_time():
+    predictor = command_history.build()
+    predictor.commanded(command(0, 1.0))
+    predictor.commanded(command(3_600_000, 1.0))
+    predictor.applied(command(3_600_000, 0).stamp_ns, 3_600_050 * MS)
+    predicted = predictor.predict(sample(3_600_050, v=1.0), 0.1)
+    assert predicted.position[0] == pytest.approx(0.1)
+
+
+def test_values_of_a_file_replace_the_parameters(tmp_path):
+    path = tmp_path / "model.yaml"
+    path.write_text("time_constant: [.5, .5, .5]\ndead_time: [0, 0, 0]\ngain: [1, 1, 1]\nmore: 1\n")
+    own = after_a_step(0.2, time_constant=(0.5, 0.5, 0.5), dead_time=(0, 0, 0))
+    assert after_a_step(0.2, model=path) == own
+
+
+@pytest.mark.parametrize(
+    ("build", "parameters", "text"),
+    [
+        (command_history.build, {"time_constant": (0.3, 0, 0.1)}, "time_constant: 0.0 must be"),
+        (command_history.build, {"model": "none.yaml"}, "model: none.yaml: cannot be read.*ident"),
+        (command_history.build, {"acceleration_max": 0.0}, "acceleration_max: 0.0 must be above 0"),
+        (model_based.build, {"integral_limit_xy": -1.0}, "integral_limit_xy: -1.0 must be"),
+        (kalman.build, {"position_noise": 0.0}, "position_noise: 0.0 must be above 0"),
+        (kalman.build, {"parameters": {"gain": 1}}, "parameters: .*'gain'; see 'cloudrc list"),
+    ],
+)
+def test_a_bad_parameter_is_named(build, parameters, text, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=text):
+        build(**parameters)
+
+
+def test_a_file_without_a_value_is_refused(tmp_path):
+    path = tmp_path / "model.yaml"
+    path.write_text("time_constant: [.5, .5, .5]\n")
+    with pytest.raises(ValueError, match=r"model.yaml has no dead_time; 'cloudrc identify' writes"):
+        command_history.build(model=path)
+
+
+# model_based and kalman
+
+
+def fly(predictor, push=0.0, noise=0.0, seconds=6.0, speed=0.5):
+    """Fly a model under commands along x; `push` [m/s^2] acts on it, `noise` is measured [m, m/s].
+
+    Return the errors of the predictions by 100 ms, as (position [m], velocity [m/s]) along x.
+    """
+    rng = np.random.default_rng(1)
+    body = model_based.build()
+    body.predict(sample(0), 0.0)
+    truth, states, predicted = body.model(), [], []
+    for k in range(round(seconds * 100)):
+        u = speed * ((k // 100) % 2)
+        predictor.commanded(command(10 * k - 50, u))
+        predictor.applied(command(10 * k - 50, 0).stamp_ns, 10 * k * MS)
+        state = truth.odometry() if k else sample(0)
+        x, v = state.position[0], state.velocity[0]
+        states.append((x, v))
+        truth.velocity = (v + push * 0.01, *truth.velocity[1:])
+        truth.step((u, 0.0, 0.0), 0.01)
+        measured = sample(10 * k, x + noise * rng.normal(), v + 4 * noise * rng.normal())
+        predictor.observe(measured)
+        later = predictor.predict(measured, 0.1)
+        predicted.append((later.position[0], later.velocity[0]))
+    return np.array(predicted[:-10]) - np.array(states[10:])
+
+
+def rms(errors):
+    return float(np.sqrt((errors**2).mean()))
+
+
+def test_model_based_stands_still_without_commands():
+    predictor = model_based.build()
+    predictor.predict(sample(0), 0.0)
+    still = predictor.model()
+    for _ in range(300):
+        state = still.step(ZERO, 0.01)
+    assert state.position == pytest.approx(ZERO, abs=0.06)
+    assert state.velocity == pytest.approx(ZERO, abs=0.02)
+
+
+def test_a_velocity_command_is_reached_without_a_steady_error():
+    predictor = model_based.build(integral_limit_xy=0.3)
+    predictor.predict(sample(0), 0.0)
+    flying = predictor.model()
+    for _ in range(400):
+        state = flying.step((2.0, -1.0, 0.5), 0.01)
+    assert state.velocity == pytest.approx((2.0, -1.0, 0.5), abs=0.1)
+
+
+def test_a_sinking_reference_leads_the_robot_by_half_a_metre_per_second():
+    predictor = model_based.build()
+    predictor.predict(sample(0), 0.0)
+    sinking = predictor.model()
+    states = [sinking.step((0.0, 0.0, -3.0), 0.01) for _ in range(20)]
+    falls = [(b.velocity[2] - a.velocity[2]) / 0.01 for a, b in pairwise(states)]
+    assert min(falls) > -9.0  # without the limit the rotors would stop
+
+
+def test_model_based_learns_a_constant_push():
+    errors = fly(model_based.build(), push=0.5, speed=0.0, seconds=12.0)
+    assert rms(errors[-100:, 1]) < 0.3 * rms(errors[5:50, 1])
+
+
+@pytest.mark.parametrize("model", ["white_box", "first_order"])
+def test_kalman_halves_the_noise_of_the_odometry(model):
+    noisy = {"white_box": model_based, "first_order": command_history}[model].build()
+    quiet = kalman.build(model=model)
+    raw, filtered = (fly(each, noise=0.005, speed=0.0)[100:] for each in (noisy, quiet))
+    assert rms(filtered[:, 0]) < 0.5 * rms(raw[:, 0])
+    assert rms(filtered[:, 1]) < 0.5 * rms(raw[:, 1])
+
+
+def test_a_filter_that_trusts_the_odometry_is_the_replay():
+    sure = kalman.build(position_noise=1e-6, velocity_noise=1e-6, acceleration_error=1e3)
+    assert fly(sure, seconds=2.0) == pytest.approx(fly(model_based.build(), seconds=2.0), abs=1e-5)

@@ -1,0 +1,162 @@
+"""How the guard flies the plan of a command, and how it trusts nothing of it."""
+
+from math import hypot, inf, nan, nextafter
+
+import pytest
+import z3
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloudrc.messages import Cause, Command, GuardState
+from cloudrc.world.guard import limits as rules
+from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX, Limits
+from tests.world.guard.conftest import (
+    DT,
+    LIMITS,
+    MS,
+    TICK,
+    armed,
+    command,
+    everywhere,
+    run,
+    sensed,
+)
+from tests.world.guard.test_any_input import check_flown
+from tests.world.guard.test_limits import ANY, PLACES, SPEEDS, VECTORS
+from tests.world.guard.test_state import told
+
+TRACK, HOLD = GuardState.TRACK, GuardState.HOLD
+PLANS = Limits(LIMITS.fence_low, LIMITS.fence_high, speed_max=4.0, plan_max_ns=800 * MS)
+
+
+def planned(speeds, basis_ns=0, planned_ns=None):
+    """Return a command along x: its velocity and a plan [m/s]."""
+    first, *rest = [(speed, 0.0, 0.0) for speed in speeds]
+    begin_ns = basis_ns if planned_ns is None else planned_ns
+    return command(first, basis_ns)._replace(plan=tuple(rest), planned_ns=begin_ns)
+
+
+def following(sent, limits=PLANS, now_ns=0):
+    guard = armed(limits)
+    assert guard.accept_command(sent, now_ns) is None
+    return guard
+
+
+def test_a_plan_is_played_on_its_own_time_line():
+    guard = following(planned([0.0, 0.1, 0.2, 0.3], planned_ns=10 * MS), now_ns=20 * MS)
+    flown = [reference[0] for reference in run(guard, 20 * MS, 60 * MS)]
+    assert flown[4::5] == [0.1, 0.2, 0.3, 0.3]
+    early = following(planned([0.1, 0.2], planned_ns=30 * MS))
+    assert [reference[0] for reference in run(early, 0, 60 * MS)][14::5] == [0.1, 0.1, 0.2, 0.2]
+
+
+def test_the_newest_plan_wins():
+    guard = following(planned([0.1] * 60))
+    run(guard, 0, 100 * MS)
+    guard.accept_command(planned([0.2] * 3, basis_ns=100 * MS), 100 * MS)
+    run(guard, 100 * MS, 200 * MS)
+    assert guard.reference == (0.2, 0.0, 0.0)
+    guard.accept_command(command((0.3, 0.0, 0.0), 200 * MS), 200 * MS)
+    run(guard, 200 * MS, 220 * MS)
+    assert guard.reference == (0.3, 0.0, 0.0), "a command without a plan ends it"
+
+
+@pytest.mark.promise("brakes-without-commands")
+@pytest.mark.parametrize(
+    ("steps", "planned_ms", "arrival_ms", "plan_max_ms", "until_ms"),
+    [
+        (40, 0, 0, 800, 400),  # while the plan lasts
+        (40, 50, 100, 800, 450),
+        (80, 100, 100, 800, 900),  # at most 0.8 s from its arrival
+        (81, 200, 100, 800, 900),
+        (40, 0, 0, 0, 250),  # no plans
+        (10, 0, 0, 800, 250),  # the age of the odometry counts as without a plan
+        (40, 0, 250, 800, 400),  # the odometry was just fresh
+    ],
+)
+def test_a_plan_is_fresh_while_it_lasts(steps, planned_ms, arrival_ms, plan_max_ms, until_ms):
+    limits = Limits(
+        LIMITS.fence_low, LIMITS.fence_high, speed_max=4.0, plan_max_ns=plan_max_ms * MS
+    )
+    plan = planned([0.1] * steps, planned_ns=planned_ms * MS)
+    guard = following(plan, limits, arrival_ms * MS)
+    run(guard, arrival_ms * MS, until_ms * MS + 1)
+    assert guard.state is TRACK
+    run(guard, until_ms * MS + TICK, until_ms * MS + 2 * TICK)
+    age = f"{(until_ms + 2) / 1000:.3f}"
+    assert told(guard) == (until_ms * MS + TICK, HOLD, f"command age {age} s above 0.250 s")
+    assert guard.cause is Cause.SILENCE
+    assert guard.accept_command(plan, until_ms * MS + 2 * TICK) == "stale"
+
+
+@pytest.mark.parametrize("bad", [nan, inf, nextafter(COMMAND_MAX, inf), -1000.1])
+@pytest.mark.parametrize("place", [0, 39])
+def test_an_absurd_plan_is_rejected_as_a_whole(bad, place):
+    guard = following(planned([0.1] * 60))
+    speeds = [0.1] * 41
+    speeds[place + 1] = bad
+    assert guard.accept_command(planned(speeds), 0) == "range"
+    for _ in range(4):
+        guard.accept_command(planned(speeds), 0)
+    assert guard.state is GuardState.LAND
+
+
+@pytest.mark.parametrize("ahead_ns", [-1, AGE_MAX_NS + 1, -(2**63), 2**63 - 1])
+def test_a_plan_for_an_impossible_time_is_rejected(ahead_ns):
+    assert armed(PLANS).accept_command(planned([0.1] * 9, planned_ns=ahead_ns), 0) == "range"
+
+
+def test_played_velocities_are_capped_and_forgotten_with_the_session():
+    guard = following(planned([0.1, 9.0, 9.0, *[0.2] * 60]))
+    run(guard, 0, 50 * MS)
+    assert guard.counts["limited_speed"] == 2
+    guard.forget_commands()
+    assert run(guard, 50 * MS, 60 * MS)[-1] == (0.0, 0.0, 0.0)
+    assert guard.state is HOLD
+
+
+def test_a_plan_does_not_shorten_the_settling_time():
+    """Ten commands with plans of 0.8 s end a HOLD no sooner than ten without a plan."""
+    guard = following(planned([0.1]))
+    run(guard, 0, 260 * MS)
+    for now_ns in range(260 * MS, 1000 * MS, 10 * MS):
+        guard.accept_command(planned([0.1] * 81, basis_ns=now_ns), now_ns)
+    assert guard.state is HOLD
+    guard.accept_command(planned([0.1] * 81, basis_ns=1010 * MS), 1010 * MS)
+    assert guard.state is TRACK
+
+
+SHOCKS = st.one_of(SPEEDS, st.tuples(*[st.floats(-COMMAND_MAX, COMMAND_MAX)] * 3), VECTORS)
+
+
+@pytest.mark.promise("commands-within-caps")
+@given(
+    plan=st.lists(SHOCKS, max_size=5).map(tuple),
+    second=st.lists(SHOCKS, max_size=3).map(tuple),
+    planned_ms=st.sampled_from([0, 1, 20, 5000]),
+    place=PLACES,
+    velocity=st.one_of(SPEEDS, VECTORS),
+    yaw_rate=ANY,
+)
+@settings(max_examples=300, deadline=None)
+def test_any_plan_is_flown_inside_the_caps(plan, second, planned_ms, place, velocity, yaw_rate):
+    guard = following(command())
+    guard.accept_command(command()._replace(plan=plan, planned_ns=planned_ms * MS), 0)
+    for now_ns in range(0, 80 * MS, TICK):
+        if now_ns == 20 * MS:
+            sent = Command(0, 10 * MS, 0, (1.0, 0.0, 0.0), yaw_rate, second, planned_ms * MS)
+            guard.accept_command(sent, now_ns)
+        check_flown(guard, guard.step(now_ns, sensed(place, velocity), DT), place)
+        assert hypot(*guard.reference) <= PLANS.speed_max
+
+
+def test_no_velocity_out_of_range_is_within():
+    """Prove it for all floats."""
+
+    def check(run):
+        numbers = [run.fresh(name) for name in "xyz"]
+        inside = z3.And([z3.fpAbs(number.term) <= COMMAND_MAX for number in numbers])
+        answer = rules.within([tuple(numbers)], COMMAND_MAX)
+        run.prove(inside if answer else z3.Not(inside))
+
+    assert everywhere(check) == 4
