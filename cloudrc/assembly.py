@@ -57,7 +57,7 @@ def build_world(
     from cloudrc.world.guard.limits import Limits
     from cloudrc.world.guard.state import Guard
     from cloudrc.world.low_level import LowLevel
-    from cloudrc.world.robot import Robot
+    from cloudrc.world.native.robot import make_robot
     from cloudrc.world.sensors import Sensors
     from cloudrc.world.simulator import Simulator
 
@@ -71,9 +71,9 @@ def build_world(
         yaw_rate_max=guard.yaw_rate_max_radps,
         hold_max_ns=round(guard.hold_max_s * 1e9),
     )
-    robot = Robot(
-        Simulator(world.robot, world.scene), LowLevel(**world.low_level.model_dump()), Guard(limits)
-    )
+    simulator = Simulator(world.robot, world.scene)
+    low_level = LowLevel(**world.low_level.model_dump())
+    robot = make_robot(simulator, low_level, Guard(limits), limits)
     noise = np.random.Generator(np.random.PCG64([experiment.seed, _stream("odometry noise")]))
     sensors = Sensors(world.sensors.position_noise_m, world.sensors.velocity_noise_mps, noise)
     return WorldEndpoint(

@@ -46,7 +46,15 @@ the published formula is wrong."""
 
 
 class LowLevel:
-    """Make the robot follow a velocity at a yaw of 0, as the published controller does."""
+    """Make the robot follow a velocity at a yaw of 0, as the published controller does.
+
+    Attributes:
+        gains: Force per velocity error, per integrated error and per change of the error in one
+            step, each for x, y and z [N s/m, N/m, N s/m], shape (9,).
+        limits: Limits of the integrated error in x and y, and in z [m], and the step [s].
+        memory: What the next update needs of the last one: integrated velocity error [m], and
+            velocity error [m/s] or None after a reset.
+    """
 
     def __init__(
         self,
@@ -69,9 +77,18 @@ class LowLevel:
         """
         dx, dy, dz = gain_d
         # Gains of the error, its integral and its change per step; one tuple unpacks fastest.
-        self._gains = (*gain_p, *gain_i, dx / dt, dy / dt, dz / dt)
-        self._limits = (integral_limit_xy, integral_limit_z, dt)
+        self.gains = (*gain_p, *gain_i, dx / dt, dy / dt, dz / dt)
+        self.limits = (integral_limit_xy, integral_limit_z, dt)
         self.reset()
+
+    @property
+    def memory(self) -> tuple[Vector, Vector | None]:
+        """Integrated velocity error [m] and last velocity error [m/s], each of shape (3,)."""
+        return self._integral, self._error
+
+    @memory.setter
+    def memory(self, memory: tuple[Vector, Vector | None]) -> None:
+        self._integral, self._error = memory
 
     def reset(self) -> None:
         """Set the integral to zero and forget the last error."""
@@ -103,8 +120,8 @@ class LowLevel:
         e = v - v_ref;  F = -(Kp · e + Ki · int(e dt) + Kd · de/dt) + (0, 0, m · g), with a clamped
         integral. `velocity` is v, `reference` is v_ref, both in [m/s]; all are in the world frame.
         """
-        px, py, pz, ix, iy, iz, dx, dy, dz = self._gains
-        limit_xy, limit_z, dt = self._limits
+        px, py, pz, ix, iy, iz, dx, dy, dz = self.gains
+        limit_xy, limit_z, dt = self.limits
         (vx, vy, vz), (rx, ry, rz) = velocity, reference
         # The opposite sign of the equation saves a negation per term.
         ex, ey, ez = error = (rx - vx, ry - vy, rz - vz)

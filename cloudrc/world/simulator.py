@@ -6,6 +6,7 @@ the time that a numpy slice assignment takes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import dist
 from struct import Struct
 from typing import Any
@@ -37,9 +38,9 @@ class Simulator:
 
     Attributes:
         model: The compiled `MjModel`.
+        data: The `MjData` of the simulation.
         dt: Duration of a step [s].
         steps: Number of steps since the last reset.
-        readings: State of the base after the last step.
         tip_force_peak: Largest force on the arm's tip since the last call of `take_tip_force` [N].
         tip_impulse: Integral over time of the force on the tip since that call [N s].
         touches: Contacts that began since the last call of `take_contacts`.
@@ -55,7 +56,7 @@ class Simulator:
         self.model = model = compile_model(robot, scene)
         self.dt: float = model.opt.timestep
         self.tape: list[Controls] | None = None
-        self._data = data = mujoco.MjData(model)
+        self.data = data = mujoco.MjData(model)
         self._rotors = Rotors(self.dt)
 
         self._qpos, self._qvel = memoryview(data.qpos), memoryview(data.qvel)
@@ -73,8 +74,8 @@ class Simulator:
 
     def reset(self) -> None:
         """Reset the robot to its spawn, at rest, with stopped rotors."""
-        mujoco.mj_resetData(self.model, self._data)
-        mujoco.mj_forward(self.model, self._data)
+        mujoco.mj_resetData(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)
         self._rotors.speeds = STOPPED
         self.steps = self._contacts = 0
         self.tip_force_peak = self.tip_impulse = 0.0
@@ -83,7 +84,7 @@ class Simulator:
         self.touches: list[Contact] = []
         # The robot stands on the floor: only after a flight is the next contact a new contact.
         self._last_touch: dict[tuple[str, bool], int] = {("floor", False): 0}
-        self.readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
+        self._readings: Readings | None = None
 
     def step(self, rotor_speeds: RotorSpeeds) -> None:
         """Advance by `dt` with these commanded rotor speeds [rad/s], shape (4,).
@@ -91,7 +92,7 @@ class Simulator:
         Thrust and drag use the rotor speeds at the end of the step. The drag uses the velocity at
         the beginning of the step.
         """
-        before, data = self.readings, self._data
+        before, data = self.readings, self.data
         controls = self._rotors.step(rotor_speeds, before)
         front, left, back, right, fx, fy, fz, tx, ty, tz = controls
         _pack_ctrl(self._ctrl, 0, front, left, back, right)
@@ -101,17 +102,37 @@ class Simulator:
 
         _mj_step(self.model, data)
         self.steps += 1
-        self.readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
+        self._readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
         contacts = data.ncon
         if contacts or self._contacts:
-            force = self._sensors[self._tip_sensor]
-            self.tip_impulse += force * self.dt
-            if force > self.tip_force_peak:
-                self.tip_force_peak = force
-            # Check at once if the number of contacts has changed, else only every few steps.
-            if contacts and (contacts != self._contacts or self.steps % CONTACT_CHECK_STEPS == 0):
-                self._note_contacts(before)
-            self._contacts = contacts
+            self._feel(contacts, before)
+
+    def take_over(
+        self, steps: int, rotor_speeds: RotorSpeeds, before: Callable[[], Readings]
+    ) -> None:
+        """Continue after `steps` steps that `native/step.c` has run on `data`.
+
+        Only the last step may have a contact. `rotor_speeds` are the actual speeds [rad/s], shape
+        (4,). `before` returns the readings at the beginning of the last step.
+        """
+        self.steps += steps
+        self._rotors.speeds, self._readings = rotor_speeds, None
+        if self.data.ncon:
+            self._feel(self.data.ncon, before())
+
+    @property
+    def readings(self) -> Readings:
+        """State of the base after the last step."""
+        readings = self._readings
+        if readings is None:
+            readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
+            self._readings = readings
+        return readings
+
+    @property
+    def touching(self) -> bool:
+        """Whether the robot touched something in the last step."""
+        return self._contacts != 0
 
     @property
     def touch_age(self) -> float:
@@ -146,13 +167,24 @@ class Simulator:
         """
         spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
         physics = np.empty(mujoco.mj_stateSize(self.model, spec))
-        mujoco.mj_getState(self.model, self._data, physics, spec)
-        return physics, self._data.qacc_warmstart.copy()
+        mujoco.mj_getState(self.model, self.data, physics, spec)
+        return physics, self.data.qacc_warmstart.copy()
+
+    def _feel(self, contacts: int, before: Readings) -> None:
+        """Measure the tip's force after a step with `contacts` contacts, and store new contacts."""
+        force = self._sensors[self._tip_sensor]
+        self.tip_impulse += force * self.dt
+        if force > self.tip_force_peak:
+            self.tip_force_peak = force
+        # Check at once if the number of contacts has changed, else only every few steps.
+        if contacts and (contacts != self._contacts or self.steps % CONTACT_CHECK_STEPS == 0):
+            self._note_contacts(before)
+        self._contacts = contacts
 
     def _note_contacts(self, before: Readings) -> None:
         """Store the new contacts with the state of the robot before the step, `before`."""
-        contact = self._data.contact
-        tip = self._data.site_xpos[self._tip].tolist()
+        contact = self.data.contact
+        tip = self.data.site_xpos[self._tip].tolist()
         pairs, places = contact.geom.tolist(), contact.pos.tolist()
         for (first, second), place in zip(pairs, places, strict=True):
             body = self._bodies[first] or self._bodies[second]

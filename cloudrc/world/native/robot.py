@@ -1,0 +1,137 @@
+"""A robot that runs its usual steps in C, and all others in Python, with the same results."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+from functools import cache
+from struct import Struct
+
+from cloudrc.geometry import fence
+from cloudrc.messages import Command
+from cloudrc.world.guard.limits import Limits
+from cloudrc.world.guard.state import Guard
+from cloudrc.world.low_level import LowLevel
+from cloudrc.world.native.flight import Flight, make_flight
+from cloudrc.world.native.library import Library, library, mistrust
+from cloudrc.world.readings import Readings
+from cloudrc.world.robot import STEP_NS, Robot
+from cloudrc.world.simulator import Simulator
+
+_pack_track, _pack_memory = Struct("6d3q").pack_into, Struct("10dq").pack_into
+_unpack_track, _unpack_memory = Struct("3d24xqq8x4d").unpack_from, Struct("10dq").unpack_from
+_TRACK, _MEMORY, _BEFORE = (Flight.reference.offset, Flight.speeds.offset, Flight.before.offset)
+_unpack_before = Struct("13d").unpack_from
+
+
+def make_robot(
+    simulator: Simulator, low_level: LowLevel, guard: Guard, limits: Limits
+) -> Robot:
+    """Make a robot that uses C if this machine can; `limits` are those of the guard."""
+    if usable().run is None:
+        return Robot(simulator, low_level, guard)
+    return NativeRobot(simulator, low_level, guard, limits)
+
+
+def usable() -> Library:
+    """Return the library, tested once per process against Python; see `library.library`."""
+    if library().run is not None and (wrong := _self_test()):
+        mistrust(wrong)
+        logging.getLogger("cloudrc").warning("steps run in Python: %s", wrong)
+    return library()
+
+
+class NativeRobot(Robot):
+    """A `Robot` whose usual steps `step.c` runs.
+
+    Usual steps follow a fresh command far from the fence, without contact. Python runs the others,
+    and all steps while the robot has observers or the simulator has a tape.
+    """
+
+    def __init__(
+        self, simulator: Simulator, low_level: LowLevel, guard: Guard, limits: Limits
+    ) -> None:
+        """Connect the parts; `limits` are those of the guard."""
+        super().__init__(simulator, low_level, guard)
+        self._flight = make_flight(simulator, low_level, limits, STEP_NS)
+        self._address = ctypes.addressof(self._flight)
+        run = library().run
+        assert run is not None
+        self._run_steps = run
+        self._in_c = False  # whether C has the newest state of rotors and controller
+
+    def put_on_ground(self, now_ns: int, cause: str) -> None:
+        """Reset the robot to its spawn, as `Robot` does."""
+        self._in_c = False
+        super().put_on_ground(now_ns, cause)
+
+    def run(self, tick_ns: int, until_ns: int) -> int:
+        """Run steps, as `Robot` does: the first ones in C, if they are usual steps."""
+        simulator = self.simulator
+        if not (self.observers or simulator.touching) and simulator.tape is None:
+            if track := self.guard.plain_track(tick_ns):
+                reference, wanted, steady_ns, track_ns = track
+                flight = self._flight
+                settled = reference is wanted
+                _pack_track(flight, _TRACK, *reference, *wanted, settled, steady_ns, track_ns)
+                if not self._in_c:
+                    self._give()
+                if steps := self._run_steps(self._address, tick_ns, until_ns):
+                    tick_ns += steps * STEP_NS
+                    x, y, z, settled, steady_ns, *speeds = _unpack_track(flight, _TRACK)
+                    self.guard.continue_track(None if settled else (x, y, z), steady_ns)
+                    simulator.take_over(steps, tuple(speeds), self._before)
+        if tick_ns < until_ns:
+            if self._in_c:
+                self._take_back()
+            return super().run(tick_ns, until_ns)
+        return tick_ns
+
+    def _before(self) -> Readings:
+        numbers = _unpack_before(self._flight, _BEFORE)
+        return Readings.of(numbers[:7], numbers[7:])
+
+    def _give(self) -> None:
+        """Give the state of rotors and controller to C."""
+        integral, error = self._low_level.memory
+        has_error = error is not None
+        speeds = self.simulator.rotor_speeds
+        _pack_memory(
+            self._flight, _MEMORY, *speeds, *integral, *(error or integral), has_error
+        )
+        self._in_c = True
+
+    def _take_back(self) -> None:
+        """Take the state of the controller back from C; the simulator has that of the rotors."""
+        *_, ix, iy, iz, ex, ey, ez, has_error = _unpack_memory(self._flight, _MEMORY)
+        self._low_level.memory = (ix, iy, iz), (ex, ey, ez) if has_error else None
+        self._in_c = False
+
+
+@cache
+def _self_test() -> str:
+    """Fly in C and in Python; return how the results differ, in words, or an empty text."""
+    limits = Limits(fence.LOW, fence.HIGH)
+    ends = []
+    try:
+        for native in (False, True):
+            parts = Simulator("pelican", "empty"), LowLevel(), Guard(limits)
+            robot = NativeRobot(*parts, limits) if native else Robot(*parts)
+            ends.append(_fly(robot))
+    except (OSError, AttributeError, KeyError, ImportError) as error:
+        return f"MuJoCo is not as expected: {error!r}"
+    return "" if ends[0] == ends[1] else "the self-test differs from Python"
+
+
+def _fly(robot: Robot) -> list[object]:
+    """Take off and fly curves for 1 s; return the state of robot and guard."""
+    robot.put_on_ground(0, "self-test")
+    robot.guard.start_mission(0)
+    seen: list[object] = []
+    for now_ns in range(0, 1_000_000_000, 5 * STEP_NS):
+        share = now_ns * 1e-9
+        velocity = (2.0 * share, 1.0 - share, 3.0 if share < 0.6 else -0.1)
+        robot.guard.accept_command(Command(0, now_ns, 0, velocity, 0.0), now_ns)
+        robot.run(now_ns, now_ns + 5 * STEP_NS)
+        seen += [robot.simulator.readings, robot.guard.reference, robot.simulator.rotor_speeds]
+    return seen
