@@ -7,6 +7,8 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
+from cloudrc.geometry.fence import FLOOR_MARGIN
+from cloudrc.messages import NEVER_NS
 from cloudrc.world import low_level, rotors
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard import state
@@ -43,6 +45,8 @@ GUARD_NUMBERS: dict[str, float] = {
     "reaction": rules.REACTION,
     "stop_coefficient": rules.STOP_COEFFICIENT,
     "recheck_distance": rules.RECHECK_DISTANCE,
+    "far": rules.FAR,
+    "low_z": 0.0,
 }
 """Numbers of the guard, likewise."""
 
@@ -58,7 +62,8 @@ class Flight(ctypes.Structure):
         *((name, _double) for name in NUMBERS),
         *(("gains", _double * 9), ("limit_xy", _double), ("limit_z", _double), ("dt", _double)),
         *((name, _double) for name in GUARD_NUMBERS),
-        *(("low", _vector), ("high", _vector), ("recheck_ns", _int64), ("step_ns", _int64)),
+        *(("low", _vector), ("high", _vector)),
+        *((name, _int64) for name in ("recheck_ns", "never_ns", "step_ns")),
         *(("reference", _vector), ("wanted", _vector), ("settled", _int64)),
         *(("steady_until_ns", _int64), ("track_until_ns", _int64)),
         *(("speeds", _double * 4), ("integral", _vector), ("error", _vector)),
@@ -80,6 +85,7 @@ def make_flight(
     turning = rotors.Rotors(simulator.dt)
     known = {**NUMBERS, **GUARD_NUMBERS, "up": turning.up, "down": turning.down}
     known["change_max"] = limits.acceleration_max * (step_ns * 1e-9)
+    known["low_z"] = low[2] - FLOOR_MARGIN + rules.LOW_HEIGHT
     return Flight(
         ctypes.cast(mujoco_library().mj_step, ctypes.c_void_p),
         *(model._address, data._address),  # the only way to these addresses
@@ -88,7 +94,7 @@ def make_flight(
         **known,
         gains=controller.gains,
         **{"limit_xy": limit_xy, "limit_z": limit_z, "dt": dt, "low": low, "high": high},
-        **{"recheck_ns": rules.RECHECK_NS, "step_ns": step_ns},
+        **{"recheck_ns": rules.RECHECK_NS, "never_ns": NEVER_NS, "step_ns": step_ns},
     )
 
 

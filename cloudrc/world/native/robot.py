@@ -8,7 +8,7 @@ from functools import cache
 from struct import Struct
 
 from cloudrc.geometry import fence
-from cloudrc.messages import Command
+from cloudrc.messages import Command, Vector
 from cloudrc.world.guard.limits import Limits
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
@@ -19,9 +19,9 @@ from cloudrc.world.robot import STEP_NS, Robot
 from cloudrc.world.simulator import Simulator
 
 _pack_track, _pack_memory = Struct("6d3q").pack_into, Struct("10dq").pack_into
-_unpack_track, _unpack_memory = Struct("3d24xqq8x4d").unpack_from, Struct("10dq").unpack_from
+_unpack_track, _unpack_memory = Struct("3d24xqq").unpack_from, Struct("10dq").unpack_from
 _TRACK, _MEMORY, _BEFORE = (Flight.reference.offset, Flight.speeds.offset, Flight.before.offset)
-_unpack_before = Struct("13d").unpack_from
+_unpack_before, _unpack_speeds = Struct("13d").unpack_from, Struct("4d").unpack_from
 
 
 def make_robot(
@@ -44,8 +44,8 @@ def usable() -> Library:
 class NativeRobot(Robot):
     """A `Robot` whose usual steps `step.c` runs.
 
-    Usual steps follow a fresh command far from the fence, without contact. Python runs the others,
-    and all steps while the robot has observers or the simulator has a tape.
+    Usual steps follow a fresh command that the guard need not limit. Python runs the others, and
+    all steps while the robot has observers or the simulator has a tape.
     """
 
     def __init__(
@@ -67,24 +67,35 @@ class NativeRobot(Robot):
 
     def run(self, tick_ns: int, until_ns: int) -> int:
         """Run steps, as `Robot` does: the first ones in C, if they are usual steps."""
-        simulator = self.simulator
-        if not (self.observers or simulator.touching) and simulator.tape is None:
+        if not self.observers and self.simulator.tape is None:
             if track := self.guard.plain_track(tick_ns):
-                reference, wanted, steady_ns, track_ns = track
-                flight = self._flight
-                settled = reference is wanted
-                _pack_track(flight, _TRACK, *reference, *wanted, settled, steady_ns, track_ns)
-                if not self._in_c:
-                    self._give()
-                if steps := self._run_steps(self._address, tick_ns, until_ns):
-                    tick_ns += steps * STEP_NS
-                    x, y, z, settled, steady_ns, *speeds = _unpack_track(flight, _TRACK)
-                    self.guard.continue_track(None if settled else (x, y, z), steady_ns)
-                    simulator.take_over(steps, tuple(speeds), self._before)
+                tick_ns = self._run_in_c(track, tick_ns, until_ns)
         if tick_ns < until_ns:
             if self._in_c:
                 self._take_back()
             return super().run(tick_ns, until_ns)
+        return tick_ns
+
+    def _run_in_c(
+        self, track: tuple[Vector, Vector, int, int], tick_ns: int, until_ns: int
+    ) -> int:
+        """Run steps until one is not usual; `track` is the result of `Guard.plain_track`."""
+        flight, simulator = self._flight, self.simulator
+        reference, wanted, steady_ns, track_ns = track
+        settled = reference is wanted
+        _pack_track(flight, _TRACK, *reference, *wanted, settled, steady_ns, track_ns)
+        if not self._in_c:
+            self._give()
+        while tick_ns < until_ns:
+            # With a contact, the simulator has to look at it after every step.
+            stop_ns = tick_ns + STEP_NS if simulator.touching else until_ns
+            steps = self._run_steps(self._address, tick_ns, stop_ns)
+            if not steps:
+                break
+            tick_ns += steps * STEP_NS
+            simulator.take_over(steps, _unpack_speeds(flight, _MEMORY), self._before)
+        x, y, z, settled, steady_ns = _unpack_track(flight, _TRACK)
+        self.guard.continue_track(None if settled else (x, y, z), steady_ns)
         return tick_ns
 
     def _before(self) -> Readings:

@@ -1,4 +1,4 @@
-/* Fly the robot in the usual case: a fresh command, far from the fence, touching nothing.
+/* Fly the robot in the usual case: a fresh command that the guard need not limit.
 
    This file is the twin of Python code, and gives the same bits. The Python code is the reference:
    it has the sources of all formulas and numbers, and it flies the robot in every other case.
@@ -6,6 +6,7 @@
      read          readings.Readings.of
      guard_step    guard.state.Guard.step, for a robot in TRACK with a fresh command
      is_far        guard.limits.is_far_from_fence
+     is_free       guard.limits.limit_to_fence, if it changes nothing
      update        low_level.LowLevel.update
      turn_rotors   rotors.Rotors.step, simulator.Simulator.step
 
@@ -32,8 +33,9 @@ typedef struct {
   double two_arms, four_ratios, thrust_max, nose_cosine_min, yaw_sine_max;
   double gains[9], limit_xy, limit_z, dt;
   double overturned_cosine, change_max, sink_lead_max;
-  double fence_reaction, reaction, stop_coefficient, recheck_distance, low[3], high[3];
-  i64 recheck_ns, step_ns;
+  double fence_reaction, reaction, stop_coefficient, recheck_distance, far, low_z;
+  double low[3], high[3];
+  i64 recheck_ns, never_ns, step_ns;
   /* State, which Python reads and writes between two runs. */
   double reference[3], wanted[3];
   i64 settled; /* whether Python's `reference` is the object `wanted` */
@@ -75,6 +77,25 @@ static int is_far(const Flight *f, const double *velocity, const double *positio
   return 1;
 }
 
+static double approach_speed(const Flight *f, double distance, double reaction) {
+  if (distance > f->far) return 1e300;
+  double root = sqrt(reaction * reaction + 4.0 * f->stop_coefficient * distance);
+  return 2.0 * distance / (reaction + root);
+}
+
+/* Tell whether the fence surely limits no velocity at this position; Python handles the rest. */
+static int is_free(const Flight *f, const double *velocity, const double *position) {
+  if (!(position[2] >= f->low_z)) return 0;
+  for (int i = 0; i < 3; i++) {
+    double below = position[i] - f->low[i], above = f->high[i] - position[i];
+    if (!(below > 0.0 && above > 0.0)) return 0;
+    double reaction = i == 2 ? f->reaction : f->fence_reaction;
+    if (!(-approach_speed(f, below, reaction) <= velocity[i])) return 0;
+    if (!(velocity[i] <= approach_speed(f, above, f->fence_reaction))) return 0;
+  }
+  return 1;
+}
+
 /* Move the reference by one step; return 0, with nothing changed, if Python has to do this step. */
 static int guard_step(Flight *f, const Readings *r, i64 now_ns) {
   if (now_ns <= f->steady_until_ns && f->settled) return 1;
@@ -86,11 +107,14 @@ static int guard_step(Flight *f, const Readings *r, i64 now_ns) {
   double share = settles ? 0.0 : f->change_max / sqrt(square);
   double moved[3] = {from[0] + share * x, from[1] + share * y, from[2] + share * z};
   const double *reference = settles ? to : moved;
-  if (reference[2] < r->twist[2] - f->sink_lead_max || !is_far(f, reference, r->pose)) return 0;
+  if (reference[2] < r->twist[2] - f->sink_lead_max) return 0;
+  int far = is_far(f, reference, r->pose);
+  if (!far && !is_free(f, reference, r->pose)) return 0;
   for (int i = 0; i < 3; i++) f->reference[i] = reference[i];
   f->settled = settles;
-  i64 recheck_ns = now_ns + f->recheck_ns;
-  f->steady_until_ns = f->track_until_ns < recheck_ns ? f->track_until_ns : recheck_ns;
+  i64 until_ns = now_ns + f->recheck_ns;
+  if (f->track_until_ns < until_ns) until_ns = f->track_until_ns;
+  f->steady_until_ns = far ? until_ns : f->never_ns;
   return 1;
 }
 
