@@ -289,6 +289,7 @@ def _record_virtual(
     from cloudrc.record.writer import McapWriter
     from cloudrc.report.document import Run
     from cloudrc.report.write import attachments
+    from cloudrc.world.native.robot import usable
 
     records: tuple[list[Record], list[Record]] = ([], [])
     digest, interrupted = RecordHash(), False
@@ -311,7 +312,8 @@ def _record_virtual(
         except KeyboardInterrupt:
             interrupted = True
         try:
-            run = Run("virtual", "virtual", digest.hexdigest(), interrupted)
+            found = digest.hexdigest(), interrupted
+            run = Run("virtual", "virtual", *found, physics_steps=usable().text)
             yield Recording.from_records(*records), run
         finally:
             for name, data in attachments(folder).items():
@@ -332,6 +334,7 @@ def _record_local(
     from cloudrc.record.merge import merge
     from cloudrc.report.document import Run
     from cloudrc.report.write import attachments
+    from cloudrc.world.native.library import library
 
     if absent := missing("api"):
         text = f"no operator's API in this run: {', '.join(absent)} not installed"
@@ -359,7 +362,8 @@ def _record_local(
     notes = (*local.notes, *([str(broken)] if broken else ()))
     digest = messages_sha256(mission.messages)
     try:
-        yield mission.recording(), Run("local", "relay", digest, interrupted, notes)
+        facts = digest, interrupted, notes, library().text
+        yield mission.recording(), Run("local", "relay", *facts)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))
     if broken:

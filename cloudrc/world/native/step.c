@@ -18,7 +18,7 @@
 typedef long long i64;
 double sqrt(double);
 
-/* Shared with Python: library.py has the same fields, all of 8 bytes, in the same order. */
+/* Shared with Python: flight.py has the same fields, all of 8 bytes, in the same order. */
 typedef struct {
   /* MuJoCo: mj_step, its arguments, arrays of mjData, and the address of its number of contacts. */
   void (*mj_step)(const void *model, void *data);
@@ -27,14 +27,15 @@ typedef struct {
   const double *qpos, *qvel;
   double *ctrl, *applied;
   const int *contacts;
-  /* Numbers of the Python modules. */
-  double thrust_coefficient, drag_coefficient, drag_arm, arm_squared, height, up, down;
-  double weight, tiny, half_tilt_gain, half_yaw_gain, tilt_rate_gain, yaw_rate_gain;
-  double two_arms, four_ratios, thrust_max, nose_cosine_min, yaw_sine_max;
-  double gains[9], limit_xy, limit_z, dt;
-  double overturned_cosine, change_max, sink_lead_max;
-  double fence_reaction, reaction, stop_coefficient, recheck_distance, far, low_z;
-  double low[3], high[3];
+  /* Constants of the Python modules rotors, low_level and guard, with the same names. */
+  double thrust_coefficient, torque_ratio, drag_coefficient, arm, height;
+  double mass, gravity, tilt_gain, yaw_gain, tilt_rate_gain, yaw_rate_gain;
+  double thrust_max, tiny, nose_cosine_min, yaw_sine_max;
+  double overturned_cosine, sink_lead_max;
+  double fence_reaction, reaction, stop_coefficient, recheck_distance, far;
+  /* Values of this robot: gains and limits of the controller, corners of the fence, and so on. */
+  double up, down, gains[9], limit_xy, limit_z, dt;
+  double change_max, low_z, low[3], high[3];
   i64 recheck_ns, never_ns, step_ns;
   /* State, which Python reads and writes between two runs. */
   double reference[3], wanted[3];
@@ -134,7 +135,7 @@ static void update(Flight *f, const Readings *r, double *commands) {
     force[i] = g[i] * e + g[3 + i] * s + g[6 + i] * (e - last);
   }
   f->has_error = 1;
-  double fx = force[0], fy = force[1], fz = force[2] + f->weight;
+  double fx = force[0], fy = force[1], fz = force[2] + f->mass * f->gravity;
 
   double thrust = fx * a[6] + fy * a[7] + fz * a[8];
   double across = fy * fy + fz * fz, size = sqrt(fx * fx + across), scale;
@@ -150,11 +151,12 @@ static void update(Flight *f, const Readings *r, double *commands) {
   double roll = y2 - z1, pitch = z0 + y1 * z0 - y0 * z1, yaw;
   if (y1 < f->nose_cosine_min || a[1] > f->yaw_sine_max || a[1] < -f->yaw_sine_max)
     roll = -z1 - z1, pitch = z0 + z0;
-  roll = f->half_tilt_gain * roll - f->tilt_rate_gain * rate[0];
-  pitch = f->half_tilt_gain * pitch - f->tilt_rate_gain * rate[1];
-  yaw = f->half_yaw_gain * (y2 * z0 - y0 * z2 - y0) - f->yaw_rate_gain * rate[2];
+  roll = 0.5 * f->tilt_gain * roll - f->tilt_rate_gain * rate[0];
+  pitch = 0.5 * f->tilt_gain * pitch - f->tilt_rate_gain * rate[1];
+  yaw = 0.5 * f->yaw_gain * (y2 * z0 - y0 * z2 - y0) - f->yaw_rate_gain * rate[2];
 
-  roll = roll / f->two_arms, pitch = pitch / f->two_arms, yaw = yaw / f->four_ratios;
+  roll = roll / (2.0 * f->arm), pitch = pitch / (2.0 * f->arm);
+  yaw = yaw / (4.0 * f->torque_ratio);
   double share = 0.25 * thrust, with_yaw = share + yaw, against_yaw = share - yaw;
   double thrusts[4] = {with_yaw - pitch, against_yaw + roll, with_yaw + pitch, against_yaw - roll};
   int plain = thrust <= f->thrust_max;
@@ -169,7 +171,8 @@ static void turn_rotors(Flight *f, const Readings *r, const double *commands) {
   for (int i = 0; i < 4; i++) s[i] += (commands[i] - s[i]) * (commands[i] > s[i] ? f->up : f->down);
 
   double total = f->drag_coefficient * (s[0] + s[1] + s[2] + s[3]);
-  double across_x = f->drag_arm * (s[0] - s[2]), across_y = f->drag_arm * (s[1] - s[3]);
+  double drag_arm = f->drag_coefficient * f->arm;
+  double across_x = drag_arm * (s[0] - s[2]), across_y = drag_arm * (s[1] - s[3]);
   double u = a[0] * v[0] + a[1] * v[1] + a[2] * v[2] + rate[1] * f->height;
   double w = a[3] * v[0] + a[4] * v[1] + a[5] * v[2] - rate[0] * f->height;
   double force_x = across_y * rate[2] - total * u;
@@ -178,7 +181,7 @@ static void turn_rotors(Flight *f, const Readings *r, const double *commands) {
   for (int i = 0; i < 3; i++) f->applied[i] = a[i] * force_x + a[3 + i] * force_y;
   f->applied[3] = -f->height * force_y;
   f->applied[4] = f->height * force_x;
-  f->applied[5] = across_y * u - across_x * w - f->arm_squared * total * rate[2];
+  f->applied[5] = across_y * u - across_x * w - f->arm * f->arm * total * rate[2];
 }
 
 /* Run steps from now_ns up to until_ns [ns]; return their number. The run ends early before a step
