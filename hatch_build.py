@@ -1,6 +1,6 @@
 """Put the machine code of `cloudrc/world/native/step.c` into a wheel, if CLOUDRC_NATIVE is 1.
 
-Otherwise the wheel is pure Python, and a machine with a compiler makes the code at the first flight.
+Otherwise the wheel is pure Python, and a machine with a compiler makes the code when it flies.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ API = ("teleop/api", "teleop/auth")
 RESERVED: dict[str, tuple[str, ...]] = {
     "mujoco": ("world/",),
     # The simulator packs forces into MuJoCo's buffers; this is the fastest way.
-    "struct": ("tunnel/codec", "record/", "world/simulator"),
+    "struct": ("tunnel/codec", "record/", "world/simulator", "world/native/robot"),
     "yaml": ("config/", "link/", "record/", "report/", "cli/", "cluster/", "faults/schedule"),
     "pydantic": (*("config/", "link/", "cli/", "teleop/", "report/folder"), "faults/schedule"),
     **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("teleop/api", "teleop/auth")),
@@ -64,7 +64,8 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "argparse": ("cli/",),
     "importlib.metadata": ("plugins", "cli/", "report/"),
     "pkgutil": ("plugins",),
-    "subprocess": ("drivers/", "cli/", "cluster/"),
+    # A compiler makes the machine code of the usual step.
+    "subprocess": ("drivers/", "cli/", "cluster/", "world/native/library"),
     "multiprocessing": ("drivers/", "cli/"),
     "concurrent": ("cli/", "cluster/", "teleop/"),
     **dict.fromkeys(

@@ -52,8 +52,6 @@ class LowLevel:
         gains: Force per velocity error, per integrated error and per change of the error in one
             step, each for x, y and z [N s/m, N/m, N s/m], shape (9,).
         limits: Limits of the integrated error in x and y, and in z [m], and the step [s].
-        memory: What the next update needs of the last one: integrated velocity error [m], and
-            velocity error [m/s] or None after a reset.
     """
 
     def __init__(
@@ -81,19 +79,19 @@ class LowLevel:
         self.limits = (integral_limit_xy, integral_limit_z, dt)
         self.reset()
 
+    def reset(self) -> None:
+        """Set the integral to zero and forget the last error."""
+        self._integral = ZERO
+        self._error: Vector | None = None
+
     @property
     def memory(self) -> tuple[Vector, Vector | None]:
-        """Integrated velocity error [m] and last velocity error [m/s], each of shape (3,)."""
+        """Integrated velocity error [m], shape (3,), and last velocity error [m/s] or None."""
         return self._integral, self._error
 
     @memory.setter
     def memory(self, memory: tuple[Vector, Vector | None]) -> None:
         self._integral, self._error = memory
-
-    def reset(self) -> None:
-        """Set the integral to zero and forget the last error."""
-        self._integral = ZERO
-        self._error: Vector | None = None
 
     def update(self, readings: Readings, velocity_reference: Vector) -> RotorSpeeds:
         """Compute the rotor speeds that make the robot follow a velocity; call once per `dt`.

@@ -112,8 +112,9 @@ class Simulator:
     ) -> None:
         """Continue after `steps` steps that `native/step.c` has run on `data`.
 
-        Only the last step may have a contact, or be the end of a contact. `rotor_speeds` are the actual speeds [rad/s], shape
-        (4,). `before` returns the readings at the beginning of the last step.
+        Only the last step may have a contact, or be the end of a contact. `rotor_speeds` are the
+        actual speeds [rad/s], shape (4,). `before` returns the readings at the beginning of the
+        last step.
         """
         self.steps += steps
         self._rotors.speeds, self._readings = rotor_speeds, None

@@ -31,7 +31,7 @@ _VALUES = {
     for name in names.split()
 }
 _double, _int64 = ctypes.c_double, ctypes.c_int64
-_SIZES = {
+_FIELDS: dict[str, Any] = {
     **dict.fromkeys(_POINTERS, ctypes.c_void_p),
     **dict.fromkeys([*_VALUES, "up", "down"], _double),
     **{"gains": _double * 9, "limit_xy": _double, "limit_z": _double, "dt": _double},
@@ -47,7 +47,7 @@ _SIZES = {
 class Flight(ctypes.Structure):
     """The structure `Flight` of `step.c`, which explains the fields."""
 
-    _fields_ = tuple(_SIZES.items())
+    _fields_ = tuple(_FIELDS.items())
 
 
 def make_flight(

@@ -1,0 +1,199 @@
+"""Flights in C and in Python have the same bits, whatever the cloud sends."""
+
+import logging
+
+import pytest
+
+from cloudrc import assembly
+from cloudrc.config.load import load_experiment
+from cloudrc.geometry import fence
+from cloudrc.messages import Command, GuardState
+from cloudrc.tunnel.end import Identity
+from cloudrc.world.guard.limits import Limits
+from cloudrc.world.guard.state import Guard
+from cloudrc.world.low_level import LowLevel
+from cloudrc.world.native import robot as native
+from cloudrc.world.native.library import SWITCH, Library, library
+from cloudrc.world.native.robot import NativeRobot, make_robot, usable
+from cloudrc.world.robot import Robot
+from cloudrc.world.simulator import Simulator
+from tests.flights.conftest import digest
+from tests.world.guard.conftest import MS, hostile
+
+pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
+LIMITS = Limits(fence.LOW, fence.HIGH)
+PERIOD_NS = 10 * MS
+
+
+def robot_of(kind, scene="empty", limits=LIMITS):
+    parts = Simulator("pelican", scene), LowLevel(), Guard(limits)
+    return NativeRobot(*parts, limits) if kind is NativeRobot else Robot(*parts)
+
+
+def both(scene="empty", limits=LIMITS):
+    return robot_of(Robot, scene, limits), robot_of(NativeRobot, scene, limits)
+
+
+class Count:
+    """Counts the steps that run in C."""
+
+    def __init__(self, robot):
+        self.steps, self._run = 0, robot._run_steps
+        robot._run_steps = self
+
+    def __call__(self, *given):
+        ran = self._run(*given)
+        self.steps += ran
+        return ran
+
+
+class Pilot:
+    """Flies a robot with the commands of a policy, and notes everything that is to be equal."""
+
+    def __init__(self, robot, start_ns=0):
+        self.robot, self.guard, self.now_ns = robot, robot.guard, start_ns
+        self.seen, self.states = [], set()
+        robot.put_on_ground(start_ns, "test")
+        self.guard.start_mission(start_ns)
+
+    def fly(self, seconds, policy, parts=(4, 6)):
+        """Fly; run every period in two parts [ms], as arrivals of commands divide it."""
+        for _ in range(round(seconds * 100)):
+            if (velocity := policy(self)) is not None:
+                command = Command(0, self.now_ns, 0, velocity, 0.0)
+                self.guard.accept_command(command, self.now_ns)
+            for part in parts:
+                self.robot.run(self.now_ns, self.now_ns + part * MS)
+                self.now_ns += part * MS
+            simulator, guard = self.robot.simulator, self.guard
+            self.states.add(guard.state)
+            self.seen += [simulator.readings, simulator.rotor_speeds, simulator.steps]
+            self.seen += [guard.state, guard.reference, dict(guard.counts)]
+            self.seen += [simulator.take_tip_force(), simulator.take_contacts()]
+        return self
+
+
+@pytest.mark.parametrize(("scale", "least"), [(1.0, 10), (0.1, 1000)])
+@pytest.mark.parametrize("seed", range(4))
+def test_hostile_commands_fly_the_same_in_c(seed, scale, least):
+    """Large ones reach caps, fence and floor; small ones stay where C flies."""
+
+    def scaled(policy):
+        return lambda pilot: tuple(scale * axis for axis in policy(pilot))
+
+    python, c = both()
+    count = Count(c)
+    lift = lambda pilot: (0.0, 0.0, 1.0)  # noqa: E731
+    pilots = [Pilot(robot).fly(1.0, lift).fly(6.0, scaled(hostile(seed))) for robot in (python, c)]
+    assert pilots[0].seen == pilots[1].seen
+    assert count.steps >= least
+
+
+def silence(pilot):
+    """Command in jumps, with a pause that leads to HOLD, and at the end no commands at all."""
+    second = pilot.now_ns * 1e-9
+    if 2.0 < second < 3.5 or second > 5.5:
+        return None
+    return (1.0, -1.5, 1.0 if second < 1.0 else 0.0)
+
+
+def test_hold_and_land_fly_the_same_in_c():
+    limits = Limits(fence.LOW, fence.HIGH, hold_max_ns=2000 * MS)
+    python, c = both(limits=limits)
+    count = Count(c)
+    pilots = [Pilot(robot).fly(14.0, silence) for robot in (python, c)]
+    assert pilots[0].seen == pilots[1].seen
+    assert {GuardState.TRACK, GuardState.HOLD, GuardState.LAND} <= pilots[1].states
+    assert count.steps > 900
+
+
+def test_a_contact_with_the_board_flies_the_same_in_c(scene_at):
+    python, c = both(scene_at(8.0, -6.42, 0.9))
+    count = Count(c)
+    policy = lambda pilot: (0.3, 0.0, 0.1)  # noqa: E731
+    pilots = [Pilot(robot).fly(1.5, policy, parts=(10,)) for robot in (python, c)]
+    assert pilots[0].seen == pilots[1].seen
+    assert count.steps > 500
+    assert any(touches and touches[0].body == "board" for touches in pilots[1].seen[7::8])
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("paper", ()),
+        ("paper-verbatim", ()),
+        ("paper", ("link.profile=satellite",)),
+        ("steps", ("link.profile=paper-p3", "cloud.predictor=last_sample")),
+        ("steps", ("world.low_level.integral_limit_xy=0.3", "guard.speed_max_mps=0.5")),
+        ("hover", ("link.profile=ideal",)),
+        ("hover", ("link.uplink.blackouts=[{start_s: 8, duration_s: 3}]",)),
+    ],
+)
+def test_an_experiment_has_the_same_records_in_c(name, settings, monkeypatch):
+    experiment = load_experiment(name, settings)
+    in_c = digest(experiment)
+    monkeypatch.setenv(SWITCH, "0")
+    assert digest(experiment) == in_c
+
+
+def test_observers_and_a_tape_see_every_step():
+    robot = robot_of(NativeRobot)
+    count, seen = Count(robot), []
+    robot.observers.append(type("Seen", (), {"see_step": lambda self, *step: seen.append(step)})())
+    Pilot(robot).fly(1.0, lambda pilot: (0.0, 0.0, 1.0))
+    assert len(seen) == 500
+    robot.observers.clear()
+    robot.simulator.tape = []
+    Pilot(robot).fly(1.0, lambda pilot: (0.0, 0.0, 1.0))
+    assert len(robot.simulator.tape) == 500
+    assert count.steps == 0
+
+
+def test_a_robot_that_moves_from_c_to_python_flies_on_the_same():
+    python, c = both()
+    pilots = Pilot(python), Pilot(c)
+    for pilot in pilots:
+        for _ in range(3):
+            pilot.fly(0.5, lambda pilot: (0.3, 0.0, 1.0))
+            pilot.robot.simulator.tape = []
+            pilot.fly(0.2, lambda pilot: (0.0, -0.3, 0.5))
+            pilot.robot.simulator.tape = None
+    assert pilots[0].seen == pilots[1].seen
+
+
+def test_the_switch_and_the_machine_choose_the_robot(monkeypatch):
+    experiment = load_experiment("hover")
+    identity = Identity(bytes(16), bytes(16))
+    assert isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
+    monkeypatch.setenv(SWITCH, "0")
+    assert not isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
+
+
+@pytest.fixture
+def _untested():
+    native._self_test.cache_clear()
+    yield
+    native._self_test.cache_clear()
+
+
+@pytest.mark.usefixtures("_untested")
+@pytest.mark.parametrize("what", ["other bits", "another MuJoCo"])
+def test_a_failed_self_test_means_python_and_one_warning(what, monkeypatch, caplog):
+    if what == "other bits":
+        flights = iter([[1.0], [1.0 + 2**-52]])
+        monkeypatch.setattr(native, "_fly", lambda robot: next(flights))
+    else:
+        monkeypatch.setattr(native, "make_flight", lambda *parts: {}["mjtNew"])
+    with caplog.at_level(logging.WARNING):
+        assert usable().run is None
+        robot = make_robot(Simulator("pelican", "empty"), LowLevel(), Guard(LIMITS), LIMITS)
+    assert not isinstance(robot, NativeRobot)
+    (warning,) = [record.message for record in caplog.records]
+    assert warning.startswith("all steps run in Python: ")
+    assert usable().text.startswith("Python (")
+
+
+@pytest.mark.usefixtures("_untested")
+def test_the_self_test_sees_a_wrong_number(monkeypatch):
+    monkeypatch.setitem(native.make_flight.__globals__["_VALUES"], "mass", 1.05 + 1e-12)
+    assert usable() == Library(None, "C and Python differ")
