@@ -270,9 +270,11 @@ def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoi
     from cloudrc.drivers.virtual import VirtualRun
     from cloudrc.tunnel.end import Identity
 
-    world = assembly.build_world(experiment, Identity(CLOCK, b"world".ljust(16)))
-    cloud = assembly.build_cloud(experiment, Identity(CLOCK, b"cloud".ljust(16)))
-    return world, cloud, VirtualRun(world, cloud, *assembly.build_links(experiment))
+    links = assembly.build_links(experiment)
+    passes = not any(link.corrupts for link in links)  # only bytes can be damaged
+    world = assembly.build_world(experiment, Identity(CLOCK, b"world".ljust(16), passes=passes))
+    cloud = assembly.build_cloud(experiment, Identity(CLOCK, b"cloud".ljust(16), passes=passes))
+    return world, cloud, VirtualRun(world, cloud, *links)
 
 
 @contextlib.contextmanager

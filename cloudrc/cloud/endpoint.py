@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from math import nan
+from typing import Any
 
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import (
@@ -20,7 +21,14 @@ from cloudrc.cloud.operator import (
     is_for_session,
     make_robot_status,
 )
-from cloudrc.messages import NEVER_NS, GuardState, OperatorRequest, Request, Setpoint
+from cloudrc.messages import (
+    NEVER_NS,
+    Datagram,
+    GuardState,
+    OperatorRequest,
+    Request,
+    Setpoint,
+)
 from cloudrc.records import Arrival, Counted, Fault, MissionEvent, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import LATE, REPEATED, USED
@@ -175,7 +183,7 @@ class CloudEndpoint(TunnelEnd):
         if self._loop.faults:
             self._records += self._loop.take_faults()
 
-    def receive_datagram(self, data: bytes, now_ns: int) -> None:
+    def receive_datagram(self, data: Datagram, now_ns: int) -> None:
         """Handle a datagram that arrived at `now_ns` [ns]; count and drop an invalid datagram."""
         try:
             kind, epoch, counter, body = self._session.open(data)
@@ -241,13 +249,13 @@ class CloudEndpoint(TunnelEnd):
         self._commanded_ns = NEVER_NS
         self._records.append(SessionOpened(now_ns, "cloud", epoch, "world accepted"))
 
-    def _receive_telemetry(self, epoch: int, counter: int, body: bytes, now_ns: int) -> None:
+    def _receive_telemetry(self, epoch: int, counter: int, body: Any, now_ns: int) -> None:
         outcome = self._channel.take(counter)
         if outcome != REPEATED:  # an attacker can repeat datagrams
             self._heard_ns = now_ns
         self._counts[outcome] += 1
         used = outcome == USED
-        telemetry, delay = codec.decode_telemetry(body), nan
+        telemetry, delay = codec.decode_telemetry(body) if type(body) is bytes else body, nan
         if self._clock_is_shared:
             delay = (now_ns - telemetry.stamp_ns - telemetry.slip_ns) * 1e-9
         if outcome != REPEATED or not self._channel.is_flooded:
@@ -301,7 +309,7 @@ class CloudEndpoint(TunnelEnd):
         self._commanded_ns = now_ns
         epoch, counter = self._session.epoch, self._session.next_counter(COMMAND)
         command, control = self._loop.command(setpoint, now_ns, elapsed_ns * 1e-9, epoch, counter)
-        self._send(COMMAND, codec.encode_command(command))
+        self._send_message(COMMAND, command)
         self._records.append(control)
         self._delays = (control.horizon, control.rtt, control.loop_delay)
 

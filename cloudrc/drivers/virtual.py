@@ -13,8 +13,9 @@ from heapq import heappop, heappush
 
 from cloudrc.endpoint import Endpoint
 from cloudrc.link.model import LinkDirection
+from cloudrc.messages import Datagram, Passed
 from cloudrc.records import Record
-from cloudrc.tunnel.codec import peek
+from cloudrc.tunnel.codec import SIZES, peek
 
 Sink = Callable[[list[Record], list[Record]], None]
 """Function that is called with the new records of world and the new records of cloud."""
@@ -38,7 +39,7 @@ class VirtualRun:
         self._world, self._cloud = world, cloud
         self._uplink, self._downlink = uplink, downlink
         self._offset_ns = cloud_clock_offset_ns
-        self._arrivals: list[tuple[int, int, bool, bytes]] = []
+        self._arrivals: list[tuple[int, int, bool, Datagram]] = []
         self._sent = 0
         self.now_ns = 0
 
@@ -92,10 +93,14 @@ class VirtualRun:
                     self._send(datagrams, self._downlink, to_world=True)
         self.now_ns = end_ns
 
-    def _send(self, datagrams: list[bytes], link: LinkDirection, *, to_world: bool) -> None:
+    def _send(self, datagrams: list[Datagram], link: LinkDirection, *, to_world: bool) -> None:
         for data in datagrams:
-            kind, epoch, counter = peek(data)
-            arrivals = link.send(epoch, kind, counter, len(data), self.now_ns)
+            if type(data) is Passed:
+                kind, epoch, counter, _ = data
+                size = SIZES[kind]
+            else:
+                (kind, epoch, counter), size = peek(data), len(data)
+            arrivals = link.send(epoch, kind, counter, size, self.now_ns)
             if link.corrupts and arrivals:
                 data = link.corrupted(epoch, kind, counter, data)
             for arrival_ns in arrivals:

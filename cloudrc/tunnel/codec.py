@@ -20,9 +20,11 @@ from typing import NamedTuple, TypeAlias
 from cloudrc.messages import (
     Cause,
     Command,
+    Datagram,
     GuardState,
     Odometry,
     OperatorRequest,
+    Passed,
     Request,
     Start,
     Telemetry,
@@ -140,11 +142,13 @@ def check(data: bytes) -> Header:
     return header
 
 
-def peek(data: bytes) -> tuple[int, int, int]:
+def peek(data: Datagram) -> tuple[int, int, int]:
     """Read kind, epoch and counter of a datagram without any check, for the link and for logs.
 
     Raise the DecodeError "malformed" if the datagram is shorter than a header.
     """
+    if isinstance(data, Passed):
+        return data[:3]
     if len(data) < HEADER_SIZE:
         raise DecodeError("malformed")
     _, _, epoch, kind, counter = _unpack_header(data)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections import defaultdict
 from dataclasses import dataclass
 
+from cloudrc.messages import Command, Datagram, Telemetry
 from cloudrc.records import Record
 from cloudrc.tunnel.channel import Channel
-from cloudrc.tunnel.codec import Direction
+from cloudrc.tunnel.codec import Direction, encode_command, encode_telemetry
 from cloudrc.tunnel.handshake import HandshakeLog
 from cloudrc.tunnel.keys import KeyRing
 from cloudrc.tunnel.session import Session
@@ -21,11 +22,13 @@ class Identity:
         clock_id: 16 bytes that identify the monotonic clock of this machine.
         nonce: 16 random bytes that identify this process.
         ring: The pre-shared keys; None if both ends are in one process.
+        passes: Whether both ends pass their frequent messages on as they are, not as bytes.
     """
 
     clock_id: bytes
     nonce: bytes
     ring: KeyRing | None = None
+    passes: bool = False
 
 
 class TunnelEnd:
@@ -37,7 +40,7 @@ class TunnelEnd:
         self._channel = Channel(newest_wins)
         self._complaints = HandshakeLog()
         self._clock_is_shared = False
-        self._datagrams: list[bytes] = []
+        self._datagrams: list[Datagram] = []
         self._records: list[Record] = []
         self._counts: defaultdict[str, int] = defaultdict(int)
 
@@ -51,7 +54,7 @@ class TunnelEnd:
         """Whether the datagrams are encrypted and authenticated."""
         return self._session.sealed
 
-    def take_datagrams(self) -> list[bytes]:
+    def take_datagrams(self) -> list[Datagram]:
         """Return the outgoing datagrams that were made since the last call."""
         datagrams, self._datagrams = self._datagrams, []
         return datagrams
@@ -64,6 +67,15 @@ class TunnelEnd:
     def _send(self, kind: int, body: bytes) -> None:
         self._datagrams.append(self._session.seal(kind, body))
         self._counts["sent"] += 1
+
+    def _send_message(self, kind: int, message: Telemetry | Command) -> None:
+        if self._identity.passes:
+            self._datagrams.append(self._session.pass_on(kind, message))
+            self._counts["sent"] += 1
+        elif isinstance(message, Command):
+            self._send(kind, encode_command(message))
+        else:
+            self._send(kind, encode_telemetry(message))
 
     def _queue(self, datagrams: list[bytes]) -> None:
         self._datagrams += datagrams

@@ -19,6 +19,7 @@ from math import hypot, isnan, nan
 from cloudrc.messages import (
     NEVER_NS,
     Command,
+    Datagram,
     GuardState,
     Odometry,
     OperatorRequest,
@@ -214,13 +215,14 @@ class WorldEndpoint(TunnelEnd):
         self._session.follow_keys()
         self._advance(self._follow(now_ns) + 1)
 
-    def receive_datagram(self, data: bytes, now_ns: int) -> None:
+    def receive_datagram(self, data: Datagram, now_ns: int) -> None:
         """Handle a datagram that arrived at `now_ns` [ns]; count and drop an invalid datagram."""
         world_ns = self._follow(now_ns)
         try:
             kind, epoch, counter, body = self._session.open(data)
             if kind == COMMAND:
-                self._receive_command(epoch, counter, body, now_ns, world_ns)
+                command = codec.decode_command(body) if type(body) is bytes else body
+                self._receive_command(epoch, counter, command, now_ns, world_ns)
             elif kind == Kind.HELLO:
                 self._advance(world_ns)
                 self._receive_hello(codec.decode_hello(body), counter, now_ns)
@@ -303,7 +305,7 @@ class WorldEndpoint(TunnelEnd):
             )
             telemetry = _new(Telemetry, known)
             counter = self._session.next_counter(TELEMETRY)
-            self._send(TELEMETRY, codec.encode_telemetry(telemetry))
+            self._send_message(TELEMETRY, telemetry)
             records.append(_new(TelemetrySent, (now_ns, epoch, counter, telemetry)))
         if now_ns >= self._count_ns:
             self._count_ns += COUNT_PERIOD_NS
@@ -350,9 +352,9 @@ class WorldEndpoint(TunnelEnd):
                 observer.see_request(request, tick_ns)
 
     def _receive_command(
-        self, epoch: int, counter: int, body: bytes, now_ns: int, world_ns: int
+        self, epoch: int, counter: int, command: Command, now_ns: int, world_ns: int
     ) -> None:
-        command, guard = codec.decode_command(body), self.robot.guard
+        guard = self.robot.guard
         outcome = self._channel.take(counter)
         if outcome != REPEATED:
             self._door.hear(now_ns)
