@@ -6,7 +6,6 @@ the time that a numpy slice assignment takes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import dist
 from struct import Struct
 from typing import Any
@@ -41,6 +40,7 @@ class Simulator:
         data: The `MjData` of the simulation.
         dt: Duration of a step [s].
         steps: Number of steps since the last reset.
+        contacts: Number of contacts in the last step.
         tip_force_peak: Largest force on the arm's tip since the last call of `take_tip_force` [N].
         tip_impulse: Integral over time of the force on the tip since that call [N s].
         touches: Contacts that began since the last call of `take_contacts`.
@@ -77,7 +77,7 @@ class Simulator:
         mujoco.mj_resetData(self.model, self.data)
         mujoco.mj_forward(self.model, self.data)
         self._rotors.speeds = STOPPED
-        self.steps = self._contacts = 0
+        self.steps = self.contacts = 0
         self.tip_force_peak = self.tip_impulse = 0.0
         if self.tape is not None:
             self.tape.clear()
@@ -104,23 +104,28 @@ class Simulator:
         self.steps += 1
         self._readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
         contacts = data.ncon
-        if contacts or self._contacts:
+        if contacts or self.contacts:
             self._feel(contacts, before)
 
     def take_over(
-        self, steps: int, rotor_speeds: RotorSpeeds, before: Callable[[], Readings]
+        self,
+        rotor_speeds: RotorSpeeds,
+        tip_force_peak: float,
+        tip_impulse: float,
+        contacts: int,
+        steps: int,
+        before: Readings | None,
     ) -> None:
-        """Continue after `steps` steps that `native/step.c` has run on `data`.
+        """Continue after steps that `native/step.c` has run on `data`; the arguments are the state.
 
-        Only the last step may have a contact, or be the end of a contact. `rotor_speeds` are the
-        actual speeds [rad/s], shape (4,). `before` returns the readings at the beginning of the
-        last step.
+        `rotor_speeds` are the actual speeds [rad/s], shape (4,). `before` is None, or the readings
+        at the beginning of the last step if the contacts of this step have to be checked.
         """
-        self.steps += steps
         self._rotors.speeds, self._readings = rotor_speeds, None
-        contacts = self.data.ncon
-        if contacts or self._contacts:
-            self._feel(contacts, before())
+        self.tip_force_peak, self.tip_impulse = tip_force_peak, tip_impulse
+        self.contacts, self.steps = contacts, steps
+        if before:
+            self._note_contacts(before)
 
     @property
     def readings(self) -> Readings:
@@ -132,9 +137,10 @@ class Simulator:
         return readings
 
     @property
-    def touching(self) -> bool:
-        """Whether the robot touched something in the last step."""
-        return self._contacts != 0
+    def tip_sensor(self) -> npt.NDArray[np.float64]:
+        """MuJoCo's value of `tip_force`, which it changes in every step [N], shape (1,)."""
+        found: npt.NDArray[np.float64] = self.data.sensordata[self._tip_sensor :][:1]
+        return found
 
     @property
     def touch_age(self) -> float:
@@ -179,9 +185,9 @@ class Simulator:
         if force > self.tip_force_peak:
             self.tip_force_peak = force
         # Check at once if the number of contacts has changed, else only every few steps.
-        if contacts and (contacts != self._contacts or self.steps % CONTACT_CHECK_STEPS == 0):
+        if contacts and (contacts != self.contacts or self.steps % CONTACT_CHECK_STEPS == 0):
             self._note_contacts(before)
-        self._contacts = contacts
+        self.contacts = contacts
 
     def _note_contacts(self, before: Readings) -> None:
         """Store the new contacts with the state of the robot before the step, `before`."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import ctypes
-from math import prod
+from math import dist, prod
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import NEVER_NS
@@ -14,9 +16,23 @@ from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard import state
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.scene import mujoco
-from cloudrc.world.simulator import Simulator
+from cloudrc.world.simulator import CONTACT_CHECK_STEPS, Simulator
 
-_POINTERS = ("mj_step", "model", "data", "qpos", "qvel", "ctrl", "applied", "contacts")
+_POINTERS = (
+    *("mj_step", "model", "data", "qpos", "qvel", "ctrl", "applied"),
+    *("tip_force", "contacts", "disable", "obstacles"),
+)
+ACCELERATION_MAX = 200.0
+"""Limit of the robot's acceleration [m/s^2]: all thrust on a robot that is 10 % lighter gives 153."""
+MARGIN = 1e-3
+"""Distance that is added to every geom [m]; it covers rounding errors."""
+HUGE = 1e4
+"""Half the edge of the box that stands for the space below a plane [m]."""
+_DISABLE = mujoco.mjtDisableBit
+UNUSED_WITHOUT_CONTACTS = int(
+    _DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT | _DISABLE.mjDSBL_SENSOR
+)
+"""Parts of MuJoCo that do nothing while the robot touches nothing."""
 _CONSTANTS = {
     rotors: "thrust_coefficient torque_ratio drag_coefficient arm height",
     low_level: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
@@ -36,9 +52,13 @@ _FIELDS: dict[str, Any] = {
     **dict.fromkeys([*_VALUES, "up", "down"], _double),
     **{"gains": _double * 9, "limit_xy": _double, "limit_z": _double, "dt": _double},
     **{"change_max": _double, "low_z": _double, "low": _double * 3, "high": _double * 3},
+    **dict.fromkeys(("time_step", "robot_radius", "acceleration_max"), _double),
     **dict.fromkeys(("recheck_ns", "never_ns", "step_ns"), _int64),
+    **dict.fromkeys(("check_steps", "obstacle_count", "unused"), _int64),
     **{"reference": _double * 3, "wanted": _double * 3},
     **dict.fromkeys(("settled", "steady_until_ns", "track_until_ns"), _int64),
+    **{"force_peak": _double, "impulse": _double},
+    **dict.fromkeys(("touching", "steps", "is_news", "free_steps"), _int64),
     **{"speeds": _double * 4, "integral": _double * 3, "error": _double * 3},
     **{"has_error": _int64, "before": _double * 13},
 }
@@ -60,18 +80,47 @@ def make_flight(
     model, data = simulator.model, simulator.data
     turning, (low, high) = rotors.Rotors(simulator.dt), limits.inner_corners()
     limit_xy, limit_z, dt = controller.limits
-    arrays = data.qpos, data.qvel, data.ctrl, data.qfrc_applied
-    return Flight(
+    arrays = data.qpos, data.qvel, data.ctrl, data.qfrc_applied, simulator.tip_sensor
+    flags = model.opt.gravity.ctypes.data - _offset("mjOption", "gravity")
+    flags += _offset("mjOption", "disableflags")
+    obstacles, radius = _obstacles(model, data)
+    flight = Flight(
         ctypes.cast(_mujoco_library().mj_step, ctypes.c_void_p),
         *(model._address, data._address),  # MuJoCo has no public name for them
         *(array.ctypes.data for array in arrays),
-        data._address + _contacts_offset(),
+        *(data._address + _offset("mjData", "ncon"), flags, obstacles.ctypes.data),
         *_VALUES.values(),
         *(turning.up, turning.down, controller.gains, limit_xy, limit_z, dt),
         limits.acceleration_max * (step_ns * 1e-9),
         low[2] - FLOOR_MARGIN + rules.LOW_HEIGHT,
-        *(low, high, rules.RECHECK_NS, NEVER_NS, step_ns),
+        *(low, high, simulator.dt, radius, ACCELERATION_MAX, rules.RECHECK_NS, NEVER_NS, step_ns),
+        *(CONTACT_CHECK_STEPS, len(obstacles), UNUSED_WITHOUT_CONTACTS),
     )
+    flight.keep = obstacles
+    return flight
+
+
+def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
+    """Return a box with rounded edges around each geom of the scene, and the robot's radius [m].
+
+    A row has the centre (3,) and the axes (9,) of the box, its half sizes (3,), and the radius of
+    the edges, all [m]. The radius of the robot is that of a ball around its base's origin.
+    """
+    rows, radius = [], 0.0
+    for geom in range(model.ngeom):
+        size, bound = model.geom_size[geom], model.geom_rbound[geom]
+        place, axes = data.geom_xpos[geom], data.geom_xmat[geom]
+        margin = model.geom_margin[geom] + MARGIN
+        if model.geom_bodyid[geom]:  # a geom of the robot; those of the scene are fused to body 0
+            radius = max(radius, dist(place, data.qpos[:3]) + bound + margin)
+        elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+            rows.append([*place, *axes, *size, margin])
+        elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
+            normal = axes.reshape(3, 3)[:, 2]
+            rows.append([*(place - HUGE * normal), *axes, HUGE, HUGE, HUGE, margin])
+        else:
+            rows.append([*place, *axes, 0.0, 0.0, 0.0, bound + margin])
+    return np.array(rows), radius
 
 
 def _mujoco_library() -> ctypes.CDLL:
@@ -83,20 +132,20 @@ def _mujoco_library() -> ctypes.CDLL:
     return ctypes.CDLL(str(files[0]))
 
 
-def _contacts_offset() -> int:
-    """Return where `ncon`, the number of contacts, is in `mjData` [bytes].
+def _offset(struct: str, name: str) -> int:
+    """Return where a field is in a structure of MuJoCo [bytes].
 
     The place depends on MuJoCo's version. The package describes its structures.
     """
     from mujoco.introspect import structs
 
     fields = []
-    for field in structs.STRUCTS["mjData"].fields:
+    for field in structs.STRUCTS[struct].fields:
         fields.append((field.name, _ctype(field.type, structs.STRUCTS)))
-        if field.name == "ncon":
+        if field.name == name:
             break
-    layout: Any = type("mjData", (ctypes.Structure,), {"_fields_": fields})
-    offset: int = layout.ncon.offset
+    layout = type(struct, (ctypes.Structure,), {"_fields_": fields})
+    offset: int = getattr(layout, name).offset
     return offset
 
 

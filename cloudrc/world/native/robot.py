@@ -18,10 +18,10 @@ from cloudrc.world.readings import Readings
 from cloudrc.world.robot import STEP_NS, Robot
 from cloudrc.world.simulator import Simulator
 
-_TRACK, _MEMORY, _BEFORE = Flight.reference.offset, Flight.speeds.offset, Flight.before.offset
-_pack_track, _unpack_track = Struct("6d3q").pack_into, Struct("3d24xqq").unpack_from
-_pack_memory, _unpack_memory = Struct("10dq").pack_into, Struct("32x6d").unpack_from
-_unpack_speeds, _unpack_before = Struct("4d").unpack_from, Struct("13d").unpack_from
+_TRACK, _MEMORY, _BEFORE = Flight.reference.offset, Flight.free_steps.offset, Flight.before.offset
+_pack_track, _unpack_track = Struct("6d3q2d2q").pack_into, Struct("3d24x2q8x2d3q8x4d").unpack_from
+_pack_memory, _unpack_memory = Struct("q10dq").pack_into, Struct("40x6d").unpack_from
+_unpack_before = Struct("13d").unpack_from
 
 
 def make_robot(simulator: Simulator, low_level: LowLevel, guard: Guard, limits: Limits) -> Robot:
@@ -79,24 +79,26 @@ class NativeRobot(Robot):
         flight, simulator = self._flight, self.simulator
         (ax, ay, az), (bx, by, bz), steady_ns, track_ns = track
         settled = track[0] is track[1]
-        _pack_track(flight, _TRACK, ax, ay, az, bx, by, bz, settled, steady_ns, track_ns)
+        # fmt: off
+        _pack_track(
+            flight, _TRACK, ax, ay, az, bx, by, bz, settled, steady_ns, track_ns,
+            simulator.tip_force_peak, simulator.tip_impulse, simulator.contacts, simulator.steps,
+        )
+        # fmt: on
         if not self._in_c:
             integral, error = self._low_level.memory
             memory = (*integral, *(error or integral), error is not None)
-            _pack_memory(flight, _MEMORY, *simulator.rotor_speeds, *memory)
-        ran = False
-        while tick_ns < until_ns:
-            # During a contact, the simulator looks at the contact after every step.
-            stop_ns = tick_ns + STEP_NS if simulator.touching else until_ns
-            steps = self._run_steps(self._address, tick_ns, stop_ns)
-            if not steps:
-                break
-            tick_ns, ran = tick_ns + steps * STEP_NS, True
-            simulator.take_over(steps, _unpack_speeds(flight, _MEMORY), self._before)
-        if ran:
+            _pack_memory(flight, _MEMORY, 0, *simulator.rotor_speeds, *memory)
+        while steps := self._run_steps(self._address, tick_ns, until_ns):
+            tick_ns += steps * STEP_NS
             self._in_c = True
-            ax, ay, az, settled, steady_ns = _unpack_track(flight, _TRACK)
+            ax, ay, az, settled, steady_ns, *touch, is_news, front, left, back, right = (
+                _unpack_track(flight, _TRACK)
+            )
             self.guard.continue_track(None if settled else (ax, ay, az), steady_ns)
+            simulator.take_over((front, left, back, right), *touch, is_news and self._before())
+            if not is_news:
+                break
         return tick_ns
 
     def _before(self) -> Readings:

@@ -9,6 +9,7 @@
      is_free       guard.limits.limit_to_fence, if it changes nothing
      update        low_level.LowLevel.update
      turn_rotors   rotors.Rotors.step, simulator.Simulator.step
+     feel          simulator.Simulator._feel
 
    Every sum and product has the order of the Python code. Compile without contraction of
    a * b + c, and without fast-math. The only function from outside, apart from mj_step, is sqrt,
@@ -19,14 +20,21 @@ typedef long long i64;
 double sqrt(double);
 
 /* Shared with Python: flight.py has the same fields, all of 8 bytes, in the same order. */
+typedef struct { /* a box with rounded edges that contains a geom of the scene */
+  double centre[3], axes[9], half[3], radius;
+} Obstacle;
+
 typedef struct {
-  /* MuJoCo: mj_step, its arguments, arrays of mjData, and the address of its number of contacts. */
+  /* MuJoCo: mj_step, its arguments, arrays and numbers of mjData, and the model's flags. */
   void (*mj_step)(const void *model, void *data);
   const void *model;
   void *data;
   const double *qpos, *qvel;
   double *ctrl, *applied;
+  const double *tip_force;
   const int *contacts;
+  int *disable;
+  const Obstacle *obstacles;
   /* Constants of the Python modules rotors, low_level and guard, with the same names. */
   double thrust_coefficient, torque_ratio, drag_coefficient, arm, height;
   double mass, gravity, tilt_gain, yaw_gain, tilt_rate_gain, yaw_rate_gain;
@@ -36,11 +44,15 @@ typedef struct {
   /* Values of this robot: gains and limits of the controller, corners of the fence, and so on. */
   double up, down, gains[9], limit_xy, limit_z, dt;
   double change_max, low_z, low[3], high[3];
-  i64 recheck_ns, never_ns, step_ns;
+  double time_step, robot_radius, acceleration_max;
+  i64 recheck_ns, never_ns, step_ns, check_steps, obstacle_count, unused;
   /* State, which Python reads and writes between two runs. */
   double reference[3], wanted[3];
   i64 settled; /* whether Python's `reference` is the object `wanted` */
   i64 steady_until_ns, track_until_ns;
+  double force_peak, impulse;
+  i64 touching, steps, is_news; /* number of contacts; whether Python has to look at them */
+  i64 free_steps; /* steps without contact that are sure; below 0: steps until the next look */
   double speeds[4], integral[3], error[3];
   i64 has_error;
   double before[13]; /* position, orientation and velocities at the beginning of the last step */
@@ -184,11 +196,65 @@ static void turn_rotors(Flight *f, const Readings *r, const double *commands) {
   f->applied[5] = across_y * u - across_x * w - f->arm * f->arm * total * rate[2];
 }
 
+/* Measure the tip's force, and note in is_news whether Python has to look at the contacts. */
+static void feel(Flight *f) {
+  i64 contacts = *f->contacts, before = f->touching;
+  f->is_news = 0;
+  if (!contacts && !before) return;
+  double force = *f->tip_force;
+  f->impulse += force * f->time_step;
+  if (force > f->force_peak) f->force_peak = force;
+  f->is_news = contacts && (contacts != before || f->steps % f->check_steps == 0);
+  f->touching = contacts;
+}
+
+/* Return for how many steps nothing can touch a ball around the robot. The speed grows by at most
+   acceleration_max. */
+static i64 free_steps(const Flight *f, const double *position, const double *velocity) {
+  double nearest = 1e6, speed = 0.0, most = f->acceleration_max;
+  for (const Obstacle *o = f->obstacles; o < f->obstacles + f->obstacle_count; o++) {
+    double square = 0.0;
+    for (int axis = 0; axis < 3; axis++) {
+      double along = 0.0;
+      for (int i = 0; i < 3; i++) along += o->axes[3 * i + axis] * (position[i] - o->centre[i]);
+      double beyond = (along < 0.0 ? -along : along) - o->half[axis];
+      if (beyond > 0.0) square += beyond * beyond;
+    }
+    double distance = sqrt(square) - o->radius;
+    if (distance < nearest) nearest = distance;
+  }
+  nearest -= f->robot_radius;
+  if (!(nearest > 0.0)) return 0;
+  for (int i = 0; i < 3; i++) speed += velocity[i] * velocity[i];
+  speed = sqrt(speed);
+  double duration = (sqrt(speed * speed + 2.0 * most * nearest) - speed) / most;
+  i64 steps = (i64)(duration / f->time_step) - 1;
+  return steps > 100 ? 100 : steps;
+}
+
+/* Do a step of MuJoCo. While nothing can touch the robot, MuJoCo need not look for contacts: the
+   flags for that change no bit of the result. */
+static void step_physics(Flight *f, const Readings *r) {
+  if (f->free_steps == 0 && !f->touching) {
+    f->free_steps = free_steps(f, r->pose, r->twist);
+    if (f->free_steps <= 0) f->free_steps = -5;
+  }
+  int disabled = *f->disable;
+  if (f->free_steps > 0) {
+    *f->disable = disabled | (int)f->unused;
+    f->free_steps--;
+  } else if (f->free_steps < 0)
+    f->free_steps++;
+  f->mj_step(f->model, f->data);
+  *f->disable = disabled;
+}
+
 /* Run steps from now_ns up to until_ns [ns]; return their number. The run ends early before a step
-   that Python has to do, and after a step with a contact. */
+   that Python has to do, and after a step with new contacts. */
 i64 cloudrc_run(Flight *f, i64 now_ns, i64 until_ns) {
   i64 steps = 0;
-  for (; now_ns < until_ns; now_ns += f->step_ns) {
+  f->is_news = 0;
+  for (; now_ns < until_ns && !f->is_news; now_ns += f->step_ns) {
     Readings r;
     double commands[4];
     read(f, &r);
@@ -197,9 +263,9 @@ i64 cloudrc_run(Flight *f, i64 now_ns, i64 until_ns) {
     for (int i = 0; i < 6; i++) f->before[7 + i] = r.twist[i];
     update(f, &r, commands);
     turn_rotors(f, &r, commands);
-    f->mj_step(f->model, f->data);
-    steps++;
-    if (*f->contacts) break;
+    step_physics(f, &r);
+    f->steps++, steps++;
+    feel(f);
   }
   return steps;
 }
