@@ -20,7 +20,7 @@ from cloudrc.world.simulator import CONTACT_CHECK_STEPS, Simulator
 
 _POINTERS = (
     *("mj_step", "model", "data", "qpos", "qvel", "ctrl", "applied"),
-    *("tip_force", "contacts", "disable", "obstacles"),
+    *("tip_force", "contacts", "disable", "timer", "obstacles"),
 )
 ACCELERATION_MAX = 200.0
 """Limit of the robot's acceleration [m/s^2]: all thrust on a robot that is 10 % lighter gives 153."""
@@ -84,11 +84,13 @@ def make_flight(
     flags = model.opt.gravity.ctypes.data - _offset("mjOption", "gravity")
     flags += _offset("mjOption", "disableflags")
     obstacles, radius = _obstacles(model, data)
+    library = _mujoco_library()
+    timer = ctypes.addressof(ctypes.c_void_p.in_dll(library, "mjcb_time"))
     flight = Flight(
-        ctypes.cast(_mujoco_library().mj_step, ctypes.c_void_p),
+        ctypes.cast(library.mj_step, ctypes.c_void_p),
         *(model._address, data._address),  # MuJoCo has no public name for them
         *(array.ctypes.data for array in arrays),
-        *(data._address + _offset("mjData", "ncon"), flags, obstacles.ctypes.data),
+        *(data._address + _offset("mjData", "ncon"), flags, timer, obstacles.ctypes.data),
         *_VALUES.values(),
         *(turning.up, turning.down, controller.gains, limit_xy, limit_z, dt),
         limits.acceleration_max * (step_ns * 1e-9),
