@@ -21,7 +21,6 @@ from cloudrc.messages import (
     Command,
     Datagram,
     GuardState,
-    Odometry,
     OperatorRequest,
     Request,
     Start,
@@ -277,8 +276,7 @@ class WorldEndpoint(TunnelEnd):
         simulator, guard, records = self.robot.simulator, self.robot.guard, self._records
         orders = self._orders
         tip_force = simulator.tip_force()
-        position, orientation, velocity, rate, _ = simulator.readings
-        truth = _new(Odometry, (now_ns, position, orientation, velocity, rate))
+        truth = simulator.truth(now_ns)
         forces = (tip_force, *simulator.take_tip_force())
         records.append(_new(GroundTruth, (now_ns, truth, *forces, guard.reference)))
         if guard.changes:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cloudrc.messages import Vector
+from cloudrc.messages import Odometry, Vector
 from cloudrc.records import Contact
 from cloudrc.world.readings import Readings, RotorSpeeds
 from cloudrc.world.rotors import STOPPED, Controls, Rotors
@@ -29,6 +29,7 @@ _mj_step = mujoco.mj_step
 _pack_ctrl = Struct("4d").pack_into
 _pack_applied = Struct("6d").pack_into
 _unpack_pose, _unpack_twist = Struct("7d").unpack_from, Struct("6d").unpack_from
+_new = tuple.__new__
 _readings_of = Readings.of  # looking up a class method binds it anew each time
 
 
@@ -135,6 +136,12 @@ class Simulator:
             readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
             self._readings = readings
         return readings
+
+    def truth(self, now_ns: int) -> Odometry:
+        """Return the true odometry after the last step, with the stamp `now_ns` [ns]."""
+        px, py, pz, w, x, y, z = _unpack_pose(self._qpos)
+        vx, vy, vz, p, q, r = _unpack_twist(self._qvel)
+        return _new(Odometry, (now_ns, (px, py, pz), (w, x, y, z), (vx, vy, vz), (p, q, r)))
 
     @property
     def tip_sensor(self) -> npt.NDArray[np.float64]:

@@ -13,14 +13,14 @@ from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import NEVER_NS
 from cloudrc.world import low_level, rotors
 from cloudrc.world.guard import limits as rules
-from cloudrc.world.guard import state
+from cloudrc.world.guard import hold, state
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.scene import mujoco
 from cloudrc.world.simulator import CONTACT_CHECK_STEPS, Simulator
 
 _POINTERS = (
     *("mj_step", "model", "data", "qpos", "qvel", "ctrl", "applied"),
-    *("tip_force", "contacts", "disable", "timer", "obstacles"),
+    *("tip_force", "contacts", "disable", "geoms", "timer", "obstacles"),
 )
 ACCELERATION_MAX = 200.0
 """Limit of the robot's acceleration [m/s^2]: all thrust on a robot that is 10 % lighter gives 153."""
@@ -38,6 +38,7 @@ _CONSTANTS = {
     low_level: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
     "thrust_max tiny nose_cosine_min yaw_sine_max",
     state: "overturned_cosine",
+    hold: "lift_off_height",
     rules: "sink_lead_max fence_reaction reaction stop_coefficient recheck_distance far",
 }
 """Modules and their constants that `step.c` needs, in the order of its fields."""
@@ -55,7 +56,7 @@ _FIELDS: dict[str, Any] = {
     **dict.fromkeys(("time_step", "robot_radius", "acceleration_max"), _double),
     **dict.fromkeys(("recheck_ns", "never_ns", "step_ns"), _int64),
     **dict.fromkeys(("check_steps", "obstacle_count", "unused"), _int64),
-    **{"reference": _double * 3, "wanted": _double * 3},
+    **{"ground": _double, "reference": _double * 3, "wanted": _double * 3},
     **dict.fromkeys(("settled", "steady_until_ns", "track_until_ns"), _int64),
     **{"force_peak": _double, "impulse": _double},
     **dict.fromkeys(("touching", "steps", "is_news", "free_steps"), _int64),
@@ -83,6 +84,7 @@ def make_flight(
     arrays = data.qpos, data.qvel, data.ctrl, data.qfrc_applied, simulator.tip_sensor
     flags = model.opt.gravity.ctypes.data - _offset("mjOption", "gravity")
     flags += _offset("mjOption", "disableflags")
+    geoms = model._address + _offset("mjModel", "ngeom")
     obstacles, radius = _obstacles(model, data)
     library = _mujoco_library()
     timer = ctypes.addressof(ctypes.c_void_p.in_dll(library, "mjcb_time"))
@@ -90,7 +92,7 @@ def make_flight(
         ctypes.cast(library.mj_step, ctypes.c_void_p),
         *(model._address, data._address),  # MuJoCo has no public name for them
         *(array.ctypes.data for array in arrays),
-        *(data._address + _offset("mjData", "ncon"), flags, timer, obstacles.ctypes.data),
+        *(data._address + _offset("mjData", "ncon"), flags, geoms, timer, obstacles.ctypes.data),
         *_VALUES.values(),
         *(turning.up, turning.down, controller.gains, limit_xy, limit_z, dt),
         limits.acceleration_max * (step_ns * 1e-9),

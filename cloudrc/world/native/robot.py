@@ -18,8 +18,8 @@ from cloudrc.world.readings import Readings
 from cloudrc.world.robot import STEP_NS, Robot
 from cloudrc.world.simulator import Simulator
 
-_TRACK, _MEMORY, _BEFORE = Flight.reference.offset, Flight.free_steps.offset, Flight.before.offset
-_pack_track, _unpack_track = Struct("6d3q2d2q").pack_into, Struct("3d24x2q8x2d3q8x4d").unpack_from
+_TRACK, _MEMORY, _BEFORE = Flight.ground.offset, Flight.free_steps.offset, Flight.before.offset
+_pack_track, _unpack_track = Struct("7d3q2d2q").pack_into, Struct("8x3d24x2q8x2d3q8x4d").unpack_from
 _pack_memory, _unpack_memory = Struct("q10dq").pack_into, Struct("40x6d").unpack_from
 _unpack_before = Struct("13d").unpack_from
 
@@ -63,43 +63,46 @@ class NativeRobot(Robot):
 
     def run(self, tick_ns: int, until_ns: int) -> int:
         """Run steps, as `Robot` does: the first ones in C, if they are usual steps."""
-        if not self.observers and self.simulator.tape is None:
-            if track := self.guard.plain_track(tick_ns):
-                tick_ns = self._run_in_c(track, tick_ns, until_ns)
-        if tick_ns < until_ns:
-            if self._in_c:
-                numbers = _unpack_memory(self._flight, _MEMORY)
-                self._low_level.memory = numbers[:3], numbers[3:]
-                self._in_c = False
-            return super().run(tick_ns, until_ns)
-        return tick_ns
+        simulator, guard = self.simulator, self.guard
+        if not self.observers and simulator.tape is None and (track := guard.plain_track(tick_ns)):
+            self._give(*track)
+            while steps := self._run_steps(self._address, tick_ns, until_ns):
+                tick_ns += steps * STEP_NS
+                self._in_c = True
+                # fmt: off
+                (
+                    x, y, z, settled, steady_ns, peak, impulse, contacts, total, news,
+                    front, left, back, right,
+                ) = _unpack_track(self._flight, _TRACK)
+                # fmt: on
+                guard.continue_track(None if settled else (x, y, z), steady_ns)
+                before = self._before() if news else None
+                speeds = (front, left, back, right)
+                simulator.take_over(speeds, peak, impulse, contacts, total, before)
+                if tick_ns >= until_ns:
+                    return tick_ns
+        if self._in_c:
+            numbers = _unpack_memory(self._flight, _MEMORY)
+            self._low_level.memory = numbers[:3], numbers[3:]
+            self._in_c = False
+        return super().run(tick_ns, until_ns)
 
-    def _run_in_c(self, track: tuple[Vector, Vector, int, int], tick_ns: int, until_ns: int) -> int:
-        """Run steps until one is not usual; `track` is the result of `Guard.plain_track`."""
-        flight, simulator = self._flight, self.simulator
-        (ax, ay, az), (bx, by, bz), steady_ns, track_ns = track
-        settled = track[0] is track[1]
+    def _give(
+        self, ground: float, reference: Vector, wanted: Vector, steady_ns: int, track_ns: int
+    ) -> None:
+        """Give C the state before its first step; the arguments are from `Guard.plain_track`."""
+        simulator, (x, y, z), (to_x, to_y, to_z) = self.simulator, reference, wanted
         # fmt: off
         _pack_track(
-            flight, _TRACK, ax, ay, az, bx, by, bz, settled, steady_ns, track_ns,
-            simulator.tip_force_peak, simulator.tip_impulse, simulator.contacts, simulator.steps,
+            self._flight, _TRACK, ground, x, y, z, to_x, to_y, to_z, reference is wanted,
+            steady_ns, track_ns, simulator.tip_force_peak, simulator.tip_impulse,
+            simulator.contacts, simulator.steps,
         )
         # fmt: on
         if not self._in_c:
             integral, error = self._low_level.memory
             memory = (*integral, *(error or integral), error is not None)
-            _pack_memory(flight, _MEMORY, 0, *simulator.rotor_speeds, *memory)
-        while steps := self._run_steps(self._address, tick_ns, until_ns):
-            tick_ns += steps * STEP_NS
-            self._in_c = True
-            ax, ay, az, settled, steady_ns, *touch, is_news, front, left, back, right = (
-                _unpack_track(flight, _TRACK)
-            )
-            self.guard.continue_track(None if settled else (ax, ay, az), steady_ns)
-            simulator.take_over((front, left, back, right), *touch, is_news and self._before())
-            if not is_news:
-                break
-        return tick_ns
+            _pack_memory(self._flight, _MEMORY, 0, *simulator.rotor_speeds, *memory)
 
     def _before(self) -> Readings:
         numbers = _unpack_before(self._flight, _BEFORE)
