@@ -69,9 +69,6 @@ class LinkDirection:
         self._only = self._timeline.only()
         self._plain = not profile.keep_order and all(p.rate is None for p in self._timeline.pieces)
         self._fates: dict[tuple[int, int, int, float, Loss], list[Fate]] = {}
-        self._stream: tuple[int, int, int] | None = None
-        self._conditions: Conditions | None = None
-        self._table: list[Fate] = []
 
     def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
         """Send one packet of `size` bytes of UDP payload at `now_ns` [ns]; compute when it arrives.
@@ -89,15 +86,10 @@ class LinkDirection:
         if conditions.blackout:
             self._counts["blackout"] += 1
             return ()
-        index = counter % BLOCK
-        stream = (epoch, kind, counter - index)
-        if stream == self._stream and conditions is self._conditions:  # nearly always: save time
-            fate = self._table[index]
-        else:
-            key = (epoch, kind, counter // BLOCK, conditions.jitter, conditions.loss)
-            self._table = self._fates.get(key) or self._draw(key)
-            self._stream, self._conditions = stream, conditions
-            fate = self._table[index]
+        block, index = divmod(counter, BLOCK)
+        key = (epoch, kind, block, conditions.jitter, conditions.loss)
+        table = self._fates.get(key) or self._draw(key)
+        fate = table[index]
         if len(fate) == 1 and self._plain:  # nearly all packets: save time
             self._counts["passed"] += 1
             delay_ns = conditions.delay_ns + fate[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from math import dist, prod
+from math import dist, inf, prod
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ import numpy as np
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import NEVER_NS
 from cloudrc.world import low_level, rotors
-from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard import hold, state
+from cloudrc.world.guard import limits as rules
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.scene import mujoco
 from cloudrc.world.simulator import CONTACT_CHECK_STEPS, Simulator
@@ -23,9 +23,9 @@ _POINTERS = (
     *("tip_force", "contacts", "disable", "geoms", "timer", "obstacles"),
 )
 ACCELERATION_MAX = 200.0
-"""Limit of the robot's acceleration [m/s^2]: all thrust on a robot that is 10 % lighter gives 153."""
+"""Limit of the robot's acceleration [m/s^2]. Full thrust gives a robot 10 % lighter 153 m/s^2."""
 MARGIN = 1e-3
-"""Distance that is added to every geom [m]; it covers rounding errors."""
+"""Distance that is added to every geom and its own margin [m]; it covers rounding errors."""
 HUGE = 1e4
 """Half the edge of the box that stands for the space below a plane [m]."""
 _DISABLE = mujoco.mjtDisableBit
@@ -108,13 +108,16 @@ def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
     """Return a box with rounded edges around each geom of the scene, and the robot's radius [m].
 
     A row has the centre (3,) and the axes (9,) of the box, its half sizes (3,), and the radius of
-    the edges, all [m]. The radius of the robot is that of a ball around its base's origin.
+    the edges, all [m]. The radius of the robot is that of a ball around its base's origin; it is
+    infinite if geoms matter without a contact, too.
     """
-    rows, radius = [], 0.0
+    option, rows, radius = model.opt, [], 0.0
+    if option.density or option.viscosity or model.nflex or model.npair:
+        radius = inf
     for geom in range(model.ngeom):
         size, bound = model.geom_size[geom], model.geom_rbound[geom]
         place, axes = data.geom_xpos[geom], data.geom_xmat[geom]
-        margin = model.geom_margin[geom] + MARGIN
+        margin = MARGIN + max(model.geom_margin[geom], option.o_margin)
         if model.geom_bodyid[geom]:  # a geom of the robot; those of the scene are fused to body 0
             radius = max(radius, dist(place, data.qpos[:3]) + bound + margin)
         elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
@@ -124,7 +127,7 @@ def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
             rows.append([*(place - HUGE * normal), *axes, HUGE, HUGE, HUGE, margin])
         else:
             rows.append([*place, *axes, 0.0, 0.0, 0.0, bound + margin])
-    return np.array(rows), radius
+    return np.array(rows, float), radius
 
 
 def _mujoco_library() -> ctypes.CDLL:

@@ -1,7 +1,7 @@
 """How the guard is armed, limits commands, holds, lands, stops, and takes off."""
 
 from dataclasses import replace
-from math import cos, dist, inf, nan, nextafter, radians, sin, isnan
+from math import cos, dist, inf, isnan, nan, nextafter, radians, sin
 
 import pytest
 

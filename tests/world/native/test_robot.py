@@ -1,7 +1,9 @@
 """Flights in C and in Python have the same bits, whatever the cloud sends."""
 
 import logging
+from math import inf
 
+import numpy as np
 import pytest
 
 from cloudrc import assembly
@@ -16,9 +18,10 @@ from cloudrc.world.native import robot as native
 from cloudrc.world.native.library import SWITCH, Library, library
 from cloudrc.world.native.robot import NativeRobot, make_robot, usable
 from cloudrc.world.robot import Robot
+from cloudrc.world.scene import mujoco
 from cloudrc.world.simulator import Simulator
 from tests.flights.conftest import digest
-from tests.world.guard.conftest import MS, hostile
+from tests.world.guard.conftest import MS, SECOND, UP, hostile
 
 pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
 LIMITS = Limits(fence.LOW, fence.HIGH)
@@ -73,18 +76,19 @@ class Pilot:
         return self
 
 
+def scaled(seed, scale):
+    """Lift off for 1 s, then jump between velocities."""
+    policy = hostile(seed)
+    return lambda pilot: UP if pilot.now_ns < SECOND else tuple(scale * v for v in policy(pilot))
+
+
 @pytest.mark.parametrize(("scale", "least"), [(1.0, 10), (0.1, 1000)])
 @pytest.mark.parametrize("seed", range(4))
 def test_hostile_commands_fly_the_same_in_c(seed, scale, least):
     """Large ones reach caps, fence and floor; small ones stay where C flies."""
-
-    def scaled(policy):
-        return lambda pilot: tuple(scale * axis for axis in policy(pilot))
-
     python, c = both()
     count = Count(c)
-    lift = lambda pilot: (0.0, 0.0, 1.0)  # noqa: E731
-    pilots = [Pilot(robot).fly(1.0, lift).fly(6.0, scaled(hostile(seed))) for robot in (python, c)]
+    pilots = [Pilot(robot).fly(7.0, scaled(seed, scale)) for robot in (python, c)]
     assert pilots[0].seen == pilots[1].seen
     assert count.steps >= least
 
@@ -115,6 +119,53 @@ def test_a_contact_with_the_board_flies_the_same_in_c(scene_at):
     assert pilots[0].seen == pilots[1].seen
     assert count.steps > 500
     assert any(touches and touches[0].body == "board" for touches in pilots[1].seen[7::8])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_flight_against_the_walls_of_a_pipe_is_the_same_in_c(seed, scene_at):
+    python, c = both(scene_at(-1.0, 0.5, 0.5))
+    count = Count(c)
+    pilots = [Pilot(robot).fly(4.0, scaled(seed, 0.1)) for robot in (python, c)]
+    assert pilots[0].seen == pilots[1].seen
+    assert count.steps > 500
+
+
+def test_c_leaves_the_model_as_it_was():
+    robot = robot_of(NativeRobot, "pipes")
+    model = robot.simulator.model
+    before = model.ngeom, model.opt.disableflags
+    Pilot(robot).fly(2.0, lambda pilot: (0.3, 0.0, 0.5))
+    assert (model.ngeom, model.opt.disableflags) == before
+
+
+def nearest(robot, position):
+    """Return how far the ball around a robot at `position` is from every obstacle of `step.c`."""
+    rows = robot._flight.keep
+    along = np.einsum("nij,ni->nj", rows[:, 3:12].reshape(-1, 3, 3), position - rows[:, :3])
+    beyond = np.maximum(abs(along) - rows[:, 12:15], 0.0)
+    return (np.sqrt((beyond**2).sum(1)) - rows[:, 15]).min() - robot._flight.robot_radius
+
+
+def test_where_c_looks_for_no_contact_there_is_none():
+    robot = robot_of(NativeRobot, "pipes")
+    model, data = robot.simulator.model, robot.simulator.data
+    rng, free = np.random.default_rng(1), 0
+    for _ in range(3000):
+        data.qpos[:3] = rng.uniform((-2.0, -7.0, 0.3), (9.0, 3.0, 1.6))
+        data.qpos[3:] = rng.normal(size=4)
+        mujoco.mj_forward(model, data)
+        is_free = nearest(robot, data.qpos[:3]) > 0.0
+        free += is_free
+        assert not (is_free and data.ncon)
+    assert 300 < free < 2900
+
+
+@pytest.mark.parametrize("setting", [{"density": 1.2}, {"viscosity": 1e-5}])
+def test_geoms_that_air_acts_on_are_always_placed(setting):
+    parts = Simulator("pelican", "empty"), LowLevel(), Guard(LIMITS)
+    for name, value in setting.items():
+        setattr(parts[0].model.opt, name, value)
+    assert NativeRobot(*parts, LIMITS)._flight.robot_radius == inf
 
 
 @pytest.mark.parametrize(
