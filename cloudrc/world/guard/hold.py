@@ -7,7 +7,7 @@ distance of the stop rule, which assumes the deceleration BRAKE after the time R
 
 from __future__ import annotations
 
-from math import hypot, isnan, nan
+from math import hypot, nan
 from operator import le
 
 from cloudrc.messages import ZERO, Cause, Vector
@@ -185,16 +185,6 @@ class TakeOff:
     def allowed(self) -> bool:
         """Whether the robot may leave the ground."""
         return not self._stopped or self._still_ticks >= STILL_TICKS
-
-    @property
-    def ground(self) -> float:
-        """Height of the robot on the ground [m]; NaN before it is known."""
-        return self._height
-
-    @property
-    def must_look(self) -> bool:
-        """Whether the next `look` at a flying robot changes more than `over` at LIFT_OFF_HEIGHT."""
-        return self._stopped or isnan(self._height)
 
     @property
     def condition(self) -> Cause:

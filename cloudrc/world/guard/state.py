@@ -33,7 +33,7 @@ A robot that touches nothing never turns over: no command tilts it as far as OVE
 from __future__ import annotations
 
 from collections import Counter, deque
-from math import inf, nan
+from math import inf
 
 from cloudrc.messages import NEVER_NS, ZERO, Cause, Command, GuardState, Vector
 from cloudrc.records import GuardChange
@@ -236,22 +236,16 @@ class Guard:
         self._follow(reference, now_ns, readings, dt)
         return self.reference
 
-    def plain_track(self, now_ns: int) -> tuple[float, Vector, Vector, int, int] | None:
+    def plain_track(self, now_ns: int) -> tuple[Vector, Vector, int, int] | None:
         """Return what `native/step.c` needs to run steps from `now_ns` [ns] on, or None.
 
         None: a step may do more than follow the command, so that `step` has to run it. Else: the
-        height on the ground before take-off [m], NaN afterwards; the reference and the commanded
-        velocity [m/s], which are one object once the reference has arrived; the end of the time
-        without checks, and the end of the fresh command [ns].
+        reference and the commanded velocity [m/s], which are one object once the reference has
+        arrived; the end of the time without checks, and the end of the fresh command [ns].
         """
-        take_off, track_ns = self._take_off, self._track_until_ns
-        if not self._ramp_until_ns <= now_ns <= track_ns:
-            return None
-        if take_off.over:
-            return nan, self.reference, self._wanted, self._steady_until_ns, track_ns
-        if take_off.must_look:
-            return None
-        return take_off.ground, self.reference, self._wanted, self._steady_until_ns, track_ns
+        if self._take_off.over and self._ramp_until_ns <= now_ns <= self._track_until_ns:
+            return self.reference, self._wanted, self._steady_until_ns, self._track_until_ns
+        return None
 
     def continue_track(self, reference: Vector | None, steady_until_ns: int) -> None:
         """Continue after steps that `native/step.c` has run.

@@ -12,8 +12,8 @@ import numpy as np
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import NEVER_NS
 from cloudrc.world import low_level, rotors
-from cloudrc.world.guard import hold, state
 from cloudrc.world.guard import limits as rules
+from cloudrc.world.guard import state
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.scene import mujoco
 from cloudrc.world.simulator import CONTACT_CHECK_STEPS, Simulator
@@ -38,8 +38,7 @@ _CONSTANTS = {
     low_level: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
     "thrust_max tiny nose_cosine_min yaw_sine_max",
     state: "overturned_cosine",
-    hold: "lift_off_height",
-    rules: "sink_lead_max fence_reaction reaction stop_coefficient recheck_distance far",
+    rules: "sink_lead_max fence_reaction reaction stop_coefficient recheck_distance far low_speed",
 }
 """Modules and their constants that `step.c` needs, in the order of its fields."""
 _VALUES = {
@@ -56,7 +55,7 @@ _FIELDS: dict[str, Any] = {
     **dict.fromkeys(("time_step", "robot_radius", "acceleration_max"), _double),
     **dict.fromkeys(("recheck_ns", "never_ns", "step_ns"), _int64),
     **dict.fromkeys(("check_steps", "obstacle_count", "unused"), _int64),
-    **{"ground": _double, "reference": _double * 3, "wanted": _double * 3},
+    **{"reference": _double * 3, "wanted": _double * 3},
     **dict.fromkeys(("settled", "steady_until_ns", "track_until_ns"), _int64),
     **{"force_peak": _double, "impulse": _double},
     **dict.fromkeys(("touching", "steps", "is_news", "free_steps"), _int64),

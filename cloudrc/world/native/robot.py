@@ -18,8 +18,8 @@ from cloudrc.world.readings import Readings
 from cloudrc.world.robot import STEP_NS, Robot
 from cloudrc.world.simulator import Simulator
 
-_TRACK, _MEMORY, _BEFORE = Flight.ground.offset, Flight.free_steps.offset, Flight.before.offset
-_pack_track, _unpack_track = Struct("7d3q2d2q").pack_into, Struct("8x3d24x2q8x2d3q8x4d").unpack_from
+_TRACK, _MEMORY, _BEFORE = Flight.reference.offset, Flight.free_steps.offset, Flight.before.offset
+_pack_track, _unpack_track = Struct("6d3q2d2q").pack_into, Struct("3d24x2q8x2d3q8x4d").unpack_from
 _pack_memory, _unpack_memory = Struct("q10dq").pack_into, Struct("40x6d").unpack_from
 _unpack_before = Struct("13d").unpack_from
 
@@ -87,14 +87,12 @@ class NativeRobot(Robot):
             self._in_c = False
         return super().run(tick_ns, until_ns)
 
-    def _give(
-        self, ground: float, reference: Vector, wanted: Vector, steady_ns: int, track_ns: int
-    ) -> None:
+    def _give(self, reference: Vector, wanted: Vector, steady_ns: int, track_ns: int) -> None:
         """Give C the state before its first step; the arguments are from `Guard.plain_track`."""
         simulator, (x, y, z), (to_x, to_y, to_z) = self.simulator, reference, wanted
         # fmt: off
         _pack_track(
-            self._flight, _TRACK, ground, x, y, z, to_x, to_y, to_z, reference is wanted,
+            self._flight, _TRACK, x, y, z, to_x, to_y, to_z, reference is wanted,
             steady_ns, track_ns, simulator.tip_force_peak, simulator.tip_impulse,
             simulator.contacts, simulator.steps,
         )

@@ -41,15 +41,14 @@ typedef struct {
   double thrust_coefficient, torque_ratio, drag_coefficient, arm, height;
   double mass, gravity, tilt_gain, yaw_gain, tilt_rate_gain, yaw_rate_gain;
   double thrust_max, tiny, nose_cosine_min, yaw_sine_max;
-  double overturned_cosine, lift_off_height, sink_lead_max;
-  double fence_reaction, reaction, stop_coefficient, recheck_distance, far;
+  double overturned_cosine, sink_lead_max;
+  double fence_reaction, reaction, stop_coefficient, recheck_distance, far, low_speed;
   /* Values of this robot: gains and limits of the controller, corners of the fence, and so on. */
   double up, down, gains[9], limit_xy, limit_z, dt;
   double change_max, low_z, low[3], high[3];
   double time_step, robot_radius, acceleration_max;
   i64 recheck_ns, never_ns, step_ns, check_steps, obstacle_count, unused;
   /* State, which Python reads and writes between two runs. */
-  double ground; /* height of the robot on the ground [m], before take-off; else NaN */
   double reference[3], wanted[3];
   i64 settled; /* whether Python's `reference` is the object `wanted` */
   i64 steady_until_ns, track_until_ns;
@@ -101,12 +100,14 @@ static double approach_speed(const Flight *f, double distance, double reaction) 
 
 /* Tell whether the fence surely limits no velocity at this position; Python handles the rest. */
 static int is_free(const Flight *f, const double *velocity, const double *position) {
-  if (!(position[2] >= f->low_z)) return 0;
+  double across = velocity[0] * velocity[0] + velocity[1] * velocity[1];
+  if (!(position[2] >= f->low_z || across < f->low_speed * f->low_speed)) return 0;
   for (int i = 0; i < 3; i++) {
     double below = position[i] - f->low[i], above = f->high[i] - position[i];
-    if (!(below > 0.0 && above > 0.0)) return 0;
-    double reaction = i == 2 ? f->reaction : f->fence_reaction;
-    if (!(-approach_speed(f, below, reaction) <= velocity[i])) return 0;
+    double reaction = i == 2 ? f->reaction : f->fence_reaction, slowest = 0.0;
+    if (!((below > 0.0 || i == 2) && above > 0.0)) return 0;
+    if (below > 0.0) slowest = -approach_speed(f, below, reaction);
+    if (!(slowest <= velocity[i])) return 0;
     if (!(velocity[i] <= approach_speed(f, above, f->fence_reaction))) return 0;
   }
   return 1;
@@ -116,8 +117,6 @@ static int is_free(const Flight *f, const double *velocity, const double *positi
 static int guard_step(Flight *f, const Readings *r, i64 now_ns) {
   if (now_ns <= f->steady_until_ns && f->settled) return 1;
   if (r->axes[8] < f->overturned_cosine || now_ns > f->track_until_ns) return 0;
-  double climbed = r->pose[2] - f->ground;
-  if (climbed >= f->lift_off_height || climbed <= -f->lift_off_height) return 0; /* not if NaN */
   const double *from = f->reference, *to = f->wanted;
   double x = to[0] - from[0], y = to[1] - from[1], z = to[2] - from[2];
   double square = x * x + y * y + z * z;
