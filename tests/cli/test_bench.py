@@ -14,5 +14,6 @@ def test_the_closed_loop_is_fast_enough_beside_raw_physics():
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     figures = json.loads(done.stdout)
-    assert figures["closed loop, records in memory"]["ratio"] >= 0.30
-    assert figures["closed loop, records hashed"]["ratio"] >= 0.25
+    least = (0.44, 0.37) if figures["physics_steps"].startswith("C (") else (0.24, 0.22)
+    assert figures["closed loop, records in memory"]["ratio"] >= least[0]
+    assert figures["closed loop, records hashed"]["ratio"] >= least[1]

@@ -11,6 +11,8 @@
      turn_rotors   rotors.Rotors.step, simulator.Simulator.step
      feel          simulator.Simulator._feel
 
+   Where nothing can touch the robot, `step_physics` tells MuJoCo to leave the geoms out.
+
    Every sum and product has the order of the Python code. Compile without contraction of
    a * b + c, and without fast-math. The only function from outside, apart from mj_step, is sqrt,
    which IEEE 754 defines to the last bit. No header is included: a small compiler without headers
@@ -47,7 +49,8 @@ typedef struct {
   double up, down, gains[9], limit_xy, limit_z, dt;
   double change_max, low_z, low[3], high[3];
   double time_step, robot_radius, acceleration_max;
-  i64 recheck_ns, never_ns, step_ns, check_steps, obstacle_count, unused;
+  i64 recheck_ns, never_ns, step_ns, check_steps, obstacle_count;
+  i64 unused; /* flags of what MuJoCo does not need while nothing can touch the robot */
   /* State, which Python reads and writes between two runs. */
   double reference[3], wanted[3];
   i64 settled; /* whether Python's `reference` is the object `wanted` */
@@ -244,7 +247,6 @@ static void step_physics(Flight *f, const Readings *r) {
     if (f->free_steps <= 0) f->free_steps = -5;
   }
   int disabled = *f->disable, geoms = *f->geoms;
-
   if (f->free_steps > 0) {
     *f->disable = disabled | (int)f->unused;
     *f->geoms = 0;
