@@ -52,6 +52,8 @@ class LowLevel:
         gains: Force per velocity error, per integrated error and per change of the error in one
             step, each for x, y and z [N s/m, N/m, N s/m], shape (9,).
         limits: Limits of the integrated error in x and y, and in z [m], and the step [s].
+        integral: Integrated velocity error [m], shape (3,).
+        error: Velocity error of the last update [m/s], shape (3,); None after a reset.
     """
 
     def __init__(
@@ -81,17 +83,8 @@ class LowLevel:
 
     def reset(self) -> None:
         """Set the integral to zero and forget the last error."""
-        self._integral = ZERO
-        self._error: Vector | None = None
-
-    @property
-    def memory(self) -> tuple[Vector, Vector | None]:
-        """Integrated velocity error [m], shape (3,), and last velocity error [m/s] or None."""
-        return self._integral, self._error
-
-    @memory.setter
-    def memory(self, memory: tuple[Vector, Vector | None]) -> None:
-        self._integral, self._error = memory
+        self.integral = ZERO
+        self.error: Vector | None = None
 
     def update(self, readings: Readings, velocity_reference: Vector) -> RotorSpeeds:
         """Compute the rotor speeds that make the robot follow a velocity; call once per `dt`.
@@ -107,9 +100,9 @@ class LowLevel:
         Deviation: the published controller always integrates. Its integral winds up while the robot
         brakes, and pushes the robot back for a second afterwards.
         """
-        integral = self._integral
+        integral = self.integral
         speeds = self.update(readings, velocity_reference)
-        self._integral = integral
+        self.integral = integral
         return speeds
 
     def force(self, velocity: Vector, reference: Vector) -> Vector:
@@ -124,17 +117,17 @@ class LowLevel:
         # The opposite sign of the equation saves a negation per term.
         ex, ey, ez = error = (rx - vx, ry - vy, rz - vz)
         # After a reset there is no last error: the rate is 0.
-        last_x, last_y, last_z = self._error or error
-        self._error = error
+        last_x, last_y, last_z = self.error or error
+        self.error = error
 
-        sx, sy, sz = self._integral
+        sx, sy, sz = self.integral
         sx += ex * dt
         sy += ey * dt
         sz += ez * dt
         sx = limit_xy if sx > limit_xy else -limit_xy if sx < -limit_xy else sx
         sy = limit_xy if sy > limit_xy else -limit_xy if sy < -limit_xy else sy
         sz = limit_z if sz > limit_z else -limit_z if sz < -limit_z else sz
-        self._integral = (sx, sy, sz)
+        self.integral = (sx, sy, sz)
 
         return (
             px * ex + ix * sx + dx * (ex - last_x),

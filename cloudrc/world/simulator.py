@@ -144,12 +144,6 @@ class Simulator:
         return _new(Odometry, (now_ns, (px, py, pz), (w, x, y, z), (vx, vy, vz), (p, q, r)))
 
     @property
-    def tip_sensor(self) -> npt.NDArray[np.float64]:
-        """MuJoCo's value of `tip_force`, which it changes in every step [N], shape (1,)."""
-        found: npt.NDArray[np.float64] = self.data.sensordata[self._tip_sensor :][:1]
-        return found
-
-    @property
     def touch_age(self) -> float:
         """Time since the robot's last contact, or since the last reset [s]."""
         return (self.steps - max(self._last_touch.values())) * self.dt

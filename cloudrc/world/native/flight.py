@@ -15,7 +15,7 @@ from cloudrc.world import low_level, rotors
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard import state
 from cloudrc.world.low_level import LowLevel
-from cloudrc.world.scene import mujoco
+from cloudrc.world.scene import ROBOT_PREFIX, mujoco
 from cloudrc.world.simulator import CONTACT_CHECK_STEPS, Simulator
 
 _POINTERS = (
@@ -76,12 +76,13 @@ def make_flight(
 ) -> Flight:
     """Fill everything but the state; `step_ns` is the duration of a step [ns].
 
-    Raise an OSError, AttributeError, KeyError or ImportError if MuJoCo is not as expected.
+    Call it after a reset of the simulator. Raise an OSError, AttributeError, KeyError or ImportError if MuJoCo is not as expected.
     """
     model, data = simulator.model, simulator.data
     turning, (low, high) = rotors.Rotors(simulator.dt), limits.inner_corners()
     limit_xy, limit_z, dt = controller.limits
-    arrays = data.qpos, data.qvel, data.ctrl, data.qfrc_applied, simulator.tip_sensor
+    arrays = data.qpos, data.qvel, data.ctrl, data.qfrc_applied
+    tip_force = data.sensordata[model.sensor(f"{ROBOT_PREFIX}tip").adr[0] :]
     flags = model.opt.gravity.ctypes.data - _offset("mjOption", "gravity")
     flags += _offset("mjOption", "disableflags")
     geoms = model._address + _offset("mjModel", "ngeom")
@@ -91,7 +92,7 @@ def make_flight(
     flight = Flight(
         ctypes.cast(library.mj_step, ctypes.c_void_p),
         *(model._address, data._address),  # MuJoCo has no public name for them
-        *(array.ctypes.data for array in arrays),
+        *(array.ctypes.data for array in (*arrays, tip_force)),
         *(data._address + _offset("mjData", "ncon"), flags, geoms, timer, obstacles.ctypes.data),
         *_VALUES.values(),
         *(turning.up, turning.down, controller.gains, limit_xy, limit_z, dt),
@@ -100,7 +101,7 @@ def make_flight(
         *(low, high, simulator.dt, radius, ACCELERATION_MAX, rules.RECHECK_NS, NEVER_NS, step_ns),
         *(CONTACT_CHECK_STEPS, len(obstacles), UNUSED_WITHOUT_CONTACTS),
     )
-    flight.keep = obstacles
+    flight.keep = obstacles  # else Python frees their memory
     return flight
 
 

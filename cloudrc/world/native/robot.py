@@ -83,7 +83,7 @@ class NativeRobot(Robot):
                     return tick_ns
         if self._in_c:
             numbers = _unpack_memory(self._flight, _MEMORY)
-            self._low_level.memory = numbers[:3], numbers[3:]
+            self._low_level.integral, self._low_level.error = numbers[:3], numbers[3:]
             self._in_c = False
         return super().run(tick_ns, until_ns)
 
@@ -98,7 +98,7 @@ class NativeRobot(Robot):
         )
         # fmt: on
         if not self._in_c:
-            integral, error = self._low_level.memory
+            integral, error = self._low_level.integral, self._low_level.error
             memory = (*integral, *(error or integral), error is not None)
             _pack_memory(self._flight, _MEMORY, 0, *simulator.rotor_speeds, *memory)
 
@@ -111,13 +111,10 @@ class NativeRobot(Robot):
 def _self_test() -> str:
     """Fly in C and in Python; return how the results differ, in words, or an empty text."""
     limits = Limits(fence.LOW, fence.HIGH)
-    robots: list[Robot] = []
+    parts = [(Simulator("pelican", "empty"), LowLevel(), Guard(limits)) for _ in range(2)]
     wrong = ""
     try:
-        for kind in (Robot, NativeRobot):
-            parts = Simulator("pelican", "empty"), LowLevel(), Guard(limits)
-            robots.append(NativeRobot(*parts, limits) if kind is NativeRobot else Robot(*parts))
-        if _fly(robots[0]) != _fly(robots[1]):
+        if _fly(Robot(*parts[0])) != _fly(NativeRobot(*parts[1], limits)):
             wrong = "C and Python differ"
     except (OSError, AttributeError, KeyError, ImportError) as error:
         wrong = f"MuJoCo is not as expected: {error!r}"
