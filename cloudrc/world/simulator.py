@@ -117,10 +117,16 @@ class Simulator:
         steps: int,
         before: Readings | None,
     ) -> None:
-        """Continue after steps that `native/step.c` has run on `data`; the arguments are the state.
+        """Continue after steps that `native/step.c` has run on `data`.
 
-        `rotor_speeds` are the actual speeds [rad/s], shape (4,). `before` is None, or the readings
-        at the beginning of the last step if the contacts of this step have to be checked.
+        Args:
+            rotor_speeds: Actual rotor speeds [rad/s], shape (4,).
+            tip_force_peak: The attribute of this name [N].
+            tip_impulse: The attribute of this name [N s].
+            contacts: The attribute of this name.
+            steps: The attribute of this name.
+            before: None, or the readings at the beginning of the last step if its contacts have to
+                be checked.
         """
         self._rotors.speeds, self._readings = rotor_speeds, None
         self.tip_force_peak, self.tip_impulse = tip_force_peak, tip_impulse
