@@ -76,7 +76,8 @@ def make_flight(
 ) -> Flight:
     """Fill everything but the state; `step_ns` is the duration of a step [ns].
 
-    Call it after a reset of the simulator. Raise an OSError, AttributeError, KeyError or ImportError if MuJoCo is not as expected.
+    Call it after a reset of the simulator. Raise an OSError, AttributeError, KeyError or
+    ImportError if MuJoCo is not as expected.
     """
     model, data = simulator.model, simulator.data
     turning, (low, high) = rotors.Rotors(simulator.dt), limits.inner_corners()
