@@ -61,15 +61,13 @@ def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoi
     from cloudrc.drivers.virtual import CPU_CLOCK, Clock, VirtualRun
 
     own = Clock(round(experiment.cloud.clock_offset_s * 1e9), experiment.cloud.clock_drift_ppm)
-    identity = VIRTUAL_CLOCK if own == Clock() else CLOUD_CLOCK
-    world = build_world(experiment, Identity(VIRTUAL_CLOCK, b"world".ljust(16)))
-    cloud = build_cloud(
-        experiment,
-        Identity(identity, b"cloud".ljust(16)),
-        lambda: own.at(0),
-        cpu_clock=CPU_CLOCK,
-    )
-    return world, cloud, VirtualRun(world, cloud, *build_links(experiment), cloud_clock=own)
+    links = build_links(experiment)
+    passes = not any(link.corrupts for link in links)  # only bytes can be damaged
+    clock_id = VIRTUAL_CLOCK if own == Clock() else CLOUD_CLOCK
+    identity = Identity(clock_id, b"cloud".ljust(16), passes=passes)
+    world = build_world(experiment, Identity(VIRTUAL_CLOCK, b"world".ljust(16), passes=passes))
+    cloud = build_cloud(experiment, identity, lambda: own.at(0), cpu_clock=CPU_CLOCK)
+    return world, cloud, VirtualRun(world, cloud, *links, cloud_clock=own)
 
 
 def virtual_notes(experiment: ResolvedExperiment) -> tuple[str, ...]:
@@ -94,8 +92,8 @@ def build_world(
     from cloudrc.world.guard.limits import Limits
     from cloudrc.world.guard.state import Guard
     from cloudrc.world.low_level import LowLevel
+    from cloudrc.world.native.robot import make_robot
     from cloudrc.world.plant import Wind
-    from cloudrc.world.robot import Robot
     from cloudrc.world.simulator import Simulator
 
     world, guard, seed = experiment.world, experiment.guard, experiment.seed
@@ -113,7 +111,8 @@ def build_world(
     if any(air.velocity_mps) or air.gust_mps:
         wind = Wind(air.velocity_mps, air.gust_mps, air.gust_time_s, _generator(seed, "wind"))
     simulator = Simulator(world.robot, world.scene, world.plant, wind)
-    robot = Robot(simulator, LowLevel(**world.low_level.model_dump()), Guard(limits))
+    low_level = LowLevel(**world.low_level.model_dump())
+    robot = make_robot(simulator, low_level, Guard(limits), limits)
     return WorldEndpoint(
         robot,
         _sensors(world.sensors, seed),

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from cloudrc.messages import Datagram
 from cloudrc.records import Record
 
 
@@ -28,7 +29,7 @@ class Endpoint(Protocol):
     def sealed(self) -> bool:
         """Whether datagrams are authenticated; only authenticated datagrams may go to a socket."""
 
-    def receive_datagram(self, data: bytes, now_ns: int) -> None:
+    def receive_datagram(self, data: Datagram, now_ns: int) -> None:
         """Process one datagram; count and drop an invalid datagram, without an exception."""
 
     def next_deadline_ns(self) -> int:
@@ -37,7 +38,7 @@ class Endpoint(Protocol):
     def handle_deadline(self, now_ns: int) -> None:
         """Do the work that is due at `now_ns` [ns]; the driver may call this late."""
 
-    def take_datagrams(self) -> list[bytes]:
+    def take_datagrams(self) -> list[Datagram]:
         """Return the datagrams to send that are new since the last call, oldest first."""
 
     def take_records(self) -> list[Record]:

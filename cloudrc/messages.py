@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 from math import nan
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 Vector: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -247,3 +247,23 @@ class Setpoint(NamedTuple):
     epoch: int = 0
     velocity: Vector = ZERO
     motion: Motion | None = None
+
+
+class Passed(NamedTuple):
+    """A message that stays in one process, in place of a datagram with `message` as its body.
+
+    Attributes:
+        kind: Kind of the datagram, a `tunnel.codec.Kind`.
+        epoch: Number of the session.
+        counter: Counter of the datagram.
+        message: The message; the receiver uses this object itself.
+    """
+
+    kind: int
+    epoch: int
+    counter: int
+    message: Any
+
+
+Datagram: TypeAlias = Any
+"""What an end sends: bytes, or a `Passed` message where an `Identity` asks for it."""

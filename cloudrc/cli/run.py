@@ -276,6 +276,7 @@ def _record_virtual(
     from cloudrc.record.writer import McapWriter
     from cloudrc.report.document import Run
     from cloudrc.report.write import attachments
+    from cloudrc.world.native.robot import usable
 
     store, interrupted = RecordStore(), False
     # Record during the flight, so that the recording is kept if the run or its report fails.
@@ -296,8 +297,9 @@ def _record_virtual(
         except KeyboardInterrupt:
             interrupted = True
         try:
-            notes = assembly.virtual_notes(experiment)
-            run = Run("virtual", "virtual", store.hexdigest(), interrupted, notes)
+            notes, steps = assembly.virtual_notes(experiment), usable().text
+            found = store.hexdigest(), interrupted, notes
+            run = Run("virtual", "virtual", *found, physics_steps=steps)
             yield store.recording(), run
         finally:
             for name, data in attachments(folder).items():
@@ -319,6 +321,7 @@ def _record_local(
     from cloudrc.record.merge import merge
     from cloudrc.report.document import Run
     from cloudrc.report.write import attachments
+    from cloudrc.world.native.library import library
 
     if absent := missing("api"):
         text = f"no operator's API in this run: {', '.join(absent)} not installed"
@@ -346,7 +349,8 @@ def _record_local(
     notes = (*local.notes, *([str(broken)] if broken else ()))
     digest = messages_sha256(mission.messages)
     try:
-        yield mission.recording(), Run("local", "relay", digest, interrupted, notes)
+        facts = digest, interrupted, notes, library().text
+        yield mission.recording(), Run("local", "relay", *facts)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))
     if broken:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from math import nan
+from typing import Any
 
 from cloudrc.cloud.compute import ComputeTime
 from cloudrc.cloud.loop import ControlLoop
@@ -21,7 +22,14 @@ from cloudrc.cloud.operator import (
     is_for_session,
     make_robot_status,
 )
-from cloudrc.messages import NEVER_NS, GuardState, OperatorRequest, Request, Setpoint
+from cloudrc.messages import (
+    NEVER_NS,
+    Datagram,
+    GuardState,
+    OperatorRequest,
+    Request,
+    Setpoint,
+)
 from cloudrc.records import Arrival, Counted, Fault, MissionEvent, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import LATE, REPEATED, USED
@@ -123,7 +131,7 @@ class CloudEndpoint(TunnelEnd):
         self._period_ns = loop.period_ns
         self._missed_periods = MissedPeriods(loop.period_ns)
         self._compute = compute
-        self._unsent: tuple[int, bytes] | None = None  # departure [ns] and command
+        self._unsent: tuple[int, Datagram] | None = None  # departure [ns] and command
         self._asked = 0  # highest number of an operator request in this session
         self._start: tuple[int, int] | None = None  # number and time [ns] of the newest START
         self._tick_ns = start_ns
@@ -189,7 +197,7 @@ class CloudEndpoint(TunnelEnd):
         if self._loop.faults:
             self._records += self._loop.take_faults()
 
-    def receive_datagram(self, data: bytes, now_ns: int) -> None:
+    def receive_datagram(self, data: Datagram, now_ns: int) -> None:
         """Handle a datagram that arrived at `now_ns` [ns]; count and drop an invalid datagram."""
         try:
             kind, epoch, counter, body = self._session.open(data)
@@ -255,13 +263,13 @@ class CloudEndpoint(TunnelEnd):
         self._commanded_ns = NEVER_NS
         self._records.append(SessionOpened(now_ns, "cloud", epoch, "world accepted"))
 
-    def _receive_telemetry(self, epoch: int, counter: int, body: bytes, now_ns: int) -> None:
+    def _receive_telemetry(self, epoch: int, counter: int, body: Any, now_ns: int) -> None:
         outcome = self._channel.take(counter)
         if outcome != REPEATED:  # an attacker can repeat datagrams
             self._heard_ns = now_ns
         self._counts[outcome] += 1
         used = outcome == USED
-        telemetry, delay = codec.decode_telemetry(body), nan
+        telemetry, delay = codec.decode_telemetry(body) if type(body) is bytes else body, nan
         if self._clock_is_shared:
             delay = (now_ns - telemetry.stamp_ns - telemetry.slip_ns) * 1e-9
         if outcome != REPEATED or not self._channel.is_flooded:
@@ -324,10 +332,9 @@ class CloudEndpoint(TunnelEnd):
             compute.begin()
         command, control = self._loop.command(setpoint, now_ns, elapsed_ns * 1e-9, epoch, counter)
         if compute is None:
-            self._send(COMMAND, codec.encode_command(command))
+            self._send_message(COMMAND, command)
         else:
-            data = self._session.seal(COMMAND, codec.encode_command(command))
-            self._unsent = now_ns + compute.end(), data
+            self._unsent = now_ns + compute.end(), self._make_datagram(COMMAND, command)
         self._records.append(control)
         self._delays = (control.horizon, control.rtt, control.loop_delay)
 

@@ -323,7 +323,7 @@ class ControlLoop:
             position, velocity = _triple(estimate.position), _triple(estimate.velocity)
             w, x, y, z = estimate.orientation_wxyz
             orientation = (float(w), float(x), float(y), float(z))
-            if not isfinite(sum(position) + sum(velocity) + sum(orientation)):
+            if not isfinite(sum(position + velocity + orientation)):
                 _refuse(position=position, velocity=velocity, orientation=orientation)
             stamp_ns, rate = estimate.stamp_ns, estimate.angular_velocity_body
             return _new(Odometry, (stamp_ns, position, orientation, velocity, rate))
@@ -403,4 +403,6 @@ def _refuse(**values: tuple[float, ...]) -> NoReturn:
 
 def _triple(numbers: Vector) -> Vector:
     x, y, z = numbers
+    if float is type(x) is type(y) is type(z) and type(numbers) is tuple:  # save time
+        return numbers
     return float(x), float(y), float(z)

@@ -15,8 +15,9 @@ from heapq import heappop, heappush
 
 from cloudrc.endpoint import Endpoint
 from cloudrc.link.model import LinkDirection
+from cloudrc.messages import Datagram, Passed
 from cloudrc.records import Record
-from cloudrc.tunnel.codec import peek
+from cloudrc.tunnel.codec import SIZES, peek
 
 Sink = Callable[[list[Record], list[Record]], None]
 """Function that is called with the new records of world and the new records of cloud."""
@@ -63,7 +64,7 @@ class VirtualRun:
         self._world, self._cloud = world, cloud
         self._uplink, self._downlink = uplink, downlink
         self.cloud_clock = cloud_clock
-        self._arrivals: list[tuple[int, int, bool, bytes]] = []
+        self._arrivals: list[tuple[int, int, bool, Datagram]] = []
         self._sent = 0
         self.now_ns = 0
 
@@ -124,10 +125,14 @@ class VirtualRun:
                     self._send(datagrams, self._downlink, to_world=True)
         self.now_ns = end_ns
 
-    def _send(self, datagrams: list[bytes], link: LinkDirection, *, to_world: bool) -> None:
+    def _send(self, datagrams: list[Datagram], link: LinkDirection, *, to_world: bool) -> None:
         for data in datagrams:
-            kind, epoch, counter = peek(data)
-            arrivals = link.send(epoch, kind, counter, len(data), self.now_ns)
+            if type(data) is Passed:
+                kind, epoch, counter, _ = data
+                size = SIZES[kind]
+            else:
+                (kind, epoch, counter), size = peek(data), len(data)
+            arrivals = link.send(epoch, kind, counter, size, self.now_ns)
             if link.corrupts and arrivals:
                 data = link.corrupted(epoch, kind, counter, data)
             for arrival_ns in arrivals:

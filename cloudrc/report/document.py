@@ -38,6 +38,7 @@ class Run:
     records_sha256: str | None = None
     interrupted: bool = False  # whether the user stopped the run
     notes: tuple[str, ...] = ()  # sentences for the reader of the report
+    physics_steps: str = ""  # where the usual steps ran, such as "C (compiled by cc)"; "": unknown
 
 
 @dataclass(frozen=True)
@@ -90,8 +91,11 @@ def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
     return _known({"method": method, "uncertainty": known})
 
 
-def environment_document() -> dict[str, Any]:
-    """Describe the software and hardware of this machine, without names of users and hosts."""
+def environment_document(physics_steps: str = "") -> dict[str, Any]:
+    """Describe the software and hardware of this machine, without names of users and hosts.
+
+    `physics_steps` is that of the `Run`.
+    """
     packages = {}
     for name in PACKAGES:
         try:
@@ -106,6 +110,7 @@ def environment_document() -> dict[str, Any]:
         "architecture": platform.machine(),
         "processor": _processor(),
         "cores": os.cpu_count(),
+        **({"physics_steps": physics_steps} if physics_steps else {}),
     }
 
 

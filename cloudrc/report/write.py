@@ -71,7 +71,7 @@ def write_report(
             written before the error.
     """
     assessment = assess(recording, experiment, run, own)
-    document, environment = assessment.document, environment_document()
+    document, environment = assessment.document, environment_document(run.physics_steps)
     write_json(folder / "report.json", document)
     write_json(folder / "environment.json", environment)
     if page:

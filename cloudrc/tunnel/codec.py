@@ -22,9 +22,11 @@ from cloudrc.messages import (
     NEVER_NS,
     Cause,
     Command,
+    Datagram,
     GuardState,
     Odometry,
     OperatorRequest,
+    Passed,
     Request,
     Start,
     Telemetry,
@@ -151,11 +153,13 @@ def check(data: bytes) -> Header:
     return header
 
 
-def peek(data: bytes) -> tuple[int, int, int]:
+def peek(data: Datagram) -> tuple[int, int, int]:
     """Read kind, epoch and counter of a datagram without any check, for the link and for logs.
 
     Raise the DecodeError "malformed" if the datagram is shorter than a header.
     """
+    if isinstance(data, Passed):
+        return data[:3]
     if len(data) < HEADER_SIZE:
         raise DecodeError("malformed")
     _, _, epoch, kind, counter = _unpack_header(data)

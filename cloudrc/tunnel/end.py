@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
+from typing import Any
 
+from cloudrc.messages import Command, Datagram, Telemetry
 from cloudrc.records import Record
 from cloudrc.tunnel.channel import Channel
-from cloudrc.tunnel.codec import Direction
+from cloudrc.tunnel.codec import Direction, encode_command, encode_telemetry
 from cloudrc.tunnel.handshake import HandshakeLog
 from cloudrc.tunnel.keys import KeyRing
 from cloudrc.tunnel.session import Session
@@ -21,11 +23,13 @@ class Identity:
         clock_id: 16 bytes that identify the monotonic clock of this machine.
         nonce: 16 random bytes that identify this process.
         ring: The pre-shared keys; None if both ends are in one process.
+        passes: Whether both ends pass their frequent messages on as they are, not as bytes.
     """
 
     clock_id: bytes
     nonce: bytes
     ring: KeyRing | None = None
+    passes: bool = False
 
 
 class TunnelEnd:
@@ -37,7 +41,7 @@ class TunnelEnd:
         self._channel = Channel(newest_wins)
         self._complaints = HandshakeLog()
         self._clock_is_shared = False
-        self._datagrams: list[bytes] = []
+        self._datagrams: list[Datagram] = []
         self._records: list[Record] = []
         self._counts: defaultdict[str, int] = defaultdict(int)
 
@@ -51,7 +55,7 @@ class TunnelEnd:
         """Whether the datagrams are encrypted and authenticated."""
         return self._session.sealed
 
-    def take_datagrams(self) -> list[bytes]:
+    def take_datagrams(self) -> list[Datagram]:
         """Return the outgoing datagrams that were made since the last call."""
         datagrams, self._datagrams = self._datagrams, []
         return datagrams
@@ -65,6 +69,16 @@ class TunnelEnd:
         self._datagrams.append(self._session.seal(kind, body))
         self._counts["sent"] += 1
 
-    def _queue(self, datagrams: list[bytes]) -> None:
+    def _send_message(self, kind: int, message: Telemetry | Command) -> None:
+        self._datagrams.append(self._make_datagram(kind, message))
+        self._counts["sent"] += 1
+
+    def _make_datagram(self, kind: int, message: Telemetry | Command) -> Datagram:
+        if self._identity.passes:
+            return self._session.pass_on(kind, message)
+        encode: Any = encode_command if isinstance(message, Command) else encode_telemetry
+        return self._session.seal(kind, encode(message))
+
+    def _queue(self, datagrams: list[Datagram]) -> None:
         self._datagrams += datagrams
         self._counts["sent"] += len(datagrams)

@@ -19,8 +19,8 @@ from math import hypot, isnan, nan
 from cloudrc.messages import (
     NEVER_NS,
     Command,
+    Datagram,
     GuardState,
-    Odometry,
     OperatorRequest,
     Request,
     Start,
@@ -43,7 +43,7 @@ from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
 from cloudrc.tunnel.end import Identity, TunnelEnd
 from cloudrc.tunnel.handshake import ServerHandshake
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.robot import Robot
+from cloudrc.world.robot import STEP_NS, Robot
 from cloudrc.world.sensors import Sensors
 
 START_AGE_MAX_NS = 1_000_000_000
@@ -186,6 +186,7 @@ class WorldEndpoint(TunnelEnd):
         super().__init__(identity, Direction.UPLINK, newest_wins)
         self.robot, self._sensors = robot, sensors
         self._tick_ns, self._slip_ns = start_ns, 0  # world's clock and its lag
+        self._owes_step = False  # whether the step before `_tick_ns` has yet to be simulated
         self._pace = PaceMonitor()
         self._door = ServerHandshake(
             self._session, identity.nonce, identity.clock_id, command_age_max_ns
@@ -217,15 +218,16 @@ class WorldEndpoint(TunnelEnd):
     def handle_deadline(self, now_ns: int) -> None:
         """Simulate up to and including `now_ns` [ns]; send the telemetry that is due."""
         self._session.follow_keys()
-        self._advance(self._follow(now_ns) + 1)
+        self._advance(self._follow(now_ns) + 1, owes=not self.robot.observers)
 
-    def receive_datagram(self, data: bytes, now_ns: int) -> None:
+    def receive_datagram(self, data: Datagram, now_ns: int) -> None:
         """Handle a datagram that arrived at `now_ns` [ns]; count and drop an invalid datagram."""
         world_ns = self._follow(now_ns)
         try:
             kind, epoch, counter, body = self._session.open(data)
             if kind == COMMAND:
-                self._receive_command(epoch, counter, body, now_ns, world_ns)
+                command = codec.decode_command(body) if type(body) is bytes else body
+                self._receive_command(epoch, counter, command, now_ns, world_ns)
             elif kind == Kind.HELLO:
                 self._advance(world_ns)
                 self._receive_hello(codec.decode_hello(body), counter, now_ns)
@@ -254,14 +256,24 @@ class WorldEndpoint(TunnelEnd):
         self._slip_ns += behind_ns - CATCH_UP_NS
         return now_ns - self._slip_ns
 
-    def _advance(self, until_ns: int) -> None:
-        """Simulate all steps that begin before `until_ns` [ns], world's clock."""
+    def _advance(self, until_ns: int, *, owes: bool = False) -> None:
+        """Simulate all steps that begin before `until_ns` [ns], world's clock.
+
+        If `owes`, the next call may simulate a single last step together with its own steps, which
+        takes less time. Nothing uses the result of this step before.
+        """
         tick_ns = self._tick_ns
         if tick_ns < until_ns and self._waiting is not None:
             self._apply(tick_ns)
+        if self._owes_step:
+            until_ns, tick_ns = max(until_ns, tick_ns), tick_ns - STEP_NS
+            self._owes_step = False
         while tick_ns < until_ns:
             if tick_ns >= self._sample_ns:
                 self._sample(tick_ns)
+            if owes and until_ns == tick_ns + 1:
+                self._owes_step, self._tick_ns = True, tick_ns + STEP_NS
+                return
             sample_ns = self._sample_ns
             stop_ns = sample_ns if sample_ns < until_ns else until_ns
             tick_ns = self._tick_ns = self.robot.run(tick_ns, stop_ns)
@@ -284,8 +296,7 @@ class WorldEndpoint(TunnelEnd):
         simulator, guard, records = self.robot.simulator, self.robot.guard, self._records
         orders = self._orders
         tip_force = simulator.tip_force()
-        position, orientation, velocity, rate, _ = simulator.readings
-        truth = _new(Odometry, (now_ns, position, orientation, velocity, rate))
+        truth = simulator.truth(now_ns)
         forces = (tip_force, *simulator.take_tip_force())
         records.append(_new(GroundTruth, (now_ns, truth, *forces, guard.reference)))
         if guard.changes:
@@ -315,7 +326,7 @@ class WorldEndpoint(TunnelEnd):
             )
             telemetry = _new(Telemetry, known)
             counter = self._session.next_counter(TELEMETRY)
-            self._send(TELEMETRY, codec.encode_telemetry(telemetry))
+            self._send_message(TELEMETRY, telemetry)
             records.append(_new(TelemetrySent, (now_ns, epoch, counter, telemetry)))
         if now_ns >= self._count_ns:
             self._count_ns += COUNT_PERIOD_NS
@@ -362,9 +373,9 @@ class WorldEndpoint(TunnelEnd):
                 observer.see_request(request, tick_ns)
 
     def _receive_command(
-        self, epoch: int, counter: int, body: bytes, now_ns: int, world_ns: int
+        self, epoch: int, counter: int, command: Command, now_ns: int, world_ns: int
     ) -> None:
-        command, guard = codec.decode_command(body), self.robot.guard
+        guard = self.robot.guard
         outcome = self._channel.take(counter, bool(command.plan))
         if outcome != REPEATED:
             self._door.hear(now_ns)

@@ -46,7 +46,15 @@ the published formula is wrong."""
 
 
 class LowLevel:
-    """Make the robot follow a velocity at a yaw of 0, as the published controller does."""
+    """Make the robot follow a velocity at a yaw of 0, as the published controller does.
+
+    Attributes:
+        gains: Force per velocity error, per integrated error and per change of the error in one
+            step, each for x, y and z [N s/m, N/m, N s/m], shape (9,).
+        limits: Limits of the integrated error in x and y, and in z [m], and the step [s].
+        integral: Integrated velocity error [m], shape (3,).
+        error: Velocity error of the last update [m/s], shape (3,); None after a reset.
+    """
 
     def __init__(
         self,
@@ -69,14 +77,14 @@ class LowLevel:
         """
         dx, dy, dz = gain_d
         # Gains of the error, its integral and its change per step; one tuple unpacks fastest.
-        self._gains = (*gain_p, *gain_i, dx / dt, dy / dt, dz / dt)
-        self._limits = (integral_limit_xy, integral_limit_z, dt)
+        self.gains = (*gain_p, *gain_i, dx / dt, dy / dt, dz / dt)
+        self.limits = (integral_limit_xy, integral_limit_z, dt)
         self.reset()
 
     def reset(self) -> None:
         """Set the integral to zero and forget the last error."""
-        self._integral = ZERO
-        self._error: Vector | None = None
+        self.integral = ZERO
+        self.error: Vector | None = None
 
     def update(self, readings: Readings, velocity_reference: Vector) -> RotorSpeeds:
         """Compute the rotor speeds that make the robot follow a velocity; call once per `dt`.
@@ -92,9 +100,9 @@ class LowLevel:
         Deviation: the published controller always integrates. Its integral winds up while the robot
         brakes, and pushes the robot back for a second afterwards.
         """
-        integral = self._integral
+        integral = self.integral
         speeds = self.update(readings, velocity_reference)
-        self._integral = integral
+        self.integral = integral
         return speeds
 
     def force(self, velocity: Vector, reference: Vector) -> Vector:
@@ -103,23 +111,23 @@ class LowLevel:
         e = v - v_ref;  F = -(Kp · e + Ki · int(e dt) + Kd · de/dt) + (0, 0, m · g), with a clamped
         integral. `velocity` is v, `reference` is v_ref, both in [m/s]; all are in the world frame.
         """
-        px, py, pz, ix, iy, iz, dx, dy, dz = self._gains
-        limit_xy, limit_z, dt = self._limits
+        px, py, pz, ix, iy, iz, dx, dy, dz = self.gains
+        limit_xy, limit_z, dt = self.limits
         (vx, vy, vz), (rx, ry, rz) = velocity, reference
         # The opposite sign of the equation saves a negation per term.
         ex, ey, ez = error = (rx - vx, ry - vy, rz - vz)
         # After a reset there is no last error: the rate is 0.
-        last_x, last_y, last_z = self._error or error
-        self._error = error
+        last_x, last_y, last_z = self.error or error
+        self.error = error
 
-        sx, sy, sz = self._integral
+        sx, sy, sz = self.integral
         sx += ex * dt
         sy += ey * dt
         sz += ez * dt
         sx = limit_xy if sx > limit_xy else -limit_xy if sx < -limit_xy else sx
         sy = limit_xy if sy > limit_xy else -limit_xy if sy < -limit_xy else sy
         sz = limit_z if sz > limit_z else -limit_z if sz < -limit_z else sz
-        self._integral = (sx, sy, sz)
+        self.integral = (sx, sy, sz)
 
         return (
             px * ex + ix * sx + dx * (ex - last_x),

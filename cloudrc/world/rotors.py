@@ -38,12 +38,15 @@ frame [N] and a torque in the body frame [N m], as MuJoCo's free joint requires.
 
 
 class Rotors:
-    """Four rotors with lag, thrust and drag; `speeds` are front, left, back, right [rad/s]."""
+    """Four rotors with lag, thrust and drag; `speeds` are front, left, back, right [rad/s].
+
+    `up` and `down` are the shares of the way to the commanded speed that one step makes.
+    """
 
     def __init__(self, dt: float) -> None:
         """Begin with stopped rotors; `dt` is the duration of a step [s]."""
-        self._up = 1.0 - exp(-dt / TIME_CONSTANT_UP)
-        self._down = 1.0 - exp(-dt / TIME_CONSTANT_DOWN)
+        self.up = 1.0 - exp(-dt / TIME_CONSTANT_UP)
+        self.down = 1.0 - exp(-dt / TIME_CONSTANT_DOWN)
         self.speeds = STOPPED
 
     def step(self, commands: RotorSpeeds, readings: Readings) -> Controls:
@@ -57,7 +60,7 @@ class Rotors:
         The sum of r x F over the hubs is the torque (-h · Fy, h · Fx, sum of x · Fy - y · Fx).
                 Source: docs/reference/plant.md, "Rotor speed", "Rotor drag".
         """
-        up, down, k = self._up, self._down, THRUST_COEFFICIENT
+        up, down, k = self.up, self.down, THRUST_COEFFICIENT
         front, left, back, right = self.speeds
         to_front, to_left, to_back, to_right = commands
         front += (to_front - front) * (up if to_front > front else down)

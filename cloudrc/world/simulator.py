@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cloudrc.config.schema import Plant
-from cloudrc.messages import Vector
+from cloudrc.messages import Odometry, Vector
 from cloudrc.records import Contact
 from cloudrc.world.plant import Wind
 from cloudrc.world.readings import Readings, RotorSpeeds
@@ -31,6 +31,7 @@ _mj_step = mujoco.mj_step
 _pack_ctrl = Struct("4d").pack_into
 _pack_applied = Struct("6d").pack_into
 _unpack_pose, _unpack_twist = Struct("7d").unpack_from, Struct("6d").unpack_from
+_new = tuple.__new__
 _readings_of = Readings.of  # looking up a class method binds it anew each time
 
 
@@ -39,9 +40,11 @@ class Simulator:
 
     Attributes:
         model: The compiled `MjModel`.
+        data: The `MjData` of the simulation.
         dt: Duration of a step [s].
+        is_nominal: Whether there is no wind and the true robot equals its model.
         steps: Number of steps since the last reset.
-        readings: State of the base after the last step.
+        contacts: Number of contacts in the last step.
         tip_force_peak: Largest force on the arm's tip since the last call of `take_tip_force` [N].
         tip_impulse: Integral over time of the force on the tip since that call [N s].
         touches: Contacts that began since the last call of `take_contacts`.
@@ -63,9 +66,10 @@ class Simulator:
         """
         self.model = model = compile_model(robot, scene, plant)
         self._wind = wind
+        self.is_nominal = wind is None and plant in (None, Plant())
         self.dt: float = model.opt.timestep
         self.tape: list[Controls] | None = None
-        self._data = data = mujoco.MjData(model)
+        self.data = data = mujoco.MjData(model)
         self._rotors = Rotors(self.dt)
 
         self._qpos, self._qvel = memoryview(data.qpos), memoryview(data.qvel)
@@ -83,17 +87,17 @@ class Simulator:
 
     def reset(self) -> None:
         """Reset the robot to its spawn, at rest, with stopped rotors."""
-        mujoco.mj_resetData(self.model, self._data)
-        mujoco.mj_forward(self.model, self._data)
+        mujoco.mj_resetData(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)
         self._rotors.speeds = STOPPED
-        self.steps = self._contacts = 0
+        self.steps = self.contacts = 0
         self.tip_force_peak = self.tip_impulse = 0.0
         if self.tape is not None:
             self.tape.clear()
         self.touches: list[Contact] = []
         # The robot stands on the floor: only after a flight is the next contact a new contact.
         self._last_touch: dict[tuple[str, bool], int] = {("floor", False): 0}
-        self.readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
+        self._readings: Readings | None = None
 
     def step(self, rotor_speeds: RotorSpeeds) -> None:
         """Advance by `dt` with these commanded rotor speeds [rad/s], shape (4,).
@@ -101,7 +105,7 @@ class Simulator:
         Thrust and drag use the rotor speeds at the end of the step. The drag uses the velocity at
         the beginning of the step, relative to the air.
         """
-        before, data, wind = self.readings, self._data, self._wind
+        before, data, wind = self.readings, self.data, self._wind
         in_air = before if wind is None else wind.seen_from(before, self.dt)
         controls = self._rotors.step(rotor_speeds, in_air)
         front, left, back, right, fx, fy, fz, tx, ty, tz = controls
@@ -112,17 +116,51 @@ class Simulator:
 
         _mj_step(self.model, data)
         self.steps += 1
-        self.readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
+        self._readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
         contacts = data.ncon
-        if contacts or self._contacts:
-            force = self._sensors[self._tip_sensor]
-            self.tip_impulse += force * self.dt
-            if force > self.tip_force_peak:
-                self.tip_force_peak = force
-            # Check at once if the number of contacts has changed, else only every few steps.
-            if contacts and (contacts != self._contacts or self.steps % CONTACT_CHECK_STEPS == 0):
-                self._note_contacts(before)
-            self._contacts = contacts
+        if contacts or self.contacts:
+            self._feel(contacts, before)
+
+    def take_over(
+        self,
+        rotor_speeds: RotorSpeeds,
+        tip_force_peak: float,
+        tip_impulse: float,
+        contacts: int,
+        steps: int,
+        before: Readings | None,
+    ) -> None:
+        """Continue after steps that `native/step.c` has run on `data`.
+
+        Args:
+            rotor_speeds: Actual rotor speeds [rad/s], shape (4,).
+            tip_force_peak: The attribute of this name [N].
+            tip_impulse: The attribute of this name [N s].
+            contacts: The attribute of this name.
+            steps: The attribute of this name.
+            before: None, or the readings at the beginning of the last step if its contacts have to
+                be checked.
+        """
+        self._rotors.speeds, self._readings = rotor_speeds, None
+        self.tip_force_peak, self.tip_impulse = tip_force_peak, tip_impulse
+        self.contacts, self.steps = contacts, steps
+        if before:
+            self._note_contacts(before)
+
+    @property
+    def readings(self) -> Readings:
+        """State of the base after the last step."""
+        readings = self._readings
+        if readings is None:
+            readings = _readings_of(_unpack_pose(self._qpos), _unpack_twist(self._qvel))
+            self._readings = readings
+        return readings
+
+    def truth(self, now_ns: int) -> Odometry:
+        """Return the true odometry after the last step, with the stamp `now_ns` [ns]."""
+        px, py, pz, w, x, y, z = _unpack_pose(self._qpos)
+        vx, vy, vz, p, q, r = _unpack_twist(self._qvel)
+        return _new(Odometry, (now_ns, (px, py, pz), (w, x, y, z), (vx, vy, vz), (p, q, r)))
 
     @property
     def touch_age(self) -> float:
@@ -157,13 +195,24 @@ class Simulator:
         """
         spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
         physics = np.empty(mujoco.mj_stateSize(self.model, spec))
-        mujoco.mj_getState(self.model, self._data, physics, spec)
-        return physics, self._data.qacc_warmstart.copy()
+        mujoco.mj_getState(self.model, self.data, physics, spec)
+        return physics, self.data.qacc_warmstart.copy()
+
+    def _feel(self, contacts: int, before: Readings) -> None:
+        """Measure the tip's force after a step with `contacts` contacts, and store new contacts."""
+        force = self._sensors[self._tip_sensor]
+        self.tip_impulse += force * self.dt
+        if force > self.tip_force_peak:
+            self.tip_force_peak = force
+        # Check at once if the number of contacts has changed, else only every few steps.
+        if contacts and (contacts != self.contacts or self.steps % CONTACT_CHECK_STEPS == 0):
+            self._note_contacts(before)
+        self.contacts = contacts
 
     def _note_contacts(self, before: Readings) -> None:
         """Store the new contacts with the state of the robot before the step, `before`."""
-        contact = self._data.contact
-        tip = self._data.site_xpos[self._tip].tolist()
+        contact = self.data.contact
+        tip = self.data.site_xpos[self._tip].tolist()
         pairs, places = contact.geom.tolist(), contact.pos.tolist()
         for (first, second), place in zip(pairs, places, strict=True):
             body = self._bodies[first] or self._bodies[second]

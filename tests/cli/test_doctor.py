@@ -47,6 +47,13 @@ def test_every_problem_says_how_to_fix_it(monkeypatch):
         extras.require("mode virtual", ["world", "record"])
 
 
+def test_the_doctor_says_where_the_usual_steps_run(monkeypatch):
+    monkeypatch.setenv("CLOUDRC_NATIVE", "0")
+    check = doctor.native_steps()
+    assert (check.state, check.found) == ("warn", "Python (CLOUDRC_NATIVE=0)")
+    assert "CLOUDRC_NATIVE" in check.fix
+
+
 def test_the_extras_are_those_of_pyproject():
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     declared = project["optional-dependencies"]

@@ -14,6 +14,7 @@ from cloudrc.messages import (
     Cause,
     Command,
     GuardState,
+    Odometry,
     OperatorRequest,
     Request,
     Start,
@@ -42,8 +43,8 @@ def bare_robot():
     guard = Mock(state=GuardState.TRACK, cause=Cause.COMMAND, latched=False, armed=True)
     guard.configure_mock(counts={}, changes=[], reference=ZERO)
     guard.accept_command.return_value = None
-    readings = (ZERO, UPRIGHT, ZERO, ZERO, ZERO * 3)
-    simulator = Mock(tip_force=lambda: 0.0, readings=readings, touches=[])
+    truth = lambda now_ns: Odometry(now_ns, ZERO, UPRIGHT, ZERO, ZERO)  # noqa: E731
+    simulator = Mock(tip_force=lambda: 0.0, truth=truth, touches=[])
     simulator.take_tip_force.return_value = (0.0, 0.0)
     run = lambda tick_ns, stop_ns: stop_ns  # noqa: E731
     return Mock(guard=guard, simulator=simulator, observers=[], run=run)

@@ -5,13 +5,17 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
+from cloudrc.assembly import assemble
 from cloudrc.config.load import dump, load_experiment
+from cloudrc.messages import Passed
 from cloudrc.record.columns import Recording
-from tests.flights.conftest import digest, records
+from cloudrc.record.hash import RecordHash
+from tests.flights.conftest import LIMIT_NS, digest, fly_on, join, records
 
 SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 1.0}]", "criteria.contact=false")
 ROOT = Path(__file__).resolve().parents[2]
@@ -39,6 +43,42 @@ def test_the_resolved_experiment_flies_the_same_run_again(tmp_path):
     path, flown = tmp_path / "config.yaml", short("link.profile=lossy", "seed=5")
     path.write_text(dump(flown))
     assert digest(load_experiment(path)) == digest(flown)
+
+
+@pytest.mark.parametrize("profile", ["paper-p2", "lossy", "ideal"])
+def test_messages_passed_without_bytes_make_the_same_records(profile):
+    experiment = short(f"link.profile={profile}")
+    _, cloud, run = assemble(experiment)
+    passed = RecordHash()
+    for each in fly_on(run, LIMIT_NS, lambda: cloud.mission_over):
+        passed.update(each)
+    assert passed.hexdigest() == digest(experiment)
+
+
+def test_a_link_that_damages_datagrams_gets_bytes():
+    damaging = short("link.downlink.corrupt=0.2", "link.profile=ideal")
+    for experiment, kind in ((short(), Passed), (damaging, bytes)):
+        world, _, run = assemble(experiment)
+        run.fly(lambda: False, 200_000_000, lambda of_world, of_cloud: None)
+        world.handle_deadline(world.next_deadline_ns())
+        assert {type(data) for data in world.take_datagrams()} == {kind}
+
+
+def test_an_observed_robot_flies_the_same_flight():
+    """An observer sees every step at once; without observers world puts some steps off."""
+    seen = []
+
+    class Observer(Mock):
+        def see_step(self, now_ns, *given):
+            seen.append(now_ns)
+
+    world, cloud, run = join(short())
+    world.robot.observers.append(Observer())
+    observed = RecordHash()
+    for each in fly_on(run, LIMIT_NS, lambda: cloud.mission_over):
+        observed.update(each)
+    assert observed.hexdigest() == digest(short())
+    assert seen == list(range(0, seen[-1] + 1, 2_000_000))
 
 
 def test_the_clocks_of_the_ends_need_not_agree():

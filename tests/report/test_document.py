@@ -52,6 +52,8 @@ def test_the_environment_names_software_but_no_user_or_host():
     environment = environment_document()
     assert environment["packages"]["numpy"]
     assert environment["cores"] >= 1
+    assert "physics_steps" not in environment
+    assert environment_document("C (compiled by cc)")["physics_steps"] == "C (compiled by cc)"
     words = json.dumps(environment).replace('"', " ").split()
     assert {getpass.getuser(), platform.node()}.isdisjoint(words)
 

@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cloudrc.messages import ZERO, Command
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
@@ -163,3 +164,16 @@ def test_a_counter_that_no_recording_can_hold_is_refused():
     cloud._counters[Kind.COMMAND] = 2**63 - 1
     assert world.open(cloud.seal(Kind.COMMAND, BODY))[2] == 2**63 - 1
     assert refuses(world, cloud.seal(Kind.COMMAND, BODY), "malformed")
+
+
+def test_a_passed_message_has_the_number_that_its_datagram_would_have():
+    world, cloud = pair(secret=None)
+    cloud.seal(Kind.COMMAND, BODY)
+    message = Command(1, 2, 3, ZERO, 0.0)
+    passed = cloud.pass_on(Kind.COMMAND, message)
+    assert codec.peek(passed) == (Kind.COMMAND, 1, 1)
+    assert world.open(passed)[3] is message
+    assert codec.peek(cloud.seal(Kind.COMMAND, BODY)) == (Kind.COMMAND, 1, 2)
+    world.begin(2)
+    assert refuses(world, passed, "old_epoch")
+    assert refuses(Session(Direction.UPLINK, None), passed, "old_epoch")

@@ -279,6 +279,30 @@ class Guard:
         self._follow(reference, now_ns, readings, dt)
         return self.reference
 
+    def plain_track(self, now_ns: int) -> tuple[int, Vector, Vector, int, int] | None:
+        """Return what `native/step.c` needs to run steps from `now_ns` [ns] on, or None.
+
+        None: a step may do more than follow the command, so that `step` has to run it. Else: when
+        the plan's next velocity is due [ns]; the reference and the commanded velocity [m/s], which
+        are one object once the reference has arrived; the end of the time without checks, and the
+        end of the fresh command [ns].
+        """
+        if not (self._take_off.over and self._ramp_until_ns <= now_ns <= self._track_until_ns):
+            return None
+        if now_ns >= self._next_ns:
+            self._play(self._played, now_ns)
+        reference, wanted = self.reference, self._wanted
+        return self._next_ns, reference, wanted, self._steady_until_ns, self._track_until_ns
+
+    def continue_track(self, reference: Vector | None, steady_until_ns: int) -> None:
+        """Continue after steps that `native/step.c` has run.
+
+        `reference` is the velocity reference of the last step [m/s], shape (3,), or None if it is
+        the commanded velocity. The guard need not check again before `steady_until_ns` [ns].
+        """
+        self.reference = self._wanted if reference is None else reference
+        self._steady_until_ns = steady_until_ns
+
     def _follow(self, reference: Vector, now_ns: int, readings: Readings, dt: float) -> None:
         """Set the velocity reference, limited to keep the robot upright and inside the fence."""
         climb, position = readings.velocity[2], readings.position

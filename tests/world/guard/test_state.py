@@ -495,3 +495,30 @@ def test_after_flying_the_rotors_do_not_stop_where_it_stood():
     feed(guard, 3 * SECOND, 20, ZERO, position=STANDS)
     run(guard, 4 * SECOND, 6 * SECOND, STANDS)
     assert states(guard) == [TRACK, HOLD]
+
+
+def test_c_may_run_the_steps_of_a_fresh_command_in_the_air():
+    guard = taking_off(1.0)
+    wanted = (0.0, 0.0, 1.0)
+    next_ns, reference, asked, steady_ns, track_ns = guard.plain_track(10 * MS)
+    assert (reference, asked, track_ns) == (guard.reference, wanted, 250 * MS)
+    assert next_ns > SECOND  # there is no plan
+    assert steady_ns <= track_ns
+    assert guard.plain_track(252 * MS) is None
+    guard.continue_track((0.0, 0.0, 0.5), 20 * MS)
+    assert guard.plain_track(20 * MS)[1:] == ((0.0, 0.0, 0.5), wanted, 20 * MS, 250 * MS)
+    guard.continue_track(None, 30 * MS)
+    _, reference, asked, *_ = guard.plain_track(30 * MS)
+    assert reference is asked
+
+
+def test_c_runs_no_step_before_take_off_or_on_the_ramp_after_a_hold():
+    assert taking_off(0.01).plain_track(10 * MS) is None
+    guard = taking_off(1.0)
+    run(guard, 10 * MS, 2 * SECOND, (0.0, 0.0, 1.1))
+    now_ns = feed(guard, 2 * SECOND, 20, (0.0, 0.0, 1.0), position=(0.0, 0.0, 1.1))
+    assert states(guard) == [HOLD, TRACK]
+    assert guard.plain_track(now_ns) is None
+    ramp_ns = LIMITS.ramp_ns
+    now_ns = feed(guard, now_ns, 1 + ramp_ns // (10 * MS), ZERO, position=(0.0, 0.0, 1.1))
+    assert guard.plain_track(now_ns) is not None

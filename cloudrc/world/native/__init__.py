@@ -1,0 +1,1 @@
+"""The usual step in C: `step.c`, the code that loads it, and the robot that flies with it."""

@@ -1,0 +1,178 @@
+"""The memory that Python and `step.c` share: numbers, MuJoCo's addresses and the present state."""
+
+from __future__ import annotations
+
+import ctypes
+from math import dist, inf, prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cloudrc.geometry.fence import FLOOR_MARGIN
+from cloudrc.messages import NEVER_NS
+from cloudrc.world import low_level, rotors
+from cloudrc.world.guard import limits as rules
+from cloudrc.world.guard import state
+from cloudrc.world.low_level import LowLevel
+from cloudrc.world.scene import ROBOT_PREFIX, mujoco
+from cloudrc.world.simulator import CONTACT_CHECK_STEPS, Simulator
+
+_POINTERS = (
+    *("mj_step", "model", "data", "qpos", "qvel", "ctrl", "applied"),
+    *("tip_force", "contacts", "disable", "geoms", "timer", "obstacles"),
+)
+ACCELERATION_MAX = 400.0
+"""Limit of the robot's acceleration in the air [m/s^2]. Full thrust gives a robot that is 10 %
+lighter 153 m/s^2, and a spin of 50 rad/s about a centre of mass 3 cm away gives 75 m/s^2."""
+MARGIN = 1e-3
+"""Distance that is added to every geom and its own margin [m]; it covers rounding errors."""
+HUGE = 1e4
+"""Half the edge of the box that stands for the space below a plane [m]."""
+_DISABLE = mujoco.mjtDisableBit
+UNUSED_WITHOUT_CONTACTS = int(
+    _DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT | _DISABLE.mjDSBL_SENSOR
+)
+"""Parts of MuJoCo that do nothing while the robot touches nothing."""
+_CONSTANTS = {
+    rotors: "thrust_coefficient torque_ratio drag_coefficient arm height",
+    low_level: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
+    "thrust_max tiny nose_cosine_min yaw_sine_max",
+    state: "overturned_cosine",
+    rules: "sink_lead_max fence_reaction reaction stop_coefficient recheck_distance far low_speed",
+}
+"""Modules and their constants that `step.c` needs, in the order of its fields."""
+_VALUES = {
+    name: getattr(module, name.upper())
+    for module, names in _CONSTANTS.items()
+    for name in names.split()
+}
+_double, _int64 = ctypes.c_double, ctypes.c_int64
+_FIELDS: dict[str, Any] = {
+    **dict.fromkeys(_POINTERS, ctypes.c_void_p),
+    **dict.fromkeys([*_VALUES, "up", "down"], _double),
+    **{"gains": _double * 9, "limit_xy": _double, "limit_z": _double, "dt": _double},
+    **{"change_max": _double, "low_z": _double, "low": _double * 3, "high": _double * 3},
+    **dict.fromkeys(("time_step", "robot_radius", "acceleration_max"), _double),
+    **dict.fromkeys(("recheck_ns", "never_ns", "step_ns"), _int64),
+    **dict.fromkeys(("check_steps", "obstacle_count", "unused"), _int64),
+    **{"reference": _double * 3, "wanted": _double * 3},
+    **dict.fromkeys(("settled", "steady_until_ns", "track_until_ns"), _int64),
+    **{"force_peak": _double, "impulse": _double},
+    **dict.fromkeys(("touching", "steps", "is_news", "free_steps"), _int64),
+    **{"speeds": _double * 4, "integral": _double * 3, "error": _double * 3},
+    **{"has_error": _int64, "before": _double * 13},
+}
+
+
+class Flight(ctypes.Structure):
+    """The structure `Flight` of `step.c`, which explains the fields."""
+
+    _fields_ = tuple(_FIELDS.items())
+
+
+def make_flight(
+    simulator: Simulator, controller: LowLevel, limits: rules.Limits, step_ns: int
+) -> Flight:
+    """Fill everything but the state; `step_ns` is the duration of a step [ns].
+
+    Call it after a reset of the simulator. Raise an OSError, AttributeError, KeyError or
+    ImportError if MuJoCo is not as expected.
+    """
+    model, data = simulator.model, simulator.data
+    turning, (low, high) = rotors.Rotors(simulator.dt), limits.inner_corners()
+    limit_xy, limit_z, dt = controller.limits
+    arrays = data.qpos, data.qvel, data.ctrl, data.qfrc_applied
+    tip_force = data.sensordata[model.sensor(f"{ROBOT_PREFIX}tip").adr[0] :]
+    flags = model.opt.gravity.ctypes.data - _offset("mjOption", "gravity")
+    flags += _offset("mjOption", "disableflags")
+    geoms = model._address + _offset("mjModel", "ngeom")
+    obstacles, radius = _obstacles(model, data)
+    library = _mujoco_library()
+    timer = ctypes.addressof(ctypes.c_void_p.in_dll(library, "mjcb_time"))
+    flight = Flight(
+        ctypes.cast(library.mj_step, ctypes.c_void_p),
+        *(model._address, data._address),  # MuJoCo has no public name for them
+        *(array.ctypes.data for array in (*arrays, tip_force)),
+        *(data._address + _offset("mjData", "ncon"), flags, geoms, timer, obstacles.ctypes.data),
+        *_VALUES.values(),
+        *(turning.up, turning.down, controller.gains, limit_xy, limit_z, dt),
+        limits.acceleration_max * (step_ns * 1e-9),
+        low[2] - FLOOR_MARGIN + rules.LOW_HEIGHT,
+        *(low, high, simulator.dt, radius, ACCELERATION_MAX, rules.RECHECK_NS, NEVER_NS, step_ns),
+        *(CONTACT_CHECK_STEPS, len(obstacles), UNUSED_WITHOUT_CONTACTS),
+    )
+    flight.keep = obstacles  # else Python frees their memory
+    return flight
+
+
+def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
+    """Return a box with rounded edges around each geom of the scene, and the robot's radius [m].
+
+    A row has the centre (3,) and the axes (9,) of the box, its half sizes (3,), and the radius of
+    the edges, all [m]. The radius of the robot is that of a ball around its base's origin; it is
+    infinite if geoms matter without a contact, too.
+    """
+    option, rows, radius = model.opt, [], 0.0
+    if option.density or option.viscosity or model.nflex or model.npair:
+        radius = inf
+    for geom in range(model.ngeom):
+        size, bound = model.geom_size[geom], model.geom_rbound[geom]
+        place, axes = data.geom_xpos[geom], data.geom_xmat[geom]
+        margin = MARGIN + max(model.geom_margin[geom], option.o_margin)
+        if model.geom_bodyid[geom]:  # a geom of the robot; those of the scene are fused to body 0
+            radius = max(radius, dist(place, data.qpos[:3]) + bound + margin)
+        elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+            rows.append([*place, *axes, *size, margin])
+        elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
+            normal = axes.reshape(3, 3)[:, 2]
+            rows.append([*(place - HUGE * normal), *axes, HUGE, HUGE, HUGE, margin])
+        else:
+            rows.append([*place, *axes, 0.0, 0.0, 0.0, bound + margin])
+    return np.array(rows, float), radius
+
+
+def _mujoco_library() -> ctypes.CDLL:
+    """Return MuJoCo's own library, which `import mujoco` has loaded."""
+    folder = Path(mujoco.__file__).parent
+    files = [*folder.glob("libmujoco.so*"), *folder.glob("libmujoco*.dylib")]
+    if len(files) != 1:
+        raise OSError(f"{folder}: has {len(files)} files of MuJoCo's library, not 1")
+    return ctypes.CDLL(str(files[0]))
+
+
+def _offset(struct: str, name: str) -> int:
+    """Return where a field is in a structure of MuJoCo [bytes].
+
+    The place depends on MuJoCo's version. The package describes its structures.
+    """
+    from mujoco.introspect import structs
+
+    fields = []
+    for field in structs.STRUCTS[struct].fields:
+        fields.append((field.name, _ctype(field.type, structs.STRUCTS)))
+        if field.name == name:
+            break
+    layout = type(struct, (ctypes.Structure,), {"_fields_": fields})
+    offset: int = getattr(layout, name).offset
+    return offset
+
+
+_SCALARS = {
+    **dict.fromkeys(("int", "float", "mjtTimer"), ctypes.c_int32),
+    **dict.fromkeys(("mjtBool", "mjtByte"), ctypes.c_uint8),
+    **dict.fromkeys(("mjtNum", "mjtSize", "size_t", "uintptr_t", "uint64_t"), _int64),
+}
+"""Types of `mujoco.introspect`, as types of the same size."""
+
+
+def _ctype(kind: Any, structs: Any) -> Any:
+    """Return the type of ctypes for a type of `mujoco.introspect`; KeyError if it is unknown."""
+    if hasattr(kind, "extents"):
+        return _ctype(kind.inner_type, structs) * prod(kind.extents)
+    if not hasattr(kind, "name"):
+        return ctypes.c_void_p
+    if kind.name in _SCALARS:
+        return _SCALARS[kind.name]
+    fields = [(field.name, _ctype(field.type, structs)) for field in structs[kind.name].fields]
+    return type(kind.name, (ctypes.Structure,), {"_fields_": fields})

