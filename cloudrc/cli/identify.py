@@ -102,12 +102,10 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _document(fits: Sequence[Fit], seconds: float, topics: tuple[str, str]) -> dict[str, Any]:
-    values = {
-        name: [round(float(fit.values[n]), 4) for fit in fits] for n, name in enumerate(NAMES)
-    }
-    halves = {
-        name: [round(float(fit.half_widths[n]), 4) for fit in fits] for n, name in enumerate(NAMES)
-    }
+    values, halves = (
+        {name: [round(float(fit[part][n]), 4) for fit in fits] for n, name in enumerate(NAMES)}
+        for part in (0, 1)
+    )
     shares = [round(fit.share, 4) for fit in fits]
     more = {"seconds": round(seconds, 2), "input": topics[0], "output": topics[1]}
     return {**values, "half_width_95": halves, "explained": shares, **more}
@@ -169,7 +167,10 @@ def identify(given: Array, measured: Array, name: str) -> Fit:
         change = np.linalg.lstsq(slopes, -error, rcond=None)[0]
         if theta[1] == 0.0 and change[1] < 0.0:  # the dead time stays at its limit
             change[[0, 2]] = np.linalg.lstsq(slopes[:, [0, 2]], -error, rcond=None)[0]
-        tries = [np.maximum(theta + share * change, (2.0 * DT, 0.0, 0.0)) for share in (1.0, 0.5, 0.2, 0.05)]
+        tries = [
+            np.maximum(theta + share * change, (2.0 * DT, 0.0, 0.0))
+            for share in (1.0, 0.5, 0.2, 0.05)
+        ]
         best = min([theta, *tries], key=lambda each: float((residuals(each) ** 2).sum()))
         if np.abs(best - theta).max() < 1e-5:
             break
