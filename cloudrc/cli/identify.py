@@ -1,61 +1,27 @@
-"""`cloudrc identify RUN`: fit the model of the velocity loop that `command_history` uses.
-
-Per axis, the model is v' = (K u(t - d) - v) / T with time constant T, dead time d and gain K. The
-fit minimises the squared difference of measured and simulated velocity by Gauss-Newton steps.
-
-The residuals of neighbouring samples are correlated. Therefore the 95 % intervals come from the
-scatter of ten blocks of the recording, which are almost independent.
-"""
+"""`cloudrc identify RUN`: fit the model of the velocity loop that `command_history` uses."""
 
 from __future__ import annotations
 
 import argparse
 import os
 from collections.abc import Sequence
-from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import format_document, output_argument, print_line, table
 from cloudrc.errors import BadInputError
-from cloudrc.messages import GuardState
 
 if TYPE_CHECKING:
-    from cloudrc.record.columns import Recording
+    from cloudrc.metrics.velocity_loop import Fit
 
-Array: TypeAlias = NDArray[np.float64]
 NAMES = ("time_constant", "dead_time", "gain")
-INPUTS = {"/reference": "reference", "/command_applied": "velocity", "/cmd_vel": "command"}
-OUTPUTS = {"/ground_truth": "velocity", "/odometry": "velocity"}
-"""Topic -> column with velocities; the first topic that has rows is used."""
-DT = 0.01
-"""Time between two samples of the fit [s]."""
-START = 100
-"""Number of samples at the start that the fit leaves out: the input before them is unknown."""
-TAKE_OFF = 2.0
-"""Time after the beginning of TRACK that is left out [s]."""
-BLOCKS, T_QUANTILE = 10, 2.262
-"""Number of blocks, and the 97.5 % quantile of Student's t with 9 degrees of freedom."""
-DURATION_MIN, DEVIATION_MIN, SHARE_MIN = 20.0, 0.1, 0.8
-"""Least duration [s], standard deviation of the input [m/s], and explained share of variance."""
 EPILOG = """\
 examples:
   cloudrc run steps --mode virtual
   cloudrc identify runs/latest --out model.yaml
   cloudrc run steps --set cloud.predictor=command_history \\
       --set cloud.predictor.model=model.yaml"""
-
-
-class Fit(NamedTuple):
-    """Time constant [s], dead time [s], gain [1]; half widths; explained share of variance [1]."""
-
-    values: Array
-    half_widths: Array
-    share: float
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -69,6 +35,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Fit the model, write it to a file, and print it."""
     require("identify", ("record",))
+    from cloudrc.metrics.velocity_loop import DT, identify, series
     from cloudrc.record.columns import Recording
 
     path, out = options.run, options.out
@@ -102,107 +69,10 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _document(fits: Sequence[Fit], seconds: float, topics: tuple[str, str]) -> dict[str, Any]:
-    values = {
-        name: [round(float(fit.values[n]), 4) for fit in fits] for n, name in enumerate(NAMES)
-    }
-    halves = {
-        name: [round(float(fit.half_widths[n]), 4) for fit in fits] for n, name in enumerate(NAMES)
-    }
+    values, halves = (
+        {name: [round(float(fit[:2][part][n]), 4) for fit in fits] for n, name in enumerate(NAMES)}
+        for part in (0, 1)
+    )
     shares = [round(fit.share, 4) for fit in fits]
     more = {"seconds": round(seconds, 2), "input": topics[0], "output": topics[1]}
     return {**values, "half_width_95": halves, "explained": shares, **more}
-
-
-def series(recording: Recording, name: str) -> tuple[Array, Array, tuple[str, str]]:
-    """Return input and output velocities [m/s], shape (n, 3), each DT, and their topics.
-
-    The samples are from the longest time in TRACK, without the take-off; from the whole recording
-    if it does not contain the guard's states. `name` is the recording's name in error messages.
-    """
-    topics = []
-    for candidates in (INPUTS, OUTPUTS):
-        there = [topic for topic in candidates if len(recording[topic])]
-        if not there:
-            raise BadInputError(f"{name}: has no {' or '.join(candidates)}; record one of them")
-        topics.append(there[0])
-    source, sink = (recording[topic] for topic in topics)
-    start_ns, end_ns = sink["stamp_ns"][[0, -1]]
-    guard = recording["/guard"]
-    if len(guard):
-        ends_ns = np.append(guard["stamp_ns"][1:], end_ns)
-        tracks = np.where(guard["state"] == GuardState.TRACK, ends_ns - guard["stamp_ns"], 0)
-        longest = int(tracks.argmax())
-        start_ns, end_ns = guard["stamp_ns"][longest] + int(TAKE_OFF * 1e9), ends_ns[longest]
-        end_ns = end_ns if tracks[longest] else start_ns
-    if end_ns - start_ns < DURATION_MIN * 1e9:
-        raise BadInputError(
-            f"{name}: {max(0, end_ns - start_ns) * 1e-9:.1f} s of flight under commands after the "
-            f"take-off, and the fit needs {DURATION_MIN:g} s; record a longer flight"
-        )
-    at_ns = np.arange(start_ns, end_ns, int(DT * 1e9))
-    held = source["stamp_ns"].searchsorted(at_ns, "right") - 1
-    given = source[INPUTS[topics[0]]][np.maximum(held, 0)]
-    columns = sink[OUTPUTS[topics[1]]].T
-    measured = np.stack([np.interp(at_ns, sink["stamp_ns"], column) for column in columns], axis=1)
-    return given, measured, (topics[0], topics[1])
-
-
-def identify(given: Array, measured: Array, name: str) -> Fit:
-    """Fit the model to the input and output velocities of one axis [m/s], shape (n,), each DT.
-
-    Raises:
-        BadInputError: If the input does not excite the axis `name`, or the model does not fit.
-    """
-    if given.std() < DEVIATION_MIN:
-        raise BadInputError(
-            f"{name}: the commanded velocity hardly changes (standard deviation {given.std():.2g} "
-            f"m/s, below {DEVIATION_MIN:g}); record a flight with steps, as 'cloudrc run steps'"
-        )
-
-    def residuals(theta: Array) -> Array:
-        return (measured - simulate(given, theta, measured[0]))[START:]
-
-    starts = [np.array([t, d, 1.0]) for t in (0.1, 0.3, 0.8) for d in (0.0, 0.1, 0.3)]
-    theta = min(starts, key=lambda start: float((residuals(start) ** 2).sum()))
-    for _ in range(20):
-        error, slopes = residuals(theta), _slopes(residuals, theta)
-        change = np.linalg.lstsq(slopes, -error, rcond=None)[0]
-        if theta[1] == 0.0 and change[1] < 0.0:  # the dead time stays at its limit
-            change[[0, 2]] = np.linalg.lstsq(slopes[:, [0, 2]], -error, rcond=None)[0]
-        tries = [
-            np.maximum(theta + share * change, (2.0 * DT, 0.0, 0.0))
-            for share in (1.0, 0.5, 0.2, 0.05)
-        ]
-        best = min([theta, *tries], key=lambda each: float((residuals(each) ** 2).sum()))
-        if np.abs(best - theta).max() < 1e-5:
-            break
-        theta = best
-    error, slopes = residuals(theta), _slopes(residuals, theta)
-    share = 1.0 - error.var() / measured.var()
-    if share < SHARE_MIN:
-        raise BadInputError(
-            f"{name}: a first-order model explains {share:.0%} of the velocity, below "
-            f"{SHARE_MIN:.0%}; record a flight in free air, without HOLD and without contact"
-        )
-    blocks = np.array_split(slopes * error[:, None], BLOCKS)
-    scores = np.array([block.sum(axis=0) for block in blocks])
-    inverse = np.linalg.pinv(slopes.T @ slopes)
-    variance = inverse @ (scores.T @ scores) @ inverse * BLOCKS / (BLOCKS - 1)
-    return Fit(theta, T_QUANTILE * np.sqrt(variance.diagonal()), float(share))
-
-
-def simulate(given: Array, theta: Array, start: float) -> Array:
-    """Return the model's velocity [m/s], shape (n,), for an input [m/s] and `theta`: T, d, K."""
-    constant, dead, gain = theta
-    at = np.arange(len(given)) * DT
-    late = np.interp(at - dead, at, given) * gain
-    decay = float(np.exp(-DT / constant))
-    steps = ((1.0 - decay) * late[:-1]).tolist()
-    return np.array(list(accumulate(steps, lambda v, u: decay * v + u, initial=float(start))))
-
-
-def _slopes(residuals: Any, theta: Array) -> Array:
-    """Return the derivatives of the residuals with respect to T, d and K, shape (n, 3)."""
-    step = 0.5 * DT
-    pairs = [(theta + change, theta - change) for change in np.eye(3) * step]
-    return np.stack([(residuals(a) - residuals(b)) / (2.0 * step) for a, b in pairs], axis=1)

@@ -7,11 +7,11 @@ from math import exp
 import numpy as np
 import pytest
 
-from cloudrc.cli.identify import DT, identify, series
 from cloudrc.cli.main import main
 from cloudrc.config.document import parse_yaml
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
+from cloudrc.metrics.velocity_loop import DT, identify, series
 from cloudrc.record.columns import Recording
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import GroundTruth, GuardChange

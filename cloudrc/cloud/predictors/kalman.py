@@ -20,25 +20,18 @@ class Kalman(Predictor):
     """Filters position and velocity, and gives the filtered samples to another predictor."""
 
     def __init__(self, replay: Replay, position: float, velocity: float, model: float) -> None:
-        """Set the predictor of the replay, and standard deviations.
+        """Set the predictor that replays the commands, and standard deviations.
 
-        Args:
-            replay: Predictor that forecasts the next sample, and replays the commands.
-            position: Of the noise of the position [m].
-            velocity: Of the noise of the velocity [m/s].
-            model: Of the error of the model's acceleration [m/s^2].
+        These are of position [m], velocity [m/s] and the model's acceleration [m/s^2].
         """
         self._replay = replay
         self._noise = (position * position, velocity * velocity, model * model)
-        self._begin()
-
-    def _begin(self) -> None:
-        self._estimate: Odometry | None = None
-        self._covariance = (self._noise[0], 0.0, self._noise[1])
+        self.reset()
 
     def reset(self) -> None:
         """Forget the estimate, all commands and echoes."""
-        self._begin()
+        self._estimate: Odometry | None = None
+        self._covariance = (0.0, 0.0, 0.0)
         self._replay.reset()
 
     def commanded(self, command: Command) -> None:
@@ -54,7 +47,7 @@ class Kalman(Predictor):
         before, forecast = self._estimate, self._replay.forecast(odometry.stamp_ns)
         estimate = odometry
         if before is None or forecast is None:
-            self._begin()
+            self._covariance = (self._noise[0], 0.0, self._noise[1])
         else:
             gains = self._update((odometry.stamp_ns - before.stamp_ns) * 1e-9)
             position, velocity = _blend(forecast, odometry, gains)
@@ -121,13 +114,6 @@ def _blend(
     return position, velocity
 
 
-REPLAYS: dict[str, Any] = {
-    "white_box": model_based.build,
-    "first_order": command_history.build,
-}
-"""Value of the parameter `model` -> function that builds the replay."""
-
-
 def build(
     model: Literal["white_box", "first_order"] = "white_box",
     parameters: dict[str, Any] | None = None,
@@ -148,8 +134,9 @@ def build(
     Raises:
         ValueError: If a standard deviation is not above 0, or the predictor refuses a parameter.
     """
+    build_replay: Any = model_based.build if model == "white_box" else command_history.build
     try:
-        replay = REPLAYS[model](**(parameters or {}))
+        replay = build_replay(**(parameters or {}))
     except TypeError as error:
         raise ValueError(f"parameters: {error}; see 'cloudrc list predictors'") from error
     return Kalman(

@@ -21,22 +21,18 @@ from cloudrc.messages import ZERO, Odometry, Vector
 
 STEP = 0.010
 """Longest time step of the model [s]."""
-MASS, ASSUMED_MASS = 1.06, 1.05
-"""Mass of the robot, and the mass that the onboard controller assumes [kg].
-Source: docs/reference/plant.md, "Total mass"."""
-GRAVITY, ASSUMED_WEIGHT = 9.8066, 1.05 * 9.81
-"""Gravity [m/s^2], and the weight that the onboard controller assumes [N].
-Source: docs/reference/plant.md, "Gravity"."""
+MASS, GRAVITY, ASSUMED_WEIGHT = 1.06, 9.8066, 1.05 * 9.81
+"""Mass [kg], gravity [m/s^2], and the weight that the onboard controller assumes [N].
+Source: docs/reference/plant.md, "Total mass", "Gravity"."""
 INERTIA_X, INERTIA_Y = 0.0116, 0.0121
 """Inertia of the whole robot about its centre of mass [kg m^2].
 Source: docs/reference/plant.md, "Total inertia"."""
 RATE_GAIN = 0.22
 """Torque per angular velocity [N m s]; the torque per attitude error is 1 N m.
 Source: docs/reference/plant.md, "Low-level controller"."""
-LAG_UP, LAG_DOWN = 0.0125, 0.025
-"""Time constants of the rotors [s]; a torque needs both. Source: docs/reference/plant.md,
-"Rotor speed"."""
-LAG = 0.5 * (LAG_UP + LAG_DOWN)
+LAG_UP, LAG_DOWN, LAG = 0.0125, 0.025, 0.01875
+"""Time constants of the thrust, and of a torque, which needs both: their mean [s].
+Source: docs/reference/plant.md, "Rotor speed"."""
 DRAG = 0.155
 """Deceleration per velocity across the thrust axis, with the rotors at hover speed [1/s].
 Source: docs/reference/plant.md, "Rotor drag"."""
@@ -49,7 +45,7 @@ refuses to descend. Source: docs/safety.md, "Limits"."""
 THRUST_MAX = 134.9
 """Largest thrust of the four rotors [N]. Source: docs/reference/plant.md, "Rotor speed"."""
 GAIN_ACCELERATION, GAIN_TORQUE = 0.3, 1.0
-"""Rates at which the estimates of unmodelled acceleration and torque follow the errors [1/s]."""
+"""Rates at which the estimates of what the model misses follow its errors [1/s]."""
 GAP_NS = 500_000_000
 """After a longer time without odometry the model begins anew [ns]."""
 
@@ -82,11 +78,9 @@ class WhiteBox(Body):
         self._missed = (bx + k * (ax - vx), by + k * (ay - vy), bz + k * (az - vz))
         before_x, before_y = self._rate
         self._take(odometry)
-        (qx, qy), (cx, cy), k = self._rate, self._trim, GAIN_TORQUE
-        self._trim = (
-            cx + k * INERTIA_Y * (qx - before_x),
-            cy + k * INERTIA_X * (qy - before_y),
-        )
+        (qx, qy), (cx, cy) = self._rate, self._trim
+        k_x, k_y = GAIN_TORQUE * INERTIA_Y, GAIN_TORQUE * INERTIA_X
+        self._trim = (cx + k_x * (qx - before_x), cy + k_y * (qy - before_y))
 
     def _take(self, odometry: Odometry) -> None:
         self.basis, self.horizon = odometry, 0.0
