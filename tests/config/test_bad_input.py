@@ -38,8 +38,8 @@ def test_all_problems_are_listed_with_their_lines(mine):
         "mine.yaml:2: guard.speed_max: unknown key; did you mean speed_max_mps [m/s]?",
         "mine.yaml:3: link.uplink.delay_ms: -3: must be a number >= 0 [ms]",
         "mine.yaml:5: cloud.predictor: no predictor named 'last_sampel'; available: "
-        "commanded_velocity, constant_acceleration, constant_velocity, last_sample; "
-        "did you mean last_sample?",
+        "command_history, commanded_velocity, constant_acceleration, constant_velocity, kalman, "
+        "last_sample, model_based; did you mean last_sample?",
         "mine.yaml:6: cloud.controller.sped_max: unknown key; did you mean speed_max?",
         "mine.yaml:7: world.scene: no scene named 'pipe'; available: empty, pipes; "
         "did you mean pipes?",
