@@ -36,7 +36,6 @@ def no_page(monkeypatch):
         ("--set cloud.predictr=last_sample", "predictor"),
         ("--set report.metrics=./no.py", "no.py': there is no such file"),
         ("--set nonsense", "key=value"),
-        ("--mode local --set cloud.clock_offset_s=5", "virtual time only"),
     ],
 )
 def test_bad_input_gives_one_line_and_writes_nothing(line, words, folder, capsys):
@@ -73,10 +72,11 @@ def test_a_run_and_its_report_can_be_repeated(folder, capsys):
     assert main(["report", "a"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "a/report.html"
     assert (folder / "a/report.html").is_file()
-    later = json.loads((folder / "a/report.json").read_text())["numbers"]
-    assert later.keys() == first["numbers"].keys()
-    for name, number in first["numbers"].items():  # the file has velocities in the body frame
-        assert later[name]["value"] == pytest.approx(number["value"], rel=1e-12), name
+    numbers = json.loads((folder / "a/report.json").read_text())["numbers"]
+    assert numbers.keys() == first["numbers"].keys()
+    # A recording has velocities in the body frame, so their last bit may change.
+    for name, number in numbers.items():
+        assert number["value"] == pytest.approx(first["numbers"][name]["value"], rel=1e-12), name
 
 
 @pytest.mark.usefixtures("no_page")
