@@ -44,8 +44,9 @@ LOW_HEIGHT, LOW_SPEED, FLOOR_MARGIN = 0.25, 1.0, 0.35
 refuses to descend. Source: docs/safety.md, "Limits"."""
 THRUST_MAX = 134.9
 """Largest thrust of the four rotors [N]. Source: docs/reference/plant.md, "Rotor speed"."""
-GAIN_ACCELERATION, GAIN_TORQUE = 0.3, 1.0
-"""Rates at which the estimates of what the model misses follow its errors [1/s]."""
+GAIN_ACCELERATION, GAIN_TORQUE = 0.3, 0.1
+"""Rates at which the estimates of what the model misses follow its errors [1/s]. The rate of the
+torque begins at 1 and falls with time, because the model's own errors disturb it."""
 GAP_NS = 500_000_000
 """After a longer time without odometry the model begins anew [ns]."""
 
@@ -67,6 +68,7 @@ class WhiteBox(Body):
         self._gains, self._acceleration_max = gains, acceleration_max
         self._reference, self._thrust = basis.velocity, ASSUMED_WEIGHT
         self._integral = self._missed = ZERO  # _missed: acceleration that the model lacks [m/s^2]
+        self._age = 0.0  # of the estimates [s]
         self._torque = self._trim = (0.0, 0.0)  # _trim: torque that the model lacks [N m]
         self._take(basis)
 
@@ -76,11 +78,12 @@ class WhiteBox(Body):
         bx, by, bz = self._missed
         k = GAIN_ACCELERATION
         self._missed = (bx + k * (ax - vx), by + k * (ay - vy), bz + k * (az - vz))
-        before_x, before_y = self._rate
+        (before_x, before_y), since_ns = self._rate, self.basis.stamp_ns
         self._take(odometry)
         (qx, qy), (cx, cy) = self._rate, self._trim
-        k_x, k_y = GAIN_TORQUE * INERTIA_Y, GAIN_TORQUE * INERTIA_X
-        self._trim = (cx + k_x * (qx - before_x), cy + k_y * (qy - before_y))
+        self._age += (odometry.stamp_ns - since_ns) * 1e-9
+        k = max(GAIN_TORQUE, 1.0 / (1.0 + self._age))
+        self._trim = (cx + k * INERTIA_Y * (qx - before_x), cy + k * INERTIA_X * (qy - before_y))
 
     def _take(self, odometry: Odometry) -> None:
         self.basis, self.horizon = odometry, 0.0
