@@ -36,7 +36,13 @@ DURATION_MIN, DEVIATION_MIN, SHARE_MIN = 20.0, 0.1, 0.8
 
 
 class Fit(NamedTuple):
-    """Time constant [s], dead time [s], gain [1]; half widths; explained share of variance [1]."""
+    """The model of one axis, and how certain it is.
+
+    Attributes:
+        values: Time constant [s], dead time [s] and gain [1], shape (3,).
+        half_widths: Half the 95 % interval of each value, in the units of `values`, shape (3,).
+        share: Share of the variance of the velocity that the model explains [1].
+    """
 
     values: Array
     half_widths: Array
@@ -78,10 +84,15 @@ def series(recording: Recording, name: str) -> tuple[Array, Array, tuple[str, st
 
 
 def identify(given: Array, measured: Array, name: str) -> Fit:
-    """Fit the model to the input and output velocities of one axis [m/s], shape (n,), each DT.
+    """Fit the model to the velocities of one axis, one sample per DT.
+
+    Args:
+        given: Input velocities [m/s], shape (n,).
+        measured: Output velocities [m/s], shape (n,).
+        name: Name of the axis in error messages.
 
     Raises:
-        BadInputError: If the input does not excite the axis `name`, or the model does not fit.
+        BadInputError: If the input does not excite the axis, or if the model does not fit.
     """
     if given.std() < DEVIATION_MIN:
         raise BadInputError(
@@ -122,7 +133,10 @@ def identify(given: Array, measured: Array, name: str) -> Fit:
 
 
 def simulate(given: Array, theta: Array, start: float) -> Array:
-    """Return the model's velocity [m/s], shape (n,), for an input [m/s] and `theta`: T, d, K."""
+    """Return the model's velocity [m/s], shape (n,), for `theta` with T, d [s] and K [1].
+
+    `given` is the input velocity, `start` the first velocity [m/s].
+    """
     constant, dead, gain = theta
     at = np.arange(len(given)) * DT
     late = np.interp(at - dead, at, given) * gain

@@ -126,7 +126,7 @@ class Body(Model):
         raise NotImplementedError
 
     def step(self, velocity: Vector, dt: float) -> Odometry:
-        """Advance the state as `advance` does, and return it."""
+        """Advance by `dt` [s] under the command `velocity` [m/s], and return the state."""
         self.advance(velocity, dt)
         self.horizon += dt
         return self.odometry()
@@ -188,7 +188,7 @@ class Replay(Predictor):
 
 
 def approach(reference: Vector, wanted: Vector, change_max: float) -> Vector:
-    """Change a velocity by at most `change_max` [m/s] towards `wanted`, as the guard does."""
+    """Change the velocity `reference` towards `wanted`, by at most `change_max`, all [m/s]."""
     (ax, ay, az), (bx, by, bz) = reference, wanted
     x, y, z = bx - ax, by - ay, bz - az
     square = x * x + y * y + z * z

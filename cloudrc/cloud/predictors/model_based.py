@@ -181,7 +181,7 @@ class ModelBased(Replay):
     """Rolls the white box from the newest odometry through the commands of the horizon."""
 
     def __init__(self, gains: tuple[float, ...], acceleration_max: float) -> None:
-        """Set the onboard velocity loop, as in `WhiteBox`."""
+        """Set the gains of the onboard velocity loop, and `acceleration_max` [m/s^2]."""
         self._loop = gains, acceleration_max
         super().__init__()
 
