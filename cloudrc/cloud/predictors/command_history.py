@@ -21,7 +21,7 @@ STEPS_MAX = 200
 
 
 class Loop(NamedTuple):
-    """Per axis: time constant [s], dead time [s], gain [1]; the limit `acceleration_max` [m/s^2]."""
+    """Time constant [s], dead time [s], gain [1] per axis; limit `acceleration_max` [m/s^2]."""
 
     time_constant: Vector
     dead_time: Vector
