@@ -40,7 +40,7 @@ class Fit(NamedTuple):
 
     Attributes:
         values: Time constant [s], dead time [s] and gain [1], shape (3,).
-        half_widths: Half the 95 % interval of each value, in the units of `values`, shape (3,).
+        half_widths: Half of the 95 % intervals of `values` [s], [s] and [1], shape (3,).
         share: Share of the variance of the velocity that the model explains [1].
     """
 

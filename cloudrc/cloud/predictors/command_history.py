@@ -21,7 +21,14 @@ STEPS_MAX = 200
 
 
 class Loop(NamedTuple):
-    """Time constant [s], dead time [s], gain [1] per axis; limit `acceleration_max` [m/s^2]."""
+    """The model of the onboard velocity loop.
+
+    Attributes:
+        time_constant: Time constant per axis [s], shape (3,).
+        dead_time: Dead time per axis [s], shape (3,).
+        gain: Gain per axis [1], shape (3,).
+        acceleration_max: The guard's cap on the acceleration [m/s^2].
+    """
 
     time_constant: Vector
     dead_time: Vector
