@@ -56,9 +56,12 @@ def execute(options: argparse.Namespace) -> int:
 
     interrupt_on_signals()
     require("margin", MODES["virtual"])
-    key, size = options.key, options.resolution or (10.0 if options.key.endswith("_ms") else 0.01)
-    first = max(1, round(_present(load(options.experiment, options.set), key) / abs(size)))
-    limit = options.max or STEPS_MAX * first * size
+    key, size, limit = options.key, options.resolution, options.max
+    if size is None:
+        size = 10.0 if key.endswith("_ms") else 0.01
+    present = _present(load(options.experiment, options.set), key)
+    first = max(1, round(present / size)) if 0 < size < math.inf else 1
+    limit = STEPS_MAX * first * size if limit is None else limit
     if not 0 < size <= limit < math.inf:
         raise BadInputError(f"--resolution {size:g} must be above 0, --max {limit:g} not below it")
     top = math.floor(limit / size + 1e-9)
@@ -124,7 +127,7 @@ def _try(options: argparse.Namespace, value: float, *, first: bool) -> Trial:
     """Fly the seeds with one value of the key until one fails."""
     from cloudrc.cli.run import load
 
-    settings = [*options.set, f"{options.key}={value:g}"]
+    settings = [*options.set, f"{options.key}={value:.12g}"]
     try:
         experiment = load(options.experiment, settings)
     except BadInputError as error:
@@ -143,9 +146,9 @@ def _try(options: argparse.Namespace, value: float, *, first: bool) -> Trial:
     # A worker takes as long to start as three flights of `steps`.
     with closing(map_in_order(fly_job, jobs, len(jobs) // 4)) as flights:
         for seed, flight in enumerate(flights, start=1):
-            if flight.verdict != "success":
-                code = (*flight.failures, flight.verdict)[0]
-                failed = {"stable": False, "code": code, "text": flight.text, "seed": seed}
+            if flight["verdict"] != "success":
+                code = (*flight["failures"], flight["verdict"])[0]
+                failed = {"stable": False, "code": code, "text": flight["text"], "seed": seed}
                 return trial | failed
     return trial
 
@@ -167,7 +170,7 @@ def _limits(experiment: ResolvedExperiment) -> list[str]:
 
 def _value(key: str, trial: Trial) -> str:
     rtt = f" (RTT {trial['rtt_ms']:g} ms)" if "rtt_ms" in trial else ""
-    return f"{trial['value']:g}{' ms' if key.endswith('_ms') else ''}{rtt}"
+    return f"{trial['value']:.12g}{' ms' if key.endswith('_ms') else ''}{rtt}"
 
 
 def _result(trial: Trial) -> str:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import json
 import statistics
 import sys
@@ -18,6 +16,8 @@ from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.cli.report import print_traceback
 from cloudrc.cli.run import fly, load, new_folder
 from cloudrc.metrics.verdict import exit_code
+from cloudrc.sweep import store
+from cloudrc.sweep.pairs import row_of
 from cloudrc.sweep.statistics import median_interval
 
 Report: TypeAlias = Mapping[str, Any]
@@ -54,13 +54,10 @@ def as_table(summary: Mapping[str, Any]) -> str:
 
 def as_csv(reports: Sequence[Report]) -> str:
     """Format reports as CSV, one line per run: seed, verdict and all measurements."""
-    units, text = _units(reports), io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["seed", "verdict", *(f"{name} [{unit}]" for name, unit in units.items())])
-    for report in reports:
-        values = [report["numbers"].get(name, {"value": ""})["value"] for name in units]
-        writer.writerow([report["seed"], report["verdict"], *values])
-    return text.getvalue()
+    units, rows = _units(reports), [*map(row_of, reports)]
+    columns = {name: [row[name] for row in rows] for name in ("seed", "verdict")}
+    columns |= {name: [row["numbers"].get(name) for row in rows] for name in units}
+    return store.as_csv(columns, units)
 
 
 def fly_seeds(options: argparse.Namespace) -> int:

@@ -29,8 +29,8 @@ from cloudrc.cli.sweep_pods import cluster_arguments, print_rows, rows_from_pods
 from cloudrc.errors import BadInputError, InvalidRunError
 
 if TYPE_CHECKING:
+    from cloudrc.sweep.flight import Row
     from cloudrc.sweep.plan import Flight, Plan
-    from cloudrc.sweep.store import Row
 
 ACTIONS = {
     "run": "fly all points of a grid, or those that are missing in --out",
@@ -188,8 +188,8 @@ def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
 
     flight, record, folder = job
     flown = fly_point(flight.experiment)
-    wanted = record == "all" or (record == "failed" and flown.verdict != "success")
-    if wanted and flown.verdict != ERROR:
+    wanted = record == "all" or (record == "failed" and flown["verdict"] != "success")
+    if wanted and flown["verdict"] != ERROR:
         _fly_into(folder / flight.key, flight, page=False)
     return make_row(flight, flown)
 
@@ -256,8 +256,8 @@ def draw_figure(options: argparse.Namespace) -> int:
     from cloudrc.sweep.figure import draw_sweep
     from cloudrc.sweep.pairs import read_flights
 
-    rows = read_flights(options.folder)
-    files, caption = draw_sweep(rows, options.number, options.x, options.by)
+    rows, units = read_flights(options.folder)
+    files, caption = draw_sweep(rows, units, options.number, options.x, options.by)
     out = options.out or options.folder / "figure"
     stem = out.stem if out.suffix.removeprefix(".") in files else out.name
     print_or_drop(f"{caption}\n")
@@ -280,7 +280,7 @@ class Progress:
         """Print `head`; set the number of flights, and of those that have no row yet."""
         self._stream, self._total, self._before = stream, total, total - missing
         self._done, self._failed, self._began = 0, 0, monotonic()
-        self._printed, self._error = self._began, ""
+        self._printed, self._told = self._began, {"success"}
         done = f", {self._before} done before" if self._before else ""
         print_or_drop(escape(head) + done, stream)
         self._status = None
@@ -291,12 +291,13 @@ class Progress:
             self._status.start()
 
     def see(self, row: Row) -> None:
-        """Count a new row; print the first error."""
+        """Count a new row; print the text of the first failure and of the first error."""
         self._done += 1
         self._failed += row["verdict"] != "success"
-        if "text" in row and not self._error:
-            self._error = f"{row['key']}: error: {row['text']}"
-            print_or_drop(escape(self._error), self._stream)
+        if row["verdict"] not in self._told:
+            self._told.add(row["verdict"])
+            text = f"{row['key']}: {row['verdict']}: {row['text']}"
+            print_or_drop(escape(text), self._stream)
         rate = self._done / max(monotonic() - self._began, 1e-3)
         left = (self._total - self._before - self._done) / rate
         time = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"

@@ -17,8 +17,8 @@ from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
+    from cloudrc.sweep.flight import Row
     from cloudrc.sweep.plan import Flight, Plan
-    from cloudrc.sweep.store import Row
 
 IMAGE = f"cloudrc/world:{__version__}"
 

@@ -6,10 +6,10 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.cli.margin import largest_stable
-from cloudrc.sweep.flight import Outcome
 
 KEY = "link.uplink.delay_ms"
-FAILED = Outcome("failure", ("unstable",), text="the loop is unstable; lower the gains")
+TEXT = "the loop is unstable; lower the gains"
+FAILED = {"verdict": "failure", "failures": ["unstable"], "text": TEXT}
 
 
 def fly_with(monkeypatch, works):
@@ -17,7 +17,7 @@ def fly_with(monkeypatch, works):
 
     def fly(job):
         settings = dict(text.split("=") for text in job[1])
-        return Outcome("success") if works(settings, job[2]) else FAILED
+        return {"verdict": "success"} if works(settings, job[2]) else FAILED
 
     monkeypatch.setattr("cloudrc.cli.margin.fly_job", fly)
 
@@ -62,6 +62,15 @@ def test_a_second_border_below_is_told(monkeypatch, capsys):
     assert (code, found["stable_up_to"], found["fails_below"]) == (0, 210, [150])
 
 
+def test_a_large_value_is_flown_with_all_digits(monkeypatch, capsys):
+    key, flown = "link.uplink.rate_kbit", set()
+    fly_with(monkeypatch, lambda found, seed: flown.add(found[key]) or True)
+    line = ["margin", key, "--max", "1234567", "--resolution", "1", "--seeds", "1"]
+    assert main(line) == 0
+    assert "1234567" in flown
+    assert "stable up to 1234567," in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("works", "code", "text"),
     [(True, 0, "80 ms (RTT 150 ms), the largest value tried; raise --max"),
@@ -87,7 +96,8 @@ def test_a_value_that_the_schema_refuses_is_a_border(monkeypatch, capsys):
         (["link.profile"], "is no number; name a key such as"),
         ([KEY, "--max", "5"], "--resolution 10 must be above 0, --max 5 not below it"),
         ([KEY, "--resolution", "-1"], "--resolution -1 must be above 0"),
-        ([KEY, "--max", "nan"], "--max nan"),
+        *(([KEY, "--resolution", text], f"--resolution {text} must") for text in ("nan", "0")),
+        *(([KEY, "--max", text], f"--max {text} not") for text in ("nan", "0")),
     ],
 )
 def test_a_search_that_cannot_begin_is_refused(arguments, text, capsys):
