@@ -124,7 +124,7 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
         warn(experiment)
     jobs = [(options.experiment, side, n + 1) for n in range(options.seeds) for side in sides]
     flights: list[Row] = []
-    head = f"{resolved[0].name}: A and B with {options.seeds} seeds"
+    head = f"{resolved[0].name}: A and B, each with seeds 1 to {options.seeds}"
     stream = sys.stdout if options.output == "table" else sys.stderr
     view = Progress(stream, f"{head}, {len(jobs)} flights", len(jobs), len(jobs))
 
@@ -161,7 +161,7 @@ def as_text(document: Mapping[str, Any]) -> str:
     ]
     lines = [
         *(f"{side.upper()}: {document[side]}" for side in "ab"),
-        f"of {document['of']}, {document['pairs']} pairs"
+        f"of {document['of']}; pairs: {document['pairs']}"
         + (f"; {left_out} left out with {LEFT_OUT}" if left_out else ""),
         *("", table([TITLES, *body], right=(1, 2, 3)), ""),
         f"success: {', '.join(rates)}, p = {success['p_mcnemar']:.2g}",

@@ -144,7 +144,11 @@ def run(options: argparse.Namespace) -> int:
         folder = new_folder(folder, f"sweep-{options.file.stem}", "latest-sweep")
     before = store.begin(folder, plan)
     mine = [*plan.flights.values()][(shard or 1) - 1 :: count]
-    jobs = [(each, options.record, folder) for each in mine if each.key not in before]
+    jobs = [
+        (each, options.record, folder)
+        for each in mine
+        if each.key not in before or _to_record(before[each.key], options.record, folder)
+    ]
     part = f", shard {shard} of {count}" if shard else ""
     head = f"{len(plan.points)} points x {len(plan.seeds)} seeds{part}: {len(mine)} flights"
     stream = sys.stdout if options.output == "table" else sys.stderr
@@ -152,7 +156,8 @@ def run(options: argparse.Namespace) -> int:
     with store.append_rows(folder, shard) as append, closing(view):
 
         def take(row: Row) -> None:
-            append(row)
+            if row["key"] not in before:
+                append(row)
             view.see(row)
 
         stopped, code = take_each(_rows(options, plan, jobs), take)
@@ -183,15 +188,21 @@ def _rows(
 
 def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
     """Fly, record the flight if that is asked for, and return the row."""
-    from cloudrc.sweep.flight import ERROR, fly_point
+    from cloudrc.sweep.flight import fly_point
     from cloudrc.sweep.store import make_row
 
     flight, record, folder = job
     flown = fly_point(flight.experiment)
-    wanted = record == "all" or (record == "failed" and flown["verdict"] != "success")
-    if wanted and flown["verdict"] != ERROR:
+    row = make_row(flight, flown)
+    if _to_record(row, record, folder):
         _fly_into(folder / flight.key, flight, page=False)
-    return make_row(flight, flown)
+    return row
+
+
+def _to_record(row: Row, record: str | None, folder: Path) -> bool:
+    """Return whether a flight shall have a recording in `folder` and has none."""
+    wanted = record == "all" or (record == "failed" and row["verdict"] != "success")
+    return wanted and row["verdict"] != "error" and not (folder / row["key"]).is_dir()
 
 
 def _fly_into(folder: Path, flight: Flight, *, page: bool) -> dict[str, Any]:
@@ -280,7 +291,7 @@ class Progress:
         """Print `head`; set the number of flights, and of those that have no row yet."""
         self._stream, self._total, self._before = stream, total, total - missing
         self._done, self._failed, self._began = 0, 0, monotonic()
-        self._printed, self._told = self._began, {"success"}
+        self._printed, self._told = self._began, set[str]()
         done = f", {self._before} done before" if self._before else ""
         print_or_drop(escape(head) + done, stream)
         self._status = None
@@ -291,10 +302,10 @@ class Progress:
             self._status.start()
 
     def see(self, row: Row) -> None:
-        """Count a new row; print the text of the first failure and of the first error."""
+        """Count a new row; print the first text of each verdict."""
         self._done += 1
         self._failed += row["verdict"] != "success"
-        if row["verdict"] not in self._told:
+        if row["text"] and row["verdict"] not in self._told:
             self._told.add(row["verdict"])
             text = f"{row['key']}: {row['verdict']}: {row['text']}"
             print_or_drop(escape(text), self._stream)

@@ -15,8 +15,9 @@ from cloudrc.report.write import assess
 ERROR = "error"
 """Verdict of a flight that raised an exception, and code of its only failure."""
 Row: TypeAlias = dict[str, Any]
-"""A flight: `verdict`, `failures` (codes, the earliest first), `text` (the first failure in words),
-`numbers` (metric -> value) and `records_sha256`; in a sweep also `key`, `point` and `seed`."""
+"""A flight: `verdict`; `failures` (codes, the earliest first); `text`, which says the first failure
+or why a metric has no number; `numbers` (metric -> value); and `records_sha256`.
+A row of a sweep also has `key`, `point` and `seed`."""
 
 
 def fly_point(experiment: ResolvedExperiment) -> Row:
@@ -27,10 +28,11 @@ def fly_point(experiment: ResolvedExperiment) -> Row:
         text, none = describe_error(error), {"numbers": {}, "records_sha256": ""}
         return {"verdict": ERROR, "failures": [ERROR], "text": text, **none}
     failures = found.verdict.failures
+    notes = (note for note in found.notes if note.startswith(metrics.METRIC_NOTE))
     return {
         "verdict": found.verdict.outcome,
         "failures": [failure.code for failure in failures],
-        "text": failures[0].text if failures else "",
+        "text": failures[0].text if failures else next(notes, ""),
         "numbers": {name: number.value for name, number in found.numbers.items()},
         "records_sha256": found.run.records_sha256,
     }

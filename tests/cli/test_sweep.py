@@ -98,6 +98,9 @@ def test_failed_flights_are_recorded_if_asked_for(write_sweep):
     assert bad["failures"] == ["board_not_touched"]
     assert Path(f"grid/{bad['key']}/mission.mcap").is_file()
     assert not Path(f"grid/{good['key']}").exists()
+    assert main(["sweep", "run", str(write_sweep(grid)), "--out", "grid", "--record=all"]) == 1
+    assert Path(f"grid/{good['key']}/mission.mcap").is_file()
+    assert rows("grid") == [good, bad]
 
 
 def test_an_error_becomes_a_row_and_the_others_fly(write_sweep, monkeypatch, capsys):

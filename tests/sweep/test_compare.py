@@ -8,7 +8,6 @@ from cloudrc.errors import BadInputError
 from cloudrc.sweep.compare import Pair, compare
 from cloudrc.sweep.pairs import of_folders
 
-
 UNITS = {"iae_mean": "m", "rtt_mean": "s"}
 
 

@@ -19,6 +19,13 @@ def test_a_point_gives_the_numbers_of_the_report(tmp_path):
     assert numbers == report["numbers"]
 
 
+def test_a_metric_that_fails_is_told(tmp_path):
+    (tmp_path / "mine.py").write_text("UNIT = '1'\n\n\ndef measure(flight):\n    return 1 / 0\n")
+    flown = fly_point(load_experiment("steps", [*SHORT, f"report.metrics=[{tmp_path}/mine.py]"]))
+    assert (flown["verdict"], "mine" in flown["numbers"]) == ("success", False)
+    assert flown["text"] == "metric mine failed: ZeroDivisionError: division by zero"
+
+
 def test_an_exception_becomes_the_verdict_error(monkeypatch):
     def fail(experiment):
         raise RuntimeError("no\nluck")
