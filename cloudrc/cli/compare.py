@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -102,29 +102,29 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
     from cloudrc.cli.run import load
     from cloudrc.cli.sweep import Progress
     from cloudrc.sweep.compare import Pair
-    from cloudrc.sweep.flight import units
+    from cloudrc.sweep.flight import fly_point, units
     from cloudrc.sweep.pairs import Found
 
-    for side in (options.a, options.b):
-        if "=" not in side:
-            text = "is neither KEY=VALUE nor, with the other side, a folder; see --in for a sweep"
-            raise BadInputError(f"{side}: {text}")
+    for text in (options.a, options.b):
+        if "=" not in text:
+            what = "is neither KEY=VALUE nor, with the other side, a folder; see --in for a sweep"
+            raise BadInputError(f"{text}: {what}")
     interrupt_on_signals()
     require("compare", MODES["virtual"])
     # A comma separates settings only before KEY=: a list may contain commas.
-    sides = [[*options.set, *re.split(r",(?=[\w.]+=)", text)] for text in (options.a, options.b)]
-    resolved = [load(options.experiment, side) for side in sides]
-    if resolved[0] == resolved[1]:
+    texts = [re.split(r",(?=[\w.]+=)", text) for text in (options.a, options.b)]
+    sides = [load(options.experiment, [*options.set, *each]) for each in texts]
+    if sides[0] == sides[1]:
         raise BadInputError("A and B are the same experiment; change one of them")
-    unit_of = units({name for each in resolved for name in each.report.metrics})
+    unit_of = units({name for each in sides for name in each.report.metrics})
     for name in options.number:
         if name not in unit_of:
             raise BadInputError(f"--number: {unknown_name_text('number', name, sorted(unit_of))}")
-    for experiment in resolved:
-        warn(experiment)
-    jobs = [(options.experiment, side, n + 1) for n in range(options.seeds) for side in sides]
+    for side in sides:
+        warn(side)
+    jobs = [side.model_copy(update={"seed": n + 1}) for n in range(options.seeds) for side in sides]
     flights: list[Row] = []
-    head = f"{resolved[0].name}: A and B, each with seeds 1 to {options.seeds}"
+    head = f"{sides[0].name}: A and B, each with seeds 1 to {options.seeds}"
     stream = sys.stdout if options.output == "table" else sys.stderr
     view = Progress(stream, f"{head}, {len(jobs)} flights", len(jobs), len(jobs))
 
@@ -132,19 +132,11 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
         flights.append(flight)
         view.see({"key": "BA"[len(flights) % 2], **flight})
 
-    stopped, code = take_each(map_in_order(fly_job, jobs, len(jobs)), take)
+    stopped, code = take_each(map_in_order(fly_point, jobs, len(jobs)), take)
     view.close()
     both = zip(flights[::2], flights[1::2], strict=False)
     pairs = [Pair({"seed": n}, a, b) for n, (a, b) in enumerate(both, start=1)]
     return Found(pairs, unit_of, f"experiment {options.experiment}"), stopped, code
-
-
-def fly_job(job: tuple[str, Sequence[str], int]) -> Row:
-    """Fly an experiment with overrides and a seed in virtual time, without files."""
-    from cloudrc.cli.run import load
-    from cloudrc.sweep.flight import fly_point
-
-    return fly_point(load(*job))
 
 
 def as_text(document: Mapping[str, Any]) -> str:

@@ -9,7 +9,7 @@ from contextlib import closing
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from cloudrc.cli.advice import simulate_ages
-from cloudrc.cli.compare import flight_arguments, fly_job
+from cloudrc.cli.compare import flight_arguments
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.output import format_document, output_argument, print_or_drop
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order
@@ -126,6 +126,7 @@ def _present(experiment: ResolvedExperiment, key: str) -> float:
 def _try(options: argparse.Namespace, value: float, *, first: bool) -> Trial:
     """Fly the seeds with one value of the key until one fails."""
     from cloudrc.cli.run import load
+    from cloudrc.sweep.flight import fly_point
 
     settings = [*options.set, f"{options.key}={value:.12g}"]
     try:
@@ -142,9 +143,9 @@ def _try(options: argparse.Namespace, value: float, *, first: bool) -> Trial:
         if options.key.endswith("delay_ms"):
             trial["rtt_ms"] = experiment.uplink.delay_ms + experiment.downlink.delay_ms
     trial["speed_max_mps"] = experiment.guard.speed_max_mps
-    jobs = [(options.experiment, settings, seed + 1) for seed in range(options.seeds)]
+    jobs = [experiment.model_copy(update={"seed": n + 1}) for n in range(options.seeds)]
     # A worker takes as long to start as three flights of `steps`.
-    with closing(map_in_order(fly_job, jobs, len(jobs) // 4)) as flights:
+    with closing(map_in_order(fly_point, jobs, len(jobs) // 4)) as flights:
         for seed, flight in enumerate(flights, start=1):
             if flight["verdict"] != "success":
                 code = (*flight["failures"], flight["verdict"])[0]

@@ -117,9 +117,8 @@ def execute(options: argparse.Namespace) -> int:
     if options.action is None:
         names = ", ".join(ACTIONS)
         raise BadInputError(f"an action is missing: {names}; see 'cloudrc sweep --help'")
-    actions = {"run": run, "status": print_status, "fly": fly_again, "figure": draw_figure}
-    actions["rows"] = print_rows
-    return actions[options.action](options)
+    functions = (run, print_status, fly_again, draw_figure, print_rows)
+    return dict(zip(ACTIONS, functions, strict=True))[options.action](options)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -9,13 +9,11 @@ from __future__ import annotations
 import base64
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from typing import Any
 
 from cloudrc.cluster.client import ClusterError, Release, retry
-from cloudrc.cluster.jobs import delete_job, owner_of
+from cloudrc.cluster.jobs import create_job, delete_job
 from cloudrc.cluster.pods import container_statuses, list_pods, one_line, pod_failure, pod_log
-from cloudrc.errors import CloudrcError
 
 COMPONENT = "sweep"
 """Label `component` of the Jobs and pods of sweeps, and name of their container."""
@@ -68,21 +66,12 @@ def start(
             delete_job(release, name, COMPONENT)
     labels = {**release.labels(COMPONENT), "app.kubernetes.io/part-of": "cloudrc"}
     admission = {"kueue.x-k8s.io/queue-name": queue} if queue else {}
-    body = {
+    job = {
         "metadata": {"name": name, "labels": {**labels, **admission}},
         "spec": _job_spec(name, shards, image, cpu, labels),
     }
-    owner = owner_of("batch/v1", "Job", release.request("create", "jobs", body=body))
-    data = {
-        "metadata": {"name": name, "labels": labels, "ownerReferences": [owner]},
-        "binaryData": {FILE: base64.b64encode(flights).decode()},
-    }
-    try:
-        release.request("create", "configmaps", body=data)
-    except BaseException:  # Ctrl-C too: without its flights the Job would wait forever
-        with suppress(CloudrcError):
-            delete_job(release, name, COMPONENT)
-        raise
+    files = {"binaryData": {FILE: base64.b64encode(flights).decode()}}
+    create_job(release, job, files, labels, COMPONENT)
 
 
 def _job_spec(name: str, shards: int, image: str, cpu: str, labels: dict[str, str]) -> Any:

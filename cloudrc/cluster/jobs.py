@@ -116,17 +116,24 @@ def run_job(
     job["spec"] |= {"activeDeadlineSeconds": deadline, "ttlSecondsAfterFinished": KEEP_FINISHED}
     job["spec"]["template"]["metadata"]["labels"] = labels
     _fill_pod(job["spec"]["template"]["spec"], release, deployment, name, queue)
-    created = release.request("create", "jobs", body=job)
-    owner = owner_of("batch/v1", "Job", created)
-    plan["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
     plan["data"] = {FILE: json.dumps(mission, indent=2) + "\n"}
+    return _status(create_job(release, job, plan, labels, COMPONENT), None)
+
+
+def create_job(
+    release: Release, job: Any, files: Any, labels: Mapping[str, str], component: str
+) -> Any:
+    """Create a Job, and the ConfigMap `files` with its name; return the Job as created."""
+    name, created = job["metadata"]["name"], release.request("create", "jobs", body=job)
+    owner = owner_of("batch/v1", "Job", created)
+    files["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
     try:
-        release.request("create", "configmaps", body=plan)
-    except BaseException:  # Ctrl-C too: without its mission the Job would wait forever
+        release.request("create", "configmaps", body=files)
+    except BaseException:  # Ctrl-C too: without its files the Job would wait forever
         with suppress(CloudrcError):
-            delete_job(release, name)
+            delete_job(release, name, component)
         raise
-    return _status(created, None)
+    return created
 
 
 def owner_of(version: str, kind: str, owner: Any) -> dict[str, Any]:

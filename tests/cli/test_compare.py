@@ -11,16 +11,15 @@ SHORT = ["--set=mission.steps.count=1", "--set=mission.steps.period_s=1.0",
 
 
 def fly_with(monkeypatch, measure):
-    """Replace flights: `measure(settings, seed)` returns verdict and prediction error [m]."""
+    """Replace flights: `measure(predictor, seed)` returns verdict and prediction error [m]."""
 
-    def fly(job):
-        _, settings, seed = job
-        verdict, error = measure(",".join(settings), seed)
+    def fly(experiment):
+        verdict, error = measure(experiment.cloud.predictor.name, experiment.seed)
         failures = ["unstable"] * (verdict == "failure")
         numbers = {"prediction_error_rms": error}
         return {"verdict": verdict, "failures": failures, "text": "it broke", "numbers": numbers}
 
-    monkeypatch.setattr("cloudrc.cli.compare.fly_job", fly)
+    monkeypatch.setattr("cloudrc.sweep.flight.fly_point", fly)
     monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 1)
 
 
@@ -85,7 +84,7 @@ def test_what_cannot_be_compared_is_refused(arguments, text, capsys):
 
 
 def test_ctrl_c_compares_the_finished_pairs(monkeypatch, capsys):
-    def measure(settings, seed):
+    def measure(predictor, seed):
         if seed == 3:
             raise KeyboardInterrupt
         return "success", 0.01
@@ -95,7 +94,7 @@ def test_ctrl_c_compares_the_finished_pairs(monkeypatch, capsys):
 
 
 def test_ctrl_c_before_the_first_pair_is_no_bad_input(monkeypatch, capsys):
-    def measure(settings, seed):
+    def measure(predictor, seed):
         raise KeyboardInterrupt
 
     fly_with(monkeypatch, measure)
