@@ -55,6 +55,8 @@ ARRAYS = {
 }
 """Variable with the index of a process -> variables with the number of processes and with the first
 index, which is 0 without a variable."""
+WARNINGS_MAX = 3
+"""Largest number of warnings about points."""
 PLAIN_PERIOD = 30.0
 """Time between two lines of progress that is not shown on a terminal [s]."""
 
@@ -88,7 +90,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--number", action="append", default=[], metavar="NAME", help=about)
     about = "axis of the sweep along x (default: the first one with numbers)"
     add("--x", metavar="AXIS", help=about)
-    about = "axis with one line per value (default: the first of the others)"
+    about = "axis with one line per value (default: the first with names, else the next one)"
     add("--by", metavar="AXIS", help=about)
     about = "path of the files, with or without a suffix (default: DIR/figure)"
     add("--out", type=Path, metavar="FILE", help=about)
@@ -135,7 +137,9 @@ def run(options: argparse.Namespace) -> int:
     if options.shard and options.out is None:
         raise BadInputError("--shard needs --out, the folder that all shards share")
     plan, folder, (shard, count) = read_plan(options.file), options.out, options.shard or (None, 1)
-    for text in dict.fromkeys(text for point in plan.points for text in advise(point)):
+    advice = list(dict.fromkeys(text for point in plan.points for text in advise(point)))
+    more = [f"{len(advice)} warnings; the others are alike"] if len(advice) > WARNINGS_MAX else []
+    for text in advice[:WARNINGS_MAX] + more:
         print_line(f"cloudrc: warning: {text}", sys.stderr)
     if options.shard:
         folder.mkdir(parents=True, exist_ok=True)  # another shard may be faster

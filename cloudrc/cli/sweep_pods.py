@@ -78,10 +78,12 @@ def rows_from_pods(
 
 def _parse(line: str) -> dict[str, Any] | None:
     """Return the row that a line of a pod's log has; None for another line."""
+    from cloudrc.sweep.store import FIELDS
+
     try:
         row = json.loads(line)
-        return row if isinstance(row["key"], str) and {*row} >= {"point", "verdict"} else None
-    except (ValueError, TypeError, KeyError):
+        return row if {*row} >= FIELDS else None
+    except (ValueError, TypeError):
         return None
 
 

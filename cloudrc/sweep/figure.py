@@ -37,7 +37,7 @@ def draw_sweep(
         units: Metric -> unit.
         names: Metrics to show; by default the first three of `compare.NUMBERS`.
         x: Axis of the sweep along x; by default the first one with numbers, else the first.
-        by: Axis with one line per value; by default the first of the others.
+        by: Axis with one line per value; by default the first one with names, else the next one.
 
     Returns:
         The figure as PDF, PNG and SVG by suffix; and its caption.
@@ -50,7 +50,7 @@ def draw_sweep(
         if name not in known:
             raise BadInputError(f"--number: {unknown_name_text('number', name, known)}")
     values, x, by, pooled = _choose(rows, x, by)
-    is_numeric = all(type(value) in (int, float) for value in values[x])
+    is_numeric = _is_numeric(values[x])
     along = sorted(values[x]) if is_numeric else values[x]
     groups = {
         str(name): [
@@ -81,12 +81,18 @@ def _choose(
         if axis is not None and axis not in values:
             raise BadInputError(unknown_name_text("axis", axis, sorted(values)))
     free = [axis for axis in values if len(values[axis]) > 1 and axis != by] or list(values)
-    numeric = (a for a in free if all(type(value) in (int, float) for value in values[a]))
-    x = x or next(numeric, free[0])
+    numeric = [axis for axis in free if _is_numeric(values[axis])]
+    x = x or next(iter(numeric), free[0])
     if x == by:
         raise BadInputError(f"--x and --by are both {x}; name two axes, or leave one out")
-    by = by or next((axis for axis in free if axis != x), None)
+    # Numbers of two predictors make no common median, those of two delays rather do.
+    others = sorted((axis for axis in free if axis != x), key=lambda axis: axis in numeric)
+    by = by or next(iter(others), None)
     return values, x, by, [axis for axis in free if axis not in (x, by)]
+
+
+def _is_numeric(values: Sequence[Any]) -> bool:
+    return all(type(value) in (int, float) for value in values)
 
 
 def _metric(name: str, unit: str, groups: Groups, at: Sequence[float]) -> Panel:

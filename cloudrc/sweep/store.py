@@ -25,6 +25,8 @@ from cloudrc.sweep.flight import Row, units
 from cloudrc.sweep.plan import Flight, Plan
 
 FILE, SUMMARY = "sweep.yaml", "sweep.json"
+FIELDS = {"key", "point", "seed", "verdict", "failures", "text", "numbers", "records_sha256"}
+"""Fields of a row."""
 TABLE, PARQUET = "table.csv", "table.parquet"
 
 
@@ -45,8 +47,10 @@ def read_rows(folder: Path) -> dict[str, Row]:
         for number, line in enumerate(lines, start=1):
             try:
                 row = json.loads(line)
+                if not FIELDS <= row.keys():
+                    raise KeyError
                 found.setdefault(row["key"], row)
-            except (ValueError, TypeError, KeyError) as error:
+            except (ValueError, TypeError, KeyError, AttributeError) as error:
                 text = "is not a row of a sweep; delete this line to fly its flight again"
                 raise BadInputError(f"{path}:{number}: {text}") from error
     return found

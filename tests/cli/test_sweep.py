@@ -76,6 +76,15 @@ def test_a_sweep_goes_on_where_it_ended(write_sweep, monkeypatch, capsys):
     assert flown == [1, 2, 2, 3]
 
 
+def test_alike_warnings_of_many_points_are_counted(write_sweep, monkeypatch, capsys):
+    monkeypatch.setattr("cloudrc.cli.sweep.advise", lambda point: [f"{point.uplink.delay_ms} ms"])
+    grid = {"link.both.delay_ms": [0, 1, 2, 3, 4]}
+    assert main(["sweep", "run", str(write_sweep(grid)), "--out", "grid", "--shard", "6/6"]) == 0
+    told = capsys.readouterr().err.splitlines()
+    assert told[0] == "cloudrc: warning: 0.0 ms"
+    assert told[3:] == ["cloudrc: warning: 5 warnings; the others are alike"]
+
+
 def test_a_row_flies_again_to_the_same_hash(write_sweep, monkeypatch, capsys):
     monkeypatch.setattr("cloudrc.report.write._write_page", lambda *given: None)  # it is slow
     main(["sweep", "run", str(write_sweep(ONE)), "--out", "grid"])

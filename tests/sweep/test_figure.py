@@ -20,7 +20,7 @@ def sweep(folder, rows=None):
     lines = [
         {"key": str(n), "point": {"delay_ms": d, "predictor": p, "gain": g}, "seed": seed,
          "verdict": "success" if d == 5 else "failure", "failures": [],
-         "numbers": {"iae_mean": d + seed + 0.5 * (p == "none")}}
+         "numbers": {"iae_mean": d + seed + 0.5 * (p == "none")}, "text": "", "records_sha256": ""}
         for n, (d, p, g, seed) in enumerate(points)
     ]  # fmt: skip
     folder.mkdir()
@@ -53,6 +53,12 @@ def test_names_along_x_keep_the_order_of_the_grid(tmp_path, drawn):
     draw_sweep(*read_flights(sweep(tmp_path / "s")), x="predictor", by="gain")
     assert drawn[1:] == ["predictor", ["none", "kalman"], "gain"]
     assert [*drawn[0][0].lines] == ["[1, 2]", "[3, 4]"]
+
+
+def test_lines_are_names_rather_than_numbers(drawn):
+    draw_sweep([row({"delay": d, "loss": p, "predictor": name}, 1)
+                for d in (1, 2) for p in (0, 1) for name in "ab"], UNITS)  # fmt: skip
+    assert (drawn[1], drawn[3]) == ("delay", "predictor")
 
 
 def row(point, seed, *failures):

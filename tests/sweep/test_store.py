@@ -11,7 +11,8 @@ from cloudrc.sweep.plan import read_plan
 
 
 def flown(**numbers):
-    return {"verdict": "success", "failures": [], "text": "", "numbers": numbers}
+    rest = {"failures": [], "text": "", "records_sha256": ""}
+    return {"verdict": "success", "numbers": numbers, **rest}
 
 
 @pytest.fixture
@@ -69,7 +70,7 @@ def test_half_a_line_is_dropped(rows, tmp_path):
 
 def test_a_line_that_is_no_row_is_named(rows, tmp_path):
     write(tmp_path, rows[:1])
-    for line in ("{", "[]", "{}"):
+    for line in ("{", "[]", "{}", "3", '{"key": "a"}'):
         (tmp_path / "rows-2.jsonl").write_text(f"{json.dumps(rows[1])}\n{line}\n")
         with pytest.raises(BadInputError, match=r"rows-2.jsonl:2: is not a row of a sweep"):
             store.read_rows(tmp_path)
