@@ -126,7 +126,7 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
     flights: list[Row] = []
     head = f"{sides[0].name}: A and B, each with seeds 1 to {options.seeds}"
     stream = sys.stdout if options.output == "table" else sys.stderr
-    view = Progress(stream, f"{head}, {len(jobs)} flights", len(jobs), len(jobs))
+    view = Progress(stream, f"{head}, {len(jobs)} flights", len(jobs))
 
     def take(flight: Row) -> None:
         flights.append(flight)

@@ -17,6 +17,7 @@ from cloudrc.cli.report import print_traceback
 from cloudrc.cli.run import fly, load, new_folder
 from cloudrc.metrics.verdict import exit_code
 from cloudrc.sweep import store
+from cloudrc.sweep.flight import counts
 from cloudrc.sweep.pairs import row_of
 from cloudrc.sweep.statistics import median_interval
 
@@ -26,10 +27,13 @@ METHOD = "95 % interval of the median, by order statistics"
 
 
 def summarise(reports: Sequence[Report]) -> dict[str, Any]:
-    """Count all runs and successful runs; compute median and interval of each measurement."""
-    numbers = {}
-    for name, unit in _units(reports).items():
-        found = [r["numbers"][name]["value"] for r in reports if name in r["numbers"]]
+    """Count all runs and successful runs; compute median and interval of each measurement.
+
+    Runs that were interrupted or whose plug-in failed have no numbers here.
+    """
+    numbers, measured = {}, [each for each in reports if counts(row_of(each))]
+    for name, unit in _units(measured).items():
+        found = [r["numbers"][name]["value"] for r in measured if name in r["numbers"]]
         middle = {"median": statistics.median(found), "interval": median_interval(found)}
         numbers[name] = {**middle, "unit": unit, "count": len(found)}
     done = sum(report["verdict"] == "success" for report in reports)

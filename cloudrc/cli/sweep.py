@@ -25,7 +25,12 @@ from cloudrc.cli.output import (
 )
 from cloudrc.cli.parser import COUNT_MAX, input_file, read_count
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
-from cloudrc.cli.sweep_pods import cluster_arguments, print_rows, rows_from_pods
+from cloudrc.cli.sweep_pods import (
+    cluster_arguments,
+    print_rows,
+    refuse_local_files,
+    rows_from_pods,
+)
 from cloudrc.errors import BadInputError, InvalidRunError
 
 if TYPE_CHECKING:
@@ -127,20 +132,9 @@ def run(options: argparse.Namespace) -> int:
     """Fly the flights of a sweep that have no row yet; return the exit code of the worst row."""
     from cloudrc.cli.run import new_folder
     from cloudrc.sweep import store
-    from cloudrc.sweep.plan import read_plan
 
     interrupt_on_signals()
-    if not options.on:
-        require("a sweep", MODES["virtual"] if options.record else ("world",))
-    elif options.record or options.shard:
-        raise BadInputError("--on kubernetes has no --record and no --shard; see --shards")
-    if options.shard and options.out is None:
-        raise BadInputError("--shard needs --out, the folder that all shards share")
-    plan, folder, (shard, count) = read_plan(options.file), options.out, options.shard or (None, 1)
-    advice = list(dict.fromkeys(text for point in plan.points for text in advise(point)))
-    more = [f"{len(advice)} warnings; the others are alike"] if len(advice) > WARNINGS_MAX else []
-    for text in advice[:WARNINGS_MAX] + more:
-        print_line(f"cloudrc: warning: {text}", sys.stderr)
+    plan, folder, (shard, count) = _plan(options), options.out, options.shard or (None, 1)
     if options.shard:
         folder.mkdir(parents=True, exist_ok=True)  # another shard may be faster
     elif folder is None or not (folder / store.FILE).is_file():
@@ -155,7 +149,8 @@ def run(options: argparse.Namespace) -> int:
     part = f", shard {shard} of {count}" if shard else ""
     head = f"{len(plan.points)} points x {len(plan.seeds)} seeds{part}: {len(mine)} flights"
     stream = sys.stdout if options.output == "table" else sys.stderr
-    view = Progress(stream, f"{plan.points[0].name}: {head}", len(mine), len(jobs))
+    head += f", {len(mine) - len(jobs)} done before" if len(jobs) < len(mine) else ""
+    view = Progress(stream, f"{plan.points[0].name}: {head}", len(jobs))
     with store.append_rows(folder, shard) as append, closing(view):
 
         def take(row: Row) -> None:
@@ -175,6 +170,26 @@ def run(options: argparse.Namespace) -> int:
     else:
         print_or_drop(format_document(store.read_summary(folder), options.output))
     return code or int(any(rows[each.key]["verdict"] != "success" for each in mine))
+
+
+def _plan(options: argparse.Namespace) -> Plan:
+    """Check the flags, read the plan, and print warnings; nothing is written yet."""
+    from cloudrc.sweep.plan import read_plan
+
+    if not options.on:
+        require("a sweep", MODES["virtual"] if options.record else ("world",))
+    elif options.record or options.shard:
+        raise BadInputError("--on kubernetes has no --record and no --shard; see --shards")
+    if options.shard and options.out is None:
+        raise BadInputError("--shard needs --out, the folder that all shards share")
+    plan = read_plan(options.file)
+    if options.on:
+        refuse_local_files(plan)
+    advice = list(dict.fromkeys(text for point in plan.points for text in advise(point)))
+    more = [f"{len(advice)} warnings; the others are alike"] if len(advice) > WARNINGS_MAX else []
+    for text in advice[:WARNINGS_MAX] + more:
+        print_line(f"cloudrc: warning: {text}", sys.stderr)
+    return plan
 
 
 def _rows(
@@ -205,7 +220,9 @@ def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
 def _to_record(row: Row, record: str | None, folder: Path) -> bool:
     """Return whether a flight shall have a recording in `folder` and has none."""
     wanted = record == "all" or (record == "failed" and row["verdict"] != "success")
-    return wanted and row["verdict"] != "error" and not (folder / row["key"]).is_dir()
+    return (
+        wanted and row["verdict"] != "error" and not (folder / row["key"] / "report.json").is_file()
+    )
 
 
 def _fly_into(folder: Path, flight: Flight, *, page: bool) -> dict[str, Any]:
@@ -290,13 +307,12 @@ def _verdicts(rows: Iterable[Row]) -> str:
 class Progress:
     """Shows how many flights are done: in a line on a terminal, else in a line every 30 s."""
 
-    def __init__(self, stream: TextIO, head: str, total: int, missing: int) -> None:
-        """Print `head`; set the number of flights, and of those that have no row yet."""
-        self._stream, self._total, self._before = stream, total, total - missing
+    def __init__(self, stream: TextIO, head: str, total: int) -> None:
+        """Print `head`; set the number of flights to fly."""
+        self._stream, self._total = stream, total
         self._done, self._failed, self._began = 0, 0, monotonic()
         self._printed, self._told = self._began, set[str]()
-        done = f", {self._before} done before" if self._before else ""
-        print_or_drop(escape(head) + done, stream)
+        print_or_drop(escape(head), stream)
         self._status = None
         if is_live(stream):
             from rich.console import Console
@@ -313,9 +329,9 @@ class Progress:
             text = f"{row['key']}: {row['verdict']}: {row['text']}"
             print_or_drop(escape(text), self._stream)
         rate = self._done / max(monotonic() - self._began, 1e-3)
-        left = (self._total - self._before - self._done) / rate
+        left = (self._total - self._done) / rate
         time = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
-        line = f"{self._before + self._done}/{self._total}  {rate:.1f} flights/s, {time} left"
+        line = f"{self._done}/{self._total}  {rate:.1f} flights/s, {time} left"
         line += f", {self._failed} failed" if self._failed else ""
         if self._status:
             self._status.update(line)

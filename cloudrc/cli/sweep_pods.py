@@ -35,24 +35,28 @@ def cluster_arguments(parser: argparse.ArgumentParser) -> None:
     add("--queue", metavar="NAME", help="queue of Kueue that admits the Job")
 
 
+def refuse_local_files(plan: Plan) -> None:
+    """Raise a BadInputError if a point needs a file of this machine, which no pod has."""
+    from cloudrc.sweep.plan import local_files
+
+    for point in plan.points:
+        for file in local_files(point.model_dump(mode="json")):
+            text = "the pods do not have this file; fly without --on; docs/sweeps.md says more"
+            raise BadInputError(f"{file}: {text}")
+
+
 def rows_from_pods(
     options: argparse.Namespace, plan: Plan, flights: Sequence[Flight]
 ) -> Generator[Row]:
     """Fly flights of a plan on a cluster, and yield each row once.
 
     Raises:
-        BadInputError: If the sweep needs local files, which the pods do not have.
         ClusterError: If the Job fails, or if a pod will never run.
     """
     from cloudrc.cluster import batch
     from cloudrc.cluster.client import ClusterError
     from cloudrc.sweep.parcel import pack
-    from cloudrc.sweep.plan import local_files
 
-    for point in plan.points:
-        for file in local_files(point.model_dump(mode="json")):
-            text = "the pods do not have this file; build it into an image, or fly without --on"
-            raise BadInputError(f"{file}: {text}")
     if not flights:
         return
 

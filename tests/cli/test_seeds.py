@@ -71,6 +71,13 @@ def test_a_signal_ends_a_sweep_at_once(how, folder):
     assert 1 <= document["count"] < 40
 
 
+def test_numbers_of_a_plugin_that_failed_do_not_count():
+    failed = report(2, "failure", x=9.0) | {"failures": [{"code": "plugin_failed", "text": ""}]}
+    summary = summarise([report(1, x=1.0), failed])
+    assert (summary["done"], summary["count"]) == (1, 2)
+    assert (summary["numbers"]["x"]["median"], summary["numbers"]["x"]["count"]) == (1.0, 1)
+
+
 def test_runs_may_lack_a_number():
     runs = [report(1, x=1.0), report(2, "failure", y=2.0), report(3, x=3.0)]
     summary = summarise(runs)

@@ -54,3 +54,4 @@ def test_files_that_no_pod_has_are_refused(write_sweep, cluster, tmp_path, capsy
     path = write_sweep({"cloud.predictor": ["./mine.py"]})
     assert main(["sweep", "run", str(path), "--out", "grid", "--on", "kubernetes"]) == 2
     assert "mine.py: the pods do not have this file" in capsys.readouterr().err
+    assert not Path("grid").exists()
