@@ -220,9 +220,8 @@ def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
 def _to_record(row: Row, record: str | None, folder: Path) -> bool:
     """Return whether a flight shall have a recording in `folder` and has none."""
     wanted = record == "all" or (record == "failed" and row["verdict"] != "success")
-    return (
-        wanted and row["verdict"] != "error" and not (folder / row["key"] / "report.json").is_file()
-    )
+    has = (folder / row["key"] / "report.json").is_file()
+    return wanted and row["verdict"] != "error" and not has
 
 
 def _fly_into(folder: Path, flight: Flight, *, page: bool) -> dict[str, Any]:
