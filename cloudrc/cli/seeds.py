@@ -15,6 +15,7 @@ from cloudrc.cli.output import escape, format_document, format_number, print_or_
 from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.cli.report import print_traceback
 from cloudrc.cli.run import fly, load, new_folder
+from cloudrc.config.load import ResolvedExperiment
 from cloudrc.metrics.verdict import exit_code
 from cloudrc.sweep import store
 from cloudrc.sweep.flight import counts
@@ -69,12 +70,12 @@ def fly_seeds(options: argparse.Namespace) -> int:
 
     If Ctrl-C or a killed worker ends the command early, the table shows the finished seeds only.
     """
-    # Load the experiment here too, so that a mistake is reported once, not N times.
     experiment = load(options.experiment, options.set)
     warn(experiment)
     name = experiment.name
     folder = new_folder(options.out, f"{name}-virtual-{options.seeds}seeds", "latest-sweep")
-    work = [(options.experiment, options.set, folder, n + 1) for n in range(options.seeds)]
+    seeds = range(1, options.seeds + 1)
+    work = [(experiment.model_copy(update={"seed": n}), folder / f"seed-{n}") for n in seeds]
     for_people, reports = options.output == "table", list[dict[str, Any]]()
 
     def take(report: dict[str, Any]) -> None:
@@ -109,8 +110,7 @@ def fly_seeds(options: argparse.Namespace) -> int:
     return code or max(map(exit_code, reports))
 
 
-def _fly_one(job: tuple[str, list[str], Path, int]) -> dict[str, Any]:
-    experiment, overrides, folder, seed = job
-    run_folder = folder / f"seed-{seed}"
-    run_folder.mkdir()
-    return fly(load(experiment, overrides, seed), "virtual", run_folder, page=False)
+def _fly_one(job: tuple[ResolvedExperiment, Path]) -> dict[str, Any]:
+    experiment, folder = job
+    folder.mkdir()
+    return fly(experiment, "virtual", folder, page=False)

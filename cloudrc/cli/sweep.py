@@ -233,7 +233,7 @@ def _fly_into(folder: Path, flight: Flight, *, page: bool) -> dict[str, Any]:
 
 def fly_again(options: argparse.Namespace) -> int:
     """Fly a row again with recording and report; exit with 6 if its records differ."""
-    from cloudrc.cli.report import summary
+    from cloudrc.cli.report import print_traceback, summary
     from cloudrc.sweep import store
     from cloudrc.sweep.plan import read_plan
 
@@ -249,6 +249,7 @@ def fly_again(options: argparse.Namespace) -> int:
     if key not in flights:
         raise InvalidRunError(changed)
     report = _fly_into(options.folder / key, flights[key], page=True)
+    print_traceback(options, report)
     print_or_drop(summary(report, options.folder / key))
     if rows[0]["records_sha256"] != report["records_sha256"]:
         raise InvalidRunError(changed)

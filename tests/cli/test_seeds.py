@@ -45,7 +45,7 @@ def test_many_seeds_become_one_table(folder, capsys):
 
 
 def test_the_newest_sweep_and_the_newest_run_have_their_own_link(folder, monkeypatch):
-    monkeypatch.setattr("cloudrc.cli.seeds._fly_one", lambda job: report(job[-1]))
+    monkeypatch.setattr("cloudrc.cli.seeds._fly_one", lambda job: report(job[0].seed))
     monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 1)
     assert main(["run", "steps", "--seeds", "1", *SHORT]) == 0
     assert (folder / "runs/latest-sweep/sweep.json").is_file()
