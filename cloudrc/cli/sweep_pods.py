@@ -7,7 +7,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Generator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cloudrc import __version__
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
@@ -56,6 +56,7 @@ def rows_from_pods(
     from cloudrc.cluster import batch
     from cloudrc.cluster.client import ClusterError
     from cloudrc.sweep.parcel import pack
+    from cloudrc.sweep.store import parse_row
 
     if not flights:
         return
@@ -71,24 +72,13 @@ def rows_from_pods(
     tell(f"Job '{name}' {release.where}, {options.shards} pods; it goes on without this command")
     missing = {flight.key for flight in flights}
     for line in batch.read_lines(release, name, tell):
-        row = _parse(line)
+        row = parse_row(line)
         if row is not None and row["key"] in missing:
             missing.remove(row["key"])
             yield row
     if missing:
         text = "the same command flies them; is the image of this version of cloudrc?"
         raise ClusterError(f"the pods printed no row of {len(missing)} flights; {text}")
-
-
-def _parse(line: str) -> dict[str, Any] | None:
-    """Return the row that a line of a pod's log has; None for another line."""
-    from cloudrc.sweep.store import FIELDS
-
-    try:
-        row = json.loads(line)
-        return row if {*row} >= FIELDS else None
-    except (ValueError, TypeError):
-        return None
 
 
 def print_rows(options: argparse.Namespace) -> int:

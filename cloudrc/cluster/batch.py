@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from cloudrc.cluster.client import ClusterError, Release, retry
-from cloudrc.cluster.jobs import create_job, delete_job
+from cloudrc.cluster.jobs import create_job, delete_job, failure_of
 from cloudrc.cluster.pods import container_statuses, list_pods, one_line, pod_failure, pod_log
 
 COMPONENT = "sweep"
@@ -61,7 +61,7 @@ def start(
         raise ClusterError(f"{text}; split the file of the sweep")
     for job in release.find("jobs", COMPONENT):
         if job.metadata.name == name:
-            if not _ending(job):  # flies, or is complete
+            if not failure_of(job):  # flies, or is complete
                 return
             delete_job(release, name, COMPONENT)
     labels = {**release.labels(COMPONENT), "app.kubernetes.io/part-of": "cloudrc"}
@@ -118,18 +118,6 @@ def _job_spec(name: str, shards: int, image: str, cpu: str, labels: dict[str, st
     }
 
 
-def _ending(job: Any) -> str | None:
-    """Return "" if a Job is complete, the cause if it has failed, None while it flies."""
-    for condition in job.status.conditions or []:
-        if condition.status == "True" and condition.type == "Complete":
-            return ""
-        if condition.status == "True" and condition.type == "Failed":
-            which = job.status.failed_indexes
-            where = f" (index {which})" if which else ""
-            return f"{condition.reason}: {condition.message}{where}"
-    return None
-
-
 def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iterator[str]:
     """Yield each line of the logs of a Job until it ends, some lines twice; then delete the Job.
 
@@ -148,7 +136,7 @@ def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iter
     ending = None
     while ending is None:
         time.sleep(LOOK_PERIOD)
-        ending = _ending(retry(lambda: release.request("get", "jobs", name=name), tell_once))
+        ending = failure_of(retry(lambda: release.request("get", "jobs", name=name), tell_once))
         for pod in retry(lambda: list_pods(release, COMPONENT), tell_once):
             if (pod.metadata.labels or {}).get(JOB_LABEL) != name or pod.metadata.uid in fetched:
                 continue

@@ -221,18 +221,23 @@ def _status(job: Any, pod: Any) -> JobStatus:
             state = "flying" if ended or container.state.running else state
             exit_code = ended and ended.exit_code
             message = one_line(ended and ended.message)
-    for condition in job.status.conditions or []:
-        if condition.status == "True" and condition.type == "Complete":
-            state = "complete"
-        elif condition.status == "True" and condition.type == "Failed":
-            state, message = "failed", message or _failure(condition)
+    cause = failure_of(job)
+    if cause is not None:
+        state, message = ("failed", message or cause) if cause else ("complete", message)
     return JobStatus(job.metadata.name, state, exit_code, message)
 
 
-def _failure(condition: Any) -> str:
-    if condition.reason == "DeadlineExceeded":
-        return "the Job took longer than its activeDeadlineSeconds"
-    return f"{condition.reason}: {condition.message}"
+def failure_of(job: Any) -> str | None:
+    """Return why a Job has failed, "" if it is complete, None if it has not ended."""
+    for condition in job.status.conditions or []:
+        if condition.status == "True" and condition.type == "Complete":
+            return ""
+        if condition.status == "True" and condition.type == "Failed":
+            if condition.reason == "DeadlineExceeded":
+                return "the Job took longer than its activeDeadlineSeconds"
+            where = f" (index {job.status.failed_indexes})" if job.status.failed_indexes else ""
+            return f"{condition.reason}: {condition.message}{where}"
+    return None
 
 
 def follow(

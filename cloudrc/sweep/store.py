@@ -11,7 +11,7 @@ import io
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -45,15 +45,21 @@ def read_rows(folder: Path) -> dict[str, Row]:
     for path in sorted(folder.glob("rows*.jsonl")):
         *lines, _ = path.read_bytes().split(b"\n")
         for number, line in enumerate(lines, start=1):
-            try:
-                row = json.loads(line)
-                if not FIELDS <= row.keys():
-                    raise KeyError
-                found.setdefault(row["key"], row)
-            except (ValueError, TypeError, KeyError, AttributeError) as error:
+            row = parse_row(line)
+            if row is None:
                 text = "is not a row of a sweep; delete this line to fly its flight again"
-                raise BadInputError(f"{path}:{number}: {text}") from error
+                raise BadInputError(f"{path}:{number}: {text}")
+            found.setdefault(row["key"], row)
     return found
+
+
+def parse_row(line: bytes | str) -> Row | None:
+    """Return the row in a line of JSON; None if there is none."""
+    with suppress(ValueError):
+        row = json.loads(line)
+        if isinstance(row, dict) and FIELDS <= row.keys():
+            return row
+    return None
 
 
 @contextmanager

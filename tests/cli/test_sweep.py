@@ -99,6 +99,20 @@ def test_a_row_flies_again_to_the_same_hash(write_sweep, monkeypatch, capsys):
     assert main(["sweep", "fly", ".", row["key"]]) == 2
 
 
+def test_a_plugin_that_failed_is_flown_again_with_its_traceback(write_sweep, monkeypatch, capsys):
+    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *given: None)
+    Path("mine.py").write_text(
+        "from cloudrc.cloud.predictors import Predictor\n\n\nclass Mine(Predictor):\n"
+        "    def predict(self, odometry, horizon):\n        return 1 / 0\n\n\nbuild = Mine\n"
+    )
+    grid = {"cloud.predictor": [str(Path("mine.py").resolve())]}
+    assert main(["sweep", "run", str(write_sweep(grid)), "--out", "grid"]) == 1
+    (row,) = rows("grid")
+    assert row["failures"] == ["plugin_failed"]
+    assert main(["--debug", "sweep", "fly", "grid", row["key"]]) == 0
+    assert "ZeroDivisionError: division by zero" in capsys.readouterr().err
+
+
 def test_failed_flights_are_recorded_if_asked_for(write_sweep):
     grid = {"criteria.contact": [False, True]}
     assert main(["sweep", "run", str(write_sweep(grid)), "--out", "grid", "--record=failed"]) == 1
