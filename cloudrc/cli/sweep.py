@@ -287,11 +287,11 @@ def draw_figure(options: argparse.Namespace) -> int:
     from cloudrc.sweep.figure import draw_sweep
     from cloudrc.sweep.pairs import read_flights
 
-    rows, units = read_flights(options.folder)
+    rows, units, missing = read_flights(options.folder)
     files, caption = draw_sweep(rows, units, options.number, options.x, options.by)
     out = options.out or options.folder / "figure"
     stem = out.stem if out.suffix.removeprefix(".") in files else out.name
-    print_or_drop(f"{caption}\n")
+    print_or_drop(caption + (f" {missing}." if missing else "") + "\n")
     for kind, data in files.items():
         path = out.with_name(f"{stem}.{kind}")
         write_atomically(path, data)

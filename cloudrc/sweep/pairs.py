@@ -30,9 +30,10 @@ class Found(NamedTuple):
     what: str  # what differs, and where
 
 
-def read_flights(folder: Path) -> tuple[list[Row], dict[str, str]]:
-    """Read the rows of a sweep in the order of its grid, and the unit of each metric.
+def read_flights(folder: Path) -> tuple[list[Row], dict[str, str], str]:
+    """Read the rows of a sweep in the order of its grid.
 
+    Also return the unit of each metric, and a text that says how many flights are missing, or "".
     A value of a point that is neither a number nor a text becomes text. Raise a BadInputError if
     there are no rows.
     """
@@ -48,7 +49,8 @@ def read_flights(folder: Path) -> tuple[list[Row], dict[str, str]]:
                         for axis, value in row["point"].items()}  # fmt: skip
     if not rows:
         raise BadInputError(f"{folder}: has no rows; run the sweep again with this --out")
-    return rows, summary["units"]
+    missing = summary["flights"] - len(rows)
+    return rows, summary["units"], f"{missing} flights are not done" if missing else ""
 
 
 def values_of(rows: Sequence[Row]) -> dict[str, list[Any]]:
@@ -65,7 +67,7 @@ def of_sweep(folder: Path, a: str, b: str) -> Found:
     Raises:
         BadInputError: If not exactly one axis has both values, or if they are the same.
     """
-    rows, units = read_flights(folder)
+    rows, units, missing = read_flights(folder)
     axes = values_of(rows)
     sides = [
         [(axis, v) for axis in axes for v in axes[axis] if text in (f"{v}", f"{axis}={v}")]
@@ -88,9 +90,11 @@ def of_sweep(folder: Path, a: str, b: str) -> Found:
         for shared, each in flown.items()
         if first in each and second in each
     ]
-    pooled = ", ".join(name for name, each in axes.items() if name != axis and len(each) > 1)
-    note = f", over all values of {pooled}; flights with equal seeds depend on each other, so p is "
-    return Found(pairs, units, f"{axis} in {folder}" + (f"{note}too small" if pooled else ""))
+    what = f"{axis} in {folder}" + (f", of which {missing}" if missing else "")
+    if pooled := ", ".join(name for name, each in axes.items() if name != axis and len(each) > 1):
+        what += f", over all values of {pooled}; flights with equal seeds depend on each other, "
+        what += "so p is too small"
+    return Found(pairs, units, what)
 
 
 def of_folders(a: Path, b: Path) -> Found:

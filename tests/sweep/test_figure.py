@@ -39,7 +39,7 @@ def drawn(monkeypatch):
 
 
 def test_numbers_go_along_x_in_order_and_failures_get_a_panel(tmp_path, drawn):
-    _, caption = draw_sweep(*read_flights(sweep(tmp_path / "s")))
+    _, caption = draw_sweep(*read_flights(sweep(tmp_path / "s"))[:2])
     (iae, success), x, names, by = drawn
     assert (iae.title, iae.unit, x, names, by) == ("iae mean", "m s", "delay_ms", [], "predictor")
     assert [point.x for point in iae.lines["kalman"]] == [5, 10, 20]
@@ -50,7 +50,7 @@ def test_numbers_go_along_x_in_order_and_failures_get_a_panel(tmp_path, drawn):
 
 
 def test_names_along_x_keep_the_order_of_the_grid(tmp_path, drawn):
-    draw_sweep(*read_flights(sweep(tmp_path / "s")), x="predictor", by="gain")
+    draw_sweep(*read_flights(sweep(tmp_path / "s"))[:2], x="predictor", by="gain")
     assert drawn[1:] == ["predictor", ["none", "kalman"], "gain"]
     assert [*drawn[0][0].lines] == ["[1, 2]", "[3, 4]"]
 
@@ -106,6 +106,14 @@ def test_a_sweep_without_axes_or_rows_has_no_figure(tmp_path):
         draw_sweep([row({}, 1)], UNITS)
     with pytest.raises(BadInputError, match="has no rows"):
         read_flights(sweep(tmp_path / "s", rows=0))
+
+
+def test_missing_flights_are_told(tmp_path, capsys):
+    """A sweep that still flies may answer otherwise in the end."""
+    folder = sweep(tmp_path / "s", rows=22)
+    assert "s, of which 2 flights are not done, over" in of_sweep(folder, "none", "kalman").what
+    assert main(["sweep", "figure", str(folder)]) == 0
+    assert "2 flights are not done." in capsys.readouterr().out
 
 
 def test_values_of_an_axis_are_paired_over_the_others(tmp_path):
