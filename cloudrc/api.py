@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from cloudrc import metrics
 from cloudrc.config.load import dump, load_experiment
 from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Columns
@@ -84,8 +85,12 @@ def fly(
         cloudrc.errors.BadInputError: If a name, key or value is invalid; the text says where.
     """
     changes = dict(settings or {}) | ({} if seed is None else {"seed": seed})
-    texts = [f"{key}={json.dumps(value, default=_plain)}" for key, value in changes.items()]
+    texts = [
+        f"{key}={json.dumps(value, default=_plain, ensure_ascii=False)}"
+        for key, value in changes.items()
+    ]
     resolved = load_experiment(experiment, texts)
+    metrics.check(resolved.report.metrics)
     found = fly_in_memory(resolved)
     return Result(
         verdict=found.verdict.outcome,

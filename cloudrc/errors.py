@@ -33,9 +33,11 @@ class DiskFullError(MissingPrerequisiteError):
 
     def __init__(self, where: str) -> None:
         """Name the file or folder on the full disk."""
-        super().__init__(
-            f"disk_full: {where}: free some space, or choose another folder with --out"
-        )
+        super().__init__(where)  # a worker process sends the error by its arguments
+
+    def __str__(self) -> str:
+        """Return the message."""
+        return f"disk_full: {self.args[0]}: free some space, or choose another folder with --out"
 
 
 class InvalidRunError(CloudrcError):

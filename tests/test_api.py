@@ -53,6 +53,19 @@ def test_values_of_numpy_and_mappings_are_settings():
     assert "gain_p: [0.5, 0.5, 0.5]" in cloudrc.fly("steps", settings).config
 
 
+def test_a_wrong_metric_is_refused_before_the_flight():
+    with pytest.raises(BadInputError, match="no metric named 'nope'"):
+        cloudrc.fly("steps", {"report.metrics": ["nope"]})
+
+
+def test_the_path_of_a_plugin_may_have_any_characters(tmp_path):
+    path = tmp_path / "🚁.py"
+    path.write_text("def build():\n    return 1 / 0\n")
+    with pytest.raises(BadInputError) as caught:
+        cloudrc.fly("steps", {"cloud.predictor": path})
+    assert str(path) in str(caught.value)
+
+
 def test_a_failed_mission_is_a_result():
     result = cloudrc.fly("steps", {**SHORT, "link.downlink.loss": 1.0}, seed=1)
     assert result.verdict == "failure"

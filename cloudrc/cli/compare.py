@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,10 +20,11 @@ from cloudrc.cli.output import (
 from cloudrc.cli.parser import read_count
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.errors import BadInputError
+from cloudrc.plugins import unknown_name_text
 
 if TYPE_CHECKING:
-    from cloudrc.sweep.compare import Pair
-    from cloudrc.sweep.flight import Outcome
+    from cloudrc.sweep.flight import Row
+    from cloudrc.sweep.pairs import Found
 
 EPILOG = """\
 A and B are one of:
@@ -76,68 +77,72 @@ def execute(options: argparse.Namespace) -> int:
     if options.set and (options.sweep or all(folder.is_dir() for folder in folders)):
         raise BadInputError(f"--set {options.set[0]}: these flights are finished; leave it out")
     if options.sweep:
-        found, what = pairs.of_sweep(options.sweep, options.a, options.b)
+        found = pairs.of_sweep(options.sweep, options.a, options.b)
     elif all(folder.is_dir() for folder in folders):
-        found, what = pairs.of_folders(*folders)
+        found = pairs.of_folders(*folders)
     else:
-        what = f"experiment {options.experiment}"
         found, stopped, code = _fly_both(options)
-    document = {
-        **{"schemaVersion": 1, "a": options.a, "b": options.b, "of": what},
-        **{"overrides": options.set, "interrupted": bool(stopped)},
-        **compare(found, options.number),
-    }
     if stopped:
-        print_or_drop(f"cloudrc: {stopped}: {len(found)} pairs are finished", sys.stderr)
+        print_or_drop(f"cloudrc: {stopped}: {len(found.pairs)} pairs are finished", sys.stderr)
+        if not found.pairs:
+            return code
+    document = {
+        **{"schemaVersion": 1, "a": options.a, "b": options.b, "of": found.what},
+        **{"overrides": options.set, "interrupted": bool(stopped)},
+        **compare(found.pairs, found.units, options.number),
+    }
     for_people = options.output == "table"
     print_or_drop(as_text(document) if for_people else format_document(document, options.output))
     return code
 
 
-def _fly_both(options: argparse.Namespace) -> tuple[list[Pair], str, int]:
+def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
     """Fly A and B with each seed; return the pairs, and why and with which code it ended early."""
     from cloudrc.cli.advice import warn
     from cloudrc.cli.run import load
     from cloudrc.cli.sweep import Progress
     from cloudrc.sweep.compare import Pair
-    from cloudrc.sweep.flight import ERROR
+    from cloudrc.sweep.flight import fly_point, units
+    from cloudrc.sweep.pairs import Found
 
+    for text in (options.a, options.b):
+        if "=" not in text:
+            what = "is neither KEY=VALUE nor, with the other side, a folder; see --in for a sweep"
+            raise BadInputError(f"{text}: {what}")
     interrupt_on_signals()
     require("compare", MODES["virtual"])
     # A comma separates settings only before KEY=: a list may contain commas.
-    sides = [[*options.set, *re.split(r",(?=[\w.]+=)", text)] for text in (options.a, options.b)]
-    resolved = [load(options.experiment, side) for side in sides]
-    if resolved[0] == resolved[1]:
+    texts = [re.split(r",(?=[\w.]+=)", text) for text in (options.a, options.b)]
+    sides = [load(options.experiment, [*options.set, *each]) for each in texts]
+    if sides[0] == sides[1]:
         raise BadInputError("A and B are the same experiment; change one of them")
-    for experiment in resolved:
-        warn(experiment)
-    jobs = [(options.experiment, side, n + 1) for n in range(options.seeds) for side in sides]
-    flights: list[Outcome] = []
-    head = f"{resolved[0].name}: A and B with {options.seeds} seeds"
+    unit_of = units({name for each in sides for name in each.report.metrics})
+    for name in options.number:
+        if name not in unit_of:
+            raise BadInputError(f"--number: {unknown_name_text('number', name, sorted(unit_of))}")
+    for side in sides:
+        warn(side)
+    jobs = [side.model_copy(update={"seed": n + 1}) for n in range(options.seeds) for side in sides]
+    flights: list[Row] = []
+    head = f"{sides[0].name}: A and B, each with seeds 1 to {options.seeds}"
     stream = sys.stdout if options.output == "table" else sys.stderr
-    view = Progress(stream, f"{head}, {len(jobs)} flights", len(jobs), len(jobs))
+    view = Progress(stream, f"{head}, {len(jobs)} flights", len(jobs))
 
-    def take(flight: Outcome) -> None:
+    def take(flight: Row) -> None:
         flights.append(flight)
-        error = {"text": flight.text} if flight.verdict == ERROR else {}
-        view.see({"key": "AB"[len(flights) % 2 - 1], "verdict": flight.verdict, **error})
+        view.see({"key": "BA"[len(flights) % 2], **flight})
 
-    stopped, code = take_each(map_in_order(fly_job, jobs, len(jobs)), take)
+    stopped, code = take_each(map_in_order(fly_point, jobs, len(jobs)), take)
     view.close()
     both = zip(flights[::2], flights[1::2], strict=False)
-    return [Pair({"seed": n}, a, b) for n, (a, b) in enumerate(both, start=1)], stopped, code
-
-
-def fly_job(job: tuple[str, Sequence[str], int]) -> Outcome:
-    """Fly an experiment with overrides and a seed in virtual time, without files."""
-    from cloudrc.cli.run import load
-    from cloudrc.sweep.flight import fly_point
-
-    return fly_point(load(*job))
+    pairs = [Pair({"seed": n}, a, b) for n, (a, b) in enumerate(both, start=1)]
+    return Found(pairs, unit_of, f"experiment {options.experiment}"), stopped, code
 
 
 def as_text(document: Mapping[str, Any]) -> str:
     """Format the result of a comparison as a table and one sentence that answers."""
+    from cloudrc.sweep.compare import LEFT_OUT
+
     body = [_row(name, entry) for name, entry in document["numbers"].items()]
     success, left_out = document["success"], document["left_out"]
     rates = [
@@ -148,8 +153,8 @@ def as_text(document: Mapping[str, Any]) -> str:
     ]
     lines = [
         *(f"{side.upper()}: {document[side]}" for side in "ab"),
-        f"of {document['of']}, {document['pairs']} pairs"
-        + (f"; {left_out} left out, because a flight did not end" if left_out else ""),
+        f"of {document['of']}; pairs: {document['pairs']}"
+        + (f"; {left_out} left out with {LEFT_OUT}" if left_out else ""),
         *("", table([TITLES, *body], right=(1, 2, 3)), ""),
         f"success: {', '.join(rates)}, p = {success['p_mcnemar']:.2g}",
         *(document["method"], "", _answer(document)),

@@ -9,7 +9,7 @@ from contextlib import closing
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from cloudrc.cli.advice import simulate_ages
-from cloudrc.cli.compare import flight_arguments, fly_job
+from cloudrc.cli.compare import flight_arguments
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.output import format_document, output_argument, print_or_drop
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order
@@ -56,9 +56,12 @@ def execute(options: argparse.Namespace) -> int:
 
     interrupt_on_signals()
     require("margin", MODES["virtual"])
-    key, size = options.key, options.resolution or (10.0 if options.key.endswith("_ms") else 0.01)
-    first = max(1, round(_present(load(options.experiment, options.set), key) / abs(size)))
-    limit = options.max or STEPS_MAX * first * size
+    key, size, limit = options.key, options.resolution, options.max
+    if size is None:
+        size = 10.0 if key.endswith("_ms") else 0.01
+    present = _present(load(options.experiment, options.set), key)
+    first = max(1, round(present / size)) if 0 < size < math.inf else 1
+    limit = STEPS_MAX * first * size if limit is None else limit
     if not 0 < size <= limit < math.inf:
         raise BadInputError(f"--resolution {size:g} must be above 0, --max {limit:g} not below it")
     top = math.floor(limit / size + 1e-9)
@@ -123,8 +126,9 @@ def _present(experiment: ResolvedExperiment, key: str) -> float:
 def _try(options: argparse.Namespace, value: float, *, first: bool) -> Trial:
     """Fly the seeds with one value of the key until one fails."""
     from cloudrc.cli.run import load
+    from cloudrc.sweep.flight import fly_point
 
-    settings = [*options.set, f"{options.key}={value:g}"]
+    settings = [*options.set, f"{options.key}={value:.12g}"]
     try:
         experiment = load(options.experiment, settings)
     except BadInputError as error:
@@ -139,13 +143,13 @@ def _try(options: argparse.Namespace, value: float, *, first: bool) -> Trial:
         if options.key.endswith("delay_ms"):
             trial["rtt_ms"] = experiment.uplink.delay_ms + experiment.downlink.delay_ms
     trial["speed_max_mps"] = experiment.guard.speed_max_mps
-    jobs = [(options.experiment, settings, seed + 1) for seed in range(options.seeds)]
+    jobs = [experiment.model_copy(update={"seed": n + 1}) for n in range(options.seeds)]
     # A worker takes as long to start as three flights of `steps`.
-    with closing(map_in_order(fly_job, jobs, len(jobs) // 4)) as flights:
+    with closing(map_in_order(fly_point, jobs, len(jobs) // 4)) as flights:
         for seed, flight in enumerate(flights, start=1):
-            if flight.verdict != "success":
-                code = (*flight.failures, flight.verdict)[0]
-                failed = {"stable": False, "code": code, "text": flight.text, "seed": seed}
+            if flight["verdict"] != "success":
+                code = (*flight["failures"], flight["verdict"])[0]
+                failed = {"stable": False, "code": code, "text": flight["text"], "seed": seed}
                 return trial | failed
     return trial
 
@@ -167,7 +171,7 @@ def _limits(experiment: ResolvedExperiment) -> list[str]:
 
 def _value(key: str, trial: Trial) -> str:
     rtt = f" (RTT {trial['rtt_ms']:g} ms)" if "rtt_ms" in trial else ""
-    return f"{trial['value']:g}{' ms' if key.endswith('_ms') else ''}{rtt}"
+    return f"{trial['value']:.12g}{' ms' if key.endswith('_ms') else ''}{rtt}"
 
 
 def _result(trial: Trial) -> str:

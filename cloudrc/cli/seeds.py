@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import json
 import statistics
 import sys
@@ -17,7 +15,11 @@ from cloudrc.cli.output import escape, format_document, format_number, print_or_
 from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.cli.report import print_traceback
 from cloudrc.cli.run import fly, load, new_folder
+from cloudrc.config.load import ResolvedExperiment
 from cloudrc.metrics.verdict import exit_code
+from cloudrc.sweep import store
+from cloudrc.sweep.flight import counts
+from cloudrc.sweep.pairs import row_of
 from cloudrc.sweep.statistics import median_interval
 
 Report: TypeAlias = Mapping[str, Any]
@@ -26,10 +28,13 @@ METHOD = "95 % interval of the median, by order statistics"
 
 
 def summarise(reports: Sequence[Report]) -> dict[str, Any]:
-    """Count all runs and successful runs; compute median and interval of each measurement."""
-    numbers = {}
-    for name, unit in _units(reports).items():
-        found = [r["numbers"][name]["value"] for r in reports if name in r["numbers"]]
+    """Count all runs and successful runs; compute median and interval of each measurement.
+
+    Runs that were interrupted or whose plug-in failed have no numbers here.
+    """
+    numbers, measured = {}, [each for each in reports if counts(row_of(each))]
+    for name, unit in _units(measured).items():
+        found = [r["numbers"][name]["value"] for r in measured if name in r["numbers"]]
         middle = {"median": statistics.median(found), "interval": median_interval(found)}
         numbers[name] = {**middle, "unit": unit, "count": len(found)}
     done = sum(report["verdict"] == "success" for report in reports)
@@ -54,13 +59,10 @@ def as_table(summary: Mapping[str, Any]) -> str:
 
 def as_csv(reports: Sequence[Report]) -> str:
     """Format reports as CSV, one line per run: seed, verdict and all measurements."""
-    units, text = _units(reports), io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["seed", "verdict", *(f"{name} [{unit}]" for name, unit in units.items())])
-    for report in reports:
-        values = [report["numbers"].get(name, {"value": ""})["value"] for name in units]
-        writer.writerow([report["seed"], report["verdict"], *values])
-    return text.getvalue()
+    units, rows = _units(reports), [*map(row_of, reports)]
+    columns = {name: [row[name] for row in rows] for name in ("seed", "verdict")}
+    columns |= {name: [row["numbers"].get(name) for row in rows] for name in units}
+    return store.as_csv(columns, units)
 
 
 def fly_seeds(options: argparse.Namespace) -> int:
@@ -68,12 +70,12 @@ def fly_seeds(options: argparse.Namespace) -> int:
 
     If Ctrl-C or a killed worker ends the command early, the table shows the finished seeds only.
     """
-    # Load the experiment here too, so that a mistake is reported once, not N times.
     experiment = load(options.experiment, options.set)
     warn(experiment)
     name = experiment.name
     folder = new_folder(options.out, f"{name}-virtual-{options.seeds}seeds", "latest-sweep")
-    work = [(options.experiment, options.set, folder, n + 1) for n in range(options.seeds)]
+    seeds = range(1, options.seeds + 1)
+    work = [(experiment.model_copy(update={"seed": n}), folder / f"seed-{n}") for n in seeds]
     for_people, reports = options.output == "table", list[dict[str, Any]]()
 
     def take(report: dict[str, Any]) -> None:
@@ -108,8 +110,7 @@ def fly_seeds(options: argparse.Namespace) -> int:
     return code or max(map(exit_code, reports))
 
 
-def _fly_one(job: tuple[str, list[str], Path, int]) -> dict[str, Any]:
-    experiment, overrides, folder, seed = job
-    run_folder = folder / f"seed-{seed}"
-    run_folder.mkdir()
-    return fly(load(experiment, overrides, seed), "virtual", run_folder, page=False)
+def _fly_one(job: tuple[ResolvedExperiment, Path]) -> dict[str, Any]:
+    experiment, folder = job
+    folder.mkdir()
+    return fly(experiment, "virtual", folder, page=False)

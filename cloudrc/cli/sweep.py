@@ -25,12 +25,17 @@ from cloudrc.cli.output import (
 )
 from cloudrc.cli.parser import COUNT_MAX, input_file, read_count
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
-from cloudrc.cli.sweep_pods import cluster_arguments, print_rows, rows_from_pods
+from cloudrc.cli.sweep_pods import (
+    cluster_arguments,
+    print_rows,
+    refuse_local_files,
+    rows_from_pods,
+)
 from cloudrc.errors import BadInputError, InvalidRunError
 
 if TYPE_CHECKING:
+    from cloudrc.sweep.flight import Row
     from cloudrc.sweep.plan import Flight, Plan
-    from cloudrc.sweep.store import Row
 
 ACTIONS = {
     "run": "fly all points of a grid, or those that are missing in --out",
@@ -55,6 +60,8 @@ ARRAYS = {
 }
 """Variable with the index of a process -> variables with the number of processes and with the first
 index, which is 0 without a variable."""
+WARNINGS_MAX = 3
+"""Largest number of warnings about points."""
 PLAIN_PERIOD = 30.0
 """Time between two lines of progress that is not shown on a terminal [s]."""
 
@@ -88,7 +95,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--number", action="append", default=[], metavar="NAME", help=about)
     about = "axis of the sweep along x (default: the first one with numbers)"
     add("--x", metavar="AXIS", help=about)
-    about = "axis with one line per value (default: the first of the others)"
+    about = "axis with one line per value (default: the first with names, else the next one)"
     add("--by", metavar="AXIS", help=about)
     about = "path of the files, with or without a suffix (default: DIR/figure)"
     add("--out", type=Path, metavar="FILE", help=about)
@@ -117,42 +124,38 @@ def execute(options: argparse.Namespace) -> int:
     if options.action is None:
         names = ", ".join(ACTIONS)
         raise BadInputError(f"an action is missing: {names}; see 'cloudrc sweep --help'")
-    actions = {"run": run, "status": print_status, "fly": fly_again, "figure": draw_figure}
-    actions["rows"] = print_rows
-    return actions[options.action](options)
+    functions = (run, print_status, fly_again, draw_figure, print_rows)
+    return dict(zip(ACTIONS, functions, strict=True))[options.action](options)
 
 
 def run(options: argparse.Namespace) -> int:
     """Fly the flights of a sweep that have no row yet; return the exit code of the worst row."""
     from cloudrc.cli.run import new_folder
     from cloudrc.sweep import store
-    from cloudrc.sweep.plan import read_plan
 
     interrupt_on_signals()
-    if not options.on:
-        require("a sweep", MODES["virtual"] if options.record else ("world",))
-    elif options.record or options.shard:
-        raise BadInputError("--on kubernetes has no --record and no --shard; see --shards")
-    if options.shard and options.out is None:
-        raise BadInputError("--shard needs --out, the folder that all shards share")
-    plan, folder, (shard, count) = read_plan(options.file), options.out, options.shard or (None, 1)
-    for text in dict.fromkeys(text for point in plan.points for text in advise(point)):
-        print_line(f"cloudrc: warning: {text}", sys.stderr)
+    plan, folder, (shard, count) = _plan(options), options.out, options.shard or (None, 1)
     if options.shard:
         folder.mkdir(parents=True, exist_ok=True)  # another shard may be faster
     elif folder is None or not (folder / store.FILE).is_file():
         folder = new_folder(folder, f"sweep-{options.file.stem}", "latest-sweep")
     before = store.begin(folder, plan)
     mine = [*plan.flights.values()][(shard or 1) - 1 :: count]
-    jobs = [(each, options.record, folder) for each in mine if each.key not in before]
+    jobs = [
+        (each, options.record, folder)
+        for each in mine
+        if each.key not in before or _to_record(before[each.key], options.record, folder)
+    ]
     part = f", shard {shard} of {count}" if shard else ""
     head = f"{len(plan.points)} points x {len(plan.seeds)} seeds{part}: {len(mine)} flights"
     stream = sys.stdout if options.output == "table" else sys.stderr
-    view = Progress(stream, f"{plan.points[0].name}: {head}", len(mine), len(jobs))
+    head += f", {len(mine) - len(jobs)} done before" if len(jobs) < len(mine) else ""
+    view = Progress(stream, f"{plan.points[0].name}: {head}", len(jobs))
     with store.append_rows(folder, shard) as append, closing(view):
 
         def take(row: Row) -> None:
-            append(row)
+            if row["key"] not in before:
+                append(row)
             view.see(row)
 
         stopped, code = take_each(_rows(options, plan, jobs), take)
@@ -169,6 +172,26 @@ def run(options: argparse.Namespace) -> int:
     return code or int(any(rows[each.key]["verdict"] != "success" for each in mine))
 
 
+def _plan(options: argparse.Namespace) -> Plan:
+    """Check the flags, read the plan, and print warnings; nothing is written yet."""
+    from cloudrc.sweep.plan import read_plan
+
+    if not options.on:
+        require("a sweep", MODES["virtual"] if options.record else ("world",))
+    elif options.record or options.shard:
+        raise BadInputError("--on kubernetes has no --record and no --shard; see --shards")
+    if options.shard and options.out is None:
+        raise BadInputError("--shard needs --out, the folder that all shards share")
+    plan = read_plan(options.file)
+    if options.on:
+        refuse_local_files(plan)
+    advice = list(dict.fromkeys(text for point in plan.points for text in advise(point)))
+    more = [f"{len(advice)} warnings; the others are alike"] if len(advice) > WARNINGS_MAX else []
+    for text in advice[:WARNINGS_MAX] + more:
+        print_line(f"cloudrc: warning: {text}", sys.stderr)
+    return plan
+
+
 def _rows(
     options: argparse.Namespace, plan: Plan, jobs: list[tuple[Flight, str | None, Path]]
 ) -> Generator[Row]:
@@ -183,15 +206,22 @@ def _rows(
 
 def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
     """Fly, record the flight if that is asked for, and return the row."""
-    from cloudrc.sweep.flight import ERROR, fly_point
+    from cloudrc.sweep.flight import fly_point
     from cloudrc.sweep.store import make_row
 
     flight, record, folder = job
     flown = fly_point(flight.experiment)
-    wanted = record == "all" or (record == "failed" and flown.verdict != "success")
-    if wanted and flown.verdict != ERROR:
+    row = make_row(flight, flown)
+    if _to_record(row, record, folder):
         _fly_into(folder / flight.key, flight, page=False)
-    return make_row(flight, flown)
+    return row
+
+
+def _to_record(row: Row, record: str | None, folder: Path) -> bool:
+    """Return whether a flight shall have a recording in `folder` and has none."""
+    wanted = record == "all" or (record == "failed" and row["verdict"] != "success")
+    has = (folder / row["key"] / "report.json").is_file()
+    return wanted and row["verdict"] != "error" and not has
 
 
 def _fly_into(folder: Path, flight: Flight, *, page: bool) -> dict[str, Any]:
@@ -203,7 +233,7 @@ def _fly_into(folder: Path, flight: Flight, *, page: bool) -> dict[str, Any]:
 
 def fly_again(options: argparse.Namespace) -> int:
     """Fly a row again with recording and report; exit with 6 if its records differ."""
-    from cloudrc.cli.report import summary
+    from cloudrc.cli.report import print_traceback, summary
     from cloudrc.sweep import store
     from cloudrc.sweep.plan import read_plan
 
@@ -219,6 +249,7 @@ def fly_again(options: argparse.Namespace) -> int:
     if key not in flights:
         raise InvalidRunError(changed)
     report = _fly_into(options.folder / key, flights[key], page=True)
+    print_traceback(options, report)
     print_or_drop(summary(report, options.folder / key))
     if rows[0]["records_sha256"] != report["records_sha256"]:
         raise InvalidRunError(changed)
@@ -256,11 +287,11 @@ def draw_figure(options: argparse.Namespace) -> int:
     from cloudrc.sweep.figure import draw_sweep
     from cloudrc.sweep.pairs import read_flights
 
-    rows = read_flights(options.folder)
-    files, caption = draw_sweep(rows, options.number, options.x, options.by)
+    rows, units, missing = read_flights(options.folder)
+    files, caption = draw_sweep(rows, units, options.number, options.x, options.by)
     out = options.out or options.folder / "figure"
     stem = out.stem if out.suffix.removeprefix(".") in files else out.name
-    print_or_drop(f"{caption}\n")
+    print_or_drop(caption + (f" {missing}." if missing else "") + "\n")
     for kind, data in files.items():
         path = out.with_name(f"{stem}.{kind}")
         write_atomically(path, data)
@@ -276,13 +307,12 @@ def _verdicts(rows: Iterable[Row]) -> str:
 class Progress:
     """Shows how many flights are done: in a line on a terminal, else in a line every 30 s."""
 
-    def __init__(self, stream: TextIO, head: str, total: int, missing: int) -> None:
-        """Print `head`; set the number of flights, and of those that have no row yet."""
-        self._stream, self._total, self._before = stream, total, total - missing
+    def __init__(self, stream: TextIO, head: str, total: int) -> None:
+        """Print `head`; set the number of flights to fly."""
+        self._stream, self._total = stream, total
         self._done, self._failed, self._began = 0, 0, monotonic()
-        self._printed, self._error = self._began, ""
-        done = f", {self._before} done before" if self._before else ""
-        print_or_drop(escape(head) + done, stream)
+        self._printed, self._told = self._began, set[str]()
+        print_or_drop(escape(head), stream)
         self._status = None
         if is_live(stream):
             from rich.console import Console
@@ -291,16 +321,17 @@ class Progress:
             self._status.start()
 
     def see(self, row: Row) -> None:
-        """Count a new row; print the first error."""
+        """Count a new row; print the first text of each verdict."""
         self._done += 1
         self._failed += row["verdict"] != "success"
-        if "text" in row and not self._error:
-            self._error = f"{row['key']}: error: {row['text']}"
-            print_or_drop(escape(self._error), self._stream)
+        if row["text"] and row["verdict"] not in self._told:
+            self._told.add(row["verdict"])
+            text = f"{row['key']}: {row['verdict']}: {row['text']}"
+            print_or_drop(escape(text), self._stream)
         rate = self._done / max(monotonic() - self._began, 1e-3)
-        left = (self._total - self._before - self._done) / rate
+        left = (self._total - self._done) / rate
         time = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
-        line = f"{self._before + self._done}/{self._total}  {rate:.1f} flights/s, {time} left"
+        line = f"{self._done}/{self._total}  {rate:.1f} flights/s, {time} left"
         line += f", {self._failed} failed" if self._failed else ""
         if self._status:
             self._status.update(line)

@@ -7,7 +7,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Generator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cloudrc import __version__
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
@@ -17,8 +17,8 @@ from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
+    from cloudrc.sweep.flight import Row
     from cloudrc.sweep.plan import Flight, Plan
-    from cloudrc.sweep.store import Row
 
 IMAGE = f"cloudrc/world:{__version__}"
 
@@ -35,24 +35,29 @@ def cluster_arguments(parser: argparse.ArgumentParser) -> None:
     add("--queue", metavar="NAME", help="queue of Kueue that admits the Job")
 
 
+def refuse_local_files(plan: Plan) -> None:
+    """Raise a BadInputError if a point needs a file of this machine, which no pod has."""
+    from cloudrc.sweep.plan import local_files
+
+    for point in plan.points:
+        for file in local_files(point.model_dump(mode="json")):
+            text = "the pods do not have this file; fly without --on; docs/sweeps.md says more"
+            raise BadInputError(f"{file}: {text}")
+
+
 def rows_from_pods(
     options: argparse.Namespace, plan: Plan, flights: Sequence[Flight]
 ) -> Generator[Row]:
     """Fly flights of a plan on a cluster, and yield each row once.
 
     Raises:
-        BadInputError: If the sweep needs local files, which the pods do not have.
         ClusterError: If the Job fails, or if a pod will never run.
     """
     from cloudrc.cluster import batch
     from cloudrc.cluster.client import ClusterError
     from cloudrc.sweep.parcel import pack
-    from cloudrc.sweep.plan import local_files
+    from cloudrc.sweep.store import parse_row
 
-    for point in plan.points:
-        for file in local_files(point.model_dump(mode="json")):
-            text = "the pods do not have this file; build it into an image, or fly without --on"
-            raise BadInputError(f"{file}: {text}")
     if not flights:
         return
 
@@ -67,22 +72,13 @@ def rows_from_pods(
     tell(f"Job '{name}' {release.where}, {options.shards} pods; it goes on without this command")
     missing = {flight.key for flight in flights}
     for line in batch.read_lines(release, name, tell):
-        row = _parse(line)
+        row = parse_row(line)
         if row is not None and row["key"] in missing:
             missing.remove(row["key"])
             yield row
     if missing:
         text = "the same command flies them; is the image of this version of cloudrc?"
         raise ClusterError(f"the pods printed no row of {len(missing)} flights; {text}")
-
-
-def _parse(line: str) -> dict[str, Any] | None:
-    """Return the row that a line of a pod's log has; None for another line."""
-    try:
-        row = json.loads(line)
-        return row if isinstance(row["key"], str) and {*row} >= {"point", "verdict"} else None
-    except (ValueError, TypeError, KeyError):
-        return None
 
 
 def print_rows(options: argparse.Namespace) -> int:

@@ -9,13 +9,11 @@ from __future__ import annotations
 import base64
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from typing import Any
 
 from cloudrc.cluster.client import ClusterError, Release, retry
-from cloudrc.cluster.jobs import delete_job, owner_of
+from cloudrc.cluster.jobs import create_job, delete_job, failure_of
 from cloudrc.cluster.pods import container_statuses, list_pods, one_line, pod_failure, pod_log
-from cloudrc.errors import CloudrcError
 
 COMPONENT = "sweep"
 """Label `component` of the Jobs and pods of sweeps, and name of their container."""
@@ -63,26 +61,17 @@ def start(
         raise ClusterError(f"{text}; split the file of the sweep")
     for job in release.find("jobs", COMPONENT):
         if job.metadata.name == name:
-            if not _ending(job):  # flies, or is complete
+            if not failure_of(job):  # flies, or is complete
                 return
             delete_job(release, name, COMPONENT)
     labels = {**release.labels(COMPONENT), "app.kubernetes.io/part-of": "cloudrc"}
     admission = {"kueue.x-k8s.io/queue-name": queue} if queue else {}
-    body = {
+    job = {
         "metadata": {"name": name, "labels": {**labels, **admission}},
         "spec": _job_spec(name, shards, image, cpu, labels),
     }
-    owner = owner_of("batch/v1", "Job", release.request("create", "jobs", body=body))
-    data = {
-        "metadata": {"name": name, "labels": labels, "ownerReferences": [owner]},
-        "binaryData": {FILE: base64.b64encode(flights).decode()},
-    }
-    try:
-        release.request("create", "configmaps", body=data)
-    except BaseException:  # Ctrl-C too: without its flights the Job would wait forever
-        with suppress(CloudrcError):
-            delete_job(release, name, COMPONENT)
-        raise
+    files = {"binaryData": {FILE: base64.b64encode(flights).decode()}}
+    create_job(release, job, files, labels, COMPONENT)
 
 
 def _job_spec(name: str, shards: int, image: str, cpu: str, labels: dict[str, str]) -> Any:
@@ -129,18 +118,6 @@ def _job_spec(name: str, shards: int, image: str, cpu: str, labels: dict[str, st
     }
 
 
-def _ending(job: Any) -> str | None:
-    """Return "" if a Job is complete, the cause if it has failed, None while it flies."""
-    for condition in job.status.conditions or []:
-        if condition.status == "True" and condition.type == "Complete":
-            return ""
-        if condition.status == "True" and condition.type == "Failed":
-            which = job.status.failed_indexes
-            where = f" (index {which})" if which else ""
-            return f"{condition.reason}: {condition.message}{where}"
-    return None
-
-
 def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iterator[str]:
     """Yield each line of the logs of a Job until it ends, some lines twice; then delete the Job.
 
@@ -159,7 +136,7 @@ def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iter
     ending = None
     while ending is None:
         time.sleep(LOOK_PERIOD)
-        ending = _ending(retry(lambda: release.request("get", "jobs", name=name), tell_once))
+        ending = failure_of(retry(lambda: release.request("get", "jobs", name=name), tell_once))
         for pod in retry(lambda: list_pods(release, COMPONENT), tell_once):
             if (pod.metadata.labels or {}).get(JOB_LABEL) != name or pod.metadata.uid in fetched:
                 continue

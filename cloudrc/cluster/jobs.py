@@ -116,17 +116,24 @@ def run_job(
     job["spec"] |= {"activeDeadlineSeconds": deadline, "ttlSecondsAfterFinished": KEEP_FINISHED}
     job["spec"]["template"]["metadata"]["labels"] = labels
     _fill_pod(job["spec"]["template"]["spec"], release, deployment, name, queue)
-    created = release.request("create", "jobs", body=job)
-    owner = owner_of("batch/v1", "Job", created)
-    plan["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
     plan["data"] = {FILE: json.dumps(mission, indent=2) + "\n"}
+    return _status(create_job(release, job, plan, labels, COMPONENT), None)
+
+
+def create_job(
+    release: Release, job: Any, files: Any, labels: Mapping[str, str], component: str
+) -> Any:
+    """Create a Job, and the ConfigMap `files` with its name; return the Job as created."""
+    name, created = job["metadata"]["name"], release.request("create", "jobs", body=job)
+    owner = owner_of("batch/v1", "Job", created)
+    files["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
     try:
-        release.request("create", "configmaps", body=plan)
-    except BaseException:  # Ctrl-C too: without its mission the Job would wait forever
+        release.request("create", "configmaps", body=files)
+    except BaseException:  # Ctrl-C too: without its files the Job would wait forever
         with suppress(CloudrcError):
-            delete_job(release, name)
+            delete_job(release, name, component)
         raise
-    return _status(created, None)
+    return created
 
 
 def owner_of(version: str, kind: str, owner: Any) -> dict[str, Any]:
@@ -214,18 +221,23 @@ def _status(job: Any, pod: Any) -> JobStatus:
             state = "flying" if ended or container.state.running else state
             exit_code = ended and ended.exit_code
             message = one_line(ended and ended.message)
-    for condition in job.status.conditions or []:
-        if condition.status == "True" and condition.type == "Complete":
-            state = "complete"
-        elif condition.status == "True" and condition.type == "Failed":
-            state, message = "failed", message or _failure(condition)
+    cause = failure_of(job)
+    if cause is not None:
+        state, message = ("failed", message or cause) if cause else ("complete", message)
     return JobStatus(job.metadata.name, state, exit_code, message)
 
 
-def _failure(condition: Any) -> str:
-    if condition.reason == "DeadlineExceeded":
-        return "the Job took longer than its activeDeadlineSeconds"
-    return f"{condition.reason}: {condition.message}"
+def failure_of(job: Any) -> str | None:
+    """Return why a Job has failed, "" if it is complete, None if it has not ended."""
+    for condition in job.status.conditions or []:
+        if condition.status == "True" and condition.type == "Complete":
+            return ""
+        if condition.status == "True" and condition.type == "Failed":
+            if condition.reason == "DeadlineExceeded":
+                return "the Job took longer than its activeDeadlineSeconds"
+            where = f" (index {job.status.failed_indexes})" if job.status.failed_indexes else ""
+            return f"{condition.reason}: {condition.message}{where}"
+    return None
 
 
 def follow(

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from cloudrc.errors import BadInputError
 from cloudrc.plugins import unknown_name_text
-from cloudrc.sweep.flight import Outcome
+from cloudrc.sweep.flight import Row, counts
 from cloudrc.sweep.statistics import LEVEL, paired, sign_test, wilson_interval
 
 NUMBERS = (
@@ -21,31 +21,34 @@ METHOD = (
     "B - A: Hodges-Lehmann estimate, 95 % interval and p of the exact Wilcoxon signed-rank test; "
     "success: Wilson intervals, p of the exact McNemar test"
 )
+LEFT_OUT = "a flight that did not end or whose plug-in failed"
 
 
 class Pair(NamedTuple):
     """Two flights that differ in the compared setting only."""
 
     label: Mapping[str, Any]  # what both share, such as the seed
-    a: Outcome
-    b: Outcome
+    a: Row
+    b: Row
 
 
-def compare(pairs: Sequence[Pair], names: Sequence[str] = ()) -> dict[str, Any]:
+def compare(
+    pairs: Sequence[Pair], units: Mapping[str, str], names: Sequence[str] = ()
+) -> dict[str, Any]:
     """Evaluate success and the metrics `names` (default: `NUMBERS`); return a JSON document.
 
-    A pair with a flight that was invalid, interrupted or ended with an error is left out. Where one
-    flight of a pair lacks a metric, the pair is left out for this metric.
+    A pair is left out if one of its flights did not end or had a plug-in that failed. Where one
+    flight of a pair lacks a metric, the pair is left out for this metric. `units`: metric -> unit.
 
     Raises:
         BadInputError: If no pair counts, or if no pair has a metric of `names`.
     """
-    flown = [pair for pair in pairs if {pair.a.verdict, pair.b.verdict} <= {"success", "failure"}]
+    flown = [pair for pair in pairs if counts(pair.a) and counts(pair.b)]
     if not flown:
-        texts = [flight.text for pair in pairs for flight in pair[1:] if flight.text]
-        why = f"each has a flight that did not end: {texts[0]}" if texts else "none was found"
+        bad = [row["text"] for _, *both in pairs for row in both if not counts(row)]
+        why = f"each has {LEFT_OUT}: {bad[0]}" if bad else "none was found"
         raise BadInputError(f"no pair of flights to compare: {why}")
-    known = sorted({name for pair in flown for name in pair.a.numbers.keys() & pair.b.numbers})
+    known = sorted({n for _, a, b in flown for n in a["numbers"].keys() & b["numbers"].keys()})
     for name in names:
         if name not in known:
             raise BadInputError(f"--number: {unknown_name_text('number', name, known)}")
@@ -54,7 +57,7 @@ def compare(pairs: Sequence[Pair], names: Sequence[str] = ()) -> dict[str, Any]:
         "pairs": len(flown),
         "left_out": len(pairs) - len(flown),
         "success": _success(flown),
-        "numbers": {name: _number(flown, name) for name in chosen},
+        "numbers": {name: _number(flown, name, units[name]) for name in chosen},
         "method": METHOD,
         "flights": [
             {**label, "a": _flight(a, chosen), "b": _flight(b, chosen)} for label, a, b in pairs
@@ -62,23 +65,21 @@ def compare(pairs: Sequence[Pair], names: Sequence[str] = ()) -> dict[str, Any]:
     }
 
 
-def _number(pairs: Sequence[Pair], name: str) -> dict[str, Any]:
-    both = [(a.numbers[name], b.numbers[name]) for _, a, b in pairs
-            if name in a.numbers and name in b.numbers]  # fmt: skip
+def _number(pairs: Sequence[Pair], name: str, unit: str) -> dict[str, Any]:
+    both = [(a["numbers"][name], b["numbers"][name]) for _, a, b in pairs
+            if name in a["numbers"] and name in b["numbers"]]  # fmt: skip
     return {
-        "unit": both[0][0].unit,
-        "a_median": median(a.value for a, _ in both),
-        "b_median": median(b.value for _, b in both),
-        **asdict(paired([b.value - a.value for a, b in both])),
+        "unit": unit,
+        "a_median": median(a for a, _ in both),
+        "b_median": median(b for _, b in both),
+        **asdict(paired([b - a for a, b in both])),
         "left_out": len(pairs) - len(both),
     }
 
 
 def _success(pairs: Sequence[Pair]) -> dict[str, Any]:
-    done, count = (
-        [(a.verdict == "success", b.verdict == "success") for _, a, b in pairs],
-        len(pairs),
-    )
+    done = [(a["verdict"] == "success", b["verdict"] == "success") for _, a, b in pairs]
+    count = len(pairs)
     a, b = (sum(each) for each in zip(*done, strict=True))
     only_a = sum(a and not b for a, b in done)
     only_b = b - (a - only_a)
@@ -90,9 +91,9 @@ def _success(pairs: Sequence[Pair]) -> dict[str, Any]:
     }
 
 
-def _flight(flight: Outcome, names: Sequence[str]) -> dict[str, Any]:
-    numbers = {name: flight.numbers[name].value for name in names if name in flight.numbers}
-    return {"verdict": flight.verdict, "numbers": numbers}
+def _flight(row: Row, names: Sequence[str]) -> dict[str, Any]:
+    numbers = {name: row["numbers"][name] for name in names if name in row["numbers"]}
+    return {"verdict": row["verdict"], "numbers": numbers}
 
 
 def scale(unit: str, largest: float) -> tuple[float, str]:

@@ -11,28 +11,33 @@ from cloudrc.errors import BadInputError
 from cloudrc.plugins import unknown_name_text
 from cloudrc.report.figures.bands import Panel, Point, draw
 from cloudrc.sweep.compare import NUMBERS, scale
-from cloudrc.sweep.flight import Outcome
-from cloudrc.sweep.pairs import Row
+from cloudrc.sweep.flight import Row, counts
+from cloudrc.sweep.pairs import values_of
 from cloudrc.sweep.statistics import median_interval, wilson_interval
 
 SHOWN = 3
 """Number of metrics that a figure shows by default."""
-Groups = Mapping[str, Sequence[Sequence[Outcome]]]
+Groups = Mapping[str, Sequence[Sequence[Row]]]
 """Name of a line -> flights of each point."""
-Summary = Callable[[Sequence[Outcome]], tuple[float, float, float]]
+Summary = Callable[[Sequence[Row]], tuple[float, float, float]]
 """Function that returns a value and its interval."""
 
 
 def draw_sweep(
-    rows: Sequence[Row], names: Sequence[str] = (), x: str | None = None, by: str | None = None
+    rows: Sequence[Row],
+    units: Mapping[str, str],
+    names: Sequence[str] = (),
+    x: str | None = None,
+    by: str | None = None,
 ) -> tuple[dict[str, bytes], str]:
     """Draw a panel per metric and, if flights failed, one with the share of successes.
 
     Args:
         rows: All flights of the sweep.
+        units: Metric -> unit.
         names: Metrics to show; by default the first three of `compare.NUMBERS`.
         x: Axis of the sweep along x; by default the first one with numbers, else the first.
-        by: Axis with one line per value; by default the first of the others.
+        by: Axis with one line per value; by default the first one with names, else the next one.
 
     Returns:
         The figure as PDF, PNG and SVG by suffix; and its caption.
@@ -40,32 +45,28 @@ def draw_sweep(
     Raises:
         BadInputError: If the sweep lacks an axis or a metric.
     """
-    known = list(dict.fromkeys(name for row in rows for name in row.outcome.numbers))
+    known = sorted({name for row in rows if counts(row) for name in row["numbers"]})
     for name in names:
         if name not in known:
-            raise BadInputError(f"--number: {unknown_name_text('number', name, sorted(known))}")
+            raise BadInputError(f"--number: {unknown_name_text('number', name, known)}")
     values, x, by, pooled = _choose(rows, x, by)
-    is_numeric = all(type(value) in (int, float) for value in values[x])
+    is_numeric = _is_numeric(values[x])
     along = sorted(values[x]) if is_numeric else values[x]
     groups = {
         str(name): [
-            [
-                row.outcome
-                for row in rows
-                if row.point[x] == at and (not by or row.point[by] == name)
-            ]
+            [r for r in rows if r["point"][x] == at and (not by or r["point"][by] == name)]
             for at in along
         ]
         for name in (values[by] if by else [x])
     }
     at = along if is_numeric else range(len(along))
-    panels = [_metric(name, groups, at) for name in names or
+    panels = [_metric(name, units[name], groups, at) for name in names or
               [name for name in NUMBERS if name in known][:SHOWN]]  # fmt: skip
-    if any(row.outcome.verdict != "success" for row in rows):
+    if any(row["verdict"] != "success" for row in rows):
         panels.append(Panel("success", "%", _lines(groups, at, _rate)))
     caption = (
-        "Median and its 95 % interval per point; success: share and Wilson's 95 % interval. "
-        "Open markers: some flights failed."
+        "Median of each point, with its 95 % interval from 6 flights on; success: share and "
+        "Wilson's 95 % interval. Open markers: some flights failed."
         + (f" Each point pools all values of {', '.join(pooled)}." if pooled else "")
     )
     return draw(panels, x, [] if is_numeric else list(map(str, along)), by), caption
@@ -75,35 +76,45 @@ def _choose(
     rows: Sequence[Row], x: str | None, by: str | None
 ) -> tuple[dict[str, list[Any]], str, str | None, list[str]]:
     """Return axes with their values; the axis along x, that of the lines, and the other axes."""
-    values: dict[str, list[Any]] = {
-        axis: list(dict.fromkeys(row.point[axis] for row in rows)) for axis in rows[0].point
-    }
+    values = values_of(rows)
     for axis in (x, by, *([] if values else ["of any name"])):
         if axis is not None and axis not in values:
             raise BadInputError(unknown_name_text("axis", axis, sorted(values)))
     free = [axis for axis in values if len(values[axis]) > 1 and axis != by] or list(values)
-    numeric = (a for a in free if all(type(value) in (int, float) for value in values[a]))
-    x = x or next(numeric, free[0])
-    by = by or next((axis for axis in free if axis != x), None)
+    numeric = [axis for axis in free if _is_numeric(values[axis])]
+    x = x or next(iter(numeric), free[0])
+    if x == by:
+        raise BadInputError(f"--x and --by are both {x}; name two axes, or leave one out")
+    # Numbers of two predictors make no common median, those of two delays rather do.
+    others = sorted((axis for axis in free if axis != x), key=lambda axis: axis in numeric)
+    by = by or next(iter(others), None)
     return values, x, by, [axis for axis in free if axis not in (x, by)]
 
 
-def _metric(name: str, groups: Groups, at: Sequence[float]) -> Panel:
-    flights = [flight for points in groups.values() for point in points for flight in point]
-    numbers = [flight.numbers[name] for flight in flights if name in flight.numbers]
-    factor, unit = scale(numbers[0].unit, max(abs(number.value) for number in numbers))
+def _is_numeric(values: Sequence[Any]) -> bool:
+    return all(type(value) in (int, float) for value in values)
 
-    def summarise(point: Sequence[Outcome]) -> tuple[float, float, float]:
-        found = [flight.numbers[name].value * factor for flight in point if name in flight.numbers]
+
+def _metric(name: str, unit: str, groups: Groups, at: Sequence[float]) -> Panel:
+    def values(point: Sequence[Row]) -> list[float]:
+        return [r["numbers"][name] for r in point if counts(r) and name in r["numbers"]]
+
+    sizes = [
+        abs(value) for points in groups.values() for point in points for value in values(point)
+    ]
+    factor, unit = scale(unit, max(sizes))
+
+    def summarise(point: Sequence[Row]) -> tuple[float, float, float]:
+        found = [value * factor for value in values(point)]
         return (median(found), *(median_interval(found) or (nan, nan))) if found else (nan,) * 3
 
     return Panel(name.replace("_", " "), unit, _lines(groups, at, summarise))
 
 
-def _rate(point: Sequence[Outcome]) -> tuple[float, float, float]:
+def _rate(point: Sequence[Row]) -> tuple[float, float, float]:
     if not point:
         return nan, nan, nan
-    done = sum(flight.verdict == "success" for flight in point)
+    done = sum(row["verdict"] == "success" for row in point)
     low, high = wilson_interval(done, len(point))
     return 100 * done / len(point), 100 * low, 100 * high
 
@@ -111,7 +122,7 @@ def _rate(point: Sequence[Outcome]) -> tuple[float, float, float]:
 def _lines(groups: Groups, at: Sequence[float], summarise: Summary) -> dict[str, list[Point]]:
     return {
         name: [
-            Point(x, *summarise(point), any(flight.verdict != "success" for flight in point))
+            Point(x, *summarise(point), any(row["verdict"] != "success" for row in point))
             for x, point in zip(at, points, strict=True)
         ]
         for name, points in groups.items()

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from typing import Any, TypeAlias
 
-from cloudrc import assembly
+from cloudrc import assembly, metrics, plugins
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.errors import describe_error
-from cloudrc.metrics import Number
 from cloudrc.record.columns import RecordStore
 from cloudrc.records import Record
 from cloudrc.report.document import Assessment, Run
@@ -15,37 +15,42 @@ from cloudrc.report.write import assess
 
 ERROR = "error"
 """Verdict of a flight that raised an exception, and code of its only failure."""
+Row: TypeAlias = dict[str, Any]
+"""A flight: `verdict`; `failures` (codes, the earliest first); `text`, which says the first failure
+or why a metric has no number; `numbers` (metric -> value); and `records_sha256`.
+A row of a sweep also has `key`, `point` and `seed`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What remains of a flight."""
-
-    verdict: str  # as in report.json, or ERROR
-    failures: tuple[str, ...] = ()  # codes, the earliest failure first
-    numbers: dict[str, Number] = field(default_factory=dict)  # metric -> value
-    records_sha256: str = ""  # equal to that of `cloudrc run --mode virtual`; "" after an error
-    text: str = ""  # the first failure in words
-
-
-def fly_point(experiment: ResolvedExperiment) -> Outcome:
+def fly_point(experiment: ResolvedExperiment) -> Row:
     """Fly an experiment in virtual time and measure it; an exception becomes the verdict ERROR."""
     try:
-        return _fly(experiment)
+        found = fly_in_memory(experiment)
     except (Exception, SystemExit) as error:  # one point that cannot fly must not stop the others
-        return Outcome(ERROR, (ERROR,), text=describe_error(error))
-
-
-def _fly(experiment: ResolvedExperiment) -> Outcome:
-    found = fly_in_memory(experiment)
+        text, none = describe_error(error), {"numbers": {}, "records_sha256": ""}
+        return {"verdict": ERROR, "failures": [ERROR], "text": text, **none}
     failures = found.verdict.failures
-    return Outcome(
-        found.verdict.outcome,
-        tuple(failure.code for failure in failures),
-        found.numbers,
-        found.run.records_sha256 or "",
-        failures[0].text if failures else "",
-    )
+    notes = (note for note in found.notes if note.startswith(metrics.METRIC_NOTE))
+    return {
+        "verdict": found.verdict.outcome,
+        "failures": [failure.code for failure in failures],
+        "text": failures[0].text if failures else next(notes, ""),
+        "numbers": {name: number.value for name, number in found.numbers.items()},
+        "records_sha256": found.run.records_sha256,
+    }
+
+
+def counts(row: Row) -> bool:
+    """Return whether the numbers of a flight are those of its experiment.
+
+    They are not if the flight did not end, or if a plug-in failed: then another one took over.
+    """
+    return row["verdict"] in ("success", "failure") and "plugin_failed" not in row["failures"]
+
+
+def units(own: Iterable[str]) -> dict[str, str]:
+    """Return the unit of each metric, those of the user (`own`, names or paths) included."""
+    names = (*metrics.SHIPPED, *plugins.names("metrics"), *own)
+    return {metric.name: metric.unit for metric in map(metrics.find, names)}
 
 
 def fly_in_memory(experiment: ResolvedExperiment) -> Assessment:

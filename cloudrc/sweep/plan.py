@@ -7,16 +7,19 @@ checked before the first flight.
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from itertools import chain, product
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from pydantic import Field
 
-from cloudrc import __version__, metrics
+from cloudrc import __version__, metrics, plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, Source, read_document
 from cloudrc.config.load import ResolvedExperiment, load_experiment, validate
@@ -110,8 +113,20 @@ def flight_key(point: ResolvedExperiment, seed: int) -> str:
 
 
 def _everything(point: ResolvedExperiment) -> dict[str, Any]:
-    values = point.model_dump(mode="json")
-    return {**values, "cloudrc": __version__, "files": local_files(values)}
+    values, cloud = point.model_dump(mode="json"), point.cloud
+    chosen = ("estimators", cloud.estimator), ("predictors", cloud.predictor)
+    code = [_code(kind, each.name) for kind, each in (*chosen, ("controllers", cloud.controller))]
+    return {**values, "cloudrc": __version__, "code": code, "files": local_files(values)}
+
+
+@cache
+def _code(kind: str, name: str) -> str:
+    """Return the SHA-256 of the file of a plug-in with a name; "" for a path or without a file."""
+    with suppress(TypeError, OSError):
+        if not plugins.is_path(name):
+            file = inspect.getfile(plugins.find(kind, name))
+            return hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    return ""
 
 
 def _key(everything: Mapping[str, Any], seed: int) -> str:

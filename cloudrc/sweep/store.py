@@ -10,38 +10,29 @@ import csv
 import io
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
-from cloudrc import __version__, metrics, plugins
+from cloudrc import __version__
 from cloudrc.config.document import write_yaml
 from cloudrc.errors import BadInputError
 from cloudrc.files import write_atomically
-from cloudrc.sweep.flight import ERROR, Outcome
+from cloudrc.sweep.flight import Row, units
 from cloudrc.sweep.plan import Flight, Plan
 
-Row: TypeAlias = dict[str, Any]
-"""`key`, `point` (axis -> value or name), `seed`, `verdict`, `failures` (codes), `numbers`
-(name -> value), `records_sha256` and, after an exception, `text`."""
-FILE, SUMMARY, TABLE = "sweep.yaml", "sweep.json", "table.csv"
+FILE, SUMMARY = "sweep.yaml", "sweep.json"
+FIELDS = {"key", "point", "seed", "verdict", "failures", "text", "numbers", "records_sha256"}
+"""Fields of a row."""
+TABLE, PARQUET = "table.csv", "table.parquet"
 
 
-def make_row(flight: Flight, flown: Outcome) -> Row:
-    """Make the row of a flight."""
-    row = {
-        "key": flight.key,
-        "point": flight.point,
-        "seed": flight.seed,
-        "verdict": flown.verdict,
-        "failures": list(flown.failures),
-        "numbers": {name: number.value for name, number in flown.numbers.items()},
-        "records_sha256": flown.records_sha256,
-    }
-    return row | ({"text": flown.text} if flown.verdict == ERROR else {})
+def make_row(flight: Flight, flown: Row) -> Row:
+    """Make the row of a flight of a sweep."""
+    return {"key": flight.key, "point": flight.point, "seed": flight.seed, **flown}
 
 
 def read_rows(folder: Path) -> dict[str, Row]:
@@ -54,13 +45,21 @@ def read_rows(folder: Path) -> dict[str, Row]:
     for path in sorted(folder.glob("rows*.jsonl")):
         *lines, _ = path.read_bytes().split(b"\n")
         for number, line in enumerate(lines, start=1):
-            try:
-                row = json.loads(line)
-                found.setdefault(row["key"], row)
-            except (ValueError, TypeError, KeyError) as error:
+            row = parse_row(line)
+            if row is None:
                 text = "is not a row of a sweep; delete this line to fly its flight again"
-                raise BadInputError(f"{path}:{number}: {text}") from error
+                raise BadInputError(f"{path}:{number}: {text}")
+            found.setdefault(row["key"], row)
     return found
+
+
+def parse_row(line: bytes | str) -> Row | None:
+    """Return the row in a line of JSON; None if there is none."""
+    with suppress(ValueError):
+        row = json.loads(line)
+        if isinstance(row, dict) and FIELDS <= row.keys():
+            return row
+    return None
 
 
 @contextmanager
@@ -90,24 +89,32 @@ def begin(folder: Path, plan: Plan) -> dict[str, Row]:
         raise BadInputError(f"--out {folder}: has {text}; name a new folder")
     write_atomically(folder / FILE, write_yaml(plan.file).encode())
     _write_summary(folder, plan, rows)
+    if len(rows) < len(plan.flights):  # the tables of a smaller grid would look like the whole
+        for name in (TABLE, PARQUET):
+            (folder / name).unlink(missing_ok=True)
     return rows
 
 
 def finish(folder: Path, plan: Plan) -> dict[str, Row]:
     """Count the rows; once all flights are done, write their tables. Return the rows."""
     rows = read_rows(folder)
-    units = _write_summary(folder, plan, rows)
+    unit_of = _write_summary(folder, plan, rows)
     if len(rows) == len(plan.flights):
         columns = _columns([rows[key] for key in plan.flights], plan)
-        head = [f"{name} [{units[name]}]" if name in units else name for name in columns]
-        text = io.StringIO()
-        cells = [head, *zip(*columns.values(), strict=True)]
-        csv.writer(text, lineterminator="\n").writerows(cells)
-        write_atomically(folder / TABLE, text.getvalue().encode())
+        write_atomically(folder / TABLE, as_csv(columns, unit_of).encode())
         if find_spec("pyarrow"):
             parquet, tables = import_module("pyarrow.parquet"), import_module("pyarrow")
-            parquet.write_table(tables.table(columns), folder / "table.parquet")
+            parquet.write_table(tables.table(columns), folder / PARQUET)
     return rows
+
+
+def as_csv(columns: Mapping[str, Sequence[Any]], unit_of: Mapping[str, str]) -> str:
+    """Format columns of equal length as CSV; the first line has names, and units in brackets."""
+    head = [f"{name} [{unit_of[name]}]" if name in unit_of else name for name in columns]
+    text = io.StringIO()
+    cells = [head, *zip(*columns.values(), strict=True)]
+    csv.writer(text, lineterminator="\n").writerows(cells)
+    return text.getvalue()
 
 
 def _columns(rows: list[Row], plan: Plan) -> dict[str, list[Any]]:
@@ -142,8 +149,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
 def _write_summary(folder: Path, plan: Plan, rows: Mapping[str, Row]) -> dict[str, str]:
     """Write the description of a sweep; return the units of all metrics."""
     own = {choice for point in plan.points for choice in point.report.metrics}
-    found = [metrics.find(name) for name in (*metrics.SHIPPED, *plugins.names("metrics"), *own)]
-    units = {metric.name: metric.unit for metric in found}
+    unit_of = units(own)
     summary = {
         "schemaVersion": 1,
         "experiment": plan.points[0].name,
@@ -153,7 +159,7 @@ def _write_summary(folder: Path, plan: Plan, rows: Mapping[str, Row]) -> dict[st
         "seeds": plan.seeds,
         "flights": len(plan.flights),
         "counts": dict(sorted(Counter(row["verdict"] for row in rows.values()).items())),
-        "units": units,
+        "units": unit_of,
     }
     write_atomically(folder / SUMMARY, f"{json.dumps(summary, indent=2)}\n".encode())
-    return units
+    return unit_of

@@ -5,23 +5,21 @@ import json
 import pytest
 
 from cloudrc.cli.main import main
-from cloudrc.metrics import Number
-from cloudrc.sweep.flight import Outcome
 
 SHORT = ["--set=mission.steps.count=1", "--set=mission.steps.period_s=1.0",
          "--set=criteria.settle_m=null"]  # fmt: skip
 
 
 def fly_with(monkeypatch, measure):
-    """Replace flights: `measure(settings, seed)` returns verdict and prediction error [m]."""
+    """Replace flights: `measure(predictor, seed)` returns verdict and prediction error [m]."""
 
-    def fly(job):
-        _, settings, seed = job
-        verdict, error = measure(",".join(settings), seed)
-        numbers = {"prediction_error_rms": Number(error, "m", "")}
-        return Outcome(verdict, ("unstable",) * (verdict == "failure"), numbers)
+    def fly(experiment):
+        verdict, error = measure(experiment.cloud.predictor.name, experiment.seed)
+        failures = ["unstable"] * (verdict == "failure")
+        numbers = {"prediction_error_rms": error}
+        return {"verdict": verdict, "failures": failures, "text": "it broke", "numbers": numbers}
 
-    monkeypatch.setattr("cloudrc.cli.compare.fly_job", fly)
+    monkeypatch.setattr("cloudrc.sweep.flight.fly_point", fly)
     monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 1)
 
 
@@ -74,7 +72,8 @@ def test_success_comes_before_every_number(monkeypatch, capsys):
         (["seed=1", "seed=1"], "A and B are the same experiment"),
         (["cloud.predictor=last_sample", "cloud.predicter=kalman"], "cloud.predicter"),
         (["link.profile=paper-p1", "link.profile=wifi", "--set", "link.profile=x"], "set twice"),
-        (["last_sample", "nonsense"], "must be key=value"),
+        (["last_sample", "nonsense"], "last_sample: is neither KEY=VALUE nor"),
+        (["seed=1", "seed=2", "--number", "iae_men"], "--number: no number named 'iae_men'"),
         (["a", "b", "--in", "nowhere"], "nowhere"),
         (["a", "b", "--in", "nowhere", "--set", "seed=1"], "--set seed=1: these flights are"),
     ],
@@ -85,13 +84,23 @@ def test_what_cannot_be_compared_is_refused(arguments, text, capsys):
 
 
 def test_ctrl_c_compares_the_finished_pairs(monkeypatch, capsys):
-    def measure(settings, seed):
+    def measure(predictor, seed):
         if seed == 3:
             raise KeyboardInterrupt
         return "success", 0.01
 
     fly_with(monkeypatch, measure)
     assert sentence(capsys, "--seeds", "9", "-o", "json")[0] == 130
+
+
+def test_ctrl_c_before_the_first_pair_is_no_bad_input(monkeypatch, capsys):
+    def measure(predictor, seed):
+        raise KeyboardInterrupt
+
+    fly_with(monkeypatch, measure)
+    sides = "cloud.predictor=last_sample", "cloud.predictor=constant_velocity"
+    assert main(["compare", *sides, "--seeds", "2"]) == 130
+    assert "interrupted: 0 pairs are finished" in capsys.readouterr().err
 
 
 @pytest.mark.full

@@ -6,20 +6,20 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.cli.margin import largest_stable
-from cloudrc.sweep.flight import Outcome
 
 KEY = "link.uplink.delay_ms"
-FAILED = Outcome("failure", ("unstable",), text="the loop is unstable; lower the gains")
+TEXT = "the loop is unstable; lower the gains"
+FAILED = {"verdict": "failure", "failures": ["unstable"], "text": TEXT}
 
 
 def fly_with(monkeypatch, works):
-    """Replace flights by `works(settings, seed)`; `settings` are keys with their texts."""
+    """Replace flights by `works(experiment, seed)`."""
 
-    def fly(job):
-        settings = dict(text.split("=") for text in job[1])
-        return Outcome("success") if works(settings, job[2]) else FAILED
+    def fly(experiment):
+        return {"verdict": "success"} if works(experiment, experiment.seed) else FAILED
 
-    monkeypatch.setattr("cloudrc.cli.margin.fly_job", fly)
+    monkeypatch.setattr("cloudrc.sweep.flight.fly_point", fly)
+    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 1)
 
 
 def margin(capsys, *arguments):
@@ -36,7 +36,7 @@ def test_the_search_finds_each_border(start, limit):
 
 
 def test_the_border_is_a_multiple_of_the_resolution(monkeypatch, capsys):
-    fly_with(monkeypatch, lambda found, seed: float(found[KEY]) <= 228 - 3 * (seed == 2))
+    fly_with(monkeypatch, lambda found, seed: found.uplink.delay_ms <= 228 - 3 * (seed == 2))
     code, found = margin(capsys, "--resolution", "20")
     assert (code, found["stable_up_to"], found["fails_at"]) == (0, 220, 240)
     assert main(["margin", KEY]) == 0
@@ -47,19 +47,28 @@ def test_the_border_is_a_multiple_of_the_resolution(monkeypatch, capsys):
 def test_the_limits_of_cloud_and_guard_follow_the_delay(monkeypatch, capsys):
     """The mean age is the round trip and one or two periods; --set has the last word."""
     seen = {}
-    fly_with(monkeypatch, lambda found, seed: seen.update({found[KEY]: found}) or True)
+    fly_with(monkeypatch, lambda found, seed: seen.update({found.uplink.delay_ms: found}) or True)
     margin(capsys, "--max", "2000", "--set", "cloud.freeze_after_s=0.7", "--seeds", "1")
-    limits = seen["2000"]
-    assert 2.2 <= float(limits["cloud.horizon_max_s"]) <= 2.4
-    assert 2200 <= float(limits["guard.command_age_max_ms"]) <= 2400
-    assert limits["cloud.freeze_after_s"] == "0.7"
-    assert seen["70"]["guard.command_age_max_ms"] == "400"
+    limits = seen[2000]
+    assert 2.2 <= limits.cloud.horizon_max_s <= 2.4
+    assert 2200 <= limits.guard.command_age_max_ms <= 2400
+    assert limits.cloud.freeze_after_s == 0.7
+    assert seen[70].guard.command_age_max_ms == 400
 
 
 def test_a_second_border_below_is_told(monkeypatch, capsys):
-    fly_with(monkeypatch, lambda found, seed: float(found[KEY]) in (70, 140, 210, 200))
+    fly_with(monkeypatch, lambda found, seed: found.uplink.delay_ms in (70, 140, 210, 200))
     code, found = margin(capsys)
     assert (code, found["stable_up_to"], found["fails_below"]) == (0, 210, [150])
+
+
+def test_a_large_value_is_flown_with_all_digits(monkeypatch, capsys):
+    flown = set()
+    fly_with(monkeypatch, lambda found, seed: flown.add(found.uplink.rate_kbit) or True)
+    line = ["--max", "1234567", "--resolution", "1", "--seeds", "1"]
+    assert main(["margin", "link.uplink.rate_kbit", *line]) == 0
+    assert 1234567 in flown
+    assert "stable up to 1234567," in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -87,7 +96,8 @@ def test_a_value_that_the_schema_refuses_is_a_border(monkeypatch, capsys):
         (["link.profile"], "is no number; name a key such as"),
         ([KEY, "--max", "5"], "--resolution 10 must be above 0, --max 5 not below it"),
         ([KEY, "--resolution", "-1"], "--resolution -1 must be above 0"),
-        ([KEY, "--max", "nan"], "--max nan"),
+        *(([KEY, "--resolution", text], f"--resolution {text} must") for text in ("nan", "0")),
+        *(([KEY, "--max", text], f"--max {text} not") for text in ("nan", "0")),
     ],
 )
 def test_a_search_that_cannot_begin_is_refused(arguments, text, capsys):

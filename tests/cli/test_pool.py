@@ -6,11 +6,13 @@ import signal
 import subprocess
 import sys
 import time
+from copy import copy
 from pathlib import Path
 
 import pytest
 
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
+from cloudrc.errors import BadInputError, DiskFullError
 
 KILLED = 5
 """The piece of work at which a worker kills its own process."""
@@ -95,3 +97,9 @@ def test_workers_end_if_their_parent_is_killed(tmp_path):
         while any(Path(f"/proc/{worker}").exists() for worker in workers):
             assert time.monotonic() < until, "workers still wait for work"
             time.sleep(0.1)
+
+
+@pytest.mark.parametrize("error", [DiskFullError("runs/a"), BadInputError("a: b")])
+def test_errors_keep_their_text_on_the_way_from_a_worker(error):
+    """A copy is made as the receiver makes the error: from its arguments."""
+    assert str(copy(error)) == str(error)

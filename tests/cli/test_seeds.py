@@ -45,7 +45,7 @@ def test_many_seeds_become_one_table(folder, capsys):
 
 
 def test_the_newest_sweep_and_the_newest_run_have_their_own_link(folder, monkeypatch):
-    monkeypatch.setattr("cloudrc.cli.seeds._fly_one", lambda job: report(job[-1]))
+    monkeypatch.setattr("cloudrc.cli.seeds._fly_one", lambda job: report(job[0].seed))
     monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 1)
     assert main(["run", "steps", "--seeds", "1", *SHORT]) == 0
     assert (folder / "runs/latest-sweep/sweep.json").is_file()
@@ -69,6 +69,13 @@ def test_a_signal_ends_a_sweep_at_once(how, folder):
     document, _ = written(folder)
     assert document["interrupted"]
     assert 1 <= document["count"] < 40
+
+
+def test_numbers_of_a_plugin_that_failed_do_not_count():
+    failed = report(2, "failure", x=9.0) | {"failures": [{"code": "plugin_failed", "text": ""}]}
+    summary = summarise([report(1, x=1.0), failed])
+    assert (summary["done"], summary["count"]) == (1, 2)
+    assert (summary["numbers"]["x"]["median"], summary["numbers"]["x"]["count"]) == (1.0, 1)
 
 
 def test_runs_may_lack_a_number():

@@ -76,6 +76,15 @@ def test_a_sweep_goes_on_where_it_ended(write_sweep, monkeypatch, capsys):
     assert flown == [1, 2, 2, 3]
 
 
+def test_alike_warnings_of_many_points_are_counted(write_sweep, monkeypatch, capsys):
+    monkeypatch.setattr("cloudrc.cli.sweep.advise", lambda point: [f"{point.uplink.delay_ms} ms"])
+    grid = {"link.both.delay_ms": [0, 1, 2, 3, 4]}
+    assert main(["sweep", "run", str(write_sweep(grid)), "--out", "grid", "--shard", "6/6"]) == 0
+    told = capsys.readouterr().err.splitlines()
+    assert told[0] == "cloudrc: warning: 0.0 ms"
+    assert told[3:] == ["cloudrc: warning: 5 warnings; the others are alike"]
+
+
 def test_a_row_flies_again_to_the_same_hash(write_sweep, monkeypatch, capsys):
     monkeypatch.setattr("cloudrc.report.write._write_page", lambda *given: None)  # it is slow
     main(["sweep", "run", str(write_sweep(ONE)), "--out", "grid"])
@@ -90,6 +99,20 @@ def test_a_row_flies_again_to_the_same_hash(write_sweep, monkeypatch, capsys):
     assert main(["sweep", "fly", ".", row["key"]]) == 2
 
 
+def test_a_plugin_that_failed_is_flown_again_with_its_traceback(write_sweep, monkeypatch, capsys):
+    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *given: None)
+    Path("mine.py").write_text(
+        "from cloudrc.cloud.predictors import Predictor\n\n\nclass Mine(Predictor):\n"
+        "    def predict(self, odometry, horizon):\n        return 1 / 0\n\n\nbuild = Mine\n"
+    )
+    grid = {"cloud.predictor": [str(Path("mine.py").resolve())]}
+    assert main(["sweep", "run", str(write_sweep(grid)), "--out", "grid"]) == 1
+    (row,) = rows("grid")
+    assert row["failures"] == ["plugin_failed"]
+    assert main(["--debug", "sweep", "fly", "grid", row["key"]]) == 0
+    assert "ZeroDivisionError: division by zero" in capsys.readouterr().err
+
+
 def test_failed_flights_are_recorded_if_asked_for(write_sweep):
     grid = {"criteria.contact": [False, True]}
     assert main(["sweep", "run", str(write_sweep(grid)), "--out", "grid", "--record=failed"]) == 1
@@ -98,6 +121,9 @@ def test_failed_flights_are_recorded_if_asked_for(write_sweep):
     assert bad["failures"] == ["board_not_touched"]
     assert Path(f"grid/{bad['key']}/mission.mcap").is_file()
     assert not Path(f"grid/{good['key']}").exists()
+    assert main(["sweep", "run", str(write_sweep(grid)), "--out", "grid", "--record=all"]) == 1
+    assert Path(f"grid/{good['key']}/mission.mcap").is_file()
+    assert rows("grid") == [good, bad]
 
 
 def test_an_error_becomes_a_row_and_the_others_fly(write_sweep, monkeypatch, capsys):

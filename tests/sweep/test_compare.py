@@ -5,15 +5,15 @@ import json
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.metrics import Number
 from cloudrc.sweep.compare import Pair, compare
-from cloudrc.sweep.flight import Outcome
 from cloudrc.sweep.pairs import of_folders
 
+UNITS = {"iae_mean": "m", "rtt_mean": "s"}
 
-def flown(verdict="success", **numbers):
-    found = {name: Number(value, "m", "") for name, value in numbers.items()}
-    return Outcome(verdict, (), found, text="" if verdict == "success" else "a reason")
+
+def flown(verdict="success", *failures, **numbers):
+    text = "" if verdict == "success" else "a reason"
+    return {"verdict": verdict, "failures": [*failures], "text": text, "numbers": numbers}
 
 
 def pairs(*both):
@@ -22,7 +22,7 @@ def pairs(*both):
 
 def test_ten_equal_gains_are_decided():
     both = [(flown(iae_mean=5.0 + n), flown(iae_mean=4.0 + 0.9 * n)) for n in range(10)]
-    found = compare(pairs(*both))["numbers"]["iae_mean"]
+    found = compare(pairs(*both), UNITS)["numbers"]["iae_mean"]
     assert (found["a_median"], found["b_median"], found["unit"]) == (9.5, 8.05, "m")
     assert found["difference"] == pytest.approx(-1.45)
     assert (found["lower"], found["decided"]) == (10, True)
@@ -31,7 +31,7 @@ def test_ten_equal_gains_are_decided():
 
 def test_success_is_compared_by_pairs():
     ok, bad = flown(), flown("failure")
-    found = compare(pairs(*[(bad, ok)] * 7, (ok, ok), (ok, bad)))["success"]
+    found = compare(pairs(*[(bad, ok)] * 7, (ok, ok), (ok, bad)), UNITS)["success"]
     assert (found["a"], found["b"], found["count"]) == (2, 8, 9)
     assert (found["only_a"], found["only_b"]) == (1, 7)
     assert found["p_mcnemar"] == pytest.approx(2 * (1 + 8) / 2**8)
@@ -39,7 +39,7 @@ def test_success_is_compared_by_pairs():
 
 def test_pairs_without_a_number_or_an_end_are_left_out_and_counted():
     whole, torn = flown(iae_mean=1.0, rtt_mean=1.0), flown(rtt_mean=2.0)
-    found = compare(pairs((whole, whole), (whole, torn), (whole, flown("error"))))
+    found = compare(pairs((whole, whole), (whole, torn), (whole, flown("error"))), UNITS)
     assert (found["pairs"], found["left_out"]) == (2, 1)
     assert (found["numbers"]["iae_mean"]["count"], found["numbers"]["iae_mean"]["left_out"]) == (
         1,
@@ -50,9 +50,18 @@ def test_pairs_without_a_number_or_an_end_are_left_out_and_counted():
 
 def test_no_pairs_and_unknown_numbers_are_refused():
     with pytest.raises(BadInputError, match=r"no pair of flights to compare: each .* a reason"):
-        compare(pairs((flown("error"), flown())))
+        compare(pairs((flown("error"), flown())), UNITS)
     with pytest.raises(BadInputError, match=r"no number named 'iea_mean'.*did you mean iae_mean"):
-        compare(pairs((flown(iae_mean=1.0), flown(iae_mean=1.0))), ["iea_mean"])
+        compare(pairs((flown(iae_mean=1.0), flown(iae_mean=1.0))), UNITS, ["iea_mean"])
+
+
+def test_numbers_of_a_plugin_that_failed_do_not_count():
+    """Another plug-in took over, so B would look equal to A."""
+    ok, failed = flown(iae_mean=1.0), flown("failure", "plugin_failed", iae_mean=1.0)
+    found = compare(pairs((ok, ok), (ok, failed)), UNITS)
+    assert (found["pairs"], found["left_out"]) == (1, 1)
+    with pytest.raises(BadInputError, match="plug-in failed: a reason"):
+        compare(pairs((ok, failed)), UNITS)
 
 
 def run_folder(path, seeds=(1, 2), mode="virtual", **changes):
@@ -72,16 +81,25 @@ def run_folder(path, seeds=(1, 2), mode="virtual", **changes):
 def test_two_folders_are_paired_by_seed(tmp_path):
     a = run_folder(tmp_path / "a", (1, 2, 3))
     b = run_folder(tmp_path / "b", (2, 3, 4), cloud={"predictor": {"name": "none", "gain": 1}})
-    found, what = of_folders(a, b)
+    found, units, what = of_folders(a, b)
+    assert units == {"settling_time_mean": "s"}
     assert [pair.label["seed"] for pair in found] == [2, 3]
     assert what == "folders that differ in cloud.predictor.gain, cloud.predictor.name"
-    assert of_folders(a / "seed-2", b)[0] == found[:1]
+    assert of_folders(a / "seed-2", b).pairs == found[:1]
+
+
+def test_a_report_of_something_else_is_named(tmp_path):
+    a, b = run_folder(tmp_path / "a"), run_folder(tmp_path / "b", cloud={})
+    for text in ("{", "[]", "{}"):
+        (b / "seed-2/report.json").write_text(text)
+        with pytest.raises(BadInputError, match=r"seed-2/report.json: is not a report of cloudrc"):
+            of_folders(a, b)
 
 
 def test_limits_that_follow_the_link_profile_are_no_second_change(tmp_path):
     a = run_folder(tmp_path / "a", guard={"command_age_max_ms": 250})
     b = run_folder(tmp_path / "b", guard={"command_age_max_ms": 900}, link={"profile": "b"})
-    assert of_folders(a, b)[1] == "folders that differ in link.profile"
+    assert of_folders(a, b).what == "folders that differ in link.profile"
 
 
 @pytest.mark.parametrize(

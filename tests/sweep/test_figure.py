@@ -6,11 +6,10 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
-from cloudrc.metrics import Number
 from cloudrc.sweep.figure import draw_sweep
-from cloudrc.sweep.flight import Outcome
-from cloudrc.sweep.pairs import Row, of_sweep, read_flights
+from cloudrc.sweep.pairs import of_sweep, read_flights
 
+UNITS = {"iae_mean": "m s"}
 AXES = {"delay_ms": [20, 5, 10], "predictor": ["none", "kalman"], "gain": [[1, 2], [3, 4]]}
 
 
@@ -21,11 +20,11 @@ def sweep(folder, rows=None):
     lines = [
         {"key": str(n), "point": {"delay_ms": d, "predictor": p, "gain": g}, "seed": seed,
          "verdict": "success" if d == 5 else "failure", "failures": [],
-         "numbers": {"iae_mean": d + seed + 0.5 * (p == "none")}}
+         "numbers": {"iae_mean": d + seed + 0.5 * (p == "none")}, "text": "", "records_sha256": ""}
         for n, (d, p, g, seed) in enumerate(points)
     ]  # fmt: skip
     folder.mkdir()
-    summary = {"axes": AXES, "units": {"iae_mean": "m s"}, "files": {}, "flights": 24}
+    summary = {"axes": AXES, "units": UNITS, "flights": 24}
     (folder / "sweep.json").write_text(json.dumps(summary))
     (folder / "rows.jsonl").write_text("".join(f"{json.dumps(line)}\n" for line in lines[:rows]))
     return folder
@@ -40,7 +39,7 @@ def drawn(monkeypatch):
 
 
 def test_numbers_go_along_x_in_order_and_failures_get_a_panel(tmp_path, drawn):
-    _, caption = draw_sweep(read_flights(sweep(tmp_path / "s")))
+    _, caption = draw_sweep(*read_flights(sweep(tmp_path / "s"))[:2])
     (iae, success), x, names, by = drawn
     assert (iae.title, iae.unit, x, names, by) == ("iae mean", "m s", "delay_ms", [], "predictor")
     assert [point.x for point in iae.lines["kalman"]] == [5, 10, 20]
@@ -51,18 +50,35 @@ def test_numbers_go_along_x_in_order_and_failures_get_a_panel(tmp_path, drawn):
 
 
 def test_names_along_x_keep_the_order_of_the_grid(tmp_path, drawn):
-    draw_sweep(read_flights(sweep(tmp_path / "s")), x="predictor", by="gain")
+    draw_sweep(*read_flights(sweep(tmp_path / "s"))[:2], x="predictor", by="gain")
     assert drawn[1:] == ["predictor", ["none", "kalman"], "gain"]
     assert [*drawn[0][0].lines] == ["[1, 2]", "[3, 4]"]
 
 
+def test_lines_are_names_rather_than_numbers(drawn):
+    draw_sweep([row({"delay": d, "loss": p, "predictor": name}, 1)
+                for d in (1, 2) for p in (0, 1) for name in "ab"], UNITS)  # fmt: skip
+    assert (drawn[1], drawn[3]) == ("delay", "predictor")
+
+
+def row(point, seed, *failures):
+    verdict = "failure" if failures else "success"
+    numbers = {"numbers": {"iae_mean": seed}}
+    return {"point": point, "seed": seed, "verdict": verdict, "failures": [*failures], **numbers}
+
+
 def test_a_band_needs_six_values(drawn):
-    rows = [Row({"a": a}, seed, Outcome("success", (), {"iae_mean": Number(seed, "m s", "")}))
-            for a in (1, 2) for seed in range(1, 6 + a - 1)]  # fmt: skip
-    draw_sweep(rows)
+    draw_sweep([row({"a": a}, seed) for a in (1, 2) for seed in range(1, 6 + a - 1)], UNITS)
     five, six = drawn[0][0].lines["a"]
     assert five.low != five.low  # NaN
     assert (six.low, six.middle, six.high) == (1, 3.5, 6)
+
+
+def test_numbers_of_a_plugin_that_failed_are_not_drawn(drawn):
+    draw_sweep([row({"a": 1}, 3), row({"a": 1}, 7, "plugin_failed"), row({"a": 2}, 4)], UNITS)
+    iae, success = drawn[0]
+    assert [point.middle for point in iae.lines["a"]] == [3, 4]
+    assert [point.middle for point in success.lines["a"]] == [50, 100]
 
 
 def test_a_figure_is_three_files_whose_text_is_text(tmp_path, capsys):
@@ -77,7 +93,8 @@ def test_a_figure_is_three_files_whose_text_is_text(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [(["--x", "delay"], "no axis named 'delay'"), (["--by", "x"], "no axis named 'x'"),
-     (["--number", "iea"], "no number named 'iea'")],
+     (["--number", "iea"], "no number named 'iea'"),
+     (["--x", "gain", "--by", "gain"], "--x and --by are both gain; name two axes")],
 )  # fmt: skip
 def test_a_figure_of_unknown_names_is_refused(arguments, text, tmp_path, capsys):
     assert main(["sweep", "figure", str(sweep(tmp_path / "s")), *arguments]) == 2
@@ -86,20 +103,31 @@ def test_a_figure_of_unknown_names_is_refused(arguments, text, tmp_path, capsys)
 
 def test_a_sweep_without_axes_or_rows_has_no_figure(tmp_path):
     with pytest.raises(BadInputError, match="no axis"):
-        draw_sweep([Row({}, 1, Outcome("success"))])
+        draw_sweep([row({}, 1)], UNITS)
     with pytest.raises(BadInputError, match="has no rows"):
         read_flights(sweep(tmp_path / "s", rows=0))
 
 
+def test_missing_flights_are_told(tmp_path, capsys):
+    """A sweep that still flies may answer otherwise in the end."""
+    folder = sweep(tmp_path / "s", rows=22)
+    assert "s, of which 2 flights are not done, over" in of_sweep(folder, "none", "kalman").what
+    assert main(["sweep", "figure", str(folder)]) == 0
+    assert "2 flights are not done." in capsys.readouterr().out
+
+
 def test_values_of_an_axis_are_paired_over_the_others(tmp_path):
-    found, what = of_sweep(sweep(tmp_path / "s"), "predictor=none", "kalman")
-    assert what == f"predictor in {tmp_path / 's'}"
+    found, _, what = of_sweep(sweep(tmp_path / "s"), "predictor=none", "kalman")
+    assert what.startswith(f"predictor in {tmp_path / 's'}, over all values of delay_ms, gain; ")
+    assert what.endswith("p is too small")
     assert len(found) == 12
     assert found[0].label == {"delay_ms": 20, "gain": "[1, 2]", "seed": 1}
-    assert {a.numbers["iae_mean"].value - b.numbers["iae_mean"].value for _, a, b in found} == {0.5}
+    assert {a["numbers"]["iae_mean"] - b["numbers"]["iae_mean"] for _, a, b in found} == {0.5}
 
 
-@pytest.mark.parametrize("sides", [("none", "none"), ("none", "5"), ("none", "last_sample")])
+@pytest.mark.parametrize(
+    "sides", [("none", "none"), ("none", "predictor=none"), ("none", "5"), ("none", "last_sample")]
+)
 def test_values_that_make_no_pairs_are_refused(sides, tmp_path):
     with pytest.raises(BadInputError, match=r"must be two values of one axis.*delay_ms: 20, 5"):
         of_sweep(sweep(tmp_path / "s"), *sides)

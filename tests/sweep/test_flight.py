@@ -2,7 +2,7 @@
 
 from cloudrc.cli.run import fly
 from cloudrc.config.load import load_experiment
-from cloudrc.sweep.flight import ERROR, fly_point
+from cloudrc.sweep.flight import ERROR, fly_point, units
 
 SHORT = "mission.steps.count=1", "mission.steps.period_s=1.0", "criteria.settle_m=null"
 """Overrides of `steps` for one second of flight."""
@@ -12,10 +12,18 @@ def test_a_point_gives_the_numbers_of_the_report(tmp_path):
     experiment = load_experiment("steps", SHORT)
     report = fly(experiment, "virtual", tmp_path, page=False)
     flown = fly_point(experiment)
-    assert (flown.verdict, flown.failures, flown.text) == ("success", (), "")
-    assert flown.records_sha256 == report["records_sha256"]
-    numbers = {n: {"value": v.value, "unit": v.unit} for n, v in flown.numbers.items()}
+    assert (flown["verdict"], flown["failures"], flown["text"]) == ("success", [], "")
+    assert flown["records_sha256"] == report["records_sha256"]
+    unit_of = units(())
+    numbers = {n: {"value": v, "unit": unit_of[n]} for n, v in flown["numbers"].items()}
     assert numbers == report["numbers"]
+
+
+def test_a_metric_that_fails_is_told(tmp_path):
+    (tmp_path / "mine.py").write_text("UNIT = '1'\n\n\ndef measure(flight):\n    return 1 / 0\n")
+    flown = fly_point(load_experiment("steps", [*SHORT, f"report.metrics=[{tmp_path}/mine.py]"]))
+    assert (flown["verdict"], "mine" in flown["numbers"]) == ("success", False)
+    assert flown["text"] == "metric mine failed: ZeroDivisionError: division by zero"
 
 
 def test_an_exception_becomes_the_verdict_error(monkeypatch):
@@ -24,5 +32,5 @@ def test_an_exception_becomes_the_verdict_error(monkeypatch):
 
     monkeypatch.setattr("cloudrc.assembly.assemble", fail)
     flown = fly_point(load_experiment("steps", SHORT))
-    assert (flown.verdict, flown.failures) == (ERROR, (ERROR,))
-    assert flown.text == "RuntimeError: no luck"
+    assert (flown["verdict"], flown["failures"]) == (ERROR, [ERROR])
+    assert flown["text"] == "RuntimeError: no luck"

@@ -1,5 +1,6 @@
 """A grid becomes points with keys; problems are refused at their place, before any flight."""
 
+import inspect
 import re
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import pytest
 
 from cloudrc.assembly import build_links
 from cloudrc.errors import BadInputError
+from cloudrc.sweep import plan
 from cloudrc.sweep.plan import read_plan
 from tests.sweep.conftest import SHORT
 
@@ -42,6 +44,22 @@ def test_equal_flights_have_equal_keys_however_they_are_written(write_sweep):
     assert all(len(key) == 16 for key in keys)
     delays = {"far": {"link.uplink.delay_ms": 40, "link.downlink.delay_ms": 40.0}}
     assert list(read_plan(write_sweep({"delay": delays}, seeds=2)).flights) == keys[:2]
+
+
+def test_a_key_depends_on_the_code_of_a_named_plugin(write_sweep, monkeypatch, tmp_path):
+    """Somebody may edit a predictor in a clone, and go on with a sweep."""
+    path, found = write_sweep({"cloud.predictor": ["last_sample", "constant_velocity"]}), []
+    (tmp_path / "edited.py").write_text("# edited")
+    real = inspect.getfile
+    for name in ("", "last_sample"):
+        plan._code.cache_clear()
+        monkeypatch.setattr(inspect, "getfile", lambda module, edited=name: str(
+            tmp_path / "edited.py" if module.__name__.endswith(f".{edited}") else real(module)
+        ))  # fmt: skip
+        found.append([*read_plan(path).flights])
+    plan._code.cache_clear()
+    assert found[0][0] != found[1][0]
+    assert found[0][1] == found[1][1]
 
 
 def test_points_with_one_seed_meet_the_same_draws(write_sweep):

@@ -6,10 +6,13 @@ import json
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.metrics import Number
 from cloudrc.sweep import store
-from cloudrc.sweep.flight import Outcome
 from cloudrc.sweep.plan import read_plan
+
+
+def flown(**numbers):
+    rest = {"failures": [], "text": "", "records_sha256": ""}
+    return {"verdict": "success", "numbers": numbers, **rest}
 
 
 @pytest.fixture
@@ -20,9 +23,9 @@ def plan(write_sweep):
 @pytest.fixture
 def rows(plan):
     """Four rows in the order of the grid; the last one lacks a number."""
-    numbers = [{"duration": Number(n + 0.1, "s", "")} for n in range(3)]
+    numbers = [{"duration": n + 0.1} for n in range(3)]
     pairs = zip(plan.flights.values(), [*numbers, {}], strict=True)
-    return [store.make_row(flight, Outcome("success", (), found)) for flight, found in pairs]
+    return [store.make_row(flight, flown(**found)) for flight, found in pairs]
 
 
 def write(folder, rows, shard=None):
@@ -67,7 +70,7 @@ def test_half_a_line_is_dropped(rows, tmp_path):
 
 def test_a_line_that_is_no_row_is_named(rows, tmp_path):
     write(tmp_path, rows[:1])
-    for line in ("{", "[]", "{}"):
+    for line in ("{", "[]", "{}", "3", '{"key": "a"}'):
         (tmp_path / "rows-2.jsonl").write_text(f"{json.dumps(rows[1])}\n{line}\n")
         with pytest.raises(BadInputError, match=r"rows-2.jsonl:2: is not a row of a sweep"):
             store.read_rows(tmp_path)
@@ -76,8 +79,12 @@ def test_a_line_that_is_no_row_is_named(rows, tmp_path):
 def test_a_folder_holds_one_sweep(plan, rows, write_sweep, tmp_path):
     store.begin(tmp_path, plan)
     write(tmp_path, rows)
+    store.finish(tmp_path, plan)
+    store.begin(tmp_path, plan)
+    assert (tmp_path / "table.csv").is_file()
     more = read_plan(write_sweep(seeds=2))  # more flights are no other sweep
     assert list(store.begin(tmp_path, more).values()) == rows
+    assert not (tmp_path / "table.csv").exists()  # it has fewer flights than sweep.json says
     other = read_plan(write_sweep({"link.both.delay_ms": [7]}))
     with pytest.raises(BadInputError, match=r"has rows of another grid.*name a new folder"):
         store.begin(tmp_path, other)
@@ -89,7 +96,7 @@ def test_a_changed_plugin_is_not_mixed_with_rows_of_the_old_one(write_sweep, tmp
     mine.write_text(source)
     path = write_sweep({"cloud.predictor": ["./mine.py"]})
     (flight,) = read_plan(path).flights.values()
-    write(tmp_path, [store.make_row(flight, Outcome("failure"))])
+    write(tmp_path, [store.make_row(flight, flown())])
     assert list(store.begin(tmp_path, read_plan(path))) == [flight.key]
     mine.write_text(f"{source}# changed\n")
     with pytest.raises(BadInputError, match=r"has rows of .* changed plug-ins"):

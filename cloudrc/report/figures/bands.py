@@ -86,6 +86,7 @@ def _draw_panel(axes: Axes, content: Panel, *, named: bool) -> None:
             axes.plot(x, middle, ls=dashes, label=name, **look)
         bad = failed > 0
         axes.plot(x[bad], middle[bad], ls="none", mfc="white", zorder=5, **look)
+    axes.ticklabel_format(axis="y", useOffset=False)
     if content.unit == "%":
         axes.set_ylim(-5.0, 105.0)
 
