@@ -6,43 +6,50 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cloudrc.sweep.statistics import median_interval
 from tests.conftest import nightly
 from tests.flights.conftest import fly
-from tools.results import LINKS, NUMBERS, PREDICTORS, sweep
+from tools.results import fly as fly_sweep
+from tools.results import results
+
+LINKS = "paper-p1", "paper-p2", "paper-p3"
+PREDICTORS = "constant_acceleration", "constant_velocity", "commanded_velocity", "last_sample"
 
 
-def row(name):
-    """Return the cells of the row that begins with a name, as texts."""
+@pytest.mark.full
+def test_the_table_of_predictors_is_that_of_this_version(tmp_path):
     text = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
-    (line,) = re.findall(rf"^\| `{name}`.*$", text, re.MULTILINE)
-    return [cell.strip() for cell in line.strip("|").split("|")]
+    found = results(fly_sweep("predictors", tmp_path / "sweep"))
+    for name, (errors, done) in found.items():
+        (line,) = re.findall(rf"^\| `{name}`.*$", text, re.MULTILINE)
+        _, error, *shares = [cell.strip() for cell in line.strip("|").split("|")]
+        low, high = median_interval(errors)
+        assert low - 0.05 <= float(error.partition(" ")[0]) <= high + 0.05, name
+        assert shares == [f"{count}/{len(errors)}" for count in done], name
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("profile", LINKS)
 def test_the_mission_on_the_links_of_the_paper(profile):
-    found, (_, done, *cells) = sweep("paper", f"link.profile={profile}"), row(profile)
-    assert done == f"{found['done']}/{found['count']}" == "10/10"
-    for cell, (name, (factor, _, digits)) in zip(cells, NUMBERS.items(), strict=True):
-        low, high = (factor * value for value in found["numbers"][name]["interval"])
-        rounding = 0.5 * 10.0**-digits
-        assert low - rounding <= float(cell.partition(" ")[0]) <= high + rounding, name
+    flights = [fly("paper", f"link.profile={profile}", f"seed={n}") for n in range(1, 11)]
+    assert [flight.verdict.failures for flight in flights] == [()] * 10
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("predictor", PREDICTORS)
-def test_the_prediction_error_of_each_predictor(predictor):
-    found, (_, cell) = sweep("steps", f"cloud.predictor={predictor}"), row(predictor)
-    low, high = found["numbers"]["prediction_error_rms"]["interval"]
-    assert 1e3 * low - 0.05 <= float(cell.partition(" ")[0]) <= 1e3 * high + 0.05
+@pytest.mark.parametrize(("predictor", "done"), [("last_sample", 0), ("constant_velocity", 6)])
+def test_the_mission_over_a_satellite_needs_a_predictor(predictor, done):
+    settings = "link.profile=satellite", f"cloud.predictor={predictor}"
+    flights = [fly("paper", *settings, f"seed={n}") for n in range(1, 7)]
+    assert sum(flight.verdict.outcome == "success" for flight in flights) == done
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("profile", LINKS)
 @pytest.mark.parametrize("predictor", PREDICTORS)
 def test_the_steps_succeed_with_every_predictor_on_the_links_of_the_paper(profile, predictor):
-    found = sweep("steps", f"link.profile={profile}", f"cloud.predictor={predictor}")
-    assert found["done"] == found["count"] == 10
+    settings = f"link.profile={profile}", f"cloud.predictor={predictor}"
+    flights = [fly("steps", *settings, f"seed={n}") for n in range(1, 11)]
+    assert [flight.verdict.failures for flight in flights] == [()] * 10
 
 
 @pytest.mark.parametrize("seed", [1, *nightly(*range(2, 11))])

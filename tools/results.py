@@ -1,11 +1,13 @@
-"""Write the tables of results in README.md: `make results` flies seeds 1 to 10 in two minutes.
+"""Write the table and the picture of results in README.md: `make results` takes two minutes.
 
-A nightly test flies again: each number in the README must lie within the interval of its sweep.
+A nightly test flies again: each number in the table must lie within the interval of its sweep.
 """
 
 from __future__ import annotations
 
 import json
+import shutil
+import statistics
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,66 +15,65 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from cloudrc.sweep.statistics import median_interval
 from tools.docs import table
 
-README = Path(__file__).resolve().parents[1] / "README.md"
-SEEDS = 10
-LINKS = {"paper-p1": "20 ± 10 ms", "paper-p2": "45 ± 25 ms", "paper-p3": "70 ± 40 ms"}
-"""Link profile of the paper -> delay ± jitter, each way."""
-NUMBERS = {
-    "contact_time": (1.0, "s", 1),
-    "min_clearance": (1.0, "m", 3),
-    "tip_speed": (1.0, "m/s", 3),
-    "steady_contact_force": (1.0, "N", 2),
-}
-"""Metric in the table of links -> factor to its unit, the unit, and the number of decimals."""
-PREDICTORS = ("constant_acceleration", "constant_velocity", "commanded_velocity", "last_sample")
+ROOT = Path(__file__).resolve().parents[1]
+README, SWEEPS = ROOT / "README.md", ROOT / "docs" / "sweeps"
+MARK = "<!-- made by `make results` -->\n"
+LINKS = "paper-p3", "far"
+"""Links in `predictors.yaml`."""
+ERROR = "prediction_error_rms"
 
 
-def sweep(experiment: str, *settings: str) -> dict[str, Any]:
-    """Fly an experiment with seeds 1 to 10; return the content of sweep.json."""
-    with TemporaryDirectory() as folder:
-        words = [word for setting in settings for word in ("--set", setting)]
-        command = [sys.executable, "-m", "cloudrc", "run", experiment, f"--seeds={SEEDS}", *words]
-        subprocess.run([*command, f"--out={folder}/sweep"], check=False, stdout=subprocess.DEVNULL)
-        found: dict[str, Any] = json.loads(Path(folder, "sweep", "sweep.json").read_text())
+def cloudrc(*words: str | Path) -> None:
+    """Run cloudrc; a sweep with failed flights is a result, too."""
+    subprocess.run([sys.executable, "-m", "cloudrc", *map(str, words)], check=False)
+
+
+def fly(name: str, folder: Path) -> list[dict[str, Any]]:
+    """Fly a sweep of the documentation into a folder; return its rows."""
+    cloudrc("sweep", "run", SWEEPS / f"{name}.yaml", "--out", folder)
+    return [json.loads(line) for line in (folder / "rows.jsonl").read_text().splitlines()]
+
+
+def results(rows: list[dict[str, Any]]) -> dict[str, tuple[list[float], list[int]]]:
+    """Return for each predictor its errors over the first link [mm], and successes per link."""
+    found = {}
+    for name in dict.fromkeys(row["point"]["predictor"] for row in rows):
+        mine = [row for row in rows if row["point"]["predictor"] == name]
+        near, far = ([row for row in mine if row["point"]["link"] == link] for link in LINKS)
+        done = [sum(row["verdict"] == "success" for row in part) for part in (near, far)]
+        found[name] = [1e3 * row["numbers"][ERROR] for row in near], done
     return found
 
 
-def links() -> Iterator[tuple[str, ...]]:
-    """Yield a row for each link of the paper: the mission's numbers, medians."""
-    for profile, words in LINKS.items():
-        found = sweep("paper", f"link.profile={profile}")
-        values = (
-            f"{found['numbers'][name]['median'] * factor:.{digits}f} {unit}"
-            for name, (factor, unit, digits) in NUMBERS.items()
-        )
-        yield f"`{profile}`, {words}", f"{found['done']}/{found['count']}", *values
-
-
-def predictors() -> Iterator[tuple[str, ...]]:
-    """Yield a row for each predictor: its prediction error with a 95 % interval."""
-    for name in PREDICTORS:
-        found = sweep("steps", f"cloud.predictor={name}")
-        error = found["numbers"]["prediction_error_rms"]
-        middle, low, high = (1e3 * value for value in (error["median"], *error["interval"]))
-        yield f"`{name}`", f"{middle:.1f} mm [{low:.1f}, {high:.1f}]"
+def cells(rows: list[dict[str, Any]]) -> Iterator[tuple[str, ...]]:
+    """Yield the table's row for each predictor, the largest error first."""
+    found = results(rows)
+    for name in sorted(found, key=lambda name: -statistics.median(found[name][0])):
+        errors, done = found[name]
+        low, high = median_interval(errors) or (float("nan"), float("nan"))
+        middle = f"{statistics.median(errors):.1f} mm [{low:.1f}, {high:.1f}]"
+        yield f"`{name}`", middle, *(f"{count}/{len(errors)}" for count in done)
 
 
 def main() -> None:
-    """Fly everything and write both tables between their marks."""
-    text = README.read_text(encoding="utf-8")
-    for mark, made in (
-        ("links", table("link | missions done | contact at | smallest clearance in the pipes | "
-                        "tip speed at contact | steady force", links())),
-        ("predictors", table("predictor | prediction error, RMS", predictors())),
-    ):  # fmt: skip
-        before, begin, rest = text.partition(f"<!-- made by `make results`: {mark} -->\n")
-        _, end, after = rest.partition("<!-- end -->\n")
-        assert begin, f"README.md has no mark of the table {mark}"
-        assert end, f"README.md has no end of the table {mark}"
-        text = f"{before}{begin}{made}{end}{after}"
-    README.write_text(text, encoding="utf-8")
+    """Fly both sweeps; write the table into README.md, and the picture beside the pages."""
+    with TemporaryDirectory() as folder:
+        made = table(
+            "predictor | prediction error at 70 ± 40 ms | flights that succeed | "
+            "at 200 ± 40 ms with 10 % loss",
+            cells(fly("predictors", Path(folder, "predictors"))),
+        )
+        fly("delay", delay := Path(folder, "delay"))
+        cloudrc("sweep", "figure", delay, "--number", ERROR, "--by", "predictor")
+        shutil.copy(delay / "figure.png", ROOT / "docs" / "delay.png")
+    before, begin, rest = README.read_text(encoding="utf-8").partition(MARK)
+    _, end, after = rest.partition("<!-- end -->\n")
+    assert begin, f"README.md has no mark {MARK}"
+    assert end, "README.md has no end of the table"
+    README.write_text(f"{before}{begin}{made}{end}{after}", encoding="utf-8")
 
 
 if __name__ == "__main__":
