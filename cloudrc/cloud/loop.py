@@ -275,7 +275,8 @@ class ControlLoop:
             counter: Counter of the command's datagram, for the record.
         """
         basis, delays, moving = self._basis, self._delays, setpoint
-        setpoint = setpoint_at(moving, now_ns)
+        if moving.motion is not None:
+            setpoint = setpoint_at(moving, now_ns)
         assert basis is not None, "check `ready` first"
         try:
             self._horizon = delays.horizon(now_ns)
@@ -289,7 +290,8 @@ class ControlLoop:
             output = STAND_STILL
         else:
             output = self._steer(estimate, setpoint, dt, now_ns)
-            plan = self._plan(moving, output.velocity, now_ns)
+            if self._planned:
+                plan = self._plan(moving, output.velocity, now_ns)
         velocity, yaw_rate, proportional, integral, derivative = output
         hold_ns = now_ns - self._basis_arrival_ns
         planned_ns = basis.stamp_ns + round(horizon * 1e9) if plan else NEVER_NS
@@ -350,7 +352,7 @@ class ControlLoop:
     def _plan(self, setpoint: Setpoint, velocity: Vector, now_ns: int) -> tuple[Vector, ...]:
         """Plan the commands after `velocity` [m/s]; a predictor without a model gives no plan."""
         try:
-            model = self._predictor.model() if self._planned else None
+            model = self._predictor.model()
             if model is None:
                 return ()
             count = self._planned

@@ -95,8 +95,9 @@ class VirtualRun:
     def _advance(self, end_ns: int) -> None:
         """Handle all events up to and including `end_ns` [ns]."""
         world, cloud, arrivals = self._world, self._cloud, self._arrivals
-        at, when = self.cloud_clock.at, self.cloud_clock.when
-        world_ns, cloud_ns = world.next_deadline_ns(), when(cloud.next_deadline_ns())
+        clock = None if self.cloud_clock == Clock() else self.cloud_clock  # None takes less time
+        world_ns, cloud_ns = world.next_deadline_ns(), cloud.next_deadline_ns()
+        cloud_ns = clock.when(cloud_ns) if clock else cloud_ns
         while True:
             deadline_ns = world_ns if world_ns <= cloud_ns else cloud_ns
             if arrivals and arrivals[0][0] <= deadline_ns:
@@ -106,7 +107,7 @@ class VirtualRun:
                 if to_world:
                     world.receive_datagram(data, self.now_ns)
                 else:
-                    cloud.receive_datagram(data, at(self.now_ns))
+                    cloud.receive_datagram(data, clock.at(self.now_ns) if clock else self.now_ns)
             elif deadline_ns > end_ns:
                 break
             else:
@@ -114,13 +115,14 @@ class VirtualRun:
                 if to_world := world_ns <= cloud_ns:
                     world.handle_deadline(deadline_ns)
                 else:
-                    cloud.handle_deadline(at(deadline_ns))
+                    cloud.handle_deadline(clock.at(deadline_ns) if clock else deadline_ns)
             if to_world:
                 world_ns = world.next_deadline_ns()
                 if datagrams := world.take_datagrams():
                     self._send(datagrams, self._uplink, to_world=False)
             else:
-                cloud_ns = when(cloud.next_deadline_ns())
+                cloud_ns = cloud.next_deadline_ns()
+                cloud_ns = clock.when(cloud_ns) if clock else cloud_ns
                 if datagrams := cloud.take_datagrams():
                     self._send(datagrams, self._downlink, to_world=True)
         self.now_ns = end_ns

@@ -222,14 +222,15 @@ class Guard:
 
     def _play(self, command: Command, now_ns: int) -> None:
         """Follow the velocity that a command has for `now_ns` [ns]; note when its next is due."""
-        velocity = command.velocity_at(now_ns)
+        velocity, self._played, self._next_ns = command.velocity, command, FOREVER_NS
+        if command.plan:
+            velocity = command.velocity_at(now_ns)
+            step = max(now_ns - command.planned_ns, 0) // PLAN_STEP_NS
+            if step < len(command.plan):
+                self._next_ns = command.planned_ns + (step + 1) * PLAN_STEP_NS
         self._wanted = rules.limit_length(velocity, self._speed_max)
         if self._wanted is not velocity:
             self.counts["limited_speed"] += 1
-        self._played, self._next_ns = command, FOREVER_NS
-        step = max(now_ns - command.planned_ns, 0) // PLAN_STEP_NS
-        if step < len(command.plan):
-            self._next_ns = command.planned_ns + (step + 1) * PLAN_STEP_NS
 
     def _leave_hold(self, now_ns: int, fresh_until_ns: int) -> None:
         self._fresh_ns.append(now_ns)
