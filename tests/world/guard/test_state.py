@@ -512,6 +512,17 @@ def test_c_may_run_the_steps_of_a_fresh_command_in_the_air():
     assert reference is asked
 
 
+def test_c_gets_the_velocity_of_a_plan_that_is_due():
+    guard = taking_off(1.0)
+    plan = ((0.0, 0.0, 0.5), (0.0, 0.0, 0.25))
+    planned = command((0.0, 0.0, 1.0), 10 * MS)._replace(plan=plan, planned_ns=12 * MS)
+    assert guard.accept_command(planned, 10 * MS) is None
+    next_ns, _, wanted, *_ = guard.plain_track(20 * MS)
+    assert (next_ns, wanted) == (22 * MS, (0.0, 0.0, 1.0))
+    next_ns, _, wanted, *_ = guard.plain_track(22 * MS)
+    assert (next_ns, wanted) == (32 * MS, plan[0])
+
+
 def test_c_runs_no_step_before_take_off_or_on_the_ramp_after_a_hold():
     assert taking_off(0.01).plain_track(10 * MS) is None
     guard = taking_off(1.0)
