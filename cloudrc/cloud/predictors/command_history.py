@@ -97,12 +97,15 @@ class CommandHistory(Replay):
 
     def _at(self, time_ns: int) -> FirstOrder:
         """Return the replayed body at a time on cloud's clock [ns]."""
-        index = bisect_right(self.history.stamps, time_ns) - 1
-        if index < 0:
+        history = self.history
+        if not history.stamps:
             return FirstOrder(self._loop)
-        body, dt = copy(self._bodies[index]), (time_ns - self.history.stamps[index]) * 1e-9
-        if dt:
-            body.advance(self.history.commands[index].velocity, dt)
+        index = max(bisect_right(history.stamps, time_ns) - 1, 0)
+        body, since_ns = copy(self._bodies[index]), history.commands[index].planned_ns
+        end_ns = since_ns + time_ns - history.stamps[index]
+        for velocity, duration in history.followed(index + 1, since_ns, end_ns):
+            if duration > 0.0:
+                body.advance(velocity, duration)
         return body
 
     def roll(self, odometry: Odometry, horizon: float) -> FirstOrder:
