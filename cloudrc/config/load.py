@@ -214,6 +214,20 @@ def fingerprint(experiment: ResolvedExperiment) -> str:
     return hashlib.sha256(dump(experiment).encode()).hexdigest()
 
 
+def local_files(value: Any, key: str = "") -> dict[str, str]:
+    """Return the files that a resolved experiment names, such as plug-ins: key -> absolute path.
+
+    `value` is the whole experiment as plain data, or the part of it at `key`.
+    """
+    if isinstance(value, str):
+        return {key: value} if value.startswith("/") and Path(value).is_file() else {}
+    inner = dict(enumerate(value)) if isinstance(value, list | tuple) else value
+    if not isinstance(inner, dict):
+        return {}
+    parts = [local_files(each, f"{key}.{name}".lstrip(".")) for name, each in inner.items()]
+    return {where: path for part in parts for where, path in part.items()}
+
+
 def _is_inside_name(path: KeyPath) -> bool:
     """Whether a key is inside mission or profile, instead of which a file may give a name."""
     is_direction = path[0] == "link" and len(path) > 2 and path[1] in DIRECTIONS

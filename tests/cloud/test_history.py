@@ -45,7 +45,9 @@ def test_command_history_knows_the_plan_between_two_commands():
     """At 20 Hz the robot flies four steps of the plan before the next command."""
     planning, plain = command_history.build(), command_history.build()
     for k in range(20):
-        planning.commanded(planned(50 * k, 50 * k, *([0.0, 1.0, 1.0, 1.0, 1.0] if k > 9 else [0.0])))
+        planning.commanded(
+            planned(50 * k, 50 * k, *([0.0, 1.0, 1.0, 1.0, 1.0] if k > 9 else [0.0]))
+        )
         plain.commanded(planned(50 * k, 50 * k, 0.0))
     basis = Odometry(850 * MS, ZERO, UPRIGHT, ZERO, ZERO)
     assert plain.predict(basis, 0.1).position[0] == 0.0
