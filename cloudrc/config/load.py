@@ -215,16 +215,12 @@ def fingerprint(experiment: ResolvedExperiment) -> str:
 
 
 def local_files(value: Any, key: str = "") -> dict[str, str]:
-    """Return the files that a resolved experiment names, such as plug-ins: key -> absolute path.
-
-    `value` is the whole experiment as plain data, or the part of it at `key`.
-    """
+    """Return the files that a resolved experiment names: key -> path; `value` is that of `key`."""
     if isinstance(value, str):
         return {key: value} if value.startswith("/") and Path(value).is_file() else {}
-    inner = dict(enumerate(value)) if isinstance(value, list | tuple) else value
-    if not isinstance(inner, dict):
-        return {}
-    parts = [local_files(each, f"{key}.{name}".lstrip(".")) for name, each in inner.items()]
+    listed = dict(enumerate(value)) if isinstance(value, list) else value
+    inner = listed.items() if isinstance(listed, dict) else ()
+    parts = [local_files(each, f"{key}.{name}".lstrip(".")) for name, each in inner]
     return {where: path for part in parts for where, path in part.items()}
 
 

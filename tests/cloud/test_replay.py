@@ -203,7 +203,9 @@ def test_values_of_a_file_replace_the_parameters(tmp_path):
         (command_history.build, {"acceleration_max": 0.0}, "acceleration_max: 0.0 must be above 0"),
         (model_based.build, {"integral_limit_xy": -1.0}, "integral_limit_xy: -1.0 must be"),
         (kalman.build, {"position_noise": 0.0}, "position_noise: 0.0 must be above 0"),
-        (kalman.build, {"parameters": {"gain": 1}}, "parameters: .*'gain'; see 'cloudrc list"),
+        (kalman.build, {"parameters": {"model": "m.yaml"}}, "parameters: .* as model_file, beside"),
+        (kalman.build, {"model_file": "none.yaml"}, "model_file: is for model: first_order"),
+        (kalman.build, {"parameters": {"gain": 1}}, "no 'gain'; available: gain_p, gain_i"),
     ],
 )
 def test_a_bad_parameter_is_named(build, parameters, text, tmp_path, monkeypatch):

@@ -8,6 +8,8 @@ Source: docs/reference/control.md, "Predictors", (f).
 
 from __future__ import annotations
 
+from inspect import signature
+from pathlib import Path
 from typing import Any, Literal
 
 from cloudrc.cloud.parameters import positive
@@ -117,6 +119,7 @@ def _blend(
 def build(
     model: Literal["white_box", "first_order"] = "white_box",
     parameters: dict[str, Any] | None = None,
+    model_file: Path | None = None,
     position_noise: float = 0.005,
     velocity_noise: float = 0.02,
     acceleration_error: float = 0.5,
@@ -126,6 +129,7 @@ def build(
     Args:
         model: `white_box`, as in `model_based`, or `first_order`, as in `command_history`.
         parameters: Parameters of that predictor; None: its defaults.
+        model_file: File from `cloudrc identify`, for `first_order`.
         position_noise: Standard deviation of the measured position per axis [m].
         velocity_noise: Standard deviation of the measured velocity per axis [m/s].
         acceleration_error: Standard deviation of the model's acceleration [m/s^2]. A larger value
@@ -135,10 +139,14 @@ def build(
         ValueError: If a standard deviation is not above 0, or the predictor refuses a parameter.
     """
     build_replay: Any = model_based.build if model == "white_box" else command_history.build
-    try:
-        replay = build_replay(**(parameters or {}))
-    except TypeError as error:
-        raise ValueError(f"parameters: {error}; see 'cloudrc list predictors'") from error
+    given, names = dict(parameters or {}), [*signature(build_replay).parameters]
+    if model_file is not None and model == "white_box":
+        raise ValueError("model_file: is for model: first_order; set that, or leave it out")
+    if "model" in given:  # the experiment file makes a relative model_file absolute
+        raise ValueError("parameters: give the file of a model as model_file, beside parameters")
+    if unknown := sorted(given.keys() - names):
+        raise ValueError(f"parameters: no {unknown[0]!r}; available: {', '.join(names)}")
+    replay = build_replay(**given, **({} if model_file is None else {"model": model_file}))
     return Kalman(
         replay,
         positive("position_noise", position_noise),
