@@ -127,9 +127,11 @@ def test_a_flight_on_a_cluster_writes_a_whole_run(ready, tmp_path, capsys):
     assert "--namespace=demo --create-namespace" in line
 
 
-def test_the_job_flies_the_mission_with_its_carrot(ready):
+def test_the_job_flies_the_mission_with_its_carrot_over_an_own_link(ready, tmp_path):
+    (tmp_path / "own.yaml").write_text("uplink: {delay_ms: 5}")
     ends(ready)
-    assert main([*LINE, "--out", "out", "--set", "mission.carrot.speed_mps=1.5"]) == 6
+    own = ["--set", "mission.carrot.speed_mps=1.5", "--set", "link.profile=./own.yaml"]
+    assert main([*LINE, "--out", "out", *own]) == 6
     (plan,) = [body for key, body in ready.objects.items() if key[0] == "configmaps"]
     (text,) = plan["data"].values()
     assert json.loads(text)["carrot"] == {"speed_mps": 1.5, "acceleration_mps2": 2.0}
