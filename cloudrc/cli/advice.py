@@ -40,7 +40,8 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     if carrot is not None and carrot.speed_mps > cap:
         yield (
             f"the carrot moves at {cap:.3g} instead of {carrot.speed_mps:g} m/s, because the guard "
-            f"caps the speed; a value that fits: --set mission.carrot.speed_mps={int(cap * 10) / 10:g}"
+            "caps the speed; a value that fits: "
+            f"--set mission.carrot.speed_mps={int(cap * 10) / 10:g}"
         )
     ages, echoes = simulate_ages(experiment)
     if ages:
