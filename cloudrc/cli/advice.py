@@ -36,6 +36,13 @@ def warn(experiment: ResolvedExperiment) -> None:
 def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     """Describe the settings of an experiment that do not fit together."""
     yield from _hover(experiment)
+    carrot, cap = experiment.mission.carrot, experiment.guard.speed_max_mps
+    if carrot is not None and carrot.speed_mps > cap:
+        yield (
+            f"the carrot moves at {cap:.3g} instead of {carrot.speed_mps:g} m/s, because the guard "
+            "caps the speed; a value that fits: "
+            f"--set mission.carrot.speed_mps={int(cap * 10) / 10:g}"
+        )
     ages, echoes = simulate_ages(experiment)
     if ages:
         yield from _long_link(experiment, ages, echoes)

@@ -20,7 +20,7 @@ EPILOG = """\
 examples:
   cloudrc run steps --mode virtual
   cloudrc identify runs/latest --out model.yaml
-  cloudrc run steps --set cloud.predictor=command_history \\
+  cloudrc run steps --mode virtual --set cloud.predictor=command_history \\
       --set cloud.predictor.model=model.yaml"""
 
 

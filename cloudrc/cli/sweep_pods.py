@@ -37,12 +37,12 @@ def cluster_arguments(parser: argparse.ArgumentParser) -> None:
 
 def refuse_local_files(plan: Plan) -> None:
     """Raise a BadInputError if a point needs a file of this machine, which no pod has."""
-    from cloudrc.sweep.plan import local_files
+    from cloudrc.config.load import local_files
 
     for point in plan.points:
-        for file in local_files(point.model_dump(mode="json")):
+        for key, path in local_files(point.model_dump(mode="json")).items():
             text = "the pods do not have this file; fly without --on; docs/sweeps.md says more"
-            raise BadInputError(f"{file}: {text}")
+            raise BadInputError(f"{key}: {path}: {text}")
 
 
 def rows_from_pods(

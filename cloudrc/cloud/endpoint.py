@@ -67,7 +67,7 @@ class MissedPeriods:
         self._reported = True
         text = (
             f"cloud sent no command in {self._missed} periods of {self._period_ns * 1e-6:g} ms: "
-            "a plug-in is slow or the machine is busy"
+            "a plug-in is slow, cloud.compute_ms is long, or the machine is busy"
         )
         return [Fault(now_ns, "late", text)]
 

@@ -24,7 +24,7 @@ from typing import NoReturn
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
-from cloudrc.cloud.plan import make_plan
+from cloudrc.cloud.plan import ControllerError, make_plan
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.errors import describe_error
 from cloudrc.messages import (
@@ -358,7 +358,10 @@ class ControlLoop:
             count = self._planned
             return make_plan(model, self._controller, setpoint, velocity, now_ns, count)
         except BaseException as error:
-            self._note("predictor", error, now_ns, "cloud sends this command without a plan")
+            kind, cause = "predictor", error
+            if isinstance(error, ControllerError) and error.__cause__ is not None:
+                kind, cause = "controller", error.__cause__
+            self._note(kind, cause, now_ns, "cloud sends this command without a plan")
             return ()
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:

@@ -17,6 +17,10 @@ SPEED_MAX = 1000.0
 Source: docs/reference/faults.md, "F23"."""
 
 
+class ControllerError(Exception):
+    """The controller failed while a plan was made; the cause is its exception."""
+
+
 def make_plan(
     model: Model,
     controller: Controller,
@@ -37,13 +41,22 @@ def make_plan(
 
     Returns:
         The plan; it ends before a velocity that the guard would refuse.
+
+    Raises:
+        ControllerError: If the controller cannot be copied, or fails.
     """
-    controller, plan = deepcopy(controller), list[Vector]()
+    plan = list[Vector]()
+    try:
+        controller = deepcopy(controller)
+    except Exception as error:
+        raise ControllerError from error
     for k in range(1, count + 1):
-        state = model.step(velocity, STEP)
-        output = controller.update(state, setpoint_at(setpoint, now_ns + k * PLAN_STEP_NS), STEP)
-        x, y, z = output.velocity
-        velocity = (float(x), float(y), float(z))
+        state, later = model.step(velocity, STEP), setpoint_at(setpoint, now_ns + k * PLAN_STEP_NS)
+        try:
+            x, y, z = controller.update(state, later, STEP).velocity
+            velocity = (float(x), float(y), float(z))
+        except Exception as error:
+            raise ControllerError from error
         largest = max(map(abs, velocity))
         if not (isfinite(sum(velocity)) and largest <= SPEED_MAX):
             break

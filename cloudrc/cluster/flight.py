@@ -184,25 +184,16 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
     """Raise a BadInputError if an experiment names local files, or if its mission has steps.
 
     The pods cannot read files of this machine, and the API accepts missions with waypoints only.
+    Own metrics are evaluated on this machine, and a link profile is part of the experiment.
     """
-    from cloudrc.config.load import FILE_READERS
+    from cloudrc.config.load import local_files
 
-    cloud, link, world = experiment.cloud, experiment.link, experiment.world
-    names = {
-        **{f"cloud.{k}": getattr(cloud, k).name for k in ("estimator", "predictor", "controller")},
-        **{
-            f"link.{way}.{key}": getattr(getattr(link, way), key)
-            for way in ("uplink", "downlink")
-            for key in FILE_READERS
-        },
-        **{"world.robot": world.robot, "world.scene": world.scene},
-    }
-    for key, name in names.items():
-        if name is not None and ("/" in name or name.endswith(".py")):
-            raise BadInputError(
-                f"{key}: {name}: the pods do not have this file; build it into an image, "
-                "or fly with --mode local"
-            )
+    flown = experiment.model_dump(mode="json", exclude={"report": True, "link": {"profile"}})
+    for key, path in local_files(flown).items():
+        raise BadInputError(
+            f"{key}: {path}: the pods do not have this file; build it into an image, "
+            "or fly with --mode local"
+        )
     if experiment.mission.steps is not None:
         raise BadInputError(
             "mission.steps: a mission in a cluster has waypoints; fly steps with --mode local "
@@ -217,6 +208,7 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
         "start": mission["start"],
         "time_limit_s": limit,
         "waypoints": mission["waypoints"],
+        "carrot": mission["carrot"],
     }
     job = run_job(release, document, limit=limit)
     tell(f"Job {job.name} flies {experiment.name}")

@@ -214,6 +214,16 @@ def fingerprint(experiment: ResolvedExperiment) -> str:
     return hashlib.sha256(dump(experiment).encode()).hexdigest()
 
 
+def local_files(value: Any, key: str = "") -> dict[str, str]:
+    """Return the files that a resolved experiment names: key -> path; `value` is that of `key`."""
+    if isinstance(value, str):
+        return {key: value} if value.startswith("/") and Path(value).is_file() else {}
+    listed = dict(enumerate(value)) if isinstance(value, list) else value
+    inner = listed.items() if isinstance(listed, dict) else ()
+    parts = [local_files(each, f"{key}.{name}".lstrip(".")) for name, each in inner]
+    return {where: path for part in parts for where, path in part.items()}
+
+
 def _is_inside_name(path: KeyPath) -> bool:
     """Whether a key is inside mission or profile, instead of which a file may give a name."""
     is_direction = path[0] == "link" and len(path) > 2 and path[1] in DIRECTIONS

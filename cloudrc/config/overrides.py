@@ -172,7 +172,7 @@ def _check_model(predictor: Any, name: str) -> None:
     if predictor.model() is None:
         raise BadInputError(
             f"'{name}' has no model of the robot, which cloud.plan_s above 0 needs; choose "
-            "model_based or command_history, or set cloud.plan_s to 0"
+            "model_based, command_history or kalman, or set cloud.plan_s to 0"
         )
 
 

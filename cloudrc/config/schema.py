@@ -446,7 +446,8 @@ class Cloud(Section):
     """Tracks the setpoint: a name, or a mapping with parameters"""
     plan_s: PlanTime = 0.0
     """Length of the plan of future velocities in each command [s], in steps of 10 ms. The robot
-    follows it while newer commands are late or lost. Needs a predictor with a model. 0: no plan"""
+    follows it while newer commands are late or lost. Needs a predictor with a model; the estimator
+    earliest fits. 0: no plan"""
     horizon_max_s: CloudTime | None = None
     """Longest horizon of the prediction [s]. null: the link profile's value, else 1"""
     freeze_after_s: CloudTime | None = None

@@ -6,13 +6,13 @@ checked before the first flight.
 
 from __future__ import annotations
 
-import hashlib
 import inspect
 import json
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
+from hashlib import sha256
 from itertools import chain, product
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -22,7 +22,7 @@ from pydantic import Field
 from cloudrc import __version__, metrics, plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, Source, read_document
-from cloudrc.config.load import ResolvedExperiment, load_experiment, validate
+from cloudrc.config.load import ResolvedExperiment, load_experiment, local_files, validate
 from cloudrc.config.overrides import collect_settings
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Section
@@ -116,7 +116,10 @@ def _everything(point: ResolvedExperiment) -> dict[str, Any]:
     values, cloud = point.model_dump(mode="json"), point.cloud
     chosen = ("estimators", cloud.estimator), ("predictors", cloud.predictor)
     code = [_code(kind, each.name) for kind, each in (*chosen, ("controllers", cloud.controller))]
-    return {**values, "cloudrc": __version__, "code": code, "files": local_files(values)}
+    files = {
+        file: sha256(Path(file).read_bytes()).hexdigest() for file in local_files(values).values()
+    }
+    return {**values, "cloudrc": __version__, "code": code, "files": files}
 
 
 @cache
@@ -125,13 +128,13 @@ def _code(kind: str, name: str) -> str:
     with suppress(TypeError, OSError):
         if not plugins.is_path(name):
             file = inspect.getfile(plugins.find(kind, name))
-            return hashlib.sha256(Path(file).read_bytes()).hexdigest()
+            return sha256(Path(file).read_bytes()).hexdigest()
     return ""
 
 
 def _key(everything: Mapping[str, Any], seed: int) -> str:
     text = json.dumps({**everything, "seed": seed}, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return sha256(text.encode()).hexdigest()[:16]
 
 
 def _seeds(given: Any) -> tuple[int, ...]:
@@ -180,13 +183,3 @@ def _resolve(experiment: str, entries: Iterable[_Entry]) -> ResolvedExperiment:
     resolved = load_experiment(experiment, settings)
     metrics.check(resolved.report.metrics)
     return resolved
-
-
-def local_files(value: Any) -> dict[str, str]:
-    """Return the files that a resolved experiment names, such as plug-ins: path -> SHA-256."""
-    if isinstance(value, str):
-        is_file = value.startswith("/") and Path(value).is_file()
-        return {value: hashlib.sha256(Path(value).read_bytes()).hexdigest()} if is_file else {}
-    inner = value.values() if isinstance(value, dict) else value
-    parts = [local_files(each) for each in inner] if isinstance(value, dict | list) else []
-    return {name: digest for part in parts for name, digest in part.items()}

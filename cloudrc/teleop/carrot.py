@@ -29,7 +29,7 @@ def setpoint_at(setpoint: Setpoint, now_ns: int) -> Setpoint:
         return setpoint
     distance, ramp, total = _profile(setpoint)
     since, acceleration = (now_ns - motion.begin_ns) * 1e-9, motion.acceleration
-    if since >= total:
+    if since >= total or not distance:
         return setpoint
     if since <= 0.0:
         way, speed = 0.0, 0.0

@@ -28,6 +28,7 @@ def both(delay, jitter, **others):
             ("cloud freezes at times; ", "cloud.freeze_after_s="),
         ),
         (["cloud.controller={name: pid, gain_i: [0.3, 0, 0]}"], ("cloud.controller.speed_max=6",)),
+        (["mission=carrot", "mission.carrot.speed_mps=8"], ("instead of 8 m/s", "speed_mps=")),
         (["world.wind.velocity_mps=[0, -3]"], ("0.19 m from", "low_level.integral_limit_xy=")),
         (["world.plant.payload_kg=0.4"], ("0.20 m from", "low_level.integral_limit_z=")),
         (

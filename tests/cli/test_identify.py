@@ -121,6 +121,9 @@ def test_the_command_writes_a_model_that_a_predictor_takes(tmp_path, capsys):
     file.write_text("mission: steps\nworld: {scene: empty}\n" + PREDICTOR)
     predictor = load_experiment(file).cloud.predictor
     assert predictor.model_extra["model"] == str(tmp_path / "model.yaml")
+    filtered = "{name: kalman, model: first_order, model_file: model.yaml}"
+    predictor = load_experiment(file, [f"cloud.predictor={filtered}"]).cloud.predictor
+    assert predictor.model_extra["model_file"] == str(tmp_path / "model.yaml")
     assert main(["identify", str(tmp_path)]) == 2
     assert "model.yaml: already there; name another file with --out" in capsys.readouterr().err
     assert main(["identify", str(tmp_path), "--out", "second.yaml", "-o", "json"]) == 0

@@ -2,6 +2,7 @@
 
 import pytest
 
+from cloudrc.cloud.predictors import command_history
 from cloudrc.cloud.predictors._history import History
 from cloudrc.messages import UPRIGHT, ZERO, Command, Odometry
 
@@ -38,3 +39,16 @@ def test_a_plan_begins_at_its_own_time_however_late_it_is():
     assert history.shift_ns(basis, 0.02) == 100 * MS
     ahead = history.ahead(100 * MS, 120 * MS, 100 * MS)
     assert along_x(ahead) == [(1.0, 0.01), (2.0, 0.01)]
+
+
+def test_command_history_knows_the_plan_between_two_commands():
+    """At 20 Hz the robot flies four steps of the plan before the next command."""
+    planning, plain = command_history.build(), command_history.build()
+    for k in range(20):
+        planning.commanded(
+            planned(50 * k, 50 * k, *([0.0, 1.0, 1.0, 1.0, 1.0] if k > 9 else [0.0]))
+        )
+        plain.commanded(planned(50 * k, 50 * k, 0.0))
+    basis = Odometry(850 * MS, ZERO, UPRIGHT, ZERO, ZERO)
+    assert plain.predict(basis, 0.1).position[0] == 0.0
+    assert planning.predict(basis, 0.1).velocity[0] > 0.1

@@ -95,6 +95,26 @@ def test_a_failing_model_is_reported_and_the_command_goes_out():
     assert "cloud sends this command without a plan" in a_loop.faults[0].text
 
 
+def test_a_controller_that_fails_in_a_plan_is_the_one_to_fix():
+    class Uncopied(Integrating):
+        def __deepcopy__(self, memo):
+            raise TypeError("cannot copy")
+
+    class Impatient(Integrating):
+        def update(self, estimate, setpoint, dt):
+            return ControlOutput(ZERO, 0.0) if estimate.stamp_ns else 1 / 0
+
+    for controller, word in ((Uncopied(), "cannot copy"), (Impatient(), "in update")):
+        a_loop = loop(
+            predictor=Modelled(), controller=controller, heard_ms=1090, echo_ms=1000, plan=0.05
+        )
+        sent, _ = command(a_loop, 1094)
+        assert sent.plan == ()
+        assert a_loop.counts == {"controller_failed": 1}
+        assert word in a_loop.faults[0].text
+        assert "fix cloud.controller" in a_loop.faults[0].text
+
+
 def test_the_earliest_command_sets_the_horizon():
     a_loop = loop(estimator=lambda: earliest(2), heard_ms=1090, echo_ms=1000)
     horizons = []

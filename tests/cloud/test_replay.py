@@ -52,12 +52,34 @@ def test_commands_ahead_begin_at_their_stamps_and_the_last_stays():
 @pytest.mark.parametrize("every", [1, 2])
 def test_the_shift_gives_commands_their_mean_age(every):
     """A command that loses its successors is older, on average, while it is in force."""
-    history = History()
-    for k in range(0, 400, every):
-        history.add(command(10 * k, 0.0))
-        history.note_applied(command(10 * k, 0).stamp_ns, (10 * k + 50) * MS)
     expected_ms = 50 + 5 * (every - 1)
-    assert history.shift_ns(sample(0), 0.1) + AHEAD == pytest.approx(expected_ms * MS, abs=MS)
+    assert shift_ms(every=every) == pytest.approx(expected_ms, abs=1)
+
+
+def shift_ms(every=1, period_ms=10, odometry_ms=10):
+    """Return the shift if commands take 50 ms, each `every`-th arrives, and echoes are exact."""
+    history = History()
+    for k in range(400):
+        history.add(command(period_ms * k, 0.0))
+        begins_ms = period_ms * k + 50
+        history.seen_ns = (begins_ms - 1) // odometry_ms * odometry_ms * MS
+        if k % every == 0 and begins_ms % odometry_ms < period_ms:
+            history.note_applied(command(period_ms * k, 0).stamp_ns, begins_ms * MS)
+    return (history.shift_ns(sample(0), 0.1) + AHEAD) / MS
+
+
+@pytest.mark.parametrize("rates", [{"period_ms": 20}, {"period_ms": 2}, {"odometry_ms": 50}])
+def test_the_shift_does_not_depend_on_rates(rates):
+    assert shift_ms(**rates) == pytest.approx(50, abs=1.5)
+
+
+def test_an_older_command_counts_if_the_robot_follows_it_after_a_newer_one():
+    history = History()
+    for k in range(3):
+        history.add(command(10 * k, float(k)))
+    for k, at_ms in ((0, 50), (2, 60), (1, 70)):  # tunnel.order: arrival
+        history.note_applied(command(10 * k, 0).stamp_ns, at_ms * MS)
+    assert in_ms(history.past(50 * MS, 80 * MS)) == [(0, 10), (2, 10), (1, 10)]
 
 
 def test_echoes_of_late_telemetry_change_no_shift():
@@ -82,6 +104,43 @@ def test_a_history_forgets_the_oldest_commands():
     predictor.applied(command(49_940, 0).stamp_ns, 49_990 * MS)
     at_speed = predictor.predict(sample(49_990, v=1.0), 0.05)
     assert at_speed.position[0] == pytest.approx(0.05, abs=1e-6)
+    forgotten = predictor.predict(sample(1000, v=1.0), 0.05)
+    assert forgotten.position[0] == pytest.approx(0.0, abs=0.1)
+
+
+def after_silence(predictor, *, lost):
+    """Return the error of a prediction by 0.3 s, after a silence of 20 s in which a robot held.
+
+    Telemetry, commands or nothing is `lost`. The robot follows its commands 50 ms late.
+    """
+    body = model_based.build()
+    body.predict(sample(0), 0.0)
+    truth, dark = body.model(), range(200, 200 if lost == "none" else 2200)
+    x = {}
+    for k in range(2260):
+        state = truth.odometry()
+        x[k] = state.position[0]
+        if k not in dark or lost == "commands":
+            if k not in dark and k >= 5:
+                predictor.applied(command(10 * k - 50, 0).stamp_ns, 10 * k * MS)
+            newest = state._replace(stamp_ns=10 * k * MS)
+            predictor.observe(newest)
+        if k == 2220:
+            later = predictor.predict(newest, 0.3).position[0]
+        predictor.commanded(command(10 * k, wanted(k)))
+        truth.step((wanted(k - 5) if k - 5 not in dark and k not in dark else 0.0, 0, 0), 0.01)
+    return later - x[2250]
+
+
+def wanted(k):
+    return 2.0 if 0 <= k < 200 else -2.0 if k >= 2200 else 0.0
+
+
+@pytest.mark.parametrize("lost", ["telemetry", "commands"])
+@pytest.mark.parametrize("module", [command_history, model_based, kalman])
+def test_a_silence_of_20_s_leaves_no_error(module, lost):
+    without = after_silence(module.build(), lost="none")
+    assert after_silence(module.build(), lost=lost) == pytest.approx(without, abs=0.01)
 
 
 # command_history
@@ -144,7 +203,9 @@ def test_values_of_a_file_replace_the_parameters(tmp_path):
         (command_history.build, {"acceleration_max": 0.0}, "acceleration_max: 0.0 must be above 0"),
         (model_based.build, {"integral_limit_xy": -1.0}, "integral_limit_xy: -1.0 must be"),
         (kalman.build, {"position_noise": 0.0}, "position_noise: 0.0 must be above 0"),
-        (kalman.build, {"parameters": {"gain": 1}}, "parameters: .*'gain'; see 'cloudrc list"),
+        (kalman.build, {"parameters": {"model": "m.yaml"}}, "parameters: .* as model_file, beside"),
+        (kalman.build, {"model_file": "none.yaml"}, "model_file: is for model: first_order"),
+        (kalman.build, {"parameters": {"gain": 1}}, "no 'gain'; available: gain_p, gain_i"),
     ],
 )
 def test_a_bad_parameter_is_named(build, parameters, text, tmp_path, monkeypatch):

@@ -127,6 +127,16 @@ def test_a_flight_on_a_cluster_writes_a_whole_run(ready, tmp_path, capsys):
     assert "--namespace=demo --create-namespace" in line
 
 
+def test_the_job_flies_the_mission_with_its_carrot_over_an_own_link(ready, tmp_path):
+    (tmp_path / "own.yaml").write_text("uplink: {delay_ms: 5}")
+    ends(ready)
+    own = ["--set", "mission.carrot.speed_mps=1.5", "--set", "link.profile=./own.yaml"]
+    assert main([*LINE, "--out", "out", *own]) == 6
+    (plan,) = [body for key, body in ready.objects.items() if key[0] == "configmaps"]
+    (text,) = plan["data"].values()
+    assert json.loads(text)["carrot"] == {"speed_mps": 1.5, "acceleration_mps2": 2.0}
+
+
 def test_a_refused_mission_leaves_no_run(ready, tmp_path, capsys):
     ends(ready, "Failed", 5, "mission m-1 is under way")
     assert main(LINE) == 5
@@ -196,11 +206,15 @@ def test_a_run_does_not_end_a_flight_in_progress(ready, teleop, tmp_path, capsys
     assert not (tmp_path / "out").exists()
 
 
+FITTED = "cloud.predictor={name: command_history, model: ./mine.yaml}"
+
+
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
         (["hover", "--set", "cloud.predictor=./mine.py"], "the pods do not have this file"),
         (["hover", "--set", "world.scene=./mine.xml"], "world.scene: /"),
+        (["hover", "--set", FITTED], "cloud.predictor.model: /"),
         (["steps"], "mission.steps"),
     ],
 )
@@ -211,6 +225,8 @@ def test_what_pods_cannot_have_is_refused_before_the_install(
     plugin = "from cloudrc.cloud.predictors.last_sample import build as build\n"
     (tmp_path / "mine.py").write_text(plugin)
     (tmp_path / "mine.xml").write_text("<mujoco/>")
+    fitted = "{time_constant: [1, 1, 1], dead_time: [0, 0, 0], gain: [1, 1, 1]}"
+    (tmp_path / "mine.yaml").write_text(fitted)
     assert main(["run", *settings, "--mode", "cluster"]) == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "runs").exists()

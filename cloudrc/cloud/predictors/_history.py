@@ -12,23 +12,31 @@ from collections.abc import Iterator
 from copy import copy
 
 from cloudrc.cloud.predictors import Model, Predictor, rotate_ahead
-from cloudrc.messages import PLAN_STEP_NS, ZERO, Command, Odometry, Vector
+from cloudrc.messages import NEVER_NS, PLAN_STEP_NS, ZERO, Command, Odometry, Vector
 
 PERIOD_NS = 10_000_000
-"""Time between two commands [ns]. Source: docs/reference/plant.md, "Commands"."""
+"""Usual time between two samples or commands [ns]. Source: docs/reference/plant.md, "Commands"."""
 COUNT = 2048
-"""Number of commands that are remembered at least: 20 s, twice the longest horizon."""
+"""Number of commands that are remembered at least: 20 s at 100 Hz, twice the longest horizon."""
 GAIN = 0.05
-"""Weight of a command that lasts one period in the mean shift."""
+"""Weight of a command that lasts PERIOD_NS in the mean shift."""
+SILENCE_NS = 200_000_000
+"""The mean shift begins anew after a longer time without a new command [ns]."""
+FOLLOWED_NS = 1_000_000_000
+"""The robot follows no command for longer without a newer one, not even a plan [ns]."""
 NO_COMMAND = Command(0, 0, 0, ZERO, 0.0)
 
 
 class History:
-    """The `commands` of a session, and their `stamps` [ns], cloud's clock, rising."""
+    """The `commands` of a session, and their `stamps` [ns], cloud's clock, rising.
+
+    `seen_ns` is the stamp of the newest odometry [ns], world's clock.
+    """
 
     def __init__(self) -> None:
         self.stamps: list[int] = []
         self.commands: list[Command] = []
+        self.seen_ns = NEVER_NS
         self._applied: deque[tuple[int, int]] = deque(maxlen=COUNT)  # beginning and stamp [ns]
         self._shift_ns = 0.0
 
@@ -42,20 +50,30 @@ class History:
             del self.stamps[:COUNT], self.commands[:COUNT]
         return True
 
+    @property
+    def _period_ns(self) -> int:
+        return self.stamps[-1] - self.stamps[-2] if len(self.stamps) > 1 else PERIOD_NS
+
     def note_applied(self, stamp_ns: int, began_ns: int) -> None:
         """Note when the robot began to follow the command with this stamp, world's clock [ns]."""
-        if not self._applied:
+        last_began_ns, last_stamp_ns = self._applied[-1] if self._applied else (NEVER_NS, 0)
+        lasted_ns = began_ns - last_began_ns
+        if lasted_ns <= 0:
+            return  # from late telemetry
+        # The echoes of other commands since the newest odometry may be late or lost.
+        lasted_ns = min(lasted_ns, max(self.seen_ns - last_began_ns, 0) + self._period_ns)
+        if not self._applied or lasted_ns > SILENCE_NS:
             self._shift_ns = began_ns - stamp_ns
         else:
-            last_began_ns, last_stamp_ns = self._applied[-1]
-            lasted_ns = began_ns - last_began_ns
-            if lasted_ns <= 0 or stamp_ns <= last_stamp_ns:
-                return  # from late telemetry
             # A command lasts longer if the next ones are lost. So half of this time counts, too.
-            shift_ns = last_began_ns - last_stamp_ns + 0.5 * (lasted_ns - PERIOD_NS)
+            shift_ns = last_began_ns - last_stamp_ns + 0.5 * (lasted_ns - self._period_ns)
             share = min(1.0, GAIN * lasted_ns / PERIOD_NS)
             self._shift_ns += share * (shift_ns - self._shift_ns)
         self._applied.append((began_ns, stamp_ns))
+
+    def is_silent(self, now_ns: int) -> bool:
+        """Whether the robot has followed no new command for FOLLOWED_NS at `now_ns` [ns]."""
+        return bool(self._applied) and now_ns - self._applied[-1][0] > FOLLOWED_NS
 
     def shift_ns(self, odometry: Odometry, horizon: float) -> int:
         """Return the shift [ns]; before the first echo, the one that `horizon` [s] implies.
@@ -66,7 +84,7 @@ class History:
             return self.commands[-1].planned_ns - self.stamps[-1]
         if self._applied or not self.stamps:
             return round(self._shift_ns)
-        return odometry.stamp_ns + round(horizon * 1e9) - self.stamps[-1] - PERIOD_NS
+        return odometry.stamp_ns + round(horizon * 1e9) - self.stamps[-1] - self._period_ns
 
     def past(self, start_ns: int, end_ns: int) -> Iterator[tuple[Vector, float]]:
         """Yield velocity [m/s] and duration [s] of the commands that the echoes have shown.
@@ -77,7 +95,7 @@ class History:
         for began_ns, stamp_ns in reversed(self._applied):
             if began_ns < end_ns:
                 index = bisect_right(self.stamps, stamp_ns)
-                followed = self._followed(index, max(began_ns, start_ns), end_ns)
+                followed = self.followed(index, max(began_ns, start_ns), end_ns)
                 parts += reversed(followed)
                 end_ns = began_ns
             if began_ns <= start_ns:
@@ -93,10 +111,10 @@ class History:
         while start_ns < end_ns:
             more = index < len(self.stamps)
             until_ns = min(self.stamps[index] + shift_ns, end_ns) if more else end_ns
-            yield from self._followed(index, start_ns, until_ns)
+            yield from self.followed(index, start_ns, until_ns)
             start_ns, index = until_ns, index + 1
 
-    def _followed(self, count: int, start_ns: int, end_ns: int) -> list[tuple[Vector, float]]:
+    def followed(self, count: int, start_ns: int, end_ns: int) -> list[tuple[Vector, float]]:
         """List velocity [m/s] and duration [s] of the last of `count` commands, with its plan."""
         command = self.commands[count - 1] if count else NO_COMMAND
         if not command.plan:
@@ -165,7 +183,7 @@ class Replay(Predictor):
 
     def observe(self, odometry: Odometry) -> None:
         """Remember the newest sample."""
-        self.newest = odometry
+        self.newest, self.history.seen_ns = odometry, odometry.stamp_ns
 
     def roll(self, odometry: Odometry, horizon: float) -> Body:
         """Return a body that has moved from the newest sample for `horizon` [s]."""

@@ -10,38 +10,24 @@ from collections.abc import Sequence
 from copy import copy
 from math import ceil, exp
 from pathlib import Path
-from typing import NamedTuple
+from typing import TypeAlias
 
 from cloudrc.cloud.parameters import positive, read_model, vector
 from cloudrc.cloud.predictors._history import COUNT, PERIOD_NS, Body, Replay, approach
 from cloudrc.messages import ZERO, Command, Odometry, Vector
 
+Axes: TypeAlias = tuple[Vector, ...]
+"""Time constant [s], dead time [s] and gain [1] of x, y and z."""
 STEPS_MAX = 200
 """Largest number of steps from one command to the next."""
-
-
-class Loop(NamedTuple):
-    """The model of the onboard velocity loop.
-
-    Attributes:
-        time_constant: Time constant per axis [s], shape (3,).
-        dead_time: Dead time per axis [s], shape (3,).
-        gain: Gain per axis [1], shape (3,).
-        acceleration_max: The guard's cap on the acceleration [m/s^2].
-    """
-
-    time_constant: Vector
-    dead_time: Vector
-    gain: Vector
-    acceleration_max: float
 
 
 class FirstOrder(Body):
     """The guard's acceleration limit, a dead time as a lag, and a first-order lag per axis."""
 
-    def __init__(self, loop: Loop) -> None:
-        """Begin at rest."""
-        self._loop = loop
+    def __init__(self, axes: Axes, acceleration_max: float) -> None:
+        """Begin at rest, with `acceleration_max` [m/s^2], the guard's cap."""
+        self._axes, self._acceleration_max = axes, acceleration_max
         self._reference = self._delayed = self.velocity = self.position = ZERO
 
     def advance(self, command: Vector, dt: float) -> None:
@@ -54,11 +40,11 @@ class FirstOrder(Body):
             self._step(command, dt / steps)
 
     def _step(self, command: Vector, dt: float) -> None:
-        before, loop = self._reference, self._loop
-        self._reference = approach(before, command, loop.acceleration_max * dt)
+        before = self._reference
+        self._reference = approach(before, command, self._acceleration_max * dt)
         axes = []
-        for a, b, late, v, p, constant, dead, gain in zip(
-            before, self._reference, self._delayed, self.velocity, self.position, *loop[:3],
+        for a, b, late, v, p, (constant, dead, gain) in zip(
+            before, self._reference, self._delayed, self.velocity, self.position, self._axes,
             strict=True,
         ):  # fmt: skip
             given = 0.5 * (a + b)
@@ -77,9 +63,9 @@ class CommandHistory(Replay):
     enough: the measured velocity differs from the replayed one by an error that decays.
     """
 
-    def __init__(self, loop: Loop) -> None:
-        """Set the model of the velocity loop."""
-        self._loop = loop
+    def __init__(self, axes: Axes, acceleration_max: float) -> None:
+        """Set the model of the velocity loop, and `acceleration_max` [m/s^2]."""
+        self._axes, self._loop = axes, (axes, acceleration_max)
         super().__init__()
 
     def reset(self) -> None:
@@ -97,12 +83,15 @@ class CommandHistory(Replay):
 
     def _at(self, time_ns: int) -> FirstOrder:
         """Return the replayed body at a time on cloud's clock [ns]."""
-        index = bisect_right(self.history.stamps, time_ns) - 1
-        if index < 0:
-            return FirstOrder(self._loop)
-        body, dt = copy(self._bodies[index]), (time_ns - self.history.stamps[index]) * 1e-9
-        if dt:
-            body.advance(self.history.commands[index].velocity, dt)
+        history = self.history
+        if not history.stamps:
+            return FirstOrder(*self._loop)
+        index = max(bisect_right(history.stamps, time_ns) - 1, 0)
+        body, since_ns = copy(self._bodies[index]), history.commands[index].planned_ns
+        end_ns = since_ns + time_ns - history.stamps[index]
+        for velocity, duration in history.followed(index + 1, since_ns, end_ns):
+            if duration > 0.0:
+                body.advance(velocity, duration)
         return body
 
     def roll(self, odometry: Odometry, horizon: float) -> FirstOrder:
@@ -110,9 +99,9 @@ class CommandHistory(Replay):
         start_ns = odometry.stamp_ns - self.history.shift_ns(odometry, horizon)
         start, body = self._at(start_ns), self._at(start_ns + round(horizon * 1e9))
         axes = []
-        for v, p, v0, p0, v1, p1, constant in zip(
+        for v, p, v0, p0, v1, p1, (constant, _, _) in zip(
             odometry.velocity, odometry.position, start.velocity, start.position,
-            body.velocity, body.position, self._loop.time_constant, strict=True,
+            body.velocity, body.position, self._axes, strict=True,
         ):  # fmt: skip
             decay = exp(-horizon / constant)
             axes.append((v1 + (v - v0) * decay, p + p1 - p0 + (v - v0) * constant * (1.0 - decay)))
@@ -146,6 +135,5 @@ def build(
         values = read_model(model, values)
     constants, deads, gains = (vector(name, value) for name, value in values.items())
     positive("time_constant", min(constants))
-    return CommandHistory(
-        Loop(constants, deads, gains, positive("acceleration_max", acceleration_max))
-    )
+    axes = tuple(zip(constants, deads, gains, strict=True))
+    return CommandHistory(axes, positive("acceleration_max", acceleration_max))

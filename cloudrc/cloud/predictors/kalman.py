@@ -8,12 +8,19 @@ Source: docs/reference/control.md, "Predictors", (f).
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from inspect import signature
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from cloudrc.cloud.parameters import positive
 from cloudrc.cloud.predictors import Model, Predictor, command_history, model_based
-from cloudrc.cloud.predictors._history import Body, Replay
-from cloudrc.messages import Command, Odometry, Vector
+from cloudrc.cloud.predictors._history import Replay
+from cloudrc.messages import Command, Odometry
+
+Array: TypeAlias = NDArray[np.float64]
 
 
 class Kalman(Predictor):
@@ -24,14 +31,14 @@ class Kalman(Predictor):
 
         These are of position [m], velocity [m/s] and the model's acceleration [m/s^2].
         """
-        self._replay = replay
-        self._noise = (position * position, velocity * velocity, model * model)
+        self._replay, self._error = replay, model * model
+        self._noise = np.diag([position * position, velocity * velocity])
         self.reset()
 
     def reset(self) -> None:
         """Forget the estimate, all commands and echoes."""
         self._estimate: Odometry | None = None
-        self._covariance = (0.0, 0.0, 0.0)
+        self._covariance = self._noise
         self._replay.reset()
 
     def commanded(self, command: Command) -> None:
@@ -47,40 +54,27 @@ class Kalman(Predictor):
         before, forecast = self._estimate, self._replay.forecast(odometry.stamp_ns)
         estimate = odometry
         if before is None or forecast is None:
-            self._covariance = (self._noise[0], 0.0, self._noise[1])
+            self._covariance = self._noise
         else:
             gains = self._update((odometry.stamp_ns - before.stamp_ns) * 1e-9)
-            position, velocity = _blend(forecast, odometry, gains)
-            estimate = odometry._replace(position=position, velocity=velocity)
+            model = np.array((forecast.position, forecast.velocity))
+            measured = np.array((odometry.position, odometry.velocity))
+            position, velocity = (model + gains @ (measured - model)).tolist()
+            estimate = odometry._replace(position=tuple(position), velocity=tuple(velocity))
         self._estimate = estimate
         self._replay.observe(estimate)
 
-    def _update(self, dt: float) -> tuple[float, float, float, float]:
-        """Advance the covariance by `dt` [s] and one sample; return the gains K, row by row.
+    def _update(self, dt: float) -> Array:
+        """Advance the covariance by `dt` [s] and one sample; return the gains K, shape (2, 2).
 
         With F = (1 dt; 0 1) and an acceleration error that is constant during `dt`:
             P = F P F' + q · (dt^2/2, dt)' (dt^2/2, dt);  K = P (P + R)^-1;  P = (1 - K) P.
         Source: R. E. Kalman, "A New Approach to Linear Filtering and Prediction Problems", 1960.
         """
-        r, s, q = self._noise
-        a, b, c = self._covariance
-        half = 0.5 * dt * dt
-        a += dt * (2.0 * b + dt * c) + q * half * half
-        b += dt * c + q * half * dt
-        c += q * dt * dt
-        scale = 1.0 / ((a + r) * (c + s) - b * b)
-        gains = (
-            (a * (c + s) - b * b) * scale,
-            b * r * scale,
-            b * s * scale,
-            (c * (a + r) - b * b) * scale,
-        )
-        aa, ab, ba, bb = gains
-        self._covariance = (
-            (1.0 - aa) * a - ab * b,
-            (1.0 - aa) * b - ab * c,
-            (1.0 - bb) * c - ba * b,
-        )
+        ahead, push = np.array(((1.0, dt), (0.0, 1.0))), np.array((0.5 * dt * dt, dt))
+        covariance = ahead @ self._covariance @ ahead.T + self._error * np.outer(push, push)
+        gains: Array = covariance @ np.linalg.inv(covariance + self._noise)
+        self._covariance = covariance - gains @ covariance
         return gains
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
@@ -99,24 +93,10 @@ class Kalman(Predictor):
         return self._replay.model()
 
 
-def _blend(
-    forecast: Body, measured: Odometry, gains: tuple[float, float, float, float]
-) -> tuple[Vector, Vector]:
-    """Correct a forecast by gains times the difference of measured position and velocity."""
-    aa, ab, ba, bb = gains
-    axes = []
-    for p, v, measured_p, measured_v in zip(
-        forecast.position, forecast.velocity, measured.position, measured.velocity, strict=True
-    ):
-        far, fast = measured_p - p, measured_v - v
-        axes.append((p + aa * far + ab * fast, v + ba * far + bb * fast))
-    position, velocity = zip(*axes, strict=True)
-    return position, velocity
-
-
 def build(
     model: Literal["white_box", "first_order"] = "white_box",
     parameters: dict[str, Any] | None = None,
+    model_file: Path | None = None,
     position_noise: float = 0.005,
     velocity_noise: float = 0.02,
     acceleration_error: float = 0.5,
@@ -126,6 +106,7 @@ def build(
     Args:
         model: `white_box`, as in `model_based`, or `first_order`, as in `command_history`.
         parameters: Parameters of that predictor; None: its defaults.
+        model_file: File from `cloudrc identify`, for `first_order`.
         position_noise: Standard deviation of the measured position per axis [m].
         velocity_noise: Standard deviation of the measured velocity per axis [m/s].
         acceleration_error: Standard deviation of the model's acceleration [m/s^2]. A larger value
@@ -135,10 +116,14 @@ def build(
         ValueError: If a standard deviation is not above 0, or the predictor refuses a parameter.
     """
     build_replay: Any = model_based.build if model == "white_box" else command_history.build
-    try:
-        replay = build_replay(**(parameters or {}))
-    except TypeError as error:
-        raise ValueError(f"parameters: {error}; see 'cloudrc list predictors'") from error
+    given, names = dict(parameters or {}), [*signature(build_replay).parameters]
+    if model_file is not None and model == "white_box":
+        raise ValueError("model_file: is for model: first_order; set that, or leave it out")
+    if "model" in given:  # the experiment file makes a relative model_file absolute
+        raise ValueError("parameters: give the file of a model as model_file, beside parameters")
+    if unknown := sorted(given.keys() - names):
+        raise ValueError(f"parameters: no {unknown[0]!r}; available: {', '.join(names)}")
+    replay = build_replay(**given, **({} if model_file is None else {"model": model_file}))
     return Kalman(
         replay,
         positive("position_noise", position_noise),

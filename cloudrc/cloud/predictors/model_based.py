@@ -195,12 +195,15 @@ class ModelBased(Replay):
         body = copy(self._body)
         if body is None or not 0 < stamp_ns - body.basis.stamp_ns < GAP_NS:
             return None
+        if self.history.is_silent(stamp_ns):  # the guard holds the robot
+            return None
         for velocity, duration in self.history.past(body.basis.stamp_ns, stamp_ns):
             body.advance(velocity, duration)
         return body
 
     def observe(self, odometry: Odometry) -> None:
         """Correct the model with a new sample."""
+        super().observe(odometry)
         self._body = self.forecast(odometry.stamp_ns) or WhiteBox(*self._loop, odometry)
         self._body.correct(odometry)
 
