@@ -111,10 +111,11 @@ def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
 
     A row has the centre (3,) and the axes (9,) of the box, its half sizes (3,), and the radius of
     the edges, all [m]. The radius of the robot is that of a ball around its base's origin; it is
-    infinite if geoms matter without a contact, too.
+    infinite if geoms or constraints matter without a contact, too.
     """
     option, rows, radius = model.opt, [], 0.0
-    if option.density or option.viscosity or model.nflex or model.npair:
+    other = option.density, option.viscosity, model.nflex, model.npair, model.neq, model.ntendon
+    if any(other) or model.dof_frictionloss.any():
         radius = inf
     for geom in range(model.ngeom):
         size, bound = model.geom_size[geom], model.geom_rbound[geom]

@@ -18,7 +18,7 @@ from cloudrc.world.native import robot as native
 from cloudrc.world.native.library import SWITCH, Library, library
 from cloudrc.world.native.robot import NativeRobot, make_robot, usable
 from cloudrc.world.robot import Robot
-from cloudrc.world.scene import mujoco
+from cloudrc.world.scene import FOLDER, mujoco
 from cloudrc.world.simulator import Simulator
 from tests.flights.conftest import digest
 from tests.world.guard.conftest import MS, SECOND, UP, hostile
@@ -28,8 +28,8 @@ LIMITS = Limits(fence.LOW, fence.HIGH)
 PERIOD_NS = 10 * MS
 
 
-def robot_of(kind, scene="empty", limits=LIMITS):
-    parts = Simulator("pelican", scene), LowLevel(), Guard(limits)
+def robot_of(kind, scene="empty", limits=LIMITS, model="pelican"):
+    parts = Simulator(model, scene), LowLevel(), Guard(limits)
     return NativeRobot(*parts, limits) if kind is NativeRobot else Robot(*parts)
 
 
@@ -181,6 +181,19 @@ def test_where_c_looks_for_no_contact_there_is_none():
         free += is_free
         assert not (is_free and data.ncon)
     assert 300 < free < 2900
+
+
+def test_a_tether_holds_the_robot_in_c_too(tmp_path):
+    """It is a constraint, but no contact."""
+    text = (FOLDER / "robots" / "pelican.xml").read_text()
+    rope = '<tendon><spatial limited="true" range="0 1"><site site="post"/><site site="tip"/>'
+    text = text.replace("<worldbody>", '<worldbody><site name="post" pos="0 0 0"/>')
+    path = tmp_path / "tethered.xml"
+    path.write_text(text.replace("<actuator>", f"{rope}</spatial></tendon><actuator>"))
+    robots = [robot_of(kind, model=str(path)) for kind in (Robot, NativeRobot)]
+    pilots = [Pilot(robot).fly(2.0, lambda pilot: UP) for robot in robots]
+    assert pilots[0].seen == pilots[1].seen
+    assert pilots[1].robot.simulator.readings.position[2] < 1.1
 
 
 @pytest.mark.parametrize("setting", [{"density": 1.2}, {"viscosity": 1e-5}])
