@@ -86,7 +86,8 @@ class Guard:
         yaw_rate: Limited yaw rate [rad/s]; the published low-level controller ignores it.
         changes: Changes of the state since the last `take_changes`.
         counts: How often a limit was applied. "limited_speed" and "limited_yaw_rate" are numbers of
-            changed commands; "limited_fence" is the number of steps with a changed reference.
+            changed commands, and of changed velocities in a plan that were flown; "limited_fence"
+            is the number of steps with a changed reference.
     """
 
     def __init__(self, limits: Limits) -> None:
