@@ -26,7 +26,7 @@ ACCELERATION_MAX = 400.0
 """Limit of the robot's acceleration in the air [m/s^2]. Full thrust gives a robot that is 10 %
 lighter 153 m/s^2, and a spin of 50 rad/s about a centre of mass 3 cm away gives 75 m/s^2."""
 MARGIN = 1e-3
-"""Distance that is added to every geom and its own margin [m]; it covers rounding errors."""
+"""Distance that is added to every geom and its own margin and gap [m]; it covers rounding errors."""
 HUGE = 1e4
 """Half the edge of the box that stands for the space below a plane [m]."""
 _DISABLE = mujoco.mjtDisableBit
@@ -120,7 +120,8 @@ def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
     for geom in range(model.ngeom):
         size, bound = model.geom_size[geom], model.geom_rbound[geom]
         place, axes = data.geom_xpos[geom], data.geom_xmat[geom]
-        margin = MARGIN + max(model.geom_margin[geom], option.o_margin)
+        margin = model.geom_margin[geom] + model.geom_gap[geom]
+        margin = MARGIN + max(margin, option.o_margin)
         if model.geom_bodyid[geom]:  # a geom of the robot; those of the scene are fused to body 0
             radius = max(radius, dist(place, data.qpos[:3]) + bound + margin)
         elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:

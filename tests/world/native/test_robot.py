@@ -169,10 +169,13 @@ def nearest(robot, position):
     return (np.sqrt((beyond**2).sum(1)) - rows[:, 15]).min() - robot._flight.robot_radius
 
 
-def test_where_c_looks_for_no_contact_there_is_none():
-    robot = robot_of(NativeRobot, "pipes")
-    model, data = robot.simulator.model, robot.simulator.data
+@pytest.mark.parametrize("kind", ["margin", "gap"])
+def test_where_c_looks_for_no_contact_there_is_none(kind):
+    parts = Simulator("pelican", "pipes"), LowLevel(), Guard(LIMITS)
+    model, data = parts[0].model, parts[0].data
     rng, free = np.random.default_rng(1), 0
+    getattr(model, f"geom_{kind}")[:] = rng.choice([0.0, 0.1], model.ngeom)
+    robot = NativeRobot(*parts, LIMITS)
     for _ in range(3000):
         data.qpos[:3] = rng.uniform((-2.0, -7.0, 0.3), (9.0, 3.0, 1.6))
         data.qpos[3:] = rng.normal(size=4)
