@@ -84,7 +84,8 @@ def test_a_plan_is_fresh_while_it_lasts(steps, planned_ms, arrival_ms, plan_max_
     assert guard.state is TRACK
     run(guard, until_ms * MS + TICK, until_ms * MS + 2 * TICK)
     age = f"{(until_ms + 2) / 1000:.3f}"
-    assert told(guard) == (until_ms * MS + TICK, HOLD, f"command age {age} s above 0.250 s")
+    text = f"command age {age} s above 0.250 s, and its plan has ended"
+    assert told(guard) == (until_ms * MS + TICK, HOLD, text)
     assert guard.cause is Cause.SILENCE
     assert guard.accept_command(plan, until_ms * MS + 2 * TICK) == "stale"
 
