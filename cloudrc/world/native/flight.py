@@ -26,7 +26,7 @@ ACCELERATION_MAX = 400.0
 """Limit of the robot's acceleration in the air [m/s^2]. Full thrust gives a robot that is 10 %
 lighter 153 m/s^2, and a spin of 50 rad/s about a centre of mass 3 cm away gives 75 m/s^2."""
 MARGIN = 1e-3
-"""Distance that is added to every geom and its own margin and gap [m]; it covers rounding errors."""
+"""Distance added to every geom with its own margin and gap [m]; it covers rounding errors."""
 HUGE = 1e4
 """Half the edge of the box that stands for the space below a plane [m]."""
 _DISABLE = mujoco.mjtDisableBit
