@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import NEVER_NS
 from cloudrc.world import low_level, rotors
 from cloudrc.world.guard import limits as rules
@@ -39,7 +38,7 @@ _CONSTANTS = {
     low_level: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
     "thrust_max tiny nose_cosine_min yaw_sine_max",
     state: "overturned_cosine",
-    rules: "sink_lead_max fence_reaction reaction stop_coefficient recheck_distance far low_speed",
+    rules: "sink_lead_max fence_reaction reaction stop_coefficient recheck_distance",
 }
 """Modules and their constants that `step.c` needs, in the order of its fields."""
 _VALUES = {
@@ -52,7 +51,7 @@ _FIELDS: dict[str, Any] = {
     **dict.fromkeys(_POINTERS, ctypes.c_void_p),
     **dict.fromkeys([*_VALUES, "up", "down"], _double),
     **{"gains": _double * 9, "limit_xy": _double, "limit_z": _double, "dt": _double},
-    **{"change_max": _double, "low_z": _double, "low": _double * 3, "high": _double * 3},
+    **{"change_max": _double, "low": _double * 3, "high": _double * 3},
     **dict.fromkeys(("time_step", "robot_radius", "acceleration_max"), _double),
     **dict.fromkeys(("recheck_ns", "never_ns", "step_ns"), _int64),
     **dict.fromkeys(("check_steps", "obstacle_count", "unused"), _int64),
@@ -98,7 +97,6 @@ def make_flight(
         *_VALUES.values(),
         *(turning.up, turning.down, controller.gains, limit_xy, limit_z, dt),
         limits.acceleration_max * (step_ns * 1e-9),
-        low[2] - FLOOR_MARGIN + rules.LOW_HEIGHT,
         *(low, high, simulator.dt, radius, ACCELERATION_MAX, rules.RECHECK_NS, NEVER_NS, step_ns),
         *(CONTACT_CHECK_STEPS, len(obstacles), UNUSED_WITHOUT_CONTACTS),
     )

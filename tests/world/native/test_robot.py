@@ -11,6 +11,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.geometry import fence
 from cloudrc.messages import Command, GuardState
 from cloudrc.tunnel.end import Identity
+from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.limits import Limits
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
@@ -96,7 +97,8 @@ def test_hostile_commands_fly_the_same_in_c(seed, scale, least):
 @pytest.mark.parametrize("seed", range(3))
 def test_plans_fly_the_same_in_c(seed):
     """Commands every 10 ms or much later; a plan's velocities are due at odd times."""
-    robots = both()
+    limits = Limits(fence.LOW, fence.HIGH, speed_max=4.0, plan_max_ns=800 * MS)
+    robots = both(limits=limits)
     count, flights = Count(robots[1]), []
     for robot in robots:
         rng, seen = np.random.default_rng(seed), []
@@ -106,7 +108,7 @@ def test_plans_fly_the_same_in_c(seed):
             velocity = UP if now_ns < SECOND else tuple(rng.uniform(-0.8, 0.8, 3).tolist())
             plan = tuple(map(tuple, rng.uniform(-0.8, 0.8, (int(rng.integers(0, 40)), 3)).tolist()))
             ahead_ns = int(rng.integers(0, 60 * MS))
-            if now_ns < 2 * SECOND or rng.random() < 0.05:
+            if now_ns < 3 * SECOND or rng.random() < 0.05:
                 command = Command(0, now_ns, 0, velocity, 0.0, plan, now_ns + ahead_ns)
                 robot.guard.accept_command(command, now_ns)
             robot.run(now_ns, now_ns + PERIOD_NS)
@@ -114,6 +116,23 @@ def test_plans_fly_the_same_in_c(seed):
         flights.append(seen)
     assert flights[0] == flights[1]
     assert count.steps > 1000
+
+
+def test_a_micrometre_of_room_means_that_no_fence_limits(monkeypatch):
+    """`ROOM` in `step.c`: velocities with which the robot can just stop that far from a face."""
+    rng, found, (low, high) = np.random.default_rng(1), 0, LIMITS.inner_corners()
+    monkeypatch.setattr(rules, "RECHECK_DISTANCE", 1e-6)
+    for _ in range(20_000):
+        velocity, place = rng.uniform(-6.0, 6.0, 3).tolist(), rng.uniform(low, high).tolist()
+        axis = int(rng.integers(3))
+        up, speed = velocity[axis] > 0.0, abs(velocity[axis])
+        reaction = rules.FENCE_REACTION if up or axis < 2 else rules.REACTION
+        way = rules.stopping_distance(speed, reaction) + 1e-6
+        place[axis] = high[axis] - way if up else low[axis] + way
+        if rules.is_far_from_fence(velocity, place, low, high):
+            found += 1
+            assert rules.limit_to_fence(velocity, place, low, high) == tuple(velocity)
+    assert found > 1000
 
 
 def silence(pilot):
