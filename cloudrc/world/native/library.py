@@ -115,7 +115,7 @@ def _refuse_shared(*paths: Path) -> None:
     for path in paths:
         status = path.stat()
         if status.st_uid != os.geteuid() or status.st_mode & 0o022:
-            raise PermissionError(f"other users may write to {path}")
+            raise PermissionError(f"set XDG_CACHE_HOME, other users may write to {path}")
 
 
 def _open(file: Path, origin: str) -> Library:
