@@ -133,6 +133,19 @@ def test_played_velocities_are_capped_and_forgotten_with_the_session():
     assert guard.state is HOLD
 
 
+@pytest.mark.parametrize("ends", ["end_mission", "stop", "put_on_ground"])
+def test_no_plan_outlives_its_mission(ends):
+    guard = following(planned([0.1] * 60))
+    run(guard, 0, 50 * MS)
+    cause = ("test",) if ends == "put_on_ground" else ()
+    getattr(guard, ends)(50 * MS, *cause)
+    guard.acknowledge(50 * MS)
+    guard.start_mission(50 * MS)
+    run(guard, 50 * MS, 500 * MS)
+    assert guard.state is (HOLD if ends == "end_mission" else GuardState.GROUND)
+    assert guard.reference == (0.0, 0.0, 0.0)
+
+
 def test_a_plan_does_not_shorten_the_settling_time():
     """Ten commands with plans of 0.8 s end a HOLD no sooner than ten without a plan."""
     guard = following(planned([0.1]))
