@@ -108,7 +108,7 @@ def build_world(
         plan_max_ns=round(guard.plan_max_s * 1e9),
     )
     air, wind = world.wind, None
-    if any(air.velocity_mps) or air.gust_mps:
+    if air.blows:
         wind = Wind(air.velocity_mps, air.gust_mps, air.gust_time_s, _generator(seed, "wind"))
     simulator = Simulator(world.robot, world.scene, world.plant, wind)
     low_level = LowLevel(**world.low_level.model_dump())

@@ -59,11 +59,11 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection
     from cloudrc.messages import PLAN_STEP_NS
-    from cloudrc.tunnel.codec import PLAN_SIZES, SIZES, Kind
+    from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
 
     plan = round(experiment.cloud.plan_s * 1e9) // PLAN_STEP_NS
     newest_wins = experiment.tunnel.order == "newest" or plan > 0
-    sizes = {**SIZES, Kind.COMMAND: SIZES[Kind.COMMAND] + PLAN_SIZES[plan]}
+    sizes = {**SIZES, Kind.COMMAND: COMMAND_SIZES[plan]}
     links = [
         LinkDirection(
             link_profile(way.model_copy(update={"blackouts": ()})), experiment.seed, uplink=uplink

@@ -365,7 +365,8 @@ def link_monitor(
     from cloudrc.link.traces import SIZE_MAX
     from cloudrc.link.verify.judge import Flow
     from cloudrc.link.verify.monitor import LinkMonitor
-    from cloudrc.tunnel.codec import SIZES, Kind
+    from cloudrc.messages import PLAN_STEP_NS
+    from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
 
     def load(values: object) -> tuple[DirectionProfile, DirectionProfile]:
         profile = Profile.model_validate_json(json.dumps(values))
@@ -375,7 +376,9 @@ def link_monitor(
     file_max = TRACE_MAX if options.link is None else SIZE_MAX
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
     rate = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz
-    flow = Flow(experiment.seed, uplink, kind, SIZES[kind])
+    plan = round(experiment.cloud.plan_s * 1e9) // PLAN_STEP_NS
+    size = SIZES[kind] if uplink else COMMAND_SIZES[plan]
+    flow = Flow(experiment.seed, uplink, kind, size)
     computes = experiment.cloud.compute_ms > 0
     check = LinkMonitor(uplink=uplink, flow=flow, period=1.0 / rate, computes=computes)
     requested = link_profile(experiment.uplink), link_profile(experiment.downlink)

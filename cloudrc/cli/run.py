@@ -44,6 +44,8 @@ Flight = Callable[[Path], dict[str, Any]]
 See = Callable[["list[Record]"], None]
 """Function that displays records during the flight."""
 
+NO_C = "Python (wind, or a robot that differs from its model)"
+"""Where the usual steps run if C cannot run them."""
 EPILOG = """\
 modes:
   local    real time: four processes, UDP on 127.0.0.1
@@ -262,6 +264,12 @@ def fly(
         raise CloudrcError(f"{where}: {error.strerror or error}; choose another folder") from error
 
 
+def _is_nominal(experiment: ResolvedExperiment) -> bool:
+    from cloudrc.config.schema import Plant
+
+    return experiment.world.plant == Plant() and not experiment.world.wind.blows
+
+
 @contextlib.contextmanager
 def _record_virtual(
     experiment: ResolvedExperiment, folder: Path, see: See
@@ -297,7 +305,8 @@ def _record_virtual(
         except KeyboardInterrupt:
             interrupted = True
         try:
-            notes, steps = assembly.virtual_notes(experiment), usable().text
+            notes = assembly.virtual_notes(experiment)
+            steps = usable().text if _is_nominal(experiment) else NO_C
             found = store.hexdigest(), interrupted, notes
             run = Run("virtual", "virtual", *found, physics_steps=steps)
             yield store.recording(), run
@@ -349,7 +358,7 @@ def _record_local(
     notes = (*local.notes, *([str(broken)] if broken else ()))
     digest = messages_sha256(mission.messages)
     try:
-        facts = digest, interrupted, notes, library().text
+        facts = digest, interrupted, notes, library().text if _is_nominal(experiment) else NO_C
         yield mission.recording(), Run("local", "relay", *facts)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))

@@ -357,6 +357,11 @@ class Wind(Section):
     gust_time_s: Annotated[float, Field(ge=0.01, le=100)] = 1.0
     """Time constant of the gusts: their correlation falls to 37 % after this time [s]"""
 
+    @property
+    def blows(self) -> bool:
+        """Whether there is any wind."""
+        return any(self.velocity_mps) or self.gust_mps > 0.0
+
 
 class World(Section):
     """The robot and its scene."""

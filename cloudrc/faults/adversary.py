@@ -312,28 +312,37 @@ def _stop_and_go(rng: Generator) -> Lie:
 
 
 def _hostile_plans(rng: Generator) -> Lie:
-    """Send plans of random lengths for wrong times, with jumps and now and then NaN.
+    """Send plans of random lengths, for now or much later, with jumps and now and then NaN.
 
-    Some clouds alternate plans with plain commands, and some state a wrong odometry stamp.
+    Some clouds alternate plans with plain commands. Others pause, by stale commands, so that the
+    robot flies a plan to its end.
     """
-    shift, share = float(rng.choice([0.0, 0.1, 1.0, 20.0])), float(rng.choice([0.0, 0.5, 1.0]))
-    absurd, old_ns = float(rng.choice([0.0, 0.003])), int(rng.choice([0, 150_000_000]))
-    jumps, fly = int(rng.choice([1, 5, 80])), _operators_voice(rng)
+    ahead, share = float(rng.choice([0.05, 0.5, 9.9])), float(rng.choice([0.0, 0.5]))
+    absurd, old_ns = float(rng.choice([0.0, 0.003])), int(rng.choice([0, 150_000_000, 300_000_000]))
+    jumps, spread = int(rng.choice([1, 5, 80])), float(rng.choice([0.0, FAST, 2.0 * FAST]))
+    period_ns, fly = int(rng.uniform(0.3e9, 4e9)), _operators_voice(rng)
 
     def lie(command: Command, control: Control) -> Command:
         command = fly(command, control)
+        pauses = control.stamp_ns % period_ns < period_ns // 2
+        basis_ns = command.basis_stamp_ns - old_ns * pauses
+        command = command._replace(basis_stamp_ns=basis_ns)
         if rng.random() < share:
             return command
-        basis_ns = command.basis_stamp_ns - old_ns * (rng.random() < 0.5)
-        planned_ns = basis_ns + int(rng.normal(0.05, shift) * 1e9)
-        corners = rng.uniform(-2.0 * FAST, 2.0 * FAST, (80 // jumps + 1, 3)).tolist()
-        plan = [tuple(corners[n // jumps]) for n in range(int(rng.integers(1, 81)))]
+        planned_ns = basis_ns + int(rng.uniform(0.0, ahead) * 1e9)
+        corners = command.velocity + rng.uniform(-spread, spread, (80 // jumps + 1, 3))
+        plan = list(map(tuple, corners.repeat(jumps, axis=0)[: int(rng.integers(1, 81))].tolist()))
         if rng.random() < absurd:
             plan[-1] = tuple(rng.choice((nan, inf, -inf, 1e30, 1e3, -1e3), 3).tolist())
-        command = command._replace(basis_stamp_ns=basis_ns, planned_ns=planned_ns)
-        return command._replace(plan=tuple(plan))
+            planned_ns = int(rng.choice([planned_ns, basis_ns - 1, -(2**62), 2**62]))
+        return command._replace(plan=tuple(plan), planned_ns=planned_ns)
 
     return lie
+
+
+def _plans_and_requests(rng: Generator) -> Lie:
+    """Send hostile plans, while `at_bad_moments` makes requests."""
+    return _hostile_plans(rng)
 
 
 def _operators_voice(rng: Generator) -> Lie:
@@ -353,12 +362,12 @@ def _refused_and_released(rng: Generator) -> Lie:
 
 
 FASTEST: tuple[Policy, ...] = (_towards_a_face, _face_after_face, _greedy, _on_the_limit, _random)
-SPEAKING = ("operators-voice", "refused-and-released")
+SPEAKING = ("operators-voice", "plans-and-requests", "refused-and-released")
 POLICIES: dict[str, Policy] = {
     policy.__name__[1:].replace("_", "-"): policy
     for policy in (
-        *(*FASTEST, _false_basis, _hostile_plans, _operators_voice, _refused_and_released),
-        *(_shaking, _stop_and_go, _strange_numbers),
+        *(*FASTEST, _false_basis, _hostile_plans, _operators_voice, _plans_and_requests),
+        *(_refused_and_released, _shaking, _stop_and_go, _strange_numbers),
     )
 }
 """Name, such as towards-a-face -> policy."""

@@ -6,9 +6,9 @@ fence      The base stays inside the fence while the rotors turn. After a collis
 cap, stop  The reference velocity stays within its limits, and the robot can always stop before the
            fence. During LAND the robot may fly down to the floor. After a HOLD the reference
            velocity grows slowly at first.
-stale      World rejects a command that is based on too old odometry. TRACK ends before the odometry
-           of the last command is too old, or when its plan ends. HOLD changes to TRACK only after
-           `RESUME_COMMANDS` fresh commands within `RESUME_NS`.
+stale      World rejects a command that is based on too old odometry. TRACK ends with the session,
+           or when the odometry of the last command is too old and its plan has ended. HOLD changes
+           to TRACK only after `RESUME_COMMANDS` fresh commands within `RESUME_NS`.
 rest       After TRACK the robot stops within its stopping distance. The rotors stop only on a
            request, after a collision, or if the robot does not move.
 collision  If the cloud is honest, only the arm's tip touches something, and it touches only the
@@ -139,8 +139,7 @@ class RobotInvariants:
         self._was = self._state = robot.guard.state  # after the last step; after the last event
         self._next_ns, self._steps = start_ns, 0
         self._before = ZERO  # the last reference [m/s]
-        self._newest_ns = -1  # newest odometry stamp of accepted commands [ns]
-        self._plan_end_ns = -1  # latest end of accepted plans [ns]
+        self._fresh_until_ns = -1  # when the last accepted command gets too old [ns]
         # Motion after a stop or a collision, and after TRACK.
         self._comes_down = False  # whether it lands, or fell after an emergency stop
         self._falls = False  # after a stop or a collision, until it flies again
@@ -186,9 +185,9 @@ class RobotInvariants:
             if reference is not self._before:
                 self._check_caps(reference, state is TRACK, now_ns)
             if state is TRACK:
-                age_ns = now_ns - self._newest_ns
-                if age_ns > self._limits.age_ns and now_ns > self._plan_end_ns:
-                    self._note(now_ns, "stale", f"TRACK on a command {age_ns * 1e-9:.3f} s old")
+                late = (now_ns - self._fresh_until_ns) * 1e-9
+                if late > 0.0:
+                    self._note(now_ns, "stale", f"TRACK, {late:.3f} s after the last fresh command")
             elif any(rotor_speeds):
                 self._check_rest(position, now_ns)
         elif any(rotor_speeds):
@@ -205,11 +204,11 @@ class RobotInvariants:
             if not 0 <= now_ns - basis_ns <= self._limits.age_ns:
                 age = (now_ns - basis_ns) * 1e-9
                 self._note(now_ns, "stale", f"accepted a command {age:.3f} s old")
-            self._newest_ns = max(self._newest_ns, basis_ns)
+            self._fresh_until_ns = basis_ns + self._limits.age_ns
             if command.plan:
                 end_ns = command.planned_ns + (len(command.plan) + 1) * PLAN_STEP_NS
                 end_ns = min(end_ns, now_ns + self._limits.plan_ns)
-                self._plan_end_ns = max(self._plan_end_ns, end_ns)
+                self._fresh_until_ns = max(self._fresh_until_ns, end_ns)
             if self._armed:
                 self._goes_back = basis_ns < self._basis_ns
                 self._basis_ns = max(self._basis_ns, basis_ns)
@@ -248,6 +247,7 @@ class RobotInvariants:
 
     def see_session(self, now_ns: int) -> None:
         """Implement `Observer.see_session`: forget the commands of the old session."""
+        self._fresh_until_ns = -1
         self._fresh_ns.clear()
         self._invalid_ns.clear()
 

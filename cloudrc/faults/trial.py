@@ -129,7 +129,7 @@ def _prepare(schedule: Schedule, settings: tuple[str, ...], keep: bool) -> Fligh
         lies.append(lie)
     if schedule.of(*BUGS):
         lies.append(_bugs(schedule, clock))
-    plans = ["guard.plan_max_s=0.8"] if schedule.policy == "hostile-plans" else []
+    plans = ["guard.plan_max_s=0.8"] if "plans" in schedule.policy else []
     return Flight(
         *plans,
         f"link.profile={schedule.profile}",

@@ -2,8 +2,8 @@
 
 A datagram has a 16-byte header (version, direction, epoch, kind, counter), a body with a fixed
 length for each kind, and a 16-byte authentication tag, which `session` adds and verifies. Only a
-command may be longer, by a plan. The epoch
-is the number of the session. The functions raise no exception except DecodeError.
+command may be longer, by a plan. The epoch is the number of the session. The functions raise no
+exception except DecodeError.
 
 The header is authenticated but not encrypted, because the link reads it. Its last 12 bytes are the
 nonce of the cipher: no two datagrams of one direction and epoch have the same kind and counter.
@@ -123,9 +123,11 @@ SIZES = {int(kind): HEADER_SIZE + size + TAG_SIZE for kind, size in BODY_SIZES.i
 _GUARD_STATES, _CAUSES = tuple(GuardState), tuple(Cause)
 _new = tuple.__new__  # makes a named tuple four times as fast as its class does
 _PLANNED, _VELOCITY = struct.Struct("<q"), struct.Struct("<3f")
-PLAN_SIZES = (0, *(_PLANNED.size + n * _VELOCITY.size for n in range(1, PLAN_MAX + 1)))
-"""Number of velocities in a plan -> what the plan adds to the size of a command [bytes]."""
-_COMMAND_SIZES = {SIZES[Kind.COMMAND] + size for size in PLAN_SIZES}
+COMMAND_SIZES = tuple(
+    SIZES[Kind.COMMAND] + (_PLANNED.size + n * _VELOCITY.size if n else 0)
+    for n in range(PLAN_MAX + 1)
+)
+"""Number of velocities in a command's plan -> size of the datagram [bytes]."""
 _size_of = SIZES.get
 _unpack_header: Callable[[bytes], Header] = _HEADER.unpack_from
 
@@ -148,7 +150,7 @@ def check(data: bytes) -> Header:
         raise DecodeError("version")
     if header[1] > 1:
         raise DecodeError("malformed")
-    if _size_of(header[3]) != size and (header[3] != Kind.COMMAND or size not in _COMMAND_SIZES):
+    if _size_of(header[3]) != size and (header[3] != Kind.COMMAND or size not in COMMAND_SIZES):
         raise DecodeError("malformed")
     return header
 

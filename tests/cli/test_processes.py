@@ -181,6 +181,16 @@ def test_a_restart_keeps_the_recording_of_a_crash(tmp_path):
     assert len(list(tmp_path.iterdir())) == 2
 
 
+@pytest.mark.parametrize(("plan_s", "size"), [(0.0, 88), (0.4, 576)])
+def test_the_link_is_expected_to_carry_the_plans(plan_s, size, monkeypatch, tmp_path):
+    monitor = Mock()
+    monkeypatch.setattr("cloudrc.link.verify.monitor.LinkMonitor", monitor)
+    options = argparse.Namespace(link=None, route=tmp_path / "route")
+    experiment = load_experiment("fast", [f"cloud.plan_s={plan_s}"])
+    processes.link_monitor(options, experiment, uplink=False)
+    assert monitor.call_args.kwargs["flow"].size == size
+
+
 def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch):
     loads, path = [], tmp_path / "trace.csv"
     monkeypatch.setattr(LinkMonitor, "begin", lambda self, asked, path, load: loads.append(load))

@@ -60,6 +60,16 @@ def test_the_last_line_is_the_report_and_the_folder_is_complete(folder, capsys):
 
 
 @pytest.mark.usefixtures("no_page")
+@pytest.mark.parametrize(
+    "key", ["wind.velocity_mps=[1,0]", "wind.gust_mps=1", "plant.mass_factor=1.1"]
+)
+def test_a_run_that_c_cannot_fly_says_so(key, folder):
+    main([*FLY, f"--set=world.{key}", "--out", "a"])
+    steps = json.loads((folder / "a/environment.json").read_text())["physics_steps"]
+    assert steps == "Python (wind, or a robot that differs from its model)"
+
+
+@pytest.mark.usefixtures("no_page")
 def test_a_run_and_its_report_can_be_repeated(folder, capsys):
     assert main([*FLY, "--seed", "3", "--out", "a", "-o", "json"]) == 0
     written = (folder / "a/report.json").read_text()

@@ -22,7 +22,7 @@ class FakeRobot:
         self.observers = []
         self.position, self.velocity = (1.0, 1.0, 1.0), ZERO
         self.now_ns = 0
-        self.watch = Watch(Limits(hold_ns=hold_ms * MS))
+        self.watch = Watch(Limits(hold_ns=hold_ms * MS, plan_ns=800 * MS))
         self.watch.attach(self, 0, honest=honest)
         (self.observer,) = self.observers
         self.request(Request.START)
@@ -34,11 +34,11 @@ class FakeRobot:
                 self.simulator.steps = 0
             self.observer.see_request(OperatorRequest(1, request, start), self.now_ns)
 
-    def offer(self, count=1, rejection=None, basis_ms=None):
-        """Let commands come now; without `basis_ms` they are fresh."""
+    def offer(self, count=1, rejection=None, basis_ms=None, plan=0):
+        """Let commands come now; without `basis_ms` they are fresh. `plan` is its length."""
         basis_ns = self.now_ns if basis_ms is None else round(basis_ms * MS)
         for _ in range(count):
-            command = Command(0, basis_ns, 0, ZERO, 0.0)
+            command = Command(0, basis_ns, 0, ZERO, 0.0, (ZERO,) * plan, basis_ns)
             self.observer.see_command(command, rejection, self.now_ns)
 
     def touch(self, body, *, tip=False):

@@ -19,6 +19,7 @@ IMPOSSIBLE = offer(5, "range")
 STOP, END = request(Request.ESTOP), request(Request.END)
 SPAWN = request(Request.START, start=Start.SPAWN)
 RELEASE = (request(Request.ACKNOWLEDGE, Request.START), offer(10))
+SESSION = lambda robot: robot.observer.see_session(robot.now_ns)  # noqa: E731
 STEPPED = lambda robot: setattr(robot.simulator, "steps", robot.simulator.steps + 1)  # noqa: E731
 
 
@@ -78,6 +79,12 @@ MOTION = [
     ({"stale"}, (offer(), step(TRACK, ms=254, fresh=False))),
     ({"stale"}, (offer(basis_ms=-251),)),
     ({"stale"}, (offer(basis_ms=1),)),
+    # A plan is fresh until it ends, for 0.8 s at most, and until the next command or session.
+    *((kinds, (offer(plan=plan), *others, step(TRACK, ms=ms, fresh=False)))
+      for plan, others, ms, kinds in (
+          (40, (), 412, set()), (40, (), 414, {"stale"}), (80, (), 804, {"stale"}),
+          (40, (offer(),), 254, {"stale"}), (40, (SESSION,), 2, {"stale"}),
+      )),
     ({"tick"}, (step(TRACK), STEPPED, step(TRACK))),
     (set(), (step(GROUND), SPAWN, step(GROUND))),
     # Without commands it stops within its stopping distance.
@@ -126,7 +133,7 @@ OPERATOR = [
     # A HOLD ends after ten fresh commands in half a second, of one session and mission.
     (set(), resumes(10, 55)),
     *(({"stale"}, resumes(*each)) for each in ((10, 56), (9, 10))),
-    ({"stale"}, (*NINE, lambda robot: robot.observer.see_session(0), offer(), step(TRACK))),
+    ({"stale"}, (*NINE, SESSION, offer(), step(TRACK))),
     ({"stale"}, (*NINE, offer(9, "stale"), step(TRACK, fresh=False), offer())),
     # TRACK and HOLD for silence begin a second apart, unless commands go back.
     ({"hold"}, (step(GROUND), step(TRACK, ms=100), step(HOLD, ms=898), offer(10), step(TRACK))),

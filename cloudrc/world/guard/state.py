@@ -86,7 +86,8 @@ class Guard:
         yaw_rate: Limited yaw rate [rad/s]; the published low-level controller ignores it.
         changes: Changes of the state since the last `take_changes`.
         counts: How often a limit was applied. "limited_speed" and "limited_yaw_rate" are numbers of
-            changed commands; "limited_fence" is the number of steps with a changed reference.
+            changed commands, and of changed velocities in a plan that were flown; "limited_fence"
+            is the number of steps with a changed reference.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -331,7 +332,8 @@ class Guard:
         elif state is TRACK:
             age_ns = now_ns - self._played.basis_stamp_ns
             limit = limits.command_age_max_ns * 1e-9
-            text = f"command age {age_ns * 1e-9:.3f} s above {limit:.3f} s"
+            ended = ", and its plan has ended" if self._played.plan else ""
+            text = f"command age {age_ns * 1e-9:.3f} s above {limit:.3f} s{ended}"
             self._enter(HOLD, now_ns, Cause.SILENCE, text)
         elif self.armed and now_ns - self._alone_ns > limits.alone_max_ns(self._flies):
             text = f"held for {limits.alone_max_ns(self._flies) * 1e-9:g} s without the cloud"

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import NEVER_NS
 from cloudrc.world import low_level, rotors
 from cloudrc.world.guard import limits as rules
@@ -26,7 +25,7 @@ ACCELERATION_MAX = 400.0
 """Limit of the robot's acceleration in the air [m/s^2]. Full thrust gives a robot that is 10 %
 lighter 153 m/s^2, and a spin of 50 rad/s about a centre of mass 3 cm away gives 75 m/s^2."""
 MARGIN = 1e-3
-"""Distance that is added to every geom and its own margin [m]; it covers rounding errors."""
+"""Distance added to every geom with its own margin and gap [m]; it covers rounding errors."""
 HUGE = 1e4
 """Half the edge of the box that stands for the space below a plane [m]."""
 _DISABLE = mujoco.mjtDisableBit
@@ -39,7 +38,7 @@ _CONSTANTS = {
     low_level: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
     "thrust_max tiny nose_cosine_min yaw_sine_max",
     state: "overturned_cosine",
-    rules: "sink_lead_max fence_reaction reaction stop_coefficient recheck_distance far low_speed",
+    rules: "sink_lead_max fence_reaction reaction stop_coefficient recheck_distance",
 }
 """Modules and their constants that `step.c` needs, in the order of its fields."""
 _VALUES = {
@@ -52,7 +51,7 @@ _FIELDS: dict[str, Any] = {
     **dict.fromkeys(_POINTERS, ctypes.c_void_p),
     **dict.fromkeys([*_VALUES, "up", "down"], _double),
     **{"gains": _double * 9, "limit_xy": _double, "limit_z": _double, "dt": _double},
-    **{"change_max": _double, "low_z": _double, "low": _double * 3, "high": _double * 3},
+    **{"change_max": _double, "low": _double * 3, "high": _double * 3},
     **dict.fromkeys(("time_step", "robot_radius", "acceleration_max"), _double),
     **dict.fromkeys(("recheck_ns", "never_ns", "step_ns"), _int64),
     **dict.fromkeys(("check_steps", "obstacle_count", "unused"), _int64),
@@ -98,7 +97,6 @@ def make_flight(
         *_VALUES.values(),
         *(turning.up, turning.down, controller.gains, limit_xy, limit_z, dt),
         limits.acceleration_max * (step_ns * 1e-9),
-        low[2] - FLOOR_MARGIN + rules.LOW_HEIGHT,
         *(low, high, simulator.dt, radius, ACCELERATION_MAX, rules.RECHECK_NS, NEVER_NS, step_ns),
         *(CONTACT_CHECK_STEPS, len(obstacles), UNUSED_WITHOUT_CONTACTS),
     )
@@ -111,15 +109,17 @@ def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
 
     A row has the centre (3,) and the axes (9,) of the box, its half sizes (3,), and the radius of
     the edges, all [m]. The radius of the robot is that of a ball around its base's origin; it is
-    infinite if geoms matter without a contact, too.
+    infinite if geoms or constraints matter without a contact, too.
     """
     option, rows, radius = model.opt, [], 0.0
-    if option.density or option.viscosity or model.nflex or model.npair:
+    other = option.density, option.viscosity, model.nflex, model.npair, model.neq, model.ntendon
+    if any(other) or model.dof_frictionloss.any():
         radius = inf
     for geom in range(model.ngeom):
         size, bound = model.geom_size[geom], model.geom_rbound[geom]
         place, axes = data.geom_xpos[geom], data.geom_xmat[geom]
-        margin = MARGIN + max(model.geom_margin[geom], option.o_margin)
+        margin = model.geom_margin[geom] + model.geom_gap[geom]
+        margin = MARGIN + max(margin, option.o_margin)
         if model.geom_bodyid[geom]:  # a geom of the robot; those of the scene are fused to body 0
             radius = max(radius, dist(place, data.qpos[:3]) + bound + margin)
         elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:

@@ -6,7 +6,6 @@
      read          readings.Readings.of
      guard_step    guard.state.Guard.step, for a robot in TRACK with a fresh command
      is_far        guard.limits.is_far_from_fence
-     is_free       guard.limits.limit_to_fence, if it changes nothing
      update        low_level.LowLevel.update
      turn_rotors   rotors.Rotors.step, simulator.Simulator.step
      feel          simulator.Simulator._feel
@@ -19,6 +18,7 @@
    has to suffice. All quantities have the units of the Python code. */
 
 typedef long long i64;
+static const double ROOM = 1e-6; /* [m]: no rounding error matters, the fence limits nothing */
 double sqrt(double);
 
 /* Shared with Python: flight.py has the same fields, all of 8 bytes, in the same order. */
@@ -44,10 +44,10 @@ typedef struct {
   double mass, gravity, tilt_gain, yaw_gain, tilt_rate_gain, yaw_rate_gain;
   double thrust_max, tiny, nose_cosine_min, yaw_sine_max;
   double overturned_cosine, sink_lead_max;
-  double fence_reaction, reaction, stop_coefficient, recheck_distance, far, low_speed;
+  double fence_reaction, reaction, stop_coefficient, recheck_distance;
   /* Values of this robot: gains and limits of the controller, corners of the fence, and so on. */
   double up, down, gains[9], limit_xy, limit_z, dt;
-  double change_max, low_z, low[3], high[3];
+  double change_max, low[3], high[3];
   double time_step, robot_radius, acceleration_max;
   i64 recheck_ns, never_ns, step_ns, check_steps, obstacle_count;
   i64 unused; /* flags of what MuJoCo does not need while nothing can touch the robot */
@@ -81,7 +81,8 @@ static void read(const Flight *f, Readings *r) {
   a[6] = xz + wy, a[7] = yz - wx, a[8] = 1.0 - xx - yy;
 }
 
-static int is_far(const Flight *f, const double *velocity, const double *position) {
+/* Tell whether the fence limits no velocity within a distance `room` of the position. */
+static int is_far(const Flight *f, const double *velocity, const double *position, double room) {
   for (int i = 0; i < 3; i++) {
     double low = f->low[i], high = f->high[i], v = velocity[i];
     double reaction = i == 2 ? f->reaction : f->fence_reaction; /* towards the lower face */
@@ -89,29 +90,7 @@ static int is_far(const Flight *f, const double *velocity, const double *positio
       high -= v * (f->fence_reaction + v * f->stop_coefficient);
     else
       low -= v * (reaction - v * f->stop_coefficient);
-    if (!(low + f->recheck_distance <= position[i] && position[i] <= high - f->recheck_distance))
-      return 0;
-  }
-  return 1;
-}
-
-static double approach_speed(const Flight *f, double distance, double reaction) {
-  if (distance > f->far) return 1e300;
-  double root = sqrt(reaction * reaction + 4.0 * f->stop_coefficient * distance);
-  return 2.0 * distance / (reaction + root);
-}
-
-/* Tell whether the fence surely limits no velocity at this position; Python handles the rest. */
-static int is_free(const Flight *f, const double *velocity, const double *position) {
-  double across = velocity[0] * velocity[0] + velocity[1] * velocity[1];
-  if (!(position[2] >= f->low_z || across < f->low_speed * f->low_speed)) return 0;
-  for (int i = 0; i < 3; i++) {
-    double below = position[i] - f->low[i], above = f->high[i] - position[i];
-    double reaction = i == 2 ? f->reaction : f->fence_reaction, slowest = 0.0;
-    if (!((below > 0.0 || i == 2) && above > 0.0)) return 0;
-    if (below > 0.0) slowest = -approach_speed(f, below, reaction);
-    if (!(slowest <= velocity[i])) return 0;
-    if (!(velocity[i] <= approach_speed(f, above, f->fence_reaction))) return 0;
+    if (!(low + room <= position[i] && position[i] <= high - room)) return 0;
   }
   return 1;
 }
@@ -128,8 +107,8 @@ static int guard_step(Flight *f, const Readings *r, i64 now_ns) {
   double moved[3] = {from[0] + share * x, from[1] + share * y, from[2] + share * z};
   const double *reference = settles ? to : moved;
   if (reference[2] < r->twist[2] - f->sink_lead_max) return 0;
-  int far = is_far(f, reference, r->pose);
-  if (!far && !is_free(f, reference, r->pose)) return 0;
+  int far = is_far(f, reference, r->pose, f->recheck_distance);
+  if (!far && !is_far(f, reference, r->pose, ROOM)) return 0;
   for (int i = 0; i < 3; i++) f->reference[i] = reference[i];
   f->settled = settles;
   i64 until_ns = now_ns + f->recheck_ns;

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.messages import Cause, Command, GuardState
+from cloudrc.tunnel.codec import PLAN_MAX
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX, Limits
 from tests.world.guard.conftest import (
@@ -84,9 +85,26 @@ def test_a_plan_is_fresh_while_it_lasts(steps, planned_ms, arrival_ms, plan_max_
     assert guard.state is TRACK
     run(guard, until_ms * MS + TICK, until_ms * MS + 2 * TICK)
     age = f"{(until_ms + 2) / 1000:.3f}"
-    assert told(guard) == (until_ms * MS + TICK, HOLD, f"command age {age} s above 0.250 s")
+    text = f"command age {age} s above 0.250 s, and its plan has ended"
+    assert told(guard) == (until_ms * MS + TICK, HOLD, text)
     assert guard.cause is Cause.SILENCE
     assert guard.accept_command(plan, until_ms * MS + 2 * TICK) == "stale"
+
+
+@pytest.mark.promise("brakes-without-commands")
+@given(
+    ahead_ns=st.integers(0, AGE_MAX_NS),
+    age_ns=st.integers(0, PLANS.command_age_max_ns),
+    count=st.integers(1, PLAN_MAX),
+)
+@settings(max_examples=100, deadline=None)
+def test_no_plan_is_flown_longer_than_the_cap_allows(ahead_ns, age_ns, count):
+    arrival_ns = 1000 * MS
+    basis_ns = arrival_ns - age_ns
+    sent = planned([0.1] * (count + 1), basis_ns, basis_ns + ahead_ns)
+    guard = following(sent, now_ns=arrival_ns)
+    guard.step(arrival_ns + PLANS.plan_max_ns + 1, sensed(), DT)
+    assert guard.state is not TRACK
 
 
 @pytest.mark.parametrize("bad", [nan, inf, nextafter(COMMAND_MAX, inf), -1000.1])
@@ -113,6 +131,19 @@ def test_played_velocities_are_capped_and_forgotten_with_the_session():
     guard.forget_commands()
     assert run(guard, 50 * MS, 60 * MS)[-1] == (0.0, 0.0, 0.0)
     assert guard.state is HOLD
+
+
+@pytest.mark.parametrize("ends", ["end_mission", "stop", "put_on_ground"])
+def test_no_plan_outlives_its_mission(ends):
+    guard = following(planned([0.1] * 60))
+    run(guard, 0, 50 * MS)
+    cause = ("test",) if ends == "put_on_ground" else ()
+    getattr(guard, ends)(50 * MS, *cause)
+    guard.acknowledge(50 * MS)
+    guard.start_mission(50 * MS)
+    run(guard, 50 * MS, 500 * MS)
+    assert guard.state is (HOLD if ends == "end_mission" else GuardState.GROUND)
+    assert guard.reference == (0.0, 0.0, 0.0)
 
 
 def test_a_plan_does_not_shorten_the_settling_time():

@@ -11,6 +11,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.geometry import fence
 from cloudrc.messages import Command, GuardState
 from cloudrc.tunnel.end import Identity
+from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.limits import Limits
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
@@ -18,7 +19,7 @@ from cloudrc.world.native import robot as native
 from cloudrc.world.native.library import SWITCH, Library, library
 from cloudrc.world.native.robot import NativeRobot, make_robot, usable
 from cloudrc.world.robot import Robot
-from cloudrc.world.scene import mujoco
+from cloudrc.world.scene import FOLDER, mujoco
 from cloudrc.world.simulator import Simulator
 from tests.flights.conftest import digest
 from tests.world.guard.conftest import MS, SECOND, UP, hostile
@@ -28,8 +29,8 @@ LIMITS = Limits(fence.LOW, fence.HIGH)
 PERIOD_NS = 10 * MS
 
 
-def robot_of(kind, scene="empty", limits=LIMITS):
-    parts = Simulator("pelican", scene), LowLevel(), Guard(limits)
+def robot_of(kind, scene="empty", limits=LIMITS, model="pelican"):
+    parts = Simulator(model, scene), LowLevel(), Guard(limits)
     return NativeRobot(*parts, limits) if kind is NativeRobot else Robot(*parts)
 
 
@@ -96,7 +97,8 @@ def test_hostile_commands_fly_the_same_in_c(seed, scale, least):
 @pytest.mark.parametrize("seed", range(3))
 def test_plans_fly_the_same_in_c(seed):
     """Commands every 10 ms or much later; a plan's velocities are due at odd times."""
-    robots = both()
+    limits = Limits(fence.LOW, fence.HIGH, speed_max=4.0, plan_max_ns=800 * MS)
+    robots = both(limits=limits)
     count, flights = Count(robots[1]), []
     for robot in robots:
         rng, seen = np.random.default_rng(seed), []
@@ -106,7 +108,7 @@ def test_plans_fly_the_same_in_c(seed):
             velocity = UP if now_ns < SECOND else tuple(rng.uniform(-0.8, 0.8, 3).tolist())
             plan = tuple(map(tuple, rng.uniform(-0.8, 0.8, (int(rng.integers(0, 40)), 3)).tolist()))
             ahead_ns = int(rng.integers(0, 60 * MS))
-            if now_ns < 2 * SECOND or rng.random() < 0.05:
+            if now_ns < 3 * SECOND or rng.random() < 0.05:
                 command = Command(0, now_ns, 0, velocity, 0.0, plan, now_ns + ahead_ns)
                 robot.guard.accept_command(command, now_ns)
             robot.run(now_ns, now_ns + PERIOD_NS)
@@ -114,6 +116,23 @@ def test_plans_fly_the_same_in_c(seed):
         flights.append(seen)
     assert flights[0] == flights[1]
     assert count.steps > 1000
+
+
+def test_a_micrometre_of_room_means_that_no_fence_limits(monkeypatch):
+    """`ROOM` in `step.c`: velocities with which the robot can just stop that far from a face."""
+    rng, found, (low, high) = np.random.default_rng(1), 0, LIMITS.inner_corners()
+    monkeypatch.setattr(rules, "RECHECK_DISTANCE", 1e-6)
+    for _ in range(20_000):
+        velocity, place = rng.uniform(-6.0, 6.0, 3).tolist(), rng.uniform(low, high).tolist()
+        axis = int(rng.integers(3))
+        up, speed = velocity[axis] > 0.0, abs(velocity[axis])
+        reaction = rules.FENCE_REACTION if up or axis < 2 else rules.REACTION
+        way = rules.stopping_distance(speed, reaction) + 1e-6
+        place[axis] = high[axis] - way if up else low[axis] + way
+        if rules.is_far_from_fence(velocity, place, low, high):
+            found += 1
+            assert rules.limit_to_fence(velocity, place, low, high) == tuple(velocity)
+    assert found > 1000
 
 
 def silence(pilot):
@@ -169,10 +188,13 @@ def nearest(robot, position):
     return (np.sqrt((beyond**2).sum(1)) - rows[:, 15]).min() - robot._flight.robot_radius
 
 
-def test_where_c_looks_for_no_contact_there_is_none():
-    robot = robot_of(NativeRobot, "pipes")
-    model, data = robot.simulator.model, robot.simulator.data
+@pytest.mark.parametrize("kind", ["margin", "gap"])
+def test_where_c_looks_for_no_contact_there_is_none(kind):
+    parts = Simulator("pelican", "pipes"), LowLevel(), Guard(LIMITS)
+    model, data = parts[0].model, parts[0].data
     rng, free = np.random.default_rng(1), 0
+    getattr(model, f"geom_{kind}")[:] = rng.choice([0.0, 0.1], model.ngeom)
+    robot = NativeRobot(*parts, LIMITS)
     for _ in range(3000):
         data.qpos[:3] = rng.uniform((-2.0, -7.0, 0.3), (9.0, 3.0, 1.6))
         data.qpos[3:] = rng.normal(size=4)
@@ -181,6 +203,19 @@ def test_where_c_looks_for_no_contact_there_is_none():
         free += is_free
         assert not (is_free and data.ncon)
     assert 300 < free < 2900
+
+
+def test_a_tether_holds_the_robot_in_c_too(tmp_path):
+    """It is a constraint, but no contact."""
+    text = (FOLDER / "robots" / "pelican.xml").read_text()
+    rope = '<tendon><spatial limited="true" range="0 1"><site site="post"/><site site="tip"/>'
+    text = text.replace("<worldbody>", '<worldbody><site name="post" pos="0 0 0"/>')
+    path = tmp_path / "tethered.xml"
+    path.write_text(text.replace("<actuator>", f"{rope}</spatial></tendon><actuator>"))
+    robots = [robot_of(kind, model=str(path)) for kind in (Robot, NativeRobot)]
+    pilots = [Pilot(robot).fly(2.0, lambda pilot: UP) for robot in robots]
+    assert pilots[0].seen == pilots[1].seen
+    assert pilots[1].robot.simulator.readings.position[2] < 1.1
 
 
 @pytest.mark.parametrize("setting", [{"density": 1.2}, {"viscosity": 1e-5}])
