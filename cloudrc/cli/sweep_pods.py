@@ -50,6 +50,9 @@ def rows_from_pods(
 ) -> Generator[Row]:
     """Fly flights of a plan on a cluster, and yield each row once.
 
+    A pod that is deleted just after its last flight takes its log along, and Kubernetes counts its
+    shard as flown. So another Job flies what is missing, as long as rows arrive.
+
     Raises:
         ClusterError: If the Job fails, or if a pod will never run.
     """
@@ -58,9 +61,6 @@ def rows_from_pods(
     from cloudrc.sweep.parcel import pack
     from cloudrc.sweep.store import parse_row
 
-    if not flights:
-        return
-
     def tell(text: str) -> None:
         print_line(f"  {text}", sys.stderr)
 
@@ -68,17 +68,22 @@ def rows_from_pods(
     every = "".join(plan.flights).encode() + str(options.shards).encode()
     name = f"sweep-{hashlib.sha256(every).hexdigest()[:12]}"
     words = {"image": options.image, "cpu": options.cpu, "queue": options.queue}
-    batch.start(release, name, pack(flights), options.shards, **words)
-    tell(f"Job '{name}' {release.where}, {options.shards} pods; it goes on without this command")
-    missing = {flight.key for flight in flights}
-    for line in batch.read_lines(release, name, tell):
-        row = parse_row(line)
-        if row is not None and row["key"] in missing:
-            missing.remove(row["key"])
-            yield row
-    if missing:
-        text = "the same command flies them; is the image of this version of cloudrc?"
-        raise ClusterError(f"the pods printed no row of {len(missing)} flights; {text}")
+    missing = {flight.key: flight for flight in flights}
+    while missing:
+        before = len(missing)
+        batch.start(release, name, pack(missing.values()), options.shards, **words)
+        tell(
+            f"Job '{name}' {release.where}, {options.shards} pods; it goes on without this command"
+        )
+        for line in batch.read_lines(release, name, tell):
+            row = parse_row(line)
+            if row is not None and missing.pop(row["key"], None) is not None:
+                yield row
+        if len(missing) == before:
+            text = "the same command flies them; is the image of this version of cloudrc?"
+            raise ClusterError(f"the pods printed no row of {before} flights; {text}")
+        if missing:
+            tell(f"the rows of {len(missing)} flights were lost with their pods")
 
 
 def print_rows(options: argparse.Namespace) -> int:

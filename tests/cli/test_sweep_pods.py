@@ -21,8 +21,14 @@ def cluster(monkeypatch):
     lines = []
     monkeypatch.setattr("cloudrc.cli.sweep_pods.release_from_flags", lambda options: Release())
     monkeypatch.setattr(batch, "start", lambda *given, **words: None)
-    monkeypatch.setattr(batch, "read_lines", lambda release, name, tell: iter(lines))
+    monkeypatch.setattr(batch, "read_lines", lambda release, name, tell: take(lines))
     return lines
+
+
+def take(lines):
+    """Yield the lines of one Job, which end before a line "end"."""
+    while lines and (line := lines.pop(0)) != "end":
+        yield line
 
 
 class Release:
@@ -38,6 +44,15 @@ def test_each_row_is_taken_once_and_other_lines_are_not(write_sweep, cluster):
     assert main(["sweep", "run", str(path), "--out", "grid", "--on", "kubernetes"]) == 0
     assert list(read_rows(Path("grid")).values()) == rows[::-1]
     assert len(Path("grid/rows.jsonl").read_text().splitlines()) == 4
+
+
+def test_rows_that_are_lost_with_their_pod_are_flown_again(write_sweep, cluster, capsys):
+    path = write_sweep()
+    lines = [json.dumps(make_row(f, FLOWN)) for f in read_plan(path).flights.values()]
+    cluster += [*lines[:3], "end", *lines[3:]]
+    assert main(["sweep", "run", str(path), "--out", "grid", "--on", "kubernetes"]) == 0
+    assert len(read_rows(Path("grid"))) == 4
+    assert "the rows of 1 flights were lost with their pods" in capsys.readouterr().err
 
 
 def test_rows_that_do_not_come_are_told(write_sweep, cluster, capsys):

@@ -9,7 +9,7 @@ from tests.e2e.conftest import NAMESPACE, ROOT, eventually, kubectl, read
 
 SWEEP = {
     "experiment": "steps",
-    "set": {"link.profile": "paper-p2", "mission.steps.count": 1},
+    "set": {"link.profile": "paper-p2", "mission.steps.count": 5},
     "grid": {"cloud.predictor": ["last_sample", "constant_velocity"]},
     "seeds": 16,
 }
