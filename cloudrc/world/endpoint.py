@@ -43,7 +43,7 @@ from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
 from cloudrc.tunnel.end import Identity, TunnelEnd
 from cloudrc.tunnel.handshake import ServerHandshake
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.robot import STEP_NS, Robot
+from cloudrc.world.robot import Robot
 from cloudrc.world.sensors import Sensors
 
 START_AGE_MAX_NS = 1_000_000_000
@@ -186,7 +186,6 @@ class WorldEndpoint(TunnelEnd):
         super().__init__(identity, Direction.UPLINK, newest_wins)
         self.robot, self._sensors = robot, sensors
         self._tick_ns, self._slip_ns = start_ns, 0  # world's clock and its lag
-        self._owes_step = False  # whether the step before `_tick_ns` has yet to be simulated
         self._pace = PaceMonitor()
         self._door = ServerHandshake(
             self._session, identity.nonce, identity.clock_id, command_age_max_ns
@@ -218,7 +217,7 @@ class WorldEndpoint(TunnelEnd):
     def handle_deadline(self, now_ns: int) -> None:
         """Simulate up to and including `now_ns` [ns]; send the telemetry that is due."""
         self._session.follow_keys()
-        self._advance(self._follow(now_ns) + 1, owes=not self.robot.observers)
+        self._advance(self._follow(now_ns) + 1)
 
     def receive_datagram(self, data: Datagram, now_ns: int) -> None:
         """Handle a datagram that arrived at `now_ns` [ns]; count and drop an invalid datagram."""
@@ -256,24 +255,14 @@ class WorldEndpoint(TunnelEnd):
         self._slip_ns += behind_ns - CATCH_UP_NS
         return now_ns - self._slip_ns
 
-    def _advance(self, until_ns: int, *, owes: bool = False) -> None:
-        """Simulate all steps that begin before `until_ns` [ns], world's clock.
-
-        If `owes`, the next call may simulate a single last step together with its own steps, which
-        takes less time. Nothing uses the result of this step before.
-        """
+    def _advance(self, until_ns: int) -> None:
+        """Simulate all steps that begin before `until_ns` [ns], world's clock."""
         tick_ns = self._tick_ns
         if tick_ns < until_ns and self._waiting is not None:
             self._apply(tick_ns)
-        if self._owes_step:
-            until_ns, tick_ns = max(until_ns, tick_ns), tick_ns - STEP_NS
-            self._owes_step = False
         while tick_ns < until_ns:
             if tick_ns >= self._sample_ns:
                 self._sample(tick_ns)
-            if owes and until_ns == tick_ns + 1:
-                self._owes_step, self._tick_ns = True, tick_ns + STEP_NS
-                return
             sample_ns = self._sample_ns
             stop_ns = sample_ns if sample_ns < until_ns else until_ns
             tick_ns = self._tick_ns = self.robot.run(tick_ns, stop_ns)
