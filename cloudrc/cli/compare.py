@@ -30,15 +30,13 @@ EPILOG = """\
 A and B are one of:
   settings           KEY=VALUE[,KEY=VALUE...]: fly both with each seed
   values of an axis  of the finished sweep in --in DIR
-  folders            of 'cloudrc run' or 'cloudrc run --seeds N'
 
 examples:
   cloudrc compare cloud.predictor=constant_velocity \\
     cloud.predictor=constant_acceleration --set link.profile=paper-p3
   cloudrc compare cloud.predictor=last_sample \\
     cloud.predictor=constant_velocity,cloud.estimator=split --number iae_mean
-  cloudrc compare last_sample constant_velocity --in runs/sweep-steps-1
-  cloudrc compare runs/steps-virtual-10seeds-1 runs/steps-virtual-10seeds-2"""
+  cloudrc compare last_sample constant_velocity --in runs/sweep-steps-1"""
 TITLES = (
     *("number", "A median", "B median", "B - A", "95 % interval", "B lower in", "p", "decided"),
     "unit",
@@ -73,13 +71,11 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.sweep import pairs
     from cloudrc.sweep.compare import compare
 
-    stopped, code, folders = "", 0, (Path(options.a), Path(options.b))
-    if options.set and (options.sweep or all(folder.is_dir() for folder in folders)):
+    stopped, code = "", 0
+    if options.set and options.sweep:
         raise BadInputError(f"--set {options.set[0]}: these flights are finished; leave it out")
     if options.sweep:
         found = pairs.of_sweep(options.sweep, options.a, options.b)
-    elif all(folder.is_dir() for folder in folders):
-        found = pairs.of_folders(*folders)
     else:
         found, stopped, code = _fly_both(options)
     if stopped:
@@ -107,8 +103,7 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
 
     for text in (options.a, options.b):
         if "=" not in text:
-            what = "is neither KEY=VALUE nor, with the other side, a folder; see --in for a sweep"
-            raise BadInputError(f"{text}: {what}")
+            raise BadInputError(f"{text}: is not KEY=VALUE; for a value of a sweep, add --in DIR")
     interrupt_on_signals()
     require("compare", MODES["virtual"])
     # A comma separates settings only before KEY=: a list may contain commas.

@@ -18,8 +18,7 @@ from cloudrc.cli.run import fly, load, new_folder
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.metrics.verdict import exit_code
 from cloudrc.sweep import store
-from cloudrc.sweep.flight import counts
-from cloudrc.sweep.pairs import row_of
+from cloudrc.sweep.flight import Row, counts
 from cloudrc.sweep.statistics import median_interval
 
 Report: TypeAlias = Mapping[str, Any]
@@ -32,13 +31,22 @@ def summarise(reports: Sequence[Report]) -> dict[str, Any]:
 
     Runs that were interrupted or whose plug-in failed have no numbers here.
     """
-    numbers, measured = {}, [each for each in reports if counts(row_of(each))]
+    numbers, measured = {}, [each for each in reports if counts(_row(each))]
     for name, unit in _units(measured).items():
         found = [r["numbers"][name]["value"] for r in measured if name in r["numbers"]]
         middle = {"median": statistics.median(found), "interval": median_interval(found)}
         numbers[name] = {**middle, "unit": unit, "count": len(found)}
     done = sum(report["verdict"] == "success" for report in reports)
     return {"done": done, "count": len(reports), "method": METHOD, "numbers": numbers}
+
+
+def _row(report: Report) -> Row:
+    """Make the row of a run, as in a sweep."""
+    return {
+        **{"seed": report["seed"], "verdict": report["verdict"]},
+        "failures": [failure["code"] for failure in report["failures"]],
+        "numbers": {name: number["value"] for name, number in report["numbers"].items()},
+    }
 
 
 def _units(reports: Sequence[Report]) -> dict[str, str]:
@@ -59,7 +67,7 @@ def as_table(summary: Mapping[str, Any]) -> str:
 
 def as_csv(reports: Sequence[Report]) -> str:
     """Format reports as CSV, one line per run: seed, verdict and all measurements."""
-    units, rows = _units(reports), [*map(row_of, reports)]
+    units, rows = _units(reports), [*map(_row, reports)]
     columns = {name: [row[name] for row in rows] for name in ("seed", "verdict")}
     columns |= {name: [row["numbers"].get(name) for row in rows] for name in units}
     return store.as_csv(columns, units)

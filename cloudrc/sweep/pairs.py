@@ -1,25 +1,16 @@
-"""Read finished flights, of a sweep or of two folders of runs, and pair them."""
+"""Read the finished flights of a sweep, and pair them."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cloudrc.config.document import read_document
 from cloudrc.errors import BadInputError
 from cloudrc.sweep import store
 from cloudrc.sweep.compare import Pair
 from cloudrc.sweep.flight import Row
-
-IGNORED = ("seed", "name", "description", "report")
-"""Keys of an experiment that do not affect the flight, and the seed."""
-OF_LINK = (
-    *("guard.command_age_max_ms", "guard.speed_max_mps"),
-    *("cloud.horizon_max_s", "cloud.freeze_after_s"),
-)
-"""Keys whose defaults depend on the link profile."""
 
 
 class Found(NamedTuple):
@@ -95,69 +86,3 @@ def of_sweep(folder: Path, a: str, b: str) -> Found:
         what += f", over all values of {pooled}; flights with equal seeds depend on each other, "
         what += "so p is too small"
     return Found(pairs, units, what)
-
-
-def of_folders(a: Path, b: Path) -> Found:
-    """Pair the runs of two folders by their seeds; they may differ in keys of one section.
-
-    Raises:
-        BadInputError: If no seed is in both, if nothing differs, or if keys of several sections
-            differ: then nobody could tell which of them has an effect.
-    """
-    units = dict[str, str]()
-    first, second = _runs(a, units), _runs(b, units)
-    seeds = sorted(first.keys() & second.keys())
-    if not seeds:
-        raise BadInputError(f"{a} and {b} have no seed in common; fly both with the same --seeds")
-    before, after = (dict(_leaves(side[seeds[0]][1])) for side in (first, second))
-    keys = sorted(key for key in before | after if before.get(key) != after.get(key))
-    if any(key.startswith("link.") for key in keys):
-        keys = [key for key in keys if key not in OF_LINK]
-    if len({key.partition(".")[0] for key in keys}) != 1:
-        problem = f"differ in several sections: {', '.join(keys)}" if keys else "are the same"
-        raise BadInputError(f"{a} and {b} {problem}; compare flights that differ in one section")
-    pairs = [Pair({"seed": seed}, first[seed][0], second[seed][0]) for seed in seeds]
-    return Found(pairs, units, f"folders that differ in {', '.join(keys)}")
-
-
-def row_of(report: Mapping[str, Any]) -> Row:
-    """Make the row of a run from its report.json."""
-    failures, numbers = report["failures"], report["numbers"]
-    return {
-        **{"seed": report["seed"], "verdict": report["verdict"]},
-        "failures": [failure["code"] for failure in failures],
-        "text": "; ".join(failure["text"] for failure in failures),
-        "numbers": {name: number["value"] for name, number in numbers.items()},
-    }
-
-
-def _runs(folder: Path, units: dict[str, str]) -> dict[int, tuple[Row, Mapping[str, Any]]]:
-    """Read the runs in a folder, which may be a run: seed -> row, and mode with experiment.
-
-    The units of their metrics are added to `units`.
-    """
-    found = dict[int, tuple[Row, Mapping[str, Any]]]()
-    for path in (folder / "report.json", *sorted(folder.glob("seed-*/report.json"))):
-        if path.is_file():
-            try:
-                report = json.loads(path.read_bytes())
-                row = row_of(report)
-                units |= {name: number["unit"] for name, number in report["numbers"].items()}
-            except (ValueError, TypeError, LookupError, AttributeError) as error:
-                text = "is not a report of cloudrc; 'cloudrc report' writes it again"
-                raise BadInputError(f"{path}: {text}") from error
-            config = read_document(path.with_name("config.yaml"), f"{path.parent}/config.yaml").tree
-            found[row["seed"]] = row, {"mode": report.get("mode"), **config}
-    if not found:
-        raise BadInputError(f"{folder}: has no report.json; name a folder of 'cloudrc run'")
-    return found
-
-
-def _leaves(tree: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
-    """Yield the keys of a configuration, such as "cloud.predictor.name", with their values."""
-    if not isinstance(tree, dict):
-        yield ".".join(path), tree
-        return
-    for key, value in tree.items():
-        if path or key not in IGNORED:
-            yield from _leaves(value, (*path, key))

@@ -72,7 +72,10 @@ def test_success_comes_before_every_number(monkeypatch, capsys):
         (["seed=1", "seed=1"], "A and B are the same experiment"),
         (["cloud.predictor=last_sample", "cloud.predicter=kalman"], "cloud.predicter"),
         (["link.profile=paper-p1", "link.profile=wifi", "--set", "link.profile=x"], "set twice"),
-        (["last_sample", "nonsense"], "last_sample: is neither KEY=VALUE nor"),
+        (
+            ["last_sample", "nonsense"],
+            "last_sample: is not KEY=VALUE; for a value of a sweep, add --in DIR",
+        ),
         (["seed=1", "seed=2", "--number", "iae_men"], "--number: no number named 'iae_men'"),
         (["a", "b", "--in", "nowhere"], "nowhere"),
         (["a", "b", "--in", "nowhere", "--set", "seed=1"], "--set seed=1: these flights are"),
