@@ -9,6 +9,7 @@ from cloudrc.cloud.controllers import Controller
 from cloudrc.cloud.predictors import Model
 from cloudrc.messages import PLAN_STEP_NS, Setpoint, Vector
 from cloudrc.teleop.carrot import setpoint_at
+from cloudrc.tunnel.codec import as_planned
 
 STEP = PLAN_STEP_NS * 1e-9
 """Time between two velocities of a plan [s]."""
@@ -60,5 +61,5 @@ def make_plan(
         largest = max(map(abs, velocity))
         if not (isfinite(sum(velocity)) and largest <= SPEED_MAX):
             break
-        plan.append(velocity)
+        plan.append(as_planned(velocity))
     return tuple(plan)

@@ -214,6 +214,11 @@ def encode_command(command: Command) -> bytes:
     return body + _PLANNED.pack(planned_ns) + b"".join([_VELOCITY.pack(*each) for each in plan])
 
 
+def as_planned(velocity: Vector) -> Vector:
+    """Return a velocity [m/s] as a plan carries it: in single precision, shape (3,)."""
+    return _VELOCITY.unpack(_VELOCITY.pack(*velocity))
+
+
 def decode_command(body: bytes) -> Command:
     """Decode the body of a COMMAND datagram; its floats may have any value, even NaN."""
     stamp_ns, basis_stamp_ns, basis_hold_ns, x, y, z, yaw_rate = _COMMAND.unpack_from(body)

@@ -45,9 +45,18 @@ def test_the_resolved_experiment_flies_the_same_run_again(tmp_path):
     assert digest(load_experiment(path)) == digest(flown)
 
 
-@pytest.mark.parametrize("profile", ["paper-p2", "lossy", "ideal"])
-def test_messages_passed_without_bytes_make_the_same_records(profile):
-    experiment = short(f"link.profile={profile}")
+PLAN = ("cloud.predictor=model_based", "cloud.estimator=earliest", "cloud.plan_s=0.4")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        *((f"link.profile={name}",) for name in ("paper-p2", "lossy", "ideal")),
+        ("link.profile=paper-p3", *PLAN),
+    ],
+)
+def test_messages_passed_without_bytes_make_the_same_records(settings):
+    experiment = short(*settings)
     _, cloud, run = assemble(experiment)
     passed = RecordHash()
     for each in fly_on(run, LIMIT_NS, lambda: cloud.mission_over):
@@ -65,7 +74,7 @@ def test_a_link_that_damages_datagrams_gets_bytes():
 
 
 def test_an_observed_robot_flies_the_same_flight():
-    """An observer sees every step at once; without observers world puts some steps off."""
+    """Observers make the robot run in Python."""
     seen = []
 
     class Observer(Mock):

@@ -114,3 +114,10 @@ def test_a_value_that_does_not_exist_is_refused(decode, body, offset, largest):
     for value, said in ((largest, "fine"), (largest + 1, "malformed"), (255, "malformed")):
         changed[offset] = value
         assert outcome(decode, changed) == said
+
+
+def test_a_velocity_as_planned_arrives_as_it_is():
+    planned = codec.as_planned((0.1, -1000.0, 1e-3))
+    assert planned == pytest.approx((0.1, -1000.0, 1e-3), rel=1e-7)
+    sent = Command(1, 2, 3, (0.5, 0.0, 0.0), 0.0, (planned,), 4)
+    assert codec.decode_command(codec.encode_command(sent)) == sent
