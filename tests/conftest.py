@@ -5,11 +5,17 @@ from __future__ import annotations
 import gc
 import json
 import os
+import shutil
 import signal
 import socket
 from math import isfinite, nan
 
 import pytest
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+"""Debian's browser: `apt-get install chromium`."""
+# WebGL by the processor: a test machine has no graphics card.
+CHROMIUM_FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 # A shell that starts the tests in the background lets them ignore Ctrl-C, and so would all the
 # processes that they start, though to end on Ctrl-C is what some of these are tested for.
@@ -114,3 +120,43 @@ def signals_stay_as_they_were():
         if signal.getsignal(number) is not handler:
             signal.signal(number, handler)
     gc.unfreeze()  # a command may freeze what it has loaded
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    """A headless Chromium, for `browse`; tests that use it carry the mark `process`."""
+    if CHROMIUM is None:
+        pytest.skip("needs Chromium: apt-get install chromium")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=CHROMIUM_FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def browse(chromium):
+    """Open pages: browse(url) returns a page of Playwright, 1280 x 800.
+
+    At the end of the test, no page may have had an error or a request to another server.
+    """
+    context = chromium.new_context(viewport={"width": 1280, "height": 800})
+    errors, requests, own = [], [], []
+
+    def open_page(url: str, **options: object):
+        page = context.new_page()
+        page.on("console", lambda said: said.type == "error" and errors.append(said.text))
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("request", lambda request: requests.append(request.url))
+        page.on("websocket", lambda opened: requests.append(opened.url))
+        own.append(url.split("://")[-1].split("/")[0] + "/")
+        page.goto(url, **options)
+        return page
+
+    yield open_page
+    context.close()
+    inside = (*own, "data:", "blob:", "about:")
+    elsewhere = [url for url in requests if not url.split("://")[-1].startswith(inside)]
+    assert not errors
+    assert not elsewhere
