@@ -38,6 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "sweep": {"assembly", "config", "files", "metrics", "plugins", "record", "report"},
     "assembly": EVERYTHING,
     "api": {"sweep", "config", "metrics", "record"},
+    "exercise": {"api", "cloud", "plugins"},
     "faults": EVERYTHING,
     "cli": EVERYTHING,
     "__main__": {"cli"},

@@ -25,6 +25,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "margin": "find the largest delay, or other value, that a flight bears",
         "bench": "measure how fast the simulation runs here",
         "faults": "inject faults and check that the system handles them",
+        "class": "hand out and score the exercise for students",
     },
     "look around, set up": {
         "list": "list experiments, profiles, predictors and more",
@@ -148,7 +149,8 @@ def _find_command(name: str) -> Any:
     """Return the module or `Command` that has a command's functions `arguments` and `execute`."""
     if name in PROCESSES:
         return getattr(importlib.import_module("cloudrc.cli.processes"), name)
-    return importlib.import_module(f"cloudrc.cli.{name}")
+    module = "class_" if name == "class" else name  # a keyword of Python
+    return importlib.import_module(f"cloudrc.cli.{module}")
 
 
 def _lines(title: str) -> str:

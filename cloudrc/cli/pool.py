@@ -53,7 +53,7 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def _isolated_start() -> Iterator[None]:
+def isolated_start() -> Iterator[None]:
     """Isolate worker processes that start inside the block.
 
     The workers ignore SIGINT and SIGHUP, because the parent process ends them. They import no
@@ -86,10 +86,10 @@ def map_in_order(
         return
     # Spawn, do not fork: libraries may have started threads in this process.
     context = multiprocessing.get_context("spawn")
-    with _isolated_start():  # starts multiprocessing's resource tracker
+    with isolated_start():  # starts multiprocessing's resource tracker
         pool = ProcessPoolExecutor(workers, context, _end_with_parent)
     try:
-        with _isolated_start():  # submit() starts the workers
+        with isolated_start():  # submit() starts the workers
             futures = [pool.submit(function, each) for each in work]
         for future in futures if in_order else as_completed(futures):
             yield future.result()

@@ -1,0 +1,40 @@
+"""Controller, part 3 of the exercise: a PID controller for each of x, y and z.
+
+    e = setpoint - estimate      eq. (4), but with the sign that converges
+    u = P e + I (integral of e over time) + D (derivative of e)      eq. (5)
+
+Unlike the paper, limit each component of u to +-velocity_max.
+
+Source: the paper, eqs. (4) and (5).
+"""
+
+from cloudrc.cloud.controllers import Controller, ControlOutput
+from cloudrc.messages import ZERO, Odometry, Setpoint, Vector
+
+
+class StudentController(Controller):
+    """From the predicted position to a velocity command."""
+
+    def __init__(self, p: Vector, i: Vector, d: Vector, velocity_max: Vector) -> None:
+        """Take `p` [1/s], `i` [1/s^2], `d` [1] and `velocity_max` [m/s], each for x, y and z."""
+        self.p, self.i, self.d, self.velocity_max = p, i, d, velocity_max
+
+    def reset(self) -> None:
+        """Forget the integral and everything else: a new mission begins."""
+
+    def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
+        """Return u [m/s], `dt` [s] after the last call; both inputs have a `position` [m]."""
+        return ControlOutput(velocity=ZERO, yaw_rate=0.0)  # Your code: eqs. (4) and (5).
+
+
+def build(
+    gain_p: Vector = (0.8, 0.8, 1.5),
+    gain_i: Vector = ZERO,
+    gain_d: Vector = ZERO,
+    velocity_max: Vector = (6.0, 6.0, 6.0),
+) -> StudentController:
+    """Make a controller of `gain_p` [1/s], `gain_i` [1/s^2], `gain_d` [1], `velocity_max` [m/s].
+
+    The defaults are the published gains, and a limit that they hardly reach.
+    """
+    return StudentController(gain_p, gain_i, gain_d, velocity_max)

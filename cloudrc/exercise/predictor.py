@@ -1,0 +1,26 @@
+"""Predictor, part 2 of the exercise: the state of the robot when the next command acts, tau later.
+
+    position = p + v tau      velocity = v + a tau, with a = 0: the robot does not measure it
+    orientation: "similarly", with the angular velocity; use `rotate_ahead`
+
+Source: the paper, eqs. (2) and (3).
+"""
+
+from cloudrc.cloud.predictors import Predictor, rotate_ahead  # noqa: F401
+from cloudrc.messages import Odometry
+
+
+class StudentPredictor(Predictor):
+    """Prediction with constant velocity and constant angular velocity."""
+
+    def predict(self, odometry: Odometry, horizon: float) -> Odometry:
+        """Return the odometry after `horizon` [s], tau; its `stamp_ns` [ns] is later by tau.
+
+        `odometry._replace(position=(x, y, z))` returns a copy with another position.
+        """
+        return odometry  # Your code: eqs. (2) and (3).
+
+
+def build() -> StudentPredictor:
+    """Make a predictor."""
+    return StudentPredictor()
