@@ -126,7 +126,8 @@ def _run(part: str, folder: Path, limit: float, writer: Connection) -> NoReturn:
     null = os.open(os.devnull, os.O_RDWR)
     for stream in range(3):  # the files may print
         os.dup2(null, stream)
-    resource.setrlimit(resource.RLIMIT_DATA, (4 << 30, 4 << 30))  # [bytes]
+    with suppress(ValueError):  # the limit is lower already
+        resource.setrlimit(resource.RLIMIT_DATA, (4 << 30, 4 << 30))  # [bytes]
     signal.signal(signal.SIGPROF, expire)
     signal.setitimer(signal.ITIMER_PROF, limit, 1.0)  # again, if a file catches it
     from cloudrc.exercise import checks
