@@ -82,7 +82,7 @@ def draw(shown: Sequence[tuple[Dashboard, Curves]], path: Path) -> None:
 
 
 def _draw_panel(axis: Any, panel: Mapping[str, Any], curves: list[Curve]) -> None:
-    from matplotlib.dates import DateFormatter
+    from matplotlib.dates import DateFormatter, MinuteLocator
     from matplotlib.ticker import EngFormatter, PercentFormatter
 
     defaults = panel["fieldConfig"]["defaults"]
@@ -101,5 +101,6 @@ def _draw_panel(axis: Any, panel: Mapping[str, Any], curves: list[Curve]) -> Non
     elif unit in UNITS:
         axis.yaxis.set_major_formatter(EngFormatter(UNITS[unit]))
     axis.xaxis_date()
+    axis.xaxis.set_major_locator(MinuteLocator())
     axis.xaxis.set_major_formatter(DateFormatter("%H:%M"))
-    axis.legend(fontsize=7, frameon=False, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.12))
+    axis.legend(fontsize=7, frameon=False, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.15))

@@ -69,8 +69,8 @@ LONG = [
 """A mission that waits at its second point for longer than the tests of this module take."""
 LINK_TEST = f"{NAME}-test-link"
 """Pod of `helm test` that verifies the link; Helm keeps the pod after a failure."""
-SHOWN = 300
-"""Time that the dashboards show [s]."""
+SHOWN = 600
+"""Time that the dashboards show [s]: the missions so far."""
 ASIDE = (0.5, 0.5, 0.8)
 """Point to which the operator sends the robot while the mission is held [m]."""
 
