@@ -71,7 +71,8 @@ def draw(shown: Sequence[tuple[Dashboard, Curves]], path: Path) -> None:
 
     rows = [-(-len(dashboard["panels"]) // COLUMNS) for dashboard, _ in shown]
     figure = Figure(figsize=(12, 1.75 * sum(rows) + 0.5 * len(rows)), layout="constrained")
-    parts = figure.subfigures(len(rows), 1, height_ratios=[n + 0.25 for n in rows])
+    heights = [n + 0.25 for n in rows]
+    parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights).flat
     for (dashboard, curves), n, part in zip(shown, rows, parts, strict=True):
         part.suptitle(dashboard["title"], weight="bold")
         axes = part.subplots(n, COLUMNS, sharex=True, squeeze=False).flat
