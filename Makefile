@@ -156,10 +156,13 @@ bench: $(VENV)/all ## measure the closed loop against raw physics
 bench-link: $(VENV)/all ## compare the relay with its profiles and with a C program; needs cc
 	$(bin)/python -m tools.bench_link $(BENCH_LINK)
 
-pictures: $(VENV)/all ## draw the README's picture of a flight
+# The end-to-end tests draw the dashboards, with the data of their Prometheus.
+pictures: $(VENV)/all ## draw the README's picture of a flight, take that of the dashboards from 'make e2e'
 	rm -rf build/pictures
 	$(bin)/cloudrc run paper --mode virtual --out build/pictures
 	cp build/pictures/figures/flight.png docs/flight.png
+	@if [ -f build/e2e/dashboards.webp ]; then cp build/e2e/dashboards.webp docs/; \
+		else echo "no build/e2e/dashboards.webp: 'make e2e' draws it"; fi
 
 results: $(VENV)/dev ## fly the README's results and write them into it: two minutes
 	$(bin)/python -m tools.results

@@ -262,6 +262,18 @@ class Metrics(Values):
     """Alerts for the Prometheus operator"""
 
 
+class Dashboards(Values):
+    """Dashboards for Grafana: ConfigMaps that the sidecar of its chart finds by a label."""
+
+    enabled: bool = False
+    """Whether the chart creates the ConfigMaps"""
+    labels: Texts = {"grafana_dashboard": "1"}
+    """Labels by which the sidecar selects the ConfigMaps"""
+    annotations: Texts = {"grafana_folder": "cloudrc"}
+    """Annotations of the ConfigMaps; the sidecar's option folderAnnotation names the one that
+    selects the folder in Grafana"""
+
+
 class NetworkPolicy(Values):
     """NetworkPolicies, which allow only the tunnel, DNS, the API and metrics."""
 
@@ -313,6 +325,8 @@ class ChartValues(Values):
     """Mission that a Job flies at install"""
     metrics: Metrics = Metrics()
     """Access to the metrics"""
+    dashboards: Dashboards = Dashboards()
+    """Dashboards for Grafana"""
     network_policy: NetworkPolicy = NetworkPolicy()
     """Limits on the pods' network traffic"""
     secret: Secret = Secret()

@@ -72,6 +72,8 @@ OPEN = {
     "cluster without those of plug-ins); empty for a process without configuration",
 }
 """Label of a metric whose values cannot be listed -> description of the values."""
+COPIED = ("profile", "mission")
+"""Kinds of shipped files of which the chart has copies."""
 
 
 def outputs() -> dict[Path, str]:
@@ -86,7 +88,7 @@ def outputs() -> dict[Path, str]:
         CHART / "values.schema.json": json.dumps(_chart_schema(), indent=2) + "\n",
         **{
             CHART / "files" / f"{kind}s" / path.name: path.read_text()
-            for kind in ("profile", "mission")
+            for kind in COPIED
             for path in sorted(shipped.FOLDERS[kind].glob("*.yaml"))
         },
     }
@@ -94,7 +96,8 @@ def outputs() -> dict[Path, str]:
 
 def leftovers() -> list[Path]:
     """List copies in the chart whose original has been deleted."""
-    return sorted({*(CHART / "files").glob("*/*.yaml")} - outputs().keys())
+    copies = {path for kind in COPIED for path in (CHART / "files" / f"{kind}s").glob("*.yaml")}
+    return sorted(copies - outputs().keys())
 
 
 def _insert(page: Path, text: str) -> dict[Path, str]:

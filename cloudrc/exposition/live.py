@@ -24,7 +24,7 @@ from cloudrc.exposition.parts import (
     unlabelled,
 )
 from cloudrc.exposition.table import Labels, of_role
-from cloudrc.messages import NEVER_NS, GuardState
+from cloudrc.messages import NEVER_NS, Cause, GuardState
 from cloudrc.records import (
     UNDER_WAY,
     Arrival,
@@ -245,6 +245,8 @@ class WorldEnd(End):
         self._truth: GroundTruth | None = None
         self._guard = GuardState.GROUND
         self._changes = dict.fromkeys(table.GUARD_STATES, 0)
+        self._reason = GuardState.GROUND, Cause.SPAWN
+        self._causes = dict.fromkeys(table.GUARD_CAUSES.values(), 0)
         self._contacts = dict.fromkeys(table.BODIES, 0)
         self._slip_ns = self._admitted = 0
         self._basis_ns = NEVER_NS
@@ -272,6 +274,10 @@ class WorldEnd(End):
 
     def _on_telemetry(self, record: TelemetrySent) -> None:
         self._count_age(record.stamp_ns)
+        reason = record.telemetry.guard, record.telemetry.cause
+        if reason != self._reason:
+            self._causes[table.GUARD_CAUSES[reason[1]]] += 1
+            self._reason = reason
         if record.telemetry.guard is GuardState.TRACK:  # no other state uses commands
             self._command_age.observe((record.stamp_ns - self._basis_ns) * 1e-9)
 
@@ -297,6 +303,7 @@ class WorldEnd(End):
             "cloudrc_clouds_admitted_total": unlabelled(self._admitted),
             "cloudrc_guard_state": unlabelled(self._guard),
             "cloudrc_guard_transitions_total": by_label(self._changes),
+            "cloudrc_guard_causes_total": by_label(self._causes),
             "cloudrc_contacts_total": by_label(self._contacts),
             "cloudrc_world_slip_seconds_total": unlabelled(self._slip_ns * 1e-9),
         }

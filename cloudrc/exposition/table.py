@@ -13,6 +13,7 @@ from textwrap import dedent
 from types import MappingProxyType
 from typing import NamedTuple
 
+from cloudrc.messages import Cause
 from cloudrc.records import FAILURES
 
 WORLD, CLOUD, TELEOP, LINK = "world", "cloud", "teleop", "link"
@@ -37,6 +38,8 @@ LIMITS = ("speed", "yaw_rate", "fence")
 PLUGINS = ("estimator", "predictor", "controller")
 GUARD_STATES = ("ground", "track", "hold", "land", "estop")
 """States of the guard, in the order of `cloudrc.messages.GuardState`."""
+GUARD_CAUSES = {cause: cause.words.partition(",")[0] for cause in Cause}
+"""Cause of a guard's state -> value of the label `cause`, the first words of the cause."""
 MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cancelled")
 """States of a mission; the value of `cloudrc_mission_state` is the index of the state."""
 MISSION_OUTCOMES = ("done", "cancelled", *FAILURES, "other")
@@ -160,6 +163,7 @@ _MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
             time since the odometry from which cloud computed the command, on world's clock.
         cloudrc_guard_state: State of the guard: {numbered(GUARD_STATES)}.
         cloudrc_guard_transitions_total: Changes of the guard's state, by new state.
+        cloudrc_guard_causes_total: Changes of the guard's state, by cause.
         cloudrc_guard_limited_total: Commands that a limit of the guard changed; for the fence,
             physics steps instead of commands.
         cloudrc_guard_held_seconds_total: Time in HOLD during missions; updated once a second.
@@ -268,6 +272,7 @@ _LABELS: Mapping[str, Mapping[str, Labels]] = {
     "cloudrc_plugin_failures_total": {"plugin": PLUGINS},
     "cloudrc_position_meters": _BY_AXIS,
     "cloudrc_guard_transitions_total": {"state": GUARD_STATES},
+    "cloudrc_guard_causes_total": {"cause": tuple(dict.fromkeys(GUARD_CAUSES.values()))},
     "cloudrc_guard_limited_total": {"limit": LIMITS},
     "cloudrc_contacts_total": {"body": BODIES},
     "cloudrc_missions_total": {"outcome": MISSION_OUTCOMES},

@@ -1,5 +1,6 @@
 """Prometheus finds the metrics by annotations, or by the objects of its operator."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -7,8 +8,10 @@ import subprocess
 import pytest
 import yaml
 
+from cloudrc.exposition import table
 from cloudrc.exposition.table import METRICS, Kind
 from tests.chart.conftest import CHART, OPERATOR, ROOT, metrics_ports, of_kind, pod_specs, render
+from tools.dashboards import draw, expressions, fetch
 
 KINDS = {"PodMonitor", "PrometheusRule"}
 RULES = CHART / "files" / "rules.yaml"
@@ -40,13 +43,16 @@ def test_scrape_annotations_are_optional(wanted):
             assert int(found["prometheus.io/port"]) in metrics_ports(template["spec"]).values()
 
 
+def series():
+    """Return the names of all series: those of a histogram are its buckets, sum and count."""
+    parts = {Kind.HISTOGRAM: ("_bucket", "_sum", "_count")}
+    return {name + part for name, one in METRICS.items() for part in parts.get(one.kind, ("",))}
+
+
 def test_the_rules_use_existing_metrics_and_name_a_runbook():
     groups = yaml.safe_load(RULES.read_text())["groups"]
     rules = [rule for group in groups for rule in group["rules"]]
-    known = set(METRICS) | {rule["record"] for rule in rules if "record" in rule}
-    for name, metric in METRICS.items():
-        if metric.kind is Kind.HISTOGRAM:
-            known |= {f"{name}_{part}" for part in ("bucket", "sum", "count")}
+    known = series() | {rule["record"] for rule in rules if "record" in rule}
     for rule in rules:
         asked = re.findall(r"(?:\w+:)?cloudrc_\w+(?::\w+)?", rule["expr"])
         assert asked
@@ -64,3 +70,98 @@ def test_the_alerts_fire_when_they_should_and_only_then(tmp_path):
     for words in (["check", "rules", RULES], ["test", "rules", tmp_path / "alerts.yaml"]):
         done = subprocess.run(["promtool", *words], capture_output=True, text=True)
         assert "SUCCESS" in done.stdout, done.stdout + done.stderr
+
+
+def dashboards(values=None, **where):
+    """Render the ConfigMaps of dashboards, and the dashboards in them by name of the file."""
+    objects = render({"dashboards": {"enabled": True, **(values or {})}}, **where)
+    found = of_kind(objects, "ConfigMap").items()
+    maps = [one for name, one in found if "grafana-" in name]
+    texts = {name: text for one in maps for name, text in one["data"].items()}
+    return maps, {name: json.loads(text) for name, text in texts.items()}
+
+
+def queries():
+    """Return each query of all dashboards, with the values that Grafana shows first."""
+    found = dashboards()[1].values()
+    return [
+        query
+        for one in found
+        for panel in one["panels"]
+        for query in expressions(one, panel).values()
+    ]
+
+
+def test_dashboards_are_optional_and_found_by_the_sidecar():
+    assert not [name for name in of_kind(render(), "ConfigMap") if "grafana-" in name]
+    values = {"labels": {"team": "robots"}, "annotations": {"grafana_folder": "lab"}}
+    maps, shown = dashboards(values)
+    topics = {path.stem for path in (CHART / "files" / "dashboards").iterdir()}
+    assert topics == {"loop", "guard", "link", "resources", "missions"}
+    assert len(maps) == len(shown) == len(topics)
+    for one in maps:
+        assert one["metadata"]["annotations"] == values["annotations"]
+        wanted = values["labels"] | {"grafana_dashboard": "1"}
+        assert one["metadata"]["labels"].items() > wanted.items()
+
+
+def test_dashboards_of_several_releases_do_not_collide():
+    """Grafana refuses two dashboards with one uid, or with one title in a folder."""
+    places = (("demo", "lab"), ("demo", "class"), ("other", "lab"), ("d" * 53, "n" * 63))
+    found = [item for r, n in places for item in dashboards(release=r, namespace=n)[1].items()]
+    for distinct in (
+        {name for name, _ in found},
+        {one["uid"] for _, one in found},
+        {one["title"] for _, one in found},
+    ):
+        assert len(distinct) == len(found)
+    assert max(len(one["uid"]) for _, one in found) <= 40, "Grafana's limit"
+
+
+def test_panels_have_their_places_queries_and_states():
+    states = {}
+    for one in dashboards()[1].values():
+        taken = set()
+        for panel in one["panels"]:
+            at = panel["gridPos"]
+            cells = {(at["x"] + i, at["y"] + j) for i in range(at["w"]) for j in range(at["h"])}
+            assert not cells & taken
+            assert max(x for x, _ in cells) < 24, "the width of Grafana's grid"
+            taken |= cells
+            assert len({target["refId"] for target in panel["targets"]}) == len(panel["targets"])
+            assert panel["datasource"]["uid"] == "${datasource}"
+            for mapping in panel["fieldConfig"]["defaults"].get("mappings", ()):
+                options = mapping["options"]
+                states[panel["title"]] = tuple(options[str(n)]["text"] for n in range(len(options)))
+    assert states.pop("State of the guard") == table.GUARD_STATES
+    assert states.pop("State of the mission") == table.MISSION_STATES
+    assert states == {"The link is as asked": ("no", "yes")}
+
+
+def test_panels_query_metrics_of_the_release_alone():
+    assert len(queries()) > 40
+    for query in queries():
+        asked = set(re.findall(r"(\w+){", query))
+        assert asked, query
+        assert {name for name in asked if not name.startswith("process_")} <= series()
+        for selector in re.findall(r"{(.*?)}", query):
+            assert 'namespace=~"lab",pod=~"demo-cloudrc(-.*)?"' in selector
+
+
+@pytest.mark.skipif(shutil.which("promtool") is None, reason="Debian package prometheus")
+def test_promtool_accepts_the_queries_of_the_panels(tmp_path):
+    rules = [{"record": f"query{n}", "expr": query} for n, query in enumerate(queries())]
+    path = tmp_path / "rules.yaml"
+    path.write_text(yaml.safe_dump({"groups": [{"name": "panels", "rules": rules}]}))
+    done = subprocess.run(["promtool", "check", "rules", path], capture_output=True, text=True)
+    assert f"SUCCESS: {len(rules)} rules" in done.stdout, done.stdout + done.stderr
+
+
+def test_the_panels_are_drawn_without_grafana(tmp_path):
+    def ask(query):
+        labels = dict.fromkeys(("state", "cause", "limit"), "some")
+        return [{"metric": labels, "values": [[0, "NaN"], [5, "1"]]}]
+
+    guard = dashboards()[1]["lab-demo-cloudrc-guard.json"]
+    draw([(guard, fetch(guard, ask, 300))], tmp_path / "panels.webp")
+    assert (tmp_path / "panels.webp").read_bytes()[8:12] == b"WEBP"

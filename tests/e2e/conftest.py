@@ -312,6 +312,7 @@ def values(tmp_path_factory):
     prometheus = {"kubernetes.io/metadata.name": f"{NAMESPACE}-monitoring"}
     given = {
         "link": {"mode": "relay"},
+        "dashboards": {"enabled": True},
         "metrics": {"allowFrom": [{"namespaceSelector": {"matchLabels": prometheus}}]},
     }
     path = tmp_path_factory.mktemp("values") / "values.yaml"
@@ -334,6 +335,14 @@ def prometheus_image(cluster):
     """Name of an image with Prometheus and promtool."""
     found = command("docker", "images", "--format={{.Repository}}:{{.Tag}}", "cloudrc/prometheus")
     return found.split()[0]
+
+
+@pytest.fixture(scope="session")
+def prometheus(installed, prometheus_image):
+    """A Prometheus that scrapes the release from now on."""
+    from tests.e2e.neighbours import install_prometheus
+
+    install_prometheus(prometheus_image)
 
 
 def processor_times():

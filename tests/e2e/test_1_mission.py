@@ -24,7 +24,7 @@ from tests.e2e.conftest import (
     scrapes,
     value,
 )
-from tests.e2e.neighbours import Prometheus, install_prometheus, promtool, stranger
+from tests.e2e.neighbours import Prometheus, promtool, stranger
 
 MISSION = "paper-mission"
 LIMIT_TIME = 360.0
@@ -43,11 +43,6 @@ class FirstFlight:
     foreign_malformed: float
     own_malformed: float
     seconds: float
-
-
-@pytest.fixture(scope="module")
-def prometheus(installed, prometheus_image):
-    install_prometheus(prometheus_image)
 
 
 @pytest.fixture(scope="module")

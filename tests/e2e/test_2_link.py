@@ -12,6 +12,7 @@ import yaml
 from cloudrc.cluster.link import send_change
 from cloudrc.link.follow import PROFILE, Handed
 from tests.e2e.conftest import (
+    BUILD,
     CHART,
     NAME,
     CommandFailedError,
@@ -33,6 +34,8 @@ from tests.e2e.conftest import (
     set_link,
     value,
 )
+from tests.e2e.neighbours import Prometheus
+from tools.dashboards import draw, fetch
 
 SET_WITHIN = 1.0
 """Time limit for `link set` until the change is in force [s]. The fastest of three calls counts,
@@ -66,12 +69,16 @@ LONG = [
 """A mission that waits at its second point for longer than the tests of this module take."""
 LINK_TEST = f"{NAME}-test-link"
 """Pod of `helm test` that verifies the link; Helm keeps the pod after a failure."""
+SHOWN = 600
+"""Time that the dashboards show [s]: the missions so far."""
+TRIES = 12
+"""Largest number of tries, 5 s apart: where a test runs alone, rates need some scrapes [count]."""
 ASIDE = (0.5, 0.5, 0.8)
 """Point to which the operator sends the robot while the mission is held [m]."""
 
 
 @pytest.fixture(scope="module")
-def flight(installed):
+def flight(installed, prometheus):
     """A mission that flies while the profiles change, and is cancelled afterwards."""
     before = identity()
     fly("long", LONG, limit=300.0)
@@ -194,6 +201,25 @@ def test_a_release_is_cheap(readings, note):
     note("  " + ", ".join(f"{name} {cpu * 1000:.0f}m" for name, cpu in least.items()))
     assert sum(least.values()) <= max(LIMIT_CPU, asked)
     assert used <= LIMIT_MEMORY
+
+
+def test_each_query_of_each_dashboard_returns_data(flight, note):
+    began = time.monotonic()
+    maps = read("configmaps", "--selector=grafana_dashboard=1")["items"]
+    dashboards = [json.loads(text) for one in maps for text in one["data"].values()]
+    assert len(dashboards) == len(list((CHART / "files" / "dashboards").iterdir()))
+    with Prometheus() as prometheus:
+        for _ in range(TRIES):
+            shown = [(each, fetch(each, prometheus.ask, SHOWN)) for each in dashboards]
+            queries = [query for _, curves in shown for query in curves.items()]
+            missing = [key for key, curves in queries if not any(each.points for each in curves)]
+            if not missing:
+                break
+            time.sleep(5.0)
+    assert missing == []
+    draw(shown, BUILD / "dashboards.webp")
+    took = time.monotonic() - began
+    note(f"{len(queries)} queries of dashboards have data, and a picture: {took:.0f} s")
 
 
 @pytest.mark.full

@@ -1,5 +1,6 @@
 """Each fault fires exactly its alerts of the chart."""
 
+import re
 import shutil
 from pathlib import Path
 
@@ -33,16 +34,21 @@ FLOWN = [
 ]
 
 
-def alerts():
+def rules(kind):
     groups = yaml.safe_load(RULES.read_text(encoding="utf-8"))["groups"]
-    return {rule["alert"] for group in groups for rule in group["rules"] if "alert" in rule}
+    return {rule[kind] for group in groups for rule in group["rules"] if kind in rule}
 
 
 def test_every_alert_has_a_test_that_fires_it():
-    tried = [
-        check for test in yaml.safe_load(MADE_UP)["tests"] for check in test["alert_rule_test"]
-    ]
-    assert {check["alertname"] for check in tried if check.get("exp_alerts")} == alerts()
+    tests = yaml.safe_load(MADE_UP)["tests"]
+    tried = [check for test in tests for check in test.get("alert_rule_test", ())]
+    assert {check["alertname"] for check in tried if check.get("exp_alerts")} == rules("alert")
+
+
+def test_every_recording_rule_has_a_test_of_its_value():
+    (test,) = (test for test in yaml.safe_load(MADE_UP)["tests"] if "promql_expr_test" in test)
+    samples = [one["labels"] for one in test["promql_expr_test"][0]["exp_samples"]]
+    assert {re.findall(r'rule="(.+?)"', labels)[0] for labels in samples} == rules("record")
 
 
 @pytest.fixture

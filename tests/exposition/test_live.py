@@ -9,7 +9,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.exposition import table
 from cloudrc.exposition.live import ONE_SHAPER, LinkVerdict, LiveMetrics
 from cloudrc.exposition.parts import Histogram
-from cloudrc.messages import ZERO, GuardState
+from cloudrc.messages import UPRIGHT, ZERO, Cause, GuardState, Odometry, Telemetry
 from cloudrc.records import (
     Arrival,
     CommandApplied,
@@ -127,6 +127,23 @@ def test_guard_and_contacts_are_counted():
         assert value(live, "cloudrc_guard_transitions_total", state) == 1
     found = {body: value(live, "cloudrc_contacts_total", body) for body in table.BODIES}
     assert found == {"board": 1, "pipe": 2, "other": 1, "floor": 0}
+
+
+def test_changes_of_the_guard_are_counted_by_cause():
+    live, still = LiveMetrics("world"), Odometry(0, ZERO, UPRIGHT, ZERO, ZERO)
+    for guard, cause in (
+        (GuardState.GROUND, Cause.SPAWN),
+        (GuardState.TRACK, Cause.COMMAND),
+        (GuardState.HOLD, Cause.SILENCE),
+        (GuardState.HOLD, Cause.SILENCE),
+        (GuardState.TRACK, Cause.COMMANDS),
+        (GuardState.HOLD, Cause.SILENCE),
+    ):
+        telemetry = Telemetry(0, still, 0.0, 0, 0, 0, 0, guard, cause=cause)
+        live.see([TelemetrySent(0, 1, 1, telemetry)])
+    causes = live.read()["cloudrc_guard_causes_total"]
+    counted = {cause: number for (cause,), number in causes.items() if number}
+    assert counted == {"fresh command": 1, "no fresh commands": 2, "fresh commands again": 1}
 
 
 def test_the_real_time_factor_covers_the_last_ten_seconds():

@@ -1,0 +1,107 @@
+"""Query Prometheus for the panels of the chart's dashboards, and draw them as Grafana would.
+
+The end-to-end tests use this module: they need no Grafana, and draw build/e2e/dashboards.webp.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Any, NamedTuple
+
+STEP = 5
+"""Time between two points of a curve [s]; Prometheus scrapes as often."""
+RATE_INTERVAL = "20s"
+"""Value of Grafana's variable `$__rate_interval`: four scrapes, as in Grafana."""
+UNITS = {"s": "s", "lengthm": "m", "velocityms": "m/s", "forceN": "N", "bytes": "B", "cps": "/s"}
+"""Name of a unit in Grafana -> its symbol."""
+COLUMNS = 3
+DAY = 86_400
+"""Matplotlib's unit of time [s]."""
+
+Dashboard = Mapping[str, Any]
+Ask = Callable[[str], Sequence[Mapping[str, Any]]]
+"""A function that returns the result of a query, as in Prometheus' API."""
+
+
+class Curve(NamedTuple):
+    """One curve of a panel: its text in the legend, and its points (Unix time [s], value)."""
+
+    legend: str
+    points: list[tuple[float, float]]
+
+
+Curves = dict[tuple[str, str], list[Curve]]
+"""Title of a panel, and its query's text in the legend -> the curves that the query returns."""
+
+
+def expressions(dashboard: Dashboard, panel: Mapping[str, Any]) -> dict[str, str]:
+    """Return legend -> query of a panel, with the values of variables that Grafana shows first."""
+    values = {"__rate_interval": RATE_INTERVAL}
+    for variable in dashboard["templating"]["list"]:
+        values[variable["name"]] = variable.get("current", {}).get("value", "")
+    targets = panel["targets"]
+    return {each["legendFormat"]: _fill(each["expr"], r"\$(\w+)", values) for each in targets}
+
+
+def _fill(text: str, pattern: str, values: Mapping[str, str]) -> str:
+    return re.sub(pattern, lambda found: values[found[1]], text)
+
+
+def fetch(dashboard: Dashboard, ask: Ask, duration: int) -> Curves:
+    """Return the curves of all panels over the last `duration` [s]."""
+    found = {}
+    for panel in dashboard["panels"]:
+        for legend, query in expressions(dashboard, panel).items():
+            found[panel["title"], legend] = [
+                Curve(
+                    _fill(legend, r"{{(\w+)}}", one["metric"]),
+                    [(time, float(text)) for time, text in one["values"] if text != "NaN"],
+                )
+                for one in ask(f"({query})[{duration}s:{STEP}s]")
+            ]
+    return found
+
+
+def draw(shown: Sequence[tuple[Dashboard, Curves]], path: Path) -> None:
+    """Draw all panels of dashboards into a picture."""
+    from matplotlib.figure import Figure
+
+    rows = [-(-len(dashboard["panels"]) // COLUMNS) for dashboard, _ in shown]
+    figure = Figure(figsize=(12, 1.75 * sum(rows) + 0.5 * len(rows)), layout="constrained")
+    heights = [n + 0.25 for n in rows]
+    parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights).flat
+    for (dashboard, curves), n, part in zip(shown, rows, parts, strict=True):
+        part.suptitle(dashboard["title"], weight="bold")
+        axes = part.subplots(n, COLUMNS, sharex=True, squeeze=False).flat
+        for axis, panel in zip(axes, dashboard["panels"], strict=False):
+            of_panel = [each for key, each in curves.items() if key[0] == panel["title"]]
+            _draw_panel(axis, panel, [*chain(*of_panel)])
+    figure.savefig(path, dpi=100, pil_kwargs={"lossless": True})
+
+
+def _draw_panel(axis: Any, panel: Mapping[str, Any], curves: list[Curve]) -> None:
+    from matplotlib.dates import DateFormatter, MinuteLocator
+    from matplotlib.ticker import EngFormatter, PercentFormatter
+
+    defaults = panel["fieldConfig"]["defaults"]
+    for legend, points in curves:
+        days, values = [time / DAY for time, _ in points], [value for _, value in points]
+        axis.plot(days, values, label=legend, linewidth=1, drawstyle="steps-post")
+    axis.set_title(panel["title"], fontsize=8, loc="left")
+    axis.tick_params(labelsize=7)
+    axis.grid(alpha=0.3)
+    if mappings := defaults.get("mappings"):
+        states = mappings[0]["options"]
+        axis.set_yticks([*map(int, states)], [state["text"] for state in states.values()])
+        axis.set_ylim(-0.5, len(states) - 0.5)
+    elif (unit := defaults["unit"]) == "percentunit":
+        axis.yaxis.set_major_formatter(PercentFormatter(1.0))
+    elif unit in UNITS:
+        axis.yaxis.set_major_formatter(EngFormatter(UNITS[unit]))
+    axis.xaxis_date()
+    axis.xaxis.set_major_locator(MinuteLocator())
+    axis.xaxis.set_major_formatter(DateFormatter("%H:%M"))
+    axis.legend(fontsize=7, frameon=False, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.15))
