@@ -20,13 +20,14 @@ from cloudrc.cloud.operator import Operator
 from cloudrc.config import schema
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.overrides import build_plugin
+from cloudrc.config.setpoints import read_setpoints
 from cloudrc.geometry import fence
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Loss
 from cloudrc.link.traces import SIZE_MAX, read_table, read_trace
 from cloudrc.messages import Start
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.wire import Leg, Plan
+from cloudrc.teleop.wire import Knot, Leg, Plan
 from cloudrc.tunnel.end import Identity
 
 if TYPE_CHECKING:
@@ -204,14 +205,19 @@ def mission_plan(
 
     `seed` is the seed of random setpoints, `speed_max` the guard's speed limit [m/s].
     """
-    if mission.steps is not None:
+    track: tuple[Knot, ...] = ()
+    if mission.setpoints is not None:
+        track = tuple(Knot(*each) for each in read_setpoints(Path(mission.setpoints)))
+        legs: tuple[Leg, ...] = (Leg(track[0].position, tolerance=inf, time_limit=inf),)
+    elif mission.steps is not None:
         legs = _step_legs(mission.steps, seed)
     else:
         starts = (None, *mission.waypoints)
         ways = zip(starts, mission.waypoints, strict=False)  # no way starts at the last waypoint
         carrot = mission.carrot
         legs = tuple(_leg(start, waypoint, speed_max, carrot) for start, waypoint in ways)
-    return Plan(legs, Start.SPAWN if mission.start == "spawn" else Start.HERE, time_limit)
+    start = Start.SPAWN if mission.start == "spawn" else Start.HERE
+    return Plan(legs, start, time_limit, track=track)
 
 
 def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> DirectionProfile:

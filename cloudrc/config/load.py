@@ -38,6 +38,7 @@ from cloudrc.config.schema import (
     Cloud,
     CloudTime,
     CommandAge,
+    Criteria,
     Direction,
     Experiment,
     Guard,
@@ -47,6 +48,7 @@ from cloudrc.config.schema import (
     Profile,
     Speed,
 )
+from cloudrc.config.setpoints import read_setpoints
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
 from cloudrc.link.traces import read_table, read_trace
@@ -161,6 +163,9 @@ def load_experiment(
         _inline_mission(document)
     with _collect(found, ("link", "profile")):
         _inline_profile(document)
+    if ("mission", "setpoints") in inner and isinstance(document.get("mission"), dict):
+        for key in ("waypoints", "steps", "carrot"):
+            document.tree["mission"].pop(key, None)
     overrides.apply_overrides(document, inner)
     plans = document.get("cloud", "plan_s")
     has_plans = isinstance(plans, float | int) and plans > 0
@@ -169,6 +174,7 @@ def load_experiment(
         _default(document, ("cloud", key), getattr(Cloud(), key))
     found += overrides.resolve_plugins(document, build=build)
     found += _resolve_traces(document, ("link",)) + _resolve_files(document)
+    found += _resolve_setpoints(document)
     experiment = validate(document, ResolvedExperiment, name, found)
     scene, mission = load_scene(experiment.world.scene), experiment.mission
     wrong = check_mission(mission, scene)
@@ -176,7 +182,7 @@ def load_experiment(
     problems.raise_problems(document, below, name)
     criteria = experiment.criteria
     if criteria.contact is None:
-        contact = scene.board is not None and mission.steps is None
+        contact = scene.board is not None and not (mission.steps or mission.setpoints)
         criteria = criteria.model_copy(update={"contact": contact})
     return experiment.model_copy(update={"criteria": criteria})
 
@@ -355,6 +361,23 @@ def _resolve_traces(document: Document, above: KeyPath) -> list[Problem]:
             document.set_value(path, str(absolute), source)
             with _collect(found, path):
                 FILE_READERS[path[-1]](absolute)
+    return found
+
+
+def _resolve_setpoints(document: Document) -> list[Problem]:
+    """Make the path of the mission's setpoints absolute, and check the file; return problems."""
+    path, found = ("mission", "setpoints"), list[Problem]()
+    given, source = document.get(*path), document.source(path)
+    if isinstance(given, str):
+        document.set_value(path, str(source.absolute(given)), source)
+        with _collect(found, path):
+            lasts = read_setpoints(source.absolute(given))[-1][0]
+            limit = document.get("criteria", "time_limit_s") or Criteria().time_limit_s
+            if isinstance(limit, float | int) and lasts >= limit:
+                reason = (
+                    f"last {lasts:g} s, longer than the mission may; raise criteria.time_limit_s"
+                )
+                found.append(Problem(path, given, reason))
     return found
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.setpoints import write_setpoints
 from cloudrc.errors import BadInputError, MissingPrerequisiteError, describe_error
 from cloudrc.files import write_atomically
 from cloudrc.geometry.scene import load_scene
@@ -74,9 +75,26 @@ def write_report(
     document, environment = assessment.document, environment_document(run.physics_steps)
     write_json(folder / "report.json", document)
     write_json(folder / "environment.json", environment)
+    if driven := _driven(recording):
+        write_atomically(folder / "drive.csv", driven.encode())
     if page:
         _write_page(folder, assessment, environment)
     return document
+
+
+def _driven(recording: Recording) -> str:
+    """Return the setpoints since the operator began to drive, as CSV; "" without a drive."""
+    mission, control = recording["/mission"], recording["/setpoint_position"]
+    begins_ns = mission["stamp_ns"][mission["event"] == "driving"]
+    if not len(begins_ns):
+        return ""
+    waypoints = recording["/pid"]["waypoint"]
+    rows = (control["stamp_ns"] >= begins_ns[0]) & (waypoints < 0)
+    times = (control["stamp_ns"][rows] - begins_ns[0]) * 1e-9
+    points = zip(
+        times[::2].tolist(), map(tuple, control["setpoint"][rows][::2].tolist()), strict=True
+    )
+    return write_setpoints(points)
 
 
 def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any]) -> None:

@@ -8,6 +8,7 @@ the new process sends the stop again.
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import hypot, inf
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,8 @@ from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState, Setpoint, Start, Vector
 from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, finite_or_none, judge
 from cloudrc.records import Fault, MissionEvent
-from cloudrc.teleop.mission import Teleop
+from cloudrc.teleop.carrot import HEARTBEAT_NS, SPEED_MAX, setpoint_at
+from cloudrc.teleop.mission import HELD_LOWEST, Teleop
 from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError
 from cloudrc.teleop.wire import HELD, QUEUED, Leg, Output, Plan, RobotStatus
 
@@ -29,6 +31,8 @@ SILENCE = 1.0
 """Age from which on telemetry, or the last message from cloud, is too old [s]."""
 SETPOINT_PERIOD_NS = 100_000_000
 """Time between two copies of the setpoint [ns]; a restarted cloud needs the copies."""
+DRIVE_LIMIT = 3600.0
+"""Time limit of a mission that begins with a request to drive [s]."""
 QUEUE_MAX = 16
 """Largest number of missions that wait while another mission flies."""
 NEVER_BEGAN, ASKED = "mission cancelled before it began", "the robot is asked to start"
@@ -81,12 +85,17 @@ class MissionService:
     """
 
     def __init__(
-        self, contact_speed_max: float, book: MissionStore, scene: Scene | None = None
+        self,
+        contact_speed_max: float,
+        book: MissionStore,
+        scene: Scene | None = None,
+        speed_max: float = inf,
     ) -> None:
         """Begin with the missions of a store; the first `handle_deadline` starts or continues one.
 
         `contact_speed_max` limits the speed of the arm's tip when it touches the board [m/s]. With
-        a `scene`, the service refuses straight ways through the walls of pipes.
+        a `scene`, the service refuses straight ways through the walls of pipes. `speed_max` limits
+        the speed of a setpoint that is driven by hand [m/s], besides `carrot.SPEED_MAX`.
         """
         self._contact_speed_max, self._scene = contact_speed_max, scene
         self._outputs: list[Output | Fault] = []
@@ -98,6 +107,9 @@ class MissionService:
         self._current: Mission | None = None
         self._ends = False  # whether this process ends; the next process starts the queue
         self._trouble = ""  # trouble of the store that was last reported
+        self._speed_max = min(speed_max, SPEED_MAX)
+        self._driven_ns = -HEARTBEAT_NS  # time of the last request to drive
+        self._interrupted = False  # whether the operator has to let go before driving on
 
     @property
     def seen(self) -> RobotStatus | None:
@@ -131,7 +143,7 @@ class MissionService:
         if len(waiting) > QUEUE_MAX:
             raise ConflictError(f"{QUEUE_MAX} missions wait already; cancel one", waiting[0].id)
         self._check_can_fly()
-        if order.plan.start is Start.HERE and not waiting:
+        if order.plan.start is Start.HERE and not waiting and not order.plan.by_hand:
             self._check_way(order.plan.legs[0])
         mission = self.book.add(order)
         if waiting:
@@ -156,6 +168,7 @@ class MissionService:
 
     def hold(self, now_ns: int) -> Mission:
         """Interrupt the mission under way: the robot holds its position."""
+        self._interrupted = True
         return self._operate(self._teleop.hold, now_ns)
 
     def resume(self, now_ns: int) -> Mission:
@@ -177,8 +190,42 @@ class MissionService:
         self._check_way(leg)
         return self._operate(lambda now: self._teleop.go_to(now, leg), now_ns)
 
+    def drive(self, velocity: Vector, now_ns: int) -> dict[str, Any]:
+        """Drive the setpoint by hand, during a held mission or in a new one.
+
+        The setpoint takes up `velocity` [m/s], world frame. It brakes and rests if the next request
+        does not come within `HEARTBEAT_NS`. After a hold or the end of a mission, the operator has
+        to let go first. Return the setpoint in the form of the API's `DriveView`.
+        """
+        pause_ns, self._driven_ns = now_ns - self._driven_ns, now_ns
+        x, y, z = velocity
+        scale = self._speed_max / max(hypot(x, y, z), self._speed_max)
+        velocity = (scale * x, scale * y, scale * z)
+        rests = not any(velocity)
+        self._interrupted = self._interrupted and not rests and pause_ns <= HEARTBEAT_NS
+        self._check_can_fly()
+        waiting, seen = self.book.open(), self.seen
+        if self._interrupted:
+            raise ConflictError("a hold, a stop or an end came in between; let go, then drive on")
+        if not waiting:
+            if seen is None or rests:
+                missing = "a velocity other than zero takes off" if seen else "no telemetry yet"
+                raise ConflictError(
+                    f"no mission is under way, and there is nothing to drive: {missing}"
+                )
+            x, y, z = seen.position
+            leg = Leg((x, y, max(z, HELD_LOWEST)), tolerance=inf, dwell=0.0)
+            self.create(Order(Plan((leg,), Start.HERE, DRIVE_LIMIT, by_hand=True), "drive"), now_ns)
+        elif waiting[0].state != HELD and not waiting[0].order.plan.by_hand:
+            raise _busy(waiting[0], "hold or cancel it first")
+        mission = self._operate(lambda now: self._teleop.drive(now, velocity), now_ns)
+        view: dict[str, Any] = {"id": mission.id, "state": mission.state}
+        at = setpoint_at(self._setpoint, now_ns) if self._setpoint else None
+        return {**view, "position_m": at and at.position, "velocity_mps": at and at.velocity}
+
     def stop_rotors(self, now_ns: int) -> Mission | None:
         """Stop the rotors at once in any state; return the mission that the stop ends, if any."""
+        self._interrupted = True
         mission = self._start_next(now_ns)
         self._teleop.stop(now_ns)
         self._collect(now_ns)
@@ -188,6 +235,7 @@ class MissionService:
         """Let the robot fly again after a landing or a stop, if no mission is under way."""
         if self._current is not None:
             raise _busy(self._current, "there is nothing to acknowledge")
+        self._interrupted = True
         self._teleop.acknowledge(now_ns)
         self._collect(now_ns)
 
@@ -371,7 +419,7 @@ class MissionService:
             changed["verdict"] = judge(evidence).as_json()
         self._note(mission, event.event, event.text, now_ns, **changed)
         if mission.ended:
-            self._current = None
+            self._current, self._interrupted = None, True
 
     def _note(self, mission: Mission, event: str, text: str, now_ns: int, **changed: Any) -> None:
         if mission is self._current:
