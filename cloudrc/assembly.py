@@ -27,7 +27,7 @@ from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElli
 from cloudrc.link.traces import SIZE_MAX, read_table, read_trace
 from cloudrc.messages import Start
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.wire import Knot, Leg, Plan
+from cloudrc.teleop.wire import Leg, Plan
 from cloudrc.tunnel.end import Identity
 
 if TYPE_CHECKING:
@@ -205,10 +205,9 @@ def mission_plan(
 
     `seed` is the seed of random setpoints, `speed_max` the guard's speed limit [m/s].
     """
-    track: tuple[Knot, ...] = ()
-    if mission.setpoints is not None:
-        track = tuple(Knot(*each) for each in read_setpoints(Path(mission.setpoints)))
-        legs: tuple[Leg, ...] = (Leg(track[0].position, tolerance=inf, time_limit=inf),)
+    track = read_setpoints(Path(mission.setpoints)) if mission.setpoints else ()
+    if track:
+        legs: tuple[Leg, ...] = (Leg(track[0][1], tolerance=inf, time_limit=inf),)
     elif mission.steps is not None:
         legs = _step_legs(mission.steps, seed)
     else:

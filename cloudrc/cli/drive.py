@@ -103,6 +103,7 @@ class Pilot:
                 self._read()
             self._changed.wait(PERIOD)
             self._changed.clear()
+        self._read()
 
     def _read(self) -> None:
         try:
@@ -125,6 +126,11 @@ class Pilot:
                 screen.addnstr(row, 0, line, width - 1, curses.A_BOLD if row == 0 else 0)
         screen.refresh()
 
+    @property
+    def next_step(self) -> str:
+        """What the robot does next, in words."""
+        return escape((self._state.get("seen") or {}).get("next_step", "unknown"))
+
     def _lines(self) -> list[str]:
         """Return the lines to show."""
         mission, seen = self._state.get("mission"), self._state.get("seen")
@@ -140,21 +146,11 @@ class Pilot:
                 f"speed       {self._speed:.2f} m/s, asked ({asked}) m/s",
                 f"guard       {seen['guard']}: {seen['cause']}",
                 f"round trip  {rtt}",
-                f"next        {seen['next_step']}",
+                f"next        {self.next_step}",
             ]
         what = f"{mission['id']} ({mission['name']}) {mission['state']}" if mission else "none"
         lines += [f"mission     {what}", f"refused     {self._refused or 'nothing'}", "", *HELP]
         return [escape(line) for line in lines]
-
-    @property
-    def farewell(self) -> str:
-        """What the user should know after the end."""
-        mission = self._state.get("mission")
-        if not mission:
-            return "no mission is under way"
-        goes_on = "ends it as done" if mission["name"] == "drive" else "flies on when it is held"
-        words = f"'cloudrc mission resume' {goes_on}, 'cloudrc mission cancel' ends it"
-        return f"mission {mission['id']} is {mission['state']}; {words}"
 
 
 def drive(api: Api) -> int:
@@ -167,5 +163,5 @@ def drive(api: Api) -> int:
     except curses.error as error:
         text = f"mission drive: this terminal cannot be used ({error}); set TERM, as to xterm"
         raise BadInputError(text) from None
-    print_line(pilot.farewell)
+    print_line(f"let go; next: {pilot.next_step}")
     return 0

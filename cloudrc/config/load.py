@@ -38,7 +38,6 @@ from cloudrc.config.schema import (
     Cloud,
     CloudTime,
     CommandAge,
-    Criteria,
     Direction,
     Experiment,
     Guard,
@@ -64,8 +63,10 @@ PLAN_MAX_S = 0.8
 """Default of guard.plan_max_s if cloud sends plans [s].
 Source: docs/reference/plant.md, "Plan"."""
 DIRECTIONS = ("uplink", "downlink")
-FILE_READERS: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
-"""Key of a direction whose value is the path of a file -> function that reads this file."""
+FILE_READERS: dict[str, Callable[[Path], object]] = {
+    **{"trace": read_trace, "table": read_table, "setpoints": read_setpoints}
+}
+"""Key of an experiment whose value is the path of a file -> function that reads this file."""
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
@@ -174,7 +175,7 @@ def load_experiment(
         _default(document, ("cloud", key), getattr(Cloud(), key))
     found += overrides.resolve_plugins(document, build=build)
     found += _resolve_traces(document, ("link",)) + _resolve_files(document)
-    found += _resolve_setpoints(document)
+    found += _resolve_read(document, ("mission", "setpoints"))
     experiment = validate(document, ResolvedExperiment, name, found)
     scene, mission = load_scene(experiment.world.scene), experiment.mission
     wrong = check_mission(mission, scene)
@@ -353,31 +354,18 @@ def _remove_cap(document: Document, age_max: object) -> None:
 
 def _resolve_traces(document: Document, above: KeyPath) -> list[Problem]:
     """Make the paths of traces and tables absolute, and read these files; return problems."""
-    found: list[Problem] = []
-    for path in ((*above, way, key) for way in DIRECTIONS for key in FILE_READERS):
-        given, source = document.get(*path), document.source(path)
-        if isinstance(given, str):
-            absolute = source.absolute(given)
-            document.set_value(path, str(absolute), source)
-            with _collect(found, path):
-                FILE_READERS[path[-1]](absolute)
-    return found
+    paths = ((*above, way, key) for way in DIRECTIONS for key in ("trace", "table"))
+    return [problem for path in paths for problem in _resolve_read(document, path)]
 
 
-def _resolve_setpoints(document: Document) -> list[Problem]:
-    """Make the path of the mission's setpoints absolute, and check the file; return problems."""
-    path, found = ("mission", "setpoints"), list[Problem]()
-    given, source = document.get(*path), document.source(path)
+def _resolve_read(document: Document, path: KeyPath) -> list[Problem]:
+    """Make the path of one file absolute, and read the file; return problems."""
+    given, source, found = document.get(*path), document.source(path), list[Problem]()
     if isinstance(given, str):
-        document.set_value(path, str(source.absolute(given)), source)
+        absolute = source.absolute(given)
+        document.set_value(path, str(absolute), source)
         with _collect(found, path):
-            lasts = read_setpoints(source.absolute(given))[-1][0]
-            limit = document.get("criteria", "time_limit_s") or Criteria().time_limit_s
-            if isinstance(limit, float | int) and lasts >= limit:
-                reason = (
-                    f"last {lasts:g} s, longer than the mission may; raise criteria.time_limit_s"
-                )
-                found.append(Problem(path, given, reason))
+            FILE_READERS[path[-1]](absolute)
     return found
 
 

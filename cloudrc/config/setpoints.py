@@ -13,8 +13,6 @@ from cloudrc.link.traces import Row, read_lines, read_rows
 from cloudrc.messages import Vector
 
 COLUMNS = ["time_s", "x_m", "y_m", "z_m"]
-ROWS_MAX = 200_000
-"""Largest number of rows: more than an hour at 50 Hz."""
 ROUNDING = 1e-6
 """Largest error of a position in a file [m]."""
 TimedPosition: TypeAlias = tuple[float, Vector]
@@ -39,14 +37,13 @@ def read_setpoints(path: Path) -> tuple[TimedPosition, ...]:
             raise BadInputError(
                 f"{row.where}: time_s {time:g} does not rise; sort the rows by time"
             )
-        sides = zip(COLUMNS[1:], INNER_LOW, (x, y, z), INNER_HIGH, strict=True)
-        for column, low, at, high in sides:
+        for column, low, at, high in zip(
+            COLUMNS[1:], INNER_LOW, (x, y, z), INNER_HIGH, strict=True
+        ):
             if not low - ROUNDING <= at <= high + ROUNDING:
                 reason = f"the guard flies from {low:g} to {high:g}"
                 raise BadInputError(f"{row.where}: {column} is {at:g}; {reason}; stay inside")
         found.append((time, (x, y, z)))
-        if len(found) > ROWS_MAX:
-            raise BadInputError(f"{row.where}: more than {ROWS_MAX} rows; leave some out")
     if len(found) < 2:
         raise BadInputError(f"{name}: has {len(found)} rows; give at least two")
     return tuple((time - found[0][0], position) for time, position in found)

@@ -309,7 +309,9 @@ async def go_to(body: Body, bridge: Bridged, request: Request) -> Any:
     return await bridge.move(lambda service, now_ns: service.go_to(leg, now_ns))
 
 
-@router.post("/drive", response_model=models.DriveView, openapi_extra=_takes(models.DriveRequest))
+@router.post(
+    "/drive", response_model=models.MissionSummary, openapi_extra=_takes(models.DriveRequest)
+)
 async def drive(body: Body, bridge: Bridged) -> Any:
     """Drive the setpoint by hand, during a held mission or as a new mission.
 
@@ -319,7 +321,7 @@ async def drive(body: Body, bridge: Bridged) -> Any:
     velocity zero, or nothing for 0.5 s. 409 while a mission flies.
     """
     velocity = models.read_drive(body)
-    return await bridge.move(lambda service, now_ns: service.drive(velocity, now_ns))
+    return await bridge.move(lambda service, now_ns: service.drive(velocity, now_ns).summary())
 
 
 @router.post("/estop", response_model=models.Stopped)

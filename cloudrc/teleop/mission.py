@@ -414,7 +414,7 @@ class Teleop:
     def _follow_track(self, now_ns: int) -> None:
         """Start the setpoint from each point of the track when its time has come."""
         track = self._plan.track
-        knot = bisect_right(track, self.elapsed(now_ns), key=lambda each: each.time) - 1
+        knot = bisect_right(track, self.elapsed(now_ns), key=lambda each: each[0]) - 1
         if not self._knot < knot < len(track) - 1:
             return
         self._knot, (begin, start), (end, position) = knot, *track[knot : knot + 2]
@@ -427,7 +427,7 @@ class Teleop:
 
     def _is_reached(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
         if self._plan.track:
-            return self.elapsed(now_ns) >= self._plan.track[-1].time
+            return self.elapsed(now_ns) >= self._plan.track[-1][0]
         rested = self._watch.is_reached(leg, seen, now_ns)
         if not leg.speed:
             return rested

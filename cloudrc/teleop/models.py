@@ -167,15 +167,6 @@ class MissionView(MissionSummary):
     events_left_out: int = _field("Number of older events")
 
 
-class DriveView(_Answer):
-    """The setpoint that is driven by hand."""
-
-    id: str = _field("The mission under way")
-    state: Literal["starting", "held"] = _field("State of the mission; nothing moves before held")
-    position_m: list[float] | None = _field("Position [m], world frame; null before the first")
-    velocity_mps: list[float] | None = _field("Velocity [m/s], world frame; likewise")
-
-
 class MissionList(_Answer):
     """All known missions."""
 

@@ -19,7 +19,7 @@ from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState, Setpoint, Start, Vector
 from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, finite_or_none, judge
 from cloudrc.records import Fault, MissionEvent
-from cloudrc.teleop.carrot import HEARTBEAT_NS, SPEED_MAX, setpoint_at
+from cloudrc.teleop.carrot import HEARTBEAT_NS, SPEED_MAX
 from cloudrc.teleop.mission import HELD_LOWEST, Teleop
 from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError
 from cloudrc.teleop.wire import HELD, QUEUED, Leg, Output, Plan, RobotStatus
@@ -69,7 +69,7 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
     if age > SILENCE:
         return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
     if mission == HELD and guard is TRACK:
-        return "the operator holds the mission; to continue: cloudrc mission resume"
+        return "the operator holds the mission; to continue: cloudrc mission resume, or cancel"
     return (ALONE if mission is None else IN_MISSION)[guard]
 
 
@@ -190,12 +190,12 @@ class MissionService:
         self._check_way(leg)
         return self._operate(lambda now: self._teleop.go_to(now, leg), now_ns)
 
-    def drive(self, velocity: Vector, now_ns: int) -> dict[str, Any]:
+    def drive(self, velocity: Vector, now_ns: int) -> Mission:
         """Drive the setpoint by hand, during a held mission or in a new one.
 
         The setpoint takes up `velocity` [m/s], world frame. It brakes and rests if the next request
         does not come within `HEARTBEAT_NS`. After a hold or the end of a mission, the operator has
-        to let go first. Return the setpoint in the form of the API's `DriveView`.
+        to let go first.
         """
         pause_ns, self._driven_ns = now_ns - self._driven_ns, now_ns
         x, y, z = velocity
@@ -218,10 +218,7 @@ class MissionService:
             self.create(Order(Plan((leg,), Start.HERE, DRIVE_LIMIT, by_hand=True), "drive"), now_ns)
         elif waiting[0].state != HELD and not waiting[0].order.plan.by_hand:
             raise _busy(waiting[0], "hold or cancel it first")
-        mission = self._operate(lambda now: self._teleop.drive(now, velocity), now_ns)
-        view: dict[str, Any] = {"id": mission.id, "state": mission.state}
-        at = setpoint_at(self._setpoint, now_ns) if self._setpoint else None
-        return {**view, "position_m": at and at.position, "velocity_mps": at and at.velocity}
+        return self._operate(lambda now: self._teleop.drive(now, velocity), now_ns)
 
     def stop_rotors(self, now_ns: int) -> Mission | None:
         """Stop the rotors at once in any state; return the mission that the stop ends, if any."""

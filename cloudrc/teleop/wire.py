@@ -43,13 +43,6 @@ class Leg:
     acceleration: float = 1.0  # of the setpoint [m/s^2]
 
 
-class Knot(NamedTuple):
-    """A point of a track, on which the setpoint moves along straight lines."""
-
-    time: float  # since the mission began [s]
-    position: Vector  # [m], world frame, shape (3,)
-
-
 @dataclass(frozen=True, slots=True)
 class Plan:
     """Waypoints of a mission, with the place of the start and the time limit.
@@ -61,7 +54,9 @@ class Plan:
     start: Start = Start.SPAWN  # the spawn (world is reset), or the robot's position
     time_limit: float = 60.0  # of the mission, with holds [s]
     by_hand: bool = False  # whether the mission begins held, for an operator who drives
-    track: tuple[Knot, ...] = ()  # in order of time; at least two, or none
+    track: tuple[
+        tuple[float, Vector], ...
+    ] = ()  # times [s] and setpoints [m]; none, or two or more
 
 
 NO_PLAN = Plan((Leg(ZERO),))

@@ -3,12 +3,17 @@
 import numpy as np
 import pytest
 
+from cloudrc.config.load import load_experiment
 from cloudrc.faults.flight import Flight, conditions
 from cloudrc.faults.scenario import generator
 from cloudrc.messages import ZERO, GuardState
+from cloudrc.record.columns import Recording
 from cloudrc.records import Arrival, CommandApplied, Control, TelemetrySent
+from cloudrc.report.document import Run
+from cloudrc.report.write import write_report
 from cloudrc.teleop.service import MissionService
 from tests.conftest import nightly
+from tests.flights.conftest import digest, records
 
 EAST, WEST, UP = (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.0, 0.0, 0.5)
 ESTOP, GROUND = GuardState.ESTOP, GuardState.GROUND
@@ -95,6 +100,28 @@ def test_the_robot_holds_when_the_operator_is_lost(count, figure):
     ] * count
     figure("operator lost: braking on board after", max(took), "<=", 0.6, "s", count=count)
     figure("operator lost: setpoint at rest after", max(rested), "<=", 0.8, "s", count=count)
+
+
+def test_a_drive_flown_again_has_one_hash(tmp_path):
+    drive = Drive("paper-p2")
+    drive.press(2.0, 1.0, EAST)
+    drive.press(3.0, 0.5, UP)
+    drive.fly(5.0)
+    flight = drive.flight
+    recording = Recording.from_records(flight.of_world, flight.of_cloud)
+    write_report(tmp_path, recording, flight.experiment, Run("virtual", "virtual"), page=False)
+    again = load_experiment("hover", [f"mission.setpoints={tmp_path / 'drive.csv'}"])
+    assert digest(again) == digest(again)
+    flown = Recording.from_records(*records(again))
+    paths, begins = [], []
+    for one, event in ((recording, "driving"), (flown, "started")):
+        mission, control = one["/mission"], one["/setpoint_position"]
+        begins.append(mission["stamp_ns"][mission["event"] == event][0])
+        times = (control["stamp_ns"] - begins[-1]) * 1e-9
+        grid = np.arange(0.1, 3.0, 0.02)
+        paths.append([np.interp(grid, times, axis) for axis in control["setpoint"].T])
+    assert np.abs(np.subtract(*paths)).max() < 0.02
+    assert flown["/mission"]["event"][-1] == "done"
 
 
 @pytest.mark.promise("emergency-stop-gets-through")
