@@ -103,7 +103,6 @@ class Pilot:
                 self._read()
             self._changed.wait(PERIOD)
             self._changed.clear()
-        self._read()
 
     def _read(self) -> None:
         try:
@@ -126,11 +125,6 @@ class Pilot:
                 screen.addnstr(row, 0, line, width - 1, curses.A_BOLD if row == 0 else 0)
         screen.refresh()
 
-    @property
-    def next_step(self) -> str:
-        """What the robot does next, in words."""
-        return escape((self._state.get("seen") or {}).get("next_step", "unknown"))
-
     def _lines(self) -> list[str]:
         """Return the lines to show."""
         mission, seen = self._state.get("mission"), self._state.get("seen")
@@ -146,7 +140,7 @@ class Pilot:
                 f"speed       {self._speed:.2f} m/s, asked ({asked}) m/s",
                 f"guard       {seen['guard']}: {seen['cause']}",
                 f"round trip  {rtt}",
-                f"next        {self.next_step}",
+                f"next        {seen['next_step']}",
             ]
         what = f"{mission['id']} ({mission['name']}) {mission['state']}" if mission else "none"
         lines += [f"mission     {what}", f"refused     {self._refused or 'nothing'}", "", *HELP]
@@ -157,11 +151,9 @@ def drive(api: Api) -> int:
     """Let the user drive until q; raise BadInputError without a terminal."""
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise BadInputError("mission drive needs a terminal; from a program use POST /v1/drive")
-    pilot = Pilot(api)
     try:
-        curses.wrapper(pilot.run)
+        curses.wrapper(Pilot(api).run)
     except curses.error as error:
-        text = f"mission drive: this terminal cannot be used ({error}); set TERM, as to xterm"
-        raise BadInputError(text) from None
-    print_line(f"let go; next: {pilot.next_step}")
+        raise BadInputError(f"mission drive: {error}; set TERM, for example to xterm") from None
+    print_line("let go; what the robot does next: cloudrc mission status")
     return 0

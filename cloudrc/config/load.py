@@ -164,9 +164,6 @@ def load_experiment(
         _inline_mission(document)
     with _collect(found, ("link", "profile")):
         _inline_profile(document)
-    if ("mission", "setpoints") in inner and isinstance(document.get("mission"), dict):
-        for key in ("waypoints", "steps", "carrot"):
-            document.tree["mission"].pop(key, None)
     overrides.apply_overrides(document, inner)
     plans = document.get("cloud", "plan_s")
     has_plans = isinstance(plans, float | int) and plans > 0
@@ -175,7 +172,7 @@ def load_experiment(
         _default(document, ("cloud", key), getattr(Cloud(), key))
     found += overrides.resolve_plugins(document, build=build)
     found += _resolve_traces(document, ("link",)) + _resolve_files(document)
-    found += _resolve_read(document, ("mission", "setpoints"))
+    found += _resolve_setpoints(document, replace=("mission", "setpoints") in inner)
     experiment = validate(document, ResolvedExperiment, name, found)
     scene, mission = load_scene(experiment.world.scene), experiment.mission
     wrong = check_mission(mission, scene)
@@ -356,6 +353,14 @@ def _resolve_traces(document: Document, above: KeyPath) -> list[Problem]:
     """Make the paths of traces and tables absolute, and read these files; return problems."""
     paths = ((*above, way, key) for way in DIRECTIONS for key in ("trace", "table"))
     return [problem for path in paths for problem in _resolve_read(document, path)]
+
+
+def _resolve_setpoints(document: Document, *, replace: bool) -> list[Problem]:
+    """Read the mission's setpoints; if they `replace` its waypoints, remove these."""
+    if replace and isinstance(document.get("mission", "setpoints"), str):
+        for key in ("waypoints", "steps", "carrot"):
+            document.tree["mission"].pop(key, None)
+    return _resolve_read(document, ("mission", "setpoints"))
 
 
 def _resolve_read(document: Document, path: KeyPath) -> list[Problem]:

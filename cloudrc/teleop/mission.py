@@ -224,9 +224,9 @@ class Teleop:
             return
         self._check("drive", HELD)
         seen, setpoint = self.seen, self._setpoint
-        if seen is None or setpoint is None or seen.guard is not TRACK:
-            return
-        if now_ns - self._seen_ns > GAP_MAX_NS:
+        assert seen is not None, "telemetry has shown the start"
+        assert setpoint is not None, "the setpoint is where the robot was held"
+        if seen.guard is not TRACK or now_ns - self._seen_ns > GAP_MAX_NS:
             return
         moves = velocity != ZERO
         if moves and not self._drives:

@@ -35,6 +35,7 @@ DRIVE_LIMIT = 3600.0
 """Time limit of a mission that begins with a request to drive [s]."""
 QUEUE_MAX = 16
 """Largest number of missions that wait while another mission flies."""
+TAKES_OFF = "a velocity other than zero takes off, once there is telemetry"
 NEVER_BEGAN, ASKED = "mission cancelled before it began", "the robot is asked to start"
 RESTARTED = "teleop has restarted; the robot is asked to go on"
 REST = "after a stop or a landing only when it has stood still, at least 0.5 m inside the fence"
@@ -209,10 +210,7 @@ class MissionService:
             raise ConflictError("a hold, a stop or an end came in between; let go, then drive on")
         if not waiting:
             if seen is None or rests:
-                missing = "a velocity other than zero takes off" if seen else "no telemetry yet"
-                raise ConflictError(
-                    f"no mission is under way, and there is nothing to drive: {missing}"
-                )
+                raise ConflictError(f"no mission is under way; {TAKES_OFF}")
             x, y, z = seen.position
             leg = Leg((x, y, max(z, HELD_LOWEST)), tolerance=inf, dwell=0.0)
             self.create(Order(Plan((leg,), Start.HERE, DRIVE_LIMIT, by_hand=True), "drive"), now_ns)

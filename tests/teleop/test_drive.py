@@ -5,6 +5,8 @@ import pty
 import subprocess
 import sys
 import threading
+import time
+from contextlib import suppress
 from itertools import pairwise
 from math import dist, hypot
 
@@ -26,14 +28,19 @@ from tests.teleop.conftest import (
     service_flying,
 )
 
+COMMAND = [sys.executable, "-m", "cloudrc", "mission", "drive", "--api"]
 EAST = (0.5, 0.0, 0.0)
 SPEEDS = st.tuples(*[st.floats(-1.5, 1.5)] * 3)
 STEPS = st.lists(st.tuples(SPEEDS, st.integers(1, 60)), max_size=12)
 
 
+def inside(setpoint, axis):
+    return INNER_LOW[axis] < setpoint.position[axis] < INNER_HIGH[axis]
+
+
 @given(STEPS, st.tuples(*map(st.floats, INNER_LOW, INNER_HIGH)))
 def test_the_setpoint_keeps_its_limits_and_rests(steps, start):
-    """The fence ends a motion at once only if the operator steers along it at another speed."""
+    """At the fence itself an axis may stop at once: the others can use up the acceleration."""
     setpoint, now_ns = Setpoint(start), 0
     for velocity, periods in [*steps, (ZERO, 300)]:
         setpoint = steer(setpoint, velocity, now_ns)
@@ -42,7 +49,7 @@ def test_the_setpoint_keeps_its_limits_and_rests(steps, start):
             after = setpoint_at(setpoint, now_ns)
             sides = zip(INNER_LOW, after.position, INNER_HIGH, strict=True)
             assert all(low <= at <= high for low, at, high in sides)
-            free = [i for i in range(3) if INNER_LOW[i] < after.position[i] < INNER_HIGH[i]]
+            free = [i for i in range(3) if inside(before, i) and inside(after, i)]
             change = hypot(*(after.velocity[i] - before.velocity[i] for i in free))
             assert change <= ACCELERATION * 0.01 + 1e-9
     assert (after.velocity, after.position) == (ZERO, setpoint.position)
@@ -147,7 +154,7 @@ def test_what_interrupts_a_drive_has_to_be_answered_by_letting_go(driven):
 
 def test_only_a_held_mission_is_driven():
     flight = ServiceFlight()
-    with pytest.raises(ConflictError, match="no telemetry"):
+    with pytest.raises(ConflictError, match="once there is telemetry"):
         press(flight)
     flight.step()
     with pytest.raises(ConflictError, match="other than zero takes off"):
@@ -214,19 +221,16 @@ class Terminal:
 
     def __init__(self, api):
         self.screen, (self._keys, end) = "", pty.openpty()
-        command = [sys.executable, "-m", "cloudrc", "mission", "drive", "--api", api.url]
         environ = {**os.environ, "TERM": "xterm", "LINES": "24", "COLUMNS": "90"}
-        how = dict.fromkeys(("stdin", "stdout", "stderr"), end)
-        self.process = subprocess.Popen(command, env=environ, start_new_session=True, **how)
+        how = {**dict.fromkeys(("stdin", "stdout", "stderr"), end), "env": environ}
+        self.process = subprocess.Popen([*COMMAND, api.url], start_new_session=True, **how)
         os.close(end)
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self):
-        try:
+        with suppress(OSError):  # the process has ended
             while data := os.read(self._keys, 4096):
                 self.screen += data.decode(errors="replace")
-        except OSError:  # the process has ended
-            pass
 
     def type(self, keys):
         os.write(self._keys, keys.encode())
@@ -236,7 +240,9 @@ class Terminal:
 def test_keys_in_a_terminal_drive_the_robot():
     with running(unix=True) as api:
         flight, terminal = api.flight, Terminal(api)
-        api.until(lambda: "GROUND" in terminal.screen)
+        while "GROUND" not in terminal.screen:  # a busy machine starts it slowly
+            assert terminal.process.poll() is None, terminal.screen
+            time.sleep(0.1)
         for key, axis, sign in (("\x1bOA", 0, 1), ("\x1bOC", 1, -1), ("w", 2, 1)):
             terminal.type(key)
             api.until(lambda a=axis, s=sign: s * reference(flight).velocity[a] > 0.1)
@@ -252,12 +258,11 @@ def test_keys_in_a_terminal_drive_the_robot():
         api.until(lambda: flight.guard is GuardState.ESTOP)
         terminal.type("q")
         assert terminal.process.wait(10.0) == 0
-        assert "next: the rotors are stopped" in terminal.screen
 
 
 @pytest.mark.process
 def test_without_a_terminal_drive_says_so():
-    command = [sys.executable, "-m", "cloudrc", "mission", "drive", "--api", "unix:nowhere"]
-    said = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    how = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True}
+    said = subprocess.run([*COMMAND, "unix:nowhere"], **how)
     assert (said.returncode, said.stderr.count("\n")) == (2, 1)
     assert "needs a terminal" in said.stderr
