@@ -98,8 +98,7 @@ def execute(options: argparse.Namespace) -> int:
         book = _open_store(options.journal, stop, server)
         if book is not None:  # None: stopped while another teleop process locked the journal
             opened.callback(book.close)
-            limits = experiment.criteria.contact_speed_max_mps, experiment.guard.speed_max_mps
-            service = MissionService(limits[0], book, scene, limits[1])
+            service = MissionService(experiment.criteria.contact_speed_max_mps, book, scene)
             single_mission = _start(options, experiment, service)
             may_end = ending(service, stop)
             over = lambda: may_end() or (single_mission and service.over)  # noqa: E731

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import isfinite
 from pathlib import Path
 from typing import TypeAlias
@@ -49,8 +49,8 @@ def read_setpoints(path: Path) -> tuple[TimedPosition, ...]:
     return tuple((time - found[0][0], position) for time, position in found)
 
 
-def write_setpoints(setpoints: Iterable[TimedPosition]) -> str:
-    """Format setpoints as a CSV text that `read_setpoints` can read."""
+def write_setpoints(setpoints: Iterable[tuple[float, Sequence[float]]]) -> str:
+    """Format times [s] and positions [m] as a CSV text that `read_setpoints` can read."""
     lines = (f"{time:.3f},{x:.6g},{y:.6g},{z:.6g}" for time, (x, y, z) in setpoints)
     return "\n".join([",".join(COLUMNS), *lines, ""])
 

@@ -10,7 +10,7 @@ request follows, the setpoint brakes and rests, even if teleop has ended meanwhi
 
 from __future__ import annotations
 
-from math import dist, hypot, sqrt
+from math import dist, sqrt
 
 from cloudrc.geometry.fence import INNER_HIGH, INNER_LOW
 from cloudrc.messages import ZERO, Drive, Motion, Setpoint, Vector
@@ -24,13 +24,9 @@ _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 def arrival_ns(setpoint: Setpoint) -> int:
-    """Return when a setpoint comes to rest, at the latest [ns]; 0 if it never moves."""
+    """Return when a carrot comes to rest [ns]; 0 if the setpoint never moves."""
     if setpoint.motion is None:
         return 0
-    if isinstance(setpoint.motion, Drive):
-        _, _, before, target, acceleration, until_ns = setpoint.motion
-        fastest = max(hypot(*before), hypot(*target))
-        return until_ns + round(fastest / acceleration * 1e9)
     _, _, total = _profile(setpoint)
     return setpoint.motion.begin_ns + round(total * 1e9)
 
@@ -85,7 +81,7 @@ def steer(setpoint: Setpoint, velocity: Vector, now_ns: int) -> Setpoint:
     )
     motion = Drive(start, now_ns, before, (x, y, z), ACCELERATION, now_ns + HEARTBEAT_NS)
     moving = Setpoint(start, yaw, motion=motion)
-    return moving._replace(position=setpoint_at(moving, arrival_ns(moving)).position)
+    return moving._replace(position=setpoint_at(moving, now_ns + 4 * HEARTBEAT_NS).position)
 
 
 def _speed_within(distance: float) -> float:

@@ -438,7 +438,7 @@ class Teleop:
     def _leaves_ns(self, leg: int) -> int | None:
         """Return when the carrot has rested at a waypoint [ns]; None if it is not on this way."""
         setpoint = self._setpoint
-        if setpoint is None or setpoint.motion is None or setpoint.waypoint != leg:
+        if setpoint is None or type(setpoint.motion) is not Motion or setpoint.waypoint != leg:
             return None
         return arrival_ns(setpoint) + round(self._plan.legs[leg].dwell * 1e9)
 

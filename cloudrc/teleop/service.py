@@ -86,17 +86,12 @@ class MissionService:
     """
 
     def __init__(
-        self,
-        contact_speed_max: float,
-        book: MissionStore,
-        scene: Scene | None = None,
-        speed_max: float = inf,
+        self, contact_speed_max: float, book: MissionStore, scene: Scene | None = None
     ) -> None:
         """Begin with the missions of a store; the first `handle_deadline` starts or continues one.
 
         `contact_speed_max` limits the speed of the arm's tip when it touches the board [m/s]. With
-        a `scene`, the service refuses straight ways through the walls of pipes. `speed_max` limits
-        the speed of a setpoint that is driven by hand [m/s], besides `carrot.SPEED_MAX`.
+        a `scene`, the service refuses straight ways through the walls of pipes.
         """
         self._contact_speed_max, self._scene = contact_speed_max, scene
         self._outputs: list[Output | Fault] = []
@@ -108,7 +103,6 @@ class MissionService:
         self._current: Mission | None = None
         self._ends = False  # whether this process ends; the next process starts the queue
         self._trouble = ""  # trouble of the store that was last reported
-        self._speed_max = min(speed_max, SPEED_MAX)
         self._driven_ns = -HEARTBEAT_NS  # time of the last request to drive
         self._interrupted = False  # whether the operator has to let go before driving on
 
@@ -200,7 +194,7 @@ class MissionService:
         """
         pause_ns, self._driven_ns = now_ns - self._driven_ns, now_ns
         x, y, z = velocity
-        scale = self._speed_max / max(hypot(x, y, z), self._speed_max)
+        scale = SPEED_MAX / max(hypot(x, y, z), SPEED_MAX)
         velocity = (scale * x, scale * y, scale * z)
         rests = not any(velocity)
         self._interrupted = self._interrupted and not rests and pause_ns <= HEARTBEAT_NS

@@ -88,18 +88,15 @@ def test_the_robot_holds_when_the_operator_is_lost(count, figure):
         time += 1.6
     drive.fly(time)
     applied = {(r.epoch, r.counter): r.stamp_ns for r in drive.records[CommandApplied]}
-    took, rested = [], []
+    took = []
     for last in lost:
         command = drive.command_after(last + 0.3, brakes=True)
         later = range(command.counter, command.counter + 9)
         took.append(min(applied.get((command.epoch, k), 10**18) for k in later) * 1e-9 - last)
-        still = drive.stamps[(drive.stamps > last + 0.5) & (drive.speeds == 0.0)]
-        rested.append(still[0] - last)
     assert [event.event for event in drive.flight.events("operator_lost")] == [
         "operator_lost"
     ] * count
     figure("operator lost: braking on board after", max(took), "<=", 0.6, "s", count=count)
-    figure("operator lost: setpoint at rest after", max(rested), "<=", 0.8, "s", count=count)
 
 
 def test_a_drive_flown_again_has_one_hash(tmp_path):

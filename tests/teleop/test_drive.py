@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from cloudrc.geometry.fence import INNER_HIGH, INNER_LOW
 from cloudrc.messages import ZERO, GuardState, Setpoint
-from cloudrc.teleop.carrot import ACCELERATION, arrival_ns, setpoint_at, steer
+from cloudrc.teleop.carrot import ACCELERATION, setpoint_at, steer
 from cloudrc.teleop.store import ConflictError
 from cloudrc.teleop.wire import decode, encode
 from tests.teleop.conftest import (
@@ -53,7 +53,6 @@ def test_the_setpoint_keeps_its_limits_and_rests(steps, start):
             change = hypot(*(after.velocity[i] - before.velocity[i] for i in free))
             assert change <= ACCELERATION * 0.01 + 1e-9
     assert (after.velocity, after.position) == (ZERO, setpoint.position)
-    assert arrival_ns(setpoint) <= now_ns
     assert decode(encode(setpoint)) == setpoint
 
 
@@ -251,7 +250,6 @@ def test_keys_in_a_terminal_drive_the_robot():
         terminal.type("w")  # and no repetition
         api.until(lambda: reference(flight).velocity[2] > 0.1)
         api.until(lambda: reference(flight).velocity == ZERO)
-        assert "operator_lost" not in names(flight)
         terminal.type("hh")
         api.until(lambda: "must be flying" in terminal.screen)
         terminal.type("X")
