@@ -20,6 +20,7 @@ from cloudrc.cloud.operator import Operator
 from cloudrc.config import schema
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.overrides import build_plugin
+from cloudrc.config.setpoints import read_setpoints
 from cloudrc.geometry import fence
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Loss
@@ -204,14 +205,18 @@ def mission_plan(
 
     `seed` is the seed of random setpoints, `speed_max` the guard's speed limit [m/s].
     """
-    if mission.steps is not None:
+    track = read_setpoints(Path(mission.setpoints)) if mission.setpoints else ()
+    if track:
+        legs: tuple[Leg, ...] = (Leg(track[0][1], tolerance=inf, time_limit=inf),)
+    elif mission.steps is not None:
         legs = _step_legs(mission.steps, seed)
     else:
         starts = (None, *mission.waypoints)
         ways = zip(starts, mission.waypoints, strict=False)  # no way starts at the last waypoint
         carrot = mission.carrot
         legs = tuple(_leg(start, waypoint, speed_max, carrot) for start, waypoint in ways)
-    return Plan(legs, Start.SPAWN if mission.start == "spawn" else Start.HERE, time_limit)
+    start = Start.SPAWN if mission.start == "spawn" else Start.HERE
+    return Plan(legs, start, time_limit, track=track)
 
 
 def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> DirectionProfile:

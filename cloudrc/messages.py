@@ -229,6 +229,28 @@ class Motion(NamedTuple):
     acceleration: float
 
 
+class Drive(NamedTuple):
+    """Motion of a setpoint that is driven by hand; `teleop.carrot` computes it.
+
+    The setpoint changes its velocity to `target`, keeps it, and brakes to rest from `until_ns` on.
+
+    Attributes:
+        start: Position at the beginning [m], world frame, shape (3,).
+        begin_ns: Time of the beginning [ns], the monotonic clock of cloud's machine.
+        velocity: Velocity at the beginning [m/s], world frame, shape (3,).
+        target: Velocity to take up [m/s], world frame, shape (3,).
+        acceleration: Acceleration and deceleration [m/s^2], > 0.
+        until_ns: Time at which the setpoint begins to brake [ns], the clock of `begin_ns`.
+    """
+
+    start: Vector
+    begin_ns: int
+    velocity: Vector
+    target: Vector
+    acceleration: float
+    until_ns: int
+
+
 class Setpoint(NamedTuple):
     """Target that teleop gives to the controller.
 
@@ -246,7 +268,7 @@ class Setpoint(NamedTuple):
     waypoint: int = -1
     epoch: int = 0
     velocity: Vector = ZERO
-    motion: Motion | None = None
+    motion: Motion | Drive | None = None
 
 
 class Passed(NamedTuple):

@@ -238,7 +238,9 @@ class Control(NamedTuple):
     derivative: Vector
 
 
-UNDER_WAY = ("started", "reached", "held", "resumed", "goto", "paused")
+BY_HAND = ("goto", "driving", "operator_lost")
+"""Events of a held mission whose setpoint the operator moves; the mission stays held."""
+UNDER_WAY = ("started", "reached", "held", "resumed", "paused", *BY_HAND)
 """Events after which a mission continues; every other event ends it. After "paused", the process
 that flies the mission ends and the next process continues the mission."""
 

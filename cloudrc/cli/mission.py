@@ -46,6 +46,7 @@ examples:
   cloudrc mission run pipes
   cloudrc mission hold
   cloudrc mission goto 0.5 0 1.2
+  cloudrc mission drive
   cloudrc mission estop
   cloudrc mission run my.yaml --queue --context kind-cloudrc -n demo
   cloudrc mission logs --follow
@@ -114,6 +115,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     goto = add("goto", "fly to a point; a held mission then holds there")
     for axis in "XYZ":
         goto.add_argument(axis.lower(), type=_metres, metavar=axis, help="[m], world frame")
+    add("drive", "drive the robot with the keys of this terminal")
     add("hold", "hold the robot where it is, at least 0.35 m above the ground")
     add("resume", "resume the held mission")
     add("estop", "stop the rotors at once: the robot falls and its mission fails")
@@ -351,6 +353,12 @@ def _acknowledge(options: argparse.Namespace, api: Api) -> int:
     return 0
 
 
+def _drive(options: argparse.Namespace, api: Api) -> int:
+    from cloudrc.cli.drive import drive
+
+    return drive(api)
+
+
 API_VERBS: dict[str, Callable[[argparse.Namespace, Api], int]] = {
     "run": _run,
     "list": _list,
@@ -358,6 +366,7 @@ API_VERBS: dict[str, Callable[[argparse.Namespace, Api], int]] = {
     "cancel": _cancel,
     "logs": _logs,
     **dict.fromkeys(("goto", "hold", "resume"), _order),
+    "drive": _drive,
     "estop": _estop,
     "acknowledge": _acknowledge,
 }

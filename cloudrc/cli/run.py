@@ -119,8 +119,7 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     warn(experiment)
     in_cluster, for_programs = mode == "cluster", options.output != "table"
     stream = sys.stderr if for_programs else sys.stdout
-    mission = experiment.mission
-    count = mission.steps.count if mission.steps else len(mission.waypoints)
+    count = experiment.mission.count
     # First prepare the flight: if that fails, no folder must be left.
     if in_cluster:
         flight = _cluster_flight(experiment, options, stream)

@@ -47,6 +47,7 @@ from cloudrc.config.schema import (
     Profile,
     Speed,
 )
+from cloudrc.config.setpoints import read_setpoints
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
 from cloudrc.link.traces import read_table, read_trace
@@ -62,8 +63,10 @@ PLAN_MAX_S = 0.8
 """Default of guard.plan_max_s if cloud sends plans [s].
 Source: docs/reference/plant.md, "Plan"."""
 DIRECTIONS = ("uplink", "downlink")
-FILE_READERS: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
-"""Key of a direction whose value is the path of a file -> function that reads this file."""
+FILE_READERS: dict[str, Callable[[Path], object]] = {
+    **{"trace": read_trace, "table": read_table, "setpoints": read_setpoints}
+}
+"""Key of an experiment whose value is the path of a file -> function that reads this file."""
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
@@ -169,6 +172,7 @@ def load_experiment(
         _default(document, ("cloud", key), getattr(Cloud(), key))
     found += overrides.resolve_plugins(document, build=build)
     found += _resolve_traces(document, ("link",)) + _resolve_files(document)
+    found += _resolve_setpoints(document, replace=("mission", "setpoints") in inner)
     experiment = validate(document, ResolvedExperiment, name, found)
     scene, mission = load_scene(experiment.world.scene), experiment.mission
     wrong = check_mission(mission, scene)
@@ -176,7 +180,7 @@ def load_experiment(
     problems.raise_problems(document, below, name)
     criteria = experiment.criteria
     if criteria.contact is None:
-        contact = scene.board is not None and mission.steps is None
+        contact = scene.board is not None and not (mission.steps or mission.setpoints)
         criteria = criteria.model_copy(update={"contact": contact})
     return experiment.model_copy(update={"criteria": criteria})
 
@@ -347,14 +351,26 @@ def _remove_cap(document: Document, age_max: object) -> None:
 
 def _resolve_traces(document: Document, above: KeyPath) -> list[Problem]:
     """Make the paths of traces and tables absolute, and read these files; return problems."""
-    found: list[Problem] = []
-    for path in ((*above, way, key) for way in DIRECTIONS for key in FILE_READERS):
-        given, source = document.get(*path), document.source(path)
-        if isinstance(given, str):
-            absolute = source.absolute(given)
-            document.set_value(path, str(absolute), source)
-            with _collect(found, path):
-                FILE_READERS[path[-1]](absolute)
+    paths = ((*above, way, key) for way in DIRECTIONS for key in ("trace", "table"))
+    return [problem for path in paths for problem in _resolve_read(document, path)]
+
+
+def _resolve_setpoints(document: Document, *, replace: bool) -> list[Problem]:
+    """Read the mission's setpoints; if they `replace` its waypoints, remove these."""
+    if replace and isinstance(document.get("mission", "setpoints"), str):
+        for key in ("waypoints", "steps", "carrot"):
+            document.tree["mission"].pop(key, None)
+    return _resolve_read(document, ("mission", "setpoints"))
+
+
+def _resolve_read(document: Document, path: KeyPath) -> list[Problem]:
+    """Make the path of one file absolute, and read the file; return problems."""
+    given, source, found = document.get(*path), document.source(path), list[Problem]()
+    if isinstance(given, str):
+        absolute = source.absolute(given)
+        document.set_value(path, str(absolute), source)
+        with _collect(found, path):
+            FILE_READERS[path[-1]](absolute)
     return found
 
 

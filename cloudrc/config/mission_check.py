@@ -34,6 +34,11 @@ _INNER = ", ".join(f"{name} {low:g} to {high:g}" for name, low, high in _SPANS) 
 
 def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
     """List the problems of a mission in a scene; their paths start at the mission."""
+    if mission.setpoints is not None:
+        if mission.waypoints or mission.steps or mission.carrot:
+            reason = "a mission has setpoints, or waypoints, steps and a carrot; delete one"
+            return [Problem(("setpoints",), "", reason)]
+        return []
     if mission.carrot is None:
         for index, waypoint in enumerate(mission.waypoints):
             if waypoint.speed_mps is not None:

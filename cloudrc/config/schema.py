@@ -256,7 +256,7 @@ class Steps(Section):
 
 
 class Mission(Section):
-    """A mission: waypoints, or random steps."""
+    """A mission: waypoints, random steps, or setpoints from a file."""
 
     description: str = ""
     """One line about the mission, for lists"""
@@ -267,8 +267,16 @@ class Mission(Section):
     """Points to fly to, in this order"""
     steps: Steps | None = None
     """Random setpoints in place of waypoints"""
+    setpoints: str | None = None
+    """CSV file time_s,x_m,y_m,z_m in place of waypoints: where the setpoint is over time, with
+    straight lines between the rows. A run that was driven by hand writes such a file, drive.csv"""
     carrot: Carrot | None = None
     """Lets the setpoint move along the ways; null: the setpoint jumps to the next waypoint"""
+
+    @property
+    def count(self) -> int:
+        """Number of waypoints or random steps; setpoints from a file count as one waypoint."""
+        return self.steps.count if self.steps else 1 if self.setpoints else len(self.waypoints)
 
 
 class LowLevel(Section):

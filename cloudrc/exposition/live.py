@@ -26,6 +26,7 @@ from cloudrc.exposition.parts import (
 from cloudrc.exposition.table import Labels, of_role
 from cloudrc.messages import NEVER_NS, Cause, GuardState
 from cloudrc.records import (
+    BY_HAND,
     UNDER_WAY,
     Arrival,
     CommandApplied,
@@ -446,9 +447,9 @@ class Mission:
             self._waypoint = record.waypoint + 1
         elif event in ("held", "paused"):
             self._state = "held"
-        elif event != "goto":
+        elif event not in BY_HAND:
             self._state, self._waypoint = "flying", record.waypoint
-        elif self._state != "held":  # a new mission; in HOLD, goto only moves the hold point
+        elif self._state != "held":  # a new mission; in HOLD, these only move the hold point
             self._state, self._waypoint = "starting", NO_WAYPOINT
 
     def read(self) -> Readings:

@@ -44,7 +44,7 @@ class Flight:
     @property
     def waypoints(self) -> int:
         """Number of waypoints or random steps of the mission."""
-        return self.mission.steps.count if self.mission.steps else len(self.mission.waypoints)
+        return self.mission.count
 
     @cached_property
     def start_ns(self) -> int | None:

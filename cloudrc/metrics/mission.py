@@ -60,7 +60,7 @@ def reported(flight: Flight) -> dict[int, int]:
 def _waypoints_reached(flight: Flight) -> float | None:
     """Count the waypoints that the operator reported and that the true position confirms."""
     stamps, points = reported(flight), flight.mission.waypoints
-    if flight.mission.steps:  # a step ends after its time, wherever the robot is
+    if flight.mission.steps or flight.mission.setpoints:  # they end after their time, anywhere
         return flight.count(len(stamps))
     known = (i for i in stamps if i < len(points))
     return flight.count(sum(_was_at(flight, points[i], stamps[i]) for i in known))

@@ -69,8 +69,9 @@ _CAUSES = "of the guard's state: " + "; ".join(f"{cause:d} {cause.words}" for ca
 _ODOMETRY = "stamp of its odometry, world's clock"
 _ECHO = "stamp of the newest command applied, cloud's clock; -1 if none"
 _EVENTS = (
-    "started, reached, held, resumed, goto; at the end the outcome: done, cancelled, timed_out,"
-    " leg_timed_out, world_restarted, guard_stopped, emergency_stopped, taken_over, end_lost"
+    "started, reached, held, resumed, goto, driving, operator_lost; at the end the outcome: done,"
+    " cancelled, timed_out, leg_timed_out, world_restarted, guard_stopped, emergency_stopped,"
+    " taken_over, end_lost"
 )
 _CODES = (
     "one word, for example estimator_failed, predictor_failed, controller_failed, recorder,"

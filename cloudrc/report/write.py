@@ -6,7 +6,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.setpoints import write_setpoints
 from cloudrc.errors import BadInputError, MissingPrerequisiteError, describe_error
 from cloudrc.files import write_atomically
 from cloudrc.geometry.scene import load_scene
@@ -74,9 +77,23 @@ def write_report(
     document, environment = assessment.document, environment_document(run.physics_steps)
     write_json(folder / "report.json", document)
     write_json(folder / "environment.json", environment)
+    if driven := _driven(assessment.flight):
+        write_atomically(folder / "drive.csv", driven.encode())
     if page:
         _write_page(folder, assessment, environment)
     return document
+
+
+def _driven(flight: Flight) -> str:
+    """Return the setpoints since the operator began to drive, as CSV; "" without a drive."""
+    mission, control = flight.during("/mission"), flight.control
+    begins_ns = mission["stamp_ns"][mission["event"] == "driving"]
+    if not len(begins_ns):
+        return ""
+    by_hand = (control["stamp_ns"] >= begins_ns[0]) & (control["waypoint"] < 0)
+    rows = np.flatnonzero(by_hand)[::2]  # 50 Hz are enough
+    times = (control["stamp_ns"][rows] - begins_ns[0]) * 1e-9
+    return write_setpoints(zip(times.tolist(), control["setpoint"][rows].tolist(), strict=True))
 
 
 def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any]) -> None:

@@ -309,6 +309,21 @@ async def go_to(body: Body, bridge: Bridged, request: Request) -> Any:
     return await bridge.move(lambda service, now_ns: service.go_to(leg, now_ns))
 
 
+@router.post(
+    "/drive", response_model=models.MissionSummary, openapi_extra=_takes(models.DriveRequest)
+)
+async def drive(body: Body, bridge: Bridged) -> Any:
+    """Drive the setpoint by hand, during a held mission or as a new mission.
+
+    The setpoint takes up the velocity with at most 2 m/s^2, and stays inside the fence. Repeat this
+    request, 10 times a second for example: 0.5 s after the last one the setpoint brakes and rests,
+    and the robot holds there. After a hold, a stop or the end of a mission, let go first: send the
+    velocity zero, or nothing for 0.5 s. 409 while a mission flies.
+    """
+    velocity = models.read_drive(body)
+    return await bridge.move(lambda service, now_ns: service.drive(velocity, now_ns).summary())
+
+
 @router.post("/estop", response_model=models.Stopped)
 async def stop_rotors(bridge: Bridged) -> Any:
     """Stop the rotors at once. The robot falls, and needs an acknowledgement to fly again."""

@@ -3,19 +3,28 @@
 The carrot moves straight to its end, with a trapezoid profile of the speed: it accelerates from
 rest, moves at constant speed, and comes to rest at the end. The motion depends on time alone, so
 that cloud and teleop agree on it, and cloud knows the future of the reference.
+
+A setpoint that is driven by hand moves with the velocity of the operator's last request. If no
+request follows, the setpoint brakes and rests, even if teleop has ended meanwhile.
 """
 
 from __future__ import annotations
 
 from math import dist, sqrt
 
-from cloudrc.messages import Setpoint
+from cloudrc.geometry.fence import INNER_HIGH, INNER_LOW
+from cloudrc.messages import ZERO, Drive, Motion, Setpoint, Vector
 
+HEARTBEAT_NS = 500_000_000
+"""Time after a request to drive at which the setpoint begins to brake [ns]."""
+SPEED_MAX, ACCELERATION = 1.5, 2.0
+"""Largest speed [m/s] and acceleration [m/s^2] of a setpoint that is driven by hand. The guard
+limits the acceleration of the robot to 3 m/s^2."""
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 def arrival_ns(setpoint: Setpoint) -> int:
-    """Return when a setpoint comes to rest [ns]; 0 if it never moves."""
+    """Return when a carrot comes to rest [ns]; 0 if the setpoint never moves."""
     if setpoint.motion is None:
         return 0
     _, _, total = _profile(setpoint)
@@ -27,6 +36,8 @@ def setpoint_at(setpoint: Setpoint, now_ns: int) -> Setpoint:
     motion = setpoint.motion
     if motion is None:
         return setpoint
+    if type(motion) is Drive:
+        return _driven(setpoint, motion, now_ns)
     distance, ramp, total = _profile(setpoint)
     since, acceleration = (now_ns - motion.begin_ns) * 1e-9, motion.acceleration
     if since >= total or not distance:
@@ -52,7 +63,56 @@ def setpoint_at(setpoint: Setpoint, now_ns: int) -> Setpoint:
 def _profile(setpoint: Setpoint) -> tuple[float, float, float]:
     """Return the distance [m], the time of the acceleration [s] and the time in all [s]."""
     motion = setpoint.motion
-    assert motion is not None, "the setpoint rests"
+    assert isinstance(motion, Motion), "the setpoint rests, or is driven"
     distance, acceleration = dist(motion.start, setpoint.position), motion.acceleration
     ramp = min(motion.speed / acceleration, sqrt(distance / acceleration))
     return distance, ramp, distance / (acceleration * ramp) + ramp if ramp else 0.0
+
+
+def steer(setpoint: Setpoint, velocity: Vector, now_ns: int) -> Setpoint:
+    """Drive a setpoint with a velocity [m/s], world frame, from where it is at `now_ns` [ns].
+
+    It slows down before the box in which the guard lets the robot fly, and does not leave the box.
+    """
+    start, yaw, _, _, before, _ = setpoint_at(setpoint, now_ns)
+    x, y, z = (
+        max(-_speed_within(at - low), min(asked, _speed_within(high - at)))
+        for asked, at, low, high in zip(velocity, start, INNER_LOW, INNER_HIGH, strict=True)
+    )
+    motion = Drive(start, now_ns, before, (x, y, z), ACCELERATION, now_ns + HEARTBEAT_NS)
+    moving = Setpoint(start, yaw, motion=motion)
+    return moving._replace(position=setpoint_at(moving, now_ns + 4 * HEARTBEAT_NS).position)
+
+
+def _speed_within(distance: float) -> float:
+    """Return the speed [m/s] from which an abandoned setpoint comes to rest in `distance` [m]."""
+    wait = HEARTBEAT_NS * 1e-9
+    return ACCELERATION * (sqrt(wait * wait + 2.0 * max(distance, 0.0) / ACCELERATION) - wait)
+
+
+def _driven(setpoint: Setpoint, drive: Drive, now_ns: int) -> Setpoint:
+    start, begin_ns, before, target, acceleration, until_ns = drive
+    time = max(min(now_ns, until_ns) - begin_ns, 0) * 1e-9
+    position, velocity = _change(start, before, target, acceleration, time)
+    if now_ns > until_ns:
+        time = (now_ns - until_ns) * 1e-9
+        position, velocity = _change(position, velocity, ZERO, acceleration, time)
+    sides = zip(position, INNER_LOW, INNER_HIGH, strict=True)
+    x, y, z = inside = tuple(max(low, min(at, high)) for at, low, high in sides)
+    u, v, w = (s if a == b else 0.0 for s, a, b in zip(velocity, position, inside, strict=True))
+    return setpoint._replace(position=(x, y, z), velocity=(u, v, w))
+
+
+def _change(
+    position: Vector, before: Vector, after: Vector, acceleration: float, time: float
+) -> tuple[Vector, Vector]:
+    """Return position and velocity after `time` [s], in which a velocity changes to `after`."""
+    ramp = dist(before, after) / acceleration
+    share = min(time / ramp, 1.0) if ramp else 1.0
+    rising, steady = min(time, ramp), max(time - ramp, 0.0)
+    u, v, w = (a + share * (b - a) for a, b in zip(before, after, strict=True))
+    x, y, z = (
+        at + 0.5 * (a + now) * rising + b * steady
+        for at, a, now, b in zip(position, before, (u, v, w), after, strict=True)
+    )
+    return (x, y, z), (u, v, w)

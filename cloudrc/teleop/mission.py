@@ -14,10 +14,14 @@ makes the robot's position the setpoint.
 In a mission with a carrot the setpoint moves along the way by time alone, so that the duration of
 the mission does not depend on the network. The carrot waits at the robot while the guard does not
 follow cloud's commands, and leaves a waypoint only if telemetry shows the robot near it.
+
+During a held mission the operator may drive the setpoint by hand. Teleop then lets it rest at the
+robot while the guard does not follow cloud's commands.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable
 from math import dist
 from typing import TYPE_CHECKING
@@ -27,6 +31,8 @@ from cloudrc.geometry import fence
 from cloudrc.messages import (
     MISSION_OVER,
     NEVER_NS,
+    ZERO,
+    Drive,
     GuardState,
     Motion,
     Request,
@@ -35,7 +41,7 @@ from cloudrc.messages import (
     Vector,
 )
 from cloudrc.records import MissionEvent
-from cloudrc.teleop.carrot import arrival_ns
+from cloudrc.teleop.carrot import ACCELERATION, HEARTBEAT_NS, arrival_ns, steer
 from cloudrc.teleop.requests import REPEAT_NS, RequestSender
 from cloudrc.teleop.wire import (
     ALARM,
@@ -69,6 +75,8 @@ PROMPT_NS = 100_000_000
 the robot is there [ns]; else it leaves at that later time."""
 UNSEEN_MAX_NS = 2_000_000_000
 """Time without telemetry after which the dwell time at a waypoint starts again [ns]."""
+JUMP_SPEED = 6.0
+"""On a part of a track that is faster than this, the setpoint jumps [m/s]."""
 # Looking up a member of an enum is slow.
 GROUND, TRACK, HOLD, ESTOP = (
     GuardState.GROUND,
@@ -153,6 +161,8 @@ class Teleop:
         self._seen_ns = NEVER_NS
         # Whether the robot has followed commands in this mission, and whether the carrot waits.
         self._followed = self._waits = False
+        self._released_ns = NEVER_NS  # when the operator is lost; NEVER_NS if nobody drives
+        self._knot = -1  # of the track, from which the setpoint has started
 
     @property
     def settled(self) -> bool:
@@ -200,8 +210,29 @@ class Teleop:
 
     def hold(self, now_ns: int) -> None:
         """Hold the robot at its position; raise BadInputError unless a mission flies."""
-        self._check("hold", FLYING)
+        if not self._drives:
+            self._check("hold", FLYING)
         self._hold(now_ns)
+
+    def drive(self, now_ns: int, velocity: Vector) -> None:
+        """Move the setpoint with a velocity [m/s], world frame, while the operator repeats this.
+
+        Nothing moves before the mission is held, and while telemetry does not show that the robot
+        follows commands. Raise BadInputError unless the mission is held or will be.
+        """
+        if self._plan.by_hand and self.state == STARTING:
+            return
+        self._check("drive", HELD)
+        seen, setpoint = self.seen, self._setpoint
+        assert seen is not None, "telemetry has shown the start"
+        assert setpoint is not None, "the setpoint is where the robot was held"
+        if seen.guard is not TRACK or now_ns - self._seen_ns > GAP_MAX_NS:
+            return
+        moves = velocity != ZERO
+        if moves and not self._drives:
+            self._report("driving", NO_WAYPOINT, "driven by hand", now_ns)
+        self._released_ns = now_ns + HEARTBEAT_NS if moves else NEVER_NS
+        self._select(steer(setpoint, velocity, now_ns))
 
     def resume(self, now_ns: int) -> None:
         """Continue a held mission; raise BadInputError unless the mission is held."""
@@ -261,6 +292,8 @@ class Teleop:
             self._advance("reached, as the robot reports,", now_ns)  # the event was lost
         if self.state == FLYING and legs[self.leg].speed:
             self._lead(seen, now_ns)
+        if self._drives and seen.guard is not TRACK:
+            self._select_here()
         while self.state == FLYING and self._is_reached(legs[self.leg], seen, now_ns):
             self._advance("reached", now_ns)
         if new_session and last is self._setpoint:
@@ -271,6 +304,12 @@ class Teleop:
         """Check the time limits and repeat the request that is due."""
         if self.state in UNDER_WAY and (timeout := self._find_timeout(now_ns)):
             self._end(*timeout, now_ns)
+        if self.state == FLYING and self._plan.track:
+            self._follow_track(now_ns)
+        if self._drives and NEVER_NS < self._released_ns <= now_ns:
+            self._released_ns = NEVER_NS
+            text = f"no request to drive for {HEARTBEAT_NS * 1e-9:g} s: the robot brakes and holds"
+            self._report("operator_lost", NO_WAYPOINT, text, now_ns)
         if self.stopping:
             if now_ns >= self._stop_ns:
                 self._stop_ns = now_ns + REPEAT_NS
@@ -322,6 +361,7 @@ class Teleop:
         self.state, self.outcome, self.leg = STARTING, None, 0
         self._plan, self._mission_id, self._began_ns = plan, mission_id, began_ns
         self._continued = self._was_held = self._followed = self._waits = False
+        self._knot = -1
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
         """Begin the mission and its time, once telemetry shows the start."""
@@ -336,9 +376,9 @@ class Teleop:
             count = f"waypoints: {len(self._plan.legs)}, judged by the measured position"
             text = f"mission started from {place}, {count}"
             self._report("started", 0, text, now_ns)
-        elif self._was_held:
+        if self._was_held or self._plan.by_hand:
             self._hold(now_ns)
-        else:
+        elif self._continued:
             text = f"resumed after a restart of teleop {self.where}"
             self._report("resumed", self.leg, text, now_ns)
 
@@ -371,7 +411,23 @@ class Teleop:
             self._waits = False
             self._select_leg(self.leg, now_ns)
 
+    def _follow_track(self, now_ns: int) -> None:
+        """Start the setpoint from each point of the track when its time has come."""
+        track = self._plan.track
+        knot = bisect_right(track, self.elapsed(now_ns), key=lambda each: each[0]) - 1
+        if not self._knot < knot < len(track) - 1:
+            return
+        self._knot, (begin, start), (end, position) = knot, *track[knot : knot + 2]
+        motion, lasts = None, end - begin
+        if 0.0 < dist(start, position) <= JUMP_SPEED * lasts:
+            x, y, z = ((b - a) / lasts for a, b in zip(start, position, strict=True))
+            begin_ns, until_ns = (self._began_ns + round(at * 1e9) for at in (begin, end))
+            motion = Drive(start, begin_ns, (x, y, z), (x, y, z), ACCELERATION, until_ns)
+        self._select(Setpoint(position, waypoint=self.leg, motion=motion))
+
     def _is_reached(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
+        if self._plan.track:
+            return self.elapsed(now_ns) >= self._plan.track[-1][0]
         rested = self._watch.is_reached(leg, seen, now_ns)
         if not leg.speed:
             return rested
@@ -382,7 +438,7 @@ class Teleop:
     def _leaves_ns(self, leg: int) -> int | None:
         """Return when the carrot has rested at a waypoint [ns]; None if it is not on this way."""
         setpoint = self._setpoint
-        if setpoint is None or setpoint.motion is None or setpoint.waypoint != leg:
+        if setpoint is None or type(setpoint.motion) is not Motion or setpoint.waypoint != leg:
             return None
         return arrival_ns(setpoint) + round(self._plan.legs[leg].dwell * 1e9)
 
@@ -409,6 +465,12 @@ class Teleop:
         """Number of waypoints of this mission that the robot has stored as reached."""
         seen = self.seen
         return seen.reached if seen and seen.mission_id == self._mission_id != 0 else 0
+
+    @property
+    def _drives(self) -> bool:
+        """Whether the operator has moved the setpoint of the held mission by hand."""
+        setpoint = self._setpoint
+        return self.state == HELD and setpoint is not None and type(setpoint.motion) is Drive
 
     @property
     def _from_spawn(self) -> bool:
@@ -439,7 +501,9 @@ class Teleop:
         if self.state == STARTING and self._may_move:
             self._is_pending = True
             self._select_here()
-        elif self._setpoint is not None and self._setpoint.motion is not None:
+        elif self._drives:
+            self._select_here()
+        elif self._setpoint is not None and type(self._setpoint.motion) is Motion:
             self._select_leg(self._setpoint.waypoint, now_ns)
         elif self._setpoint is not None:
             self._select(self._setpoint)

@@ -29,6 +29,7 @@ from cloudrc.config.schema import (
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import ARM_HEIGHT, ARM_LENGTH
 from cloudrc.geometry.scene import Scene
+from cloudrc.messages import Vector
 from cloudrc.records import FAILURES
 from cloudrc.teleop.store import SHOWN, Order
 from cloudrc.teleop.wire import Leg, Plan
@@ -78,6 +79,14 @@ class GoToRequest(Section):
     yaw_deg: Finite = Field(0.0, description="Heading [deg]")
 
 
+class DriveRequest(Section):
+    """Order to move the setpoint by hand."""
+
+    velocity_mps: tuple[Finite, Finite, Finite] = Field(
+        description="Velocity of the setpoint [m/s], world frame; above 1.5 m/s it is scaled down"
+    )
+
+
 EXAMPLES: dict[type[Section], dict[str, Any]] = {
     MissionRequest: {
         "name": "to the board",
@@ -89,6 +98,7 @@ EXAMPLES: dict[type[Section], dict[str, Any]] = {
         ],
     },
     GoToRequest: {"position_m": [0.5, 0.0, 1.2], "yaw_deg": 0.0},
+    DriveRequest: {"velocity_mps": [0.5, 0.0, 0.0]},
 }
 
 
@@ -128,8 +138,9 @@ class Event(_Answer):
     id: int = _field("Number of the event; all missions share one count")
     mission: str = _field("Id of the mission")
     event: str = _field(
-        "queued, starting, started, reached, held, resumed, goto, restarted, new_session, "
-        f"board_touched, pipe_touched, paused; at the end done, cancelled, {', '.join(FAILURES)}"
+        "queued, starting, started, reached, held, resumed, goto, driving, operator_lost, "
+        "restarted, new_session, board_touched, pipe_touched, paused; at the end done, cancelled, "
+        f"{', '.join(FAILURES)}"
     )
     waypoint: int = _field("Index of the waypoint, from 0")
     text: str = _field("Event in words")
@@ -276,6 +287,11 @@ def read_goto(body: bytes, scene: Scene) -> Leg:
     if problems:
         raise RefusedError([ConfigProblem(p.path[2:], p.value, p.reason) for p in problems])
     return Leg(request.position_m, radians(request.yaw_deg))
+
+
+def read_drive(body: bytes) -> Vector:
+    """Read the velocity [m/s] in a request's body; raise a RefusedError that lists all problems."""
+    return _parse(body, DriveRequest).velocity_mps
 
 
 def leads_to_board(mission: Mission, scene: Scene) -> bool:

@@ -8,6 +8,7 @@ the new process sends the stop again.
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import hypot, inf
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,8 @@ from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState, Setpoint, Start, Vector
 from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, finite_or_none, judge
 from cloudrc.records import Fault, MissionEvent
-from cloudrc.teleop.mission import Teleop
+from cloudrc.teleop.carrot import HEARTBEAT_NS, SPEED_MAX
+from cloudrc.teleop.mission import HELD_LOWEST, Teleop
 from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError
 from cloudrc.teleop.wire import HELD, QUEUED, Leg, Output, Plan, RobotStatus
 
@@ -29,8 +31,11 @@ SILENCE = 1.0
 """Age from which on telemetry, or the last message from cloud, is too old [s]."""
 SETPOINT_PERIOD_NS = 100_000_000
 """Time between two copies of the setpoint [ns]; a restarted cloud needs the copies."""
+DRIVE_LIMIT = 3600.0
+"""Time limit of a mission that begins with a request to drive [s]."""
 QUEUE_MAX = 16
 """Largest number of missions that wait while another mission flies."""
+TAKES_OFF = "a velocity other than zero takes off, once there is telemetry"
 NEVER_BEGAN, ASKED = "mission cancelled before it began", "the robot is asked to start"
 RESTARTED = "teleop has restarted; the robot is asked to go on"
 REST = "after a stop or a landing only when it has stood still, at least 0.5 m inside the fence"
@@ -65,7 +70,7 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
     if age > SILENCE:
         return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
     if mission == HELD and guard is TRACK:
-        return "the operator holds the mission; to continue: cloudrc mission resume"
+        return "the operator holds the mission; to continue: cloudrc mission resume, or cancel"
     return (ALONE if mission is None else IN_MISSION)[guard]
 
 
@@ -98,6 +103,8 @@ class MissionService:
         self._current: Mission | None = None
         self._ends = False  # whether this process ends; the next process starts the queue
         self._trouble = ""  # trouble of the store that was last reported
+        self._driven_ns = -HEARTBEAT_NS  # time of the last request to drive
+        self._interrupted = False  # whether the operator has to let go before driving on
 
     @property
     def seen(self) -> RobotStatus | None:
@@ -131,7 +138,7 @@ class MissionService:
         if len(waiting) > QUEUE_MAX:
             raise ConflictError(f"{QUEUE_MAX} missions wait already; cancel one", waiting[0].id)
         self._check_can_fly()
-        if order.plan.start is Start.HERE and not waiting:
+        if order.plan.start is Start.HERE and not waiting and not order.plan.by_hand:
             self._check_way(order.plan.legs[0])
         mission = self.book.add(order)
         if waiting:
@@ -156,6 +163,7 @@ class MissionService:
 
     def hold(self, now_ns: int) -> Mission:
         """Interrupt the mission under way: the robot holds its position."""
+        self._interrupted = True
         return self._operate(self._teleop.hold, now_ns)
 
     def resume(self, now_ns: int) -> Mission:
@@ -177,8 +185,36 @@ class MissionService:
         self._check_way(leg)
         return self._operate(lambda now: self._teleop.go_to(now, leg), now_ns)
 
+    def drive(self, velocity: Vector, now_ns: int) -> Mission:
+        """Drive the setpoint by hand, during a held mission or in a new one.
+
+        The setpoint takes up `velocity` [m/s], world frame. It brakes and rests if the next request
+        does not come within `HEARTBEAT_NS`. After a hold or the end of a mission, the operator has
+        to let go first.
+        """
+        pause_ns, self._driven_ns = now_ns - self._driven_ns, now_ns
+        x, y, z = velocity
+        scale = SPEED_MAX / max(hypot(x, y, z), SPEED_MAX)
+        velocity = (scale * x, scale * y, scale * z)
+        rests = not any(velocity)
+        self._interrupted = self._interrupted and not rests and pause_ns <= HEARTBEAT_NS
+        self._check_can_fly()
+        waiting, seen = self.book.open(), self.seen
+        if self._interrupted:
+            raise ConflictError("a hold, a stop or an end came in between; let go, then drive on")
+        if not waiting:
+            if seen is None or rests:
+                raise ConflictError(f"no mission is under way; {TAKES_OFF}")
+            x, y, z = seen.position
+            leg = Leg((x, y, max(z, HELD_LOWEST)), tolerance=inf, dwell=0.0)
+            self.create(Order(Plan((leg,), Start.HERE, DRIVE_LIMIT, by_hand=True), "drive"), now_ns)
+        elif waiting[0].state != HELD and not waiting[0].order.plan.by_hand:
+            raise _busy(waiting[0], "hold or cancel it first")
+        return self._operate(lambda now: self._teleop.drive(now, velocity), now_ns)
+
     def stop_rotors(self, now_ns: int) -> Mission | None:
         """Stop the rotors at once in any state; return the mission that the stop ends, if any."""
+        self._interrupted = True
         mission = self._start_next(now_ns)
         self._teleop.stop(now_ns)
         self._collect(now_ns)
@@ -188,6 +224,7 @@ class MissionService:
         """Let the robot fly again after a landing or a stop, if no mission is under way."""
         if self._current is not None:
             raise _busy(self._current, "there is nothing to acknowledge")
+        self._interrupted = True
         self._teleop.acknowledge(now_ns)
         self._collect(now_ns)
 
@@ -371,7 +408,7 @@ class MissionService:
             changed["verdict"] = judge(evidence).as_json()
         self._note(mission, event.event, event.text, now_ns, **changed)
         if mission.ended:
-            self._current = None
+            self._current, self._interrupted = None, True
 
     def _note(self, mission: Mission, event: str, text: str, now_ns: int, **changed: Any) -> None:
         if mission is self._current:

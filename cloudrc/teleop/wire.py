@@ -45,11 +45,18 @@ class Leg:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Waypoints of a mission, with the place of the start and the time limit."""
+    """Waypoints of a mission, with the place of the start and the time limit.
+
+    A mission with a `track` has one waypoint, which counts as reached at the end of the track.
+    """
 
     legs: tuple[Leg, ...]  # in order; at least one
     start: Start = Start.SPAWN  # the spawn (world is reset), or the robot's position
     time_limit: float = 60.0  # of the mission, with holds [s]
+    by_hand: bool = False  # whether the mission begins held, for an operator who drives
+    track: tuple[
+        tuple[float, Vector], ...
+    ] = ()  # times [s] and setpoints [m]; none, or two or more
 
 
 NO_PLAN = Plan((Leg(ZERO),))

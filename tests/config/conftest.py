@@ -22,6 +22,7 @@ SPECIAL = {
     "world.robot": "pelican",
     "world.scene": "empty",
     "link.profile": "paper-p3",
+    "mission.setpoints": None,
     **{f"link.{way}link.{key}": None for way in ("up", "down") for key in ("trace", "table")},
     **{f"link.{way}link.distribution": "pareto" for way in ("up", "down")},
     "cloud.estimator": "split",

@@ -175,3 +175,21 @@ def test_an_invalid_mission_is_refused_with_the_reason(mine, waypoints, reason):
     found = refused_text(mine, f"mission: {{waypoints: {waypoints}}}")
     assert reason in found
     assert found.startswith("mine.yaml:1: mission.waypoints")
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ("", "has 0 rows; give at least two"),
+        ("0,0,0,1\n0,0,0,1\n", "line 3: time_s 0 does not rise"),
+        ("0,0,nan,1\n", "line 2: y_m is 'nan'; give a finite number"),
+        ("0,0,0,1\n1,0,0,9\n", "line 3: z_m is 9; the guard flies from 0.35 to 2.3"),
+        (None, "the columns are time_s,delay_ms; give time_s,x_m,y_m,z_m"),
+    ],
+)
+def test_setpoints_of_no_use_are_refused_in_one_line(tmp_path, rows, said):
+    header = "time_s,delay_ms" if rows is None else "time_s,x_m,y_m,z_m"
+    (tmp_path / "drive.csv").write_text(f"{header}\n{rows or ''}")
+    text = refused("hover", f"mission.setpoints={tmp_path / 'drive.csv'}")
+    assert said in text
+    assert "\n" not in text

@@ -19,8 +19,8 @@ PAGE = 4096
 
 
 @pytest.fixture
-def release(tmp_path):
-    one = Release(tmp_path, "world")
+def release(tmp_path, request):
+    one = Release(tmp_path, getattr(request, "param", "world"))
     yield one
     one.end()
 
@@ -78,6 +78,37 @@ def test_an_emergency_stop_stops_the_rotors_and_fails_the_job(release):
     assert "emergency_stopped" in out.splitlines()[-1]
     release.post("/v1/acknowledge")
     release.until(lambda: release.ask("/v1/state")["seen"]["guard"] != "ESTOP")
+
+
+def press(release, lasts, *velocity):
+    """Repeat a request to drive for some time [s]; return the times of first and last [ns]."""
+    sent = [time.monotonic_ns()]
+    while sent[-1] < sent[0] + lasts * 1e9:
+        sent.append(time.monotonic_ns())
+        release.post("/v1/drive", {"velocity_mps": velocity})
+        time.sleep(0.1)
+    return sent[0], sent[-1]
+
+
+@pytest.mark.parametrize("release", ["cloud"], indirect=True)
+def test_an_operator_drives_over_sockets_and_is_lost(release, figure):
+    """The smallest value counts: the machine may be busy."""
+    press(release, 1.5, 0.0, 0.0, 0.4)
+    pressed = []
+    for speed in (0.4, -0.4, 0.4, -0.4):
+        time.sleep(1.5)
+        pressed.append(press(release, 0.4, 0.0, speed, 0.0))
+    time.sleep(1.5)
+    release.stop()
+    control = Recording.read(release.folder / "cloud.mcap")["/setpoint_position"]
+    stamps, y = control["stamp_ns"], control["setpoint"][:, 1]
+    changes = np.diff(np.abs(np.diff(y, prepend=y[0])), prepend=0.0)
+    shown = [stamps[(stamps > first) & (changes > 1e-5)][0] - first for first, _ in pressed]
+    held = [stamps[(stamps > last + 3e8) & (changes < -1e-5)][0] - last for _, last in pressed]
+    figure("over sockets: key press to setpoint", min(shown) * 1e-9, "<=", 0.1, "s", count=4)
+    figure(
+        "over sockets: operator lost, setpoint brakes", min(held) * 1e-9, "<=", 0.6, "s", count=4
+    )
 
 
 def test_a_pod_that_ends_in_flight_holds_the_robot_by_its_word(release):

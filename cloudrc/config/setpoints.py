@@ -1,0 +1,62 @@
+"""Read and write the setpoints of a mission: a CSV file with the columns time_s,x_m,y_m,z_m."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from math import isfinite
+from pathlib import Path
+from typing import TypeAlias
+
+from cloudrc.errors import BadInputError
+from cloudrc.geometry.fence import INNER_HIGH, INNER_LOW
+from cloudrc.link.traces import Row, read_lines, read_rows
+from cloudrc.messages import Vector
+
+COLUMNS = ["time_s", "x_m", "y_m", "z_m"]
+ROUNDING = 1e-6
+"""Largest error of a position in a file [m]."""
+TimedPosition: TypeAlias = tuple[float, Vector]
+"""Time since the first row [s], and position of the setpoint [m], world frame."""
+
+
+def read_setpoints(path: Path) -> tuple[TimedPosition, ...]:
+    """Read the setpoints of a mission; the time of the first row becomes 0.
+
+    Raises:
+        BadInputError: If the file cannot be read, has a wrong value, has less than two rows, or
+            leads out of the box in which the guard lets the robot fly.
+    """
+    name, found = f"setpoints {path}", list[TimedPosition]()
+    columns, rows = read_rows(read_lines(path, name, f"give a CSV file: {','.join(COLUMNS)}"), name)
+    if columns != COLUMNS:
+        given = ",".join(columns)[:80] or "missing"
+        raise BadInputError(f"{name}, line 1: the columns are {given}; give {','.join(COLUMNS)}")
+    for row in rows:
+        time, x, y, z = (_number(row, column) for column in COLUMNS)
+        if found and time <= found[-1][0]:
+            raise BadInputError(
+                f"{row.where}: time_s {time:g} does not rise; sort the rows by time"
+            )
+        for column, low, at, high in zip(
+            COLUMNS[1:], INNER_LOW, (x, y, z), INNER_HIGH, strict=True
+        ):
+            if not low - ROUNDING <= at <= high + ROUNDING:
+                reason = f"the guard flies from {low:g} to {high:g}"
+                raise BadInputError(f"{row.where}: {column} is {at:g}; {reason}; stay inside")
+        found.append((time, (x, y, z)))
+    if len(found) < 2:
+        raise BadInputError(f"{name}: has {len(found)} rows; give at least two")
+    return tuple((time - found[0][0], position) for time, position in found)
+
+
+def write_setpoints(setpoints: Iterable[tuple[float, Sequence[float]]]) -> str:
+    """Format times [s] and positions [m] as a CSV text that `read_setpoints` can read."""
+    lines = (f"{time:.3f},{x:.6g},{y:.6g},{z:.6g}" for time, (x, y, z) in setpoints)
+    return "\n".join([",".join(COLUMNS), *lines, ""])
+
+
+def _number(row: Row, column: str) -> float:
+    value = row.number(column)
+    if value is None or not isfinite(value):
+        raise row.no_number(column, "a finite number")
+    return value

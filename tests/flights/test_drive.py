@@ -1,0 +1,139 @@
+"""Driving by hand over a link: latency, an operator who is lost, stops, and the flight again."""
+
+import numpy as np
+import pytest
+
+from cloudrc.config.load import load_experiment
+from cloudrc.faults.flight import Flight, conditions
+from cloudrc.faults.scenario import generator
+from cloudrc.messages import ZERO, GuardState
+from cloudrc.record.columns import Recording
+from cloudrc.records import Arrival, CommandApplied, Control, TelemetrySent
+from cloudrc.report.document import Run
+from cloudrc.report.write import write_report
+from cloudrc.teleop.service import MissionService
+from tests.conftest import nightly
+from tests.flights.conftest import digest, records
+
+EAST, WEST, UP = (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.0, 0.0, 0.5)
+ESTOP, GROUND = GuardState.ESTOP, GuardState.GROUND
+
+
+class Drive:
+    """A flight whose operator drives over teleop's own process; it takes off at 0.5 s."""
+
+    def __init__(self, profile="paper-p3", seed=1, **link):
+        settings = f"link.profile={profile}", "world.scene=empty"
+        self.flight = Flight(*settings, start=False, separate=True, seed=seed, **link)
+        ways = self.flight.experiment.uplink, self.flight.experiment.downlink
+        self.rtt = sum(way.delay_ms for way in ways) * 1e-3
+        self.random = generator(seed, 46).uniform
+        self.press(0.5, 1.0, UP)
+        self.press(1.5, 0.1, ZERO)
+
+    def at(self, time, call):
+        teleop, clock = self.flight.teleop, self.flight.cloud.clock
+        self.flight.cloud.at(time, lambda now_ns: teleop.ask(call, clock.at(now_ns)))
+
+    def press(self, time, lasts, velocity):
+        """Repeat a request at 10 Hz; return the time of the last request [s]."""
+        times = [time + 0.1 * k for k in range(round(10 * lasts))]
+        for each in times:
+            self.at(each, lambda service, now_ns: service.drive(velocity, now_ns))
+        return times[-1]
+
+    def fly(self, until):
+        """Fly, and keep the flight's records by their kind."""
+        self.flight.fly(until)
+        records = [*self.flight.of_world, *self.flight.of_cloud]
+        kinds = Control, CommandApplied, TelemetrySent, Arrival
+        self.records = {kind: [r for r in records if isinstance(r, kind)] for kind in kinds}
+        self.control = self.records[Control]
+        self.stamps = np.array([record.stamp_ns for record in self.control]) * 1e-9
+        x = np.array([record.setpoint[0] for record in self.control])
+        self.speeds = np.abs(np.diff(x, prepend=x[0])) / 0.01
+
+    def command_after(self, time, *, brakes):
+        """Return the first command after `time` [s] whose setpoint speeds up, or brakes."""
+        changes = np.diff(self.speeds, prepend=0.0)
+        rows = (changes < -0.005 if brakes else changes > 0.005) & (self.stamps > time)
+        return self.control[np.flatnonzero(rows)[0]]
+
+
+@pytest.mark.parametrize("count", [20, *nightly(100)])
+def test_telemetry_shows_a_key_press_in_time(count, figure):
+    drive, time, pressed = Drive(), 2.5, []
+    for n in range(count):
+        pressed.append(time + drive.random(0.0, 0.1))
+        drive.press(pressed[-1], 0.1, EAST if n % 2 else WEST)
+        drive.press(pressed[-1] + 0.1, 0.1, ZERO)
+        time += 0.5
+    drive.fly(time + 0.5)
+    arrived = {(r.epoch, r.counter): r.stamp_ns for r in drive.records[Arrival] if r.uplink}
+    took = []
+    for press in pressed:
+        command_ns = drive.command_after(press, brakes=False).stamp_ns
+        shown = (r for r in drive.records[TelemetrySent] if r.telemetry.echo_stamp_ns >= command_ns)
+        seen = (arrived[r.epoch, r.counter] for r in shown if (r.epoch, r.counter) in arrived)
+        took.append(next(seen) * 1e-9 - press)
+    assert len(took) == count
+    figure("key press to telemetry", max(took), "<=", drive.rtt + 0.1, "s", count=count)
+
+
+@pytest.mark.parametrize("count", [10, *nightly(50)])
+def test_the_robot_holds_when_the_operator_is_lost(count, figure):
+    drive, time, lost = Drive("paper-p2"), 2.5, []
+    for n in range(count):
+        lost.append(drive.press(time + drive.random(0.0, 0.1), 0.4, EAST if n % 2 else WEST))
+        time += 1.6
+    drive.fly(time)
+    applied = {(r.epoch, r.counter): r.stamp_ns for r in drive.records[CommandApplied]}
+    took = []
+    for last in lost:
+        command = drive.command_after(last + 0.3, brakes=True)
+        later = range(command.counter, command.counter + 9)
+        took.append(min(applied.get((command.epoch, k), 10**18) for k in later) * 1e-9 - last)
+    assert [event.event for event in drive.flight.events("operator_lost")] == [
+        "operator_lost"
+    ] * count
+    figure("operator lost: braking on board after", max(took), "<=", 0.6, "s", count=count)
+
+
+def test_a_drive_flown_again_has_one_hash(tmp_path):
+    drive = Drive("paper-p2")
+    drive.press(2.0, 1.0, EAST)
+    drive.press(3.0, 0.5, UP)
+    drive.fly(5.0)
+    flight = drive.flight
+    recording = Recording.from_records(flight.of_world, flight.of_cloud)
+    write_report(tmp_path, recording, flight.experiment, Run("virtual", "virtual"), page=False)
+    again = load_experiment("hover", [f"mission.setpoints={tmp_path / 'drive.csv'}"])
+    assert digest(again) == digest(again)
+    flown = Recording.from_records(*records(again))
+    paths, begins = [], []
+    for one, event in ((recording, "driving"), (flown, "started")):
+        mission, control = one["/mission"], one["/setpoint_position"]
+        begins.append(mission["stamp_ns"][mission["event"] == event][0])
+        times = (control["stamp_ns"] - begins[-1]) * 1e-9
+        grid = np.arange(0.1, 3.0, 0.02)
+        paths.append([np.interp(grid, times, axis) for axis in control["setpoint"].T])
+    assert np.abs(np.subtract(*paths)).max() < 0.02
+    assert flown["/mission"]["event"][-1] == "done"
+
+
+@pytest.mark.promise("emergency-stop-gets-through")
+@pytest.mark.parametrize("count", [10, *nightly(100)])
+def test_a_stop_gets_through_thirty_percent_loss(count, figure):
+    took = []
+    for seed in range(1, count + 1):
+        drive = Drive(seed=seed, link=conditions(loss=0.3))
+        flight, at = drive.flight, 2.0 + drive.random(0.0, 0.1)
+        drive.press(1.6, 2.0, EAST)  # the operator who drives does not let go
+        flight.cloud.at(at, lambda now_ns, flight=flight: flight.teleop.stop_rotors(now_ns))
+        drive.at(at + 1.0, MissionService.acknowledge)
+        flight.fly(at + 2.0)
+        (stop,) = [change for change in flight.changes if change.state is ESTOP]
+        took.append(stop.stamp_ns * 1e-9 - at)
+        assert flight.changes[-1].state is GROUND
+        assert not flight.watch.breaches
+    figure("stop under 30 % loss", max(took), "<=", drive.rtt + 0.1, "s", count=count)

@@ -1,0 +1,266 @@
+"""Driving by hand: the moving setpoint, its limits and its end, and what an operator may do."""
+
+import os
+import pty
+import subprocess
+import sys
+import threading
+import time
+from contextlib import suppress
+from itertools import pairwise
+from math import dist, hypot
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cloudrc.geometry.fence import INNER_HIGH, INNER_LOW
+from cloudrc.messages import ZERO, GuardState, Setpoint
+from cloudrc.teleop.carrot import ACCELERATION, setpoint_at, steer
+from cloudrc.teleop.store import ConflictError
+from cloudrc.teleop.wire import decode, encode
+from tests.teleop.conftest import (
+    AWAY,
+    PERIOD_NS,
+    A,
+    ServiceFlight,
+    running,
+    service_flying,
+)
+
+COMMAND = [sys.executable, "-m", "cloudrc", "mission", "drive", "--api"]
+EAST = (0.5, 0.0, 0.0)
+SPEEDS = st.tuples(*[st.floats(-1.5, 1.5)] * 3)
+STEPS = st.lists(st.tuples(SPEEDS, st.integers(1, 60)), max_size=12)
+
+
+def inside(setpoint, axis):
+    return INNER_LOW[axis] < setpoint.position[axis] < INNER_HIGH[axis]
+
+
+@given(STEPS, st.tuples(*map(st.floats, INNER_LOW, INNER_HIGH)))
+def test_the_setpoint_keeps_its_limits_and_rests(steps, start):
+    """At the fence itself an axis may stop at once: the others can use up the acceleration."""
+    setpoint, now_ns = Setpoint(start), 0
+    for velocity, periods in [*steps, (ZERO, 300)]:
+        setpoint = steer(setpoint, velocity, now_ns)
+        for _ in range(periods):
+            before, now_ns = setpoint_at(setpoint, now_ns), now_ns + PERIOD_NS
+            after = setpoint_at(setpoint, now_ns)
+            sides = zip(INNER_LOW, after.position, INNER_HIGH, strict=True)
+            assert all(low <= at <= high for low, at, high in sides)
+            free = [i for i in range(3) if inside(before, i) and inside(after, i)]
+            change = hypot(*(after.velocity[i] - before.velocity[i] for i in free))
+            assert change <= ACCELERATION * 0.01 + 1e-9
+    assert (after.velocity, after.position) == (ZERO, setpoint.position)
+    assert decode(encode(setpoint)) == setpoint
+
+
+def test_it_slows_down_before_the_fence():
+    setpoint, now_ns, speeds = Setpoint((6.0, 0.0, 1.0)), 0, []
+    while now_ns < 8_000_000_000:
+        setpoint, now_ns = steer(setpoint, (1.5, 0.0, 0.0), now_ns), now_ns + 10 * PERIOD_NS
+        speeds.append(setpoint_at(setpoint, now_ns).velocity[0])
+    assert max(speeds) == 1.5
+    assert setpoint_at(setpoint, now_ns).position[0] == pytest.approx(INNER_HIGH[0], abs=0.01)
+    assert min(b - a for a, b in pairwise(speeds)) >= -ACCELERATION * 0.1
+
+
+def press(flight, velocity=EAST, seconds=1.0):
+    """Hold a key: a request ten times a second, by the service's clock."""
+    for _ in range(round(10 * seconds)):
+        flight.teleop.drive(velocity, flight.now_ns)
+        flight.step(seconds=0.1)
+
+
+def reference(flight):
+    return setpoint_at(flight.setpoints[-1], flight.now_ns)
+
+
+def names(flight):
+    return [event.event for event in flight.events]
+
+
+@pytest.fixture
+def driven():
+    """A robot that was driven off the ground, by a key that is still held."""
+    flight = ServiceFlight()
+    flight.step()
+    press(flight)
+    return flight
+
+
+def test_the_first_request_takes_off_from_here(driven):
+    (mission,) = driven.teleop.book.missions.values()
+    assert (mission.state, mission.order.name) == ("held", "drive")
+    assert names(driven) == ["started", "held", "driving"]
+    at = reference(driven)
+    assert at.position == pytest.approx((0.38, 0.0, 0.35), abs=0.06)
+    assert at.velocity == EAST
+    press(driven, (9.0, 0.0, 0.0))
+    assert reference(driven).velocity == pytest.approx((1.5, 0.0, 0.0))
+
+
+def test_without_requests_the_setpoint_brakes_and_rests(driven):
+    last_ns = driven.now_ns - 10 * PERIOD_NS
+    driven.step(seconds=0.4)
+    assert reference(driven).velocity == EAST
+    driven.step(seconds=0.1)
+    assert dist(ZERO, reference(driven).velocity) < 0.5
+    assert names(driven)[-1] == "operator_lost"
+    assert driven.events[-1].stamp_ns - last_ns <= 520_000_000
+    driven.step(seconds=1.0)
+    assert reference(driven).velocity == ZERO
+    press(driven)  # the operator is back
+    assert reference(driven).velocity == EAST
+
+
+def test_a_key_that_is_released_is_no_lost_operator(driven):
+    press(driven, ZERO, 0.1)
+    driven.step(seconds=2.0)
+    assert reference(driven).velocity == ZERO
+    assert "operator_lost" not in names(driven)
+
+
+def test_what_interrupts_a_drive_has_to_be_answered_by_letting_go(driven):
+    def ended(verb, *words):
+        press(driven, seconds=0.1)
+        getattr(driven.teleop, verb)(*words, driven.now_ns)
+        driven.step(seconds=0.1)
+        with pytest.raises(ConflictError, match="let go"):
+            press(driven)
+        assert reference(driven).velocity == ZERO
+
+    ended("hold")
+    with pytest.raises(ConflictError, match="must be flying"):
+        driven.teleop.hold(driven.now_ns)
+    press(driven, ZERO, 0.1)  # lets go
+    ended("cancel", "m1")
+    driven.step(seconds=0.6)  # lets go, too
+    press(driven)
+    driven.teleop.stop_rotors(driven.now_ns)
+    driven.step(seconds=0.3)
+    with pytest.raises(ConflictError, match="acknowledge"):
+        press(driven)
+    driven.teleop.acknowledge(driven.now_ns)
+    driven.step(seconds=0.1)
+    with pytest.raises(ConflictError, match="let go"):
+        press(driven)
+    assert [mission.state for mission in driven.teleop.book.missions.values()] == [
+        *("cancelled", "failed")
+    ]
+
+
+def test_only_a_held_mission_is_driven():
+    flight = ServiceFlight()
+    with pytest.raises(ConflictError, match="once there is telemetry"):
+        press(flight)
+    flight.step()
+    with pytest.raises(ConflictError, match="other than zero takes off"):
+        press(flight, ZERO)
+    flight, mission_id = service_flying()
+    with pytest.raises(ConflictError, match=f"{mission_id} is flying; hold or cancel it first"):
+        press(flight)
+    flight.teleop.hold(flight.now_ns)
+    press(flight, ZERO, 0.1)
+    press(flight)
+    press(flight, ZERO, 0.1)
+    press(flight)
+    assert reference(flight).position[0] > A[0]
+    flight.teleop.resume(flight.now_ns)
+    flight.step()
+    assert flight.setpoints[-1].waypoint == 1
+    assert flight.view(mission_id)["state"] == "flying"
+
+
+def test_a_drive_is_done_when_it_is_resumed(driven):
+    driven.teleop.resume(driven.now_ns)
+    driven.step(seconds=0.1)
+    assert driven.view("m1")["verdict"]["outcome"] == "success"
+    assert driven.guard is GuardState.HOLD
+
+
+@pytest.mark.parametrize("trouble", ["guard", "cloud", "teleop", "silence"])
+def test_the_setpoint_waits_at_the_robot_in_trouble(driven, trouble):
+    if trouble == "guard":
+        driven.guard = GuardState.HOLD
+    elif trouble == "cloud":
+        driven.restart_cloud()
+    elif trouble == "teleop":
+        driven.restart_teleop()
+    driven.uplink = trouble != "silence"
+    driven.position = AWAY
+    driven.step(seconds=0.1)
+    press(driven, seconds=1.0)
+    driven.step(seconds=1.0)
+    at = reference(driven)
+    assert at.velocity == ZERO
+    if trouble != "teleop":  # a new teleop goes on at once
+        assert dist(at.position, (0.8, 0.0, 0.35) if trouble == "silence" else AWAY) < 0.5
+
+
+# Over HTTP and in a terminal
+
+
+def test_the_api_drives_and_audits_refusals_only():
+    with running() as api:
+        status, view = api.post("/v1/drive", {"velocity_mps": EAST})
+        assert (status, view["name"]) == (200, "drive")
+        for wrong in ({}, {"velocity_mps": [1, 2]}, {"velocity_mps": [1, 2, "x"]}, b"{"):
+            assert api.post("/v1/drive", wrong)[0] == 422
+        api.until(lambda: api.state_of("m1") == "held")
+        assert api.post("/v1/drive", {"velocity_mps": EAST})[0] == 200
+        assert api.post("/v1/missions/m1/cancel")[0] == 200
+        assert api.post("/v1/drive", {"velocity_mps": ZERO})[0] == 409
+        assert [line["status"] for line in api.audited()] == [422] * 4 + [200, 409]
+
+
+class Terminal:
+    """`cloudrc mission drive` in a terminal of 24 lines."""
+
+    def __init__(self, api):
+        self.screen, (self._keys, end) = "", pty.openpty()
+        environ = {**os.environ, "TERM": "xterm", "LINES": "24", "COLUMNS": "90"}
+        how = {**dict.fromkeys(("stdin", "stdout", "stderr"), end), "env": environ}
+        self.process = subprocess.Popen([*COMMAND, api.url], start_new_session=True, **how)
+        os.close(end)
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self):
+        with suppress(OSError):  # the process has ended
+            while data := os.read(self._keys, 4096):
+                self.screen += data.decode(errors="replace")
+
+    def type(self, keys):
+        os.write(self._keys, keys.encode())
+
+
+@pytest.mark.process
+def test_keys_in_a_terminal_drive_the_robot():
+    with running(unix=True) as api:
+        flight, terminal = api.flight, Terminal(api)
+        while "GROUND" not in terminal.screen:  # a busy machine starts it slowly
+            assert terminal.process.poll() is None, terminal.screen
+            time.sleep(0.1)
+        for key, axis, sign in (("\x1bOA", 0, 1), ("\x1bOC", 1, -1), ("w", 2, 1)):
+            terminal.type(key)
+            api.until(lambda a=axis, s=sign: s * reference(flight).velocity[a] > 0.1)
+            terminal.type(" ")
+            api.until(lambda: reference(flight).velocity == ZERO)
+        terminal.type("w")  # and no repetition
+        api.until(lambda: reference(flight).velocity[2] > 0.1)
+        api.until(lambda: reference(flight).velocity == ZERO)
+        terminal.type("hh")
+        api.until(lambda: "must be flying" in terminal.screen)
+        terminal.type("X")
+        api.until(lambda: flight.guard is GuardState.ESTOP)
+        terminal.type("q")
+        assert terminal.process.wait(10.0) == 0
+
+
+@pytest.mark.process
+def test_without_a_terminal_drive_says_so():
+    how = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True}
+    said = subprocess.run([*COMMAND, "unix:nowhere"], **how)
+    assert (said.returncode, said.stderr.count("\n")) == (2, 1)
+    assert "needs a terminal" in said.stderr
