@@ -22,7 +22,7 @@ Colour = tuple[int, int, int]
 GHOST_COLOUR: Colour = (0, 114, 178)
 SETPOINT_COLOUR: Colour = (213, 94, 0)
 REACHED_COLOUR: Colour = (0, 158, 115)
-OPEN_COLOUR: Colour = (255, 255, 255)
+OPEN_COLOUR: Colour = (120, 124, 130)
 PIPE_COLOUR: Colour = (110, 130, 150)
 ROD_COLOUR: Colour = (77, 77, 82)
 """Colours of the scene, those of the report's figures: blue is estimated, vermilion is asked."""
@@ -58,7 +58,7 @@ class FlightScene:
         self._ghost = self._scene.add_frame("/ghost", show_axes=False, visible=False)
         self._add_robot(model)
         self._setpoint = self._scene.add_icosphere(
-            "/setpoint", 0.04, SETPOINT_COLOUR, opacity=0.8, visible=False, cast_shadow=False
+            "/setpoint", 0.09, SETPOINT_COLOUR, opacity=0.6, visible=False, cast_shadow=False
         )
         self._waypoints: list[Any] = []  # spheres
         self._labels: list[Any] = []
@@ -248,5 +248,5 @@ def _camera(geometry: Scene) -> tuple[Vector, Vector]:
     spots = np.array([geometry.spawn, *(pipe.centre for pipe in geometry.pipes)])
     low, high = spots.min(axis=0), spots.max(axis=0)
     middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.5)
-    x, y, z = middle + size * np.array([0.42, 0.62, 0.48])
+    x, y, z = middle + size * np.array([0.38, 0.56, 0.44])
     return (float(x), float(y), float(z)), (float(middle[0]), float(middle[1]), float(middle[2]))
