@@ -28,13 +28,9 @@ FRAMES_MAX = 7_500
 STALE = 0.5
 """Age [s] from which a prediction is no longer shown."""
 
-IN_FIGURES = (
-    " A click or drag in a figure over time moves the replay to this time, which is the line there."
-)
 
-
-def write_section(flight: Flight, experiment: ResolvedExperiment, how: str = IN_FIGURES) -> str:
-    """Return the replay as a section of a page; `how` says more about its use.
+def write_section(flight: Flight, experiment: ResolvedExperiment) -> str:
+    """Return the replay as a section of a page.
 
     Raises:
         BadInputError: If the robot never flew, or if its model or scene cannot be read.
@@ -47,11 +43,11 @@ def write_section(flight: Flight, experiment: ResolvedExperiment, how: str = IN_
             player = _record(server, flight, experiment)
         finally:
             server.stop()
-    # The page reports a renderer without a graphics card over the scene; that is no problem.
+    # Hide that the browser draws without a graphics card: the message would cover the scene.
     style = "<style>.mantine-Notifications-root { display: none }</style></head>"
     player = player.replace("</head>", style, 1)
     return Template(files(__package__).joinpath("replay.html").read_text("utf-8")).substitute(
-        duration=_duration(flight), how=how, player=json.dumps(player).replace("<", "\\u003c")
+        duration=_duration(flight), player=json.dumps(player).replace("<", "\\u003c")
     )
 
 
@@ -62,7 +58,7 @@ def write_page(flight: Flight, experiment: ResolvedExperiment) -> str:
         f"<title>{escape(experiment.name)}: replay</title>\n"
         "<style>body { margin: 0; font: 1rem system-ui, sans-serif } h2, p { margin: .5rem 1rem }"
         " #replay .room { height: calc(100vh - 6rem) }</style>\n"
-        f"<body>\n{write_section(flight, experiment, '')}</body></html>\n"
+        f"<body>\n{write_section(flight, experiment)}</body></html>\n"
     )
 
 
@@ -76,8 +72,7 @@ def _record(server: viser.ViserServer, flight: Flight, experiment: ResolvedExper
     truth, control, applied = flight.truth, flight.control, flight.applied
     times = np.linspace(0.0, duration, int(min(duration * RATE, FRAMES_MAX)) + 1)
     true, asked, predicted = (
-        np.searchsorted(np.maximum.accumulate(flight.seconds(table["stamp_ns"])), times, "right")
-        - 1
+        np.searchsorted(flight.seconds(np.sort(table["stamp_ns"])), times, "right") - 1
         for table in (truth, control, applied)
     )
     true = np.maximum(true, 0)
@@ -93,8 +88,8 @@ def _record(server: viser.ViserServer, flight: Flight, experiment: ResolvedExper
         scene.set_robot(truth["position"][row], truth["orientation_wxyz"][row])
         ghost = predicted[frame]
         fresh = ghost >= 0 and now - flight.seconds(applied["stamp_ns"][ghost]) < STALE
-        columns = ("position", "orientation_wxyz")
-        scene.set_ghost(*(applied[name][ghost] if fresh else None for name in columns))
+        pose = applied["position"], applied["orientation_wxyz"]
+        scene.set_ghost(*(column[ghost] if fresh else None for column in pose))
         scene.set_setpoint(control["setpoint"][asked[frame]] if asked[frame] >= 0 else None)
         scene.set_waypoints(points, int(reached[frame]))
     return recorded.as_html()
