@@ -204,4 +204,4 @@ def _camera(geometry: Scene) -> tuple[Any, Any]:
     spots = np.array([geometry.spawn, *(pipe.centre for pipe in geometry.pipes)])
     low, high = spots.min(axis=0), spots.max(axis=0)
     middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.5)
-    return middle + size * np.array([0.38, 0.56, 0.44]), middle
+    return middle + size * np.array([0.44, 0.65, 0.50]), middle
