@@ -19,6 +19,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "mission": "start, steer and stop missions, here or in a cluster",
         "sweep": "fly a grid of settings with several seeds, on all cores",
         "report": "write the report of a recorded run again",
+        "replay": "watch a recorded flight in 3-D, in a browser",
         "identify": "fit the model of the velocity loop to a recorded flight",
         "recover": "write a clean copy of a damaged recording",
         "compare": "say whether a setting differs from another, and how sure that is",

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cloudrc.cli.extras import require
+from cloudrc.cli.extras import missing, require
 from cloudrc.cli.output import escape, format_document, output_argument, paint, print_line, table
 from cloudrc.errors import BadInputError
 
@@ -91,7 +91,9 @@ def summary(report: Mapping[str, Any], folder: Path) -> str:
     if "fault_count" in numbers and numbers["fault_count"].value:
         count = numbers["fault_count"].value
         lines.append(paint(f"  faults noted in flight: {count:.0f}, see the report", "yellow"))
-    return "\n".join([*lines, "", escape(str(folder / "report.html"))])
+    how = f"pip install 'cloudrc[console]', then cloudrc replay {folder}"
+    replay = f"replay in 3-D: {how if missing('console') else f'cloudrc replay {folder}'}"
+    return "\n".join([*lines, "", escape(replay), escape(str(folder / "report.html"))])
 
 
 def print_traceback(options: argparse.Namespace, report: Mapping[str, Any]) -> None:

@@ -117,9 +117,16 @@ SENTENCES = (_waypoints, _pipes, _contact, _link, _guard)
 
 
 def render(
-    assessment: Assessment, pictures: Sequence[Picture], environment: Mapping[str, Any]
+    assessment: Assessment,
+    pictures: Sequence[Picture],
+    environment: Mapping[str, Any],
+    replay: str = "",
 ) -> str:
-    """Return the HTML of the page; `environment` is the content of environment.json."""
+    """Return the HTML of the page.
+
+    `environment` is the content of environment.json, `replay` the HTML of the 3-D replay or of a
+    line that says why there is none.
+    """
     run, experiment, verdict = assessment.run, assessment.experiment, assessment.verdict
     headline, accent = HEADLINES[verdict.outcome]
     digest = run.records_sha256
@@ -134,6 +141,7 @@ def render(
         failures=_list([_failure(failure) for failure in verdict.failures], "failures"),
         notes=_list([escape(note) for note in assessment.notes], "note"),
         facts=_facts(run, experiment),
+        replay=replay,
         figures="\n".join(_figure(n, picture) for n, picture in enumerate(pictures, start=1)),
         numbers=_table_rows(assessment.numbers),
         repeat=escape(REPEAT[run.mode == "virtual"]),
@@ -177,8 +185,14 @@ def _list(items: Sequence[str], name: str) -> str:
 
 def _figure(number: int, picture: Picture) -> str:
     source = f"data:image/svg+xml;base64,{b64encode(picture.svg).decode()}"
+    panels = "".join(
+        f'<span style="left:{left:.2%};bottom:{bottom:.2%};width:{width:.2%};height:{height:.2%}">'
+        "</span>"
+        for left, bottom, width, height in picture.over_time
+    )
     return (
-        f'<figure id="{picture.name}"><img src="{source}" alt="{escape(picture.alt)}">\n'
+        f'<figure id="{picture.name}"><div class="plot"><img src="{source}"'
+        f' alt="{escape(picture.alt)}">{panels}</div>\n'
         f"<figcaption><b>Fig. {number}.</b> {escape(picture.caption)}</figcaption></figure>"
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.setpoints import write_setpoints
-from cloudrc.errors import BadInputError, MissingPrerequisiteError, describe_error
+from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, describe_error
 from cloudrc.files import write_atomically
 from cloudrc.geometry.scene import load_scene
 from cloudrc.metrics import Flight, measure_all
@@ -122,8 +123,21 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
     for picture in pictures:
         write_atomically(figures / f"{picture.name}.png", picture.png)
         write_atomically(figures / f"{picture.name}.svg", picture.svg)
-    text = render(assessment, pictures, environment)
+    text = render(assessment, pictures, environment, _replay(assessment))
     write_atomically(folder / "report.html", text.encode("utf-8"))
+
+
+def _replay(assessment: Assessment) -> str:
+    """Return the 3-D replay as HTML, or a line that says why there is none."""
+    try:
+        from cloudrc.report.replay import write_section
+
+        return write_section(assessment.flight, assessment.experiment)
+    except ImportError as error:
+        why = f"{error.name} is not installed; run: pip install 'cloudrc[console]'"
+    except (CloudrcError, OSError) as error:
+        why = describe_error(error)
+    return f'<p class="note" id="replay">No replay in 3-D: {escape(why)}</p>'
 
 
 def attachments(folder: Path) -> dict[str, bytes]:

@@ -52,7 +52,7 @@ def test_what_is_printed_of_a_flight(printed):
     failures = [{"code": "x", "text": EVIL}] * 2
     found = {"verdict": "failure", "failures": failures, "numbers": {}}
     print(report.summary(found, Path(EVIL)))
-    printed(count=3)
+    printed(count=4)
     stream = io.StringIO()
     FlightView(stream, 1).see([Fault(0, "bad", EVIL)])
     assert_harmless(stream.getvalue())

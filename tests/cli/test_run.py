@@ -188,4 +188,5 @@ def test_summary():
     assert {"mission took 30.90 s", "round trip, mean 69.70 ms"} <= set(shown)
     shown = summary_lines(report("failure", "touched pipe_2", "too slow", fault_count=(41.0, "1")))
     assert shown[:2] == ["FAILURE: touched pipe_2", "also: too slow (at 3.25 s)"]
-    assert shown[-2:] == ["faults noted in flight: 41, see the report", "runs/a/report.html"]
+    end = ["replay in 3-D: cloudrc replay runs/a", "runs/a/report.html"]
+    assert shown[-3:] == ["faults noted in flight: 41, see the report", *end]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from io import BytesIO
 
 import matplotlib
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cloudrc.report.figures import curves, flight, marks, snapshots
@@ -35,6 +36,8 @@ class Picture:
     svg: bytes
     caption: str
     alt: str  # for readers who cannot see the figure
+    # Panels over the whole flight: left, bottom, width and height as shares of the figure.
+    over_time: tuple[tuple[float, float, float, float], ...] = ()
 
 
 def draw_all(subject: Subject) -> list[Picture]:
@@ -51,8 +54,16 @@ def draw_all(subject: Subject) -> list[Picture]:
             draw, caption, alt = FIGURES[name]
             figure = draw(subject)
             png, svg = save(figure, "png"), save(figure, "svg")
-            pictures.append(Picture(name, png, svg, caption(subject), alt))
+            pictures.append(Picture(name, png, svg, caption(subject), alt, _over_time(figure)))
     return pictures
+
+
+def _over_time(figure: Figure) -> tuple[tuple[float, float, float, float], ...]:
+    def is_over_time(axes: Axes) -> bool:
+        siblings = axes.get_shared_x_axes().get_siblings(axes)
+        return any(sibling.get_xlabel() == curves.TIME for sibling in siblings)
+
+    return tuple(axes.get_position().bounds for axes in figure.axes if is_over_time(axes))
 
 
 def save(figure: Figure, kind: str) -> bytes:

@@ -23,6 +23,8 @@ DELAY = (
     "the dashed line its mean. Only applied commands have echoes; if the newest command wins, "
     "these are the fast ones, so the loop delay lies below the mean of the profile."
 )
+TIME = "time since start (s)"
+"""Label of the time axis, by which a page finds the panels over time."""
 MARGIN = 1.25
 """Ratio of the upper end of the delay axis to the 99.5th percentile of the delays."""
 
@@ -94,7 +96,7 @@ def _finish(axes: Axes, subject: Subject, label: str, columns: int) -> None:
 
 def _time_axis(axes: Axes, subject: Subject) -> None:
     axes.set_xlim(0.0, max(subject.duration, 1e-3))
-    axes.set_xlabel("time since start (s)")
+    axes.set_xlabel(TIME)
 
 
 ODOM_ALT = "Three line plots of the x, y and z position over time: reference, measured, estimated."

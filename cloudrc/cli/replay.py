@@ -1,0 +1,76 @@
+"""`cloudrc replay RUN`: write the 3-D replay of a recorded flight as one page, and open it."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cloudrc.cli.extras import require
+from cloudrc.cli.output import print_line
+from cloudrc.errors import BadInputError
+
+if TYPE_CHECKING:
+    from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.record.columns import Recording
+
+EPILOG = """\
+examples:
+  cloudrc replay runs/latest
+  cloudrc replay runs/latest/mission.mcap --out flight.html --no-open"""
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or an MCAP file")
+    about = "file for the page (default: replay.html beside the recording)"
+    parser.add_argument("--out", type=Path, metavar="FILE", help=about)
+    parser.add_argument("--no-open", action="store_true", help="write the page, open no browser")
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Write the page, open it in the browser, and print its path."""
+    require("a replay", ("world", "record", "console"))
+    from cloudrc.files import write_atomically
+    from cloudrc.geometry.scene import load_scene
+    from cloudrc.metrics import Flight
+    from cloudrc.report.replay import write_page
+
+    run: Path = options.run
+    out = options.out or (run if run.is_dir() else run.parent) / "replay.html"
+    if options.out and os.path.lexists(out):
+        raise BadInputError(f"{out}: already there; name another file with --out")
+    recording, experiment = _read(run)
+    scene = load_scene(experiment.world.scene)
+    flight = Flight(recording, experiment.criteria, experiment.mission, scene)
+    try:
+        write_atomically(out, write_page(flight, experiment).encode())
+    except BadInputError as error:
+        raise BadInputError(f"{run}: no replay: {error}") from error
+    except OSError as error:
+        raise BadInputError(f"{out}: {error.strerror}; name another file with --out") from error
+    if not options.no_open and not webbrowser.open(out.absolute().as_uri()):
+        print_line("cloudrc: found no browser here; open the page yourself", sys.stderr)
+    print_line(str(out))
+    return 0
+
+
+def _read(run: Path) -> tuple[Recording, ResolvedExperiment]:
+    """Read a run's recording and its experiment, which an MCAP file contains as an attachment."""
+    from cloudrc.config.load import read_experiment
+    from cloudrc.record.reader import read_contents
+    from cloudrc.report.folder import read_run
+
+    if run.is_dir():
+        return read_run(run)[:2]
+    recording = read_contents(run).recording()
+    if (config := recording.attachments.get("config.yaml")) is None:
+        raise BadInputError(f"{run}: has no config.yaml attached; name the folder of the run")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "config.yaml")
+        path.write_bytes(config)
+        return recording, read_experiment(path)

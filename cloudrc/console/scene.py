@@ -1,0 +1,207 @@
+"""Show the robot and its surroundings in a browser: `FlightScene`, on viser and mjviser.
+
+Only this module imports mjviser, which converts the shapes of the MuJoCo model to meshes.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from cloudrc.config.schema import Experiment
+from cloudrc.geometry.clearance import CLEARANCE_SHOWN, Array
+from cloudrc.geometry.scene import Pipe, Scene, load_scene
+from cloudrc.messages import Vector
+from cloudrc.world.scene import ROBOT_PREFIX, ROTORS, compile_model, mujoco
+
+Colour = tuple[int, int, int]
+GHOST, SETPOINT, REACHED = (0, 114, 178), (213, 94, 0), (0, 158, 115)
+OPEN, PIPE, STRUT = (120, 124, 130), (110, 130, 150), (77, 77, 82)
+"""Colours; those of ghost, setpoint and reached waypoints are colours of the figures."""
+FLOOR: dict[str, Any] = {
+    **{"cell_color": (228, 230, 233), "section_color": (206, 210, 214), "shadow_opacity": 0.25},
+    **{"plane_color": (246, 247, 248), "plane_opacity": 1.0, "fade_distance": 40.0},
+}
+"""Look of a plane, which is a grid."""
+GHOST_OPACITY, PIPE_OPACITY = 0.35, 0.5
+VIRIDIS = "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725"
+"""Colours of clearance in the figures, evenly spaced from 0 to `CLEARANCE_SHOWN`."""
+
+
+class FlightScene:
+    """Robot, pipes, board and floor of an experiment in the scene of a viser server.
+
+    The world frame of the scene is that of the flight [m]; its z axis points up.
+    """
+
+    def __init__(self, server: viser.ViserServer, experiment: Experiment) -> None:
+        """Add the static shapes, and the robot at its spawn.
+
+        Raises:
+            BadInputError: If robot or scene are missing or unsuitable.
+        """
+        self._scene, world = server.scene, experiment.world
+        model, geometry = compile_model(world.robot, world.scene), load_scene(world.scene)
+        self._add_surroundings(model, geometry)
+        self._robot = self._scene.add_frame("/robot", show_axes=False, position=geometry.spawn)
+        self._ghost = self._scene.add_frame("/ghost", show_axes=False, visible=False)
+        self._add_robot(model)
+        self._setpoint = self._scene.add_icosphere(
+            "/setpoint", 0.09, SETPOINT, opacity=0.6, cast_shadow=False, visible=False
+        )
+        self._waypoints: list[Any] = []  # spheres
+        self._points: Array = np.zeros((0, 3))  # of the waypoints [m]
+        server.initial_camera.position, server.initial_camera.look_at = _camera(geometry)
+
+    def set_robot(self, position: Vector | Array, orientation_wxyz: Array) -> None:
+        """Move the robot to the `position` of its base [m], shape (3,).
+
+        `orientation_wxyz` is a unit quaternion, body to world, shape (4,).
+        """
+        self._robot.position, self._robot.wxyz = np.asarray(position), np.asarray(orientation_wxyz)
+
+    def set_ghost(self, position: Vector | Array | None, orientation_wxyz: Array | None) -> None:
+        """Move the predicted robot to a `position` [m], shape (3,); None hides it.
+
+        `orientation_wxyz` is a unit quaternion, body to world, shape (4,).
+        """
+        if position is not None and orientation_wxyz is not None:
+            self._ghost.position = np.asarray(position)
+            self._ghost.wxyz = np.asarray(orientation_wxyz)
+        self._ghost.visible = position is not None
+
+    def set_trail(self, points: Array, clearances: Array) -> None:
+        """Draw the flown path, coloured by clearance.
+
+        Args:
+            points: Positions of the base [m], shape (n, 3).
+            clearances: Distance to the nearest wall at each point [m], shape (n,); NaN or an
+                empty array if unknown.
+        """
+        if len(points) < 2:
+            self._scene.remove_by_name("/trail")
+            return
+        colours = np.tile(np.array(GHOST, dtype=np.uint8), (len(points), 1))
+        if len(clearances) == len(points):
+            known = np.isfinite(clearances)
+            colours[known] = clearance_colours(np.asarray(clearances)[known])
+        ends = [np.stack([each[:-1], each[1:]], axis=1) for each in (np.asarray(points), colours)]
+        self._scene.add_line_segments("/trail", *ends, thickness=0.03)
+
+    def set_waypoints(self, points: Array, reached: int) -> None:
+        """Show numbered waypoints at `points` [m], shape (n, 3), the first `reached` in green."""
+        points = np.asarray(points, dtype=float).reshape(-1, 3)
+        if not np.array_equal(points, self._points):
+            for sphere in self._waypoints:
+                sphere.remove()
+            self._points, self._waypoints = points, []
+            for number, point in enumerate(points, start=1):
+                name, above = f"/waypoints/{number}", (0.0, 0.0, 0.14)
+                self._waypoints.append(
+                    self._scene.add_icosphere(name, 0.06, OPEN, position=point, cast_shadow=False)
+                )
+                self._scene.add_label(
+                    f"{name}/label", str(number), position=above, anchor="bottom-center"
+                )
+        for number, sphere in enumerate(self._waypoints):
+            sphere.color = REACHED if number < reached else OPEN
+
+    def set_setpoint(self, position: Vector | Array | None) -> None:
+        """Show the `position` that the controller tracks [m], shape (3,); None hides it."""
+        if position is not None:
+            self._setpoint.position = np.asarray(position)
+        self._setpoint.visible = position is not None
+
+    def _add_surroundings(self, model: Any, geometry: Scene) -> None:
+        """Add all static shapes: planes as grids, pipes as smooth tubes, the rest as they are."""
+        pipes = {pipe.name for pipe in geometry.pipes}
+        bodies = defaultdict(list)
+        for geom in map(int, np.flatnonzero(model.body_weldid[model.geom_bodyid] == 0)):
+            name = model.geom(geom).name.rpartition("/")[0]
+            if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
+                self._scene.add_grid(
+                    f"/{name}", position=model.geom_pos[geom], infinite_grid=True, **FLOOR
+                )
+            elif name not in pipes:
+                bodies[name].append(geom)
+        for name, geoms in bodies.items():
+            self._add_geoms(f"/{name}", model, geoms)
+        for pipe in geometry.pipes:
+            inner, outer = pipe.inner, pipe.outer
+            # Only the far wall is drawn, so that the robot in the pipe is seen from every side.
+            look: Any = {"color": PIPE, "cast_shadow": False}
+            name, wall = f"/{pipe.name}/wall", _surface(pipe, (inner, -0.5), (inner, 0.5))
+            self._scene.add_mesh_simple(name, *wall, side="back", opacity=PIPE_OPACITY, **look)
+            for end in (-0.5, 0.5):
+                name, rim = f"/{pipe.name}/rim_{end:+}", _surface(pipe, (inner, end), (outer, end))
+                self._scene.add_mesh_simple(name, *rim, side="double", **look)
+
+    def _add_robot(self, model: Any) -> None:
+        """Add the robot and its ghost; struts, which only pictures show, carry the rotors."""
+        base = model.jnt_bodyid[0]
+        geoms = list(map(int, np.flatnonzero(model.body_rootid[model.geom_bodyid] == base)))
+        self._add_geoms("/robot", model, geoms)
+        self._add_geoms("/ghost", model, geoms, GHOST)
+        hubs = np.array([model.site(f"{ROBOT_PREFIX}{rotor}").pos for rotor in ROTORS])
+        struts = np.stack([hubs * (0.0, 0.0, 1.0), hubs], axis=1)
+        self._scene.add_line_segments("/robot/struts", struts, STRUT, thickness=0.012)
+
+    def _add_geoms(
+        self, parent: str, model: Any, geoms: list[int], ghost: Colour | None = None
+    ) -> None:
+        """Add geoms of one body, one mesh for each colour; all in the colour `ghost` if given."""
+        # It imports mujoco, which cloudrc.world.scene has imported without OpenGL.
+        from mjviser.conversions import merge_geoms
+
+        groups = defaultdict(list)
+        for geom in geoms:
+            groups[() if ghost else tuple(map(float, model.geom_rgba[geom]))].append(geom)
+        for number, (rgba, members) in enumerate(groups.items()):
+            name, mesh = f"{parent}/{number}", merge_geoms(model, members)
+            opacity = rgba[3] if rgba else GHOST_OPACITY
+            look: Any = {"opacity": None if opacity == 1.0 else opacity, "flat_shading": True}
+            look |= {"color": ghost or np.array(rgba[:3]), "cast_shadow": ghost is None}
+            self._scene.add_mesh_simple(name, mesh.vertices, mesh.faces, **look)
+
+
+def clearance_colours(clearances: Array) -> NDArray[np.uint8]:
+    """Return the RGB colours of clearances [m], shape (n,): shape (n, 3)."""
+    colours = np.array([list(bytes.fromhex(colour)) for colour in VIRIDIS.split()])
+    place = np.linspace(0.0, CLEARANCE_SHOWN, len(colours))
+    parts = [np.interp(clearances, place, part) for part in colours.T]
+    return np.asarray(np.rint(np.stack(parts, axis=1)), dtype=np.uint8)
+
+
+def _surface(
+    pipe: Pipe, first: tuple[float, float], last: tuple[float, float], sides: int = 64
+) -> tuple[Array, Array]:
+    """Make the mesh between two circles around the axis of a pipe: its wall or a rim.
+
+    Each circle has a radius [m] and a place along the axis, from -0.5 (begin) to 0.5 (end).
+
+    Returns:
+        Vertices [m], world frame, shape (2 * sides, 3), and faces, shape (2 * sides, 3).
+    """
+    axis, angle = np.array(pipe.axis), np.linspace(0.0, 2 * np.pi, sides, endpoint=False)[:, None]
+    across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    across /= np.linalg.norm(across)
+    ring = np.cos(angle) * across + np.sin(angle) * np.cross(axis, across)
+    circles = [pipe.centre + z * pipe.length * axis + r * ring for r, z in (first, last)]
+    here, there = np.arange(sides), np.roll(np.arange(sides), -1)
+    faces = [
+        np.stack(each, 1)
+        for each in ((here, there, here + sides), (there, there + sides, here + sides))
+    ]
+    return np.concatenate(circles), np.concatenate(faces)
+
+
+def _camera(geometry: Scene) -> tuple[Any, Any]:
+    """Choose where the viewer is and where the viewer looks [m], so that the scene is in sight."""
+    spots = np.array([geometry.spawn, *(pipe.centre for pipe in geometry.pipes)])
+    low, high = spots.min(axis=0), spots.max(axis=0)
+    middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.5)
+    return middle + size * np.array([0.44, 0.65, 0.50]), middle

@@ -1,0 +1,95 @@
+"""Make the replay of a flight: the 3-D scene over time, as HTML that loads nothing from a network.
+
+The report contains the replay as a section; `cloudrc replay` writes it as a page of its own.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from contextlib import redirect_stdout
+from html import escape
+from importlib.resources import files
+from string import Template
+
+import numpy as np
+import viser
+
+from cloudrc.config.load import ResolvedExperiment
+from cloudrc.console.scene import FlightScene
+from cloudrc.errors import BadInputError
+from cloudrc.metrics import Flight
+from cloudrc.metrics.mission import reported
+
+RATE = 25.0
+"""Frames per second of the flight."""
+FRAMES_MAX = 7_500
+"""Largest number of frames; a flight of more than 5 min gets fewer frames per second."""
+STALE = 0.5
+"""Age [s] from which a prediction is no longer shown."""
+
+
+def write_section(flight: Flight, experiment: ResolvedExperiment) -> str:
+    """Return the replay as a section of a page.
+
+    Raises:
+        BadInputError: If the robot never flew, or if its model or scene cannot be read.
+    """
+    if not len(flight.truth["stamp_ns"]):
+        raise BadInputError("the robot never flew")
+    with redirect_stdout(io.StringIO()):  # viser prints where its server listens
+        server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+        try:
+            player = _record(server, flight, experiment)
+        finally:
+            server.stop()
+    # Hide that the browser draws without a graphics card: the message would cover the scene.
+    style = "<style>.mantine-Notifications-root { display: none }</style></head>"
+    player = player.replace("</head>", style, 1)
+    return Template(files(__package__).joinpath("replay.html").read_text("utf-8")).substitute(
+        duration=_duration(flight), player=json.dumps(player).replace("<", "\\u003c")
+    )
+
+
+def write_page(flight: Flight, experiment: ResolvedExperiment) -> str:
+    """Return the replay as a page; it raises the errors of `write_section`."""
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8">\n'
+        f"<title>{escape(experiment.name)}: replay</title>\n"
+        "<style>body { margin: 0; font: 1rem system-ui, sans-serif } h2, p { margin: .5rem 1rem }"
+        " #replay .room { height: calc(100vh - 6rem) }</style>\n"
+        f"<body>\n{write_section(flight, experiment)}</body></html>\n"
+    )
+
+
+def _duration(flight: Flight) -> float:
+    return max(float(flight.seconds(flight.end_ns)), 1e-3)
+
+
+def _record(server: viser.ViserServer, flight: Flight, experiment: ResolvedExperiment) -> str:
+    """Record the flight in the scene of a server; return viser's page with the player."""
+    scene, duration = FlightScene(server, experiment), _duration(flight)
+    truth, control, applied = flight.truth, flight.control, flight.applied
+    times = np.linspace(0.0, duration, int(min(duration * RATE, FRAMES_MAX)) + 1)
+    true, asked, predicted = (
+        np.searchsorted(flight.seconds(np.sort(table["stamp_ns"])), times, "right") - 1
+        for table in (truth, control, applied)
+    )
+    true = np.maximum(true, 0)
+    reached = np.searchsorted(flight.seconds(np.sort([*reported(flight).values()])), times, "right")
+    points = np.array([waypoint.position_m for waypoint in flight.mission.waypoints])
+    scene.set_trail(
+        truth["position"][true], flight.clearance[true] if flight.scene.pipes else np.zeros(0)
+    )
+    recorded = server.get_scene_serializer()
+    for frame, (row, now) in enumerate(zip(true, times, strict=True)):
+        if frame:
+            recorded.insert_sleep(float(times[1]))
+        scene.set_robot(truth["position"][row], truth["orientation_wxyz"][row])
+        ghost = predicted[frame]
+        fresh = ghost >= 0 and now - flight.seconds(applied["stamp_ns"][ghost]) < STALE
+        pose = applied["position"], applied["orientation_wxyz"]
+        scene.set_ghost(*(column[ghost] if fresh else None for column in pose))
+        scene.set_setpoint(control["setpoint"][asked[frame]] if asked[frame] >= 0 else None)
+        scene.set_waypoints(points, int(reached[frame]))
+    return recorded.as_html()

@@ -1,0 +1,50 @@
+"""The 3-D scene: its colours, and the nodes that it shows."""
+
+from contextlib import redirect_stdout
+from io import StringIO
+
+import matplotlib
+import numpy as np
+import pytest
+import viser
+
+from cloudrc.config.load import load_experiment
+from cloudrc.console.scene import FlightScene, clearance_colours
+from cloudrc.geometry.clearance import CLEARANCE_SHOWN
+
+
+@pytest.fixture
+def server():
+    with redirect_stdout(StringIO()):
+        one = viser.ViserServer("127.0.0.1", 0, verbose=False)
+        yield one
+        one.stop()
+
+
+def test_the_trail_has_the_colours_of_the_figures():
+    share = np.linspace(0.0, 1.25, 60)
+    asked = matplotlib.colormaps["viridis"](share)[:, :3] * 255
+    assert np.abs(clearance_colours(share * CLEARANCE_SHOWN) - asked).max() < 20
+
+
+@pytest.mark.parametrize("name", ["paper", "hover"])
+def test_the_scene_has_the_bodies_of_the_experiment(server, name):
+    FlightScene(server, load_experiment(name))
+    nodes = set(server.scene._handle_from_node_name)
+    assert {"/floor", "/robot/0", "/robot/struts", "/ghost/0"} <= nodes
+    pipes = {node.split("/")[1] for node in nodes if node.endswith("/wall")}
+    assert pipes == ({"pipe_1", "pipe_2", "pipe_3"} if name == "paper" else set())
+    assert ("/board/0" in nodes) == (name == "paper")
+
+
+def test_waypoints_and_trail_of_another_mission_replace_the_first(server):
+    scene, points = FlightScene(server, load_experiment("hover")), np.eye(3)
+    scene.set_waypoints(points, 1)
+    scene.set_trail(points, np.array([0.1, np.nan, 0.3]))
+    handles = server.scene._handle_from_node_name
+    colours = [handles[f"/waypoints/{number}"].color for number in (1, 2, 3)]
+    assert colours[0] != colours[1] == colours[2]
+    scene.set_waypoints(points[:1], 0)
+    scene.set_trail(points[:1], np.zeros(0))
+    assert {"/waypoints/2", "/waypoints/2/label", "/trail"}.isdisjoint(handles)
+    assert handles["/waypoints/1"].color == colours[1]
