@@ -18,7 +18,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
 from io import BufferedReader, BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -26,7 +25,7 @@ from typing import Any, Self
 
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import atomic_file, open_file
-from cloudrc.record import missing
+from cloudrc.record import missing, wall_time
 from cloudrc.record.columns import Recording
 from cloudrc.record.ros import is_known
 from cloudrc.record.topics import TOPICS, VIEWS
@@ -36,7 +35,6 @@ from cloudrc.record.writer import (
     COUNTS,
     MISSING,
     STARTED,
-    WALL_OFFSET,
     McapWriter,
 )
 
@@ -277,17 +275,6 @@ class Contents:
             for name, data in {**self.attachments, **(attachments or {})}.items():
                 media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
                 writer.attach(name, data, media_type)
-
-
-def wall_time(metadata: Mapping[str, str], stamp_ns: int) -> datetime | None:
-    """Convert a stamp [ns] to wall time in UTC; None if the recording does not know the wall time.
-
-    The time is exact to the lag of world's clock (`slip_ns`) and to steps of the wall clock.
-    """
-    with suppress(ValueError, OverflowError):
-        micros = (int(metadata.get(WALL_OFFSET, "")) + stamp_ns) // 1000
-        return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=micros)
-    return None
 
 
 def read_contents(path: Path) -> Contents:

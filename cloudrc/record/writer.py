@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import IO, Any, Self, cast
 
 from cloudrc import __version__
-from cloudrc.record import missing
+from cloudrc.record import WALL_OFFSET, missing
 from cloudrc.record.hash import add_message
 from cloudrc.record.ros import definition, encode, type_hash
 from cloudrc.record.topics import TOPICS, VIEWS, Row, rows
@@ -48,9 +48,8 @@ MISSING = "missing"
 """Metadata key: what is missing from the file, in words."""
 CHANGED = "changed"
 """Metadata key: what another program removed from the file or added to the file, in words."""
-WALL_OFFSET, STARTED = "wall_clock_offset_ns", "started"
-"""Metadata keys, only in real time: wall time minus the stamps' clock when the file was opened
-[ns], and the wall time of the first message of a mission in UTC (ISO 8601)."""
+STARTED = "started"
+"""Metadata key, only in real time: wall time of a mission's first message, in UTC (ISO 8601)."""
 COUNTS, SHA256 = "counts", "messages_sha256"
 """Metadata keys: number of messages by topic as JSON, and hash of the messages as from
 `messages_sha256`. With them a reader detects messages that were removed, added or changed. The

@@ -166,5 +166,5 @@ def test_the_wall_time_of_the_start_is_kept(tmp_path):
     target = tmp_path / "mission.mcap"
     merge(tmp_path / "world.mcap", tmp_path / "cloud.mcap").write(target)
     metadata = read_contents(target).metadata
-    assert metadata["started"] == "2026-07-25T17:20:09.000+00:00"
+    assert metadata["started"] == "2026-07-25T17:20:08.995+00:00", "by the packets"
     assert metadata["wall_clock_offset_ns"] == str(day_ns)
