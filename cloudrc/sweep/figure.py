@@ -74,7 +74,7 @@ def draw_sweep(
         "Wilson's 95 % interval. Open markers: some flights failed."
         + (f" Each point pools all values of {', '.join(pooled)}." if pooled else "")
     )
-    return draw(panels, x, [] if is_numeric else list(map(str, along)), by, look), caption
+    return draw(panels, x, [] if is_numeric else list(map(str, along)), by, look=look), caption
 
 
 def _choose(

@@ -41,7 +41,7 @@ class Panel:
 
 
 def draw(
-    panels: Sequence[Panel], x: str, x_names: Sequence[str], by: str | None, look: Look
+    panels: Sequence[Panel], x: str, x_names: Sequence[str], by: str | None, *, look: Look
 ) -> dict[str, bytes]:
     """Draw panels below each other; return the contents of a PDF, a PNG and an SVG file by suffix.
 

@@ -43,7 +43,10 @@ ROTOR_COLOUR, BOARD_COLOUR, PATH_COLOUR = (0.10, 0.10, 0.12), (0.95, 0.84, 0.58)
 
 
 class Face(NamedTuple):
-    """A flat convex polygon or a line: k corners [m], world frame, shape (k, 3), k >= 2."""
+    """A flat convex polygon or a line: k corners [m], world frame, shape (k, 3), k >= 2.
+
+    `opacity` is in [0, 1].
+    """
 
     corners: Array
     colour: Colour
