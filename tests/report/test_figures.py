@@ -9,10 +9,10 @@ import pytest
 from matplotlib.collections import LineCollection
 
 from cloudrc.config.schema import Direction
+from cloudrc.records import Control
 from cloudrc.report.figures import FIGURES, draw_all, own_settings
 from cloudrc.report.figures.labels import FREE, free_label, place_labels
 from cloudrc.report.figures.style import RC, Look, Subject, new_figure
-from cloudrc.records import Control
 from tests.metrics.conftest import ONE_PIPE, START, flown
 
 CALM = Direction(delay_ms=50.0)
