@@ -99,6 +99,30 @@ def whole_number(low: int, high: int) -> Callable[[str], int]:
 read_count = whole_number(1, COUNT_MAX)
 
 
+def _between(low: float, high: float, unit: str) -> Callable[[str], float]:
+    """Make a type for argparse that parses a number from `low` to `high`, any unit."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = -1.0
+        if not low <= value <= high:  # or it is NaN
+            raise argparse.ArgumentTypeError(f"'{text}' is not a number of {unit}, {low} to {high}")
+        return value
+
+    return parse
+
+
+def figure_arguments(parser: argparse.ArgumentParser, width: float) -> None:
+    """Declare the arguments for the size of figures, by default of `width` [in]."""
+    add = parser.add_argument
+    about = f"width of figures in inches: one column of a paper has 3.5 (default: {width})"
+    add("--width", type=_between(2, 20, "inches"), default=width, metavar="IN", help=about)
+    about = "size of the text of figures in points (default: 9)"
+    add("--font-size", type=_between(5, 24, "points"), default=9.0, metavar="PT", help=about)
+
+
 def input_file(text: str) -> Path:
     """Parse the path of an input file, as a type for argparse.
 

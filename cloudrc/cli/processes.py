@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc.cli.output import print_line
 from cloudrc.drivers.process import EndProcess, Feed, StopSignal
@@ -339,9 +339,13 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     if options.record_max:
         room = round(0.9 * options.record_max)
         size_max = max(room - kept, room // 10)
+    about: dict[str, Any] = {
+        **{"clock": clock, "clock_id": clock_id.hex()},
+        "wall_offset_ns": time.time_ns() - time.monotonic_ns(),
+    }
     return Recorder(
         path,
-        lambda file: McapWriter(file, clock=clock, clock_id=clock_id.hex()),
+        lambda file: McapWriter(file, **about),
         size_max=size_max,
     )
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from cloudrc.cli.extras import missing, require
 from cloudrc.cli.output import escape, format_document, output_argument, paint, print_line, table
+from cloudrc.cli.parser import figure_arguments
 from cloudrc.errors import BadInputError
 
 COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
@@ -30,6 +31,7 @@ EPILOG = """\
 examples:
   cloudrc report runs/latest
   cloudrc report runs/latest --metric ./overshoot.py
+  cloudrc report runs/latest --width 3.5 --font-size 8
   cloudrc report runs/paper-local-seed1-1 -o json"""
 
 
@@ -44,6 +46,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="also evaluate the metric in this Python file; repeatable. Files named by the run's"
         " configuration are never executed",
     )
+    figure_arguments(parser, 7.16)
     output_argument(parser)
 
 
@@ -54,6 +57,7 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
     from cloudrc import metrics
     from cloudrc.metrics.verdict import exit_code
+    from cloudrc.report.figures.style import Look
     from cloudrc.report.folder import read_run
     from cloudrc.report.write import write_report
 
@@ -62,7 +66,8 @@ def execute(options: argparse.Namespace) -> int:
     # The run may come from somebody else: never execute files that it names.
     unmeasured = metrics.not_measured(experiment.report.metrics, options.metric)
     run = replace(run, notes=(*run.notes, *unmeasured))
-    document = write_report(options.run, recording, experiment, run, own=options.metric)
+    look = Look(options.width, options.font_size)
+    document = write_report(options.run, recording, experiment, run, own=options.metric, look=look)
     print_traceback(options, document)
     for_people = options.output == "table"
     print(

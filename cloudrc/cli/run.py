@@ -282,6 +282,7 @@ def _record_virtual(
     from cloudrc.record.columns import RecordStore, merged
     from cloudrc.record.writer import McapWriter
     from cloudrc.report.document import Run
+    from cloudrc.report.views import views
     from cloudrc.report.write import attachments
     from cloudrc.world.native.robot import usable
 
@@ -308,7 +309,9 @@ def _record_virtual(
             steps = usable().text if _is_nominal(experiment) else NO_C
             found = store.hexdigest(), interrupted, notes
             run = Run("virtual", "virtual", *found, physics_steps=steps)
-            yield store.recording(), run
+            recording = store.recording()
+            writer.write_views(views(recording, experiment))
+            yield recording, run
         finally:
             for name, data in attachments(folder).items():
                 writer.attach(name, data)
@@ -328,6 +331,7 @@ def _record_local(
     from cloudrc.record.hash import messages_sha256
     from cloudrc.record.merge import merge
     from cloudrc.report.document import Run
+    from cloudrc.report.views import add_views
     from cloudrc.report.write import attachments
     from cloudrc.world.native.library import library
 
@@ -358,7 +362,7 @@ def _record_local(
     digest = messages_sha256(mission.messages)
     try:
         facts = digest, interrupted, notes, library().text if _is_nominal(experiment) else NO_C
-        yield mission.recording(), Run("local", "relay", *facts)
+        yield add_views(mission, experiment), Run("local", "relay", *facts)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))
     if broken:

@@ -23,7 +23,7 @@ from cloudrc.cli.output import (
     print_or_drop,
     table,
 )
-from cloudrc.cli.parser import COUNT_MAX, input_file, read_count
+from cloudrc.cli.parser import COUNT_MAX, figure_arguments, input_file, read_count
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.cli.sweep_pods import (
     cluster_arguments,
@@ -99,6 +99,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--by", metavar="AXIS", help=about)
     about = "path of the files, with or without a suffix (default: DIR/figure)"
     add("--out", type=Path, metavar="FILE", help=about)
+    figure_arguments(figure, 3.5)
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -284,11 +285,13 @@ def draw_figure(options: argparse.Namespace) -> int:
     """Draw a sweep and write the figure as PDF, PNG and SVG; print the caption and the paths."""
     require("a figure", ("report",))
     from cloudrc.files import write_atomically
+    from cloudrc.report.figures.style import Look
     from cloudrc.sweep.figure import draw_sweep
     from cloudrc.sweep.pairs import read_flights
 
     rows, units, missing = read_flights(options.folder)
-    files, caption = draw_sweep(rows, units, options.number, options.x, options.by)
+    look = Look(options.width, options.font_size)
+    files, caption = draw_sweep(rows, units, options.number, options.x, options.by, look)
     out = options.out or options.folder / "figure"
     stem = out.stem if out.suffix.removeprefix(".") in files else out.name
     print_or_drop(caption + (f" {missing}." if missing else "") + "\n")

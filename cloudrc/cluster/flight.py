@@ -277,6 +277,7 @@ def _report(
 ) -> dict[str, Any]:
     from cloudrc.record.hash import messages_sha256
     from cloudrc.report.document import Run
+    from cloudrc.report.views import add_views
     from cloudrc.report.write import attachments, write_report
 
     # The metrics of the link containers name the shaper: netem or relay.
@@ -286,7 +287,8 @@ def _report(
     digest = messages_sha256(mission.messages)
     run_facts = replace(Run("cluster", shaper, digest), interrupted=interrupted)
     try:
+        recording = add_views(mission, experiment)
         own = experiment.report.metrics  # evaluated here, so the pods do not need the file
-        return write_report(folder, mission.recording(), experiment, run_facts, own=own)
+        return write_report(folder, recording, experiment, run_facts, own=own)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))

@@ -5,7 +5,15 @@ Only the modules `ros`, `writer` and `reader` need the packages of `cloudrc[reco
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
+
 from cloudrc.errors import MissingPrerequisiteError
+
+WALL_OFFSET = "wall_clock_offset_ns"
+"""Metadata key, only in real time: wall time minus the clock of the stamps when the file was opened
+[ns]."""
 
 
 def missing(error: ImportError) -> MissingPrerequisiteError:
@@ -15,3 +23,14 @@ def missing(error: ImportError) -> MissingPrerequisiteError:
         f"recording needs the package {name}, which is not installed;"
         " install it with: pip install 'cloudrc[record]'"
     )
+
+
+def wall_time(metadata: Mapping[str, str], stamp_ns: int) -> datetime | None:
+    """Convert a stamp [ns] to wall time in UTC; None if the recording does not know the wall time.
+
+    The time is exact to the lag of world's clock (`slip_ns`) and to steps of the wall clock.
+    """
+    with suppress(ValueError, OverflowError):
+        micros = (int(metadata.get(WALL_OFFSET, "")) + stamp_ns) // 1000
+        return datetime.fromtimestamp(0, UTC) + timedelta(microseconds=micros)
+    return None

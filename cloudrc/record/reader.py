@@ -25,11 +25,18 @@ from typing import Any, Self
 
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import atomic_file, open_file
-from cloudrc.record import missing
+from cloudrc.record import missing, wall_time
 from cloudrc.record.columns import Recording
 from cloudrc.record.ros import is_known
-from cloudrc.record.topics import TOPICS
-from cloudrc.record.writer import CHANGED, CLOCK, COUNTS, MISSING, McapWriter
+from cloudrc.record.topics import TOPICS, VIEWS
+from cloudrc.record.writer import (
+    CHANGED,
+    CLOCK,
+    COUNTS,
+    MISSING,
+    STARTED,
+    McapWriter,
+)
 
 try:
     import lz4.frame
@@ -228,6 +235,7 @@ class Contents:
         messages: Topic, log time [ns] and CDR bytes of each message, in the order of log times.
         metadata: All metadata of the file; later values of a key replace earlier values.
         attachments: Name -> content of an attached file.
+        views: Messages for viewers (`VIEWS`), in the same form as `messages`.
         note: What is missing, in words; "" if nothing is missing.
         lacking: The part of `note` about damaged, removed or added messages. Messages that are
             missing only because the process was killed are not in it. "" if there is none.
@@ -238,6 +246,7 @@ class Contents:
     messages: list[tuple[str, int, bytes]] = field(default_factory=list)
     metadata: dict[str, str] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
+    views: list[tuple[str, int, bytes]] = field(default_factory=list)
     note: str = ""
     lacking: str = ""
     remarks: tuple[str, ...] = ()
@@ -258,8 +267,11 @@ class Contents:
             McapWriter(file, clock=clock, clock_id=clock_id) as writer,
         ):
             writer.note(self.metadata)
+            if self.messages and (began := wall_time(self.metadata, self.messages[0][1])):
+                writer.note({STARTED: began.isoformat(timespec="milliseconds")})
             for message in self.messages:
                 writer.write_message(*message)
+            writer.write_views(self.views)
             for name, data in {**self.attachments, **(attachments or {})}.items():
                 media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
                 writer.attach(name, data, media_type)
@@ -284,7 +296,9 @@ def _read(path: Path) -> tuple[Contents, Records, int]:
                 channel, total = records.channels[record.channel_id], total + 1
                 if channel.id not in ours:
                     ours[channel.id] = _is_ours(channel, records.schemas.get(channel.schema_id))
-                if ours[channel.id]:
+                if ours[channel.id] and channel.topic in VIEWS:
+                    contents.views.append((channel.topic, record.log_time, record.data))
+                elif ours[channel.id]:
                     contents.messages.append((channel.topic, record.log_time, record.data))
                     sequences.append(record.sequence)
             elif isinstance(record, mcap.Metadata):
@@ -301,15 +315,17 @@ def _read(path: Path) -> tuple[Contents, Records, int]:
         contents.messages = [messages[n] for n in order]
         contents.remarks += (f"was not in order of time: {late} messages were sorted",)
     _note(contents, records, ours, total)
-    return contents, records, max(records.stated or 0, total) - len(messages)
+    known = len(messages) + len(contents.views)
+    return contents, records, max(records.stated or 0, total) - known
 
 
 def _is_ours(channel: mcap.Channel, schema: mcap.Schema | None) -> bool:
     """Check whether a channel's topic and layout are those that cloudrc records."""
     topic = TOPICS.get(channel.topic)
-    if schema is None or topic is None or schema.name != topic.ros_type:
+    ros_type = topic.ros_type if topic else VIEWS.get(channel.topic)
+    if schema is None or ros_type is None or schema.name != ros_type:
         return False
-    return is_known(topic.ros_type, schema.data.decode("utf-8", "replace"))
+    return is_known(ros_type, schema.data.decode("utf-8", "replace"))
 
 
 def _note(contents: Contents, records: Records, ours: dict[int, bool], total: int) -> None:
@@ -333,7 +349,7 @@ def _note(contents: Contents, records: Records, ours: dict[int, bool], total: in
         contents.remarks += (to_one_line(told),)
     if other := sorted(others & TOPICS.keys()):
         changed.append(f"topics of another layout were left out: {', '.join(other)}")
-    twice = [name for (name, known), count in channels.items() if known and count > 1]
+    twice = [name for (name, known), n in channels.items() if known and n > 1 and name in TOPICS]
     if double := [name for name in twice if TOPICS[name].end != "either"]:
         changed.append(f"two robots or two recordings are in one file: {', '.join(double)}")
     if not metadata.get(CLOCK):

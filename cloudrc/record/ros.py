@@ -20,7 +20,7 @@ import numpy as np
 
 from cloudrc.messages import Quaternion, Vector
 from cloudrc.record import missing
-from cloudrc.record.topics import TOPICS, Kind, Topic, Values
+from cloudrc.record.topics import TOPICS, VIEWS, Kind, Topic, Values
 
 try:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -74,12 +74,12 @@ for _name in _NAMES:
 
 def definition(ros_type: str) -> str:
     """Return a message type's definition as `ros2msg`, including the types that it uses."""
-    return _DEFINITIONS[ros_type]
+    return _DEFINITIONS.get(ros_type) or _whole_definition(ros_type)
 
 
 def type_hash(ros_type: str) -> str:
     """Return the RIHS01 hash by which ROS 2 identifies a message type."""
-    return _HASHES[ros_type]
+    return _HASHES.get(ros_type) or STORE.hash_rihs01(ros_type)
 
 
 @lru_cache(maxsize=256)
@@ -114,9 +114,24 @@ _NO_COVARIANCE = np.zeros(36)
 
 def encode(topic: Topic, stamp_ns: int, values: Values) -> bytes:
     """Encode stamp [ns] and values of a row as little-endian CDR with encapsulation header."""
-    header = _Header(_Time(*divmod(stamp_ns, _SECOND_NS)), "world")
-    message = _CODECS[topic.name][0](header, values)
+    message = _CODECS[topic.name][0](header(stamp_ns), values)
     return bytes(STORE.serialize_cdr(message, topic.ros_type, little_endian=True))
+
+
+def encode_view(topic: str, *values: Any) -> bytes:
+    """Encode a message of one of `VIEWS`, with the values of its fields, as little-endian CDR."""
+    message = _type[VIEWS[topic]](*values)
+    return bytes(STORE.serialize_cdr(message, VIEWS[topic], little_endian=True))
+
+
+def part(name: str, *values: Any) -> Any:
+    """Make a part of a message, such as "geometry_msgs/msg/Point", from its fields' values."""
+    return _type[name](*values)
+
+
+def header(stamp_ns: int, frame: str = "world") -> Any:
+    """Make the header of a message from its stamp [ns] and the name of its frame."""
+    return _Header(_Time(*divmod(stamp_ns, _SECOND_NS)), frame)
 
 
 def decode(topic: Topic, data: bytes) -> tuple[int, Values]:

@@ -224,6 +224,14 @@ _TABLE = (
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 """Name -> topic, for every topic of a recording."""
 
+VIEWS: dict[str, str] = {
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/scene": "visualization_msgs/msg/MarkerArray",
+    **dict.fromkeys(("/tracking_error", "/prediction_error"), "std_msgs/msg/Float64"),
+}
+"""Topic for viewers -> ROS type. These topics repeat a mission's other topics in forms that
+Foxglove and Lichtblick can show (`cloudrc/report/views.py`). A report does not read them."""
+
 _Extract: TypeAlias = tuple[str, Callable[[Record], int], Callable[[Record], Values]]
 
 

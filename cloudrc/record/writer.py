@@ -18,14 +18,15 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from io import BytesIO, FileIO
+from operator import itemgetter
 from pathlib import Path
 from typing import IO, Any, Self, cast
 
 from cloudrc import __version__
-from cloudrc.record import missing
+from cloudrc.record import WALL_OFFSET, missing
 from cloudrc.record.hash import add_message
 from cloudrc.record.ros import definition, encode, type_hash
-from cloudrc.record.topics import TOPICS, Row, rows
+from cloudrc.record.topics import TOPICS, VIEWS, Row, rows
 from cloudrc.records import Record
 
 try:
@@ -47,6 +48,8 @@ MISSING = "missing"
 """Metadata key: what is missing from the file, in words."""
 CHANGED = "changed"
 """Metadata key: what another program removed from the file or added to the file, in words."""
+STARTED = "started"
+"""Metadata key, only in real time: wall time of a mission's first message, in UTC (ISO 8601)."""
 COUNTS, SHA256 = "counts", "messages_sha256"
 """Metadata keys: number of messages by topic as JSON, and hash of the messages as from
 `messages_sha256`. With them a reader detects messages that were removed, added or changed. The
@@ -56,11 +59,19 @@ value of `COUNTS` is "" until the file is complete."""
 class McapWriter:
     """Writes the rows of world, of cloud, or of a whole mission to one MCAP file."""
 
-    def __init__(self, target: Path | IO[bytes], *, clock: str, clock_id: str = "") -> None:
+    def __init__(
+        self,
+        target: Path | IO[bytes],
+        *,
+        clock: str,
+        clock_id: str = "",
+        wall_offset_ns: int | None = None,
+    ) -> None:
         """Open a file, or use a stream that the caller closes; every method may raise an OSError.
 
         `clock` is "world" or "cloud", the clock of the stamps. `clock_id` identifies the machine's
         clock ("" if unknown); files with the same `clock_id` need no clock offset.
+        `wall_offset_ns` is the wall time minus that clock [ns]; None in virtual time.
         """
         self._owned = isinstance(target, Path)
         # Unbuffered: mcap's writer has its own buffer, and `abandon` writes past it.
@@ -84,6 +95,8 @@ class McapWriter:
         self._mcap._Writer__chunk_indices = _ChunkIndexes()  # type: ignore[attr-defined]
         self._mcap.start(profile="ros2", library=f"cloudrc {__version__}")
         self.note({CLOCK: clock, "clock_id": clock_id, "version": __version__, COUNTS: ""})
+        if wall_offset_ns is not None:
+            self.note({WALL_OFFSET: str(wall_offset_ns)})
 
     def write(self, records: Iterable[Record]) -> None:
         """Write all rows of records from world or from cloud, oldest first."""
@@ -104,6 +117,22 @@ class McapWriter:
         log time is used.
         """
         now_ns = self._latest_ns = max(self._latest_ns, log_time_ns)
+        self._add_message(topic, now_ns, data)
+        self._counts[topic] += 1
+        add_message(self._sha256, topic, now_ns, data)
+
+    def write_views(self, views: Iterable[tuple[str, int, bytes]]) -> None:
+        """Write messages of `VIEWS`, each with its log time [ns], after all other messages.
+
+        They are in chunks of their own, in the order of their log times; readers use the index to
+        merge the chunks. They are neither counted nor hashed, because they repeat other messages.
+        """
+        self.flush()
+        for topic, log_time_ns, data in sorted(views, key=itemgetter(1)):
+            self._add_message(topic, max(log_time_ns, 0), data)
+        self.flush()
+
+    def _add_message(self, topic: str, now_ns: int, data: bytes) -> None:
         if self._chunk_start_ns is None:
             self._chunk_start_ns = now_ns
         elif now_ns - self._chunk_start_ns >= CHUNK_NS:
@@ -113,8 +142,6 @@ class McapWriter:
         # Numbered, so that a reader can restore the order of messages of the same instant.
         self._number = (self._number + 1) & 0xFFFFFFFF
         self._mcap.add_message(channel, now_ns, data, now_ns, self._number)
-        self._counts[topic] += 1
-        add_message(self._sha256, topic, now_ns, data)
 
     def note(self, metadata: Mapping[str, str]) -> None:
         """Add values to the file's metadata; a later value of a key replaces an earlier value."""
@@ -185,7 +212,7 @@ class McapWriter:
                 self._stream.close()
 
     def _open_channel(self, topic: str) -> int:
-        ros_type = TOPICS[topic].ros_type
+        ros_type = VIEWS.get(topic) or TOPICS[topic].ros_type
         if ros_type not in self._schemas:
             text = definition(ros_type).encode()
             self._schemas[ros_type] = self._mcap.register_schema(ros_type, "ros2msg", text)

@@ -26,6 +26,7 @@ from cloudrc.record.reader import Contents, NothingReadableError, read_contents
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import SHA256
 from cloudrc.report.document import Run
+from cloudrc.report.views import views
 from cloudrc.report.write import DIFFERS, RECORDING_NOTE
 
 REPORT_BYTES_MAX = 16 << 20
@@ -66,6 +67,7 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     for lack in _lacking(recording, config, whole=earlier is not None and earlier.complete):
         raise BadInputError(f"{merged}: {lack}; no report is written")
     if before is None:
+        contents.views = views(recording, experiment)
         contents.write(merged)
     return recording, experiment, _describe(recording, earlier, contents)
 

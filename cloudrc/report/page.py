@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from html import escape
 from importlib.resources import files
 from string import Template
@@ -17,8 +18,10 @@ from cloudrc import __version__
 from cloudrc.config.load import ResolvedExperiment, dump
 from cloudrc.metrics import Flight, Number
 from cloudrc.metrics.verdict import Failure
+from cloudrc.record import wall_time
 from cloudrc.report.document import Assessment, Run
 from cloudrc.report.figures import Picture
+from cloudrc.report.figures.style import PAGE
 
 HEADLINES = {
     "success": ("The mission succeeded.", "#00694b"),
@@ -140,7 +143,7 @@ def render(
         summary=escape(summary(assessment.flight, assessment.numbers)),
         failures=_list([_failure(failure) for failure in verdict.failures], "failures"),
         notes=_list([escape(note) for note in assessment.notes], "note"),
-        facts=_facts(run, experiment),
+        facts=_facts(run, experiment, assessment.flight),
         replay=replay,
         figures="\n".join(_figure(n, picture) for n, picture in enumerate(pictures, start=1)),
         numbers=_table_rows(assessment.numbers),
@@ -152,8 +155,9 @@ def render(
     )
 
 
-def _facts(run: Run, experiment: ResolvedExperiment) -> str:
+def _facts(run: Run, experiment: ResolvedExperiment, flight: Flight) -> str:
     cloud = experiment.cloud
+    flown = wall_time(flight.recording.metadata, flight.start_ns or 0)
     pairs = {
         "Experiment": experiment.name,
         "Mode": run.mode,
@@ -163,6 +167,8 @@ def _facts(run: Run, experiment: ResolvedExperiment) -> str:
         "Delay estimator": cloud.estimator.name,
         "Predictor": cloud.predictor.name,
         "Controller": cloud.controller.name,
+        # A flight in virtual time has no date.
+        "Flown" if flown else "Report written": f"{flown or datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     }
     return "\n".join(
         f"<div><dt>{name}</dt><dd>{escape(value)}</dd></div>" for name, value in pairs.items()
@@ -184,14 +190,15 @@ def _list(items: Sequence[str], name: str) -> str:
 
 
 def _figure(number: int, picture: Picture) -> str:
-    source = f"data:image/svg+xml;base64,{b64encode(picture.svg).decode()}"
+    source = f"data:image/svg+xml;base64,{b64encode(picture.files['svg']).decode()}"
+    size = f' style="max-width: {picture.width:g}in"' if picture.width < PAGE else ""
     panels = "".join(
         f'<span style="left:{left:.2%};bottom:{bottom:.2%};width:{width:.2%};height:{height:.2%}">'
         "</span>"
         for left, bottom, width, height in picture.over_time
     )
     return (
-        f'<figure id="{picture.name}"><div class="plot"><img src="{source}"'
+        f'<figure id="{picture.name}"><div class="plot"{size}><img src="{source}"'
         f' alt="{escape(picture.alt)}">{panels}</div>\n'
         f"<figcaption><b>Fig. {number}.</b> {escape(picture.caption)}</figcaption></figure>"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
 from cloudrc.report.document import Assessment, Run, environment_document, write_json
+
+if TYPE_CHECKING:
+    from cloudrc.report.figures.style import Look
 
 DIFFERS = "By what telemetry had shown when the mission ended, the operator's verdict is "
 """First words of a note: the verdict at the mission's end differs from the report's verdict."""
@@ -61,11 +64,12 @@ def write_report(
     *,
     own: Iterable[str] = (),
     page: bool = True,
+    look: Look | None = None,
 ) -> dict[str, Any]:
     """Write report.json and environment.json and, if `page`, report.html with its figures.
 
-    `folder` is the folder of the run, in which files of an earlier report are replaced. For the
-    other arguments see `assess`.
+    `folder` is the folder of the run, in which files of an earlier report are replaced. `look` is
+    the size of the figures. For the other arguments see `assess`.
 
     Returns:
         Content of report.json.
@@ -81,7 +85,7 @@ def write_report(
     if driven := _driven(assessment.flight):
         write_atomically(folder / "drive.csv", driven.encode())
     if page:
-        _write_page(folder, assessment, environment)
+        _write_page(folder, assessment, environment, look)
     return document
 
 
@@ -97,10 +101,12 @@ def _driven(flight: Flight) -> str:
     return write_setpoints(zip(times.tolist(), control["setpoint"][rows].tolist(), strict=True))
 
 
-def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any]) -> None:
+def _write_page(
+    folder: Path, assessment: Assessment, environment: dict[str, Any], look: Look | None
+) -> None:
     try:
         from cloudrc.report.figures import draw_all
-        from cloudrc.report.figures.style import Subject
+        from cloudrc.report.figures.style import Look, Subject
     except ImportError as error:
         raise MissingPrerequisiteError(
             f"report.html needs {error.name}, which is not installed; report.json is written; "
@@ -110,7 +116,7 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
 
     link = assessment.experiment.uplink, assessment.experiment.downlink
     try:
-        pictures = draw_all(Subject(assessment.flight, *link))
+        pictures = draw_all(Subject(assessment.flight, *link, look or Look()))
     except ValueError as error:  # matplotlib cannot draw impossible values
         raise BadInputError(
             f"{folder}: the recorded values cannot be drawn ({describe_error(error)}); "
@@ -121,8 +127,8 @@ def _write_page(folder: Path, assessment: Assessment, environment: dict[str, Any
         raise BadInputError(f"{figures}: is a link; remove it, figures are kept with their run")
     figures.mkdir(exist_ok=True)
     for picture in pictures:
-        write_atomically(figures / f"{picture.name}.png", picture.png)
-        write_atomically(figures / f"{picture.name}.svg", picture.svg)
+        for kind, content in picture.files.items():
+            write_atomically(figures / f"{picture.name}.{kind}", content)
     text = render(assessment, pictures, environment, _replay(assessment))
     write_atomically(folder / "report.html", text.encode("utf-8"))
 

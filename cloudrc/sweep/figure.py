@@ -10,11 +10,14 @@ from typing import Any
 from cloudrc.errors import BadInputError
 from cloudrc.plugins import unknown_name_text
 from cloudrc.report.figures.bands import Panel, Point, draw
+from cloudrc.report.figures.style import Look
 from cloudrc.sweep.compare import NUMBERS, scale
 from cloudrc.sweep.flight import Row, counts
 from cloudrc.sweep.pairs import values_of
 from cloudrc.sweep.statistics import median_interval, wilson_interval
 
+COLUMN = Look(width=3.5)
+"""Look of a figure in one column of a page. Source: IEEE conference template."""
 SHOWN = 3
 """Number of metrics that a figure shows by default."""
 Groups = Mapping[str, Sequence[Sequence[Row]]]
@@ -29,6 +32,7 @@ def draw_sweep(
     names: Sequence[str] = (),
     x: str | None = None,
     by: str | None = None,
+    look: Look = COLUMN,
 ) -> tuple[dict[str, bytes], str]:
     """Draw a panel per metric and, if flights failed, one with the share of successes.
 
@@ -38,6 +42,7 @@ def draw_sweep(
         names: Metrics to show; by default the first three of `compare.NUMBERS`.
         x: Axis of the sweep along x; by default the first one with numbers, else the first.
         by: Axis with one line per value; by default the first one with names, else the next one.
+        look: Size of the figure.
 
     Returns:
         The figure as PDF, PNG and SVG by suffix; and its caption.
@@ -69,7 +74,7 @@ def draw_sweep(
         "Wilson's 95 % interval. Open markers: some flights failed."
         + (f" Each point pools all values of {', '.join(pooled)}." if pooled else "")
     )
-    return draw(panels, x, [] if is_numeric else list(map(str, along)), by), caption
+    return draw(panels, x, [] if is_numeric else list(map(str, along)), by, look=look), caption
 
 
 def _choose(

@@ -153,3 +153,18 @@ def test_time_never_runs_backwards(steps, data):
     assert (converted <= machine_ns).all()
     if not any(steps):
         assert converted.tolist() == machine_ns.tolist()
+
+
+def test_the_wall_time_of_the_start_is_kept(tmp_path):
+    day_ns = 1_785_000_000 * SECOND  # wall time at world's stamp 0
+    for end, records, offset_ns in (
+        ("world", world_records(60, 9 * SECOND), day_ns),
+        ("cloud", cloud_records(60, 4 * SECOND), day_ns + 5 * SECOND),
+    ):
+        with McapWriter(tmp_path / f"{end}.mcap", clock=end, wall_offset_ns=offset_ns) as writer:
+            writer.write(records)
+    target = tmp_path / "mission.mcap"
+    merge(tmp_path / "world.mcap", tmp_path / "cloud.mcap").write(target)
+    metadata = read_contents(target).metadata
+    assert metadata["started"] == "2026-07-25T17:20:08.995+00:00", "by the packets"
+    assert metadata["wall_clock_offset_ns"] == str(day_ns)

@@ -70,7 +70,7 @@ def test_failures_and_notes_are_escaped():
         verdict=Verdict("failure", failures),
         notes=("metric <b> & 'c'",),
     )
-    picture = Picture("delay", b"", b"<svg/>", "Caption.", "A picture of something.")
+    picture = Picture("delay", {"svg": b"<svg/>"}, "Caption.", 7.16, "A picture of something.")
     page = render(assessment, [picture], environment_document())
     assert "The mission failed." in page
     assert "it hit, at 3.50 s, x 1.00, y -2.00, z 0.70 m <code>pipe_touched</code>" in page

@@ -34,7 +34,7 @@ def sweep(folder, rows=None):
 def drawn(monkeypatch):
     """Keep what would be drawn."""
     kept = []
-    monkeypatch.setattr("cloudrc.sweep.figure.draw", lambda *what: kept.extend(what) or {})
+    monkeypatch.setattr("cloudrc.sweep.figure.draw", lambda *what, look: kept.extend(what) or {})
     return kept
 
 

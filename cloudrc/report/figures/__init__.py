@@ -1,17 +1,22 @@
-"""Draw the figures of a report as PNG and SVG, without a display, OpenGL or pyplot."""
+"""Draw the figures of a report as PDF, PNG and SVG, without a display, OpenGL or pyplot."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import datetime
 from io import BytesIO
+from typing import Any
 
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cloudrc.report.figures import curves, flight, marks, snapshots
-from cloudrc.report.figures.style import RC, Subject
+from cloudrc.record import wall_time
+from cloudrc.report.figures import curves, flight, marks, overview
+from cloudrc.report.figures.labels import place_labels
+from cloudrc.report.figures.style import Look, Subject
 
 Draw = Callable[[Subject], Figure]
 Write = Callable[[Subject], str]
@@ -20,7 +25,7 @@ FIGURES: dict[str, tuple[Draw, Write, str]] = {
     "delay": (curves.draw_delay, lambda s: curves.DELAY + marks.legend(s), curves.DELAY_ALT),
     "odom": (curves.draw_odom, lambda s: curves.ODOM + marks.legend(s), curves.ODOM_ALT),
     "error": (curves.draw_error, lambda s: curves.ERROR + marks.legend(s), curves.ERROR_ALT),
-    "snapshots": (snapshots.draw, lambda s: snapshots.CAPTION, snapshots.ALT),
+    "overview": (overview.draw, lambda s: overview.CAPTION, overview.ALT),
 }
 """Name of a figure -> function that draws the figure, function that returns the caption, text for
 readers who cannot see the figure. The figures of the paper are delay, odom and error."""
@@ -32,9 +37,9 @@ class Picture:
     """A drawn figure."""
 
     name: str  # name of the files, without suffix
-    png: bytes
-    svg: bytes
+    files: dict[str, bytes]  # "pdf", "png", "svg" -> content
     caption: str
+    width: float  # in print [in]
     alt: str  # for readers who cannot see the figure
     # Panels over the whole flight: left, bottom, width and height as shares of the figure.
     over_time: tuple[tuple[float, float, float, float], ...] = ()
@@ -45,16 +50,16 @@ def draw_all(subject: Subject) -> list[Picture]:
 
     Only one thread at a time may draw, because matplotlib's settings are global in a process.
     """
+    flown = wall_time(subject.flight.recording.metadata, subject.flight.start_ns or 0)
     pictures = []
-    with matplotlib.rc_context():
-        # matplotlib reads a matplotlibrc in the working folder, which may be somebody else's run.
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(RC)
+    with own_settings(subject.look):
         for name in NAMES:
             draw, caption, alt = FIGURES[name]
             figure = draw(subject)
-            png, svg = save(figure, "png"), save(figure, "svg")
-            pictures.append(Picture(name, png, svg, caption(subject), alt, _over_time(figure)))
+            place_labels(figure)
+            files = {kind: save(figure, kind, flown) for kind in ("pdf", "png", "svg")}
+            width, panels = subject.look.width, _over_time(figure)
+            pictures.append(Picture(name, files, caption(subject), width, alt, panels))
     return pictures
 
 
@@ -66,9 +71,24 @@ def _over_time(figure: Figure) -> tuple[tuple[float, float, float, float], ...]:
     return tuple(axes.get_position().bounds for axes in figure.axes if is_over_time(axes))
 
 
-def save(figure: Figure, kind: str) -> bytes:
-    """Return the content of a "png", "svg" or "pdf" file; equal figures give equal bytes."""
+@contextmanager
+def own_settings(look: Look) -> Iterator[None]:
+    """Draw with the settings of cloudrc alone while the block runs."""
+    with matplotlib.rc_context():
+        # matplotlib reads a matplotlibrc in the working folder, which may be somebody else's run.
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(look.settings)
+        yield
+
+
+def save(figure: Figure, kind: str, date: datetime | None = None) -> bytes:
+    """Return the content of a "png", "svg" or "pdf" file; equal figures give equal bytes.
+
+    `date` is the date in the file; without one the file has no date, not that of today.
+    """
     target = BytesIO()
-    date = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
-    figure.savefig(target, format=kind, metadata=date)
+    keys = {"svg": "Date", "pdf": "CreationDate", "png": "Creation Time"}
+    text = date.isoformat() if date and kind == "png" else date
+    about: Any = {keys[kind]: text} if text or kind != "png" else {}
+    figure.savefig(target, format=kind, metadata=about)
     return target.getvalue()

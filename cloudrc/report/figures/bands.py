@@ -6,17 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 
-from cloudrc.report.figures import save, style
-from cloudrc.report.figures.style import RC, new_figure, panel
+from cloudrc.report.figures import own_settings, save, style
+from cloudrc.report.figures.style import Look, new_figure, panel
 
-COLUMN = 3.5
-"""Width of a column of a page [in]. Source: IEEE conference template."""
-TEXT: dict[Any, Any] = {"svg.fonttype": "none", "pdf.fonttype": 42}
-"""Settings with which text stays text in an SVG or PDF file."""
 UNITS = {"ms": "ms", "s": "s", "m": "m", "mps": "m/s", "kbit": "kbit/s", "deg": "deg"}
 """End of a key -> unit."""
 LOOKS = (
@@ -46,17 +41,15 @@ class Panel:
 
 
 def draw(
-    panels: Sequence[Panel], x: str, x_names: Sequence[str], by: str | None
+    panels: Sequence[Panel], x: str, x_names: Sequence[str], by: str | None, *, look: Look
 ) -> dict[str, bytes]:
     """Draw panels below each other; return the contents of a PDF, a PNG and an SVG file by suffix.
 
     `x` and `by` are the keys that change along x and between lines. With `x_names` the x axis has
     names instead of numbers, and no line joins the points.
     """
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update({**RC, **TEXT})
-        figure = new_figure(0.7 + 1.3 * len(panels), COLUMN)
+    with own_settings(look):
+        figure = new_figure(0.7 + 1.3 * len(panels), look.width)
         column = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
         for n, (axes, each) in enumerate(zip(column, panels, strict=True)):
             _draw_panel(axes, each, named=bool(x_names))
@@ -67,8 +60,8 @@ def draw(
             column[-1].set_xlim(-0.5, len(x_names) - 0.5)
         if by:
             lines = column[0].get_legend_handles_labels()
-            look = {"ncols": 2, "alignment": "left", "title_fontsize": 8.0}
-            figure.legend(*lines, loc="outside upper left", title=_label(by), **look)
+            shape = {"ncols": 2, "alignment": "left", "title_fontsize": look.font_size - 1.0}
+            figure.legend(*lines, loc="outside upper left", title=_label(by), **shape)
         return {kind: save(figure, kind) for kind in ("pdf", "png", "svg")}
 
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
 from cloudrc.metrics.control import round_trips
 from cloudrc.metrics.flight import Array, rms
 from cloudrc.report.figures import style
+from cloudrc.report.figures.labels import is_free
 from cloudrc.report.figures.marks import bounds, mark_events
 from cloudrc.report.figures.style import Subject, dots, legend_above, new_figure, panel
 
@@ -31,8 +34,7 @@ MARGIN = 1.25
 
 def draw_delay(subject: Subject) -> Figure:
     """Draw the one-way delay of each datagram, and the loop delay with cloud's estimate of it."""
-    figure = new_figure(2.6)
-    one_way, loop = figure.subplots(1, 2)
+    figure, (one_way, loop) = subject.look.side_by_side(2, 2.6)
     flight, time = subject.flight, np.linspace(0.0, subject.duration, 600)
     limits = [bounds(subject, time, uplink=uplink) for uplink in (True, False)]
 
@@ -82,7 +84,7 @@ def _finish_delay(axes: Axes, subject: Subject, label: str, shown: list[Array]) 
     axes.set_ylim(0.0, top)
     above = sum(int((v > top).sum()) for v in values)
     if above:
-        axes.text(0.99, 0.97, f"{above} above", ha="right", va="top", transform=axes.transAxes)
+        axes.plot([], [], "^", ms=3.5, color=style.GREY, label=f"{above} above")
     _finish(axes, subject, label, 4)
 
 
@@ -103,25 +105,33 @@ ODOM_ALT = "Three line plots of the x, y and z position over time: reference, me
 ODOM = (
     "Position per axis, as cloud knew it. Reference: the setpoint that the controller tracks. "
     "Measured: the newest odometry that had arrived. Estimated: the prediction from which the "
-    "command was computed."
+    "command was computed. The inset enlarges the part in the grey box: one step."
 )
-STEPS = {"ls": "--", "drawstyle": "steps-post"}
-"""Style of the line of the setpoint: dashed, in steps."""
+ZOOM, BEFORE = 1.2, 0.1
+"""Length of the part that the inset enlarges, and its part before the step [s]."""
+STEP_MIN = 0.2
+"""Smallest step that is enlarged [m]."""
+HEIGHTS = (0.85, 0.7, 0.55)
+"""Heights of the inset that are tried, as shares of a panel."""
+LINES: dict[str, dict[str, Any]] = {
+    "setpoint": {
+        **{"label": "reference", "color": style.REFERENCE},
+        **{"ls": "--", "drawstyle": "steps-post"},
+    },
+    "measured": {"label": "measured", "color": style.MEASURED, "lw": 1.8},
+    "position": {"label": "estimated", "color": style.ESTIMATED},
+}
+"""Column of the control loop -> style of its line."""
 
 
 def draw_odom(subject: Subject) -> Figure:
     """Draw reference, measured and estimated position, one panel per axis."""
-    figure, control = new_figure(4.2), subject.flight.control
-    looks: dict[str, dict[str, Any]] = {
-        "setpoint": {"label": "reference", "color": style.REFERENCE, **STEPS},
-        "measured": {"label": "measured", "color": style.MEASURED, "lw": 1.8},
-        "position": {"label": "estimated", "color": style.ESTIMATED},
-    }
+    figure, control = new_figure(4.2, subject.look.width), subject.flight.control
     time = subject.flight.seconds(control["stamp_ns"])
     rows = figure.subplots(3, 1, sharex=True)
     for index, (axes, name) in enumerate(zip(rows, "xyz", strict=True)):
         panel(axes, "abc"[index])
-        for column, look in looks.items():
+        for column, look in LINES.items():
             axes.plot(time, control[column][:, index], **look)
         mark_events(axes, subject)
         axes.set_ylabel(f"${name}$ (m)")
@@ -129,7 +139,58 @@ def draw_odom(subject: Subject) -> Figure:
     _time_axis(rows[-1], subject)
     legend_above(rows[0], 3)
     figure.align_ylabels(rows)
+    _draw_inset(rows, subject)
     return figure
+
+
+def _draw_inset(rows: Any, subject: Subject) -> None:
+    """Enlarge a large step in its panel, where the panel has the most room."""
+    control = subject.flight.control
+    time, jumps = subject.flight.seconds(control["stamp_ns"]), np.diff(control["setpoint"], axis=0)
+    largest = np.argsort(-np.abs(jumps), axis=None)[:9]
+    steps = np.transpose(np.unravel_index(largest, jumps.shape)).tolist()
+    steps = [(row, axis) for row, axis in steps if abs(jumps[row, axis]) > STEP_MIN]
+    if not steps:
+        return
+    width = 0.34 if subject.look.width < style.NARROW else 0.24
+    for height, (row, axis) in product(HEIGHTS, steps):
+        box = _free_box(rows[axis], time[row], width, height)
+        if box is not None:
+            break
+    else:
+        row, axis = steps[0]
+        low, high = rows[axis].get_ylim()
+        rows[axis].set_ylim(low, high + 1.2 * (high - low))
+        box = Bbox.from_bounds(0.3, 0.48, width, 0.5)
+    begin = time[row] - BEFORE
+    inside = (time >= begin) & (time <= begin + ZOOM)
+    shown = np.concatenate([control[name][inside, axis] for name in ("measured", "position")])
+    room = 0.1 * np.ptp(shown) + 1e-3
+    # The numbers of the inset are inside the box, too.
+    left, low = box.x0 + 0.2 * width, box.y0 + 0.14
+    inset = rows[axis].inset_axes((left, low, box.x1 - left, box.y1 - low))
+    for name, look in LINES.items():
+        inset.plot(time, control[name][:, axis], **look)
+    inset.set(xlim=(begin, begin + ZOOM), ylim=(shown.min() - room, shown.max() + room))
+    inset.locator_params(nbins=3)
+    inset.tick_params(labelsize="x-small", pad=1.5, length=2.0)
+    inset.spines[:].set_visible(True)
+    mark = rows[axis].indicate_inset_zoom(inset, edgecolor=style.GREY, lw=0.8)
+    for connector in mark.connectors:  # they would cross the curves
+        connector.set_visible(False)
+
+
+def _free_box(axes: Axes, time: float, width: float, height: float) -> Bbox | None:
+    """Find a box without curves, as near to `time` [s] as possible; sizes are shares of a panel."""
+    to_axes = axes.transData - axes.transAxes
+    paths = [to_axes.transform_path(line.get_path()) for line in axes.lines]
+    at = to_axes.transform((time, 0.0))[0]
+    lefts = sorted(np.linspace(0.01, 0.99 - width, 60), key=lambda x: abs(x + width / 2 - at))
+    for x, y in product(lefts, np.linspace(0.98 - height, 0.02, 6)):
+        box = Bbox.from_bounds(x, y, width, height)
+        if is_free(box, paths, np.zeros((0, 2))):
+            return box
+    return None
 
 
 ERROR_ALT = "Two line plots over time: distance to the setpoint, and the error of the estimate."
@@ -147,8 +208,7 @@ SPAN = 0.5
 
 def draw_error(subject: Subject) -> Figure:
     """Draw the distance to the setpoint, as in the paper, and the error of position estimates."""
-    figure = new_figure(2.6)
-    tracking, accuracy = figure.subplots(1, 2)
+    figure, (tracking, accuracy) = subject.look.side_by_side(2, 2.6)
     flight, control, applied = subject.flight, subject.flight.control, subject.flight.applied
 
     panel(tracking, "a")

@@ -23,7 +23,17 @@ from cloudrc.geometry.clearance import (
 from cloudrc.geometry.scene import Pipe
 from cloudrc.metrics.flight import Array
 from cloudrc.metrics.mission import first_touch
-from cloudrc.report.figures.style import BLACK, BORE, GREY, VERMILION, Subject, new_figure, panel
+from cloudrc.report.figures.labels import free_label
+from cloudrc.report.figures.style import (
+    BLACK,
+    BORE,
+    GREY,
+    NARROW,
+    VERMILION,
+    Subject,
+    new_figure,
+    panel,
+)
 
 CEILING = 2 * CLEARANCE_SHOWN
 """Upper end of the clearance axis in panel (c) [m]."""
@@ -45,21 +55,27 @@ def caption(subject: Subject) -> str:
 
 def draw(subject: Subject) -> Figure:
     """Draw the path from above, and z and clearance over the distance flown."""
-    figure = new_figure(3.5)
-    grid = figure.add_gridspec(2, 2, width_ratios=(1.0, 1.05))
+    narrow = subject.look.width < NARROW
+    figure = new_figure(5.6 if narrow else 3.5, subject.look.width)
+    if narrow:
+        grid = figure.add_gridspec(3, 1, height_ratios=(1.6, 1.0, 1.0))
+        top, middle, bottom = grid[0], grid[1], grid[2]
+    else:
+        grid = figure.add_gridspec(2, 2, width_ratios=(1.0, 1.05))
+        top, middle, bottom = grid[:, 0], grid[0, 1], grid[1, 1]
     position = subject.flight.truth["position"]
     steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
     flown = np.concatenate([np.zeros(min(len(position), 1)), np.cumsum(steps)])
-    coloured = _draw_top(figure.add_subplot(grid[:, 0]), subject, position)
+    coloured = _draw_top(figure.add_subplot(top), subject, position)
     if not len(subject.flight.clearance):
-        side = figure.add_subplot(grid[:, 1])
+        side = figure.add_subplot(grid[1:] if narrow else grid[:, 1])
         _draw_side(side, subject, flown, position)
         side.set_xlabel("distance flown (m)")
         return figure
-    side = figure.add_subplot(grid[0, 1])
+    side = figure.add_subplot(middle)
     _draw_side(side, subject, flown, position)
     side.tick_params(labelbottom=False)
-    margin = figure.add_subplot(grid[1, 1], sharex=side)
+    margin = figure.add_subplot(bottom, sharex=side)
     _draw_clearance(margin, subject, flown, position)
     if coloured is not None:
         bar = figure.colorbar(coloured, ax=[side, margin], extend="max", aspect=40, pad=0.01)
@@ -100,8 +116,8 @@ def _draw_top(axes: Axes, subject: Subject, position: Array) -> LineCollection |
         axes.plot([board.x, board.x], board.y, color=BLACK, lw=3, solid_capstyle="butt", zorder=3)
     coloured = _draw_path(axes, subject, position[:, 0], position[:, 1])
     for index, (x, y, _) in subject.waypoints.items():
-        axes.plot(x, y, "o", ms=8, mfc="white", mec=BLACK, mew=0.6, zorder=5)
-        axes.text(x, y, str(index + 1), ha="center", va="center_baseline", fontsize=6.5, zorder=6)
+        axes.plot(x, y, "o", ms=4, mfc="white", mec=BLACK, mew=0.8, zorder=5)
+        free_label(axes, str(index + 1), (x, y))
     tip = _touch_point(subject)
     if tip is not None:
         axes.plot(*tip[:2], "*", ms=9, color=VERMILION, mec="white", mew=0.5, zorder=7)
@@ -175,12 +191,4 @@ def _draw_clearance(axes: Axes, subject: Subject, flown: Array, position: Array)
         row = np.where(flight.inside, clearance, np.inf).argmin()
         lowest = flown[row], clearance[row]
         axes.plot(*lowest, "o", ms=4, mfc="none", mec=VERMILION, zorder=6)
-        axes.annotate(
-            f"{lowest[1]:.3f} m",
-            lowest,
-            (0, -11 if lowest[1] > 0.1 else 7),
-            textcoords="offset points",
-            ha="center",
-            color=VERMILION,
-            fontsize=8,
-        )
+        free_label(axes, f"{lowest[1]:.3f} m", lowest, color=VERMILION)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -13,8 +12,8 @@ from matplotlib.ticker import MaxNLocator
 
 from cloudrc.config.schema import Direction
 from cloudrc.metrics.flight import Array
-from cloudrc.report.figures import marks, save, style
-from cloudrc.report.figures.style import dots, legend_above, new_figure, panel
+from cloudrc.report.figures import marks, own_settings, save, style
+from cloudrc.report.figures.style import Look, dots, legend_above, new_figure, panel
 
 RUNS_SHOWN = 20
 """Largest number of packets lost in a row in the figure; a longer run is shown as a run
@@ -47,7 +46,7 @@ def render_link(
 
     `downlink` is None for a trace, which has one direction only.
     """
-    with matplotlib.rc_context(style.RC):
+    with own_settings(Look()):
         return save(_draw(title, uplink, downlink), kind)
 
 

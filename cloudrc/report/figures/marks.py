@@ -23,6 +23,7 @@ from cloudrc.link.traces import read_trace
 from cloudrc.metrics.flight import Array
 from cloudrc.metrics.mission import holds
 from cloudrc.report.figures import style
+from cloudrc.report.figures.labels import free_label
 from cloudrc.report.figures.style import Subject
 
 Interval: TypeAlias = tuple[float, float]
@@ -30,9 +31,6 @@ SAME_CHANGE = 0.05
 """Two records of one direction describe the same change if they are less than this apart [s]."""
 SAME_CAUSE = 1.0
 """Records of uplink and downlink describe the same change if they are at most this apart [s]."""
-ROW_HEIGHT, ROWS = 8, 8
-"""Distance between two rows for the labels of changes [points], and number of rows. Successive
-numbers are in different rows, so that they do not overlap."""
 LEGEND = (
     " Behind the curves: red, the guard was in HOLD; hatched, a blackout of the link; dotted, a "
     "change of the link by its profile."
@@ -167,17 +165,7 @@ def mark_events(axes: Axes, subject: Subject) -> None:
     for number, (instant, _) in enumerate(set_in_flight(subject)):
         axes.axvline(instant, color=colour, lw=0.8, zorder=2.5)
         axes.plot(instant, 1.0, "v", ms=6.5, mew=0, color=colour, transform=place, clip_on=False)
-        axes.annotate(
-            str(number + 1),
-            (instant, 1.0),
-            (3.5, -9 - ROW_HEIGHT * (number % ROWS)),
-            xycoords=place,
-            textcoords="offset points",
-            fontsize=7.0,
-            color=colour,
-            bbox={"fc": "white", "ec": "none", "pad": 0.5, "alpha": 0.8},
-            zorder=6,
-        )
+        free_label(axes, str(number + 1), (instant, 1.0), xycoords=place, color=colour)
 
 
 def _marks(subject: Subject) -> tuple[list[Interval], list[Interval], list[float]]:

@@ -21,6 +21,8 @@ from cloudrc.metrics.flight import Array
 
 PAGE = 7.16
 """Width of both columns of a page [in]. Source: IEEE conference template."""
+NARROW = 5.0
+"""Figures below this width [in] have their panels below each other."""
 BLACK, GREY, LIGHT, BORE = "#1a1a1a", "#6b6b6b", "#d9d9d9", "#f4f4f4"
 BLUE, SKY, GREEN = "#0072B2", "#56B4E9", "#009E73"
 ORANGE, VERMILION, PURPLE = "#E69F00", "#D55E00", "#CC79A7"
@@ -28,10 +30,10 @@ UPLINK, DOWNLINK = BLUE, ORANGE
 REFERENCE, MEASURED, ESTIMATED = BLACK, ORANGE, BLUE
 
 RC: dict[Any, Any] = {
-    "font.family": "STIXGeneral",  # shipped with matplotlib: same picture on every machine
+    "font.family": "serif",  # the first one is shipped with matplotlib, the others for an SVG
+    "font.serif": ["STIXGeneral", "STIX Two Text", "Times New Roman", "Times"],
     "mathtext.fontset": "stix",
-    **dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize"), 9.0),
-    **dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "legend.fontsize"), 8.0),
+    **dict.fromkeys(("axes.titlesize", "axes.labelsize"), "medium"),
     **dict.fromkeys(("axes.linewidth", "xtick.major.width", "ytick.major.width"), 0.6),
     **dict.fromkeys(("xtick.major.size", "ytick.major.size"), 3.0),
     **dict.fromkeys(("xtick.direction", "ytick.direction"), "out"),
@@ -43,12 +45,34 @@ RC: dict[Any, Any] = {
     "lines.linewidth": 1.1,
     "legend.handlelength": 1.6,
     "legend.borderaxespad": 0.2,
-    "svg.fonttype": "path",
+    **{"svg.fonttype": "none", "pdf.fonttype": 42},  # text stays text
     "svg.hashsalt": "cloudrc",  # the same flight gives an identical file
     "savefig.dpi": 200,
     "figure.dpi": 100,
 }
-"""Settings of matplotlib while a figure is drawn and saved."""
+"""Settings of matplotlib for figures of any size."""
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """Size of figures in print."""
+
+    width: float = PAGE  # of the figure [in]
+    font_size: float = 9.0  # of titles and labels; numbers at axes are 1 point smaller [points]
+
+    @property
+    def settings(self) -> dict[Any, Any]:
+        """Settings of matplotlib while a figure is drawn and saved."""
+        small = ("xtick.labelsize", "ytick.labelsize", "legend.fontsize")
+        return {**RC, "font.size": self.font_size, **dict.fromkeys(small, self.font_size - 1.0)}
+
+    def side_by_side(self, count: int, height: float) -> tuple[Figure, list[Axes]]:
+        """Make a figure of panels of `height` [in], below each other if it is narrow."""
+        if self.width < NARROW:
+            figure = new_figure(count * height * 0.8, self.width)
+            return figure, [*figure.subplots(count, 1)]
+        figure = new_figure(height, self.width)
+        return figure, [*figure.subplots(1, count)]
 
 
 def new_figure(height: float, width: float = PAGE) -> Figure:
@@ -84,11 +108,12 @@ def dots(axes: Axes, x: Array, y: Array, colour: str, name: str, size: float = 1
 
 @dataclass(frozen=True)
 class Subject:
-    """A flight, and the link profile of each direction at the start of the flight."""
+    """A flight, the link profile of each direction at its start, and the look of its figures."""
 
     flight: Flight
     uplink: Direction
     downlink: Direction
+    look: Look = Look()
 
     @cached_property
     def waypoints(self) -> dict[int, Vector]:

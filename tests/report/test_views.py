@@ -1,0 +1,153 @@
+"""Viewers of recordings show the robot, the scene and the path; a report ignores these topics."""
+
+import json
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+
+from cloudrc.cli.run import fly
+from cloudrc.config.load import load_experiment
+from cloudrc.geometry.scene import load_scene
+from cloudrc.record.columns import Recording
+from cloudrc.record.hash import messages_sha256
+from cloudrc.record.reader import read_contents, recover
+from cloudrc.record.topics import TOPICS, VIEWS
+from cloudrc.record.writer import SHA256
+
+LAYOUT = Path(__file__).resolve().parents[2] / "docs" / "cloudrc.foxglove.json"
+SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 0.5}]", "criteria.contact=false")
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """Fly in virtual time: the recording, report, and messages as ROS 2 tools read them."""
+    folder = tmp_path_factory.mktemp("run")
+    report = fly(load_experiment("paper", SHORT), "virtual", folder, page=False)
+    path, messages = folder / "mission.mcap", defaultdict(list)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        for _, channel, raw, message in reader.iter_decoded_messages():
+            messages[channel.topic].append((raw.log_time, message))
+    return path, report, messages
+
+
+def transforms(messages, frame):
+    """Return stamps [ns], positions and orientations (wxyz) of a frame."""
+    sent = [each for _, message in messages["/tf"] for each in message.transforms]
+    found = [each for each in sent if each.child_frame_id == frame]
+    assert {each.header.frame_id for each in found} == {"world"}
+    stamps = [each.header.stamp.sec * 10**9 + each.header.stamp.nanosec for each in found]
+    moves, turns = [e.transform.translation for e in found], [e.transform.rotation for e in found]
+    return (
+        np.array(stamps),
+        np.array([(v.x, v.y, v.z) for v in moves]),
+        np.array([(q.w, q.x, q.y, q.z) for q in turns]),
+    )
+
+
+def test_frames_are_the_poses_of_the_recording(flown):
+    path, _, messages = flown
+    recording = Recording.read(path)
+    for frame, topic, column in (
+        ("base_link", "/ground_truth", "position"),
+        ("estimate", "/estimated_odometry", "position"),
+        ("setpoint", "/setpoint_position", "setpoint"),
+    ):
+        stamps, positions, orientations = transforms(messages, frame)
+        table = recording[topic]
+        rows = np.searchsorted(table["stamp_ns"], stamps)
+        np.testing.assert_array_equal(table["stamp_ns"][rows], stamps)
+        np.testing.assert_array_equal(table[column][rows], positions)
+        if frame != "setpoint":
+            np.testing.assert_array_equal(table["orientation_wxyz"][rows], orientations)
+        assert np.diff(stamps).max() <= 50_000_000, "smooth enough to be interpolated"
+
+
+def test_the_scene_has_robot_pipes_board_and_path(flown):
+    path, _, messages = flown
+    ((began_ns, message),) = messages["/scene"]
+    truth, scene = (
+        Recording.read(path)["/ground_truth"],
+        load_scene(load_experiment("paper").world.scene),
+    )
+    assert began_ns == truth["stamp_ns"][0]
+    markers = defaultdict(list)
+    for marker in message.markers:
+        assert marker.frame_locked, "it moves with its frame"
+        markers[marker.ns, marker.header.frame_id].append(marker)
+    fixed = {(name, "world") for name in ("board", "path", *(pipe.name for pipe in scene.pipes))}
+    moving = {("robot", "base_link"), ("estimate", "estimate"), ("setpoint", "setpoint")}
+    assert markers.keys() == fixed | moving
+    assert len({marker.id for marker in message.markers}) == len(message.markers)
+    for pipe in scene.pipes:
+        (tube,) = markers[pipe.name, "world"]
+        points = np.array([(p.x, p.y, p.z) for p in tube.points]) - pipe.centre
+        along = points @ np.array(pipe.axis)
+        np.testing.assert_allclose(np.abs(along), pipe.length / 2, atol=1e-5)
+        radii = np.linalg.norm(points - along[:, None] * pipe.axis, axis=1)
+        np.testing.assert_allclose(radii, pipe.inner, atol=1e-5)
+    (line,) = markers["path", "world"]
+    ends = [(p.x, p.y, p.z) for p in (line.points[0], line.points[-1])]
+    np.testing.assert_allclose(ends, truth["position"][[0, -1]], atol=0.05)
+
+
+def test_plotted_errors_agree_with_the_report(flown):
+    _, report, messages = flown
+    known = {name: entry["value"] for name, entry in report["numbers"].items()}
+    errors = {topic: [m.data for _, m in messages[topic]] for topic in VIEWS if "error" in topic}
+    assert max(errors["/tracking_error"]) == pytest.approx(known["tracking_error_peak"], rel=0.05)
+    rms = np.sqrt(np.mean(np.square(errors["/prediction_error"])))
+    assert rms == pytest.approx(known["prediction_error_rms"], rel=0.2), "a sample of them"
+
+
+def paths_of(config):
+    """Yield the message paths of a panel of the layout."""
+    yield from (path["value"] for path in config.get("paths", []))
+    yield from config.get("topics", {})
+
+
+def test_every_path_of_the_layout_is_in_a_recording(flown):
+    layout, messages = json.loads(LAYOUT.read_text()), flown[2]
+    for panel in layout["configById"].values():
+        for value in paths_of(panel):
+            topic, *names = value.split(".")
+            assert messages[topic], value
+            for _, message in messages[topic]:
+                for name in names:
+                    message = getattr(message, name)
+                assert not names or isinstance(message, int | float | str), value
+    places, shown = [layout["layout"]], []
+    while places:
+        place = places.pop()
+        deeper = isinstance(place, dict)
+        (places if deeper else shown).extend(
+            [place["first"], place["second"]] if deeper else [place]
+        )
+    assert sorted(shown) == sorted(layout["configById"]), "every panel has its place"
+    frames = {
+        name.removeprefix("frame:") for name in layout["configById"]["3D!cloudrc"]["transforms"]
+    }
+    assert frames == {"world", "base_link", "estimate", "setpoint"}
+
+
+def test_messages_for_viewers_change_neither_hash_nor_report(flown, tmp_path):
+    path, _, _ = flown
+    contents = read_contents(path)
+    assert contents.metadata[SHA256] == messages_sha256(contents.messages)
+    assert not {message[0] for message in contents.messages} - TOPICS.keys()
+    assert (contents.note, contents.lacking, contents.remarks) == ("", "", ())
+    assert "started" not in contents.metadata, "virtual time has no wall time"
+    assert recover(path, tmp_path / "copy.mcap").complete
+    assert read_contents(tmp_path / "copy.mcap").views == contents.views
+    contents.views = []
+    contents.write(tmp_path / "without.mcap")
+    assert path.stat().st_size < 1.15 * (tmp_path / "without.mcap").stat().st_size
+    with AnyReader([path]) as reader:  # as ROS 2 plays it: in the order of time
+        stamps = [stamp for connection, stamp, _ in reader.messages()]
+        assert {connection.topic for connection in reader.connections} >= VIEWS.keys()
+    assert stamps == sorted(stamps)
