@@ -24,16 +24,30 @@ def run_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--run", type=Path, metavar="DIR", help=about)
 
 
+def short(path: Path) -> str:
+    """Format a path relative to the working folder, if it is inside."""
+    here = Path.cwd()
+    return str(path.relative_to(here) if path.is_relative_to(here) else path)
+
+
 def find_local_run(
-    options: argparse.Namespace, look: Callable[[Path, str], _Found | None], nobody: str
+    options: argparse.Namespace,
+    look: Callable[[Path, str], _Found | None],
+    nobody: str,
+    *,
+    steers: bool = True,
 ) -> _Found | None:
-    """Find a run in flight: the folder of `--run`, else ./runs/latest, else the only run in flight.
+    """Find the run in flight that a command means: the folder of `--run`, else the only run.
 
     Call `look` with the run's folder and the URL of its API ("" if the run has no API), and return
-    the result of `look`. Return None if no run is in flight or if the flags name a cluster. If
-    `--run` names a run that is not in flight, raise an error with the text `nobody`.
+    the result of `look`. Return None if no run is in flight or if the flags name a cluster.
+
+    Raises:
+        BadInputError: If `--run` names a run that is not in flight, with the text `nobody`; if
+            several runs are in flight; or if the command `steers` and ./runs/latest, a run in real
+            time, has ended: the command must not reach another flight instead.
     """
-    from cloudrc.drivers.local import under_way
+    from cloudrc.drivers.local import RELAY_LOG, under_way
 
     in_cluster = options.context or options.namespace or options.release
     if options.run is None and (in_cluster or Path(sys.argv[0]).name == KUBECTL_PLUGIN):
@@ -52,14 +66,24 @@ def find_local_run(
         if (found := find(options.run)) is None:
             raise BadInputError(f"--run {options.run}: {nobody}")
         return found
-    if (found := find(RUNS / "latest")) is not None:
-        return found
-    others = {run: found for run in flights if (found := find(run)) is not None}
+    last, others = RUNS / "latest", {}
+    for run, api in flights.items():
+        if (found := look(Path(short(run)), api)) is not None:
+            others[run] = found
     if len(others) > 1:
-        names = " or ".join(f"--run {run}" for run in others)
+        names = " or ".join(f"--run {short(run)}" for run in others)
         raise BadInputError(f"{len(others)} runs are flying here; choose one: {names}")
+    real = Path(os.path.realpath(last))
+    if steers and real not in others and (last / RELAY_LOG).exists():
+        state = "cannot be steered" if real in flights else "has ended"
+        which = "".join(f"--run {short(run)}, " for run in others)
+        raise BadInputError(
+            f"{short(real)} {state}; name another flight: {which}--release NAME (in a cluster), or "
+            "start one: cloudrc up"
+        )
     for run in others:
-        print_line(f"cloudrc: using the run in {run}", sys.stderr)
+        if run != real:
+            print_line(f"cloudrc: using the run in {short(run)}", sys.stderr)
     return next(iter(others.values()), None)
 
 

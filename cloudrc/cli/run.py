@@ -66,20 +66,29 @@ line of the output is the path of the report."""
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    add, many = parser.add_argument, parser.add_mutually_exclusive_group()
-    about = "name of a shipped experiment, or a YAML file (default: paper)"
-    add("experiment", nargs="?", default="paper", metavar="EXPERIMENT", help=about)
-    add("--mode", choices=MODES, help="where to fly (default: local; with --seeds: virtual)")
-    about = "random seed of this run (default: the experiment's)"
-    many.add_argument("--seed", type=whole_number(0, 2**53 - 1), metavar="S", help=about)
+    many = parser.add_mutually_exclusive_group()
+    experiment_arguments(parser, many)
+    about = "where to fly (default: local; with --seeds: virtual)"
+    parser.add_argument("--mode", choices=MODES, help=about)
     about = "fly seeds 1 to N on all cores and print a table"
     many.add_argument("--seeds", type=read_count, metavar="N", help=about)
-    about = "change one key of the experiment; repeatable"
-    add("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
-    add("--out", type=Path, metavar="DIR", help="folder of the run (default: a new one in runs/)")
     output_argument(parser, "json, yaml: print only the report")
     release_arguments(parser)
     timeout_argument(parser)
+
+
+def experiment_arguments(
+    parser: argparse.ArgumentParser, seed: argparse._ActionsContainer
+) -> None:
+    """Declare the arguments that choose an experiment; `--seed` is declared in the group `seed`."""
+    add = parser.add_argument
+    about = "name of a shipped experiment, or a YAML file (default: paper)"
+    add("experiment", nargs="?", default="paper", metavar="EXPERIMENT", help=about)
+    about = "random seed of this run (default: the experiment's)"
+    seed.add_argument("--seed", type=whole_number(0, 2**53 - 1), metavar="S", help=about)
+    about = "change one key of the experiment; repeatable"
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
+    add("--out", type=Path, metavar="DIR", help="folder of the run (default: a new one in runs/)")
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -111,11 +120,8 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     from cloudrc.metrics.verdict import exit_code
 
     experiment = load(options.experiment, options.set, options.seed)
-    if mode != "virtual" and (experiment.cloud.clock_offset_s or experiment.cloud.clock_drift_ppm):
-        raise BadInputError(
-            "cloud.clock_offset_s and cloud.clock_drift_ppm act in virtual time only, elsewhere "
-            "the machine's clock counts; use --mode virtual, or leave them out"
-        )
+    if mode != "virtual":
+        refuse_virtual_keys(experiment)
     warn(experiment)
     in_cluster, for_programs = mode == "cluster", options.output != "table"
     stream = sys.stderr if for_programs else sys.stdout
@@ -151,6 +157,15 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
         format_document(report, options.output) if for_programs else summary(report, folder)
     )
     return exit_code(report)
+
+
+def refuse_virtual_keys(experiment: ResolvedExperiment) -> None:
+    """Raise a BadInputError if an experiment has keys that act in virtual time only."""
+    if experiment.cloud.clock_offset_s or experiment.cloud.clock_drift_ppm:
+        raise BadInputError(
+            "cloud.clock_offset_s and cloud.clock_drift_ppm act in virtual time only, elsewhere "
+            "the machine's clock counts; use --mode virtual, or leave them out"
+        )
 
 
 def new_folder(out: Path | None, name: str, link: str = "latest") -> Path:
@@ -253,10 +268,17 @@ def fly(
 
     record = _record_virtual if mode == "virtual" else _record_local
     own = experiment.report.metrics
-    try:
+    with explain_disk_errors(folder):
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
         with record(experiment, folder, see) as (recording, run):
             return write_report(folder, recording, experiment, run, own=own, page=page)
+
+
+@contextlib.contextmanager
+def explain_disk_errors(folder: Path) -> Iterator[None]:
+    """Convert an OSError of the block, which writes into `folder`, to a CloudrcError."""
+    try:
+        yield
     except OSError as error:
         where = str(error.filename or folder)
         if error.errno in DISK_FULL:
@@ -330,16 +352,11 @@ def _record_local(
     from cloudrc.record.merge import merge
     from cloudrc.report.document import Run
     from cloudrc.report.write import attachments
-    from cloudrc.world.native.library import library
 
     if absent := missing("api"):
         text = f"no operator's API in this run: {', '.join(absent)} not installed"
         print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)
-    world = experiment.world
-    if world.robot.endswith(".xml") or world.scene.endswith(".xml"):
-        from cloudrc.world.scene import compile_model
-
-        compile_model(world.robot, world.scene)  # report an invalid model before the flight
+    check_model(experiment)
     local, broken = LocalRun(folder, see, api=not absent), None
     interrupted = True
     try:
@@ -356,11 +373,26 @@ def _record_local(
             raise
         raise broken or InterruptedRunError("interrupted, nothing was recorded") from None
     notes = (*local.notes, *([str(broken)] if broken else ()))
-    digest = messages_sha256(mission.messages)
+    facts = messages_sha256(mission.messages), interrupted, notes, where_steps_ran(experiment)
     try:
-        facts = digest, interrupted, notes, library().text if _is_nominal(experiment) else NO_C
         yield mission.recording(), Run("local", "relay", *facts)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))
     if broken:
         raise broken
+
+
+def check_model(experiment: ResolvedExperiment) -> None:
+    """Compile a robot or a scene from the user's file: report an error in it before the flight."""
+    world = experiment.world
+    if world.robot.endswith(".xml") or world.scene.endswith(".xml"):
+        from cloudrc.world.scene import compile_model
+
+        compile_model(world.robot, world.scene)
+
+
+def where_steps_ran(experiment: ResolvedExperiment) -> str:
+    """Describe where the usual physics steps of a flight in real time ran, for its report."""
+    from cloudrc.world.native.library import library
+
+    return library().text if _is_nominal(experiment) else NO_C
