@@ -234,8 +234,11 @@ def with_order(experiment: ResolvedExperiment, order: Order) -> ResolvedExperime
         )
         for leg in legs
     )
-    start = "spawn" if order.plan.start is Start.SPAWN else "here"
-    mission = schema.Mission(start=start, waypoints=waypoints, carrot=carrot)
+    mission = schema.Mission(
+        start="spawn" if order.plan.start is Start.SPAWN else "here",
+        waypoints=waypoints,
+        carrot=carrot,
+    )
     judged = {"contact": order.contact, "time_limit_s": order.plan.time_limit}
     criteria = experiment.criteria.model_copy(update=judged)
     return experiment.model_copy(update={"mission": mission, "criteria": criteria})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TypeVar
 
@@ -41,13 +41,14 @@ def find_local_run(
 
     Call `look` with the run's folder and the URL of its API ("" if the run has no API), and return
     the result of `look`. Return None if no run is in flight or if the flags name a cluster.
+    `steers` tells whether the command changes the flight.
 
     Raises:
         BadInputError: If `--run` names a run that is not in flight, with the text `nobody`; if
-            several runs are in flight; or if the command `steers` and ./runs/latest, a run in real
-            time, has ended: the command must not reach another flight instead.
+            several runs are in flight; or if the command would steer another flight after
+            ./runs/latest has ended.
     """
-    from cloudrc.drivers.local import RELAY_LOG, under_way
+    from cloudrc.drivers.local import under_way
 
     in_cluster = options.context or options.namespace or options.release
     if options.run is None and (in_cluster or Path(sys.argv[0]).name == KUBECTL_PLUGIN):
@@ -57,34 +58,39 @@ def find_local_run(
     # The URL comes from this user's flight files, never from the run's folder: a run's folder may
     # come from somebody else and name a foreign server.
     flights = under_way()
-
-    def find(run: Path) -> _Found | None:
-        real = Path(os.path.realpath(run))
-        return look(run, flights[real]) if real in flights else None
-
     if options.run is not None:
-        if (found := find(options.run)) is None:
+        url = flights.get(Path(os.path.realpath(options.run)))
+        if url is None or (found := look(options.run, url)) is None:
             raise BadInputError(f"--run {options.run}: {nobody}")
         return found
-    last, others = RUNS / "latest", {}
-    for run, api in flights.items():
-        if (found := look(Path(short(run)), api)) is not None:
-            others[run] = found
-    if len(others) > 1:
-        names = " or ".join(f"--run {short(run)}" for run in others)
-        raise BadInputError(f"{len(others)} runs are flying here; choose one: {names}")
-    real = Path(os.path.realpath(last))
-    if steers and real not in others and (last / RELAY_LOG).exists():
-        state = "cannot be steered" if real in flights else "has ended"
-        which = "".join(f"--run {short(run)}, " for run in others)
+    candidates = {run: found for run in flights if (found := look(Path(short(run)), flights[run]))}
+    _ask_if_unclear(candidates, flights, steers)
+    return next(iter(candidates.values()), None)
+
+
+def _ask_if_unclear(candidates: Collection[Path], flights: Collection[Path], steers: bool) -> None:
+    """Raise a BadInputError unless it is clear which flight the user means.
+
+    `candidates` are the folders of the flights that the command could use, `flights` those of all
+    flights here. Without candidates, the command would use a release in a cluster.
+    """
+    from cloudrc.drivers.local import RELAY_LOG
+
+    if len(candidates) > 1:
+        names = " or ".join(f"--run {short(run)}" for run in candidates)
+        raise BadInputError(f"{len(candidates)} runs are flying here; choose one: {names}")
+    latest = Path(os.path.realpath(RUNS / "latest"))
+    if latest in candidates:
+        return
+    if steers and (latest / RELAY_LOG).exists():  # a run in real time, so this user steered it
+        state = "has no API or link" if latest in flights else "has ended"
+        names = "".join(f"--run {short(run)}, " for run in candidates)
         raise BadInputError(
-            f"{short(real)} {state}; name another flight: {which}--release NAME (in a cluster), or "
-            "start one: cloudrc up"
+            f"{short(latest)} {state}; name the flight that you mean: {names}--release NAME (in a "
+            "cluster); or start one: cloudrc up"
         )
-    for run in others:
-        if run != real:
-            print_line(f"cloudrc: using the run in {short(run)}", sys.stderr)
-    return next(iter(others.values()), None)
+    for run in candidates:
+        print_line(f"cloudrc: using the run in {short(run)}", sys.stderr)
 
 
 def no_run_error(

@@ -43,7 +43,10 @@ GROUPS: dict[str, dict[str, str]] = {
     },
 }
 """Group of commands -> command -> help line. `cloudrc/cli/<command>.py` contains the command."""
-SHARED = {**dict.fromkeys(("world", "cloud", "relay"), "processes"), "up": "session", "down": "session"}
+SHARED = {
+    **dict.fromkeys(("world", "cloud", "relay"), "processes"),
+    **dict.fromkeys(("up", "down"), "session"),
+}
 """Commands without a module of their own -> the module in `cloudrc/cli` that contains them."""
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
 COUNT_MAX = 10_000

@@ -31,7 +31,7 @@ class FlightView:
     """Prints the events of a flight to a stream and, on a terminal, updates a status line."""
 
     def __init__(self, stream: TextIO, waypoints: int) -> None:
-        """Set the stream and the mission's number of waypoints, 0 for many missions; print nothing."""
+        """Set the stream and the number of waypoints (0: unknown); print nothing yet."""
         self._stream, self._waypoints = stream, waypoints
         self._first_ns = self._now_ns = NEVER_NS
         self._began = self._seen = monotonic()

@@ -77,9 +77,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     timeout_argument(parser)
 
 
-def experiment_arguments(
-    parser: argparse.ArgumentParser, seed: argparse._ActionsContainer
-) -> None:
+def experiment_arguments(parser: argparse.ArgumentParser, seed: argparse._ActionsContainer) -> None:
     """Declare the arguments that choose an experiment; `--seed` is declared in the group `seed`."""
     add = parser.add_argument
     about = "name of a shipped experiment, or a YAML file (default: paper)"

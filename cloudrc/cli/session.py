@@ -38,7 +38,7 @@ NEXT = """\
 in another terminal:
   cloudrc mission run pipes
   cloudrc mission goto 0.5 0 1.2
-  cloudrc link set --profile satellite
+  cloudrc link set --profile paper-p3
 to end: Ctrl-C here, or cloudrc down"""
 UP_EPILOG = """\
 examples:
@@ -94,6 +94,7 @@ def _up(options: argparse.Namespace) -> int:
         if report is None:
             print_or_drop(escape(f"no mission flew, so there is no report; logs: {folder}"))
         else:
+            print_or_drop(escape(report["notes"][0]))
             print_or_drop(summary(report, folder))
     if broken:
         raise broken
@@ -111,9 +112,11 @@ def _fly(
     from cloudrc.drivers.local import LocalRun
 
     def ready(api: str, metrics: dict[str, str]) -> None:
-        where = ", ".join(f"{name} http://{at}/metrics" for name, at in metrics.items())
+        ports = ", ".join(f"{name} :{at.rpartition(':')[2]}" for name, at in metrics.items())
+        shown = {"folder": short(folder.resolve()), "API": api}
+        shown["metrics"] = f"http://127.0.0.1:PORT/metrics ({ports})"
         view.say(f"ready after {time.monotonic() - began:.1f} s: the robot waits on the ground")
-        for name, text in (("folder", folder), ("API", api), ("metrics", where)):
+        for name, text in shown.items():
             view.say(escape(f"  {name:<8} {text}"))
         view.say(NEXT)
         if with_console:

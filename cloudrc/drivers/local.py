@@ -151,8 +151,8 @@ def end_session(run: Path, limit: float) -> None:
     Raises:
         TimedOutError: If the session has not ended within `limit` [s].
     """
-    flight = flight_files().get(run)
-    if flight is not None and flight.kind == SESSION:  # its lock proves that `pid` is the supervisor
+    flight = flight_files().get(run)  # it is locked, so `pid` is still the supervisor
+    if flight is not None and flight.kind == SESSION:
         with contextlib.suppress(ProcessLookupError):
             os.kill(flight.pid, signal.SIGTERM)
     descriptor, deadline = os.open(run, os.O_RDONLY), time.monotonic() + limit
