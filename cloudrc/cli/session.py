@@ -242,8 +242,8 @@ def _down(options: argparse.Namespace) -> int:
         raise BadInputError(f"{len(found)} sessions run here; choose one: {names}")
     (run,) = found
     end_session(run, DOWN_LIMIT)
-    page = run / "report.html"
-    print_line(short(page) if page.exists() else f"{short(run)}: ended; no mission flew")
+    flew = (run / "report.json").exists()
+    print_line(short(run / "report.html") if flew else f"{short(run)}: ended; no mission flew")
     return 0
 
 

@@ -13,7 +13,8 @@ from cloudrc.cli.main import main
 from cloudrc.drivers import local
 from tests.teleop.conftest import running
 
-ESTOP, STOP = ["mission", "estop"], "emergency stop: sent, and repeated until the rotors have stopped"
+ESTOP = ["mission", "estop"]
+STOP = "emergency stop: sent, and repeated until the rotors have stopped"
 SET = ["link", "set", "uplink.loss=0.1"]
 
 
