@@ -215,11 +215,10 @@ def mission_plan(
     return Plan(legs, Start.SPAWN if mission.start == "spawn" else Start.HERE, time_limit)
 
 
-def with_order(experiment: ResolvedExperiment, order: Order) -> ResolvedExperiment:
-    """Return the experiment that flies and judges a mission which an operator has ordered.
-
-    This is the inverse of `mission_plan`.
-    """
+def with_order(
+    experiment: ResolvedExperiment, order: Order, description: str
+) -> ResolvedExperiment:
+    """Return the experiment that flies an operator's order; the inverse of `mission_plan`."""
     legs, carrot = order.plan.legs, None
     if speed := max(leg.speed for leg in legs):
         carrot = schema.Carrot(speed_mps=speed, acceleration_mps2=legs[0].acceleration)
@@ -241,7 +240,8 @@ def with_order(experiment: ResolvedExperiment, order: Order) -> ResolvedExperime
     )
     judged = {"contact": order.contact, "time_limit_s": order.plan.time_limit}
     criteria = experiment.criteria.model_copy(update=judged)
-    return experiment.model_copy(update={"mission": mission, "criteria": criteria})
+    changed = {"mission": mission, "criteria": criteria, "description": description}
+    return experiment.model_copy(update=changed)
 
 
 def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> DirectionProfile:

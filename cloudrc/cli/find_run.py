@@ -64,33 +64,31 @@ def find_local_run(
             raise BadInputError(f"--run {options.run}: {nobody}")
         return found
     candidates = {run: found for run in flights if (found := look(Path(short(run)), flights[run]))}
-    _ask_if_unclear(candidates, flights, steers)
+    _ask_if_unclear(candidates, steers)
     return next(iter(candidates.values()), None)
 
 
-def _ask_if_unclear(candidates: Collection[Path], flights: Collection[Path], steers: bool) -> None:
+def _ask_if_unclear(candidates: Collection[Path], steers: bool) -> None:
     """Raise a BadInputError unless it is clear which flight the user means.
 
-    `candidates` are the folders of the flights that the command could use, `flights` those of all
-    flights here. Without candidates, the command would use a release in a cluster.
+    `candidates` are the folders of the runs here that the command could use. Without candidates,
+    the command would use a release in a cluster.
     """
     from cloudrc.drivers.local import RELAY_LOG
 
-    if len(candidates) > 1:
-        names = " or ".join(f"--run {short(run)}" for run in candidates)
-        raise BadInputError(f"{len(candidates)} runs are flying here; choose one: {names}")
     latest = Path(os.path.realpath(RUNS / "latest"))
+    names = " or ".join(f"--run {short(run)}" for run in candidates)
+    if len(candidates) > 1:
+        raise BadInputError(f"{len(candidates)} runs are flying here; choose one: {names}")
     if latest in candidates:
         return
     if steers and (latest / RELAY_LOG).exists():  # a run in real time, so this user steered it
-        state = "has no API or link" if latest in flights else "has ended"
-        names = "".join(f"--run {short(run)}, " for run in candidates)
+        names = names or "--release NAME (in a cluster)"
         raise BadInputError(
-            f"{short(latest)} {state}; name the flight that you mean: {names}--release NAME (in a "
-            "cluster); or start one: cloudrc up"
+            f"{short(latest)} has ended; name another flight: {names}; or start one: cloudrc up"
         )
-    for run in candidates:
-        print_line(f"cloudrc: using the run in {short(run)}", sys.stderr)
+    if candidates:
+        print_line(f"cloudrc: using the run in {names.removeprefix('--run ')}", sys.stderr)
 
 
 def no_run_error(

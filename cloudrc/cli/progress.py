@@ -64,6 +64,10 @@ class FlightView:
                     is_usual = self._ended and record.state is GuardState.HOLD
                     if record.state > GuardState.TRACK and not is_usual:
                         self._event(f"{record.state.name}: {record.cause}")
+                    if record.state > GuardState.HOLD and not self._waypoints:
+                        self.say(
+                            "  to fly again, find the cause, then: cloudrc mission acknowledge"
+                        )
                 case MissionEvent():
                     self._ended = record.event in ENDINGS
                     self._event(record.text)

@@ -7,6 +7,8 @@ import contextlib
 import itertools
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -31,6 +33,7 @@ from cloudrc.errors import (
     CloudrcError,
     DiskFullError,
     InterruptedRunError,
+    NothingFlownError,
 )
 
 if TYPE_CHECKING:
@@ -43,6 +46,9 @@ Flight = Callable[[Path], dict[str, Any]]
 """Function that flies, writes all files of the run into a folder, and returns the report."""
 See = Callable[["list[Record]"], None]
 """Function that displays records during the flight."""
+Ready = Callable[[Path, Callable[[str], None], contextlib.ExitStack, str, dict[str, str]], None]
+"""Function that a session calls when it is ready, with its folder, a function that prints a line,
+a stack that closes at the end, and the arguments of `session` of `LocalRun`."""
 
 NO_C = "Python (wind, or a robot that differs from its model)"
 """Where the usual steps run if C cannot run them."""
@@ -78,7 +84,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def experiment_arguments(parser: argparse.ArgumentParser, seed: argparse._ActionsContainer) -> None:
-    """Declare the arguments that choose an experiment; `--seed` is declared in the group `seed`."""
+    """Declare the arguments that choose an experiment, with `--seed` in the group `seed`."""
     add = parser.add_argument
     about = "name of a shipped experiment, or a YAML file (default: paper)"
     add("experiment", nargs="?", default="paper", metavar="EXPERIMENT", help=about)
@@ -100,7 +106,7 @@ def execute(options: argparse.Namespace) -> int:
         from cloudrc.cli import seeds
 
         return seeds.fly_seeds(options)
-    return _fly_once(options, mode)
+    return fly_once(options, mode)
 
 
 def load(name: str, overrides: Iterable[str], seed: int | None = None) -> ResolvedExperiment:
@@ -114,30 +120,41 @@ def load(name: str, overrides: Iterable[str], seed: int | None = None) -> Resolv
     return experiment
 
 
-def _fly_once(options: argparse.Namespace, mode: str) -> int:
+def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None) -> int:
+    """Fly as `options` say, print the summary, and return the exit code.
+
+    With `ready`, fly a session, which calls `ready` when everything is ready.
+    """
     from cloudrc.metrics.verdict import exit_code
 
     experiment = load(options.experiment, options.set, options.seed)
-    if mode != "virtual":
-        refuse_virtual_keys(experiment)
+    if mode != "virtual" and (experiment.cloud.clock_offset_s or experiment.cloud.clock_drift_ppm):
+        raise BadInputError(
+            "cloud.clock_offset_s and cloud.clock_drift_ppm act in virtual time only, elsewhere "
+            "the machine's clock counts; use --mode virtual, or leave them out"
+        )
     warn(experiment)
     in_cluster, for_programs = mode == "cluster", options.output != "table"
     stream = sys.stderr if for_programs else sys.stdout
     mission = experiment.mission
     count = mission.steps.count if mission.steps else len(mission.waypoints)
+    count = 0 if ready else count
     # First prepare the flight: if that fails, no folder must be left.
     if in_cluster:
         flight = _cluster_flight(experiment, options, stream)
     else:
-        flight = _local_flight(experiment, mode, stream, count)
-    name = f"{experiment.name}-{mode}-seed{experiment.seed}"
+        flight = _local_flight(experiment, mode, stream, count, ready)
+    name = f"{experiment.name}-{'session' if ready else mode}-seed{experiment.seed}"
     folder = new_folder(options.out, name, "" if in_cluster else "latest")
     if not for_programs:
         facts = f"mode {mode}, seed {experiment.seed}, link {experiment.link.profile}"
-        waypoints = "1 waypoint" if count == 1 else f"{count} waypoints"
-        print_or_drop(escape(f"{experiment.name}: {facts}, {waypoints}"))
+        waypoints = ", 1 waypoint" if count == 1 else f", {count} waypoints" * bool(count)
+        print_or_drop(escape(f"{experiment.name}: {facts}{waypoints}"))
     try:
         report = flight(folder)
+    except NothingFlownError as nothing:  # in a session, this is no error
+        print_or_drop(escape(str(nothing)))
+        return 0
     except (CloudrcError, KeyboardInterrupt) as error:
         if in_cluster:  # the folder stays empty until the mission has flown
             with contextlib.suppress(OSError):
@@ -154,16 +171,7 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     print_or_drop(
         format_document(report, options.output) if for_programs else summary(report, folder)
     )
-    return exit_code(report)
-
-
-def refuse_virtual_keys(experiment: ResolvedExperiment) -> None:
-    """Raise a BadInputError if an experiment has keys that act in virtual time only."""
-    if experiment.cloud.clock_offset_s or experiment.cloud.clock_drift_ppm:
-        raise BadInputError(
-            "cloud.clock_offset_s and cloud.clock_drift_ppm act in virtual time only, elsewhere "
-            "the machine's clock counts; use --mode virtual, or leave them out"
-        )
+    return 0 if ready else exit_code(report)
 
 
 def new_folder(out: Path | None, name: str, link: str = "latest") -> Path:
@@ -212,7 +220,7 @@ def point_to(folder: Path, link: str) -> None:
 
 
 def _local_flight(
-    experiment: ResolvedExperiment, mode: str, stream: TextIO, waypoints: int
+    experiment: ResolvedExperiment, mode: str, stream: TextIO, waypoints: int, ready: Ready | None
 ) -> Flight:
     """Return a function that flies on this machine and shows the progress on `stream`."""
     from cloudrc.cli.progress import FlightView
@@ -221,8 +229,10 @@ def _local_flight(
         return lambda folder: fly(experiment, mode, folder)
 
     def flight(folder: Path) -> dict[str, Any]:
-        with contextlib.closing(FlightView(stream, waypoints)) as view:
-            return fly(experiment, mode, folder, view.see)
+        with contextlib.ExitStack() as stack:
+            view = stack.enter_context(contextlib.closing(FlightView(stream, waypoints)))
+            session = partial(ready, folder, view.say, stack) if ready else None
+            return fly(experiment, mode, folder, view.see, session=session)
 
     return flight
 
@@ -254,29 +264,23 @@ def fly(
     see: See = lambda records: None,
     *,
     page: bool = True,
+    session: Callable[[str, dict[str, str]], None] | None = None,
 ) -> dict[str, Any]:
     """Fly in mode "virtual" or "local"; write all files into `folder`, and return the report.
 
     During the flight `see` is called with new records; in local mode some records are left out. An
     interrupted flight also gets a report, with the verdict "interrupted". Without `page`, write no
-    report.html.
+    report.html. In a session (see `LocalRun`), the report is that of the last mission.
     """
     from cloudrc.config.load import dump
     from cloudrc.report.write import write_report
 
-    record = _record_virtual if mode == "virtual" else _record_local
+    record = _record_virtual if mode == "virtual" else partial(_record_local, session=session)
     own = experiment.report.metrics
-    with explain_disk_errors(folder):
-        (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
-        with record(experiment, folder, see) as (recording, run):
-            return write_report(folder, recording, experiment, run, own=own, page=page)
-
-
-@contextlib.contextmanager
-def explain_disk_errors(folder: Path) -> Iterator[None]:
-    """Convert an OSError of the block, which writes into `folder`, to a CloudrcError."""
     try:
-        yield
+        (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
+        with record(experiment, folder, see) as flown:
+            return write_report(folder, *flown, own=own, page=page)
     except OSError as error:
         where = str(error.filename or folder)
         if error.errno in DISK_FULL:
@@ -293,8 +297,8 @@ def _is_nominal(experiment: ResolvedExperiment) -> bool:
 @contextlib.contextmanager
 def _record_virtual(
     experiment: ResolvedExperiment, folder: Path, see: See
-) -> Iterator[tuple[Recording, Run]]:
-    """Fly in virtual time, and yield the recording and facts about the run.
+) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
+    """Fly in virtual time, and yield the recording, the experiment and facts about the run.
 
     Use as a context manager, in whose block the caller writes the report. When the block ends, this
     function attaches the report to the file of the recording.
@@ -329,7 +333,7 @@ def _record_virtual(
             steps = usable().text if _is_nominal(experiment) else NO_C
             found = store.hexdigest(), interrupted, notes
             run = Run("virtual", "virtual", *found, physics_steps=steps)
-            yield store.recording(), run
+            yield store.recording(), experiment, run
         finally:
             for name, data in attachments(folder).items():
                 writer.attach(name, data)
@@ -337,60 +341,59 @@ def _record_virtual(
 
 @contextlib.contextmanager
 def _record_local(
-    experiment: ResolvedExperiment, folder: Path, see: See
-) -> Iterator[tuple[Recording, Run]]:
-    """Fly in real time, and yield the merged recording and facts about the run.
+    experiment: ResolvedExperiment,
+    folder: Path,
+    see: See,
+    session: Callable[[str, dict[str, str]], None] | None = None,
+) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
+    """Fly in real time, and yield the merged recording, the experiment and facts about the run.
 
     Use as a context manager, in whose block the caller writes the report. When the block ends, this
     function attaches the report to the file of the recording.
     """
     from cloudrc.assembly import flight_limit
+    from cloudrc.cli.session import read_last_mission
     from cloudrc.drivers.local import LocalRun
     from cloudrc.record.hash import messages_sha256
     from cloudrc.record.merge import merge
     from cloudrc.report.document import Run
     from cloudrc.report.write import attachments
+    from cloudrc.world.native.library import library
 
     if absent := missing("api"):
         text = f"no operator's API in this run: {', '.join(absent)} not installed"
         print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)
-    check_model(experiment)
-    local, broken = LocalRun(folder, see, api=not absent), None
+    world = experiment.world
+    if world.robot.endswith(".xml") or world.scene.endswith(".xml"):
+        from cloudrc.world.scene import compile_model
+
+        compile_model(world.robot, world.scene)  # report an invalid model before the flight
+    local, broken = LocalRun(folder, see, api=not absent, session=session), None
     interrupted = True
     try:
-        local.fly(flight_limit(experiment))
+        local.fly(inf if session else flight_limit(experiment))
         interrupted = False
     except KeyboardInterrupt:
         pass
     except CloudrcError as error:
         broken = error
     try:
-        mission = merge(folder / "world.mcap", folder / "cloud.mcap")
-    except CloudrcError:
-        if not interrupted:
-            raise
-        raise broken or InterruptedRunError("interrupted, nothing was recorded") from None
+        if session:
+            mission, experiment, interrupted = read_last_mission(folder)
+        else:
+            mission = merge(folder / "world.mcap", folder / "cloud.mcap")
+    except CloudrcError as error:
+        if broken or (interrupted and not session):
+            nothing = InterruptedRunError("interrupted, nothing was recorded")
+            raise broken or nothing from None
+        raise error
     notes = (*local.notes, *([str(broken)] if broken else ()))
-    facts = messages_sha256(mission.messages), interrupted, notes, where_steps_ran(experiment)
+    digest = messages_sha256(mission.messages)
     try:
-        yield mission.recording(), Run("local", "relay", *facts)
+        facts = digest, interrupted, notes, library().text if _is_nominal(experiment) else NO_C
+        yield mission.recording(), experiment, Run("local", "relay", *facts)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))
+        local.announcement.close()
     if broken:
         raise broken
-
-
-def check_model(experiment: ResolvedExperiment) -> None:
-    """Compile a robot or a scene from the user's file: report an error in it before the flight."""
-    world = experiment.world
-    if world.robot.endswith(".xml") or world.scene.endswith(".xml"):
-        from cloudrc.world.scene import compile_model
-
-        compile_model(world.robot, world.scene)
-
-
-def where_steps_ran(experiment: ResolvedExperiment) -> str:
-    """Describe where the usual physics steps of a flight in real time ran, for its report."""
-    from cloudrc.world.native.library import library
-
-    return library().text if _is_nominal(experiment) else NO_C

@@ -9,27 +9,26 @@ from __future__ import annotations
 
 import argparse
 import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager, suppress
-from math import inf
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from cloudrc.cli.advice import warn
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.find_run import run_argument, short
-from cloudrc.cli.output import escape, print_line, print_or_drop
+from cloudrc.cli.output import escape, print_line
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.cli.processes import Command
-from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
+from cloudrc.cli.run import experiment_arguments, fly_once
+from cloudrc.errors import BadInputError, MissingPrerequisiteError, NothingFlownError
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
-    from cloudrc.teleop.store import Mission
+    from cloudrc.record.reader import Contents
 
+Say = Callable[[str], None]
+"""Function that prints a line beside the progress of a flight."""
 DOWN_LIMIT = 120.0
 """Time limit for a session to end and to write its report [s]."""
 CONSOLE_LIMIT = 2.0
@@ -56,171 +55,105 @@ does not end a flight of 'cloudrc run'; that flight ends with its mission."""
 
 
 def _up_arguments(parser: argparse.ArgumentParser) -> None:
-    from cloudrc.cli.run import experiment_arguments
-
     experiment_arguments(parser, parser)
     parser.add_argument("--console", action="store_true", help="also open the console's page")
+    parser.set_defaults(output="table")
 
 
 def _up(options: argparse.Namespace) -> int:
     """Start a session, and keep it until a signal; return 0 after a regular end."""
-    from cloudrc.cli import run
-    from cloudrc.cli.report import summary
-    from cloudrc.config.load import dump
-    from cloudrc.drivers.local import locked
 
-    began = time.monotonic()
+    def ready(
+        folder: Path, say: Say, stack: ExitStack, api: str, metrics: Mapping[str, str]
+    ) -> None:
+        ports = ", ".join(f"{name} :{at.rpartition(':')[2]}" for name, at in metrics.items())
+        say("the robot waits on the ground")
+        say(escape(f"  folder   {short(folder.resolve())}"))
+        say(escape(f"  API      {api}"))
+        say(f"  metrics  http://127.0.0.1:PORT/metrics ({ports})")
+        say(NEXT)
+        if options.console:
+            stack.enter_context(_console(folder, say))
+
     interrupt_on_signals()
     require("a session", (*MODES["local"], "api"))
-    experiment = run.load(options.experiment, options.set, options.seed)
-    run.refuse_virtual_keys(experiment)
-    warn(experiment)
-    run.check_model(experiment)
-    folder = run.new_folder(options.out, f"{experiment.name}-session-seed{experiment.seed}")
-    facts = f"seed {experiment.seed}, link {experiment.link.profile}"
-    print_or_drop(escape(f"{experiment.name}: session, {facts}"))
-    report = None
-    with run.explain_disk_errors(folder), locked(folder):
-        (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
-        broken, notes = _fly(folder, began, with_console=options.console)
-        try:
-            report = finish(folder, experiment.report.metrics, notes)
-        except KeyboardInterrupt:
-            remedy = f"'cloudrc report {folder}' writes its report"
-            print_line(f"the recording is in {folder}; {remedy}", sys.stderr)
-            raise
-        except CloudrcError as error:
-            raise broken or error from None
-        if report is None:
-            print_or_drop(escape(f"no mission flew, so there is no report; logs: {folder}"))
-        else:
-            print_or_drop(escape(report["notes"][0]))
-            print_or_drop(summary(report, folder))
-    if broken:
-        raise broken
-    return 0
-
-
-def _fly(
-    folder: Path, began: float, *, with_console: bool
-) -> tuple[CloudrcError | None, tuple[str, ...]]:
-    """Keep the session in `folder` until a signal; return the error that ended it, and notes.
-
-    `began` is the time at which the command was started [s], monotonic clock.
-    """
-    from cloudrc.cli.progress import FlightView
-    from cloudrc.drivers.local import LocalRun
-
-    def ready(api: str, metrics: dict[str, str]) -> None:
-        ports = ", ".join(f"{name} :{at.rpartition(':')[2]}" for name, at in metrics.items())
-        shown = {"folder": short(folder.resolve()), "API": api}
-        shown["metrics"] = f"http://127.0.0.1:PORT/metrics ({ports})"
-        view.say(f"ready after {time.monotonic() - began:.1f} s: the robot waits on the ground")
-        for name, text in shown.items():
-            view.say(escape(f"  {name:<8} {text}"))
-        view.say(NEXT)
-        if with_console:
-            stack.enter_context(_console(folder, view.say))
-
-    with ExitStack() as stack:
-        view = stack.enter_context(closing(FlightView(sys.stdout, 0)))
-        local = LocalRun(folder, view.see, session=ready)
-        try:
-            local.fly(inf)
-        except KeyboardInterrupt:
-            view.say("the session ends and writes its report")
-            return None, local.notes
-        except CloudrcError as error:
-            return error, (*local.notes, str(error))
-    raise AssertionError("a session ends by an exception only")
+    return fly_once(options, "local", ready)
 
 
 @contextmanager
-def _console(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
+def _console(folder: Path, say: Say) -> Iterator[None]:
     """Run `cloudrc console` while the block runs; `say` gets its address, or why there is none."""
     from cloudrc.drivers.machine import interpreter
 
-    path, ends = folder / "console.log", False
-    with path.open("wb") as log:
-        process = subprocess.Popen(
-            interpreter("-m", "cloudrc", "console", str(folder)),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=log,
-            start_new_session=True,  # Ctrl-C reaches only the session, which ends the console
-        )
+    process = subprocess.Popen(
+        interpreter("-m", "cloudrc", "console", str(folder)),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        start_new_session=True,  # Ctrl-C reaches only this process, which ends the console
+    )
 
     def read() -> None:
         assert process.stdout is not None
-        for line in process.stdout:
-            say(escape(line.decode(errors="replace").rstrip()))
-        if not ends:
-            lines = path.read_text(errors="replace").splitlines() or [f"see {path}"]
-            say(escape(f"without a console: {lines[-1].removeprefix('cloudrc: error: ')}"))
+        with process.stdout as lines:
+            for line in lines:
+                if line.startswith(("console:", "cloudrc:")):
+                    say(escape(line.rstrip()))
 
     reader = Thread(target=read, daemon=True)
     reader.start()
     try:
         yield
     finally:
-        ends = True
         process.terminate()
         with suppress(subprocess.TimeoutExpired):
             process.wait(CONSOLE_LIMIT)
         process.kill()
+        process.wait()
         reader.join(CONSOLE_LIMIT)
-        process.communicate()
 
 
-def is_unfinished(folder: Path) -> bool:
-    """Return whether a folder is that of a session that was killed before it wrote its report."""
-    from cloudrc.drivers.local import JOURNAL_FILE
+def read_last_mission(folder: Path) -> tuple[Contents, ResolvedExperiment, bool]:
+    """Read the last mission of a session that has ended, and write it to config.yaml.
 
-    return (folder / JOURNAL_FILE).is_file() and not (folder / "mission.mcap").exists()
+    Returns:
+        The recording of this mission, the experiment that flies it, and whether the session ended
+        before the mission.
 
-
-def finish(
-    folder: Path, own: Iterable[str] = (), notes: tuple[str, ...] = ()
-) -> dict[str, Any] | None:
-    """Write mission.mcap and the report of a session's last mission, and return the report.
-
-    config.yaml then contains this mission. Return None if no mission flew. `own` are the user's
-    metrics, which are executed; `notes` are sentences for the reader.
+    Raises:
+        NothingFlownError: If no mission flew.
     """
-    from cloudrc import assembly
-    from cloudrc.cli.run import where_steps_ran
+    from cloudrc.assembly import with_order
     from cloudrc.config.load import dump, read_experiment
-    from cloudrc.record.hash import messages_sha256
-    from cloudrc.record.merge import cut_to_last_mission, merge
-    from cloudrc.report.document import Run
-    from cloudrc.report.write import attachments, write_report
-
-    recording, mission = merge(folder / "world.mcap", folder / "cloud.mcap"), _last(folder)
-    if mission is None:
-        return None
-    cut_to_last_mission(recording)
-    config = folder / "config.yaml"
-    experiment: ResolvedExperiment = assembly.with_order(read_experiment(config), mission.order)
-    config.write_text(dump(experiment), encoding="utf-8")
-    about = f"This is mission {mission.id} ({mission.order.name}), the last one of a session."
-    digest, steps = messages_sha256(recording.messages), where_steps_ran(experiment)
-    facts = Run("local", "relay", digest, not mission.ended, (about, *notes), steps)
-    try:
-        return write_report(folder, recording.recording(), experiment, facts, own=own)
-    finally:
-        recording.write(folder / "mission.mcap", attachments(folder))
-
-
-def _last(folder: Path) -> Mission | None:
-    """Return the mission of a session that has started last; None if none has."""
     from cloudrc.drivers.local import JOURNAL_FILE
+    from cloudrc.record.merge import cut_to_last_mission, merge
     from cloudrc.teleop.store import open_store
 
-    if not (folder / JOURNAL_FILE).exists():
-        return None
     with closing(open_store(folder / JOURNAL_FILE, b"")) as store:
         flown = [each for each in store.missions.values() if "started" in each.happened]
-    return flown[-1] if flown else None
+    if not flown:
+        raise NothingFlownError(f"no mission flew, so there is no report; logs: {folder}")
+    last, config = flown[-1], folder / "config.yaml"
+    about = f"Mission {last.id} ({last.order.name}), the last one of a session"
+    experiment = with_order(read_experiment(config), last.order, about)
+    config.write_text(dump(experiment), encoding="utf-8")
+    recording = merge(folder / "world.mcap", folder / "cloud.mcap")
+    cut_to_last_mission(recording)
+    return recording, experiment, not last.ended
+
+
+def restore_mission(folder: Path) -> None:
+    """Write mission.mcap of a session that was killed before it did so."""
+    from cloudrc.drivers.local import JOURNAL_FILE, under_way
+    from cloudrc.report.write import attachments
+
+    if (folder / JOURNAL_FILE).is_file() and not (folder / "mission.mcap").exists():
+        if folder.resolve() in under_way():
+            raise BadInputError(f"{folder}: the session has not ended; end it: cloudrc down")
+        recording, _, _ = read_last_mission(folder)
+        recording.write(folder / "mission.mcap", attachments(folder))
 
 
 def _down(options: argparse.Namespace) -> int:

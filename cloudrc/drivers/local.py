@@ -134,37 +134,19 @@ def flight_files() -> dict[Path, FlightFile]:
     return found
 
 
-@contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Lock the folder of a session while the block runs; `end_session` waits for the lock."""
-    with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError):  # a network's file system may have no locks
-            descriptor = os.open(folder, os.O_RDONLY)
-            stack.callback(os.close, descriptor)
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-
-
 def end_session(run: Path, limit: float) -> None:
     """End the session in the folder `run`, and wait until it has written its report.
 
     Raises:
         TimedOutError: If the session has not ended within `limit` [s].
     """
-    flight = flight_files().get(run)  # it is locked, so `pid` is still the supervisor
-    if flight is not None and flight.kind == SESSION:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(flight.pid, signal.SIGTERM)
-    descriptor, deadline = os.open(run, os.O_RDONLY), time.monotonic() + limit
-    try:
-        while True:
-            with contextlib.suppress(BlockingIOError):
-                return fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            if time.monotonic() > deadline:
-                raise TimedOutError(f"{run}: the session has not ended within {limit:g} s")
-            time.sleep(0.05)
-    finally:
-        os.close(descriptor)
+    deadline = time.monotonic() + limit
+    if flight := flight_files().get(run):  # the file is locked, so `pid` is the supervisor
+        os.kill(flight.pid, signal.SIGTERM)
+    while run in flight_files():
+        if time.monotonic() > deadline:
+            raise TimedOutError(f"{run}: the session has not ended within {limit:g} s")
+        time.sleep(0.05)
 
 
 def _is_private(place: Path) -> bool:
@@ -211,7 +193,12 @@ class Child:
 
 
 class LocalRun:
-    """Runs and supervises the four processes of a flight; `notes` are sentences for its report."""
+    """Runs and supervises the four processes of a flight.
+
+    Attributes:
+        notes: Sentences for the report of the flight.
+        announcement: Keeps the flight file of a session, which the caller closes at its end.
+    """
 
     def __init__(
         self,
@@ -233,6 +220,7 @@ class LocalRun:
         """
         self._folder, self._see, self._api, self._session = folder, see, api, session
         self._metrics: dict[str, str] = {}
+        self.announcement = contextlib.ExitStack()
         self._children: list[Child] = []
         self._selector = selectors.DefaultSelector()
         self.notes: tuple[str, ...] = ()
@@ -250,8 +238,9 @@ class LocalRun:
         # The folder is private, since it also holds this run's key.
         with tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder()) as sockets:
             url = f"unix:{sockets}/api.sock" if self._api else ""
-            kind = SESSION if self._session else RUN
-            with announced(self._folder, url, kind) as is_announced:
+            with contextlib.ExitStack() as stack:
+                kind = SESSION if self._session else RUN
+                is_announced = stack.enter_context(announced(self._folder, url, kind))
                 if url and not is_announced:
                     self._see([Fault(0, "unannounced", UNANNOUNCED.format(url))])
                 key = Path(sockets, "key")
@@ -263,6 +252,8 @@ class LocalRun:
                     self._stop()
                     (self._folder / API_FILE).unlink(missing_ok=True)
                     shutil.rmtree(self._folder / LINK_FOLDER, ignore_errors=True)
+                    if self._session:
+                        self.announcement = stack.pop_all()
 
     def _fly(self, limit: float, sockets: Path, url: str) -> None:
         folder, link, session = self._folder, self._folder / LINK_FOLDER, self._session
@@ -279,10 +270,8 @@ class LocalRun:
         # Only this user can open the socket of the API: no token is needed.
         files = {"api-file": folder / API_FILE, "audit": folder / AUDIT_FILE}
         given: dict[str, object] = {"api": url, **files} if url else {}
-        if session:
-            self._start("teleop", socket=sockets, **given, journal=folder / JOURNAL_FILE)
-        else:
-            self._start("teleop", "--start", socket=sockets, **given)
+        given |= {"journal": folder / JOURNAL_FILE} if session else {}
+        self._start("teleop", *(() if session else ("--start",)), socket=sockets, **given)
         self._wait_until_ready()
         record, state = folder / "cloud.mcap", link / "downlink.json"
         ways = {"listen": cloud, "peer": from_cloud, "key": key, "link": state}
