@@ -27,7 +27,8 @@ def run_argument(parser: argparse.ArgumentParser) -> None:
 def short(path: Path) -> str:
     """Format a path relative to the working folder, if it is inside."""
     here = Path.cwd()
-    return str(path.relative_to(here) if path.is_relative_to(here) else path)
+    is_inside = path.is_relative_to(here) and here != here.parent  # everything is inside "/"
+    return str(path.relative_to(here) if is_inside else path)
 
 
 def find_local_run(

@@ -33,7 +33,6 @@ from cloudrc.errors import (
     CloudrcError,
     DiskFullError,
     InterruptedRunError,
-    NothingFlownError,
 )
 
 if TYPE_CHECKING:
@@ -138,23 +137,19 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
     stream = sys.stderr if for_programs else sys.stdout
     mission = experiment.mission
     count = mission.steps.count if mission.steps else len(mission.waypoints)
-    count = 0 if ready else count
     # First prepare the flight: if that fails, no folder must be left.
     if in_cluster:
         flight = _cluster_flight(experiment, options, stream)
     else:
-        flight = _local_flight(experiment, mode, stream, count, ready)
+        flight = _local_flight(experiment, mode, stream, 0 if ready else count, ready)
     name = f"{experiment.name}-{'session' if ready else mode}-seed{experiment.seed}"
     folder = new_folder(options.out, name, "" if in_cluster else "latest")
     if not for_programs:
         facts = f"mode {mode}, seed {experiment.seed}, link {experiment.link.profile}"
-        waypoints = ", 1 waypoint" if count == 1 else f", {count} waypoints" * bool(count)
-        print_or_drop(escape(f"{experiment.name}: {facts}{waypoints}"))
+        flown = "session" if ready else "1 waypoint" if count == 1 else f"{count} waypoints"
+        print_or_drop(escape(f"{experiment.name}: {facts}, {flown}"))
     try:
         report = flight(folder)
-    except NothingFlownError as nothing:  # in a session, this is no error
-        print_or_drop(escape(str(nothing)))
-        return 0
     except (CloudrcError, KeyboardInterrupt) as error:
         if in_cluster:  # the folder stays empty until the mission has flown
             with contextlib.suppress(OSError):
@@ -339,6 +334,19 @@ def _record_virtual(
                 writer.attach(name, data)
 
 
+def _prepare(experiment: ResolvedExperiment) -> bool:
+    """Check the user's robot or scene before a flight in real time; return whether it has an API."""
+    if absent := missing("api"):
+        text = f"no operator's API in this run: {', '.join(absent)} not installed"
+        print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)
+    world = experiment.world
+    if world.robot.endswith(".xml") or world.scene.endswith(".xml"):
+        from cloudrc.world.scene import compile_model
+
+        compile_model(world.robot, world.scene)  # report an invalid model before the flight
+    return not absent
+
+
 @contextlib.contextmanager
 def _record_local(
     experiment: ResolvedExperiment,
@@ -360,15 +368,7 @@ def _record_local(
     from cloudrc.report.write import attachments
     from cloudrc.world.native.library import library
 
-    if absent := missing("api"):
-        text = f"no operator's API in this run: {', '.join(absent)} not installed"
-        print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)
-    world = experiment.world
-    if world.robot.endswith(".xml") or world.scene.endswith(".xml"):
-        from cloudrc.world.scene import compile_model
-
-        compile_model(world.robot, world.scene)  # report an invalid model before the flight
-    local, broken = LocalRun(folder, see, api=not absent, session=session), None
+    local, broken = LocalRun(folder, see, api=_prepare(experiment), session=session), None
     interrupted = True
     try:
         local.fly(inf if session else flight_limit(experiment))

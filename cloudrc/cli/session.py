@@ -77,7 +77,11 @@ def _up(options: argparse.Namespace) -> int:
 
     interrupt_on_signals()
     require("a session", (*MODES["local"], "api"))
-    return fly_once(options, "local", ready)
+    try:
+        return fly_once(options, "local", ready)
+    except NothingFlownError as nothing:
+        print_line(str(nothing))
+        return 0
 
 
 @contextmanager
@@ -134,7 +138,7 @@ def read_last_mission(folder: Path) -> tuple[Contents, ResolvedExperiment, bool]
     with closing(open_store(folder / JOURNAL_FILE, b"")) as store:
         flown = [each for each in store.missions.values() if "started" in each.happened]
     if not flown:
-        raise NothingFlownError(f"no mission flew, so there is no report; logs: {folder}")
+        raise NothingFlownError(f"{folder}: no mission flew, so there is no report")
     last, config = flown[-1], folder / "config.yaml"
     about = f"Mission {last.id} ({last.order.name}), the last one of a session"
     experiment = with_order(read_experiment(config), last.order, about)
