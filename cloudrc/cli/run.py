@@ -335,7 +335,7 @@ def _record_virtual(
 
 
 def _prepare(experiment: ResolvedExperiment) -> bool:
-    """Check the user's robot or scene before a flight in real time; return whether it has an API."""
+    """Check a robot or scene of the user before the flight; return whether it has an API."""
     if absent := missing("api"):
         text = f"no operator's API in this run: {', '.join(absent)} not installed"
         print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)
