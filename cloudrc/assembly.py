@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from math import dist, inf, radians
+from math import degrees, dist, inf, radians
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +32,7 @@ from cloudrc.tunnel.end import Identity
 
 if TYPE_CHECKING:
     from cloudrc.drivers.virtual import VirtualRun
+    from cloudrc.teleop.store import Order
     from cloudrc.world.endpoint import WorldEndpoint
     from cloudrc.world.sensors import Sensors
 
@@ -217,6 +218,35 @@ def mission_plan(
         legs = tuple(_leg(start, waypoint, speed_max, carrot) for start, waypoint in ways)
     start = Start.SPAWN if mission.start == "spawn" else Start.HERE
     return Plan(legs, start, time_limit, track=track)
+
+
+def with_order(
+    experiment: ResolvedExperiment, order: Order, description: str
+) -> ResolvedExperiment:
+    """Return the experiment that flies an operator's order; the inverse of `mission_plan`."""
+    legs, carrot = order.plan.legs, None
+    if speed := max(leg.speed for leg in legs):
+        carrot = schema.Carrot(speed_mps=speed, acceleration_mps2=legs[0].acceleration)
+    waypoints = tuple(
+        schema.Waypoint(
+            position_m=leg.position,
+            yaw_deg=round(degrees(leg.yaw), 9),
+            tolerance_m=leg.tolerance,
+            dwell_s=leg.dwell,
+            time_limit_s=leg.time_limit,
+            speed_mps=leg.speed or None,
+        )
+        for leg in legs
+    )
+    mission = schema.Mission(
+        start="spawn" if order.plan.start is Start.SPAWN else "here",
+        waypoints=waypoints,
+        carrot=carrot,
+    )
+    judged = {"contact": order.contact, "time_limit_s": order.plan.time_limit}
+    criteria = experiment.criteria.model_copy(update=judged)
+    changed = {"mission": mission, "criteria": criteria, "description": description}
+    return experiment.model_copy(update=changed)
 
 
 def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> DirectionProfile:

@@ -22,6 +22,10 @@ class BadInputError(CloudrcError):
     exit_code = 2
 
 
+class NothingFlownError(BadInputError):
+    """No mission has flown in a session, so there is nothing to report."""
+
+
 class MissingPrerequisiteError(CloudrcError):
     """A package, program or permission is missing."""
 

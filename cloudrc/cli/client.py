@@ -48,16 +48,21 @@ class UnreachableError(ApiError):
 class Api:
     """Call teleop's API at one address."""
 
-    def __init__(self, url: str, token: Callable[[], str] = lambda: "") -> None:
+    def __init__(self, url: str, token: Callable[[], str] = lambda: "", place: str = "") -> None:
         """Check and store the address, "http://HOST:PORT" or "unix:PATH".
 
-        `token` is called for each request; it returns the current token, or "" for none.
+        `token` is called for each request; it returns the current token, or "" for none. `place`
+        names the run or the release in answers to the user; "" if the user gave the address.
         """
-        self.url, self._token = url.rstrip("/"), token
+        self.url, self._token, self._place = url.rstrip("/"), token, place
         try:
             self._connection(REQUEST_TIMEOUT)
         except (ValueError, KeyError, http.client.InvalidURL):
             raise BadInputError(f"--api {url}: give http://HOST:PORT or unix:PATH") from None
+
+    def say(self, text: str) -> None:
+        """Print what the robot will do; name the run or the release."""
+        print_line(f"{self._place}: {text}" if self._place else text)
 
     def get(self, path: str) -> Any:
         """Send a GET request; results and errors are those of `post`."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TypeVar
 
@@ -24,14 +24,30 @@ def run_argument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--run", type=Path, metavar="DIR", help=about)
 
 
+def short(path: Path) -> str:
+    """Format a path relative to the working folder, if it is inside."""
+    here = Path.cwd()
+    is_inside = path.is_relative_to(here) and here != here.parent  # everything is inside "/"
+    return str(path.relative_to(here) if is_inside else path)
+
+
 def find_local_run(
-    options: argparse.Namespace, look: Callable[[Path, str], _Found | None], nobody: str
+    options: argparse.Namespace,
+    look: Callable[[Path, str], _Found | None],
+    nobody: str,
+    *,
+    steers: bool = True,
 ) -> _Found | None:
-    """Find a run in flight: the folder of `--run`, else ./runs/latest, else the only run in flight.
+    """Find the run in flight that a command means: the folder of `--run`, else the only run.
 
     Call `look` with the run's folder and the URL of its API ("" if the run has no API), and return
-    the result of `look`. Return None if no run is in flight or if the flags name a cluster. If
-    `--run` names a run that is not in flight, raise an error with the text `nobody`.
+    the result of `look`. Return None if no run is in flight or if the flags name a cluster.
+    `steers` tells whether the command changes the flight.
+
+    Raises:
+        BadInputError: If `--run` names a run that is not in flight, with the text `nobody`; if
+            several runs are in flight; or if the command would steer another flight after
+            ./runs/latest has ended.
     """
     from cloudrc.drivers.local import under_way
 
@@ -43,24 +59,37 @@ def find_local_run(
     # The URL comes from this user's flight files, never from the run's folder: a run's folder may
     # come from somebody else and name a foreign server.
     flights = under_way()
-
-    def find(run: Path) -> _Found | None:
-        real = Path(os.path.realpath(run))
-        return look(run, flights[real]) if real in flights else None
-
     if options.run is not None:
-        if (found := find(options.run)) is None:
+        url = flights.get(Path(os.path.realpath(options.run)))
+        if url is None or (found := look(options.run, url)) is None:
             raise BadInputError(f"--run {options.run}: {nobody}")
         return found
-    if (found := find(RUNS / "latest")) is not None:
-        return found
-    others = {run: found for run in flights if (found := find(run)) is not None}
-    if len(others) > 1:
-        names = " or ".join(f"--run {run}" for run in others)
-        raise BadInputError(f"{len(others)} runs are flying here; choose one: {names}")
-    for run in others:
-        print_line(f"cloudrc: using the run in {run}", sys.stderr)
-    return next(iter(others.values()), None)
+    candidates = {run: found for run in flights if (found := look(Path(short(run)), flights[run]))}
+    _ask_if_unclear(candidates, steers)
+    return next(iter(candidates.values()), None)
+
+
+def _ask_if_unclear(candidates: Collection[Path], steers: bool) -> None:
+    """Raise a BadInputError unless it is clear which flight the user means.
+
+    `candidates` are the folders of the runs here that the command could use. Without candidates,
+    the command would use a release in a cluster.
+    """
+    from cloudrc.drivers.local import RELAY_LOG
+
+    latest = Path(os.path.realpath(RUNS / "latest"))
+    names = " or ".join(f"--run {short(run)}" for run in candidates)
+    if len(candidates) > 1:
+        raise BadInputError(f"{len(candidates)} runs are flying here; choose one: {names}")
+    if latest in candidates:
+        return
+    if steers and (latest / RELAY_LOG).exists():  # a run in real time, so this user steered it
+        names = names or "--release NAME (in a cluster)"
+        raise BadInputError(
+            f"{short(latest)} has ended; name another flight: {names}; or start one: cloudrc up"
+        )
+    if candidates:
+        print_line(f"cloudrc: using the run in {names.removeprefix('--run ')}", sys.stderr)
 
 
 def no_run_error(

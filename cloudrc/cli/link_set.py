@@ -25,10 +25,11 @@ if TYPE_CHECKING:
 
 EPILOG = """\
 where:
-  a run on this machine ('cloudrc run --mode local'): found automatically, or
+  a run on this machine ('cloudrc up', 'cloudrc run'): found automatically, or
   named by --run
-  a release in a cluster: if --context, -n or --release is given, or if no run
-  flies on this machine; always with 'kubectl cloudrc link set'
+  a release in a cluster: if --context, -n or --release is given, or if there is
+  no run on this machine; always with 'kubectl cloudrc link set'
+  It asks for a flag if several runs fly, or if ./runs/latest has ended.
 
 examples:
   cloudrc link set downlink.delay_ms=120 uplink.loss=0.02
@@ -66,6 +67,7 @@ def execute(options: argparse.Namespace) -> int:
     folder = find_local_run(options, link_folder, "no run flies there")
     if folder is not None:
         edit, states = _set_here(options, folder, number)
+        where = str(folder.parent)
         took = monotonic() - began
     else:
         from cloudrc.cluster.link import keep, send
@@ -75,6 +77,7 @@ def execute(options: argparse.Namespace) -> int:
         sent = send(place, link, options.profile, options.settings, note)
         took = monotonic() - began
         keep(place, link, sent)
+        where = f"release '{place.name}'{f' {place.where}' if place.namespace else ''}"
         edit, states = sent.edit, sent.states
     for text in edit.notes:
         print_line(f"cloudrc: note: {text}", sys.stderr)
@@ -85,7 +88,7 @@ def execute(options: argparse.Namespace) -> int:
         return 0
     heads = ("DIRECTION", "SHAPER", "DELAY", "JITTER", "LOSS", "RATE", "OTHER")
     print(table([heads, *map(_row, states)]))
-    print(f"in force after {took:.1f} s")
+    print_line(f"{where}: in force after {took:.1f} s")
     return 0
 
 

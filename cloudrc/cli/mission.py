@@ -11,7 +11,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -37,10 +37,11 @@ if TYPE_CHECKING:
 
 EPILOG = """\
 where:
-  a run on this machine ('cloudrc run --mode local'): found automatically (first
-  ./runs/latest), or named by --run DIR or --api URL
-  a release in a cluster: if --context, -n or --release is given, or if no run
-  flies on this machine; always with 'kubectl cloudrc mission'
+  a run on this machine ('cloudrc up', 'cloudrc run'): found automatically, or
+  named by --run DIR or --api URL
+  a release in a cluster: if --context, -n or --release is given, or if there is
+  no run on this machine; always with 'kubectl cloudrc mission'
+  It asks for a flag if several runs fly, or if ./runs/latest has ended.
 
 examples:
   cloudrc mission run pipes
@@ -59,6 +60,8 @@ mission. An API in a network asks for a token: give --token-file or
 CLOUDRC_TOKEN_FILE; for a release the command reads its Secret with your rights
 in the cluster. A run that is found on this machine needs no token."""
 NO_API = "no run with an API flies there; name another folder, or --api URL"
+READS = ("list", "status", "logs")
+"""Verbs that do not steer the robot."""
 POLL_PERIOD = 0.5
 """Time between two requests for the state of a mission [s]."""
 RUN_TIMEOUT, API_TIMEOUT = 10.0, 180.0
@@ -136,8 +139,12 @@ def execute(options: argparse.Namespace) -> int:
         return _fly(options)
     if options.api:
         return API_VERBS[verb](options, Api(options.api, token_reader(token_file(options))))
-    if (url := find_local_run(options, lambda run, api: api or None, NO_API)) is not None:
-        return API_VERBS[verb](options, Api(url))  # a local run asks for no token, so send none
+
+    def look(run: Path, url: str) -> Api | None:
+        return Api(url, place=str(run)) if url else None  # a local run needs no token: send none
+
+    if (api := find_local_run(options, look, NO_API, steers=verb not in READS)) is not None:
+        return API_VERBS[verb](options, api)
     if verb == "run":
         return _run_job(options)
     with _forwarded_api(options) as forwarded:
@@ -186,7 +193,7 @@ class MissionFollower:
         Raise a TimedOutError if the API does not answer in time; other errors are as in `Api.post`.
         """
         view = self._retry(lambda: self._api.post("/v1/missions", mission))
-        print_line(f"mission {view['id']}: {view['state']}, waypoints: {view['waypoints']}")
+        self._api.say(f"mission {view['id']}: {view['state']}, waypoints: {view['waypoints']}")
         return str(view["id"])
 
     def follow(self, mission_id: str) -> Json:
@@ -289,11 +296,11 @@ def _status(options: argparse.Namespace, api: Api) -> int:
     if options.output != "table":
         return _print(state, options.output)
     if options.id:
-        _print_state(state)
+        print_line(_describe_mission(state))
         _print_history(state)
         return 0
     if state["mission"]:
-        _print_state(state["mission"])
+        print_line(_describe_mission(state["mission"]))
     else:
         print("no mission is under way")
     if state["queue"]:
@@ -309,7 +316,8 @@ def _cancel(options: argparse.Namespace, api: Api) -> int:
         if mission is None:
             raise BadInputError("no mission is under way; 'cloudrc mission list' shows all")
         mission_id = mission["id"]
-    _print_state(api.post(f"{mission_path(mission_id)}/cancel"))
+    cancelled = api.post(f"{mission_path(mission_id)}/cancel")
+    api.say(f"{_describe_stay(api)}; {_describe_mission(cancelled)}")
     return 0
 
 
@@ -328,16 +336,35 @@ def _logs(options: argparse.Namespace, api: Api) -> int:
 
 
 def _order(options: argparse.Namespace, api: Api) -> int:
-    point = None
-    if options.verb == "goto":
+    point, verb = None, options.verb
+    if verb == "goto":
         point = {"position_m": [options.x, options.y, options.z]}
-    _print_state(api.post(f"/v1/{options.verb}", point))
+    mission = api.post(f"/v1/{verb}", point)
+    to = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
+    if verb == "goto":
+        to = f"({options.x:g}, {options.y:g}, {options.z:g})"
+    action = _describe_stay(api) if verb == "hold" else f"flying to {to}"
+    api.say(f"{action}; {_describe_mission(mission)}")
     return 0
+
+
+def _describe_stay(api: Api) -> str:
+    """Describe where the robot stays after a command, or which mission it flies now."""
+    with suppress(CloudrcError):
+        state = api.get("/v1/state")
+        mission, seen = state["mission"], state["seen"]
+        if mission is not None and mission["state"] != "held":
+            return f"mission {mission['id']} continues"
+        if seen is not None and seen["guard"] == "GROUND":
+            return "waiting on the ground"
+        if seen is not None:
+            return f"holding at {_describe_point(seen['position_m'])}"
+    return "holding"
 
 
 def _estop(options: argparse.Namespace, api: Api) -> int:
     mission = api.post("/v1/estop")["id"]
-    print("emergency stop: sent, and repeated until the rotors have stopped", flush=True)
+    api.say("emergency stop: sent, and repeated until the rotors have stopped")
     if mission:
         print_line(f"mission {mission} has failed")
     return 0
@@ -345,8 +372,8 @@ def _estop(options: argparse.Namespace, api: Api) -> int:
 
 def _acknowledge(options: argparse.Namespace, api: Api) -> int:
     api.post("/v1/acknowledge")
+    api.say("acknowledged: the next mission may fly; a landing close to the ground ends first")
     print(
-        "acknowledged: the next mission may fly; a landing close to the ground is completed first\n"
         "after a stop or a touchdown the robot takes off only once it is at rest, and at least "
         "0.5 m inside the fence"
     )
@@ -372,11 +399,16 @@ API_VERBS: dict[str, Callable[[argparse.Namespace, Api], int]] = {
 }
 
 
-def _print_state(mission: Json) -> None:
+def _describe_mission(mission: Json) -> str:
     where = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
     name = f" ({mission['name']})" if mission["name"] else ""
     verdict = f"; {describe_verdict(mission['verdict'])}" if mission["verdict"] else ""
-    print_line(f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}")
+    return f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}"
+
+
+def _describe_point(position: Sequence[float | None]) -> str:
+    """Format a position [m]; None is unknown."""
+    return f"({', '.join('?' if value is None else f'{value:.2f}' for value in position)})"
 
 
 def _print_robot(seen: Json | None, cloud_age: float | None) -> None:
@@ -385,14 +417,14 @@ def _print_robot(seen: Json | None, cloud_age: float | None) -> None:
     if seen is None:
         print(f"no telemetry from the robot yet; is the link up? cloud heard {heard}")
         return
-    where = ", ".join("?" if value is None else f"{value:.2f}" for value in seen["position_m"])
+    where = _describe_point(seen["position_m"])
     if seen["guard_for_s"] is None:
         past = f"robot not heard for {seen['age_s']:.1f} s (guard {seen['guard']} then)"
         print_line(f"{past}; cloud heard {heard}")
-        print_line(f"last seen at ({where}) m: {seen['cause']}")
+        print_line(f"last seen at {where} m: {seen['cause']}")
     else:
         rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
-        print_line(f"robot at ({where}) m, seen {seen['age_s']:.2f} s ago{rtt}")
+        print_line(f"robot at {where} m, seen {seen['age_s']:.2f} s ago{rtt}")
         print_line(f"guard {seen['guard']} for {seen['guard_for_s']:.1f} s: {seen['cause']}")
     print_line(f"next: {seen['next_step']}")
 
@@ -427,8 +459,11 @@ def _forwarded_api(options: argparse.Namespace) -> Iterator[Api]:
     from cloudrc.cluster.pods import api_url, operator_token
 
     token = operator_token(release) if path is None else ""
+    place = f"release '{release.name}' {release.where}"
     with api_url(release) as url:
-        yield Api(url, token_reader(path) if path else lambda: token)
+        if options.verb in READS and not (options.context or options.namespace or options.release):
+            print_line(f"cloudrc: using {place}", sys.stderr)
+        yield Api(url, token_reader(path) if path else lambda: token, place)
 
 
 def _time_limit(name: str, mission: Json) -> float:
@@ -463,7 +498,8 @@ def _run_job(options: argparse.Namespace) -> int:
     # After 'helm install' without --wait, the release needs some seconds to become ready.
     wait_ready(release, timeout=options.timeout, tell=print_line)
     job = run_job(release, mission, limit=limit, queue=options.queue)
-    print(f"Job {job.name} in namespace '{release.namespace}'", flush=True)
+    where = f"on release '{release.name}' in namespace '{release.namespace}'"
+    print(f"Job {job.name} {where}", flush=True)
     try:
         ended = follow(release, job.name, print_line, timeout=follow_limit(limit, options.queue))
     except KeyboardInterrupt:

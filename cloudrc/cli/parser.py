@@ -16,6 +16,8 @@ from cloudrc.errors import BadInputError
 GROUPS: dict[str, dict[str, str]] = {
     "fly": {
         "run": "fly an experiment and write its report",
+        "up": "start a session: it waits for missions, until Ctrl-C or 'down'",
+        "down": "end the session; it writes the report of its last mission",
         "mission": "start, steer and stop missions, here or in a cluster",
         "sweep": "fly a grid of settings with several seeds, on all cores",
         "report": "write the report of a recorded run again",
@@ -43,8 +45,11 @@ GROUPS: dict[str, dict[str, str]] = {
     },
 }
 """Group of commands -> command -> help line. `cloudrc/cli/<command>.py` contains the command."""
-PROCESSES = ("world", "cloud", "relay")
-"""Commands that `cloudrc/cli/processes.py` contains; they have no modules of their own."""
+SHARED = {
+    **dict.fromkeys(("world", "cloud", "relay"), "processes"),
+    **dict.fromkeys(("up", "down"), "session"),
+}
+"""Commands without a module of their own -> the module in `cloudrc/cli` that contains them."""
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
 COUNT_MAX = 10_000
 """Largest number of repeats, seeds or processes that a flag accepts. Before Python 3.11.6, a pool
@@ -172,8 +177,8 @@ def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Pars
 
 def _find_command(name: str) -> Any:
     """Return the module or `Command` that has a command's functions `arguments` and `execute`."""
-    if name in PROCESSES:
-        return getattr(importlib.import_module("cloudrc.cli.processes"), name)
+    if name in SHARED:
+        return getattr(importlib.import_module(f"cloudrc.cli.{SHARED[name]}"), name)
     module = "class_" if name == "class" else name  # a keyword of Python
     return importlib.import_module(f"cloudrc.cli.{module}")
 

@@ -53,10 +53,11 @@ RELEASED_PERIOD = 2.0
 
 
 class Command(NamedTuple):
-    """A command of this module: the functions that other commands have in their own modules."""
+    """A command that shares its module: the names that other commands have in their own modules."""
 
     arguments: Callable[[argparse.ArgumentParser], None]
     execute: Callable[[argparse.Namespace], int]
+    EPILOG: str | None = None
 
 
 def _add(

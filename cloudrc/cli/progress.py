@@ -31,7 +31,7 @@ class FlightView:
     """Prints the events of a flight to a stream and, on a terminal, updates a status line."""
 
     def __init__(self, stream: TextIO, waypoints: int) -> None:
-        """Set the stream and the number of waypoints of the mission; print nothing yet."""
+        """Set the stream and the number of waypoints (0: unknown); print nothing yet."""
         self._stream, self._waypoints = stream, waypoints
         self._first_ns = self._now_ns = NEVER_NS
         self._began = self._seen = monotonic()
@@ -61,8 +61,13 @@ class FlightView:
                 case GuardChange():
                     self._guard = record.state
                     # The robot holds its position after every mission: do not print this.
-                    if record.state > GuardState.TRACK and not self._ended:
+                    is_usual = self._ended and record.state is GuardState.HOLD
+                    if record.state > GuardState.TRACK and not is_usual:
                         self._event(f"{record.state.name}: {record.cause}")
+                    if record.state > GuardState.HOLD and not self._waypoints:
+                        self.say(
+                            "  to fly again, find the cause, then: cloudrc mission acknowledge"
+                        )
                 case MissionEvent():
                     self._ended = record.event in ENDINGS
                     self._event(record.text)
@@ -76,7 +81,7 @@ class FlightView:
         cells = (
             f"{flown:6.1f} s",
             f"{self._guard.name:<6}",
-            f"waypoint {number}/{self._waypoints}" if number else "",
+            f"waypoint {number}{f'/{self._waypoints}' * bool(self._waypoints)}" if number else "",
             self._place(),
             "" if math.isnan(self._delay) else f"delay {self._delay * 1e3:3.0f} ms",
             f"x{flown / elapsed:.2f}" if elapsed > 0 and flown > 0 else "",
@@ -92,7 +97,10 @@ class FlightView:
         return "" if math.isnan(x) else f"({x:5.2f}, {y:5.2f}, {z:4.2f}) m"
 
     def _event(self, text: str) -> None:
-        line = _joined((f"  {escape(text):<44}", self._place()))
+        self.say(_joined((f"  {escape(text):<44}", self._place())))
+
+    def say(self, line: str) -> None:
+        """Print a line above the status line."""
         if self._status:
             self._status.console.print(Text(line))
         else:

@@ -7,6 +7,8 @@ import contextlib
 import itertools
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -43,6 +45,9 @@ Flight = Callable[[Path], dict[str, Any]]
 """Function that flies, writes all files of the run into a folder, and returns the report."""
 See = Callable[["list[Record]"], None]
 """Function that displays records during the flight."""
+Ready = Callable[[Path, Callable[[str], None], contextlib.ExitStack, str, dict[str, str]], None]
+"""Function that a session calls when it is ready, with its folder, a function that prints a line,
+a stack that closes at the end, and the arguments of `session` of `LocalRun`."""
 
 NO_C = "Python (wind, or a robot that differs from its model)"
 """Where the usual steps run if C cannot run them."""
@@ -66,20 +71,27 @@ line of the output is the path of the report."""
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    add, many = parser.add_argument, parser.add_mutually_exclusive_group()
-    about = "name of a shipped experiment, or a YAML file (default: paper)"
-    add("experiment", nargs="?", default="paper", metavar="EXPERIMENT", help=about)
-    add("--mode", choices=MODES, help="where to fly (default: local; with --seeds: virtual)")
-    about = "random seed of this run (default: the experiment's)"
-    many.add_argument("--seed", type=whole_number(0, 2**53 - 1), metavar="S", help=about)
+    many = parser.add_mutually_exclusive_group()
+    experiment_arguments(parser, many)
+    about = "where to fly (default: local; with --seeds: virtual)"
+    parser.add_argument("--mode", choices=MODES, help=about)
     about = "fly seeds 1 to N on all cores and print a table"
     many.add_argument("--seeds", type=read_count, metavar="N", help=about)
-    about = "change one key of the experiment; repeatable"
-    add("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
-    add("--out", type=Path, metavar="DIR", help="folder of the run (default: a new one in runs/)")
     output_argument(parser, "json, yaml: print only the report")
     release_arguments(parser)
     timeout_argument(parser)
+
+
+def experiment_arguments(parser: argparse.ArgumentParser, seed: argparse._ActionsContainer) -> None:
+    """Declare the arguments that choose an experiment, with `--seed` in the group `seed`."""
+    add = parser.add_argument
+    about = "name of a shipped experiment, or a YAML file (default: paper)"
+    add("experiment", nargs="?", default="paper", metavar="EXPERIMENT", help=about)
+    about = "random seed of this run (default: the experiment's)"
+    seed.add_argument("--seed", type=whole_number(0, 2**53 - 1), metavar="S", help=about)
+    about = "change one key of the experiment; repeatable"
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
+    add("--out", type=Path, metavar="DIR", help="folder of the run (default: a new one in runs/)")
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -93,7 +105,7 @@ def execute(options: argparse.Namespace) -> int:
         from cloudrc.cli import seeds
 
         return seeds.fly_seeds(options)
-    return _fly_once(options, mode)
+    return fly_once(options, mode)
 
 
 def load(name: str, overrides: Iterable[str], seed: int | None = None) -> ResolvedExperiment:
@@ -107,7 +119,11 @@ def load(name: str, overrides: Iterable[str], seed: int | None = None) -> Resolv
     return experiment
 
 
-def _fly_once(options: argparse.Namespace, mode: str) -> int:
+def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None) -> int:
+    """Fly as `options` say, print the summary, and return the exit code.
+
+    With `ready`, fly a session, which calls `ready` when everything is ready.
+    """
     from cloudrc.metrics.verdict import exit_code
 
     experiment = load(options.experiment, options.set, options.seed)
@@ -124,13 +140,13 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     if in_cluster:
         flight = _cluster_flight(experiment, options, stream)
     else:
-        flight = _local_flight(experiment, mode, stream, count)
-    name = f"{experiment.name}-{mode}-seed{experiment.seed}"
+        flight = _local_flight(experiment, mode, stream, 0 if ready else count, ready)
+    name = f"{experiment.name}-{'session' if ready else mode}-seed{experiment.seed}"
     folder = new_folder(options.out, name, "" if in_cluster else "latest")
     if not for_programs:
         facts = f"mode {mode}, seed {experiment.seed}, link {experiment.link.profile}"
-        waypoints = "1 waypoint" if count == 1 else f"{count} waypoints"
-        print_or_drop(escape(f"{experiment.name}: {facts}, {waypoints}"))
+        flown = "session" if ready else "1 waypoint" if count == 1 else f"{count} waypoints"
+        print_or_drop(escape(f"{experiment.name}: {facts}, {flown}"))
     try:
         report = flight(folder)
     except (CloudrcError, KeyboardInterrupt) as error:
@@ -149,7 +165,7 @@ def _fly_once(options: argparse.Namespace, mode: str) -> int:
     print_or_drop(
         format_document(report, options.output) if for_programs else summary(report, folder)
     )
-    return exit_code(report)
+    return 0 if ready else exit_code(report)
 
 
 def new_folder(out: Path | None, name: str, link: str = "latest") -> Path:
@@ -198,7 +214,7 @@ def point_to(folder: Path, link: str) -> None:
 
 
 def _local_flight(
-    experiment: ResolvedExperiment, mode: str, stream: TextIO, waypoints: int
+    experiment: ResolvedExperiment, mode: str, stream: TextIO, waypoints: int, ready: Ready | None
 ) -> Flight:
     """Return a function that flies on this machine and shows the progress on `stream`."""
     from cloudrc.cli.progress import FlightView
@@ -207,8 +223,10 @@ def _local_flight(
         return lambda folder: fly(experiment, mode, folder)
 
     def flight(folder: Path) -> dict[str, Any]:
-        with contextlib.closing(FlightView(stream, waypoints)) as view:
-            return fly(experiment, mode, folder, view.see)
+        with contextlib.ExitStack() as stack:
+            view = stack.enter_context(contextlib.closing(FlightView(stream, waypoints)))
+            session = partial(ready, folder, view.say, stack) if ready else None
+            return fly(experiment, mode, folder, view.see, session=session)
 
     return flight
 
@@ -240,22 +258,23 @@ def fly(
     see: See = lambda records: None,
     *,
     page: bool = True,
+    session: Callable[[str, dict[str, str]], None] | None = None,
 ) -> dict[str, Any]:
     """Fly in mode "virtual" or "local"; write all files into `folder`, and return the report.
 
     During the flight `see` is called with new records; in local mode some records are left out. An
     interrupted flight also gets a report, with the verdict "interrupted". Without `page`, write no
-    report.html.
+    report.html. In a session (see `LocalRun`), the report is that of the last mission.
     """
     from cloudrc.config.load import dump
     from cloudrc.report.write import write_report
 
-    record = _record_virtual if mode == "virtual" else _record_local
+    record = _record_virtual if mode == "virtual" else partial(_record_local, session=session)
     own = experiment.report.metrics
     try:
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
-        with record(experiment, folder, see) as (recording, run):
-            return write_report(folder, recording, experiment, run, own=own, page=page)
+        with record(experiment, folder, see) as flown:
+            return write_report(folder, *flown, own=own, page=page)
     except OSError as error:
         where = str(error.filename or folder)
         if error.errno in DISK_FULL:
@@ -272,8 +291,8 @@ def _is_nominal(experiment: ResolvedExperiment) -> bool:
 @contextlib.contextmanager
 def _record_virtual(
     experiment: ResolvedExperiment, folder: Path, see: See
-) -> Iterator[tuple[Recording, Run]]:
-    """Fly in virtual time, and yield the recording and facts about the run.
+) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
+    """Fly in virtual time, and yield the recording, the experiment and facts about the run.
 
     Use as a context manager, in whose block the caller writes the report. When the block ends, this
     function attaches the report to the file of the recording.
@@ -311,30 +330,14 @@ def _record_virtual(
             run = Run("virtual", "virtual", *found, physics_steps=steps)
             recording = store.recording()
             writer.write_views(views(recording, experiment))
-            yield recording, run
+            yield recording, experiment, run
         finally:
             for name, data in attachments(folder).items():
                 writer.attach(name, data)
 
 
-@contextlib.contextmanager
-def _record_local(
-    experiment: ResolvedExperiment, folder: Path, see: See
-) -> Iterator[tuple[Recording, Run]]:
-    """Fly in real time, and yield the merged recording and facts about the run.
-
-    Use as a context manager, in whose block the caller writes the report. When the block ends, this
-    function attaches the report to the file of the recording.
-    """
-    from cloudrc.assembly import flight_limit
-    from cloudrc.drivers.local import LocalRun
-    from cloudrc.record.hash import messages_sha256
-    from cloudrc.record.merge import merge
-    from cloudrc.report.document import Run
-    from cloudrc.report.views import add_views
-    from cloudrc.report.write import attachments
-    from cloudrc.world.native.library import library
-
+def _prepare(experiment: ResolvedExperiment) -> bool:
+    """Check a robot or scene of the user before the flight; return whether it has an API."""
     if absent := missing("api"):
         text = f"no operator's API in this run: {', '.join(absent)} not installed"
         print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)
@@ -343,27 +346,57 @@ def _record_local(
         from cloudrc.world.scene import compile_model
 
         compile_model(world.robot, world.scene)  # report an invalid model before the flight
-    local, broken = LocalRun(folder, see, api=not absent), None
+    return not absent
+
+
+@contextlib.contextmanager
+def _record_local(
+    experiment: ResolvedExperiment,
+    folder: Path,
+    see: See,
+    session: Callable[[str, dict[str, str]], None] | None = None,
+) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
+    """Fly in real time, and yield the merged recording, the experiment and facts about the run.
+
+    Use as a context manager, in whose block the caller writes the report. When the block ends, this
+    function attaches the report to the file of the recording.
+    """
+    from cloudrc.assembly import flight_limit
+    from cloudrc.cli.session import read_last_mission
+    from cloudrc.drivers.local import LocalRun
+    from cloudrc.record.hash import messages_sha256
+    from cloudrc.record.merge import merge
+    from cloudrc.report.document import Run
+    from cloudrc.report.views import add_views
+    from cloudrc.report.write import attachments
+    from cloudrc.world.native.library import library
+
+    local, broken = LocalRun(folder, see, api=_prepare(experiment), session=session), None
     interrupted = True
     try:
-        local.fly(flight_limit(experiment))
+        local.fly(inf if session else flight_limit(experiment))
         interrupted = False
     except KeyboardInterrupt:
         pass
     except CloudrcError as error:
         broken = error
     try:
-        mission = merge(folder / "world.mcap", folder / "cloud.mcap")
-    except CloudrcError:
-        if not interrupted:
-            raise
-        raise broken or InterruptedRunError("interrupted, nothing was recorded") from None
+        if session:
+            mission, experiment, interrupted = read_last_mission(folder)
+        else:
+            mission = merge(folder / "world.mcap", folder / "cloud.mcap")
+    except CloudrcError as error:
+        if broken or (interrupted and not session):
+            nothing = InterruptedRunError("interrupted, nothing was recorded")
+            raise broken or nothing from None
+        raise error
     notes = (*local.notes, *([str(broken)] if broken else ()))
     digest = messages_sha256(mission.messages)
     try:
         facts = digest, interrupted, notes, library().text if _is_nominal(experiment) else NO_C
-        yield add_views(mission, experiment), Run("local", "relay", *facts)
+        yield add_views(mission, experiment), experiment, Run("local", "relay", *facts)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))
+        local.announcement.close()
     if broken:
         raise broken

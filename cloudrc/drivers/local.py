@@ -2,7 +2,8 @@
 
 The supervisor (this process) starts the others in the order of their dependencies, and reads the
 records that they print. It ends all processes when teleop ends after the mission, when another
-process ends or hangs, or when the user interrupts.
+process ends or hangs, or when the user interrupts. In a session, teleop waits for missions and
+never ends by itself.
 
 During a flight, the flight file names the folder of the run and the address of the operator's API.
 It is a locked file in a private folder of this user. Commands trust the flight file, but not the
@@ -18,12 +19,14 @@ import os
 import secrets
 import selectors
 import shutil
+import signal
 import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from cloudrc.drivers.machine import Deadline, interpreter
 from cloudrc.drivers.process import PARENT, READY, from_line
@@ -51,6 +54,12 @@ AUDIT_FILE = "audit.jsonl"
 """File in a run's folder: a log of the commands that the API received, and of their senders."""
 LINK_FOLDER = "link"
 """Folder in a run's folder, for the relay's state and the profile from `cloudrc link set`."""
+JOURNAL_FILE = "missions.journal"
+"""File in a session's folder: teleop's store of the missions."""
+RELAY_LOG = "relay.log"
+"""File in the folder of every run of this kind, which runs in virtual time do not have."""
+RUN, SESSION = "run", "session"
+"""Kinds of flights: of `cloudrc run`, which end with their mission, and of `cloudrc up`."""
 UNANNOUNCED = (
     "'cloudrc mission' and 'cloudrc link set' cannot find this run: no folder for its flight file "
     "(XDG_STATE_HOME); give 'cloudrc mission' --api {}"
@@ -67,13 +76,22 @@ def places() -> list[Path]:
     return [Path(root, "cloudrc", "flights") for root in (runtime, state) if os.path.isabs(root)]
 
 
+class FlightFile(NamedTuple):
+    """What a flight file says, besides the folder of the run."""
+
+    api: str  # address of the operator's API; "" for none
+    kind: str  # RUN or SESSION
+    pid: int  # process id of the supervisor
+
+
 @contextlib.contextmanager
-def announced(run: Path, api: str = "") -> Iterator[bool]:
+def announced(run: Path, api: str = "", kind: str = RUN) -> Iterator[bool]:
     """Keep a flight file while the block runs; yield whether the file could be written.
 
     `run` is the folder of the run, `api` the address of the operator's API ("" without an API).
     """
-    flight = json.dumps({"schemaVersion": 1, "run": str(run.resolve()), "api": api})
+    about = FlightFile(api, kind, os.getpid())._asdict()
+    flight = json.dumps({"schemaVersion": 1, "run": str(run.resolve()), **about})
     with contextlib.ExitStack() as stack:
         yield any(_write_flight(place, flight, stack) for place in places())
 
@@ -97,6 +115,11 @@ def _write_flight(place: Path, flight: str, stack: contextlib.ExitStack) -> bool
 
 def under_way() -> dict[Path, str]:
     """Return the flights of this user: folder of the run -> address of its API ("" for none)."""
+    return {run: flight.api for run, flight in flight_files().items()}
+
+
+def flight_files() -> dict[Path, FlightFile]:
+    """Return the flights of this user: folder of the run -> content of the flight file."""
     found = {}
     for path in (path for place in places() if _is_private(place) for path in place.glob("*.json")):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError), path.open() as file:
@@ -104,10 +127,26 @@ def under_way() -> dict[Path, str]:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:  # locked: the flight is under way
                 flight = json.load(file)
-                found[Path(flight["run"])] = str(flight["api"])
+                about = FlightFile(str(flight["api"]), str(flight["kind"]), int(flight["pid"]))
+                found[Path(flight["run"])] = about
             else:  # not locked: the process of this flight was killed
                 path.unlink()
     return found
+
+
+def end_session(run: Path, limit: float) -> None:
+    """End the session in the folder `run`, and wait until it has written its report.
+
+    Raises:
+        TimedOutError: If the session has not ended within `limit` [s].
+    """
+    deadline = time.monotonic() + limit
+    if flight := flight_files().get(run):  # the file is locked, so `pid` is the supervisor
+        os.kill(flight.pid, signal.SIGTERM)
+    while run in flight_files():
+        if time.monotonic() > deadline:
+            raise TimedOutError(f"{run}: the session has not ended within {limit:g} s")
+        time.sleep(0.05)
 
 
 def _is_private(place: Path) -> bool:
@@ -154,17 +193,34 @@ class Child:
 
 
 class LocalRun:
-    """Runs and supervises the four processes of a flight; `notes` are sentences for its report."""
+    """Runs and supervises the four processes of a flight.
+
+    Attributes:
+        notes: Sentences for the report of the flight.
+        announcement: Keeps the flight file of a session, which the caller closes at its end.
+    """
 
     def __init__(
-        self, folder: Path, see: Callable[[list[Record]], None], *, api: bool = True
+        self,
+        folder: Path,
+        see: Callable[[list[Record]], None],
+        *,
+        api: bool = True,
+        session: Callable[[str, dict[str, str]], None] | None = None,
     ) -> None:
         """Prepare a run in `folder`, which contains config.yaml; start no process yet.
 
         The run adds world.mcap, cloud.mcap and four logs. `see` is called with the records that the
         processes print; `api` tells whether teleop serves the operator's API during the flight.
+
+        With `session`, teleop waits for missions instead of flying the experiment's, and stores
+        them in a journal. Every process serves metrics, and recordings contain the flights only.
+        `session` is called when everything is ready, with the address of the API, and the
+        addresses HOST:PORT of the metrics by the names of the processes.
         """
-        self._folder, self._see, self._api = folder, see, api
+        self._folder, self._see, self._api, self._session = folder, see, api, session
+        self._metrics: dict[str, str] = {}
+        self.announcement = contextlib.ExitStack()
         self._children: list[Child] = []
         self._selector = selectors.DefaultSelector()
         self.notes: tuple[str, ...] = ()
@@ -182,7 +238,9 @@ class LocalRun:
         # The folder is private, since it also holds this run's key.
         with tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder()) as sockets:
             url = f"unix:{sockets}/api.sock" if self._api else ""
-            with announced(self._folder, url) as is_announced:
+            with contextlib.ExitStack() as stack:
+                kind = SESSION if self._session else RUN
+                is_announced = stack.enter_context(announced(self._folder, url, kind))
                 if url and not is_announced:
                     self._see([Fault(0, "unannounced", UNANNOUNCED.format(url))])
                 key = Path(sockets, "key")
@@ -194,28 +252,40 @@ class LocalRun:
                     self._stop()
                     (self._folder / API_FILE).unlink(missing_ok=True)
                     shutil.rmtree(self._folder / LINK_FOLDER, ignore_errors=True)
+                    if self._session:
+                        self.announcement = stack.pop_all()
 
     def _fly(self, limit: float, sockets: Path, url: str) -> None:
-        folder, link = self._folder, self._folder / LINK_FOLDER
-        world, from_world, from_cloud, cloud = (f"127.0.0.1:{port}" for port in free_ports(4))
+        folder, link, session = self._folder, self._folder / LINK_FOLDER, self._session
+        places = [f"127.0.0.1:{port}" for port in free_ports(8 if session else 4)]
+        world, from_world, from_cloud, cloud = places[:4]
+        self._metrics = dict(zip(("world", "cloud", "teleop", "relay"), places[4:], strict=False))
         sides = {"world-side": from_world, "cloud-side": from_cloud, "world": world, "cloud": cloud}
         self._start("relay", "--fifo", **sides, link=link)
         record, key = folder / "world.mcap", sockets / "key"
         state = link / "uplink.json"
-        self._start("world", listen=world, peer=from_world, key=key, link=state, record=record)
+        flights = ("--record-flights",) if session else ()
+        ways = {"listen": world, "peer": from_world, "key": key, "link": state}
+        self._start("world", *flights, **ways, record=record)
         # Only this user can open the socket of the API: no token is needed.
         files = {"api-file": folder / API_FILE, "audit": folder / AUDIT_FILE}
-        self._start("teleop", "--start", socket=sockets, **({"api": url, **files} if url else {}))
+        given: dict[str, object] = {"api": url, **files} if url else {}
+        given |= {"journal": folder / JOURNAL_FILE} if session else {}
+        self._start("teleop", *(() if session else ("--start",)), socket=sockets, **given)
         self._wait_until_ready()
         record, state = folder / "cloud.mcap", link / "downlink.json"
         ways = {"listen": cloud, "peer": from_cloud, "key": key, "link": state}
-        self._start("cloud", **ways, record=record, teleop=sockets)
+        self._start("cloud", *flights, **ways, record=record, teleop=sockets)
         self._wait_until_ready()
+        if session:
+            session(url, self._metrics)
         self._watch(limit)
 
     def _start(self, name: str, *flags: str, **options: object) -> None:
         log = self._folder / f"{name}.log"
         options["config"] = self._folder / "config.yaml"
+        if name in self._metrics:
+            options["metrics"] = self._metrics[name]
         words = [*flags, *(f"--{option}={value}" for option, value in options.items())]
         with log.open("wb") as errors:
             process = subprocess.Popen(
@@ -275,7 +345,8 @@ class LocalRun:
     def _check_alive(self) -> None:
         for child in self._children:
             code = child.process.poll()
-            if code is None or (child.name == "teleop" and code == 0):
+            is_over = child.name == "teleop" and code == 0 and not self._session
+            if code is None or is_over:
                 continue
             how = f"signal {-code}" if code < 0 else f"exit code {code}"
             said = child.log.read_text(errors="replace").strip() or "it left no message"

@@ -194,8 +194,9 @@ def _last_mission(contents: Contents) -> tuple[int | None, int | None]:
             began, ended = stamp_ns, None
         elif event not in UNDER_WAY and ended is None:
             ended = stamp_ns
-        elif event in UNDER_WAY and began is None:
-            ended = None  # resumed by a new pod: the start is in the old pod's recording
+        elif event in UNDER_WAY and ended is not None:
+            # A later mission whose start is lost: keep all that is later than the earlier mission.
+            began, ended = ended + BEFORE_NS + 1, None
     return began, ended
 
 

@@ -21,7 +21,7 @@ def test_the_script_knows_commands_and_options(shell, capsys):
 @pytest.mark.parametrize(
     ("words", "found"),
     [
-        (["do"], ["doctor"]),
+        (["do"], ["down", "doctor"]),
         (["link", "show", "satel"], ["satellite"]),
         (["run", "--set", "cloud.controller.gain_p"], ["cloud.controller.gain_p="]),
         (["link", "set", "uplink.dela"], ["uplink.delay_ms="]),

@@ -4,13 +4,17 @@ import contextlib
 import json
 import socket
 import sys
+import threading
 
 import pytest
 
+from cloudrc.cli.client import Api
 from cloudrc.cli.main import main
 from cloudrc.drivers import local
 from tests.teleop.conftest import running
 
+ESTOP = ["mission", "estop"]
+STOP = "emergency stop: sent, and repeated until the rotors have stopped"
 SET = ["link", "set", "uplink.loss=0.1"]
 
 
@@ -35,7 +39,7 @@ def flying(folder):
 
 
 def test_an_emergency_stop_finds_the_run(tmp_path, elsewhere, capsys):
-    """./runs/latest comes first, then the only other run; of several others, --run names one."""
+    """The only run is used; of several runs, even with ./runs/latest, --run names one."""
     with flying(tmp_path / "a") as a:
         assert main(["mission", "estop"]) == 0
         assert capsys.readouterr().err == f"cloudrc: using the run in {tmp_path / 'a'}\n"
@@ -47,9 +51,55 @@ def test_an_emergency_stop_finds_the_run(tmp_path, elsewhere, capsys):
             assert (len(a.alarms), len(b.alarms)) == (1, 0)
             assert main(["mission", "estop", "--run", str(tmp_path / "b")]) == 0
             with flying(elsewhere / "runs" / "latest") as here:
-                assert main(["mission", "estop"]) == 0
-                assert (len(a.alarms), len(b.alarms), len(here.alarms)) == (1, 1, 1)
-                assert capsys.readouterr().err == ""
+                assert main(["mission", "estop"]) == 2
+                assert "--run runs/latest" in capsys.readouterr().err
+                assert (len(a.alarms), len(b.alarms), len(here.alarms)) == (1, 1, 0)
+    with flying(elsewhere / "runs" / "one"):
+        (elsewhere / "runs" / "latest").rmdir()
+        (elsewhere / "runs" / "latest").symlink_to("one")
+        assert main(["mission", "estop"]) == 0
+        assert capsys.readouterr() == (f"runs/one: {STOP}\n", "")
+
+
+def test_no_command_steers_another_flight_after_yours_has_ended(tmp_path, elsewhere, capsys):
+    def said(code, *words):
+        assert main(list(words)) == code
+        return capsys.readouterr().err
+
+    latest = elsewhere / "runs" / "latest"
+    latest.mkdir(parents=True)
+    (latest / "relay.log").touch()
+    for words in (["mission", "hold"], ["mission", "run", "pipes"], SET):
+        assert "runs/latest has ended; name another flight: --release" in said(2, *words)
+    assert "no cluster is configured" in said(3, "mission", "list"), "it may read in a cluster"
+    assert "no cluster is configured" in said(3, "mission", "hold", "--release", "other")
+    with flying(tmp_path / "a") as api:
+        assert f"has ended; name another flight: --run {tmp_path}/a; " in said(2, *ESTOP)
+        assert api.alarms == []
+        assert said(0, "mission", "list") == f"cloudrc: using the run in {tmp_path / 'a'}\n"
+        assert said(0, *ESTOP, "--run", str(tmp_path / "a")) == ""
+        (latest / "relay.log").unlink()  # as after a run in virtual time, which nobody steers
+        assert said(0, *ESTOP) == f"cloudrc: using the run in {tmp_path / 'a'}\n"
+        assert len(api.alarms) == 2
+
+
+def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, capsys):
+    with flying(elsewhere / "runs" / "latest") as served:
+        api, far = Api(served.url), {"name": "far", "waypoints": [{"position_m": [0.5, -2.0, 1.0]}]}
+        api.post("/v1/missions", far)
+        served.until(lambda: api.get("/v1/state")["mission"]["state"] == "flying")
+        for words, does in (
+            ("hold", "holding at ("),
+            ("goto 0.5 -1 1.2", "flying to (0.5, -1, 1.2); mission m1 (far): held"),
+            ("resume", "flying to waypoint 1 of 1; mission m1 (far): flying"),
+            ("cancel", "holding at ("),
+            ("acknowledge", "acknowledged: the next mission may fly"),
+            ("run pipes", "mission m2: starting, waypoints: 7"),
+        ):
+            if words.startswith("run"):
+                threading.Timer(0.5, lambda: api.post("/v1/missions/m2/cancel")).start()
+            assert main(["mission", *words.split()]) in (0, 130)
+            assert capsys.readouterr().out.startswith(f"runs/latest: {does}"), words
 
 
 def test_no_request_goes_to_a_server_that_a_folder_names(elsewhere, capsys):

@@ -52,14 +52,17 @@ def test_run_prints_the_log_of_its_job_and_ends_with_the_verdict(running, capsys
     assert main(["mission", "run", "one.yaml"]) == code
     head, *lines = capsys.readouterr().out.splitlines()
     assert head.startswith("Job ")
-    assert head.endswith(" in namespace 'demo'")
+    assert head.endswith(" on release 'cloudrc' in namespace 'demo'")
     assert lines == ["waypoint 1 of 1 reached", VERDICT[code]]
 
 
 def test_the_other_verbs_go_to_the_api_of_the_release(running, teleop, capsys):
     assert main(["mission", "list", "-o", "json"]) == 0
-    assert json.loads(capsys.readouterr().out)["missions"] == []
+    out, err = capsys.readouterr()
+    assert json.loads(out)["missions"] == []
+    assert err == "cloudrc: using release 'cloudrc' in namespace 'demo'\n"
     assert main(["mission", "acknowledge"]) == 0
+    assert capsys.readouterr().out.startswith("release 'cloudrc' in namespace 'demo': acknowledged")
     assert teleop.posted == ["/v1/acknowledge"]
     assert teleop.tokens == {f"Bearer {TOKEN}"}
     running.objects.pop(("secrets", "cloudrc-tokens"))

@@ -91,6 +91,11 @@ def wait_until_flying(run):
             break
     else:
         raise AssertionError(run.stderr.read())
+    return processes_of(run)
+
+
+def processes_of(run):
+    """Return the ids of a run's processes by role."""
     found = {}
     for children in Path(f"/proc/{run.pid}/task").glob("*/children"):
         for pid in children.read_text().split():

@@ -9,7 +9,7 @@ from cloudrc import records as rec
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.hash import messages_sha256
-from cloudrc.record.merge import clock_offset, merge, world_time_ns
+from cloudrc.record.merge import clock_offset, cut_to_last_mission, merge, world_time_ns
 from cloudrc.record.reader import read_contents
 from cloudrc.record.writer import McapWriter
 from tests.record.conftest import MS, SECOND, assert_equal, cloud_records, world_records, write
@@ -168,3 +168,27 @@ def test_the_wall_time_of_the_start_is_kept(tmp_path):
     metadata = read_contents(target).metadata
     assert metadata["started"] == "2026-07-25T17:20:08.995+00:00", "by the packets"
     assert metadata["wall_clock_offset_ns"] == str(day_ns)
+
+
+MISSIONS = [("started", 1), ("reached", 2), ("done", 3)]
+MISSIONS += [(event, 10 * at) for event, at in MISSIONS]
+LATER = rec.Counted(40 * SECOND, "cloud", "", 0)
+
+
+@pytest.mark.parametrize(
+    ("lost", "kept"),
+    [
+        ((), [10, 20, 30]),
+        ((3,), [20, 30]),  # not the earlier mission
+        ((0, 3), [20, 30]),
+        ((5,), [10, 20]),
+        ((3, 4), [1, 2, 3]),  # a mission that was cancelled before it started has not flown
+    ],
+)
+def test_the_last_mission_is_kept_even_if_its_start_is_lost(tmp_path, lost, kept):
+    rows = [row for n, row in enumerate(MISSIONS) if n not in lost]
+    events = [rec.MissionEvent(at * SECOND, event, 0, "") for event, at in rows]
+    mission = read_contents(write(tmp_path / "m.mcap", [*events, LATER]))
+    assert cut_to_last_mission(mission) is (lost != (5,))
+    stamps = mission.recording()["/mission"]["stamp_ns"] // SECOND
+    assert stamps.tolist() == kept

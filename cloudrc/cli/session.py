@@ -1,0 +1,188 @@
+"""`cloudrc up` and `cloudrc down`: a session, in which missions fly one after the other.
+
+A session consists of the processes of a local run. It has no mission of its own: the robot waits on
+the ground for the commands of an operator. The recordings of world and cloud contain all flights of
+the session; `mission.mcap` and the report contain the last mission.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager, suppress
+from pathlib import Path
+from threading import Thread
+from typing import TYPE_CHECKING
+
+from cloudrc.cli.extras import MODES, require
+from cloudrc.cli.find_run import run_argument, short
+from cloudrc.cli.output import escape, print_line
+from cloudrc.cli.pool import interrupt_on_signals
+from cloudrc.cli.processes import Command
+from cloudrc.cli.run import experiment_arguments, fly_once
+from cloudrc.errors import BadInputError, MissingPrerequisiteError, NothingFlownError
+
+if TYPE_CHECKING:
+    from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.record.reader import Contents
+
+Say = Callable[[str], None]
+"""Function that prints a line beside the progress of a flight."""
+DOWN_LIMIT = 120.0
+"""Time limit for a session to end and to write its report [s]."""
+CONSOLE_LIMIT = 2.0
+"""Time limit for the console to end after SIGTERM [s]; then it is killed."""
+NEXT = """\
+in another terminal:
+  cloudrc mission run pipes
+  cloudrc mission goto 0.5 0 1.2
+  cloudrc link set --profile paper-p3
+to end: Ctrl-C here, or cloudrc down"""
+UP_EPILOG = """\
+examples:
+  cloudrc up
+  cloudrc up hover --set link.profile=wifi
+  cloudrc up --console
+
+The session takes robot, controller and link from EXPERIMENT. The robot waits on
+the ground until 'cloudrc mission run' or 'cloudrc mission goto' lets it fly. At
+the end, the session writes the report of the last mission. The exit code is 0;
+6 or 4 if a process has died or hung in flight."""
+DOWN_EPILOG = """\
+'down' waits until the session has ended, and prints the path of its report. It
+does not end a flight of 'cloudrc run'; that flight ends with its mission."""
+
+
+def _up_arguments(parser: argparse.ArgumentParser) -> None:
+    experiment_arguments(parser, parser)
+    parser.add_argument("--console", action="store_true", help="also open the console's page")
+    parser.set_defaults(output="table")
+
+
+def _up(options: argparse.Namespace) -> int:
+    """Start a session, and keep it until a signal; return 0 after a regular end."""
+
+    def ready(
+        folder: Path, say: Say, stack: ExitStack, api: str, metrics: Mapping[str, str]
+    ) -> None:
+        ports = ", ".join(f"{name} :{at.rpartition(':')[2]}" for name, at in metrics.items())
+        say("the robot waits on the ground")
+        say(escape(f"  folder   {short(folder.resolve())}"))
+        say(escape(f"  API      {api}"))
+        say(f"  metrics  http://127.0.0.1:PORT/metrics ({ports})")
+        say(NEXT)
+        if options.console:
+            stack.enter_context(_console(folder, say))
+
+    interrupt_on_signals()
+    require("a session", (*MODES["local"], "api"))
+    try:
+        return fly_once(options, "local", ready)
+    except NothingFlownError as nothing:
+        print_line(str(nothing))
+        return 0
+
+
+@contextmanager
+def _console(folder: Path, say: Say) -> Iterator[None]:
+    """Run `cloudrc console` while the block runs; `say` gets its address, or why there is none."""
+    from cloudrc.drivers.machine import interpreter
+
+    process = subprocess.Popen(
+        interpreter("-m", "cloudrc", "console", str(folder)),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        start_new_session=True,  # Ctrl-C reaches only this process, which ends the console
+    )
+
+    def read() -> None:
+        assert process.stdout is not None
+        with process.stdout as lines:
+            for line in lines:
+                if line.startswith(("console:", "cloudrc:")):
+                    say(escape(line.rstrip()))
+
+    reader = Thread(target=read, daemon=True)
+    reader.start()
+    try:
+        yield
+    finally:
+        process.terminate()
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(CONSOLE_LIMIT)
+        process.kill()
+        process.wait()
+        reader.join(CONSOLE_LIMIT)
+
+
+def read_last_mission(folder: Path) -> tuple[Contents, ResolvedExperiment, bool]:
+    """Read the last mission of a session that has ended, and write it to config.yaml.
+
+    Returns:
+        The recording of this mission, the experiment that flies it, and whether the session ended
+        before the mission.
+
+    Raises:
+        NothingFlownError: If no mission flew.
+    """
+    from cloudrc.assembly import with_order
+    from cloudrc.config.load import dump, read_experiment
+    from cloudrc.drivers.local import JOURNAL_FILE
+    from cloudrc.record.merge import cut_to_last_mission, merge
+    from cloudrc.teleop.store import open_store
+
+    with closing(open_store(folder / JOURNAL_FILE, b"")) as store:
+        flown = [each for each in store.missions.values() if "started" in each.happened]
+    if not flown:
+        raise NothingFlownError(f"{folder}: no mission flew, so there is no report")
+    last, config = flown[-1], folder / "config.yaml"
+    about = f"Mission {last.id} ({last.order.name}), the last one of a session"
+    experiment = with_order(read_experiment(config), last.order, about)
+    config.write_text(dump(experiment), encoding="utf-8")
+    recording = merge(folder / "world.mcap", folder / "cloud.mcap")
+    cut_to_last_mission(recording)
+    return recording, experiment, not last.ended
+
+
+def restore_mission(folder: Path) -> None:
+    """Write mission.mcap of a session that was killed before it did so."""
+    from cloudrc.drivers.local import JOURNAL_FILE, under_way
+    from cloudrc.report.write import attachments
+
+    if (folder / JOURNAL_FILE).is_file() and not (folder / "mission.mcap").exists():
+        if folder.resolve() in under_way():
+            raise BadInputError(f"{folder}: the session has not ended; end it: cloudrc down")
+        recording, _, _ = read_last_mission(folder)
+        recording.write(folder / "mission.mcap", attachments(folder))
+
+
+def _down(options: argparse.Namespace) -> int:
+    """End a session, and print the path of its report."""
+    from cloudrc.drivers.local import SESSION, end_session, flight_files
+
+    flights = flight_files()
+    found = [run for run, flight in flights.items() if flight.kind == SESSION]
+    others = [short(run) for run in flights if run not in found]
+    note = f"; {' and '.join(others)}: flown by 'cloudrc run', ends by Ctrl-C there" * bool(others)
+    if options.run is not None:
+        found = [run for run in found if run == options.run.resolve()]
+        if not found:
+            raise BadInputError(f"--run {options.run}: no session runs there{note}")
+    if not found:
+        raise MissingPrerequisiteError(f"no session runs here; start one: cloudrc up{note}")
+    if len(found) > 1:
+        names = " or ".join(f"--run {short(run)}" for run in found)
+        raise BadInputError(f"{len(found)} sessions run here; choose one: {names}")
+    (run,) = found
+    end_session(run, DOWN_LIMIT)
+    flew = (run / "report.json").exists()
+    print_line(short(run / "report.html") if flew else f"{short(run)}: ended; no mission flew")
+    return 0
+
+
+up = Command(_up_arguments, _up, UP_EPILOG)
+down = Command(run_argument, _down, DOWN_EPILOG)

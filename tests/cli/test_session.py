@@ -1,0 +1,168 @@
+"""`cloudrc up` and `cloudrc down`: a session flies missions, is steered, ends, and is reported."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from cloudrc import assembly
+from cloudrc.cli import session
+from cloudrc.cli.main import main
+from cloudrc.config.load import load_experiment, read_experiment
+from cloudrc.drivers import local
+from cloudrc.drivers.machine import usable_cores
+from cloudrc.record.columns import Recording
+from cloudrc.teleop.store import Order
+from tests.drivers.conftest import FAST, processes_of
+
+RUN = ["--run", "s"]
+
+
+@pytest.mark.parametrize("name", ["paper", "fast"])
+def test_a_flown_order_becomes_the_mission_of_the_report(name):
+    experiment = load_experiment(name)
+    plan = assembly.mission_plan(experiment.mission, 33.0)
+    flown = assembly.with_order(load_experiment("hover"), Order(plan, contact=True), "")
+    assert assembly.mission_plan(flown.mission, flown.criteria.time_limit_s) == plan
+    assert (flown.criteria.contact, flown.name) == (True, "hover")
+
+
+def test_down_ends_sessions_only_and_asks_which(folder, capsys):
+    def said(code, *words):
+        assert main(["down", *words]) == code
+        return capsys.readouterr().err
+
+    assert "no session runs here; start one: cloudrc up\n" in said(3)
+    with local.announced(folder / "r"):
+        assert "r: flown by 'cloudrc run', ends by Ctrl-C there" in said(3)
+        assert "--run r: no session runs there; r: flown by" in said(2, "--run", "r")
+        with (
+            local.announced(folder / "a", "", "session"),
+            local.announced(folder / "b", "", "session"),
+        ):
+            assert "2 sessions run here; choose one: --run" in said(2)
+
+
+@pytest.mark.process
+def test_a_console_is_shown_and_a_missing_one_is_explained(folder, monkeypatch):
+    def console(code):
+        monkeypatch.setattr("cloudrc.drivers.machine.interpreter", lambda *words: [*PYTHON, code])
+        said = []
+        with session._console(folder, said.append):
+            until(lambda: said)
+        return said
+
+    sleeps = "import time; print('console: http://127.0.0.1:1', flush=True); time.sleep(60)"
+    began = time.monotonic()
+    assert console(sleeps) == ["console: http://127.0.0.1:1"]
+    assert time.monotonic() - began < 10.0, "the console ends with the session"
+    absent = "cloudrc: error: a console needs viser; run: pip install it"
+    assert console(f"raise SystemExit({absent!r})") == [absent]
+
+
+PYTHON = [sys.executable, "-c"]
+
+
+def until(condition, limit=90.0):
+    deadline = time.monotonic() + limit
+    while not condition():
+        assert time.monotonic() < deadline, "not in time"
+        time.sleep(0.05)
+
+
+def call(*words, code=0):
+    done = subprocess.run([*FAST, *words], capture_output=True, text=True)
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@contextmanager
+def up(folder, *words):
+    """Start a session in the folder `s`; yield its process once the robot waits for missions."""
+    with (folder / "said").open("w") as said:
+        process = subprocess.Popen(
+            [*FAST, "up", "hover", "--out", "s", *words], stdout=said, stderr=said
+        )
+    try:
+        until(lambda: "to end: Ctrl-C here, or cloudrc down" in (folder / "said").read_text())
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.process
+def test_a_session_flies_missions_and_reports_the_last_one(folder, figure):
+    began = time.monotonic()
+    with up(folder) as process:
+        busy = max(1.0, os.getloadavg()[0] / usable_cores())  # tests may share the machine
+        figure("session: address after", (time.monotonic() - began) / busy, "<=", 5.0, "s")
+        said = (folder / "said").read_text()
+        ports = re.findall(r"(\w+) :(\d+)", said)
+        assert [name for name, _ in ports] == ["world", "cloud", "teleop", "relay"]
+        for _, port in ports:
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as page:
+                assert b"cloudrc_build_info" in page.read()
+        assert "guard GROUND" in call("mission", "status", *RUN)
+        (folder / "m.yaml").write_text("waypoints: [{position_m: [0.2, 0, 0.6]}]")
+        assert "SUCCESS" in call("mission", "run", "m.yaml", *RUN)
+        assert "s: flying to (0.5, 0, 1.2); mission m2" in call(
+            "mission", "goto", "0.5", "0", "1.2"
+        )
+        until(lambda: "done" in call("mission", "list", *RUN).splitlines()[-1])
+        assert "s: in force after" in call("link", "set", "downlink.delay_ms=60")
+        until(lambda: "link: downlink 60 " in (folder / "said").read_text())
+        assert call("down") == "s/report.html\n"
+        assert process.wait(10) == 0
+    said = (folder / "said").read_text()
+    assert said.splitlines()[-1] == "s/report.html"
+    document = json.loads((folder / "s/report.json").read_text())
+    assert (document["verdict"], document["numbers"]["waypoints_reached"]["value"]) == (
+        "success",
+        1,
+    )
+    flown = read_experiment(folder / "s/config.yaml")
+    assert flown.description == "Mission m2 (goto), the last one of a session"
+    assert flown.mission.waypoints[0].position_m == (0.5, 0.0, 1.2)
+    assert len(Recording.read(folder / "s/mission.mcap")["/mission"]["event"]) == 3
+    assert list(Recording.read(folder / "s/cloud.mcap")["/mission"]["event"]).count("done") == 2
+    assert local.under_way() == {}
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(("victim", "code"), [("cloud", 6), ("", -signal.SIGKILL)])
+def test_a_session_that_dies_in_flight_can_be_reported(folder, victim, code):
+    with up(folder) as process:
+        call("mission", "goto", "0.5", "0", "1.2")
+        until(lambda: "mission started" in (folder / "said").read_text())
+        time.sleep(1.0)
+        pids = processes_of(process)
+        os.kill(pids[victim] if victim else process.pid, signal.SIGKILL)
+        assert process.wait(60) == code
+        until(lambda: local.under_way() == {})
+        until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids.values()))
+    if victim:
+        assert "the cloud process died in flight (signal 9)" in (folder / "said").read_text()
+    call("report", "s", code=130 if victim else 1)  # interrupted, or without an end
+    document = json.loads((folder / "s/report.json").read_text())
+    assert document["numbers"]["commands_applied"]["value"] > 10
+    (waypoint,) = read_experiment(folder / "s/config.yaml").mission.waypoints
+    assert waypoint.position_m == (0.5, 0.0, 1.2)
+
+
+@pytest.mark.process
+def test_a_session_without_a_mission_has_no_report(folder):
+    with up(folder) as process:
+        assert "s: the session has not ended; end it: cloudrc down" in call("report", "s", code=2)
+        assert call("down") == "s: ended; no mission flew\n"
+        assert process.wait(10) == 0
+    assert "s: no mission flew, so there is no report" in (folder / "said").read_text()
+    assert "no mission flew, so there is no report" in call("report", "s", code=2)
