@@ -17,6 +17,7 @@ GROUPS: dict[str, dict[str, str]] = {
     "fly": {
         "run": "fly an experiment and write its report",
         "mission": "start, steer and stop missions, here or in a cluster",
+        "console": "show a flight in the browser, and steer it there",
         "sweep": "fly a grid of settings with several seeds, on all cores",
         "report": "write the report of a recorded run again",
         "identify": "fit the model of the velocity loop to a recorded flight",
