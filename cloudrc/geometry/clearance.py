@@ -23,6 +23,9 @@ ARM_LENGTH, ARM_HEIGHT, ARM_RADIUS = 0.40, 0.17, 0.01
 ROTOR_ARM, ROTOR_HEIGHT, ROTOR_RADIUS, ROTOR_HALF_THICKNESS = 0.21, 0.05, 0.128, 0.0025
 ROD_RADIUS, ROD_BOTTOM, ROD_TOP = 0.05, 0.06, 0.18
 
+CLEARANCE_SHOWN = 0.40
+"""Upper end of the colour scale in figures and scenes [m]; inside a pipe no clearance is larger."""
+
 _CHUNK = 100  # poses per batch: 100 x 225 points fit in the processor's cache
 _STRIDE = 32  # distance of the first poses that `least_clearance` looks at
 _ROUNDING = 1e-9  # more than the rounding errors of a bound [m]

@@ -15,6 +15,7 @@ from cloudrc.geometry.clearance import (
     ARM_HEIGHT,
     ARM_LENGTH,
     ARM_RADIUS,
+    CLEARANCE_SHOWN,
     Spheres,
     pipe_index,
     place_points,
@@ -24,8 +25,6 @@ from cloudrc.metrics.flight import Array
 from cloudrc.metrics.mission import first_touch
 from cloudrc.report.figures.style import BLACK, BORE, GREY, VERMILION, Subject, new_figure, panel
 
-CLEARANCE_SHOWN = 0.40
-"""Upper end of the colour scale [m]; the clearance inside a pipe is never larger."""
 CEILING = 2 * CLEARANCE_SHOWN
 """Upper end of the clearance axis in panel (c) [m]."""
 ALT = "The flown path from above and from the side through the pipes, coloured by clearance."
