@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import io
 import secrets
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 from cloudrc.cli.client import UNIX, Api
 from cloudrc.cli.extras import require
@@ -49,16 +50,18 @@ def execute(options: argparse.Namespace) -> int:
     found = find_local_run(options, lambda run, api: (run, api), "no run flies there")
     if found is None:
         raise BadInputError("no run flies here; start one: cloudrc run --mode local")
-    run, url = found[0].resolve(), found[1]
+    (run, url), out = found, sys.stdout
+    run = run.resolve()
     if not url:
         raise BadInputError(f"{run} flies without an API; the console needs one")
     with ExitStack() as opened:
-        _serve(options.port, run, url, opened)
+        opened.enter_context(redirect_stdout(io.StringIO()))  # viser prints about itself
+        _serve(options.port, run, url, opened, out)
     print_line("the flight has ended", sys.stderr)
     return 0
 
 
-def _serve(port: int, run: Path, url: str, opened: ExitStack) -> None:
+def _serve(port: int, run: Path, url: str, opened: ExitStack, out: TextIO) -> None:
     from cloudrc.console.page import Page
 
     page = Page(port)
@@ -67,7 +70,7 @@ def _serve(port: int, run: Path, url: str, opened: ExitStack) -> None:
 
     tap = TapListener(Path(url.removeprefix(UNIX)).with_name(TAP_FILE), page.url)
     opened.callback(tap.close)
-    print_line(f"console: {page.url}")
+    print_line(f"console: {page.url}", out)
     from cloudrc.config.load import read_experiment
     from cloudrc.console.feed import FlightFeed
     from cloudrc.console.steering import Steering
@@ -101,7 +104,7 @@ def _local_link(run: Path) -> Link:
     folder = run / LINK_FOLDER
 
     def read() -> dict[str, float]:
-        found = {}
+        found: dict[str, float] = {}
         for state in read_states(folder):
             delay, jitter, loss = (state.asked.get(k) or 0.0 for k in ("delay", "jitter", "loss"))
             values = {"delay_ms": delay * 1e3, "jitter_ms": jitter * 1e3, "loss": loss}

@@ -51,6 +51,7 @@ class FlightFeed:
         control: The newest control period; None while cloud does not control the robot.
         fault: Text of the newest fault; "" before the first.
         samples: Points of the charts, oldest first.
+        flown: Number of points that the trail has had so far.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -60,6 +61,7 @@ class FlightFeed:
         self.control: Control | None = None
         self.fault = ""
         self.samples: deque[Sample] = deque()
+        self.flown = 0
         self._heard = self._controlled = -inf
         self._uplink = self._downlink = self._rtt = nan
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL_MAX)  # position and clearance
@@ -85,18 +87,18 @@ class FlightFeed:
             self.samples.popleft()
 
     def silence(self, now: float) -> float:
-        """Return the time since the newest telemetry reached cloud [s]; infinite before."""
+        """Return the time from the newest telemetry to `now` [s]; infinite before the first."""
         return now - self._heard
 
     def command_age(self, now: float) -> float:
-        """Return the age of the command that the robot has applied last [s]; infinite if none."""
+        """Return the age at `now` [s] of the command that the robot applied last; infinite if none."""
         told = self.telemetry
         if told is None or told.echo_stamp_ns == NEVER_NS:
             return inf
         return told.echo_hold_ns * 1e-9 + self.silence(now)
 
     def controls(self, now: float) -> bool:
-        """Return whether cloud controls the robot now."""
+        """Return whether cloud controls the robot at `now` [s]."""
         return now - self._controlled < STALE
 
     def trail(self) -> tuple[Array, Array]:
@@ -127,6 +129,7 @@ class FlightFeed:
         if not self._trail or dist(position, self._trail[-1][:3]) > TRAIL_STEP:
             near = clearance(self._scene, [position], [telemetry.odometry.orientation_wxyz])
             self._trail.append((*position, float(near[0])))
+            self.flown += 1
         return True
 
     def _sample(self, now: float) -> Sample:

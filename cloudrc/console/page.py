@@ -19,20 +19,23 @@ from cloudrc.config.load import ResolvedExperiment
 from cloudrc.console.feed import STALE, FlightFeed
 from cloudrc.console.steering import Steering
 from cloudrc.geometry import fence
-from cloudrc.messages import GuardState, Vector
+from cloudrc.messages import GuardState, Quaternion, Vector
 
 CHART_PERIOD, TRAIL_PERIOD, TEXT_PERIOD = 0.2, 0.5, 0.25
 """Times between two updates of the charts, the trail and the texts [s]."""
+ANSWER_SHOWN = 10.0
+"""Time for which a refusal is shown [s]; another answer is shown for half of it."""
 PANEL_WIDTH = 330
 """Width of each panel beside the scene [px]."""
 BLUE, RED, GREEN = "#0072b2", "#d55e00", "#009e73"
-CHARTS: dict[str, tuple[float, dict[str, tuple[int, str]]]] = {
-    "Delay [ms]": (1e3, {"up": (1, BLUE), "down": (2, RED), "estimate": (3, GREEN)}),
-    "Tracking error [m]": (1.0, {"setpoint - measured": (4, BLUE)}),
-    "Prediction error [mm]": (1e3, {"predicted - measured": (5, BLUE)}),
-    "Speed [m/s]": (1.0, {"speed": (6, BLUE)}),
+CHARTS: dict[str, tuple[float, float, dict[str, tuple[int, str]]]] = {
+    "Delay [ms]": (1e3, 150, {"up": (1, BLUE), "down": (2, RED), "estimate": (3, GREEN)}),
+    "Tracking error [m]": (1.0, 0.2, {"error": (4, BLUE)}),
+    "Prediction error [mm]": (1e3, 20, {"error": (5, BLUE)}),
+    "Speed [m/s]": (1.0, 0.5, {"speed": (6, BLUE)}),
 }
-"""Title of a chart -> factor from SI units, and its curves: name -> place in `Sample`, colour."""
+"""Title of a chart -> factor from SI units, smallest range of its axis, and its curves: name ->
+place in `Sample`, and colour."""
 LINK: dict[str, tuple[str, float, float, float]] = {
     "delay_ms": ("delay [ms]", 500.0, 1.0, 1.0),
     "jitter_ms": ("jitter [ms]", 100.0, 1.0, 1.0),
@@ -52,7 +55,8 @@ KEYS: dict[str, tuple[str, Vector]] = {
 STOP, HOLD = "STOP", "Hold"
 SCRIPT = """
 const drive = %s;
-const find = text => [...document.querySelectorAll('button')].find(b => b.textContent.trim() === text);
+const find = text =>
+  [...document.querySelectorAll('button')].find(b => b.textContent.trim() === text);
 const press = (kind, code) => find(drive[code])?.dispatchEvent(
   new PointerEvent(kind, {bubbles: true, button: 0, pointerId: 9}));
 const held = new Set();
@@ -76,9 +80,11 @@ if (!window.cloudrc) {
   window.addEventListener('blur', () => [...held].forEach(release));
 }"""
 STYLE = """
-button[style*='red-filled'] {height: 60px !important; font-size: 24px; letter-spacing: 3px}
+button[style*='red-filled'] {height: 60px !important; font-size: 24px; letter-spacing: 3px;
+  background: #c4140c !important}
 div:has(> button[style*='red-filled']) {position: sticky; top: 0; z-index: 9}
-div:has(> button[style*='gray-filled']) {display: inline-block; width: 31%; margin: 0 1%}
+div:has(> button[style*='gray-filled']) {display: inline-block; width: 33.3%;
+  margin: 0 !important; padding: 0 6px 6px !important}
 """
 
 
@@ -99,7 +105,8 @@ class Page:
         self._due = dict.fromkeys(("charts", "trail", "texts"), 0.0)
         self._touched = -inf  # when somebody last moved a slider [s]
         self._sliders: dict[str, Any] = {}
-        self._shown: tuple[Any, ...] = ()
+        self._shown: tuple[Any, ...] = ()  # waypoints
+        self._drawn = 0  # points of the trail
 
     def fill(self, experiment: ResolvedExperiment, feed: FlightFeed, steering: Steering) -> None:
         """Build the scene and the panels, and give the controls to the first browser."""
@@ -125,20 +132,22 @@ class Page:
         with self._server.atomic():
             if feed.telemetry is not None:
                 odometry = feed.telemetry.odometry
-                scene.set_robot(odometry.position, odometry.orientation_wxyz)
+                scene.set_robot(*_visible(odometry.position, odometry.orientation_wxyz))
             control = feed.control if feed.controls(now) else None
             if control is None:
                 scene.set_ghost(None, None)
             else:
-                scene.set_ghost(control.position, control.orientation_wxyz)
+                scene.set_ghost(*_visible(control.position, control.orientation_wxyz))
             scene.set_setpoint(control.setpoint if control else None)
         if self._is_due("charts", CHART_PERIOD, now):
             columns = feed.columns()
-            for chart, (factor, curves) in zip(self._charts, CHARTS.values(), strict=True):
+            for chart, (factor, _, curves) in zip(self._charts, CHARTS.values(), strict=True):
                 rows = [columns[place] * factor for place, _ in curves.values()]
                 chart.data = (columns[0], *rows)
         if self._is_due("trail", TRAIL_PERIOD, now):
-            scene.set_trail(*feed.trail())
+            if feed.flown != self._drawn:
+                self._drawn = feed.flown
+                scene.set_trail(*feed.trail())
             self._show_route()
         if self._is_due("texts", TEXT_PERIOD, now):
             self._status.content = self._describe(now)
@@ -155,19 +164,19 @@ class Page:
         return True
 
     def _add_chart(self, title: str) -> Any:
-        _, curves = CHARTS[title]
-        empty = np.zeros(1)
+        _, span, curves = CHARTS[title]
+        lines: list[Any] = [
+            {"label": name, "stroke": colour, "width": 1.5} for name, (_, colour) in curves.items()
+        ]
+        low, high = {"hard": 0, "pad": 0}, {"soft": span, "mode": 1, "pad": 0.1}
         return self._server.gui.add_uplot(
-            (empty,) * (1 + len(curves)),
-            (
-                {"label": "s"},
-                *({"label": name, "stroke": colour, "width": 1.5}
-                  for name, (_, colour) in curves.items()),
-            ),
+            (np.zeros(1),) * (1 + len(curves)),
+            ({"label": "s"}, *lines),
             title=title,
-            scales={"x": {"time": False}},
-            height=125,
-        )  # fmt: skip
+            scales={"x": {"time": False}, "y": {"range": {"min": low, "max": high}}},
+            legend={"show": len(curves) > 1, "live": False},
+            height=130 if len(curves) > 1 else 150,
+        )
 
     def _show_route(self) -> None:
         mission = self._steering.state.get("mission")
@@ -198,8 +207,8 @@ class Page:
         ]
         if silence > STALE:
             lines[0] = f"**No telemetry for {silence:.1f} s**, last: {lines[0]}"
-        text, is_refusal = self._steering.answer
-        if text:
+        text, is_refusal, at = self._steering.answer
+        if now - at < (ANSWER_SHOWN if is_refusal else ANSWER_SHOWN / 2):
             lines.append(f"**Refused** {text}" if is_refusal else text)
         elif seen := state.get("seen"):
             lines.append(seen["next_step"])
@@ -268,22 +277,25 @@ class Page:
         names = list(acts)
         for label, some in (("Mission", names[:3]), (" ", names[3:])):
             group = gui.add_button_group(label, some)
-            group.on_click(lambda event: acts[event.target.value]())
+
+            @group.on_click
+            def _(event: Any) -> None:
+                acts[event.target.value]()
 
     def _start_mission(self) -> None:
         experiment, mission = self._experiment, self._experiment.mission
         if mission.steps is not None:
             text = "start: random steps are for 'cloudrc run'; send waypoints instead"
-            self._steering.answer = text, True
-            return
+            return self._steering.say(text, is_refusal=True)
         order = mission.model_dump(mode="json", exclude={"steps"}, exclude_none=True)
         self._steering.ask("starting", "/v1/missions", {**order, "name": experiment.name})
+        return None
 
     def _add_target(self, client: viser.ClientHandle) -> None:
         """Add the gizmo and the numbers of the next waypoint, which follow each other."""
         feed, low, high = self._feed, fence.INNER_LOW, fence.INNER_HIGH
         at = feed.telemetry.odometry.position if feed.telemetry else self._experiment_spawn()
-        start = tuple(round(float(v), 2) for v in np.clip(np.add(at, (0, 0, 0.6)), low, high))
+        start = np.round(np.clip(np.add(at, (0.0, 0.0, 0.6)), low, high), 2)
         limits = tuple(zip(low, high, strict=True))
         gizmo = client.scene.add_transform_controls(
             "/target",
@@ -293,19 +305,22 @@ class Page:
             depth_test=False,
             position=start,
         )
-        numbers = client.gui.add_vector3("Target [m]", start, min=low, max=high, step=0.01)
+        numbers: Any = client.gui.add_vector3("Target [m]", start, min=low, max=high, step=0.01)
         send = client.gui.add_button("Send", hint="Fly to the target; a mission is held first")
 
         @gizmo.on_update
         def _(_: object) -> None:
-            numbers.value = tuple(np.round(gizmo.position, 2))
+            x, y, z = map(float, np.round(gizmo.position, 2))
+            numbers.value = (x, y, z)
 
         @numbers.on_update
         def _(event: Any) -> None:
             if event.client is not None:  # somebody has typed
                 gizmo.position = numbers.value
 
-        send.on_click(lambda _: self._steering.go_to(tuple(gizmo.position)))
+        @send.on_click
+        def _(_: object) -> None:
+            self._steering.go_to(numbers.value)
 
     def _experiment_spawn(self) -> Vector:
         from cloudrc.geometry.scene import load_scene
@@ -340,3 +355,8 @@ class Page:
                     if event.client is not None:
                         self._touched = time.monotonic()
                         self._steering.set_link(key, event.target.value / factor)
+
+
+def _visible(position: Vector, orientation_wxyz: Quaternion) -> tuple[Any, Any]:
+    """Round a pose to what is visible, so that a robot at rest costs the browser no drawing."""
+    return np.round(position, 3), np.round(orientation_wxyz, 3)

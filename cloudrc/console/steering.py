@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from typing import Any, Protocol
 
 from cloudrc.errors import CloudrcError
@@ -55,7 +56,7 @@ class Steering:
     Attributes:
         api: Makes no connection that stays open, so that several threads may use it.
         link: The way to the emulated link.
-        answer: Newest result, in words, and whether it is a refusal.
+        answer: Newest result in words, whether it is a refusal, and its time [s].
         state: Newest answer of the API's `GET /v1/state`; {} before the first.
         route: Waypoints of the mission under way [m], shape (n, 3); empty if none.
         conditions: Values that `Link.read` has returned last.
@@ -63,7 +64,7 @@ class Steering:
 
     api: Api
     link: Link
-    answer: tuple[str, bool] = ("", False)
+    answer: tuple[str, bool, float] = ("", False, -inf)
     state: dict[str, Any] = field(default_factory=dict)
     route: list[Vector] = field(default_factory=list)
     conditions: dict[str, float] = field(default_factory=dict)
@@ -88,17 +89,21 @@ class Steering:
         try:
             self.api.post(path, body)
         except CloudrcError as error:
-            self.answer = f"{words}: {error}", True
+            self.say(f"{words}: {error}", is_refusal=True)
             return False
-        self.answer = words, False
+        self.say(words)
         return True
+
+    def say(self, text: str, *, is_refusal: bool = False) -> None:
+        """Show a text as the newest answer."""
+        self.answer = text, is_refusal, time.monotonic()
 
     def cancel(self) -> None:
         """Cancel the mission under way."""
         if mission := self.state.get("mission"):
             self.ask("cancelled", f"/v1/missions/{mission['id']}/cancel")
         else:
-            self.answer = "cancel: no mission is under way", True
+            self.say("cancel: no mission is under way", is_refusal=True)
 
     def go_to(self, position: Vector) -> None:
         """Fly to a position [m]; a mission that flies is held first."""
@@ -117,7 +122,9 @@ class Steering:
         self._held.pop(key, None)
 
     def set_link(self, key: str, value: float) -> None:
-        """Set a value of the link, such as "uplink.delay_ms"; return at once."""
+        """Set a value of the link in the unit of the key, such as "uplink.delay_ms" [ms] or
+        "uplink.loss" [1]; return at once.
+        """
         self._changes[key] = value
         self._changed.set()
 
@@ -156,9 +163,9 @@ class Steering:
             try:
                 if settings:
                     self.link.change(settings)
-                    self.answer = f"link: {', '.join(settings)}", False
+                    self.say(f"link: {', '.join(settings)}")
             except CloudrcError as error:
-                self.answer = f"link: {error}", True
+                self.say(f"link: {error}", is_refusal=True)
 
     def _watch_loop(self) -> None:
         while True:
@@ -175,5 +182,5 @@ class Steering:
             self._mission = mission
         except CloudrcError as error:
             self.state = {}
-            self.answer = str(error), True
+            self.say(str(error), is_refusal=True)
         self.conditions = self.link.read()
