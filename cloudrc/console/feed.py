@@ -62,10 +62,9 @@ class FlightFeed:
         self.fault = ""
         self.samples: deque[Sample] = deque()
         self.flown = 0
-        self._heard = self._controlled = -inf
+        self._heard = self._controlled = self._judged = -inf  # times of the newest [s]
         self._uplink = self._downlink = self._rtt = nan
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL_MAX)  # position and clearance
-        self._judged = 0
 
     def take(self, records: Iterable[Record], now: float) -> None:
         """Take the records of the newest datagrams, oldest first; `now` is their arrival [s]."""
@@ -79,6 +78,7 @@ class FlightFeed:
                 news |= self._take_telemetry(record.telemetry, now)
             elif isinstance(record, SessionOpened):
                 self._judge.reset()
+                self._judged = -inf
             elif isinstance(record, Fault):
                 self.fault = record.text
         if news:
@@ -107,14 +107,19 @@ class FlightFeed:
         return rows[:, :3], rows[:, 3]
 
     def columns(self, step: int = 3) -> Array:
-        """Return every `step`-th sample, time relative to the newest [s], shape (fields, n)."""
+        """Return every `step`-th sample, time relative to the newest [s], shape (fields, n).
+
+        Unknown values are -1, below the axis: the charts cannot scale an axis with NaN.
+        """
         rows = np.array([*self.samples][::step] or [Sample(0.0)], dtype=np.float64)
         rows[:, 0] -= rows[-1, 0]
-        return np.ascontiguousarray(rows.T)
+        return np.ascontiguousarray(np.nan_to_num(rows.T, nan=-1.0))
 
     def _take_control(self, control: Control, now: float) -> None:
-        self.control, self._controlled = control, now
+        self.control, self._controlled, judged = control, now, self._judge.judged
         self._judge.take(control)
+        if self._judge.judged > judged:
+            self._judged = now
         if control.rtt != self._rtt:  # a new echo
             self._rtt, self._downlink = control.rtt, control.rtt - self._uplink
 
@@ -135,17 +140,16 @@ class FlightFeed:
     def _sample(self, now: float) -> Sample:
         assert self.telemetry is not None
         speed = hypot(*self.telemetry.odometry.velocity)
-        control, judged = self.control, self._judge.judged
+        control = self.control
         if control is None or not self.controls(now):
             return Sample(now, self._uplink, speed=speed)
-        wrong = hypot(*self._judge.error) if judged != self._judged else nan
-        self._judged = judged
+        judged = now - self._judged < STALE
         return Sample(
             now,
             self._uplink,
             self._downlink,
             control.horizon,
             dist(control.setpoint, control.measured),
-            wrong,
+            hypot(*self._judge.error) if judged else nan,
             speed,
         )

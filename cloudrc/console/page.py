@@ -19,6 +19,7 @@ from cloudrc.config.load import ResolvedExperiment
 from cloudrc.console.feed import STALE, FlightFeed
 from cloudrc.console.steering import Steering
 from cloudrc.geometry import fence
+from cloudrc.geometry.scene import SPAWN, Scene, load_scene
 from cloudrc.messages import GuardState, Quaternion, Vector
 
 CHART_PERIOD, TRAIL_PERIOD, TEXT_PERIOD = 0.2, 0.5, 0.25
@@ -114,6 +115,7 @@ class Page:
         from cloudrc.console.scene import FlightScene  # needs MuJoCo, which takes a second
 
         self._scene = FlightScene(self._server, experiment)
+        self._place_camera(load_scene(experiment.world.scene))
         gui = self._server.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_WIDTH)
@@ -157,6 +159,14 @@ class Page:
         """Stop serving the page."""
         self._server.stop()
 
+    def _place_camera(self, scene: Scene) -> None:
+        """Look along +x, so that the arrow keys fly away from the viewer, to the left and so on."""
+        spots = np.array([scene.spawn, *(pipe.centre for pipe in scene.pipes)])
+        low, high = spots.min(axis=0), spots.max(axis=0)
+        middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.5)
+        camera = self._server.initial_camera
+        camera.look_at, camera.position = middle, middle + size * np.array([-0.65, 0.3, 0.5])
+
     def _is_due(self, what: str, period: float, now: float) -> bool:
         if now < self._due[what]:
             return False
@@ -174,8 +184,10 @@ class Page:
             ({"label": "s"}, *lines),
             title=title,
             scales={"x": {"time": False}, "y": {"range": {"min": low, "max": high}}},
+            axes=({"size": 30}, {"size": 46}),
             legend={"show": len(curves) > 1, "live": False},
-            height=130 if len(curves) > 1 else 150,
+            padding=(10, 16, 0, 0),
+            height=132,
         )
 
     def _show_route(self) -> None:
@@ -294,7 +306,7 @@ class Page:
     def _add_target(self, client: viser.ClientHandle) -> None:
         """Add the gizmo and the numbers of the next waypoint, which follow each other."""
         feed, low, high = self._feed, fence.INNER_LOW, fence.INNER_HIGH
-        at = feed.telemetry.odometry.position if feed.telemetry else self._experiment_spawn()
+        at = feed.telemetry.odometry.position if feed.telemetry else SPAWN
         start = np.round(np.clip(np.add(at, (0.0, 0.0, 0.6)), low, high), 2)
         limits = tuple(zip(low, high, strict=True))
         gizmo = client.scene.add_transform_controls(
@@ -313,19 +325,15 @@ class Page:
             x, y, z = map(float, np.round(gizmo.position, 2))
             numbers.value = (x, y, z)
 
-        @numbers.on_update
-        def _(event: Any) -> None:
+        def move(event: Any) -> None:
             if event.client is not None:  # somebody has typed
                 gizmo.position = numbers.value
+
+        numbers.on_update(move)
 
         @send.on_click
         def _(_: object) -> None:
             self._steering.go_to(numbers.value)
-
-    def _experiment_spawn(self) -> Vector:
-        from cloudrc.geometry.scene import load_scene
-
-        return load_scene(self._experiment.world.scene).spawn
 
     def _add_keys(self, gui: viser.GuiApi) -> None:
         """Add the buttons of the drive; a button that is held calls back ten times a second."""

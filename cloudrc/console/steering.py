@@ -122,9 +122,7 @@ class Steering:
         self._held.pop(key, None)
 
     def set_link(self, key: str, value: float) -> None:
-        """Set a value of the link in the unit of the key, such as "uplink.delay_ms" [ms] or
-        "uplink.loss" [1]; return at once.
-        """
+        """Set `value` in the unit of `key`, "uplink.delay_ms" [ms], "uplink.loss" [1]; at once."""
         self._changes[key] = value
         self._changed.set()
 
