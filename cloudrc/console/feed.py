@@ -62,7 +62,8 @@ class FlightFeed:
         self.fault = ""
         self.samples: deque[Sample] = deque()
         self.flown = 0
-        self._heard = self._controlled = self._judged = -inf  # times of the newest [s]
+        # Times of the newest telemetry, control period, judged prediction and echo [s].
+        self._heard = self._controlled = self._judged = self._echoed = -inf
         self._uplink = self._downlink = self._rtt = nan
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL_MAX)  # position and clearance
 
@@ -91,7 +92,7 @@ class FlightFeed:
         return now - self._heard
 
     def command_age(self, now: float) -> float:
-        """Return the age at `now` [s] of the command that the robot applied last; infinite if none."""
+        """Return the age of the last applied command at `now` [s]; infinite if none."""
         told = self.telemetry
         if told is None or told.echo_stamp_ns == NEVER_NS:
             return inf
@@ -121,7 +122,8 @@ class FlightFeed:
         if self._judge.judged > judged:
             self._judged = now
         if control.rtt != self._rtt:  # a new echo
-            self._rtt, self._downlink = control.rtt, control.rtt - self._uplink
+            self._rtt, self._echoed = control.rtt, now
+            self._downlink = control.rtt - self._uplink
 
     def _take_telemetry(self, telemetry: Telemetry, now: float) -> bool:
         """Store new telemetry; return False for a copy of the last one."""
@@ -143,11 +145,11 @@ class FlightFeed:
         control = self.control
         if control is None or not self.controls(now):
             return Sample(now, self._uplink, speed=speed)
-        judged = now - self._judged < STALE
+        judged, echoed = now - self._judged < STALE, now - self._echoed < STALE
         return Sample(
             now,
             self._uplink,
-            self._downlink,
+            self._downlink if echoed else nan,
             control.horizon,
             dist(control.setpoint, control.measured),
             hypot(*self._judge.error) if judged else nan,

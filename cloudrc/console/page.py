@@ -206,7 +206,6 @@ class Page:
         if feed.telemetry is None:
             return "**waiting for the robot**"
         guard, silence = feed.telemetry.guard, feed.silence(now)
-        age = feed.command_age(now)
         mission = state.get("mission")
         doing = "none"
         if mission:
@@ -214,7 +213,7 @@ class Page:
             doing = f"{mission['name'] or mission['id']}, {mission['state']}, {reached}"
         lines = [
             f"**{GuardState(guard).name}**: {feed.telemetry.cause.words}",
-            f"Last command: {'none' if age == inf else f'{age * 1e3:.0f} ms ago'}",
+            f"Last command: {_age(feed.command_age(now))}",
             f"Mission: {doing}",
         ]
         if silence > STALE:
@@ -363,6 +362,13 @@ class Page:
                     if event.client is not None:
                         self._touched = time.monotonic()
                         self._steering.set_link(key, event.target.value / factor)
+
+
+def _age(seconds: float) -> str:
+    """Describe an age [s] in words."""
+    if seconds == inf:
+        return "none"
+    return f"{seconds:.1f} s ago" if seconds > 1.0 else f"{seconds * 1e3:.0f} ms ago"
 
 
 def _visible(position: Vector, orientation_wxyz: Quaternion) -> tuple[Any, Any]:

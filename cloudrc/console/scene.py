@@ -110,7 +110,7 @@ class FlightScene:
         """Show numbered waypoints at `points` [m], shape (n, 3), the first `reached` in green."""
         points = np.asarray(points, dtype=float).reshape(-1, 3)
         if not np.array_equal(points, self._points):
-            for handle in (*self._waypoints, *self._labels):
+            for handle in self._waypoints:  # with its label
                 handle.remove()
             self._points = points
             self._waypoints = [
