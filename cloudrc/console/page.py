@@ -115,6 +115,8 @@ class Page:
         from cloudrc.console.scene import FlightScene  # needs MuJoCo, which takes a second
 
         self._scene = FlightScene(self._server, experiment)
+        # Without a graphics card, shadows cost more than ten times the rest of a picture.
+        self._server.scene.configure_default_lights(cast_shadow=False)
         self._place_camera(load_scene(experiment.world.scene))
         gui = self._server.gui
         gui.main_panel.dock_right()
