@@ -73,11 +73,14 @@ def page(browse, flight):
 
 def z_arrow(page):
     """Return the middle of the gizmo's blue arrow on the page [px]."""
-    picture = Image.open(io.BytesIO(page.screenshot(timeout=LIMIT * 1e3))).convert("RGB")
-    red, green, blue = np.moveaxis(np.asarray(picture, dtype=int)[:, 350:930], -1, 0)
-    rows, columns = np.nonzero((blue > 200) & (red < 100) & (green < 180) & (blue - green > 60))
-    assert len(rows), "no gizmo"
-    return float(np.median(columns)) + 350, float(np.median(rows))
+    for _ in range(20):  # the scene appears slowly
+        picture = Image.open(io.BytesIO(page.screenshot(timeout=LIMIT * 1e3))).convert("RGB")
+        red, green, blue = np.moveaxis(np.asarray(picture, dtype=int)[:, 350:930], -1, 0)
+        rows, columns = np.nonzero((blue > 200) & (red < 100) & (blue - green > 60))
+        if len(rows) > 20:
+            return float(np.median(columns)) + 350, float(np.median(rows))
+        page.wait_for_timeout(500)
+    raise AssertionError("no gizmo")
 
 
 @pytest.mark.process
