@@ -86,18 +86,23 @@ def z_arrow(page):
 @pytest.mark.process
 def test_drag_and_send_moves_the_setpoint(flight, page):
     api, address, run = flight
-    target = page.get_by_role("textbox")
-    before = float(target.nth(2).input_value())
-    x, y = z_arrow(page)
+    numbers = page.get_by_role("textbox")
+
+    def target():
+        return [float(numbers.nth(axis).input_value()) for axis in range(3)]
+
+    before, (x, y) = target(), z_arrow(page)
     page.mouse.move(x, y)
     page.mouse.down()
-    page.mouse.move(x, y - 40, steps=4)
+    for up in (20, 40):
+        page.mouse.move(x, y - up)
+        page.wait_for_timeout(300)
     page.mouse.up()
-    wait_for(lambda: float(target.nth(2).input_value()) > before + 0.1)
-    goal = [float(target.nth(axis).input_value()) for axis in range(3)]
+    wait_for(lambda: target() != before)
     button(page, "Send").click()
-    wait_for(lambda: api.get("/v1/state")["mission"])
-    assert api.get(f"/v1/missions/{api.get('/v1/state')['mission']['id']}")["route_m"] == [goal]
+    wait_for(lambda: api.get("/v1/missions")["missions"])
+    (mission,) = api.get("/v1/missions")["missions"]
+    assert api.get(f"/v1/missions/{mission['id']}")["route_m"] == [target()]
     other = start(run, "console", run)
     assert address in other.communicate(timeout=LIMIT)[0]
     assert other.returncode == 2
@@ -112,7 +117,7 @@ def test_keys_drive_and_sliders_change_the_delay(flight, page, figure):
     mission = api.get("/v1/state")["mission"]
     assert mission["name"] == "drive"
     page.get_by_role("tab", name="Link").click()
-    page.get_by_label("Up delay").fill("150")
+    page.get_by_role("textbox").first.fill("150")  # the uplink's delay
     page.keyboard.press("Enter")
     took = wait_for(lambda: api.get("/v1/state")["seen"]["rtt_s"] > 0.15)
     figure("slider to measured delay", took, "<=", 2.0, "s")
