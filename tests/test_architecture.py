@@ -34,7 +34,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "record": {"endpoint", "files"},
     "metrics": {"record", "config", "geometry", "plugins"},
     "report": {"record", "metrics", "config", "geometry", "link", "files", "console"},
-    "console": {"config", "geometry", "world"},
+    "console": {"config", "exposition", "geometry", "world"},
     "cluster": {"config", "link", "record", "report"},
     "sweep": {"assembly", "config", "files", "metrics", "plugins", "record", "report"},
     "assembly": EVERYTHING,
@@ -47,9 +47,10 @@ MAY_IMPORT: dict[str, set[str]] = {
 }
 ALWAYS = {"errors", "messages", "records", "__version__"}
 
-# Parts that run in real time besides the drivers: link shapers and teleop's API.
+# Parts that run in real time besides the drivers: link shapers, teleop's API, the console's page.
 SHAPERS = ("link/relay", "link/verify/probe", "link/verify/monitor")
 API = ("teleop/api", "teleop/auth")
+CONSOLE = ("console/page", "console/steering")
 
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it.
 RESERVED: dict[str, tuple[str, ...]] = {
@@ -79,7 +80,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "concurrent": ("cli/", "cluster/", "teleop/"),
     **dict.fromkeys(
         ("time", "socket", "selectors", "select", "threading", "asyncio", "signal"),
-        ("drivers/", *SHAPERS, *API, "cluster/", "cli/", "faults/search"),
+        ("drivers/", *SHAPERS, *API, *CONSOLE, "cluster/", "cli/", "faults/search"),
     ),
     **dict.fromkeys(("random", "secrets", "uuid"), ("drivers/", "cluster/", "cli/")),
     **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),

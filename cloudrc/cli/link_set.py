@@ -6,6 +6,7 @@ import argparse
 import json
 import secrets
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -66,7 +67,7 @@ def execute(options: argparse.Namespace) -> int:
 
     folder = find_local_run(options, link_folder, "no run flies there")
     if folder is not None:
-        edit, states = _set_here(options, folder, number)
+        edit, states = set_here(folder, options.profile, options.settings, number)
         where = str(folder.parent)
         took = monotonic() - began
     else:
@@ -92,28 +93,44 @@ def execute(options: argparse.Namespace) -> int:
     return 0
 
 
-def _set_here(
-    options: argparse.Namespace, folder: Path, number: str
+def read_states(folder: Path) -> list[LinkState]:
+    """Read the states of both directions from the relay's folder; [] while there is no link."""
+    from cloudrc.config.load import DIRECTIONS
+    from cloudrc.link.state import from_text
+
+    try:
+        return [from_text((folder / f"{way}.json").read_text("utf-8")) for way in DIRECTIONS]
+    except (OSError, ValueError):
+        return []
+
+
+def set_here(
+    folder: Path, profile: str | None, settings: Sequence[str], number: str
 ) -> tuple[Edit, list[LinkState]]:
-    """Write a new profile into the relay's folder, and wait until the relay has applied it."""
+    """Write a new profile into the relay's folder, and wait until the relay has applied it.
+
+    Args:
+        folder: Folder that a local run's relay and `cloudrc link set` share.
+        profile: Name or file of a profile that replaces the present one; None keeps it.
+        settings: Changed values, each "uplink.KEY=VALUE" or "downlink.KEY=VALUE".
+        number: Identifies the change.
+
+    Raises:
+        BadInputError: If there is no link yet, or if a value cannot be used.
+        TimedOutError: If the relay does not apply the change.
+    """
     from cloudrc.config.document import Document
-    from cloudrc.config.load import DIRECTIONS, edit_profile
-    from cloudrc.link.state import CHANGE_FILE, PROFILE_FILE, from_text, publish
+    from cloudrc.config.load import edit_profile
+    from cloudrc.link.state import CHANGE_FILE, PROFILE_FILE, publish
 
-    def look() -> list[LinkState]:
-        try:
-            return [from_text((folder / f"{way}.json").read_text("utf-8")) for way in DIRECTIONS]
-        except (OSError, ValueError):
-            return []
-
-    states = look()
+    states = read_states(folder)
     if not states:
         raise BadInputError(f"{folder.parent}: no link is up there (yet); wait for the start")
-    edit = edit_profile(Document(states[0].profile), options.profile, options.settings)
+    edit = edit_profile(Document(states[0].profile), profile, settings)
     publish(folder / CHANGE_FILE, _note(edit, number))
     publish(folder / PROFILE_FILE, json.dumps(edit.values, indent=2) + "\n")
     deadline = monotonic() + LOCAL_TIMEOUT
-    while not (states := look()) or any(state.change != number for state in states):
+    while not (states := read_states(folder)) or any(state.change != number for state in states):
         if monotonic() > deadline:
             late = [s.direction for s in states if s.change != number] or ["link"]
             raise TimedOutError(

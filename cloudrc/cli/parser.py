@@ -19,6 +19,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "up": "start a session: it waits for missions, until Ctrl-C or 'down'",
         "down": "end the session; it writes the report of its last mission",
         "mission": "start, steer and stop missions, here or in a cluster",
+        "console": "show a flight in the browser, and steer it there",
         "sweep": "fly a grid of settings with several seeds, on all cores",
         "report": "write the report of a recorded run again",
         "replay": "watch a recorded flight in 3-D, in a browser",

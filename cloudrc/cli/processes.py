@@ -101,6 +101,8 @@ def _cloud_arguments(parser: argparse.ArgumentParser) -> None:
     _end_arguments(parser)
     teleop = "take missions from 'cloudrc teleop --socket DIR' (default: fly the experiment's)"
     _add(parser, "--teleop", "DIR", teleop)
+    tap = "send samples to a console that listens at this Unix socket (default: off)"
+    _add(parser, "--tap", "FILE", tap)
 
 
 def _relay_arguments(parser: argparse.ArgumentParser) -> None:
@@ -249,6 +251,7 @@ def _run_world(options: argparse.Namespace) -> int:
 def _run_cloud(options: argparse.Namespace) -> int:
     stop: Callable[[], bool] = StopSignal()
     from cloudrc import assembly
+    from cloudrc.drivers.tap import Tap
     from cloudrc.drivers.teleop import LastWord, RemoteTeleop, UnixPeer
     from cloudrc.messages import GuardState
     from cloudrc.teleop import wire
@@ -260,6 +263,8 @@ def _run_cloud(options: argparse.Namespace) -> int:
         peer = UnixPeer(options.teleop / "cloud.sock", options.teleop / "teleop.sock")
         teleop = RemoteTeleop(peer, wire.encode, wire.decode, time.monotonic_ns())
     cloud = assembly.build_cloud(experiment, identity, time.monotonic_ns, teleop)
+    if options.tap:
+        end.tap = Tap(options.tap, lambda: cloud.telemetry)
 
     def flies() -> bool:
         return cloud.guard is GuardState.TRACK

@@ -29,6 +29,7 @@ from cloudrc.messages import (
     OperatorRequest,
     Request,
     Setpoint,
+    Telemetry,
 )
 from cloudrc.records import Arrival, Counted, Fault, MissionEvent, SessionOpened
 from cloudrc.tunnel import codec
@@ -96,7 +97,7 @@ class CloudEndpoint(TunnelEnd):
 
     Attributes:
         teleop: Source of setpoints and operator requests.
-        guard: State of the guard in the newest telemetry.
+        telemetry: The newest telemetry; None before the first.
     """
 
     def __init__(
@@ -125,7 +126,7 @@ class CloudEndpoint(TunnelEnd):
         self._hellos = 0
         self._setpoint: Setpoint | None = None
         self._world = ""  # identifies the world process of the session
-        self.guard = GuardState.GROUND
+        self.telemetry: Telemetry | None = None
         self._delays = (nan, nan, nan)  # horizon, round trip and loop delay of the last command [s]
         self._alarm = EmergencyStopRepeater()
         self._period_ns = loop.period_ns
@@ -146,6 +147,11 @@ class CloudEndpoint(TunnelEnd):
     def counts(self) -> Counter[str]:
         """Copy of the counters: name of an event -> how often the event has happened."""
         return Counter(self._counts | self._loop.counts)
+
+    @property
+    def guard(self) -> GuardState:
+        """State of the guard in the newest telemetry."""
+        return GuardState.GROUND if self.telemetry is None else self.telemetry.guard
 
     @property
     def mission_over(self) -> bool:
@@ -277,7 +283,7 @@ class CloudEndpoint(TunnelEnd):
         if outcome == LATE:
             self._loop.observe_late(telemetry, now_ns)
         if used:
-            self.guard = telemetry.guard
+            self.telemetry = telemetry
             self._alarm.see(telemetry.guard, telemetry.mission)
             if self._start is not None and telemetry.mission >= self._start[0]:
                 self._loop.expect((now_ns - self._start[1]) * 1e-9)

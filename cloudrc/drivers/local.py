@@ -31,6 +31,7 @@ from typing import NamedTuple
 from cloudrc.drivers.machine import Deadline, interpreter
 from cloudrc.drivers.process import PARENT, READY, from_line
 from cloudrc.drivers.realtime import free_ports
+from cloudrc.drivers.tap import TAP_FILE
 from cloudrc.drivers.teleop import PATH_MAX
 from cloudrc.errors import BadInputError, InvalidRunError, TimedOutError
 from cloudrc.records import Fault, Record
@@ -275,7 +276,8 @@ class LocalRun:
         self._wait_until_ready()
         record, state = folder / "cloud.mcap", link / "downlink.json"
         ways = {"listen": cloud, "peer": from_cloud, "key": key, "link": state}
-        self._start("cloud", *flights, **ways, record=record, teleop=sockets)
+        ways |= {"record": record, "teleop": sockets, "tap": sockets / TAP_FILE}
+        self._start("cloud", *flights, **ways)
         self._wait_until_ready()
         if session:
             session(url, self._metrics)

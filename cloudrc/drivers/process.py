@@ -42,6 +42,7 @@ from cloudrc.records import (
 
 if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
+    from cloudrc.drivers.tap import Tap
     from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.record.recorder import Recorder
 
@@ -270,6 +271,7 @@ class EndProcess:
         flights_only: Whether to record events but no samples while the robot does not fly.
         link: File with the state of the link; None if the state is not recorded.
         check: Compares the received datagrams with the link profile; None for no comparison.
+        tap: Sends records to a console; None for no console.
     """
 
     end: str
@@ -281,6 +283,7 @@ class EndProcess:
     flights_only: bool = False
     link: Path | None = None
     check: LinkMonitor | None = None
+    tap: Tap | None = None
 
     def __post_init__(self) -> None:
         self._notes = LinkNotes(self.link, uplink=self.end == "world") if self.link else None
@@ -318,9 +321,11 @@ class EndProcess:
             thread.stop()
 
     def tell(self, records: list[Record]) -> None:
-        """Send records, and problems of the recorder, to the supervisor and to the metrics."""
+        """Send records, and problems of the recorder, to supervisor, console and metrics."""
         recorder = self.recorder
         self.feed.tell(records)
+        if self.tap is not None:
+            self.tap.tell(records)
         if records and recorder.error != self._trouble:
             self._trouble = recorder.error
             self.feed.tell([Fault(records[-1].stamp_ns, "recorder", self._trouble)])

@@ -163,6 +163,7 @@ class MissionSummary(_Answer):
 class MissionView(MissionSummary):
     """A mission with its events."""
 
+    route_m: list[tuple[float, float, float]] = _field("The waypoints [m], world frame")
     events: list[Event] = Field(max_length=SHOWN, description="The newest events, oldest first")
     events_left_out: int = _field("Number of older events")
 

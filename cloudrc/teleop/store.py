@@ -104,7 +104,12 @@ class Mission:
     def as_json(self) -> dict[str, Any]:
         """Return all fields that the API shows."""
         left_out = self.happened.total() - len(self.events)
-        return {**self.summary(), "events": list(self.events), "events_left_out": left_out}
+        return {
+            **self.summary(),
+            "route_m": [leg.position for leg in self.order.plan.legs],
+            "events": list(self.events),
+            "events_left_out": left_out,
+        }
 
 
 class UnknownMissionError(CloudrcError):

@@ -1,0 +1,378 @@
+"""The page of the console: 3-D scene, charts and state for all browsers, controls for the first.
+
+viser draws the page and serves it. Its keyboard API knows no release of a key; therefore a few
+lines of script on the page press the page's own buttons while keys are held.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from math import inf
+from typing import Any
+
+import numpy as np
+import viser
+
+from cloudrc.config.load import ResolvedExperiment
+from cloudrc.console.feed import STALE, FlightFeed
+from cloudrc.console.steering import Steering
+from cloudrc.geometry import fence
+from cloudrc.geometry.scene import SPAWN, Scene, load_scene
+from cloudrc.messages import GuardState, Quaternion, Vector
+
+CHART_PERIOD, TRAIL_PERIOD, TEXT_PERIOD = 0.2, 0.5, 0.25
+"""Times between two updates of the charts, the trail and the texts [s]."""
+ANSWER_SHOWN = 10.0
+"""Time for which a refusal is shown [s]; another answer is shown for half of it."""
+PANEL_WIDTH = 330
+"""Width of each panel beside the scene [px]."""
+BLUE, RED, GREEN = "#0072b2", "#d55e00", "#009e73"
+CHARTS: dict[str, tuple[float, float, dict[str, tuple[int, str]]]] = {
+    "Delay [ms]": (1e3, 150, {"up": (1, BLUE), "down": (2, RED), "estimate": (3, GREEN)}),
+    "Tracking error [m]": (1.0, 0.2, {"error": (4, BLUE)}),
+    "Prediction error [mm]": (1e3, 20, {"error": (5, BLUE)}),
+    "Speed [m/s]": (1.0, 0.5, {"speed": (6, BLUE)}),
+}
+"""Title of a chart -> factor from SI units, smallest range of its axis, and its curves: name ->
+place in `Sample`, and colour."""
+LINK: dict[str, tuple[str, float, float, float]] = {
+    "delay_ms": ("delay [ms]", 500.0, 1.0, 1.0),
+    "jitter_ms": ("jitter [ms]", 100.0, 1.0, 1.0),
+    "loss": ("loss [%]", 50.0, 0.5, 100.0),
+}
+"""Key of a link direction -> label, largest value and step of its slider, and factor from the
+profile's unit to that of the slider."""
+KEYS: dict[str, tuple[str, Vector]] = {
+    "KeyW": ("W up", (0.0, 0.0, 1.0)),
+    "ArrowUp": ("↑ +x", (1.0, 0.0, 0.0)),
+    "KeyS": ("S down", (0.0, 0.0, -1.0)),
+    "ArrowLeft": ("← +y", (0.0, 1.0, 0.0)),
+    "ArrowDown": ("↓ -x", (-1.0, 0.0, 0.0)),
+    "ArrowRight": ("→ -y", (0.0, -1.0, 0.0)),
+}
+"""Key, by the name of browsers -> label of its button, and direction of the drive."""
+STOP, HOLD = "STOP", "Hold"
+SCRIPT = """
+const drive = %s;
+const find = text =>
+  [...document.querySelectorAll('button')].find(b => b.textContent.trim() === text);
+const press = (kind, code) => find(drive[code])?.dispatchEvent(
+  new PointerEvent(kind, {bubbles: true, button: 0, pointerId: 9}));
+const held = new Set();
+const release = code => held.delete(code) && (press('pointerup', code), find(drive[code])?.click());
+const seize = e => (e.preventDefault(), e.stopImmediatePropagation());
+document.title = 'cloudrc';
+if (!window.cloudrc) {
+  window.cloudrc = true;
+  window.addEventListener('keydown', e => {
+    if (e.ctrlKey || e.altKey || e.metaKey || !find('STOP')) return;
+    if (e.code === 'KeyX' && e.shiftKey) return seize(e), find('STOP').click();
+    if (e.target.closest('input, textarea')) return;
+    if (e.code === 'Space') return seize(e), e.repeat || find('Hold').click();
+    if (!(e.code in drive)) return;
+    seize(e);
+    if (!held.has(e.code)) held.add(e.code), press('pointerdown', e.code);
+  }, true);
+  window.addEventListener('keyup', e => {
+    if (e.code in drive || e.code === 'Space') seize(e), release(e.code);
+  }, true);
+  window.addEventListener('blur', () => [...held].forEach(release));
+}"""
+STYLE = """
+button[style*='red-filled'] {height: 60px !important; font-size: 24px; letter-spacing: 3px;
+  background: #c4140c !important}
+div:has(> button[style*='red-filled']) {position: sticky; top: 0; z-index: 9}
+div:has(> button[style*='gray-filled']) {display: inline-block; width: 33.3%;
+  margin: 0 !important; padding: 0 6px 6px !important}
+"""
+
+
+class Page:
+    """The page of one flight, at `url`."""
+
+    def __init__(self, port: int) -> None:
+        """Serve a page on this machine only; port 0 means any free port.
+
+        Raises:
+            OSError: If the port is in use.
+        """
+        self._server = viser.ViserServer("127.0.0.1", port, label="cloudrc", verbose=False)
+        self.url = f"http://127.0.0.1:{self._server.get_port()}"
+        self._server.gui.configure_theme(show_share_button=False, show_logo=False)
+        self._lock = threading.Lock()
+        self._pilot: int | None = None  # the client that has the controls
+        self._due = dict.fromkeys(("charts", "trail", "texts"), 0.0)
+        self._touched = -inf  # when somebody last moved a slider [s]
+        self._sliders: dict[str, Any] = {}
+        self._shown: tuple[Any, ...] = ()  # waypoints
+        self._drawn = 0  # points of the trail
+
+    def fill(self, experiment: ResolvedExperiment, feed: FlightFeed, steering: Steering) -> None:
+        """Build the scene and the panels, and give the controls to the first browser."""
+        self._experiment, self._feed, self._steering = experiment, feed, steering
+        from cloudrc.console.scene import FlightScene  # needs MuJoCo, which takes a second
+
+        self._scene = FlightScene(self._server, experiment)
+        # Without a graphics card, shadows cost more than ten times the rest of a picture.
+        self._server.scene.configure_default_lights(cast_shadow=False)
+        self._place_camera(load_scene(experiment.world.scene))
+        gui = self._server.gui
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(PANEL_WIDTH)
+        self._status = gui.add_markdown("waiting for the robot", order=2)
+        panel = gui.add_panel()
+        with panel.add_tab("Charts"):
+            self._charts = [self._add_chart(title) for title in CHARTS]
+        panel.dock_left()
+        panel.set_width(PANEL_WIDTH)
+        self._server.on_client_connect(self._welcome)
+        self._server.on_client_disconnect(self._succeed)
+
+    def update(self, now: float) -> None:
+        """Show the present state; `now` is the time [s], on the clock of the feed."""
+        feed, scene = self._feed, self._scene
+        with self._server.atomic():
+            if feed.telemetry is not None:
+                odometry = feed.telemetry.odometry
+                scene.set_robot(*_visible(odometry.position, odometry.orientation_wxyz))
+            control = feed.control if feed.controls(now) else None
+            if control is None:
+                scene.set_ghost(None, None)
+            else:
+                scene.set_ghost(*_visible(control.position, control.orientation_wxyz))
+            scene.set_setpoint(control.setpoint if control else None)
+        if self._is_due("charts", CHART_PERIOD, now):
+            columns = feed.columns()
+            for chart, (factor, _, curves) in zip(self._charts, CHARTS.values(), strict=True):
+                rows = [columns[place] * factor for place, _ in curves.values()]
+                chart.data = (columns[0], *rows)
+        if self._is_due("trail", TRAIL_PERIOD, now):
+            if feed.flown != self._drawn:
+                self._drawn = feed.flown
+                scene.set_trail(*feed.trail())
+            self._show_route()
+        if self._is_due("texts", TEXT_PERIOD, now):
+            self._status.content = self._describe(now)
+            self._follow_link(now)
+
+    def close(self) -> None:
+        """Stop serving the page."""
+        self._server.stop()
+
+    def _place_camera(self, scene: Scene) -> None:
+        """Look along +x, so that the arrow keys fly away from the viewer, to the left and so on."""
+        spots = np.array([scene.spawn, *(pipe.centre for pipe in scene.pipes)])
+        low, high = spots.min(axis=0), spots.max(axis=0)
+        middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.5)
+        camera = self._server.initial_camera
+        camera.look_at, camera.position = middle, middle + size * np.array([-0.65, 0.3, 0.5])
+
+    def _is_due(self, what: str, period: float, now: float) -> bool:
+        if now < self._due[what]:
+            return False
+        self._due[what] = now + period
+        return True
+
+    def _add_chart(self, title: str) -> Any:
+        _, span, curves = CHARTS[title]
+        lines: list[Any] = [
+            {"label": name, "stroke": colour, "width": 1.5} for name, (_, colour) in curves.items()
+        ]
+        low, high = {"hard": 0, "pad": 0}, {"soft": span, "mode": 1, "pad": 0.1}
+        return self._server.gui.add_uplot(
+            (np.zeros(1),) * (1 + len(curves)),
+            ({"label": "s"}, *lines),
+            title=title,
+            scales={"x": {"time": False}, "y": {"range": {"min": low, "max": high}}},
+            axes=({"size": 30}, {"size": 46}),
+            legend={"show": len(curves) > 1, "live": False},
+            padding=(10, 16, 0, 0),
+            height=132,
+        )
+
+    def _show_route(self) -> None:
+        mission = self._steering.state.get("mission")
+        route = [point.position_m for point in self._experiment.mission.waypoints]
+        if mission and self._steering.route:
+            route = self._steering.route
+        shown = tuple(map(tuple, route)), len(mission["reached"]) if mission else 0
+        if shown != self._shown:
+            self._shown = shown
+            self._scene.set_waypoints(np.array(route).reshape(-1, 3), shown[1])
+
+    def _describe(self, now: float) -> str:
+        """Return guard, command age, mission and the newest answer, as Markdown."""
+        feed, state = self._feed, self._steering.state
+        if feed.telemetry is None:
+            return "**waiting for the robot**"
+        guard, silence = feed.telemetry.guard, feed.silence(now)
+        mission = state.get("mission")
+        doing = "none"
+        if mission:
+            reached = f"{len(mission['reached'])} of {mission['waypoints']} waypoints"
+            doing = f"{mission['name'] or mission['id']}, {mission['state']}, {reached}"
+        lines = [
+            f"**{GuardState(guard).name}**: {feed.telemetry.cause.words}",
+            f"Last command: {_age(feed.command_age(now))}",
+            f"Mission: {doing}",
+        ]
+        if silence > STALE:
+            lines[0] = f"**No telemetry for {silence:.1f} s**, last: {lines[0]}"
+        text, is_refusal, at = self._steering.answer
+        if now - at < (ANSWER_SHOWN if is_refusal else ANSWER_SHOWN / 2):
+            lines.append(f"**Refused** {text}" if is_refusal else text)
+        elif seen := state.get("seen"):
+            lines.append(seen["next_step"])
+        return "  \n".join(lines)
+
+    def _follow_link(self, now: float) -> None:
+        """Move the sliders after a change from elsewhere, unless somebody moves them here."""
+        if now - self._touched < 2.0:
+            return
+        for key, slider in self._sliders.items():
+            value = self._steering.conditions.get(key)
+            if value is not None:
+                shown = min(value * LINK[key.partition(".")[2]][-1], slider.max)
+                if abs(slider.value - shown) > 1e-6:
+                    slider.value = shown
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Give the controls to a new browser if no other has them."""
+        with self._lock:
+            is_pilot = self._pilot is None
+            if is_pilot:
+                self._pilot = client.client_id
+        if is_pilot:
+            self._add_controls(client)
+        else:
+            client.gui.add_markdown("**Read only**: another browser steers.", order=0)
+
+    def _succeed(self, client: viser.ClientHandle) -> None:
+        """Give the controls of a browser that has left to the next one."""
+        with self._lock:
+            if self._pilot != client.client_id:
+                return
+            self._pilot, self._sliders = None, {}
+        for other in self._server.get_clients().values():
+            other.gui.reset()
+            self._welcome(other)
+
+    def _add_controls(self, client: viser.ClientHandle) -> None:
+        gui, steering = client.gui, self._steering
+        script = SCRIPT % {code: label for code, (label, _) in KEYS.items()}
+        shown = script.replace("&", "&amp;").replace('"', "&quot;")
+        gui.add_html(f'<style onload="{shown}">{STYLE}</style>', order=9)
+        stop = gui.add_button(STOP, color="red", order=0, hint="Stop the rotors (Shift+X)")
+
+        @stop.on_click
+        async def _(_: object) -> None:  # in the server's loop: it does not wait for other calls
+            steering.stop()
+
+        tabs = gui.add_tab_group(order=3)
+        with tabs.add_tab("Fly"):
+            self._add_mission(gui)
+            self._add_target(client)
+            self._add_keys(gui)
+        with tabs.add_tab("Link"):
+            self._add_link(gui)
+
+    def _add_mission(self, gui: viser.GuiApi) -> None:
+        steering = self._steering
+        acts: dict[str, Callable[[], object]] = {
+            "Start": self._start_mission,
+            HOLD: lambda: steering.ask("holding", "/v1/hold"),
+            "Resume": lambda: steering.ask("resumed", "/v1/resume"),
+            "Cancel": steering.cancel,
+            "Acknowledge": lambda: steering.ask("acknowledged", "/v1/acknowledge"),
+        }
+        names = list(acts)
+        for label, some in (("Mission", names[:3]), (" ", names[3:])):
+            group = gui.add_button_group(label, some)
+
+            @group.on_click
+            def _(event: Any) -> None:
+                acts[event.target.value]()
+
+    def _start_mission(self) -> None:
+        experiment, mission = self._experiment, self._experiment.mission
+        if mission.steps is not None:
+            text = "start: random steps are for 'cloudrc run'; send waypoints instead"
+            return self._steering.say(text, is_refusal=True)
+        order = mission.model_dump(mode="json", exclude={"steps"}, exclude_none=True)
+        self._steering.ask("starting", "/v1/missions", {**order, "name": experiment.name})
+        return None
+
+    def _add_target(self, client: viser.ClientHandle) -> None:
+        """Add the gizmo and the numbers of the next waypoint, which follow each other."""
+        feed, low, high = self._feed, fence.INNER_LOW, fence.INNER_HIGH
+        at = feed.telemetry.odometry.position if feed.telemetry else SPAWN
+        start = np.round(np.clip(np.add(at, (0.0, 0.0, 0.6)), low, high), 2)
+        limits = tuple(zip(low, high, strict=True))
+        gizmo = client.scene.add_transform_controls(
+            "/target",
+            scale=0.45,
+            disable_rotations=True,
+            translation_limits=limits,  # type: ignore[arg-type]
+            depth_test=False,
+            position=start,
+        )
+        numbers: Any = client.gui.add_vector3("Target [m]", start, min=low, max=high, step=0.01)
+        send = client.gui.add_button("Send", hint="Fly to the target; a mission is held first")
+
+        @gizmo.on_update
+        def _(_: object) -> None:
+            x, y, z = map(float, np.round(gizmo.position, 2))
+            numbers.value = (x, y, z)
+
+        def move(event: Any) -> None:
+            if event.client is not None:  # somebody has typed
+                gizmo.position = numbers.value
+
+        numbers.on_update(move)
+
+        @send.on_click
+        def _(_: object) -> None:
+            self._steering.go_to(numbers.value)
+
+    def _add_keys(self, gui: viser.GuiApi) -> None:
+        """Add the buttons of the drive; a button that is held calls back ten times a second."""
+        steering = self._steering
+        speed = gui.add_slider("Drive [m/s]", 0.1, 1.0, 0.1, 0.4)
+        for code, (label, direction) in KEYS.items():
+            button = gui.add_button(label, color="gray")
+
+            @button.on_hold
+            async def _(_: object, code: str = code, direction: Vector = direction) -> None:
+                x, y, z = (part * speed.value for part in direction)
+                steering.hold_key(code, (x, y, z))
+
+            @button.on_click
+            async def _(_: object, code: str = code) -> None:
+                steering.release_key(code)
+
+    def _add_link(self, gui: viser.GuiApi) -> None:
+        for way in ("uplink", "downlink"):
+            for name, (label, largest, step, factor) in LINK.items():
+                key = f"{way}.{name}"
+                label = f"{way.removesuffix('link').title()} {label}"
+                slider = self._sliders[key] = gui.add_slider(label, 0.0, largest, step, 0.0)
+
+                @slider.on_update
+                async def _(event: Any, key: str = key, factor: float = factor) -> None:
+                    if event.client is not None:
+                        self._touched = time.monotonic()
+                        self._steering.set_link(key, event.target.value / factor)
+
+
+def _age(seconds: float) -> str:
+    """Describe an age [s] in words."""
+    if seconds == inf:
+        return "none"
+    return f"{seconds:.1f} s ago" if seconds > 1.0 else f"{seconds * 1e3:.0f} ms ago"
+
+
+def _visible(position: Vector, orientation_wxyz: Quaternion) -> tuple[Any, Any]:
+    """Round a pose to what is visible, so that a robot at rest costs the browser no drawing."""
+    return np.round(position, 3), np.round(orientation_wxyz, 3)

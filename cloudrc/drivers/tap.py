@@ -1,0 +1,121 @@
+"""Send what a console shows from cloud to a Unix socket, and receive it there.
+
+A datagram has one record per line, in the form of `to_line`: all events since the last datagram,
+then the newest record of each sampled type. Cloud never waits: a datagram is lost when nobody
+listens, or when the listener does not keep up.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from pathlib import Path
+
+from cloudrc.drivers.process import EVENTS, from_line, to_line
+from cloudrc.errors import BadInputError
+from cloudrc.messages import Telemetry
+from cloudrc.records import Arrival, Control, Record, SessionOpened, TelemetrySent
+
+TAP_FILE = "tap.sock"
+"""Name of the tap's socket, in the folder of the API's socket."""
+PERIOD = 0.03
+"""Average time between two datagrams [s]."""
+ALONE_PERIOD = 0.5
+"""Time between two attempts while nobody listens [s]."""
+EVENTS_MAX = 50
+"""Largest number of events in a datagram; older events are dropped."""
+DATAGRAM_MAX = 1 << 16
+"""Largest size of a datagram that is received [bytes]."""
+
+
+class Tap:
+    """Sends cloud's newest records to a Unix socket, without blocking."""
+
+    def __init__(self, path: Path, telemetry: Callable[[], Telemetry | None]) -> None:
+        """Prepare to send to the socket at `path`, which may appear later.
+
+        `telemetry` returns cloud's newest telemetry. It is sent as a `TelemetrySent` record without
+        epoch and counter, because cloud makes no record with its content.
+        """
+        self._path, self._telemetry = os.fspath(path), telemetry
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._events: deque[Record] = deque(maxlen=EVENTS_MAX)
+        self._arrival: Record | None = None  # the newest used
+        self._period: list[Record] = []  # the newest control period, after its newest arrival
+        self._due = 0.0
+
+    def tell(self, records: Iterable[Record]) -> None:
+        """Take new records, oldest first; send a datagram if it is due."""
+        for record in records:
+            if isinstance(record, Arrival):
+                self._arrival = record if record.used else self._arrival
+            elif isinstance(record, Control):
+                self._period = [self._arrival, record] if self._arrival else [record]
+            elif isinstance(record, (*EVENTS, SessionOpened)):
+                self._events.append(record)
+        now = time.monotonic()
+        if now < self._due:
+            return
+        self._due = max(self._due, now - PERIOD) + PERIOD
+        try:
+            self._socket.sendto(self._datagram(), self._path)
+        except BlockingIOError:  # the listener does not keep up
+            pass
+        except OSError:  # nobody listens
+            self._due = now + ALONE_PERIOD
+        self._events.clear()
+        self._arrival, self._period = None, []
+
+    def _datagram(self) -> bytes:
+        newest = [*self._events, *(self._period or filter(None, [self._arrival]))]
+        if (telemetry := self._telemetry()) is not None:
+            newest.append(TelemetrySent(telemetry.stamp_ns, 0, 0, telemetry))
+        return "\n".join(map(to_line, newest)).encode(errors="backslashreplace")
+
+
+class TapListener:
+    """Receives the datagrams of one tap; a tap has at most one listener."""
+
+    def __init__(self, path: Path, about: str) -> None:
+        """Bind the socket at `path`; `about`, one line, tells other listeners who listens here.
+
+        Raises:
+            BadInputError: If another process listens at `path`; the error has its `about`.
+        """
+        self._path, self._about = path, path.with_suffix(".txt")
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            self._socket.connect(os.fspath(path))
+        except OSError:  # nobody listens; a killed listener leaves its file
+            path.unlink(missing_ok=True)
+        else:
+            self._socket.close()
+            said = ""
+            with suppress(OSError):
+                said = self._about.read_text("utf-8").strip()
+            raise BadInputError(f"this run has a console already; open {said}")
+        self._socket.bind(os.fspath(path))
+        self._about.write_text(about, "utf-8")
+
+    def receive(self, limit: float) -> list[Record]:
+        """Wait at most `limit` [s] for a datagram; return the records of all that have arrived."""
+        found: list[Record] = []
+        self._socket.settimeout(limit)
+        with suppress(OSError):  # nothing (more) has arrived
+            while True:
+                for line in self._socket.recv(DATAGRAM_MAX).decode().splitlines():
+                    with suppress(ValueError):
+                        found.append(from_line(line))
+                self._socket.setblocking(False)
+        return found
+
+    def close(self) -> None:
+        """Close the socket and remove its files."""
+        self._socket.close()
+        for path in (self._path, self._about):
+            path.unlink(missing_ok=True)

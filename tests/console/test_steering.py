@@ -1,0 +1,99 @@
+"""What the operator asks for on the page reaches teleop and the link."""
+
+import threading
+import time
+
+import pytest
+
+from cloudrc.console.steering import RELEASED, Link, Steering
+from cloudrc.errors import BadInputError
+from cloudrc.messages import ZERO
+
+
+@pytest.fixture
+def steering(api):
+    return Steering(api, Link(dict, list))
+
+
+def test_held_keys_add_up_and_a_released_one_counts_no_more(steering):
+    steering.hold_key("up", (0.0, 0.0, 0.4))
+    steering.hold_key("left", (0.0, 0.4, 0.0))
+    now = time.monotonic()
+    assert steering.velocity(now) == (0.0, 0.4, 0.4)
+    steering.release_key("up")
+    assert steering.velocity(now) == (0.0, 0.4, 0.0)
+    assert steering.velocity(now + RELEASED) == ZERO, "no sign of a held key"
+
+
+def test_a_flying_mission_is_held_before_a_goto(api, steering):
+    steering.state = {"mission": {"state": "flying"}}
+    steering.go_to((0.5, 0.0, 1.2004))
+    goto = ("/v1/goto", {"position_m": (0.5, 0.0, 1.2)})
+    assert api.posted == [("/v1/hold", None), goto]
+    api.posted.clear()
+    steering.state = {"mission": None}
+    steering.go_to((0.5, 0.0, 1.2))
+    assert api.posted == [goto]
+
+
+def test_a_refusal_is_told_in_the_words_of_the_api(api, steering):
+    api.refused["/v1/goto"] = "outside of the fence"
+    steering.go_to((50.0, 0.0, 1.2))
+    text, is_refusal, _ = steering.answer
+    assert is_refusal
+    assert "outside of the fence" in text
+
+
+def test_the_route_is_asked_once_for_each_mission(api, steering):
+    api.answers = {
+        "/v1/state": {"mission": {"id": "m1"}},
+        "/v1/missions/m1": {"route_m": [[1] * 3]},
+    }
+    steering.watch()
+    del api.answers["/v1/missions/m1"]
+    steering.watch()
+    assert steering.route == [[1, 1, 1]]
+
+
+def wait_for(condition):
+    limit = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < limit
+        time.sleep(0.01)
+
+
+def test_a_stop_is_repeated_until_the_api_answers(api, steering):
+    api.answers["/v1/state"] = {"mission": None}
+    api.refused["/v1/estop"] = "teleop does not answer"
+    steering.start()
+    steering.stop()
+    wait_for(lambda: len(api.posted) >= 3)
+    api.refused.clear()
+    wait_for(lambda: steering.answer[0] == "stopping the rotors")
+    count = len(api.posted)
+    time.sleep(0.5)
+    assert len(api.posted) == count
+
+
+def test_a_slow_link_gets_the_newest_value_of_each_slider(api):
+    api.answers["/v1/state"] = {"mission": None}
+    applied, go = [], threading.Event()
+
+    def change(settings):
+        applied.append(sorted(settings))
+        if settings == ["uplink.loss=2"]:
+            raise BadInputError("loss: must be at most 1")
+        go.wait()
+
+    steering = Steering(api, Link(dict, change))
+    steering.start()
+    steering.set_link("uplink.delay_ms", 10)
+    wait_for(lambda: applied)
+    for value in (20, 30, 40):
+        steering.set_link("uplink.delay_ms", value)
+    steering.set_link("downlink.loss", 0.25)
+    go.set()
+    wait_for(lambda: len(applied) == 2)
+    assert applied == [["uplink.delay_ms=10"], ["downlink.loss=0.25", "uplink.delay_ms=40"]]
+    steering.set_link("uplink.loss", 2)
+    wait_for(lambda: steering.answer[0] == "link: loss: must be at most 1")
