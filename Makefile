@@ -33,7 +33,7 @@ BUILD_ARGS := $(BASE:%=--build-arg BASE=%) --build-arg VERSION=$(VERSION) \
 COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python-platform linux \
 	--generate-hashes --no-emit-index-url --custom-compile-command 'make lock'
 # MuJoCo's viewers, a tenth of the image: a pod draws nothing.
-DRAWING := glfw pyopengl mujoco-studio websockets
+DRAWING := glfw pyopengl mujoco-studio
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test process e2e e2e-full test-netem smoke-netem test-netem-full faults coverage mutants nightly lint types audit bench bench-link pictures results docs images kind-load lock clean
@@ -188,7 +188,7 @@ kind-load: ## load the images into the kind cluster CLUSTER (cloudrc)
 
 lock: $(VENV)/bin/python ## update the locked requirements of images and tests
 	$(bin)/python -m pip install --quiet uv
-	$(COMPILE) pyproject.toml --extra world --extra record --output-file images/world/requirements.txt \
+	$(COMPILE) pyproject.toml --extra world --extra record --extra console --output-file images/world/requirements.txt \
 		$(DRAWING:%=--no-emit-package %)
 	$(COMPILE) pyproject.toml --extra record --extra api --output-file images/cloud/requirements.txt
 	printf 'hatchling\ntccbox\n' | $(COMPILE) - --output-file images/build-requirements.txt

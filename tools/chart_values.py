@@ -211,6 +211,16 @@ class Teleop(Values):
     """NetworkPolicy peers that may call the API; mission Jobs of this release may always call it"""
 
 
+class Console(Values):
+    """A page with the live scene, in the cloud pod, for 'cloudrc console --cluster'."""
+
+    enabled: bool = False
+    """Whether the pod has a further container, which serves the page; it uses the image of world.
+    The page can be reached with kubectl port-forward alone, and who can reach it can steer"""
+    resources: Resources = resources("50m", "160Mi", "1", "512Mi")
+    """Requests and limits of the container"""
+
+
 class MissionJob(Values):
     """A Job that flies a mission when the release is installed."""
 
@@ -321,6 +331,8 @@ class ChartValues(Values):
     """Pod of the remote controller"""
     teleop: Teleop = Teleop()
     """Missions and API, in the cloud pod"""
+    console: Console = Console()
+    """Page with the live scene, in the cloud pod"""
     mission: MissionJob = MissionJob()
     """Mission that a Job flies at install"""
     metrics: Metrics = Metrics()

@@ -82,11 +82,12 @@ def test_annotations_and_placement_of_the_user_are_used():
 
 def test_the_command_line_accepts_every_containers_arguments():
     load = {"backgroundLoad": {"enabled": True, "workers": 3}}
-    pods = pod_specs(render({"mission": {"enabled": True, "queue": True}, "cloud": load}))
-    assert list(containers(pods["cloud"])) == ["link", "cloud", "teleop", "load"]
+    more = {"mission": {"enabled": True, "queue": True}, "console": {"enabled": True}}
+    pods = pod_specs(render({**more, "cloud": load}))
+    assert list(containers(pods["cloud"])) == ["link", "cloud", "teleop", "console", "load"]
     assert "seq 3" in containers(pods["cloud"])["load"]["command"][-1]
     parts = [part for pod in pods.values() for part in containers(pod).values() if "args" in part]
-    assert len(parts) == 8
+    assert len(parts) == 9
     for part in parts:
         arguments = [re.sub(r"\$\((\w+)\)", r"\1", text) for text in part["args"]]
         assert callable(build_parser([arguments[0]]).parse_args(arguments).execute)
@@ -104,6 +105,9 @@ def test_each_pod_has_one_image():
     cloud, world = (f"cloudrc/{role}:{cloudrc.__version__}" for role in ("cloud", "world"))
     assert images({}) == {"world": world, "cloud": cloud, "test": cloud, "test-link": cloud}
     digest = "sha256:" + "0" * 64
+    cloud_pod = pod_specs(render({"console": {"enabled": True}}))["cloud"]
+    drawn = containers(cloud_pod)["console"]["image"]
+    assert drawn == world, "the cloud image has no physics"
     found = images({"registry": "ghcr.io/me", "tag": "9.9.9", "world": {"digest": digest}})
     assert found["world"] == f"ghcr.io/me/cloudrc/world@{digest}"
     assert found["cloud"] == "ghcr.io/me/cloudrc/cloud:9.9.9"
