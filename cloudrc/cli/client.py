@@ -163,7 +163,7 @@ def _refusal(answer: http.client.HTTPResponse, *, with_token: bool) -> CloudrcEr
     return UnreachableError(detail) if answer.status in RETRY_STATUSES else ApiError(detail)
 
 
-def token_argument(parser: argparse.ArgumentParser) -> None:
+def token_argument(parser: argparse._ActionsContainer) -> None:
     """Declare the argument --token-file."""
     text = f"file with the API's token (default: from {VARIABLE}, or the release's Secret)"
     parser.add_argument("--token-file", type=Path, metavar="FILE", help=text)

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import argparse
 import io
-import secrets
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, redirect_stdout
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from secrets import token_hex
 from typing import TYPE_CHECKING, TextIO
 
-from cloudrc.cli.client import UNIX, Api
+from cloudrc.cli.client import UNIX, Api, token_argument, token_file, token_reader
+from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
 from cloudrc.cli.extras import require
 from cloudrc.cli.find_run import find_local_run
 from cloudrc.cli.output import print_line
-from cloudrc.errors import BadInputError
+from cloudrc.cli.parser import whole_number
+from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 
 if TYPE_CHECKING:
     from cloudrc.console.steering import Link
@@ -25,61 +29,97 @@ EPILOG = """\
 examples:
   cloudrc console
   cloudrc console runs/hover-local-seed1 --port 8080
+  cloudrc console --cluster -n demo      a release with console.enabled=true
 
 The page is served on this machine only. The first browser steers; others read.
 Keys: arrows fly along x and y, W and S up and down, while they are held; Space
 holds; Shift+X stops the rotors."""
+LINK_SET = "link set "
+"""Start of a line with a change of the link that the page of a pod asks for."""
 PERIOD = 0.04
 """Longest wait for the next datagram of the flight [s]."""
 LOOK_PERIOD = 1.0
 """Time between two looks whether the flight goes on [s]."""
+OWN_S = 150.0
+"""Time for which a pod's page shows a change of the link that it asked for [s]: then Kubernetes has
+written the change, or its refusal, into the file of the profile."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    add = parser.add_argument
     about = "folder of the flying run (default: ./runs/latest, else the only one)"
-    parser.add_argument("run", nargs="?", type=Path, metavar="RUN", help=about)
+    add("run", nargs="?", type=Path, metavar="RUN", help=about)
     port = "port of the page on 127.0.0.1 (default: any free port)"
-    parser.add_argument("--port", type=int, default=0, metavar="N", help=port)
-    parser.set_defaults(context=None, namespace=None, release=None)
+    add("--port", type=whole_number(0, 65_535), default=0, metavar="N", help=port)
+    about = (
+        "show the page of a release; until Ctrl-C this command carries out its changes of the link"
+    )
+    add("--cluster", action="store_true", help=about)
+    release_arguments(parser)
+    pod = parser.add_argument_group("in the container of the chart")
+    for flag, metavar, text in (
+        ("--tap", "FILE", "socket to which 'cloudrc cloud --tap' sends"),
+        ("--config", "FILE", "experiment file"),
+        ("--profile", "FILE", "file of the link profile"),
+    ):
+        pod.add_argument(flag, type=Path, metavar=metavar, help=text)
+    pod.add_argument("--api", metavar="URL", help="the API of teleop")
+    token_argument(pod)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Serve the page until the flight ends or the user interrupts."""
+    if options.cluster or options.context or options.namespace or options.release:
+        return _show_release(options)
     require("the console", ("console", "world"))
-    found = find_local_run(options, lambda run, api: (run, api), "no run flies there")
-    if found is None:
-        raise BadInputError("no run flies here; start one: cloudrc run --mode local")
-    (run, url), out = found, sys.stdout
-    run = run.resolve()
-    if not url:
-        raise BadInputError(f"{run} flies without an API; the console needs one")
     with ExitStack() as opened:
+        out = sys.stdout
         opened.enter_context(redirect_stdout(io.StringIO()))  # viser prints about itself
-        _serve(options.port, run, url, opened, out)
+        if options.tap:
+            return _serve(options.port, _in_pod(options, out), opened, out)
+        _serve(options.port, _local(options), opened, out)
     print_line("the flight has ended", sys.stderr)
     return 0
 
 
-def _serve(port: int, run: Path, url: str, opened: ExitStack, out: TextIO) -> None:
+@dataclass(frozen=True)
+class Flight:
+    """What the console shows.
+
+    Attributes:
+        config: Experiment file.
+        tap: Socket to which cloud sends its records.
+        api: API of teleop.
+        link: The way to the link.
+        ends: Returns whether the flight has ended.
+    """
+
+    config: Path
+    tap: Path
+    api: Api
+    link: Link
+    ends: Callable[[], bool]
+
+
+def _serve(port: int, flight: Flight, opened: ExitStack, out: TextIO) -> int:
     from cloudrc.console.page import Page
 
     page = Page(port)
     opened.callback(page.close)
-    from cloudrc.drivers.tap import TAP_FILE, TapListener
+    from cloudrc.drivers.tap import TapListener
 
-    tap = TapListener(Path(url.removeprefix(UNIX)).with_name(TAP_FILE), page.url)
+    tap = TapListener(flight.tap, page.url)
     opened.callback(tap.close)
     print_line(f"console: {page.url}", out)
     from cloudrc.config.load import read_experiment
     from cloudrc.console.feed import FlightFeed
     from cloudrc.console.steering import Steering
-    from cloudrc.drivers.local import under_way
     from cloudrc.geometry.scene import load_scene
 
-    experiment = read_experiment(str(run / "config.yaml"))
+    experiment = read_experiment(str(flight.config))
     feed = FlightFeed(load_scene(experiment.world.scene))
-    steering = Steering(Api(url), _local_link(run))
+    steering = Steering(flight.api, flight.link)
     steering.watch()
     steering.start()
     page.fill(experiment, feed, steering)
@@ -91,8 +131,78 @@ def _serve(port: int, run: Path, url: str, opened: ExitStack, out: TextIO) -> No
         page.update(now)
         if now - looked > LOOK_PERIOD:
             looked = now
-            if under_way().get(run) != url:
-                return
+            if flight.ends():
+                return 0
+
+
+def _local(options: argparse.Namespace) -> Flight:
+    """Return the flight of a run on this machine."""
+    from cloudrc.drivers.local import under_way
+    from cloudrc.drivers.tap import TAP_FILE
+
+    found = find_local_run(options, lambda run, api: (run, api), "no run flies there")
+    if found is None:
+        raise BadInputError("no run flies here; start one: cloudrc up")
+    run, url = found[0].resolve(), found[1]
+    if not url:
+        raise BadInputError(f"{run} flies without an API; the console needs one")
+    tap = Path(url.removeprefix(UNIX)).with_name(TAP_FILE)
+    ends = lambda: under_way().get(run) != url  # noqa: E731
+    return Flight(run / "config.yaml", tap, Api(url), _local_link(run), ends)
+
+
+def _in_pod(options: argparse.Namespace, out: TextIO) -> Flight:
+    """Return the flight of the pod in which this process runs.
+
+    The pod has no right to change the link. It prints the changes that the operator asks for, and
+    `cloudrc console --cluster` carries them out with the rights of its user.
+    """
+    from cloudrc.config.document import read_document
+    from cloudrc.config.load import DIRECTIONS
+    from cloudrc.console.steering import Link
+
+    own: dict[str, tuple[float, float]] = {}  # key -> value that was asked for last, and when [s]
+
+    def read() -> dict[str, float]:
+        tree = read_document(options.profile, str(options.profile)).tree
+        keys = [(way, key) for way in DIRECTIONS for key in ("delay_ms", "jitter_ms", "loss")]
+        found = {f"{way}.{key}": float(tree.get(way, {}).get(key, 0.0)) for way, key in keys}
+        now = time.monotonic()
+        return found | {key: value for key, (value, at) in own.items() if now - at < OWN_S}
+
+    def change(settings: Sequence[str]) -> None:
+        pairs = (setting.split("=") for setting in settings)
+        own.update({key: (float(value), time.monotonic()) for key, value in pairs})
+        print_line(f"{LINK_SET}{' '.join(settings)}", out)
+
+    api = Api(options.api, token_reader(token_file(options)))
+    return Flight(options.config, options.tap, api, Link(read, change), lambda: False)
+
+
+def _show_release(options: argparse.Namespace) -> int:
+    """Forward the page of a release to this machine; carry out the changes that it asks for."""
+    if options.run:
+        raise BadInputError("RUN names a run here, the other flags a cluster; give one")
+    release = release_from_flags(options)
+    from cloudrc.cli.link_set import note_of
+    from cloudrc.cluster.console import follow_page
+    from cloudrc.cluster.link import keep, read_link, send
+
+    for line in follow_page(release, options.port, lambda url: print_line(f"console: {url}")):
+        if not line.startswith(LINK_SET):
+            continue
+        try:
+            if (link := read_link(release)) is None:
+                raise BadInputError("the pods of the release do not run")
+            settings, note = (
+                line.removeprefix(LINK_SET).split(),
+                partial(note_of, number=token_hex(4)),
+            )
+            keep(release, link, send(release, link, None, settings, note))
+            print_line(line)
+        except CloudrcError as error:
+            print_line(f"cloudrc: {line}: {error}", sys.stderr)
+    raise InterruptedRunError("the container 'console' has ended; see its log")
 
 
 def _local_link(run: Path) -> Link:
@@ -112,6 +222,6 @@ def _local_link(run: Path) -> Link:
         return found
 
     def change(settings: Sequence[str]) -> None:
-        set_here(folder, None, settings, secrets.token_hex(4))
+        set_here(folder, None, settings, token_hex(4))
 
     return Link(read, change)

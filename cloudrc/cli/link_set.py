@@ -74,7 +74,7 @@ def execute(options: argparse.Namespace) -> int:
         from cloudrc.cluster.link import keep, send
 
         place = Release(options.context, options.namespace, options.release or DEFAULT_RELEASE)
-        link, note = _link_of(options, place), partial(_note, number=number)
+        link, note = _link_of(options, place), partial(note_of, number=number)
         sent = send(place, link, options.profile, options.settings, note)
         took = monotonic() - began
         keep(place, link, sent)
@@ -127,7 +127,7 @@ def set_here(
     if not states:
         raise BadInputError(f"{folder.parent}: no link is up there (yet); wait for the start")
     edit = edit_profile(Document(states[0].profile), profile, settings)
-    publish(folder / CHANGE_FILE, _note(edit, number))
+    publish(folder / CHANGE_FILE, note_of(edit, number))
     publish(folder / PROFILE_FILE, json.dumps(edit.values, indent=2) + "\n")
     deadline = monotonic() + LOCAL_TIMEOUT
     while not (states := read_states(folder)) or any(state.change != number for state in states):
@@ -165,7 +165,8 @@ def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
     raise failed
 
 
-def _note(edit: Edit, number: str) -> str:
+def note_of(edit: Edit, number: str) -> str:
+    """Return the record of a change, for the file beside the profile."""
     return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
 
 

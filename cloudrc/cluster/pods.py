@@ -171,14 +171,18 @@ def api_url(release: Release) -> Iterator[str]:
 
 
 @contextmanager
-def forwarded(release: Release, pod: str, ports: Sequence[int]) -> Iterator[dict[int, int]]:
+def forwarded(
+    release: Release, pod: str, ports: Sequence[int], local: int = 0
+) -> Iterator[dict[int, int]]:
     """Forward ports of a pod, also loopback ports of the pod, during the `with` block.
+
+    `local` is the port on this machine for a single port of the pod; 0: any free port.
 
     Yields:
         Port in the pod -> port on 127.0.0.1 of this machine.
     """
     command = [program("kubectl"), *release.flags, "port-forward", f"pod/{pod}"]
-    command += ["--address=127.0.0.1", *(f":{port}" for port in ports)]
+    command += ["--address=127.0.0.1", *(f"{local or ''}:{port}" for port in ports)]
     # Files, not pipes: kubectl writes a line per connection, and a full pipe would block it.
     with tempfile.TemporaryFile() as output, tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=errors)
