@@ -61,12 +61,15 @@ def make_robot_status(
 
     `world` identifies world's process. `delays` are horizon, round trip and loop delay [s].
     """
-    fields = (
-        *(epoch, telemetry.odometry.position, telemetry.guard, telemetry.mission, world),
-        *(telemetry.pipe_contacts, telemetry.touch_speed, telemetry.slip_ns, *delays),
-        *(telemetry.mission_id, telemetry.reached, telemetry.cause),
+    # fmt: off
+    _, odometry, _, _, _, slip_ns, mission, guard, pipes, touch, mission_id, reached, cause = (
+        telemetry
     )
-    return _new(RobotStatus, fields)
+    return _new(RobotStatus, (
+        epoch, odometry.position, guard, mission, world, pipes, touch, slip_ns, *delays,
+        mission_id, reached, cause,
+    ))
+    # fmt: on
 
 
 class EmergencyStopRepeater:

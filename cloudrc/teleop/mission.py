@@ -298,9 +298,9 @@ class Teleop:
 
     def _find_timeout(self, now_ns: int) -> tuple[str, str] | None:
         limit, leg_limit = self._plan.time_limit, self._plan.legs[self.leg].time_limit
-        if self.elapsed(now_ns) >= limit and self.state == STARTING:
-            return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
         if self.elapsed(now_ns) >= limit:
+            if self.state == STARTING:
+                return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
             return "timed_out", f"mission not done within {limit:g} s: {self.where}"
         if self._watch.flown >= leg_limit and self.state == FLYING:
             return "leg_timed_out", f"{self._leg_name} not reached in {leg_limit:g} s"
