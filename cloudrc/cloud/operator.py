@@ -12,6 +12,7 @@ from cloudrc.tunnel.session import NO_EPOCH
 
 REPEAT_NS = 100_000_000
 """Time between two copies of an emergency stop [ns]."""
+ESTOP = GuardState.ESTOP  # looking up a member of an enum is slow
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
@@ -96,7 +97,7 @@ class EmergencyStopRepeater:
 
     def see(self, guard: GuardState, acted_on: int) -> None:
         """Note the guard's state and the number of the last request that world has carried out."""
-        self._acted_on, self._stopped = acted_on, guard is GuardState.ESTOP
+        self._acted_on, self._stopped = acted_on, guard is ESTOP
         if self._stopped and 0 < self._number <= acted_on:
             self.sounds = False
 

@@ -242,9 +242,10 @@ class Teleop:
         before, self.seen = self.seen, seen
         if seen.guard is ESTOP:
             self.stopping = False
-        new_session = not before or (before.epoch, before.world) != (seen.epoch, seen.world)
+        new_session = not before or before.epoch != seen.epoch or before.world != seen.world
         last, onboard, legs = self._setpoint, self._onboard, self._plan.legs
-        started = self.requests.see(seen, now_ns) is Request.START and self.state == STARTING
+        confirmed = self.requests.see(seen, now_ns)
+        started = self.state == STARTING and confirmed is Request.START
         if self.state == STARTING and not self._expected and self._plan.start is Start.HERE:
             # The mission was ordered before the first telemetry.
             self._expected = (seen.mission_id, self._mission_id)
