@@ -114,7 +114,7 @@ class DelayMeter:
             return
         loop_ns = now_ns - echo_ns
         self.loop_delay, self.rtt = loop_ns * 1e-9, (loop_ns - hold_ns) * 1e-9
-        self._estimator.update(DelaySample(self.loop_delay, self.rtt))
+        self._estimator.update(_new(DelaySample, (self.loop_delay, self.rtt)))
 
     def observe_echo(self, telemetry: Telemetry) -> None:
         """Process the echo of telemetry, which shows when a command was applied.
@@ -123,10 +123,11 @@ class DelayMeter:
         telemetry that arrives late. Without this echo the average delay would be too small.
         """
         echo_ns = telemetry.echo_stamp_ns
-        if echo_ns == NEVER_NS or echo_ns in self._echoes:
+        if echo_ns > self.newest_echo_ns:
+            self.newest_echo_ns = echo_ns
+        elif echo_ns == NEVER_NS or echo_ns in self._echoes:
             return
         self._echoes.append(echo_ns)
-        self.newest_echo_ns = max(self.newest_echo_ns, echo_ns)
         applied_ns = telemetry.stamp_ns - telemetry.echo_hold_ns
         self._tell_applied(echo_ns, applied_ns)
         self._estimator.add_applied((applied_ns - echo_ns) * 1e-9)
@@ -322,12 +323,11 @@ class ControlLoop:
     def _predict(self, basis: Odometry, horizon: float, now_ns: int) -> Odometry:
         try:
             estimate = self._predictor.predict(basis, horizon)
-            position, velocity = _triple(estimate.position), _triple(estimate.velocity)
-            w, x, y, z = estimate.orientation_wxyz
+            stamp_ns, position, (w, x, y, z), velocity, rate = estimate
+            position, velocity = _triple(position), _triple(velocity)
             orientation = (float(w), float(x), float(y), float(z))
             if not isfinite(sum(position + velocity + orientation)):
                 _refuse(position=position, velocity=velocity, orientation=orientation)
-            stamp_ns, rate = estimate.stamp_ns, estimate.angular_velocity_body
             return _new(Odometry, (stamp_ns, position, orientation, velocity, rate))
         except BaseException as error:
             self._note("predictor", error, now_ns)
@@ -338,13 +338,12 @@ class ControlLoop:
     ) -> ControlOutput:
         try:
             output = self._controller.update(estimate, setpoint, dt)
-            velocity, yaw_rate = _triple(output.velocity), float(output.yaw_rate)
-            if not isfinite(sum(velocity) + yaw_rate):
+            velocity, yaw_rate, proportional, integral, derivative = output
+            velocity, yaw_rate = _triple(velocity), float(yaw_rate)
+            if not isfinite(sum(velocity, yaw_rate)):
                 _refuse(velocity=velocity, yaw_rate=(yaw_rate,))
-            proportional, integral = _triple(output.proportional), _triple(output.integral)
-            derivative = _triple(output.derivative)
-            terms = (velocity, yaw_rate, proportional, integral, derivative)
-            return _new(ControlOutput, terms)
+            terms = (_triple(proportional), _triple(integral), _triple(derivative))
+            return _new(ControlOutput, (velocity, yaw_rate, *terms))
         except BaseException as error:
             self._note("controller", error, now_ns)
             return STAND_STILL

@@ -13,6 +13,7 @@ from cloudrc.tunnel.session import NO_EPOCH
 REPEAT_NS = 10_000_000
 """Time between two copies of an emergency stop [ns]. It is short, so that a link with losses delays
 the stop by some 10 ms only."""
+ESTOP = GuardState.ESTOP  # looking up a member of an enum is slow
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
@@ -62,12 +63,15 @@ def make_robot_status(
 
     `world` identifies world's process. `delays` are horizon, round trip and loop delay [s].
     """
-    fields = (
-        *(epoch, telemetry.odometry.position, telemetry.guard, telemetry.mission, world),
-        *(telemetry.pipe_contacts, telemetry.touch_speed, telemetry.slip_ns, *delays),
-        *(telemetry.mission_id, telemetry.reached, telemetry.cause),
+    # fmt: off
+    _, odometry, _, _, _, slip_ns, mission, guard, pipes, touch, mission_id, reached, cause = (
+        telemetry
     )
-    return _new(RobotStatus, fields)
+    return _new(RobotStatus, (
+        epoch, odometry.position, guard, mission, world, pipes, touch, slip_ns, *delays,
+        mission_id, reached, cause,
+    ))
+    # fmt: on
 
 
 class EmergencyStopRepeater:
@@ -94,7 +98,7 @@ class EmergencyStopRepeater:
 
     def see(self, guard: GuardState, acted_on: int) -> None:
         """Note the guard's state and the number of the last request that world has carried out."""
-        self._acted_on, self._stopped = acted_on, guard is GuardState.ESTOP
+        self._acted_on, self._stopped = acted_on, guard is ESTOP
         if self._stopped and 0 < self._number <= acted_on:
             self.sounds = False
 

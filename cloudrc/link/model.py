@@ -69,6 +69,7 @@ class LinkDirection:
         self._only = self._timeline.only()
         self._plain = not profile.keep_order and all(p.rate is None for p in self._timeline.pieces)
         self._fates: dict[tuple[int, int, int, float, Loss], list[Fate]] = {}
+        self._place: tuple[int, int, int, Conditions] | None = None
 
     def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
         """Send one packet of `size` bytes of UDP payload at `now_ns` [ns]; compute when it arrives.
@@ -86,10 +87,10 @@ class LinkDirection:
         if conditions.blackout:
             self._counts["blackout"] += 1
             return ()
-        block, index = divmod(counter, BLOCK)
-        key = (epoch, kind, block, conditions.jitter, conditions.loss)
-        table = self._fates.get(key) or self._draw(key)
-        fate = table[index]
+        place = (epoch, kind, counter // BLOCK, conditions)
+        if place != self._place:  # comparing takes less time than a look into the dictionary
+            self._place, self._table = place, self._find_table(*place)
+        fate = self._table[counter % BLOCK]
         if len(fate) == 1 and self._plain:  # nearly all packets: save time
             self._counts["passed"] += 1
             delay_ns = conditions.delay_ns + fate[0]
@@ -153,9 +154,12 @@ class LinkDirection:
         departures.append(start + round((size + HEADER_BYTES) * 8e9 / rate))
         return True
 
-    def _draw(self, key: tuple[int, int, int, float, Loss]) -> list[Fate]:
-        """Compute the impairments of a block, and keep them for the other packets of the block."""
-        epoch, kind, block, jitter, loss = key
+    def _find_table(self, epoch: int, kind: int, block: int, conditions: Conditions) -> list[Fate]:
+        """Return the impairments of a block; keep them for the other packets of the block."""
+        jitter, loss = conditions.jitter, conditions.loss
+        key = (epoch, kind, block, jitter, loss)
+        if key in self._fates:
+            return self._fates[key]
         stream = stream_key(self._seed, self._uplink, epoch, kind)
         if len(self._fates) >= _TABLES:
             del self._fates[next(iter(self._fates))]

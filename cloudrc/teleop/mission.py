@@ -273,9 +273,10 @@ class Teleop:
         before, self.seen = self.seen, seen
         if seen.guard is ESTOP:
             self.stopping = False
-        new_session = not before or (before.epoch, before.world) != (seen.epoch, seen.world)
+        new_session = not before or before.epoch != seen.epoch or before.world != seen.world
         last, onboard, legs = self._setpoint, self._onboard, self._plan.legs
-        started = self.requests.see(seen, now_ns) is Request.START and self.state == STARTING
+        confirmed = self.requests.see(seen, now_ns)
+        started = self.state == STARTING and confirmed is Request.START
         if self.state == STARTING and not self._expected and self._plan.start is Start.HERE:
             # The mission was ordered before the first telemetry.
             self._expected = (seen.mission_id, self._mission_id)
@@ -337,9 +338,9 @@ class Teleop:
 
     def _find_timeout(self, now_ns: int) -> tuple[str, str] | None:
         limit, leg_limit = self._plan.time_limit, self._plan.legs[self.leg].time_limit
-        if self.elapsed(now_ns) >= limit and self.state == STARTING:
-            return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
         if self.elapsed(now_ns) >= limit:
+            if self.state == STARTING:
+                return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
             return "timed_out", f"mission not done within {limit:g} s: {self.where}"
         if self._watch.flown >= leg_limit and self.state == FLYING:
             return "leg_timed_out", f"{self._leg_name} not reached in {leg_limit:g} s"

@@ -5,6 +5,9 @@ from __future__ import annotations
 from cloudrc.messages import GuardState, OperatorRequest, Request, Start
 from cloudrc.teleop.wire import RobotStatus
 
+# Looking up a member of an enum is slow.
+GROUND, HOLD = GuardState.GROUND, GuardState.HOLD
+
 REPEAT_NS = 100_000_000
 """Time between two copies of a request [ns]."""
 UNNUMBERED = 0
@@ -54,7 +57,7 @@ class RequestSender:
         seen = self._seen
         if seen is None or self._next is not None:
             return False
-        return seen.guard is GuardState.GROUND or (seen.epoch, seen.mission) == self._ended
+        return seen.guard is GROUND or (seen.epoch, seen.mission) == self._ended
 
     def ask(self, request: Request, start: Start = Start.SPAWN, *, after: bool = False) -> None:
         """Begin to repeat a request; it replaces the pending request.
@@ -117,9 +120,9 @@ class RequestSender:
     def _repeat_start_if_lost(self, seen: RobotStatus, now_ns: int) -> None:
         """Send the start again if another teleop or cloud has stopped the mission."""
         ours = self._is_started and seen.mission_id == self._progress.mission_id
-        if not ours or seen.guard not in (GuardState.GROUND, GuardState.HOLD):
+        if not ours or seen.guard not in (GROUND, HOLD):
             self._flies_ns = now_ns
-        if ours and seen.guard <= GuardState.HOLD:
+        if ours and seen.guard <= HOLD:
             if 0 < self._number < seen.mission or now_ns - self._flies_ns >= IDLE_NS:
                 self.ask(Request.START, Start.HERE)
 

@@ -38,6 +38,7 @@ class TunnelEnd:
     def __init__(self, identity: Identity, sends: Direction, newest_wins: bool) -> None:
         self._identity = identity
         self._session = Session(sends, identity.ring)
+        self._make_datagram = self._session.pass_on if identity.passes else self._encode
         self._channel = Channel(newest_wins)
         self._complaints = HandshakeLog()
         self._clock_is_shared = False
@@ -73,9 +74,7 @@ class TunnelEnd:
         self._datagrams.append(self._make_datagram(kind, message))
         self._counts["sent"] += 1
 
-    def _make_datagram(self, kind: int, message: Telemetry | Command) -> Datagram:
-        if self._identity.passes:
-            return self._session.pass_on(kind, message)
+    def _encode(self, kind: int, message: Telemetry | Command) -> bytes:
         encode: Any = encode_command if isinstance(message, Command) else encode_telemetry
         return self._session.seal(kind, encode(message))
 

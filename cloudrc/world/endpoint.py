@@ -215,9 +215,9 @@ class WorldEndpoint(TunnelEnd):
         return self._sample_ns + self._slip_ns
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Simulate up to and including `now_ns` [ns]; send the telemetry that is due."""
+        """Simulate up to `now_ns` [ns]; send the telemetry that is due."""
         self._session.follow_keys()
-        self._advance(self._follow(now_ns) + 1)
+        self._advance(self._follow(now_ns), samples=True)
 
     def receive_datagram(self, data: Datagram, now_ns: int) -> None:
         """Handle a datagram that arrived at `now_ns` [ns]; count and drop an invalid datagram."""
@@ -255,10 +255,16 @@ class WorldEndpoint(TunnelEnd):
         self._slip_ns += behind_ns - CATCH_UP_NS
         return now_ns - self._slip_ns
 
-    def _advance(self, until_ns: int) -> None:
-        """Simulate all steps that begin before `until_ns` [ns], world's clock."""
+    def _advance(self, until_ns: int, *, samples: bool = False) -> None:
+        """Simulate all steps that begin before `until_ns` [ns], world's clock.
+
+        With `samples`, take the sample that is due at `until_ns`, too. The step that begins at the
+        time of a sample comes before a datagram that arrives later at the same time.
+        """
         tick_ns = self._tick_ns
-        if tick_ns < until_ns and self._waiting is not None:
+        if until_ns == tick_ns == self._sample_ns - self._sample_period_ns:
+            until_ns += 1
+        if self._waiting is not None and (tick_ns < until_ns or samples):
             self._apply(tick_ns)
         while tick_ns < until_ns:
             if tick_ns >= self._sample_ns:
@@ -266,6 +272,8 @@ class WorldEndpoint(TunnelEnd):
             sample_ns = self._sample_ns
             stop_ns = sample_ns if sample_ns < until_ns else until_ns
             tick_ns = self._tick_ns = self.robot.run(tick_ns, stop_ns)
+        if samples and tick_ns == self._sample_ns:
+            self._sample(tick_ns)
 
     def _apply(self, now_ns: int) -> None:
         assert self._waiting is not None

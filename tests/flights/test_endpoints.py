@@ -31,6 +31,15 @@ def test_a_command_is_applied_at_the_next_tick_whenever_the_driver_wakes(talk, w
     assert told == (30 * MS, 21_300_000, 8 * MS)
 
 
+def test_a_command_at_the_time_of_a_sample_waits_for_the_next_step(talk):
+    """The same result in real time, where its time is a little later."""
+    talk.now_ns = 20 * MS
+    talk.world.handle_deadline(talk.now_ns)
+    talk.send(talk.command(basis_ns=20 * MS))
+    talk.wait(10)
+    assert [applied.stamp_ns for applied in talk.take(CommandApplied)] == [22 * MS]
+
+
 ENDS = join(HOVER)[:2]
 
 

@@ -14,6 +14,7 @@ from cloudrc.cloud.parameters import not_negative, vector
 from cloudrc.messages import ZERO, Odometry, Setpoint, Vector
 
 UNLIMITED: Vector = (inf, inf, inf)
+_new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class Pid(Controller):
@@ -85,7 +86,7 @@ class Pid(Controller):
             w, x, y, z = estimate.orientation_wxyz
             measured = atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
             yaw_rate = self._gain_yaw * remainder(setpoint.yaw - measured, tau)
-        return ControlOutput(velocity, yaw_rate, proportional, integral, derivative)
+        return _new(ControlOutput, (velocity, yaw_rate, proportional, integral, derivative))
 
     def _limit(self, wanted: Vector) -> Vector:
         x, y, z = (

@@ -204,7 +204,9 @@ class Guard:
             elif self.state is HOLD:
                 self._leave_hold(now_ns, fresh_until_ns)
             if self.state is TRACK:
-                self._track_until_ns = max(fresh_until_ns, self._plan_end_ns(command, now_ns))
+                self._track_until_ns = fresh_until_ns
+                if command.plan:
+                    self._track_until_ns = max(fresh_until_ns, self._plan_end_ns(command, now_ns))
         return None
 
     def _is_plan_possible(self, command: Command) -> bool:
@@ -216,8 +218,6 @@ class Guard:
 
         The rest of the plan cannot make a command fresh that is too old when it arrives.
         """
-        if not command.plan:
-            return NEVER_NS
         end_ns = command.planned_ns + (len(command.plan) + 1) * PLAN_STEP_NS
         return min(end_ns, now_ns + self._limits.plan_max_ns)
 

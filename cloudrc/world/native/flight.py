@@ -28,9 +28,9 @@ MARGIN = 1e-3
 """Distance added to every geom with its own margin and gap [m]; it covers rounding errors."""
 HUGE = 1e4
 """Half the edge of the box that stands for the space below a plane [m]."""
-_DISABLE = mujoco.mjtDisableBit
-UNUSED_WITHOUT_CONTACTS = int(
-    _DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT | _DISABLE.mjDSBL_SENSOR
+UNUSED_WITHOUT_CONTACTS = sum(
+    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{part}", 0))  # old versions lack the last two
+    for part in ("CONTACT", "CONSTRAINT", "SENSOR", "SPRING", "DAMPER")
 )
 """Parts of MuJoCo that do nothing while the robot touches nothing."""
 _CONSTANTS = {
@@ -109,11 +109,12 @@ def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
 
     A row has the centre (3,) and the axes (9,) of the box, its half sizes (3,), and the radius of
     the edges, all [m]. The radius of the robot is that of a ball around its base's origin; it is
-    infinite if geoms or constraints matter without a contact, too.
+    infinite if geoms, constraints, springs or dampers matter without a contact, too.
     """
     option, rows, radius = model.opt, [], 0.0
     other = option.density, option.viscosity, model.nflex, model.npair, model.neq, model.ntendon
-    if any(other) or model.dof_frictionloss.any():
+    each = model.dof_frictionloss, model.dof_damping, model.jnt_stiffness, model.body_gravcomp
+    if any(other) or any(values.any() for values in each):
         radius = inf
     for geom in range(model.ngeom):
         size, bound = model.geom_size[geom], model.geom_rbound[geom]

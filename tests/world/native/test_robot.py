@@ -218,6 +218,17 @@ def test_a_tether_holds_the_robot_in_c_too(tmp_path):
     assert pilots[1].robot.simulator.readings.position[2] < 1.1
 
 
+@pytest.mark.parametrize("field", ["dof_damping", "jnt_stiffness"])
+def test_springs_and_dampers_act_in_c_too(field):
+    seen = []
+    for kind in (Robot, NativeRobot):
+        parts = Simulator("pelican", "empty"), LowLevel(), Guard(LIMITS)
+        getattr(parts[0].model, field)[:] = 0.1
+        robot = NativeRobot(*parts, LIMITS) if kind is NativeRobot else Robot(*parts)
+        seen.append(Pilot(robot).fly(2.0, lambda pilot: UP).seen)
+    assert seen[0] == seen[1]
+
+
 @pytest.mark.parametrize("setting", [{"density": 1.2}, {"viscosity": 1e-5}])
 def test_geoms_that_air_acts_on_are_always_placed(setting):
     parts = Simulator("pelican", "empty"), LowLevel(), Guard(LIMITS)
