@@ -22,6 +22,11 @@ Colour = tuple[int, int, int]
 GHOST, SETPOINT, REACHED = (0, 114, 178), (213, 94, 0), (0, 158, 115)
 OPEN, PIPE, STRUT = (120, 124, 130), (110, 130, 150), (77, 77, 82)
 """Colours; those of ghost, setpoint and reached waypoints are colours of the figures."""
+FLOOR: dict[str, Any] = {
+    **{"cell_color": (228, 230, 233), "section_color": (206, 210, 214), "shadow_opacity": 0.25},
+    **{"plane_color": (246, 247, 248), "plane_opacity": 1.0, "fade_distance": 40.0},
+}
+"""Look of a plane, which is a grid."""
 GHOST_OPACITY, PIPE_OPACITY = 0.35, 0.5
 VIRIDIS = "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725"
 """Colours of clearance in the figures, evenly spaced from 0 to `CLEARANCE_SHOWN`."""
@@ -119,15 +124,7 @@ class FlightScene:
             name = model.geom(geom).name.rpartition("/")[0]
             if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
                 self._scene.add_grid(
-                    f"/{name}",
-                    infinite_grid=True,
-                    fade_distance=40.0,
-                    cell_color=(228, 230, 233),
-                    section_color=(206, 210, 214),
-                    plane_color=(246, 247, 248),
-                    plane_opacity=1.0,
-                    shadow_opacity=0.25,
-                    position=model.geom_pos[geom],
+                    f"/{name}", position=model.geom_pos[geom], infinite_grid=True, **FLOOR
                 )
             elif name not in pipes:
                 bodies[name].append(geom)
@@ -136,22 +133,12 @@ class FlightScene:
         for pipe in geometry.pipes:
             inner, outer = pipe.inner, pipe.outer
             # Only the far wall is drawn, so that the robot in the pipe is seen from every side.
-            self._add_surface(pipe, "wall", (inner, -0.5), (inner, 0.5), "back", PIPE_OPACITY)
-            self._add_surface(pipe, "begin", (inner, -0.5), (outer, -0.5), "double", None)
-            self._add_surface(pipe, "end", (inner, 0.5), (outer, 0.5), "double", None)
-
-    def _add_surface(self, pipe: Pipe, part: str, *look: Any) -> None:
-        first, last, side, opacity = look
-        vertices, faces = _surface(pipe, first, last)
-        self._scene.add_mesh_simple(
-            f"/{pipe.name}/{part}",
-            vertices,
-            faces,
-            color=PIPE,
-            opacity=opacity,
-            side=side,
-            cast_shadow=False,
-        )
+            look: Any = {"color": PIPE, "cast_shadow": False}
+            name, wall = f"/{pipe.name}/wall", _surface(pipe, (inner, -0.5), (inner, 0.5))
+            self._scene.add_mesh_simple(name, *wall, side="back", opacity=PIPE_OPACITY, **look)
+            for end in (-0.5, 0.5):
+                name, rim = f"/{pipe.name}/rim_{end:+}", _surface(pipe, (inner, end), (outer, end))
+                self._scene.add_mesh_simple(name, *rim, side="double", **look)
 
     def _add_robot(self, model: Any) -> None:
         """Add the robot and its ghost; struts, which only pictures show, carry the rotors."""
@@ -174,17 +161,11 @@ class FlightScene:
         for geom in geoms:
             groups[() if ghost else tuple(map(float, model.geom_rgba[geom]))].append(geom)
         for number, (rgba, members) in enumerate(groups.items()):
-            mesh = merge_geoms(model, members)
+            name, mesh = f"{parent}/{number}", merge_geoms(model, members)
             opacity = rgba[3] if rgba else GHOST_OPACITY
-            self._scene.add_mesh_simple(
-                f"{parent}/{number}",
-                mesh.vertices,
-                mesh.faces,
-                color=ghost or np.array(rgba[:3]),
-                opacity=None if opacity == 1.0 else opacity,
-                flat_shading=True,
-                cast_shadow=ghost is None,
-            )
+            look: Any = {"opacity": None if opacity == 1.0 else opacity, "flat_shading": True}
+            look |= {"color": ghost or np.array(rgba[:3]), "cast_shadow": ghost is None}
+            self._scene.add_mesh_simple(name, mesh.vertices, mesh.faces, **look)
 
 
 def clearance_colours(clearances: Array) -> NDArray[np.uint8]:
@@ -223,4 +204,4 @@ def _camera(geometry: Scene) -> tuple[Any, Any]:
     spots = np.array([geometry.spawn, *(pipe.centre for pipe in geometry.pipes)])
     low, high = spots.min(axis=0), spots.max(axis=0)
     middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.5)
-    return middle + size * np.array([0.38, 0.56, 0.44]), middle
+    return middle + size * np.array([0.44, 0.65, 0.50]), middle
