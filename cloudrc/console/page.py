@@ -115,8 +115,6 @@ class Page:
         from cloudrc.console.scene import FlightScene  # needs MuJoCo, which takes a second
 
         self._scene = FlightScene(self._server, experiment)
-        # Without a graphics card, shadows cost more than ten times the rest of a picture.
-        self._server.scene.configure_default_lights(cast_shadow=False)
         self._place_camera(load_scene(experiment.world.scene))
         gui = self._server.gui
         gui.main_panel.dock_right()
@@ -167,7 +165,7 @@ class Page:
         low, high = spots.min(axis=0), spots.max(axis=0)
         middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.5)
         camera = self._server.initial_camera
-        camera.look_at, camera.position = middle, middle + size * np.array([-0.65, 0.3, 0.5])
+        camera.look_at, camera.position = middle, middle + size * np.array([-0.88, 0.4, 0.68])
 
     def _is_due(self, what: str, period: float, now: float) -> bool:
         if now < self._due[what]:

@@ -23,7 +23,7 @@ GHOST, SETPOINT, REACHED = (0, 114, 178), (213, 94, 0), (0, 158, 115)
 OPEN, PIPE, STRUT = (120, 124, 130), (110, 130, 150), (77, 77, 82)
 """Colours; those of ghost, setpoint and reached waypoints are colours of the figures."""
 FLOOR: dict[str, Any] = {
-    **{"cell_color": (228, 230, 233), "section_color": (206, 210, 214), "shadow_opacity": 0.25},
+    **{"cell_color": (228, 230, 233), "section_color": (206, 210, 214)},
     **{"plane_color": (246, 247, 248), "plane_opacity": 1.0, "fade_distance": 40.0},
 }
 """Look of a plane, which is a grid."""
@@ -46,12 +46,14 @@ class FlightScene:
         """
         self._scene, world = server.scene, experiment.world
         model, geometry = compile_model(world.robot, world.scene), load_scene(world.scene)
+        # Without a graphics card, shadows cost more than ten times the rest of a picture.
+        self._scene.configure_default_lights(cast_shadow=False)
         self._add_surroundings(model, geometry)
         self._robot = self._scene.add_frame("/robot", show_axes=False, position=geometry.spawn)
         self._ghost = self._scene.add_frame("/ghost", show_axes=False, visible=False)
         self._add_robot(model)
         self._setpoint = self._scene.add_icosphere(
-            "/setpoint", 0.09, SETPOINT, opacity=0.6, cast_shadow=False, visible=False
+            "/setpoint", 0.09, SETPOINT, opacity=0.6, visible=False
         )
         self._waypoints: list[Any] = []  # spheres
         self._points: Array = np.zeros((0, 3))  # of the waypoints [m]
@@ -101,9 +103,7 @@ class FlightScene:
             self._points, self._waypoints = points, []
             for number, point in enumerate(points, start=1):
                 name, above = f"/waypoints/{number}", (0.0, 0.0, 0.14)
-                self._waypoints.append(
-                    self._scene.add_icosphere(name, 0.06, OPEN, position=point, cast_shadow=False)
-                )
+                self._waypoints.append(self._scene.add_icosphere(name, 0.06, OPEN, position=point))
                 self._scene.add_label(
                     f"{name}/label", str(number), position=above, anchor="bottom-center"
                 )
@@ -133,7 +133,7 @@ class FlightScene:
         for pipe in geometry.pipes:
             inner, outer = pipe.inner, pipe.outer
             # Only the far wall is drawn, so that the robot in the pipe is seen from every side.
-            look: Any = {"color": PIPE, "cast_shadow": False}
+            look: Any = {"color": PIPE}
             name, wall = f"/{pipe.name}/wall", _surface(pipe, (inner, -0.5), (inner, 0.5))
             self._scene.add_mesh_simple(name, *wall, side="back", opacity=PIPE_OPACITY, **look)
             for end in (-0.5, 0.5):
@@ -164,7 +164,7 @@ class FlightScene:
             name, mesh = f"{parent}/{number}", merge_geoms(model, members)
             opacity = rgba[3] if rgba else GHOST_OPACITY
             look: Any = {"opacity": None if opacity == 1.0 else opacity, "flat_shading": True}
-            look |= {"color": ghost or np.array(rgba[:3]), "cast_shadow": ghost is None}
+            look["color"] = ghost or np.array(rgba[:3])
             self._scene.add_mesh_simple(name, mesh.vertices, mesh.faces, **look)
 
 
