@@ -32,10 +32,11 @@ def follow_page(release: Release, port: int, tell: Callable[[str], None]) -> Ite
     command = [program("kubectl"), *release.flags, *words]
     with forwarded(release, name, [PORT], local=port) as ports:
         tell(f"http://127.0.0.1:{ports[PORT]}")
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE)
-        try:
+        with subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
+        ) as process:
             assert process.stdout is not None
-            for line in process.stdout:
-                yield line.decode(errors="replace").strip()
-        finally:
-            end_process(process)
+            try:
+                yield from map(str.strip, process.stdout)
+            finally:
+                end_process(process)

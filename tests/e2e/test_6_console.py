@@ -1,0 +1,56 @@
+"""The page of a release, in a browser, through a forwarded port."""
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from cloudrc.cluster.flight import wait_ready
+from tests.e2e.conftest import CHART, NAME, NAMESPACE, ROOT, helm, metrics, place, value
+
+MEASURED = "cloudrc_uplink_delay_seconds"
+
+
+@pytest.fixture(scope="module")
+def console(installed):
+    """`cloudrc console --cluster`, on the release with a console."""
+    upgrade = ("upgrade", NAME, str(CHART), "--reuse-values", "--set")
+    helm(*upgrade, "console.enabled=true")
+    wait_ready(place(), timeout=120.0)
+    words = ["console", "--cluster", "-n", NAMESPACE, "--release", NAME]
+    command = [sys.executable, "-m", "cloudrc", *words]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        yield process
+        process.terminate()
+    helm(*upgrade, "console.enabled=false")
+    wait_ready(place(), timeout=120.0)
+
+
+def mean_delay(seconds):
+    """Return the mean delay of the uplink from now on [s], measured by cloud."""
+    before = totals()
+    time.sleep(seconds)
+    total, count = (new - old for new, old in zip(totals(), before, strict=True))
+    return total / count
+
+
+def totals():
+    samples = metrics("cloud")
+    return value(samples, f"{MEASURED}_sum"), value(samples, f"{MEASURED}_count")
+
+
+def test_a_slider_of_the_page_changes_the_link(console, browse):
+    address = console.stdout.readline().split()[-1]
+    page = browse(address)
+    page.set_default_timeout(60e3)
+    page.get_by_role("button", name="STOP", exact=True).wait_for()
+    page.get_by_text("Link", exact=True).click()
+    delay = page.locator("input:visible").first
+    before = delay.input_value()
+    for asked in ("120", before):
+        delay.fill(asked)
+        delay.press("Enter")
+        assert console.stdout.readline().strip() == f"link set uplink.delay_ms={asked}"
+        time.sleep(1.0)  # the datagrams that were under way
+        assert mean_delay(3.0) == pytest.approx(float(asked) * 1e-3, abs=0.030)
