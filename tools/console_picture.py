@@ -17,8 +17,8 @@ from playwright.sync_api import Page, sync_playwright
 
 ROOT = Path(__file__).resolve().parents[1]
 TARGET, SESSION = ROOT / "docs" / "console.webp", ROOT / "build" / "console"
-PERIOD, SHOWN, LAST = 0.75, 0.15, 1.5
-"""Time between two screenshots, time for which each one is shown, and the last one [s]."""
+COUNT, PERIOD, SHOWN, LAST = 46, 0.75, 0.15, 1.5
+"""Number of screenshots; time between them, time for which each is shown, and the last one [s]."""
 SIZE, QUALITY = (960, 600), 45
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
@@ -28,12 +28,11 @@ def film(page: Page) -> list[Image.Image]:
     button = page.get_by_role("button", name="Start", exact=True)
     button.wait_for(timeout=120e3)
     time.sleep(5.0)  # the scene appears after the buttons
+    for note in page.locator(".mantine-Notification-closeButton").all():
+        note.click()  # "software rendering"
     button.click()
     frames, due = [], time.monotonic()
-    close = page.locator(".mantine-Notification-closeButton")  # "software rendering"
-    while len(frames) < 20 or "waypoints" in page.content():
-        if not frames and close.count():
-            close.first.click()
+    for _ in range(COUNT):
         picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
         frames.append(picture.resize(SIZE, Image.Resampling.LANCZOS))
         due += PERIOD

@@ -165,7 +165,7 @@ class Page:
         low, high = spots.min(axis=0), spots.max(axis=0)
         middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.5)
         camera = self._server.initial_camera
-        camera.look_at, camera.position = middle, middle + size * np.array([-0.88, 0.4, 0.68])
+        camera.look_at, camera.position = middle, middle + size * np.array([-1.05, 0.35, 0.85])
 
     def _is_due(self, what: str, period: float, now: float) -> bool:
         if now < self._due[what]:
