@@ -157,10 +157,12 @@ bench-link: $(VENV)/all ## compare the relay with its profiles and with a C prog
 	$(bin)/python -m tools.bench_link $(BENCH_LINK)
 
 # The end-to-end tests draw the dashboards, with the data of their Prometheus.
-pictures: $(VENV)/all ## draw the README's picture of a flight, take that of the dashboards from 'make e2e'
+# The film needs Chromium and flies in real time.
+pictures: $(VENV)/dev ## film the console for the README, draw a flight, and take the dashboards from 'make e2e'
+	$(bin)/python -m tools.console_picture
 	rm -rf build/pictures
 	$(bin)/cloudrc run paper --mode virtual --out build/pictures
-	cp build/pictures/figures/flight.png docs/flight.png
+	cp build/pictures/figures/overview.png docs/overview.png
 	@if [ -f build/e2e/dashboards.webp ]; then cp build/e2e/dashboards.webp docs/; \
 		else echo "no build/e2e/dashboards.webp: 'make e2e' draws it"; fi
 
