@@ -12,8 +12,9 @@ from math import isfinite, nan
 
 import pytest
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
-"""Debian's browser: `apt-get install chromium`."""
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
+"""The browser of Debian (`apt-get install chromium`), or that of GitHub's machines."""
 # WebGL by the processor: a test machine has no graphics card.
 CHROMIUM_FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
