@@ -16,7 +16,7 @@ import numpy as np
 from cloudrc.exposition.parts import PredictionJudge
 from cloudrc.geometry.clearance import Array, clearance
 from cloudrc.geometry.scene import Scene
-from cloudrc.messages import NEVER_NS, Telemetry
+from cloudrc.messages import NEVER_NS, GuardState, Telemetry
 from cloudrc.records import Arrival, Control, Fault, Record, SessionOpened, TelemetrySent
 
 WINDOW = 25.0
@@ -99,8 +99,9 @@ class FlightFeed:
         return told.echo_hold_ns * 1e-9 + self.silence(now)
 
     def controls(self, now: float) -> bool:
-        """Return whether cloud controls the robot at `now` [s]."""
-        return now - self._controlled < STALE
+        """Return whether cloud controls the robot at `now` [s]; never on the ground."""
+        grounded = self.telemetry is not None and self.telemetry.guard == GuardState.GROUND
+        return now - self._controlled < STALE and not grounded
 
     def trail(self) -> tuple[Array, Array]:
         """Return the flown path [m], shape (n, 3), and the clearances on it [m], shape (n,)."""
@@ -110,11 +111,11 @@ class FlightFeed:
     def columns(self, step: int = 3) -> Array:
         """Return every `step`-th sample, time relative to the newest [s], shape (fields, n).
 
-        Unknown values are -1, below the axis: the charts cannot scale an axis with NaN.
+        Unknown values are NaN.
         """
         rows = np.array([*self.samples][::step] or [Sample(0.0)], dtype=np.float64)
         rows[:, 0] -= rows[-1, 0]
-        return np.ascontiguousarray(np.nan_to_num(rows.T, nan=-1.0))
+        return np.ascontiguousarray(rows.T)
 
     def _take_control(self, control: Control, now: float) -> None:
         self.control, self._controlled, judged = control, now, self._judge.judged

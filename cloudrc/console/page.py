@@ -17,10 +17,11 @@ import viser
 
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.console.feed import STALE, FlightFeed
-from cloudrc.console.steering import Steering
+from cloudrc.console.steering import Steering, is_drive
 from cloudrc.geometry import fence
+from cloudrc.geometry.clearance import Array
 from cloudrc.geometry.scene import SPAWN, Scene, load_scene
-from cloudrc.messages import GuardState, Quaternion, Vector
+from cloudrc.messages import ZERO, GuardState, Quaternion, Vector
 
 CHART_PERIOD, TRAIL_PERIOD, TEXT_PERIOD = 0.2, 0.5, 0.25
 """Times between two updates of the charts, the trail and the texts [s]."""
@@ -28,6 +29,10 @@ ANSWER_SHOWN = 10.0
 """Time for which a refusal is shown [s]; another answer is shown for half of it."""
 PANEL_WIDTH = 330
 """Width of each panel beside the scene [px]."""
+NARROW = 900
+"""Width of the window below which the charts start collapsed [px]."""
+VIEW = np.tan(np.radians(75 / 2)) * np.array([(1280 - 2 * PANEL_WIDTH) / 800, 1.0])
+"""Tangents of half the angles of view, across and up, in a window of 1280 x 800 px."""
 BLUE, RED, GREEN = "#0072b2", "#d55e00", "#009e73"
 CHARTS: dict[str, tuple[float, float, dict[str, tuple[int, str]]]] = {
     "Delay [ms]": (1e3, 150, {"up": (1, BLUE), "down": (2, RED), "estimate": (3, GREEN)}),
@@ -54,6 +59,14 @@ KEYS: dict[str, tuple[str, Vector]] = {
 }
 """Key, by the name of browsers -> label of its button, and direction of the drive."""
 STOP, HOLD = "STOP", "Hold"
+BUTTONS = {
+    "cloudrc mission resume, or cancel": "Resume, or Cancel",
+    "cloudrc mission acknowledge": "Acknowledge",
+    "by 'cloudrc mission goto'": "with Target and Send",
+    "cancel it first, or queue the new one": "press Cancel first",
+    "hold or cancel it first": "press Hold or Cancel first",
+}
+"""What teleop tells the operator to do -> how to do it on the page."""
 SCRIPT = """
 const drive = %s;
 const find = text =>
@@ -66,6 +79,7 @@ const seize = e => (e.preventDefault(), e.stopImmediatePropagation());
 document.title = 'cloudrc';
 if (!window.cloudrc) {
   window.cloudrc = true;
+  if (innerWidth < %d) document.querySelector('[aria-label="Collapse panel area"]')?.click();
   window.addEventListener('keydown', e => {
     if (e.ctrlKey || e.altKey || e.metaKey || !find('STOP')) return;
     if (e.code === 'KeyX' && e.shiftKey) return seize(e), find('STOP').click();
@@ -106,20 +120,26 @@ class Page:
         self._due = dict.fromkeys(("charts", "trail", "texts"), 0.0)
         self._touched = -inf  # when somebody last moved a slider [s]
         self._sliders: dict[str, Any] = {}
+        self._target: tuple[Any, Any] | None = None  # gizmo and its numbers, until somebody moves
         self._shown: tuple[Any, ...] = ()  # waypoints
         self._drawn = 0  # points of the trail
 
     def fill(self, experiment: ResolvedExperiment, feed: FlightFeed, steering: Steering) -> None:
         """Build the scene and the panels, and give the controls to the first browser."""
         self._experiment, self._feed, self._steering = experiment, feed, steering
-        from cloudrc.console.scene import FlightScene  # needs MuJoCo, which takes a second
+        from cloudrc.console.scene import LEGEND, FlightScene  # needs MuJoCo, which takes a second
 
-        self._scene = FlightScene(self._server, experiment)
-        self._place_camera(load_scene(experiment.world.scene))
+        self._scene, geometry = (
+            FlightScene(self._server, experiment),
+            load_scene(experiment.world.scene),
+        )
+        self._place_camera(geometry)
         gui = self._server.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_WIDTH)
         self._status = gui.add_markdown("waiting for the robot", order=2)
+        if geometry.pipes:
+            gui.add_html(LEGEND, order=2.5)
         panel = gui.add_panel()
         with panel.add_tab("Charts"):
             self._charts = [self._add_chart(title) for title in CHARTS]
@@ -144,8 +164,9 @@ class Page:
         if self._is_due("charts", CHART_PERIOD, now):
             columns = feed.columns()
             for chart, (factor, _, curves) in zip(self._charts, CHARTS.values(), strict=True):
-                rows = [columns[place] * factor for place, _ in curves.values()]
-                chart.data = (columns[0], *rows)
+                rows = [_with_gaps(columns[place] * factor) for place, _ in curves.values()]
+                # Not chart.data: it would make numbers of the values that are unknown.
+                chart._queue_update("data", (columns[0], *rows))
         if self._is_due("trail", TRAIL_PERIOD, now):
             if feed.flown != self._drawn:
                 self._drawn = feed.flown
@@ -154,18 +175,39 @@ class Page:
         if self._is_due("texts", TEXT_PERIOD, now):
             self._status.content = self._describe(now)
             self._follow_link(now)
+            if target := self._target:
+                target[0].position = target[1].value = self._place_target(now)
 
     def close(self) -> None:
         """Stop serving the page."""
         self._server.stop()
 
     def _place_camera(self, scene: Scene) -> None:
-        """Look along +x, so that the arrow keys fly away from the viewer, to the left and so on."""
-        spots = np.array([scene.spawn, *(pipe.centre for pipe in scene.pipes)])
-        low, high = spots.min(axis=0), spots.max(axis=0)
-        middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.5)
+        """Look along +x, so that the arrow keys fly away from the viewer, to the left and so on.
+
+        The place is the nearest one from which spawn, pipes and waypoints are in sight.
+        """
+        half = [0.5 * pipe.length * np.array(pipe.axis) for pipe in scene.pipes]
+        ends = [
+            pipe.centre + sign * part
+            for pipe, part in zip(scene.pipes, half, strict=True)
+            for sign in (-1, 1)
+        ]
+        waypoints = [point.position_m for point in self._experiment.mission.waypoints]
+        forward = np.array([0.7, -0.2, -0.7]) / np.linalg.norm([0.7, -0.2, -0.7])
+        right = np.cross(forward, (0.0, 0.0, 1.0)) / np.hypot(*forward[:2])
+        axes = np.array([right, np.cross(right, forward), forward])
+        *across, depth = axes @ np.array([scene.spawn, *ends, *waypoints]).T
+        slope = 0.85 * VIEW[:, None]  # with a margin
+        least, most = (across - slope * depth).max(axis=1), (across + slope * depth).min(axis=1)
+        middle = (depth.min() + depth.max()) / 2
+        back = min(((most - least) / (2 * slope[:, 0])).min(), middle - 3.5)
+        place = (least + most) / 2
+        for _ in range(20):  # until the picture has equal margins
+            seen = (across - place[:, None]) / (depth - back)
+            place += (seen.max(axis=1) + seen.min(axis=1)) / 2 * (depth.min() - back)
         camera = self._server.initial_camera
-        camera.look_at, camera.position = middle, middle + size * np.array([-1.05, 0.35, 0.85])
+        camera.look_at, camera.position = ((*place, far) @ axes for far in (middle, back))
 
     def _is_due(self, what: str, period: float, now: float) -> bool:
         if now < self._due[what]:
@@ -178,7 +220,10 @@ class Page:
         lines: list[Any] = [
             {"label": name, "stroke": colour, "width": 1.5} for name, (_, colour) in curves.items()
         ]
-        low, high = {"hard": 0, "pad": 0}, {"soft": span, "mode": 1, "pad": 0.1}
+        low, high = (
+            {"hard": 0, "soft": 0, "mode": 1, "pad": 0},
+            {"soft": span, "mode": 1, "pad": 0.1},
+        )
         return self._server.gui.add_uplot(
             (np.zeros(1),) * (1 + len(curves)),
             ({"label": "s"}, *lines),
@@ -210,7 +255,11 @@ class Page:
         doing = "none"
         if mission:
             reached = f"{len(mission['reached'])} of {mission['waypoints']} waypoints"
-            doing = f"{mission['name'] or mission['id']}, {mission['state']}, {reached}"
+            drives = self._steering.velocity(now) != ZERO
+            doing = "driving" if drives else mission["state"]
+            doing = f"{mission['name'] or mission['id']}, {doing}, {reached}"
+            if is_drive(mission):
+                doing = "driving" if drives else "drive, waits for keys"
         lines = [
             f"**{GuardState(guard).name}**: {feed.telemetry.cause.words}",
             f"Last command: {_age(feed.command_age(now))}",
@@ -223,7 +272,10 @@ class Page:
             lines.append(f"**Refused** {text}" if is_refusal else text)
         elif seen := state.get("seen"):
             lines.append(seen["next_step"])
-        return "  \n".join(lines)
+        text = "  \n".join(lines)
+        for asked, here in BUTTONS.items():
+            text = text.replace(asked, here)
+        return text
 
     def _follow_link(self, now: float) -> None:
         """Move the sliders after a change from elsewhere, unless somebody moves them here."""
@@ -252,14 +304,14 @@ class Page:
         with self._lock:
             if self._pilot != client.client_id:
                 return
-            self._pilot, self._sliders = None, {}
+            self._pilot, self._sliders, self._target = None, {}, None
         for other in self._server.get_clients().values():
             other.gui.reset()
             self._welcome(other)
 
     def _add_controls(self, client: viser.ClientHandle) -> None:
         gui, steering = client.gui, self._steering
-        script = SCRIPT % {code: label for code, (label, _) in KEYS.items()}
+        script = SCRIPT % ({code: label for code, (label, _) in KEYS.items()}, NARROW)
         shown = script.replace("&", "&amp;").replace('"', "&quot;")
         gui.add_html(f'<style onload="{shown}">{STYLE}</style>', order=9)
         stop = gui.add_button(STOP, color="red", order=0, hint="Stop the rotors (Shift+X)")
@@ -299,14 +351,12 @@ class Page:
             text = "start: random steps are for 'cloudrc run'; send waypoints instead"
             return self._steering.say(text, is_refusal=True)
         order = mission.model_dump(mode="json", exclude={"steps"}, exclude_none=True)
-        self._steering.ask("starting", "/v1/missions", {**order, "name": experiment.name})
+        self._steering.fly({**order, "name": experiment.name})
         return None
 
     def _add_target(self, client: viser.ClientHandle) -> None:
         """Add the gizmo and the numbers of the next waypoint, which follow each other."""
-        feed, low, high = self._feed, fence.INNER_LOW, fence.INNER_HIGH
-        at = feed.telemetry.odometry.position if feed.telemetry else SPAWN
-        start = np.round(np.clip(np.add(at, (0.0, 0.0, 0.6)), low, high), 2)
+        low, high, start = fence.INNER_LOW, fence.INNER_HIGH, self._place_target(time.monotonic())
         limits = tuple(zip(low, high, strict=True))
         gizmo = client.scene.add_transform_controls(
             "/target",
@@ -319,13 +369,18 @@ class Page:
         numbers: Any = client.gui.add_vector3("Target [m]", start, min=low, max=high, step=0.01)
         send = client.gui.add_button("Send", hint="Fly to the target; a mission is held first")
 
+        free = self._target = gizmo, numbers
+
         @gizmo.on_update
-        def _(_: object) -> None:
-            x, y, z = map(float, np.round(gizmo.position, 2))
-            numbers.value = (x, y, z)
+        def _(event: Any) -> None:
+            if event.client is not None:  # somebody drags
+                self._target = None
+                x, y, z = map(float, np.round(gizmo.position, 2))
+                numbers.value = (x, y, z)
 
         def move(event: Any) -> None:
             if event.client is not None:  # somebody has typed
+                self._target = None
                 gizmo.position = numbers.value
 
         numbers.on_update(move)
@@ -333,6 +388,19 @@ class Page:
         @send.on_click
         def _(_: object) -> None:
             self._steering.go_to(numbers.value)
+            self._target = free
+
+    def _place_target(self, now: float) -> Vector:
+        """Return where the target is before somebody moves it [m]: setpoint, or above the robot."""
+        feed, at = self._feed, SPAWN
+        if feed.control is not None and feed.controls(now):
+            at = feed.control.setpoint
+        elif feed.telemetry is not None:
+            at = feed.telemetry.odometry.position
+        if not feed.controls(now):
+            at = np.add(at, (0.0, 0.0, 0.6))
+        x, y, z = map(float, np.round(np.clip(at, fence.INNER_LOW, fence.INNER_HIGH), 2))
+        return x, y, z
 
     def _add_keys(self, gui: viser.GuiApi) -> None:
         """Add the buttons of the drive; a button that is held calls back ten times a second."""
@@ -343,7 +411,7 @@ class Page:
 
             @button.on_hold
             async def _(_: object, code: str = code, direction: Vector = direction) -> None:
-                x, y, z = (part * speed.value for part in direction)
+                x, y, z = (part * _clamp(speed) for part in direction)
                 steering.hold_key(code, (x, y, z))
 
             @button.on_click
@@ -361,7 +429,21 @@ class Page:
                 async def _(event: Any, key: str = key, factor: float = factor) -> None:
                     if event.client is not None:
                         self._touched = time.monotonic()
-                        self._steering.set_link(key, event.target.value / factor)
+                        self._steering.set_link(key, _clamp(event.target) / factor)
+
+
+def _clamp(slider: Any) -> float:
+    """Return the value of a slider, which its number field does not limit to the slider's range."""
+    value = float(np.clip(slider.value, slider.min, slider.max))
+    if value != slider.value:
+        slider.value = value
+    return value
+
+
+def _with_gaps(curve: Array) -> list[float | None]:
+    """Replace NaN by None, a gap in the chart; no axis is drawn for a chart without a number."""
+    values = [None if value != value else value for value in curve.tolist()]
+    return [-1.0, *values[1:]] if not any(value is not None for value in values) else values
 
 
 def _age(seconds: float) -> str:

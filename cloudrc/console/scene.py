@@ -20,7 +20,7 @@ from cloudrc.world.scene import ROBOT_PREFIX, ROTORS, compile_model, mujoco
 
 Colour = tuple[int, int, int]
 GHOST, SETPOINT, REACHED = (0, 114, 178), (213, 94, 0), (0, 158, 115)
-OPEN, PIPE, STRUT = (120, 124, 130), (110, 130, 150), (77, 77, 82)
+OPEN, PIPE, STRUT, PLAN = (120, 124, 130), (110, 130, 150), (77, 77, 82), (176, 180, 186)
 """Colours; those of ghost, setpoint and reached waypoints are colours of the figures."""
 FLOOR: dict[str, Any] = {
     **{"cell_color": (228, 230, 233), "section_color": (206, 210, 214)},
@@ -30,6 +30,12 @@ FLOOR: dict[str, Any] = {
 GHOST_OPACITY, PIPE_OPACITY = 0.35, 0.5
 VIRIDIS = "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725"
 """Colours of clearance in the figures, evenly spaced from 0 to `CLEARANCE_SHOWN`."""
+LEGEND = (
+    '<div style="margin: 0 1em 0.6em; font-size: 0.8em">Path, distance to the pipe: 0 <span style="'
+    "display: inline-block; width: 5em; height: 0.7em; background: linear-gradient(to right, "
+    f'{", ".join(f"#{each}" for each in VIRIDIS.split())})"></span> {CLEARANCE_SHOWN:g} m</div>'
+)
+"""Line of HTML that tells the colours of the flown path."""
 
 
 class FlightScene:
@@ -57,6 +63,7 @@ class FlightScene:
         )
         self._waypoints: list[Any] = []  # spheres
         self._points: Array = np.zeros((0, 3))  # of the waypoints [m]
+        self._plan: Array = np.zeros((0, 3))  # waypoints that the line of the plan joins [m]
         server.initial_camera.position, server.initial_camera.look_at = _camera(geometry)
 
     def set_robot(self, position: Vector | Array, orientation_wxyz: Array) -> None:
@@ -95,8 +102,12 @@ class FlightScene:
         self._scene.add_line_segments("/trail", *ends, thickness=0.03)
 
     def set_waypoints(self, points: Array, reached: int) -> None:
-        """Show numbered waypoints at `points` [m], shape (n, 3), the first `reached` in green."""
+        """Show numbered waypoints at `points` [m], shape (n, 3), the first `reached` in green.
+
+        A thin line shows the plan, from the last reached waypoint on.
+        """
         points = np.asarray(points, dtype=float).reshape(-1, 3)
+        self._draw_plan(points[max(reached - 1, 0) :])
         if not np.array_equal(points, self._points):
             for sphere in self._waypoints:
                 sphere.remove()
@@ -109,6 +120,17 @@ class FlightScene:
                 )
         for number, sphere in enumerate(self._waypoints):
             sphere.color = REACHED if number < reached else OPEN
+
+    def _draw_plan(self, points: Array) -> None:
+        """Draw a line through the waypoints ahead [m], shape (n, 3)."""
+        if np.array_equal(points, self._plan):
+            return
+        self._plan = points
+        if len(points) < 2:
+            self._scene.remove_by_name("/plan")
+        else:
+            lines = np.stack([points[:-1], points[1:]], axis=1)
+            self._scene.add_line_segments("/plan", lines, PLAN, thickness=0.03)
 
     def set_setpoint(self, position: Vector | Array | None) -> None:
         """Show the `position` that the controller tracks [m], shape (3,); None hides it."""

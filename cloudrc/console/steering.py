@@ -105,6 +105,14 @@ class Steering:
         else:
             self.say("cancel: no mission is under way", is_refusal=True)
 
+    def fly(self, order: Mapping[str, Any]) -> None:
+        """Fly a mission; a drive that waits for keys ends first."""
+        if is_drive(self.state.get("mission")):
+            if not self.ask("ending the drive", "/v1/resume"):
+                return
+            order = {**order, "queue": True}  # in case the drive has not ended yet
+        self.ask("starting", "/v1/missions", order)
+
     def go_to(self, position: Vector) -> None:
         """Fly to a position [m]; a mission that flies is held first."""
         x, y, z = (round(float(value), 3) for value in position)
@@ -182,3 +190,8 @@ class Steering:
             self.state = {}
             self.say(str(error), is_refusal=True)
         self.conditions = self.link.read()
+
+
+def is_drive(mission: Mapping[str, Any] | None) -> bool:
+    """Return whether a mission is a drive by hand, which waits for keys."""
+    return mission is not None and (mission["name"], mission["state"]) == ("drive", "held")

@@ -60,6 +60,13 @@ def test_old_control_is_no_ghost_and_no_error(feed):
     assert isnan(feed.samples[-1].error)
 
 
+def test_on_the_ground_error_and_estimate_are_unknown(feed):
+    feed.take([control(0.1), told(0.1, guard=GuardState.GROUND)], 1.0)
+    assert isnan(feed.samples[-1].error)
+    assert isnan(feed.samples[-1].estimate)
+    assert isnan(feed.columns()[3, 0])
+
+
 def test_copies_of_telemetry_are_silence(feed):
     assert feed.silence(5.0) == inf
     feed.take([told(0.1)], 1.0)

@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 import urllib.request
+from contextlib import ExitStack, redirect_stdout
 
 import numpy as np
 import pytest
@@ -14,7 +15,13 @@ from PIL import Image
 from cloudrc.cli import extras
 from cloudrc.cli.client import Api
 from cloudrc.cli.main import main
+from cloudrc.config.load import load_experiment
+from cloudrc.console.feed import FlightFeed
+from cloudrc.console.page import PANEL_WIDTH, Page, _with_gaps
+from cloudrc.console.steering import Link, Steering
 from cloudrc.drivers.local import under_way
+from cloudrc.geometry.scene import Scene, load_scene
+from tests.console.conftest import told
 
 LIMIT = 120.0
 """Time limit for what has no number of its own [s]: a browser without a graphics card is slow."""
@@ -50,6 +57,21 @@ def flight(tmp_path):
     assert console.wait(LIMIT) == 0, "it ends with the run"
     session.communicate(timeout=LIMIT)
     console.stdout.close()
+
+
+@pytest.fixture
+def filled(api):
+    """Make the page of an experiment without a browser: the page, its feed and its steering."""
+    with ExitStack() as opened, redirect_stdout(io.StringIO()):
+
+        def fill(name):
+            page = Page(0)
+            opened.callback(page.close)
+            feed, steering = FlightFeed(Scene("empty")), Steering(api, Link(dict, list))
+            page.fill(load_experiment(name), feed, steering)
+            return page, feed, steering
+
+        yield fill
 
 
 def answers(api):
@@ -99,10 +121,15 @@ def test_drag_and_send_moves_the_setpoint(flight, page):
         page.wait_for_timeout(300)
     page.mouse.up()
     wait_for(lambda: target() != before)
+    page.wait_for_timeout(1000)
+    asked = target()
     button(page, "Send").click()
     wait_for(lambda: api.get("/v1/missions")["missions"])
     (mission,) = api.get("/v1/missions")["missions"]
-    assert api.get(f"/v1/missions/{mission['id']}")["route_m"] == [target()]
+    assert api.get(f"/v1/missions/{mission['id']}")["route_m"] == [asked]
+    api.post(f"/v1/missions/{mission['id']}/cancel")
+    api.post("/v1/goto", {"position_m": (0.3, 0.2, 0.9)})
+    wait_for(lambda: target() == [0.3, 0.2, 0.9])  # after Send it follows the setpoint again
     other = start(run, "console", run)
     assert address in other.communicate(timeout=LIMIT)[0]
     assert other.returncode == 2
@@ -121,6 +148,12 @@ def test_keys_drive_and_sliders_change_the_delay(flight, page, figure):
     page.keyboard.press("Enter")
     took = wait_for(lambda: api.get("/v1/state")["seen"]["rtt_s"] > 0.15)
     figure("slider to measured delay", took, "<=", 2.0, "s")
+    page.get_by_role("textbox").first.fill("9999")
+    page.keyboard.press("Enter")
+    wait_for(lambda: page.get_by_role("textbox").first.input_value() == "500")
+    page.get_by_role("tab", name="Fly").click()
+    button(page, "Start").click()  # it ends the drive first
+    wait_for(lambda: (api.get("/v1/state")["mission"] or mission)["name"] == "hover")
 
 
 @pytest.mark.process
@@ -150,6 +183,44 @@ def test_the_second_browser_reads_and_stop_works_under_load(browse, flight, page
     figure("stop under load", took, "<=", 1.0, "s")
     page.close()
     button(second, "STOP").wait_for(timeout=LIMIT * 1e3)
+
+
+def test_the_first_view_shows_the_whole_mission(filled):
+    page, _, _ = filled("paper")
+    camera = page._server.initial_camera
+    pipes = load_scene("pipes").pipes
+    spots = [point.position_m for point in page._experiment.mission.waypoints]
+    for pipe in pipes:
+        along, wide = 0.5 * pipe.length * np.array(pipe.axis), (0.0, 0.0, pipe.outer)
+        spots += [pipe.centre + a * along + b * np.array(wide) for a in (-1, 1) for b in (-1, 1)]
+    forward = camera.look_at - camera.position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, (0, 0, 1)) / np.hypot(*forward[:2])
+    x, y, depth = np.array([right, np.cross(right, forward), forward]) @ (spots - camera.position).T
+    slope = np.tan(camera.fov / 2)
+    assert np.abs(x / depth).max() < slope * (1280 - 2 * PANEL_WIDTH) / 800
+    assert np.abs(y / depth).max() < slope
+    assert forward[0] > abs(forward[1]), "along +x"
+
+
+def test_the_state_tells_a_drive_and_names_buttons(filled):
+    page, feed, steering = filled("hover")
+    drive = {"id": "m1", "name": "drive", "state": "held", "reached": [], "waypoints": 1}
+    words = "to continue: cloudrc mission resume, or cancel"
+    steering.state = {"mission": drive, "seen": {"next_step": words}}
+    feed.take([told(0.1)], 1.0)
+    page.update(1.0)
+    assert "Mission: drive, waits for keys" in page._status.content
+    assert "to continue: Resume, or Cancel" in page._status.content
+    now = time.monotonic()
+    steering.hold_key("up", (0.0, 0.0, 0.4))
+    page.update(now)
+    assert "Mission: driving" in page._status.content
+
+
+def test_a_curve_has_gaps_and_an_unknown_one_keeps_its_axis():
+    assert _with_gaps(np.array([np.nan, 0.2])) == [None, 0.2]
+    assert _with_gaps(np.full(2, np.nan)) == [-1.0, None]
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys):

@@ -44,7 +44,9 @@ def test_waypoints_and_trail_of_another_mission_replace_the_first(server):
     handles = server.scene._handle_from_node_name
     colours = [handles[f"/waypoints/{number}"].color for number in (1, 2, 3)]
     assert colours[0] != colours[1] == colours[2]
+    scene.set_waypoints(points, 2)
+    assert handles["/plan"].points.tolist() == [points[1:].tolist()], "the way ahead"
     scene.set_waypoints(points[:1], 0)
     scene.set_trail(points[:1], np.zeros(0))
-    assert {"/waypoints/2", "/waypoints/2/label", "/trail"}.isdisjoint(handles)
+    assert {"/waypoints/2", "/waypoints/2/label", "/trail", "/plan"}.isdisjoint(handles)
     assert handles["/waypoints/1"].color == colours[1]

@@ -36,6 +36,17 @@ def test_a_flying_mission_is_held_before_a_goto(api, steering):
     assert api.posted == [goto]
 
 
+def test_a_start_ends_a_drive_that_waits_for_keys(api, steering):
+    steering.state = {"mission": {"name": "drive", "state": "held"}}
+    steering.fly({"waypoints": []})
+    start = ("/v1/missions", {"waypoints": [], "queue": True})
+    assert api.posted == [("/v1/resume", None), start]
+    api.posted.clear()
+    steering.state = {"mission": None}
+    steering.fly({"waypoints": []})
+    assert api.posted == [("/v1/missions", {"waypoints": []})]
+
+
 def test_a_refusal_is_told_in_the_words_of_the_api(api, steering):
     api.refused["/v1/goto"] = "outside of the fence"
     steering.go_to((50.0, 0.0, 1.2))
