@@ -20,7 +20,7 @@ from cloudrc.cloud.operator import Operator
 from cloudrc.config import schema
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.overrides import build_plugin
-from cloudrc.config.setpoints import read_setpoints
+from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
 from cloudrc.geometry import fence
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Loss
@@ -223,24 +223,32 @@ def mission_plan(
 def with_order(
     experiment: ResolvedExperiment, order: Order, description: str
 ) -> ResolvedExperiment:
-    """Return the experiment that flies an operator's order; the inverse of `mission_plan`."""
+    """Return the experiment that flies an operator's order; the inverse of `mission_plan`.
+
+    A drive by hand becomes a mission with the setpoints of `DRIVE_FILE` beside the experiment.
+    """
     legs, carrot = order.plan.legs, None
     if speed := max(leg.speed for leg in legs):
         carrot = schema.Carrot(speed_mps=speed, acceleration_mps2=legs[0].acceleration)
-    waypoints = tuple(
-        schema.Waypoint(
-            position_m=leg.position,
-            yaw_deg=round(degrees(leg.yaw), 9),
-            tolerance_m=leg.tolerance,
-            dwell_s=leg.dwell,
-            time_limit_s=leg.time_limit,
-            speed_mps=leg.speed or None,
+    waypoints = (
+        ()
+        if order.plan.by_hand
+        else tuple(
+            schema.Waypoint(
+                position_m=leg.position,
+                yaw_deg=round(degrees(leg.yaw), 9),
+                tolerance_m=leg.tolerance,
+                dwell_s=leg.dwell,
+                time_limit_s=leg.time_limit,
+                speed_mps=leg.speed or None,
+            )
+            for leg in legs
         )
-        for leg in legs
     )
     mission = schema.Mission(
         start="spawn" if order.plan.start is Start.SPAWN else "here",
         waypoints=waypoints,
+        setpoints=DRIVE_FILE if order.plan.by_hand else None,
         carrot=carrot,
     )
     judged = {"contact": order.contact, "time_limit_s": order.plan.time_limit}

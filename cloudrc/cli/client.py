@@ -52,9 +52,9 @@ class Api:
         """Check and store the address, "http://HOST:PORT" or "unix:PATH".
 
         `token` is called for each request; it returns the current token, or "" for none. `place`
-        names the run or the release in answers to the user; "" if the user gave the address.
+        names the run or the release in answers and refusals; "" if the user gave the address.
         """
-        self.url, self._token, self._place = url.rstrip("/"), token, place
+        self.url, self._token, self.place = url.rstrip("/"), token, place
         try:
             self._connection(REQUEST_TIMEOUT)
         except (ValueError, KeyError, http.client.InvalidURL):
@@ -62,7 +62,7 @@ class Api:
 
     def say(self, text: str) -> None:
         """Print what the robot will do; name the run or the release."""
-        print_line(f"{self._place}: {text}" if self._place else text)
+        print_line(f"{self.place}: {text}" if self.place else text)
 
     def get(self, path: str) -> Any:
         """Send a GET request; results and errors are those of `post`."""
@@ -104,7 +104,7 @@ class Api:
                 connection.request(method, path, body, headers)
                 answer = connection.getresponse()
                 if not 200 <= answer.status < 300:
-                    raise _refusal(answer, with_token=bool(token))
+                    raise _refusal(answer, self.place, with_token=bool(token))
                 yield answer
             except (OSError, ValueError, http.client.HTTPException) as error:
                 why = getattr(error, "strerror", None) or error
@@ -144,7 +144,7 @@ def mission_path(mission_id: str) -> str:
     return f"/v1/missions/{quote(mission_id, safe='', errors='surrogateescape')}"
 
 
-def _refusal(answer: http.client.HTTPResponse, *, with_token: bool) -> CloudrcError:
+def _refusal(answer: http.client.HTTPResponse, place: str, *, with_token: bool) -> CloudrcError:
     body: Any = None
     with suppress(OSError, ValueError, http.client.HTTPException):
         body = json.loads(answer.read())
@@ -155,11 +155,12 @@ def _refusal(answer: http.client.HTTPResponse, *, with_token: bool) -> CloudrcEr
         parts = ([p[k] for k in ("path", "value", "reason") if p[k]] for p in problems)
         lines = [escape(": ".join(words)) for words in parts]
         detail = "\n  ".join([f"the mission has {len(lines)} problems:", *lines])
-    if answer.status in (400, 413, 422):
-        return BadInputError(detail)
     if answer.status == 401:
         which = "does not know this token" if with_token else "asks for a token"
         detail = f"the API {which}; name its file: --token-file FILE or {VARIABLE}"
+    detail = f"{place}: {detail}" if place else detail
+    if answer.status in (400, 413, 422):
+        return BadInputError(detail)
     return UnreachableError(detail) if answer.status in RETRY_STATUSES else ApiError(detail)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import io
+import os
+import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -73,6 +75,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.cluster or options.context or options.namespace or options.release:
         return _show_release(options)
     require("the console", ("console", "world"))
+    _check_port(options.port)
     with ExitStack() as opened:
         out = sys.stdout
         opened.enter_context(redirect_stdout(io.StringIO()))  # viser prints about itself
@@ -81,6 +84,15 @@ def execute(options: argparse.Namespace) -> int:
         _serve(options.port, _local(options), opened, out)
     print_line("the flight has ended", sys.stderr)
     return 0
+
+
+def _check_port(port: int) -> None:
+    """Raise a BadInputError if the port cannot be used: viser would silently take the next one."""
+    try:
+        socket.create_server(("127.0.0.1", port)).close()
+    except OSError as error:
+        text = f"--port {port}: {os.strerror(error.errno or 0)}; name another port, or none"
+        raise BadInputError(text) from None
 
 
 @dataclass(frozen=True)
@@ -140,7 +152,7 @@ def _local(options: argparse.Namespace) -> Flight:
     from cloudrc.drivers.local import under_way
     from cloudrc.drivers.tap import TAP_FILE
 
-    found = find_local_run(options, lambda run, api: (run, api), "no run flies there")
+    found = find_local_run(options, lambda run, api: (run, api), "no run flies there", flag="")
     if found is None:
         raise BadInputError("no run flies here; start one: cloudrc up")
     run, url = found[0].resolve(), found[1]

@@ -128,7 +128,7 @@ class Pilot:
     def _lines(self) -> list[str]:
         """Return the lines to show."""
         mission, seen = self._state.get("mission"), self._state.get("seen")
-        lines = [f"cloudrc mission drive   {self._api.url}", ""]
+        lines = [f"cloudrc mission drive   {self._api.place or self._api.url}", ""]
         if seen is None:
             lines.append("no telemetry from the robot")
         else:

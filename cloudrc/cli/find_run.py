@@ -37,12 +37,13 @@ def find_local_run(
     nobody: str,
     *,
     steers: bool = True,
+    flag: str = "--run ",
 ) -> _Found | None:
     """Find the run in flight that a command means: the folder of `--run`, else the only run.
 
     Call `look` with the run's folder and the URL of its API ("" if the run has no API), and return
     the result of `look`. Return None if no run is in flight or if the flags name a cluster.
-    `steers` tells whether the command changes the flight.
+    `steers` tells whether the command changes the flight, `flag` how the user names the run.
 
     Raises:
         BadInputError: If `--run` names a run that is not in flight, with the text `nobody`; if
@@ -62,34 +63,35 @@ def find_local_run(
     if options.run is not None:
         url = flights.get(Path(os.path.realpath(options.run)))
         if url is None or (found := look(options.run, url)) is None:
-            raise BadInputError(f"--run {options.run}: {nobody}")
+            raise BadInputError(f"{flag}{options.run}: {nobody}")
         return found
     candidates = {run: found for run in flights if (found := look(Path(short(run)), flights[run]))}
-    _ask_if_unclear(candidates, steers)
+    ask_if_unclear(candidates, steers=steers, flag=flag)
     return next(iter(candidates.values()), None)
 
 
-def _ask_if_unclear(candidates: Collection[Path], steers: bool) -> None:
+def ask_if_unclear(candidates: Collection[Path], *, steers: bool, flag: str = "--run ") -> None:
     """Raise a BadInputError unless it is clear which flight the user means.
 
     `candidates` are the folders of the runs here that the command could use. Without candidates,
-    the command would use a release in a cluster.
+    the command would use a release in a cluster. For the other arguments see `find_local_run`.
     """
-    from cloudrc.drivers.local import RELAY_LOG
+    from cloudrc.drivers.local import RELAY_LOG, under_way
 
     latest = Path(os.path.realpath(RUNS / "latest"))
-    names = " or ".join(f"--run {short(run)}" for run in candidates)
+    names = " or ".join(f"{flag}{short(run)}" for run in candidates)
     if len(candidates) > 1:
         raise BadInputError(f"{len(candidates)} runs are flying here; choose one: {names}")
     if latest in candidates:
         return
     if steers and (latest / RELAY_LOG).exists():  # a run in real time, so this user steered it
         names = names or "--release NAME (in a cluster)"
+        why = "does not take this command" if latest in under_way() else "has ended"
         raise BadInputError(
-            f"{short(latest)} has ended; name another flight: {names}; or start one: cloudrc up"
+            f"{short(latest)} {why}; name another flight: {names}; or start one: cloudrc up"
         )
     if candidates:
-        print_line(f"cloudrc: using the run in {names.removeprefix('--run ')}", sys.stderr)
+        print_line(f"cloudrc: using the run in {names.removeprefix(flag)}", sys.stderr)
 
 
 def no_run_error(

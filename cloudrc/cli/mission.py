@@ -193,7 +193,9 @@ class MissionFollower:
         Raise a TimedOutError if the API does not answer in time; other errors are as in `Api.post`.
         """
         view = self._retry(lambda: self._api.post("/v1/missions", mission))
-        self._api.say(f"mission {view['id']}: {view['state']}, waypoints: {view['waypoints']}")
+        text = f"mission {view['id']}: {view['state']}, waypoints: {view['waypoints']}"
+        back = mission.get("start", "spawn") == "spawn"
+        self._api.say(f"{text}; the robot is set back to its spawn at the start" if back else text)
         return str(view["id"])
 
     def follow(self, mission_id: str) -> Json:
@@ -287,7 +289,12 @@ def _list(options: argparse.Namespace, api: Api) -> int:
         done = f"{len(each['reached'])}/{each['waypoints']}"
         verdict = describe_verdict(each["verdict"]) if each["verdict"] else ""
         rows.append((each["id"], each["name"], each["state"], done, verdict))
-    print(table(rows) if missions else "no missions yet")
+    if not missions:
+        api.say("no missions yet")
+        return 0
+    if api.place:
+        api.say("missions, the oldest first")
+    print(table(rows))
     return 0
 
 
@@ -296,13 +303,13 @@ def _status(options: argparse.Namespace, api: Api) -> int:
     if options.output != "table":
         return _print(state, options.output)
     if options.id:
-        print_line(_describe_mission(state))
+        api.say(_describe_mission(state))
         _print_history(state)
         return 0
     if state["mission"]:
-        print_line(_describe_mission(state["mission"]))
+        api.say(_describe_mission(state["mission"]))
     else:
-        print("no mission is under way")
+        api.say("no mission is under way")
     if state["queue"]:
         print_line(f"waiting: {', '.join(state['queue'])}")
     _print_robot(state["seen"], state["cloud_age_s"])

@@ -16,16 +16,17 @@ from threading import Thread
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import MODES, require
-from cloudrc.cli.find_run import run_argument, short
+from cloudrc.cli.find_run import ask_if_unclear, run_argument, short
 from cloudrc.cli.output import escape, print_line
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.cli.processes import Command
 from cloudrc.cli.run import experiment_arguments, fly_once
-from cloudrc.errors import BadInputError, MissingPrerequisiteError, NothingFlownError
+from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, NothingFlownError
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
     from cloudrc.record.reader import Contents
+    from cloudrc.teleop.store import Mission
 
 Say = Callable[[str], None]
 """Function that prints a line beside the progress of a flight."""
@@ -119,6 +120,18 @@ def _console(folder: Path, say: Say) -> Iterator[None]:
         reader.join(CONSOLE_LIMIT)
 
 
+def _last_mission(folder: Path) -> Mission | None:
+    """Return the last mission that flew in a session that has ended; None if none flew."""
+    from cloudrc.drivers.local import JOURNAL_FILE
+    from cloudrc.teleop.store import open_store
+
+    if not (folder / JOURNAL_FILE).exists():  # the session has ended before it was ready
+        return None
+    with closing(open_store(folder / JOURNAL_FILE, b"")) as store:
+        flown = [each for each in store.missions.values() if "started" in each.happened]
+    return flown[-1] if flown else None
+
+
 def read_last_mission(folder: Path) -> tuple[Contents, ResolvedExperiment, bool]:
     """Read the last mission of a session that has ended, and write it to config.yaml.
 
@@ -131,15 +144,15 @@ def read_last_mission(folder: Path) -> tuple[Contents, ResolvedExperiment, bool]
     """
     from cloudrc.assembly import with_order
     from cloudrc.config.load import dump, read_experiment
-    from cloudrc.drivers.local import JOURNAL_FILE
+    from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
     from cloudrc.record.merge import cut_to_last_mission, merge
-    from cloudrc.teleop.store import open_store
 
-    with closing(open_store(folder / JOURNAL_FILE, b"")) as store:
-        flown = [each for each in store.missions.values() if "started" in each.happened]
-    if not flown:
+    if (last := _last_mission(folder)) is None:
         raise NothingFlownError(f"{folder}: no mission flew, so there is no report")
-    last, config = flown[-1], folder / "config.yaml"
+    if last.order.plan.by_hand:  # until the report has the setpoints: rest where the drive began
+        rest = [(time, last.order.plan.legs[0].position) for time in (0.0, 1.0)]
+        (folder / DRIVE_FILE).write_text(write_setpoints(rest), encoding="utf-8")
+    config = folder / "config.yaml"
     about = f"Mission {last.id} ({last.order.name}), the last one of a session"
     experiment = with_order(read_experiment(config), last.order, about)
     config.write_text(dump(experiment), encoding="utf-8")
@@ -174,13 +187,19 @@ def _down(options: argparse.Namespace) -> int:
             raise BadInputError(f"--run {options.run}: no session runs there{note}")
     if not found:
         raise MissingPrerequisiteError(f"no session runs here; start one: cloudrc up{note}")
-    if len(found) > 1:
-        names = " or ".join(f"--run {short(run)}" for run in found)
-        raise BadInputError(f"{len(found)} sessions run here; choose one: {names}")
+    if options.run is None:
+        ask_if_unclear(found, steers=True)
     (run,) = found
     end_session(run, DOWN_LIMIT)
-    flew = (run / "report.json").exists()
-    print_line(short(run / "report.html") if flew else f"{short(run)}: ended; no mission flew")
+    if (run / "report.json").exists():
+        print_line(short(run / "report.html"))
+    elif last := _last_mission(run):
+        raise CloudrcError(
+            f"{short(run)}: ended; mission {last.id} flew, but has no report; the output of "
+            f"'cloudrc up' says why; to write it: cloudrc report {short(run)}"
+        )
+    else:
+        print_line(f"{short(run)}: ended; no mission flew")
     return 0
 
 

@@ -7,12 +7,16 @@ from math import isfinite
 from pathlib import Path
 from typing import TypeAlias
 
+import numpy as np
+
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import INNER_HIGH, INNER_LOW
 from cloudrc.link.traces import Row, read_lines, read_rows
 from cloudrc.messages import Vector
 
 COLUMNS = ["time_s", "x_m", "y_m", "z_m"]
+DRIVE_FILE = "drive.csv"
+"""File in the folder of a run that was driven by hand."""
 ROUNDING = 1e-6
 """Largest error of a position in a file [m]."""
 TimedPosition: TypeAlias = tuple[float, Vector]
@@ -50,8 +54,12 @@ def read_setpoints(path: Path) -> tuple[TimedPosition, ...]:
 
 
 def write_setpoints(setpoints: Iterable[tuple[float, Sequence[float]]]) -> str:
-    """Format times [s] and positions [m] as a CSV text that `read_setpoints` can read."""
-    lines = (f"{time:.3f},{x:.6g},{y:.6g},{z:.6g}" for time, (x, y, z) in setpoints)
+    """Format times [s] and positions [m] as a CSV text that `read_setpoints` can read.
+
+    A position outside the box in which the guard flies becomes the nearest one inside.
+    """
+    inside = ((time, np.clip(at, INNER_LOW, INNER_HIGH)) for time, at in setpoints)
+    lines = (f"{time:.3f},{x:.6g},{y:.6g},{z:.6g}" for time, (x, y, z) in inside)
     return "\n".join([",".join(COLUMNS), *lines, ""])
 
 

@@ -107,11 +107,7 @@ class Page:
     """The page of one flight, at `url`."""
 
     def __init__(self, port: int) -> None:
-        """Serve a page on this machine only; port 0 means any free port.
-
-        Raises:
-            OSError: If the port is in use.
-        """
+        """Serve a page on this machine only, at a free port; port 0 means any."""
         self._server = viser.ViserServer("127.0.0.1", port, label="cloudrc", verbose=False)
         self.url = f"http://127.0.0.1:{self._server.get_port()}"
         self._server.gui.configure_theme(show_share_button=False, show_logo=False)

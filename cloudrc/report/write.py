@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cloudrc.config.load import ResolvedExperiment
-from cloudrc.config.setpoints import write_setpoints
+from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, describe_error
 from cloudrc.files import write_atomically
 from cloudrc.geometry.scene import load_scene
@@ -83,7 +83,7 @@ def write_report(
     write_json(folder / "report.json", document)
     write_json(folder / "environment.json", environment)
     if driven := _driven(assessment.flight):
-        write_atomically(folder / "drive.csv", driven.encode())
+        write_atomically(folder / DRIVE_FILE, driven.encode())
     if page:
         _write_page(folder, assessment, environment, look)
     return document
@@ -97,6 +97,8 @@ def _driven(flight: Flight) -> str:
         return ""
     by_hand = (control["stamp_ns"] >= begins_ns[0]) & (control["waypoint"] < 0)
     rows = np.flatnonzero(by_hand)[::2]  # 50 Hz are enough
+    if len(rows) < 2:
+        return ""
     times = (control["stamp_ns"][rows] - begins_ns[0]) * 1e-9
     return write_setpoints(zip(times.tolist(), control["setpoint"][rows].tolist(), strict=True))
 

@@ -35,6 +35,8 @@ DRIVE_LIMIT = 3600.0
 """Time limit of a mission that begins with a request to drive [s]."""
 QUEUE_MAX = 16
 """Largest number of missions that wait while another mission flies."""
+DRIVEN = "driven"
+"""State that `next_step` describes while the operator drives the robot during a held mission."""
 TAKES_OFF = "a velocity other than zero takes off, once there is telemetry"
 NEVER_BEGAN, ASKED = "mission cancelled before it began", "the robot is asked to start"
 RESTARTED = "teleop has restarted; the robot is asked to go on"
@@ -65,10 +67,12 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
     """Describe what the robot does next, or what the operator has to do.
 
     `age` is the age of the telemetry [s], `cloud_age` the age of the last message from cloud [s],
-    and `mission` the state of the mission under way, or None.
+    and `mission` the state of the mission under way (`DRIVEN` in a drive), or None.
     """
     if age > SILENCE:
         return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
+    if mission == DRIVEN and guard is TRACK:
+        return "the operator drives; cloudrc mission resume ends the drive, cancel the mission"
     if mission == HELD and guard is TRACK:
         return "the operator holds the mission; to continue: cloudrc mission resume, or cancel"
     return (ALONE if mission is None else IN_MISSION)[guard]
@@ -289,6 +293,10 @@ class MissionService:
         if seen is None or cloud_age is None:
             return shown
         age, state = (now_ns - self._seen_ns) * 1e-9, mission.state if mission else None
+        if mission is not None and state == HELD:
+            last, pause_ns = mission.events[-1]["event"], now_ns - self._driven_ns
+            back = last == "operator_lost" and pause_ns <= HEARTBEAT_NS
+            state = DRIVEN if last == "driving" or back else HELD
         shown["seen"] = {
             "age_s": age,
             "epoch": seen.epoch,

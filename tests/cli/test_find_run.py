@@ -94,12 +94,33 @@ def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, capsys):
             ("resume", "flying to waypoint 1 of 1; mission m1 (far): flying"),
             ("cancel", "holding at ("),
             ("acknowledge", "acknowledged: the next mission may fly"),
-            ("run pipes", "mission m2: starting, waypoints: 7"),
+            ("run pipes", "mission m2: starting, waypoints: 7; the robot is set back to its spawn"),
         ):
             if words.startswith("run"):
                 threading.Timer(0.5, lambda: api.post("/v1/missions/m2/cancel")).start()
             assert main(["mission", *words.split()]) in (0, 130)
             assert capsys.readouterr().out.startswith(f"runs/latest: {does}"), words
+        for words in ("status", "status m1", "list"):
+            assert main(["mission", *words.split()]) == 0
+            assert capsys.readouterr().out.startswith("runs/latest: "), words
+        assert main(["mission", "list", "-o", "json"]) == 0
+        assert "missions" in json.loads(capsys.readouterr().out)
+        for words, code in (("hold", 5), ("goto 0 0 99", 2)):
+            assert main(["mission", *words.split()]) == code
+            refused = capsys.readouterr().err
+            assert refused.startswith("cloudrc: error: runs/latest: "), refused
+
+
+def test_the_console_names_a_run_as_it_was_given(tmp_path, capsys):
+    with flying(tmp_path / "a"), flying(tmp_path / "b"):
+        assert main(["console", "runs/nope"]) == 2
+        assert "error: runs/nope: no run flies there" in capsys.readouterr().err
+        assert main(["console"]) == 2
+        assert f"choose one: {tmp_path / 'a'} or {tmp_path / 'b'}" in capsys.readouterr().err
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        assert main(["console", "--port", str(port)]) == 2
+        assert f"--port {port}: Address already in use; name" in capsys.readouterr().err
 
 
 def test_no_request_goes_to_a_server_that_a_folder_names(elsewhere, capsys):

@@ -8,22 +8,27 @@ import subprocess
 import sys
 import time
 import urllib.request
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
+from math import inf
 from pathlib import Path
 
 import pytest
 
 from cloudrc import assembly
 from cloudrc.cli import session
+from cloudrc.cli.client import Api, ApiError
 from cloudrc.cli.main import main
-from cloudrc.config.load import load_experiment, read_experiment
+from cloudrc.config.load import dump, load_experiment, read_experiment
+from cloudrc.config.setpoints import write_setpoints
 from cloudrc.drivers import local
 from cloudrc.drivers.machine import usable_cores
+from cloudrc.messages import Start
 from cloudrc.record.columns import Recording
-from cloudrc.teleop.store import Order
+from cloudrc.teleop.store import Order, open_store
+from cloudrc.teleop.wire import Leg, Plan
 from tests.drivers.conftest import FAST, processes_of
 
-RUN = ["--run", "s"]
+RUN, USING = ["--run", "s"], "cloudrc: using the run in s\n"
 
 
 @pytest.mark.parametrize("name", ["paper", "fast"])
@@ -48,7 +53,61 @@ def test_down_ends_sessions_only_and_asks_which(folder, capsys):
             local.announced(folder / "a", "", "session"),
             local.announced(folder / "b", "", "session"),
         ):
-            assert "2 sessions run here; choose one: --run" in said(2)
+            assert "2 runs are flying here; choose one: --run" in said(2)
+
+
+def test_down_leaves_a_session_elsewhere_alone(folder, capsys, monkeypatch):
+    ended = []
+    monkeypatch.setattr(local, "end_session", lambda run, limit: ended.append(run))
+    (folder / "runs/latest").mkdir(parents=True)
+    (folder / "runs/latest/relay.log").touch()
+    with local.announced(folder / "theirs", "", "session"):
+        assert main(["down"]) == 2
+        assert (
+            "runs/latest has ended; name another flight: --run theirs;" in capsys.readouterr().err
+        )
+        with local.announced(folder / "runs/latest"):  # by 'cloudrc run'
+            assert main(["down"]) == 2
+            assert "runs/latest does not take this command; name" in capsys.readouterr().err
+        assert ended == []
+        assert main(["down", "--run", "theirs"]) == 0
+        assert ended == [folder / "theirs"]
+
+
+def drive_order():
+    leg = Leg((0.0, 99.0, 0.35), tolerance=inf, dwell=0.0)  # beyond the fence
+    return Order(Plan((leg,), Start.HERE, 3600.0, by_hand=True), "drive")
+
+
+def test_a_drive_becomes_a_mission_with_setpoints(folder):
+    flown = assembly.with_order(load_experiment("hover"), drive_order(), "")
+    (folder / "config.yaml").write_text(dump(flown))
+    rest = write_setpoints([(0.0, (0.0, 99.0, 0.35)), (1.0, (0.0, 0.0, 1.0))])
+    (folder / "drive.csv").write_text(rest)
+    again = read_experiment(folder / "config.yaml")
+    assert again.mission.setpoints == str(folder / "drive.csv")
+    assert (again.mission.start, again.criteria.contact) == ("here", False)
+    assert assembly.build_plan(again).track[0][1][1] < 10.0
+
+
+def test_down_tells_a_missing_report_from_no_mission(folder, capsys):
+    with closing(open_store(folder / "missions.journal", b"")) as store:
+        mission = store.add(drive_order())
+
+    def said(code):
+        with (
+            local.announced(folder, "", "session"),
+            pytest.MonkeyPatch.context() as patch,
+        ):
+            patch.setattr(local, "end_session", lambda run, limit: None)
+            assert main(["down"]) == code
+        captured = capsys.readouterr()
+        return captured.out + captured.err
+
+    assert "ended; no mission flew" in said(0)
+    with closing(open_store(folder / "missions.journal", b"")) as store:
+        store.note(store.find(mission.id), "started", "")
+    assert "mission m1 flew, but has no report; the output of 'cloudrc up'" in said(1)
 
 
 @pytest.mark.process
@@ -120,7 +179,7 @@ def test_a_session_flies_missions_and_reports_the_last_one(folder, figure):
         until(lambda: "done" in call("mission", "list", *RUN).splitlines()[-1])
         assert "s: in force after" in call("link", "set", "downlink.delay_ms=60")
         until(lambda: "link: downlink 60 " in (folder / "said").read_text())
-        assert call("down") == "s/report.html\n"
+        assert call("down") == f"s/report.html\n{USING}"
         assert process.wait(10) == 0
     said = (folder / "said").read_text()
     assert said.splitlines()[-1] == "s/report.html"
@@ -135,6 +194,29 @@ def test_a_session_flies_missions_and_reports_the_last_one(folder, figure):
     assert len(Recording.read(folder / "s/mission.mcap")["/mission"]["event"]) == 3
     assert list(Recording.read(folder / "s/cloud.mcap")["/mission"]["event"]).count("done") == 2
     assert local.under_way() == {}
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("ended", [True, False])
+def test_a_session_that_ends_with_a_drive_has_its_report(folder, ended):
+    with up(folder) as process:
+        api = Api(local.under_way()[folder / "s"])
+        for velocity in [(0.0, 0.0, 0.5)] * 30 + [(0.0, 0.0, 0.0)]:
+            with suppress(ApiError):  # at first there is no telemetry
+                api.post("/v1/drive", {"velocity_mps": velocity})
+            time.sleep(0.1)
+        until(lambda: "next: the operator drives;" in call("mission", "status", *RUN))
+        if ended:
+            call("mission", "resume", *RUN)
+            until(lambda: "SUCCESS" in call("mission", "list", *RUN))
+        assert call("down") == f"s/report.html\n{USING}"
+        assert process.wait(10) == 0
+    document = json.loads((folder / "s/report.json").read_text())
+    assert document["verdict"] == ("success" if ended else "interrupted")
+    assert (folder / "s/mission.mcap").exists()
+    assert len((folder / "s/drive.csv").read_text().splitlines()) > 50
+    call("report", "s", code=0 if ended else 130)
+    call("run", "s/config.yaml", "--mode", "virtual", "--out", "again")
 
 
 @pytest.mark.process
@@ -162,7 +244,7 @@ def test_a_session_that_dies_in_flight_can_be_reported(folder, victim, code):
 def test_a_session_without_a_mission_has_no_report(folder):
     with up(folder) as process:
         assert "s: the session has not ended; end it: cloudrc down" in call("report", "s", code=2)
-        assert call("down") == "s: ended; no mission flew\n"
+        assert call("down") == f"s: ended; no mission flew\n{USING}"
         assert process.wait(10) == 0
     assert "s: no mission flew, so there is no report" in (folder / "said").read_text()
     assert "no mission flew, so there is no report" in call("report", "s", code=2)

@@ -122,4 +122,4 @@ def test_a_flag_or_the_plugin_of_kubectl_selects_the_cluster(
 ):
     monkeypatch.setattr(sys, "argv", words)
     assert main() == 0
-    assert capsys.readouterr().out == "no missions yet\n"
+    assert capsys.readouterr().out == "release 'cloudrc' in namespace 'demo': no missions yet\n"

@@ -77,6 +77,10 @@ def reference(flight):
     return setpoint_at(flight.setpoints[-1], flight.now_ns)
 
 
+def step_after(flight):
+    return flight.teleop.state(flight.now_ns)["seen"]["next_step"]
+
+
 def names(flight):
     return [event.event for event in flight.events]
 
@@ -111,8 +115,14 @@ def test_without_requests_the_setpoint_brakes_and_rests(driven):
     assert driven.events[-1].stamp_ns - last_ns <= 520_000_000
     driven.step(seconds=1.0)
     assert reference(driven).velocity == ZERO
+    assert "the operator holds" in step_after(driven)
     press(driven)  # the operator is back
     assert reference(driven).velocity == EAST
+    assert "the operator drives" in step_after(driven)
+    driven.teleop.hold(driven.now_ns)
+    with pytest.raises(ConflictError, match="let go"):
+        press(driven)
+    assert "the operator holds" in step_after(driven)
 
 
 def test_a_key_that_is_released_is_no_lost_operator(driven):
