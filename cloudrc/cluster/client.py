@@ -326,7 +326,7 @@ def last_words(stderr: bytes) -> str:
     return message.removeprefix("Error: ").removeprefix("error: ") or "no error message"
 
 
-def end_process(process: subprocess.Popen[bytes]) -> None:
+def end_process(process: subprocess.Popen[Any]) -> None:
     """End a program by SIGTERM, and by SIGKILL after `STOP_LIMIT`."""
     process.terminate()
     try:
