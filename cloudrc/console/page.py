@@ -388,13 +388,11 @@ class Page:
 
     def _place_target(self, now: float) -> Vector:
         """Return where the target is before somebody moves it [m]: setpoint, or above the robot."""
-        feed, at = self._feed, SPAWN
+        feed = self._feed
         if feed.control is not None and feed.controls(now):
-            at = feed.control.setpoint
-        elif feed.telemetry is not None:
-            at = feed.telemetry.odometry.position
-        if not feed.controls(now):
-            at = np.add(at, (0.0, 0.0, 0.6))
+            at: Any = feed.control.setpoint
+        else:
+            at = np.add(feed.telemetry.odometry.position if feed.telemetry else SPAWN, (0, 0, 0.6))
         x, y, z = map(float, np.round(np.clip(at, fence.INNER_LOW, fence.INNER_HIGH), 2))
         return x, y, z
 
