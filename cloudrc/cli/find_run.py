@@ -79,7 +79,7 @@ def ask_if_unclear(candidates: Collection[Path], *, steers: bool, flag: str = "-
     from cloudrc.drivers.local import RELAY_LOG, under_way
 
     latest = Path(os.path.realpath(RUNS / "latest"))
-    names = " or ".join(f"{flag}{short(run)}" for run in candidates)
+    names = " or ".join(f"{flag}{short(run)}" for run in sorted(candidates))
     if len(candidates) > 1:
         raise BadInputError(f"{len(candidates)} runs are flying here; choose one: {names}")
     if latest in candidates:
