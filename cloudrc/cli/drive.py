@@ -8,6 +8,7 @@ request to drive and reads the state, so that no key waits for a slow API.
 from __future__ import annotations
 
 import curses
+import select
 import sys
 import threading
 import time
@@ -56,7 +57,7 @@ class Pilot:
         thread = threading.Thread(target=self._repeat)
         thread.start()
         try:
-            while (key := screen.getch()) != ord("q"):
+            while (key := screen.getch()) != ord("q") and not _is_gone():
                 self._press(key)
                 self._draw(screen)
         finally:
@@ -145,6 +146,13 @@ class Pilot:
         what = f"{mission['id']} ({mission['name']}) {mission['state']}" if mission else "none"
         lines += [f"mission     {what}", f"refused     {self._refused or 'nothing'}", "", *HELP]
         return [escape(line) for line in lines]
+
+
+def _is_gone() -> bool:
+    """Return whether the terminal was closed; without a session of its own no signal tells it."""
+    terminal = select.poll()
+    terminal.register(sys.stdin)
+    return any(events & select.POLLHUP for _, events in terminal.poll(0))
 
 
 def drive(api: Api) -> int:

@@ -2,6 +2,7 @@
 
 import os
 import pty
+import select
 import subprocess
 import sys
 import threading
@@ -234,15 +235,23 @@ class Terminal:
         how = {**dict.fromkeys(("stdin", "stdout", "stderr"), end), "env": environ}
         self.process = subprocess.Popen([*COMMAND, api.url], start_new_session=True, **how)
         os.close(end)
-        threading.Thread(target=self._read, daemon=True).start()
+        self._reads = threading.Thread(target=self._read, daemon=True)
+        self._closes = False
+        self._reads.start()
 
     def _read(self):
         with suppress(OSError):  # the process has ended
-            while data := os.read(self._keys, 4096):
-                self.screen += data.decode(errors="replace")
+            while not self._closes:
+                if select.select([self._keys], [], [], 0.1)[0]:
+                    self.screen += os.read(self._keys, 4096).decode(errors="replace")
 
     def type(self, keys):
         os.write(self._keys, keys.encode())
+
+    def close(self):
+        self._closes = True
+        self._reads.join()
+        os.close(self._keys)
 
 
 @pytest.mark.process
@@ -266,6 +275,17 @@ def test_keys_in_a_terminal_drive_the_robot():
         api.until(lambda: flight.guard is GuardState.ESTOP)
         terminal.type("q")
         assert terminal.process.wait(10.0) == 0
+
+
+@pytest.mark.process
+def test_drive_ends_with_its_terminal():
+    with running(unix=True) as api:
+        terminal = Terminal(api)
+        while "GROUND" not in terminal.screen:
+            assert terminal.process.poll() is None, terminal.screen
+            time.sleep(0.1)
+        terminal.close()
+        terminal.process.wait(10.0)
 
 
 @pytest.mark.process
