@@ -206,10 +206,8 @@ def _show_release(options: argparse.Namespace) -> int:
         try:
             if (link := read_link(release)) is None:
                 raise BadInputError("the pods of the release do not run")
-            settings, note = (
-                line.removeprefix(LINK_SET).split(),
-                partial(note_of, number=token_hex(4)),
-            )
+            settings = line.removeprefix(LINK_SET).split()
+            note = partial(note_of, number=token_hex(4))
             keep(release, link, send(release, link, None, settings, note))
             print_line(line)
         except CloudrcError as error:

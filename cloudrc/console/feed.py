@@ -17,7 +17,7 @@ from cloudrc.exposition.parts import PredictionJudge
 from cloudrc.geometry.clearance import Array, clearance
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import NEVER_NS, GuardState, Telemetry
-from cloudrc.records import Arrival, Control, Fault, Record, SessionOpened, TelemetrySent
+from cloudrc.records import Arrival, Control, Record, SessionOpened, TelemetrySent
 
 WINDOW = 25.0
 """Time that the charts show [s]."""
@@ -49,7 +49,6 @@ class FlightFeed:
     Attributes:
         telemetry: The newest telemetry; None before the first.
         control: The newest control period; None while cloud does not control the robot.
-        fault: Text of the newest fault; "" before the first.
         samples: Points of the charts, oldest first.
         flown: Number of points that the trail has had so far.
     """
@@ -59,7 +58,6 @@ class FlightFeed:
         self._scene, self._judge = scene, PredictionJudge()
         self.telemetry: Telemetry | None = None
         self.control: Control | None = None
-        self.fault = ""
         self.samples: deque[Sample] = deque()
         self.flown = 0
         # Times of the newest telemetry, control period, judged prediction and echo [s].
@@ -80,8 +78,6 @@ class FlightFeed:
             elif isinstance(record, SessionOpened):
                 self._judge.reset()
                 self._judged = -inf
-            elif isinstance(record, Fault):
-                self.fault = record.text
         if news:
             self.samples.append(self._sample(now))
         while self.samples and self.samples[0].time < now - WINDOW:

@@ -125,10 +125,8 @@ class Page:
         self._experiment, self._feed, self._steering = experiment, feed, steering
         from cloudrc.console.scene import LEGEND, FlightScene  # needs MuJoCo, which takes a second
 
-        self._scene, geometry = (
-            FlightScene(self._server, experiment),
-            load_scene(experiment.world.scene),
-        )
+        geometry = load_scene(experiment.world.scene)
+        self._scene = FlightScene(self._server, experiment)
         self._place_camera(geometry)
         gui = self._server.gui
         gui.main_panel.dock_right()
@@ -216,10 +214,8 @@ class Page:
         lines: list[Any] = [
             {"label": name, "stroke": colour, "width": 1.5} for name, (_, colour) in curves.items()
         ]
-        low, high = (
-            {"hard": 0, "soft": 0, "mode": 1, "pad": 0},
-            {"soft": span, "mode": 1, "pad": 0.1},
-        )
+        low = {"hard": 0, "soft": 0, "mode": 1, "pad": 0}
+        high = {"soft": span, "mode": 1, "pad": 0.1}
         return self._server.gui.add_uplot(
             (np.zeros(1),) * (1 + len(curves)),
             ({"label": "s"}, *lines),
@@ -345,10 +341,10 @@ class Page:
         experiment, mission = self._experiment, self._experiment.mission
         if mission.steps is not None:
             text = "start: random steps are for 'cloudrc run'; send waypoints instead"
-            return self._steering.say(text, is_refusal=True)
+            self._steering.say(text, is_refusal=True)
+            return
         order = mission.model_dump(mode="json", exclude={"steps"}, exclude_none=True)
         self._steering.fly({**order, "name": experiment.name})
-        return None
 
     def _add_target(self, client: viser.ClientHandle) -> None:
         """Add the gizmo and the numbers of the next waypoint, which follow each other."""

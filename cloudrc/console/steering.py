@@ -38,7 +38,7 @@ class Api(Protocol):
 
 @dataclass(frozen=True)
 class Link:
-    """The way to the emulated link: on this machine, or later in a cluster.
+    """The way to the emulated link, on this machine or in a cluster.
 
     Attributes:
         read: Returns "uplink.delay_ms" and the like -> the present value; {} if unknown.
