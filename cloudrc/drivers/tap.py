@@ -1,8 +1,8 @@
 """Send what a console shows from cloud to a Unix socket, and receive it there.
 
-A datagram has one record per line, in the form of `to_line`: all events since the last datagram,
-then the newest record of each sampled type. Cloud never waits: a datagram is lost when nobody
-listens, or when the listener does not keep up.
+A datagram has one record per line, in the form of `to_line`: the newest of each type, a new
+session first. Cloud never waits: a datagram is lost when nobody listens, or when the listener does
+not keep up.
 """
 
 from __future__ import annotations
@@ -10,12 +10,11 @@ from __future__ import annotations
 import os
 import socket
 import time
-from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from cloudrc.drivers.process import EVENTS, from_line, to_line
+from cloudrc.drivers.process import from_line, to_line
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Telemetry
 from cloudrc.records import Arrival, Control, Record, SessionOpened, TelemetrySent
@@ -26,8 +25,6 @@ PERIOD = 0.03
 """Average time between two datagrams [s]."""
 ALONE_PERIOD = 0.5
 """Time between two attempts while nobody listens [s]."""
-EVENTS_MAX = 50
-"""Largest number of events in a datagram; older events are dropped."""
 DATAGRAM_MAX = 1 << 16
 """Largest size of a datagram that is received [bytes]."""
 
@@ -44,7 +41,7 @@ class Tap:
         self._path, self._telemetry = os.fspath(path), telemetry
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        self._events: deque[Record] = deque(maxlen=EVENTS_MAX)
+        self._session: list[Record] = []  # the newest, if it is new
         self._arrival: Record | None = None  # the newest used
         self._period: list[Record] = []  # the newest control period, after its newest arrival
         self._due = 0.0
@@ -56,8 +53,8 @@ class Tap:
                 self._arrival = record if record.used else self._arrival
             elif isinstance(record, Control):
                 self._period = [self._arrival, record] if self._arrival else [record]
-            elif isinstance(record, (*EVENTS, SessionOpened)):
-                self._events.append(record)
+            elif isinstance(record, SessionOpened):
+                self._session = [record]
         now = time.monotonic()
         if now < self._due:
             return
@@ -68,11 +65,10 @@ class Tap:
             pass
         except OSError:  # nobody listens
             self._due = now + ALONE_PERIOD
-        self._events.clear()
-        self._arrival, self._period = None, []
+        self._arrival, self._session, self._period = None, [], []
 
     def _datagram(self) -> bytes:
-        newest = [*self._events, *(self._period or filter(None, [self._arrival]))]
+        newest = [*self._session, *(self._period or filter(None, [self._arrival]))]
         if (telemetry := self._telemetry()) is not None:
             newest.append(TelemetrySent(telemetry.stamp_ns, 0, 0, telemetry))
         return "\n".join(map(to_line, newest)).encode(errors="backslashreplace")

@@ -1,4 +1,4 @@
-"""The tap: newest samples and all events reach a console, and a console never delays cloud."""
+"""The tap: new sessions and the newest samples reach a console, and a console never delays cloud."""
 
 import time
 
@@ -7,7 +7,7 @@ import pytest
 from cloudrc.drivers import tap
 from cloudrc.drivers.tap import ALONE_PERIOD, PERIOD, Tap, TapListener
 from cloudrc.errors import BadInputError
-from cloudrc.records import Arrival, Counted, Fault
+from cloudrc.records import Arrival, Counted, SessionOpened
 from tests.console.conftest import control, told
 
 
@@ -36,22 +36,23 @@ def ends(tmp_path):
     sender._socket.close()
 
 
-def test_a_datagram_has_all_events_and_the_newest_samples(clock, ends):
+def test_a_datagram_has_a_new_session_and_the_newest_samples(clock, ends):
     sender, listener = ends
     for _ in range(2):
         sender.tell([])  # the next datagram is due after a period
     listener.receive(0.1)
     used, late = Arrival(1, True, 1, 1, 0.03, True), Arrival(2, True, 1, 2, 0.3, False)
-    sender.tell([Fault(1, "a", "first"), used, control(0.1), Counted(1, "cloud", "sent", 1)])
-    sender.tell([Fault(2, "b", "second"), control(0.2), late])
+    old, new = (SessionOpened(n, "cloud", n, "") for n in (1, 2))
+    sender.tell([old, used, control(0.1), Counted(1, "cloud", "sent", 1)])
+    sender.tell([new, control(0.2), late])
     assert listener.receive(0) == []
     clock.now += PERIOD
     sender.tell([])
     found = listener.receive(0.1)
-    assert found[:2] == [Fault(1, "a", "first"), Fault(2, "b", "second")]
+    assert found[:2] == [new, used]
     assert [record for record in found if isinstance(record, Arrival)] == [used]
-    assert found[3].stamp_ns == 200_000_000
-    assert found[4:] == [told(0.1)]
+    assert found[2].stamp_ns == 200_000_000
+    assert found[3:] == [told(0.1)]
 
 
 def test_a_blocked_or_missing_console_costs_no_wait(clock, ends):
