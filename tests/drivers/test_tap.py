@@ -1,4 +1,4 @@
-"""The tap: new sessions and the newest samples reach a console, and a console never delays cloud."""
+"""The tap: a new session and the newest samples reach a console, which never delays cloud."""
 
 import time
 
