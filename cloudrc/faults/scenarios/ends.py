@@ -40,7 +40,7 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
 def _check_epochs(outcome: Outcome, flight: Flight) -> list[int]:
     """Check that the epochs of world's sessions rise; return them."""
     opened = measures.epochs(flight)
-    outcome.true("a new epoch, higher than all before", opened == sorted(set(opened)))
+    outcome.true("each epoch is higher than all before", opened == sorted(set(opened)))
     return opened
 
 
@@ -51,19 +51,16 @@ def _check_epochs(outcome: Outcome, flight: Flight) -> list[int]:
     expects="HOLD; of what it computed before nothing is applied",
 )
 def _cloud_paused(outcome: Outcome, seed: int) -> None:
-    at, missed = measures.instant(seed), "loop_missed_periods_total"
+    at = measures.instant(seed)
     flight = Flight(seed=seed, separate=True)
     flight.cloud.at(at, partial(flight.cloud.freeze, duration=5.0))
-    measures.silence_told(outcome, flight, at, 4.0, cloud=False)
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
-    measures.causes_told(outcome, flight)
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
     old = [r for r in applied if r.stamp_ns - r.basis_stamp_ns > measures.AGE_MAX * 1e9]
     outcome.same("commands applied that were too old", len(old), 0)
     moves(outcome, flight, "world guard_transitions_total hold", since=at)
-    moves(outcome, flight, f"cloud {missed}", since=at, over=at + 5.0)
-    outcome.least(f"metric {missed} at the end", measures.reading(flight, "cloud", missed), 490)
+    moves(outcome, flight, "cloud loop_missed_periods_total", since=at, over=at + 5.0)
 
 
 @scenario(
@@ -154,7 +151,6 @@ def _swizzle(outcome: Outcome, seed: int) -> None:
     flight.cloud.at(sum(teleop), flight.teleop.start)
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
-    measures.causes_told(outcome, flight)
     metrics = (
         *("cloud datagrams_lost_total uplink", "world datagrams_lost_total downlink"),
         *("cloud loop_missed_periods_total", "world world_slip_seconds_total"),
@@ -162,6 +158,4 @@ def _swizzle(outcome: Outcome, seed: int) -> None:
     )
     moves(outcome, flight, *metrics, since=uplink[0], over=max(ends))
     for end, records in (("cloud", flight.of_cloud), ("world", flight.of_world)):
-        outcome.least(f"times that {end} tells: late", len(measures.told(records, "late")), 1)
-    restarted = measures.events_of_missions(flight, "restarted")
-    outcome.least("the log tells: restarted", len(restarted), 1)
+        outcome.least(f"times that {end} reports: late", len(measures.told(records, "late")), 1)
