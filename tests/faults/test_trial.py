@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from cloudrc.faults.adversary import POLICIES, choose
-from cloudrc.faults.invariants import Limits, Watch
+from cloudrc.faults.invariants import Watch
 from cloudrc.faults.schedule import Event, Schedule, compose, load
 from cloudrc.faults.trial import FORGETFUL, OrderInvariant, checked_in, fly
 from cloudrc.messages import ZERO
@@ -16,6 +16,7 @@ from cloudrc.teleop.service import MissionService
 from cloudrc.tunnel.channel import LATE, USED, Channel
 from cloudrc.world.guard.limits import Limits as GuardLimits
 from tests.conftest import nightly
+from tests.faults.conftest import guard
 
 MS = 1_000_000
 REGRESSIONS = sorted((Path(__file__).parent / "regressions").glob("*.yaml"))
@@ -122,7 +123,7 @@ def test_a_broken_part_is_found(breaks, kind, schedule, monkeypatch):
     ],
 )
 def test_a_command_is_applied_once_and_in_order(commands, kinds):
-    flight = SimpleNamespace(listeners=[], watch=Watch(Limits()), world_starts_ns=[0, 3])
+    flight = SimpleNamespace(listeners=[], watch=Watch(guard()), world_starts_ns=[0, 3])
     order = OrderInvariant(flight)
     for at, (epoch, counter) in enumerate(commands):
         opened = SessionOpened(at, "world", epoch, "cloud said hello")
@@ -139,6 +140,6 @@ def test_a_waypoint_is_reached_once_and_in_order(waypoints, kinds):
     events.append({"mission": "n", "event": "reached", "waypoint": 0})
     book = SimpleNamespace(events_after=lambda number: events)
     teleop, run = SimpleNamespace(service=SimpleNamespace(book=book)), SimpleNamespace(now_ns=0)
-    flight = SimpleNamespace(listeners=[], watch=Watch(Limits()), teleop=teleop, run=run)
+    flight = SimpleNamespace(listeners=[], watch=Watch(guard()), teleop=teleop, run=run)
     OrderInvariant(flight).check_waypoints()
     assert set(flight.watch.counts) == kinds
