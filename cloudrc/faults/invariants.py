@@ -20,6 +20,7 @@ hold       At least `SETTLE_NS` pass between two changes to TRACK, and between t
            for lack of commands. A HOLD may begin sooner if a command is based on older odometry
            than an earlier command. In a mission, a robot without commands lands after the
            configured time, or sooner after impossible commands.
+order      Each applied command is newer than the last one, and not of an old session.
 tick       The guard runs once in each step of the physics.
 
 All limits come from the configuration and docs/, not from the guard: from "Stop rule" and "Leaving
@@ -28,6 +29,7 @@ HOLD" in reference/plant.md, F5 and F23 in reference/faults.md, and "The guard" 
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import Counter, deque
 from math import hypot, inf, sqrt
 from typing import NamedTuple
@@ -45,6 +47,7 @@ from cloudrc.messages import (
     Start,
     Vector,
 )
+from cloudrc.records import CommandApplied, Record, SessionOpened
 from cloudrc.world.readings import Readings, RotorSpeeds
 from cloudrc.world.robot import STEP, STEP_NS, Robot
 from cloudrc.world.rotors import STOPPED
@@ -105,6 +108,34 @@ class Watch:
         self.counts[kind] += 1
         if self.counts[kind] <= REPORTED:
             self.breaches.append(Breach(now_ns * 1e-9, kind, text))
+
+
+class OrderInvariant:
+    """Checks that commands are applied once and in order."""
+
+    def __init__(self, watch: Watch, world_starts_ns: list[int]) -> None:
+        """Check commands of world's processes, which began at `world_starts_ns` [ns]."""
+        self._watch, self._world_starts_ns = watch, world_starts_ns
+        self._newest = (0, 0, -1)  # process of world, epoch and counter
+
+    def see(self, records: list[Record], now_ns: int) -> None:
+        """Check new records of world.
+
+        A restarted world continues from the last epoch that cloud knows. If cloud knows no epoch,
+        world starts with the first epoch again, which is allowed.
+        """
+        for record in records:
+            if isinstance(record, CommandApplied):
+                self._check(record.epoch, record.counter, record.stamp_ns)
+            elif isinstance(record, SessionOpened):
+                self._check(record.epoch, -1, record.stamp_ns)
+
+    def _check(self, epoch: int, counter: int, stamp_ns: int) -> None:
+        this = bisect_right(self._world_starts_ns, stamp_ns), epoch, counter
+        if this <= self._newest:
+            text = f"command {counter} of epoch {epoch} after {self._newest[1:]}"
+            self._watch.note(stamp_ns, "order", text)
+        self._newest = max(self._newest, this)
 
 
 class RobotInvariants:

@@ -169,12 +169,6 @@ def number(flight: Flight, name: str) -> float:
 # Commands, sessions, missions.
 
 
-def applied_in_order(flight: Flight) -> bool:
-    """Return whether (epoch, counter) of the applied commands always rises."""
-    order = [(r.epoch, r.counter) for r in flight.of_world if isinstance(r, CommandApplied)]
-    return all(first < second for first, second in pairwise(order))
-
-
 def epochs(flight: Flight) -> list[int]:
     """Return the epochs of the sessions that world began, in order."""
     opened = [r for r in flight.of_world if isinstance(r, SessionOpened)]

@@ -32,16 +32,8 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
     again = min((t for t in commands if t > down), default=nan)
     outcome.most("the new process commands after", again, 2.0, "s")
     outcome.most("TRACK again after its start", measures.resumed_after(flight, at + down), 1.0, "s")
-    opened = _check_epochs(outcome, flight)
     moves(outcome, flight, "world session_epoch", since=at)
-    outcome.least("epochs opened", len(opened), 3)
-
-
-def _check_epochs(outcome: Outcome, flight: Flight) -> list[int]:
-    """Check that the epochs of world's sessions rise; return them."""
-    opened = measures.epochs(flight)
-    outcome.true("each epoch is higher than all before", opened == sorted(set(opened)))
-    return opened
+    outcome.least("epochs opened", len(measures.epochs(flight)), 3)
 
 
 @scenario(
@@ -86,7 +78,6 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
     outcome.true("mission failed", flight.mission.state == "failed")
     coded = "world_restarted" in str(flight.mission.verdict)
     outcome.true("with the code world_restarted", coded)
-    _check_epochs(outcome, flight)
     refused = "world datagrams_total downlink old_epoch"  # commands for the old world
     failed = "cloud missions_total world_restarted"
     moves(outcome, flight, refused, "world session_epoch", failed, since=at + 2.0)
@@ -123,7 +114,6 @@ def _two_clouds(outcome: Outcome, seed: int) -> None:
     measures.held_in_time(outcome, flight, "HOLD once the first is gone")
     later = [epoch for epoch in measures.epochs(flight) if epoch > 2]
     outcome.true("then the second gets a higher epoch", bool(later))
-    outcome.true("commands applied in order, none twice", measures.applied_in_order(flight))
 
 
 @scenario(

@@ -24,7 +24,6 @@ HOUR_NS = 3_600_000_000_000
 def _disorder(outcome: Outcome, seed: int) -> None:
     shape = conditions(delay=0.05, jitter=0.0, reorder=0.25)
     flight = fly_safely(outcome, Flight(seed=seed, link=shape))
-    outcome.true("commands applied in order, none twice", measures.applied_in_order(flight))
     metrics = "datagrams_reordered_total downlink", "datagrams_total downlink late"
     moves(outcome, flight, *(f"world {metric}" for metric in metrics), since=0.0)
     outcome.least("late commands dropped", flight.count("late"), 100)
