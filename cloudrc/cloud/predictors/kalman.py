@@ -113,7 +113,8 @@ def build(
             trusts the odometry more.
 
     Raises:
-        ValueError: If the predictor refuses a parameter.
+        ValueError: If a file or a parameter is given in the wrong place.
+        BadInputError: If the predictor refuses a parameter.
     """
     given = dict(parameters or {})
     if model_file is not None and model == "white_box":
