@@ -31,7 +31,7 @@ from cloudrc.messages import (
     Setpoint,
     Telemetry,
 )
-from cloudrc.records import Arrival, Counted, Fault, MissionEvent, SessionOpened
+from cloudrc.records import Arrival, Counted, MissionEvent, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import LATE, REPEATED, USED
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
@@ -40,39 +40,13 @@ from cloudrc.tunnel.handshake import BUSY_TEXT, SILENCE_TEXT, ClientHandshake
 from cloudrc.tunnel.keys import Key
 from cloudrc.tunnel.session import NO_EPOCH
 
-MISSED_NS = 500_000_000
-"""Cloud reports a fault when missed periods of this length in all are not yet forgiven [ns]."""
-FORGIVEN_PERIODS = 20
-"""One missed period is forgiven in the time of this many, so 5 % of all periods may be missed."""
-
-
-class MissedPeriods:
-    """Report a fault when cloud misses many periods; report again after all were forgiven."""
-
-    def __init__(self, period_ns: int) -> None:
-        """Set the time between two commands, `period_ns` [ns]."""
-        self._period_ns, self._missed, self._reported = period_ns, 0, False
-        self._forgiven_ns = NEVER_NS  # when all missed periods will be forgiven
-
-    def miss(self, count: int, now_ns: int) -> list[Fault]:
-        """Count missed periods at `now_ns` [ns]; return the fault to report, if any."""
-        full_ns = now_ns + MISSED_NS * FORGIVEN_PERIODS
-        if self._forgiven_ns <= now_ns:
-            self._missed, self._reported, self._forgiven_ns = 0, False, now_ns
-        self._missed += count
-        self._forgiven_ns = min(
-            self._forgiven_ns + count * FORGIVEN_PERIODS * self._period_ns, full_ns
-        )
-        if self._reported or self._forgiven_ns < full_ns:
-            return []
-        self._reported = True
-        text = (
-            f"cloud sent no command in {self._missed} periods of {self._period_ns * 1e-6:g} ms: "
-            "a plug-in is slow, cloud.compute_ms is long, or the machine is busy"
-        )
-        return [Fault(now_ns, "late", text)]
-
-
+LATE_NS, LATE_WINDOW_NS = 500_000_000, 10_000_000_000
+"""Cloud reports a fault if it misses periods of more than LATE_NS within LATE_WINDOW_NS, 5 % [ns].
+The fault is reported once per session."""
+LATE_TEXT = (
+    "cloud misses more than 5 % of its periods: a plug-in is slow, cloud.compute_ms is long, "
+    "or the machine is busy"
+)
 HELLO_PERIOD_NS = 100_000_000
 """Shortest time between two periodic hellos [ns]."""
 KEY_PERIOD_NS = 5_000_000_000
@@ -130,7 +104,7 @@ class CloudEndpoint(TunnelEnd):
         self._delays = (nan, nan, nan)  # horizon, round trip and loop delay of the last command [s]
         self._alarm = EmergencyStopRepeater()
         self._period_ns = loop.period_ns
-        self._missed_periods = MissedPeriods(loop.period_ns)
+        self._late_ns, self._late_window_ns = 0, start_ns  # time missed since the second time
         self._compute = compute
         self._unsent: tuple[int, Datagram] | None = None  # departure [ns] and command
         self._asked = 0  # highest number of an operator request in this session
@@ -174,8 +148,7 @@ class CloudEndpoint(TunnelEnd):
                 return
         missed = (now_ns - self._tick_ns) // self._period_ns
         if missed:
-            self._counts["missed_periods"] += missed
-            self._records += self._missed_periods.miss(missed, now_ns)
+            self._note_missed(missed, now_ns)
         self._tick_ns += (missed + 1) * self._period_ns
         self._session.follow_keys()
         if self._wants_session(now_ns):
@@ -234,6 +207,14 @@ class CloudEndpoint(TunnelEnd):
         elif self._wants_session(now_ns):
             self._records += self._complaints.about(outcome, data, now_ns)
 
+    def _note_missed(self, count: int, now_ns: int) -> None:
+        self._counts["missed_periods"] += count
+        if now_ns - self._late_window_ns > LATE_WINDOW_NS:
+            self._late_ns, self._late_window_ns = 0, now_ns
+        self._late_ns += count * self._period_ns
+        if self._late_ns > LATE_NS:
+            self._records += self._complaints.say("late", LATE_TEXT, now_ns)
+
     def _say_hello_if_due(self, now_ns: int, period_ns: int = HELLO_PERIOD_NS) -> None:
         """Send a hello once per `period_ns`; while two keys are valid, use them in turn."""
         if now_ns < self._hello_ns + period_ns:
@@ -259,7 +240,7 @@ class CloudEndpoint(TunnelEnd):
         self._session.begin(epoch, nonces, self._session.greeting_key)
         self._complaints.forget()
         self._channel.reset()
-        self._loop.reset()
+        self._loop.reset(now_ns)
         self._setpoint = None  # the robot may have moved; teleop sends a new one
         self._asked = 0  # numbers of the previous session no longer count
         self._alarm.restart_numbers()

@@ -20,7 +20,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from math import isfinite, nan
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
@@ -68,7 +68,7 @@ _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class DelayMeter:
-    """Feed a delay estimator with the delays of commands, and get the horizon from the estimator.
+    """Gives a delay estimator the delays of commands, and gets the horizon from the estimator.
 
     Attributes:
         rtt: Newest round-trip time, without the hold time on world [s]; NaN before the first.
@@ -184,21 +184,22 @@ class ControlLoop:
         self._planned = round(plan * 1e9) // PLAN_STEP_NS  # velocities per plan
         self.faults: list[Fault] = []
         self.counts: Counter[str] = Counter()
-        self._undated: list[Fault] = []
+        self._now_ns = 0  # stamp of faults
         estimator = build_estimator()
         predictor.reset()
         controller.reset()
         self._begin(estimator)
 
-    def reset(self) -> None:
-        """Forget all measurements at the start of a session."""
+    def reset(self, now_ns: int) -> None:
+        """Forget all measurements at the start of a session at `now_ns` [ns]."""
+        self._now_ns = now_ns
         try:
             estimator = self._build_estimator()
-        except BaseException as error:
-            self._note("estimator", error, NEVER_NS)
+        except Exception as error:
+            self._note("estimator", error)
             estimator = Estimator()  # it has no estimate, so the horizon stays 0
-        self._reset("predictor", self._predictor)
-        self._reset("controller", self._controller)
+        self._call("predictor", self._predictor.reset)
+        self._call("controller", self._controller.reset)
         self._begin(estimator)
 
     def _begin(self, estimator: Estimator) -> None:
@@ -211,14 +212,8 @@ class ControlLoop:
 
     def start_mission(self) -> None:
         """Reset the controller at the start of a mission within the session."""
-        self._reset("controller", self._controller)
+        self._call("controller", self._controller.reset)
         self._echoed_ns = NEVER_NS
-
-    def _reset(self, kind: str, plugin: Predictor | Controller) -> None:
-        try:
-            plugin.reset()
-        except BaseException as error:
-            self._note(kind, error, NEVER_NS, "cloud goes on using it")
 
     @property
     def basis_stamp_ns(self) -> int:
@@ -233,17 +228,9 @@ class ControlLoop:
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
         """Process telemetry that arrived at `now_ns` [ns], cloud's clock."""
         self._basis, self._basis_arrival_ns = telemetry.odometry, now_ns
-        if self._undated:
-            self.faults += [fault._replace(stamp_ns=now_ns) for fault in self._undated]
-            self._undated.clear()
-        try:
-            self._delays.observe(telemetry, now_ns)
-        except BaseException as error:
-            self._note("estimator", error, now_ns)
-        try:
-            self._predictor.observe(telemetry.odometry)
-        except BaseException as error:
-            self._note("predictor", error, now_ns)
+        self._now_ns = now_ns
+        self._call("estimator", self._delays.observe, telemetry, now_ns)
+        self._call("predictor", self._predictor.observe, telemetry.odometry)
 
     def expect(self, round_trip: float) -> None:
         """Use a round trip [s] as the horizon until a command has been echoed."""
@@ -251,17 +238,11 @@ class ControlLoop:
 
     def observe_late(self, telemetry: Telemetry, now_ns: int) -> None:
         """Process telemetry that arrived after newer telemetry; only its echo is used."""
-        try:
-            self._delays.observe_echo(telemetry)
-        except BaseException as error:
-            self._note("estimator", error, now_ns)
+        self._now_ns = now_ns
+        self._call("estimator", self._delays.observe_echo, telemetry)
 
     def _tell_applied(self, command_stamp_ns: int, applied_ns: int) -> None:
-        """Tell the predictor that world applied a command; a failure is not the estimator's."""
-        try:
-            self._predictor.applied(command_stamp_ns, applied_ns)
-        except BaseException as error:
-            self._note("predictor", error, NEVER_NS)
+        self._call("predictor", self._predictor.applied, command_stamp_ns, applied_ns)
 
     def command(
         self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
@@ -276,21 +257,22 @@ class ControlLoop:
             counter: Counter of the command's datagram, for the record.
         """
         basis, delays, moving = self._basis, self._delays, setpoint
+        self._now_ns = now_ns
         if moving.motion is not None:
             setpoint = setpoint_at(moving, now_ns)
         assert basis is not None, "check `ready` first"
         try:
             self._horizon = delays.horizon(now_ns)
-        except BaseException as error:
-            self._note("estimator", error, now_ns)
+        except Exception as error:
+            self._note("estimator", error)
         horizon = self._horizon
-        estimate = self._predict(basis, horizon, now_ns)
+        estimate = self._predict(basis, horizon)
         plan: tuple[Vector, ...] = ()
         if self._is_echo_silent(now_ns, horizon):
             self.counts["frozen"] += 1
             output = STAND_STILL
         else:
-            output = self._steer(estimate, setpoint, dt, now_ns)
+            output = self._steer(estimate, setpoint, dt)
             if self._planned:
                 plan = self._plan(moving, output.velocity, now_ns)
         velocity, yaw_rate, proportional, integral, derivative = output
@@ -298,10 +280,7 @@ class ControlLoop:
         planned_ns = basis.stamp_ns + round(horizon * 1e9) if plan else NEVER_NS
         fields = (now_ns, basis.stamp_ns, hold_ns, velocity, yaw_rate, plan, planned_ns)
         command = _new(Command, fields)
-        try:
-            self._predictor.commanded(command)
-        except BaseException as error:
-            self._note("predictor", error, now_ns)
+        self._call("predictor", self._predictor.commanded, command)
         _, position, orientation, predicted_velocity, _ = estimate
         # fmt: off
         control = _new(Control, (
@@ -320,7 +299,7 @@ class ControlLoop:
     # A sum is finite only if all terms are finite. Finite terms whose sum overflows are refused,
     # too, because no robot can fly them.
 
-    def _predict(self, basis: Odometry, horizon: float, now_ns: int) -> Odometry:
+    def _predict(self, basis: Odometry, horizon: float) -> Odometry:
         try:
             estimate = self._predictor.predict(basis, horizon)
             stamp_ns, position, (w, x, y, z), velocity, rate = estimate
@@ -329,13 +308,11 @@ class ControlLoop:
             if not isfinite(sum(position + velocity + orientation)):
                 _refuse(position=position, velocity=velocity, orientation=orientation)
             return _new(Odometry, (stamp_ns, position, orientation, velocity, rate))
-        except BaseException as error:
-            self._note("predictor", error, now_ns)
+        except Exception as error:
+            self._note("predictor", error)
             return basis
 
-    def _steer(
-        self, estimate: Odometry, setpoint: Setpoint, dt: float, now_ns: int
-    ) -> ControlOutput:
+    def _steer(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
         try:
             output = self._controller.update(estimate, setpoint, dt)
             velocity, yaw_rate, proportional, integral, derivative = output
@@ -344,8 +321,8 @@ class ControlLoop:
                 _refuse(velocity=velocity, yaw_rate=(yaw_rate,))
             terms = (_triple(proportional), _triple(integral), _triple(derivative))
             return _new(ControlOutput, (velocity, yaw_rate, *terms))
-        except BaseException as error:
-            self._note("controller", error, now_ns)
+        except Exception as error:
+            self._note("controller", error)
             return STAND_STILL
 
     def _plan(self, setpoint: Setpoint, velocity: Vector, now_ns: int) -> tuple[Vector, ...]:
@@ -356,11 +333,9 @@ class ControlLoop:
                 return ()
             count = self._planned
             return make_plan(model, self._controller, setpoint, velocity, now_ns, count)
-        except BaseException as error:
-            kind, cause = "predictor", error
-            if isinstance(error, ControllerError) and error.__cause__ is not None:
-                kind, cause = "controller", error.__cause__
-            self._note(kind, cause, now_ns, "cloud sends this command without a plan")
+        except Exception as error:
+            kind = "controller" if isinstance(error, ControllerError) else "predictor"
+            self._note(kind, error.__cause__ or error, "cloud sends this command without a plan")
             return ()
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
@@ -371,14 +346,15 @@ class ControlLoop:
             self._echoed_ns = now_ns
         return now_ns - self._echoed_ns > horizon * 1e9 + self._freeze_after_ns
 
-    def _note(self, kind: str, error: BaseException, now_ns: int, instead: str = "") -> None:
-        """Count a failure of a plug-in; report the first failure of each kind of plug-in.
+    def _call(self, kind: str, call: Callable[..., None], *arguments: Any) -> None:
+        """Call a method of a plug-in that returns nothing; note its exception."""
+        try:
+            call(*arguments)
+        except Exception as error:
+            self._note(kind, error, "cloud goes on using it")
 
-        A plug-in may raise any exception; only KeyboardInterrupt (a user's Ctrl-C) is raised again.
-        If `now_ns` is NEVER_NS, the fault gets the arrival time of the next telemetry.
-        """
-        if isinstance(error, KeyboardInterrupt):
-            raise error
+    def _note(self, kind: str, error: BaseException, instead: str = "") -> None:
+        """Count a failure of a plug-in; report the first failure of each kind of plug-in."""
         code = f"{kind}_failed"
         self.counts[code] += 1
         if self.counts[code] == 1:
@@ -387,8 +363,7 @@ class ControlLoop:
             text = f"{what}; {instead or INSTEAD[kind]}; fix cloud.{kind} or choose another"
             frames = "".join(traceback.format_tb(error.__traceback__))[-TRACEBACK_MAX:]
             trace = frames.encode(errors="replace").decode() + describe_error(error)
-            fault = Fault(now_ns, code, text, trace)
-            (self._undated if now_ns == NEVER_NS else self.faults).append(fault)
+            self.faults.append(Fault(self._now_ns, code, text, trace))
 
 
 def _locate(error: BaseException) -> str:

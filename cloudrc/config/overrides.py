@@ -179,9 +179,14 @@ def _check_model(predictor: Any, name: str) -> None:
 def build_plugin(kind: str, choice: PlugIn) -> Any:
     """Build a plug-in of a resolved experiment; convert its parameters to the declared types.
 
-    `kind` is a key of `cloudrc.plugins.PACKAGES`, such as "controllers".
+    `kind` is a key of `cloudrc.plugins.PACKAGES`, such as "controllers". Raise a BadInputError that
+    names the wrong parameters.
     """
-    checked = _check(kind, choice.name, choice.model_extra or {})
+    try:
+        checked = _check(kind, choice.name, choice.model_extra or {})
+    except ValidationError as error:
+        found = problems.from_pydantic(error, parameter_model(kind, choice.name))
+        raise BadInputError("; ".join(map(str, found))) from None
     return plugins.load(kind, choice.name, **dict(checked))
 
 

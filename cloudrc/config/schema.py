@@ -25,6 +25,9 @@ Point = tuple[Finite, Finite, Finite]
 NotNegative = Annotated[float, Field(ge=0)]
 NotNegatives = tuple[NotNegative, NotNegative, NotNegative]
 Positive = Annotated[float, Field(gt=0)]
+Positives = tuple[Positive, Positive, Positive]
+Gain = Annotated[float, Field(gt=0, le=1)]
+Count = Annotated[int, Field(ge=1)]
 # Every limit of the guard has a smallest and a largest value, so that nobody can switch it off.
 COMMAND_AGE_MS = 1, 10_000
 """Smallest and largest value of guard.command_age_max_ms [ms]."""

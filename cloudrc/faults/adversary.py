@@ -340,11 +340,6 @@ def _hostile_plans(rng: Generator) -> Lie:
     return lie
 
 
-def _plans_and_requests(rng: Generator) -> Lie:
-    """Send hostile plans, while `at_bad_moments` makes requests."""
-    return _hostile_plans(rng)
-
-
 def _operators_voice(rng: Generator) -> Lie:
     """Fly as one of the policies in `FASTEST`, while `at_bad_moments` makes requests."""
     return FASTEST[int(rng.integers(len(FASTEST)))](rng)
@@ -366,8 +361,8 @@ SPEAKING = ("operators-voice", "plans-and-requests", "refused-and-released")
 POLICIES: dict[str, Policy] = {
     policy.__name__[1:].replace("_", "-"): policy
     for policy in (
-        *(*FASTEST, _false_basis, _hostile_plans, _operators_voice, _plans_and_requests),
+        *(*FASTEST, _false_basis, _hostile_plans, _operators_voice),
         *(_refused_and_released, _shaking, _stop_and_go, _strange_numbers),
     )
-}
+} | {"plans-and-requests": _hostile_plans}
 """Name, such as towards-a-face -> policy."""

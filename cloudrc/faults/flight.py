@@ -19,7 +19,7 @@ from cloudrc.drivers.teleop import PERIOD_NS as WAKE_NS
 from cloudrc.drivers.virtual import Clock, VirtualRun
 from cloudrc.endpoint import Endpoint
 from cloudrc.faults.adversary import DishonestLoop, HostileOperator, Lie, Words
-from cloudrc.faults.invariants import Limits, Watch
+from cloudrc.faults.invariants import OrderInvariant, Watch
 from cloudrc.faults.models import EndpointGroup, RestartableEndpoint, TeleopModel
 from cloudrc.faults.scenario import generator
 from cloudrc.link.model import LinkDirection
@@ -79,11 +79,12 @@ class Flight:
         self._life, self._second, self._lies, self._words = life, second, lies, words
         self._clock, self._clock_id = cloud_clock or Clock(), OTHER if cloud_clock else SHARED
         self.secrets, self.rings = {"world": SECRET, "cloud": SECRET}, dict[str, KeyRing]()
-        self.listeners: list[Callable[[list[Record], int], None]] = []
         self.generations = {"world": 0, "cloud": 0}
         self.of_world, self.of_cloud = list[Record](), list[Record]()
         self.changes, self.world_starts_ns = list[GuardChange](), list[int]()
-        self._hash, self.watch = RecordHash(), Watch(Limits.of(self.experiment.guard))
+        self._hash, self.watch = RecordHash(), Watch(self.experiment.guard)
+        order = OrderInvariant(self.watch, self.world_starts_ns)
+        self.listeners: list[Callable[[list[Record], int], None]] = [order.see]
         limit, phase_ns = self.experiment.criteria.contact_speed_max_mps, None
         if separate:
             phase_ns = int(generator(self.experiment.seed, 45).integers(WAKE_NS))

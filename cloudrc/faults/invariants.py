@@ -20,6 +20,7 @@ hold       At least `SETTLE_NS` pass between two changes to TRACK, and between t
            for lack of commands. A HOLD may begin sooner if a command is based on older odometry
            than an earlier command. In a mission, a robot without commands lands after the
            configured time, or sooner after impossible commands.
+order      Each applied command is newer than the last one, and not of an old session.
 tick       The guard runs once in each step of the physics.
 
 All limits come from the configuration and docs/, not from the guard: from "Stop rule" and "Leaving
@@ -28,6 +29,7 @@ HOLD" in reference/plant.md, F5 and F23 in reference/faults.md, and "The guard" 
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import Counter, deque
 from math import hypot, inf, sqrt
 from typing import NamedTuple
@@ -45,6 +47,7 @@ from cloudrc.messages import (
     Start,
     Vector,
 )
+from cloudrc.records import CommandApplied, Record, SessionOpened
 from cloudrc.world.readings import Readings, RotorSpeeds
 from cloudrc.world.robot import STEP, STEP_NS, Robot
 from cloudrc.world.rotors import STOPPED
@@ -86,33 +89,10 @@ class Breach(NamedTuple):
     text: str
 
 
-class Limits(NamedTuple):
-    """Limits that the guard must keep."""
-
-    speed: float = 6.0  # speed of the reference [m/s]
-    acceleration: float = 12.0  # growth of the reference [m/s^2]
-    yaw_rate: float = 1.0  # [rad/s]
-    age_ns: int = 250_000_000  # age of a command's odometry [ns]
-    hold_ns: int = 60_000_000_000  # time in a mission after which HOLD becomes LAND [ns]
-    plan_ns: int = 0  # longest time for which a plan is flown after its arrival [ns]
-
-    @classmethod
-    def of(cls, guard: ResolvedGuard) -> Limits:
-        """Read the limits from an experiment's section `guard`."""
-        return cls(
-            guard.speed_max_mps,
-            guard.acceleration_max_mps2,
-            guard.yaw_rate_max_radps,
-            round(guard.command_age_max_ms * 1e6),
-            round(guard.hold_max_s * 1e9),
-            round(guard.plan_max_s * 1e9),
-        )
-
-
 class Watch:
     """Collects the breaches of a flight, including those after a restart of world."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: ResolvedGuard) -> None:
         self.limits = limits
         self.breaches: list[Breach] = []  # the first ones of each kind
         self.counts: Counter[str] = Counter()  # of breaches, by kind
@@ -130,12 +110,43 @@ class Watch:
             self.breaches.append(Breach(now_ns * 1e-9, kind, text))
 
 
+class OrderInvariant:
+    """Checks that commands are applied once and in order."""
+
+    def __init__(self, watch: Watch, world_starts_ns: list[int]) -> None:
+        """Check commands of world's processes, which began at `world_starts_ns` [ns]."""
+        self._watch, self._world_starts_ns = watch, world_starts_ns
+        self._newest = (0, 0, -1)  # process of world, epoch and counter
+
+    def see(self, records: list[Record], now_ns: int) -> None:
+        """Check new records of world.
+
+        A restarted world continues from the last epoch that cloud knows. If cloud knows no epoch,
+        world starts with the first epoch again, which is allowed.
+        """
+        for record in records:
+            if isinstance(record, CommandApplied):
+                self._check(record.epoch, record.counter, record.stamp_ns)
+            elif isinstance(record, SessionOpened):
+                self._check(record.epoch, -1, record.stamp_ns)
+
+    def _check(self, epoch: int, counter: int, stamp_ns: int) -> None:
+        this = bisect_right(self._world_starts_ns, stamp_ns), epoch, counter
+        if this <= self._newest:
+            text = f"command {counter} of epoch {epoch} after {self._newest[1:]}"
+            self._watch.note(stamp_ns, "order", text)
+        self._newest = max(self._newest, this)
+
+
 class RobotInvariants:
     """Checks one robot after every step of its physics; an `Observer`."""
 
     def __init__(self, robot: Robot, watch: Watch, start_ns: int, honest: bool) -> None:
         self._guard, self._simulator, self._honest = robot.guard, robot.simulator, honest
         self._watch, self._note, self._limits = watch, watch.note, watch.limits
+        self._age_ns = round(watch.limits.command_age_max_ms * 1e6)
+        self._plan_ns = round(watch.limits.plan_max_s * 1e9)
+        self._hold_ns = round(watch.limits.hold_max_s * 1e9)
         self._was = self._state = robot.guard.state  # after the last step; after the last event
         self._next_ns, self._steps = start_ns, 0
         self._before = ZERO  # the last reference [m/s]
@@ -151,7 +162,7 @@ class RobotInvariants:
         self._is_thrown = False  # by a collision, and not yet back inside the fence
         self._turned = self._halted = self._is_asked = False
         # The operator, and the wait for commands.
-        self._ramp_ns = round(max(RAMP_MIN, watch.limits.speed / RAMP) * 1e9)
+        self._ramp_ns = round(max(RAMP_MIN, watch.limits.speed_max_mps / RAMP) * 1e9)
         self._ramp_until_ns, self._alone_ns = -1, 0
         self._tracked_ns = self._held_ns = -SETTLE_NS
         self._armed = False  # whether a mission is on
@@ -180,7 +191,7 @@ class RobotInvariants:
         if state in FLOWN:
             self._comes_down = state is LAND
             self._check_stop(position, reference, state is LAND, now_ns)
-            if not abs(guard.yaw_rate) <= self._limits.yaw_rate:  # or it is NaN
+            if not abs(guard.yaw_rate) <= self._limits.yaw_rate_max_radps:  # or it is NaN
                 self._note(now_ns, "cap", f"reference turns by {guard.yaw_rate:.3f} rad/s")
             if reference is not self._before:
                 self._check_caps(reference, state is TRACK, now_ns)
@@ -201,13 +212,13 @@ class RobotInvariants:
         """Implement `Observer.see_command`: count fresh and impossible commands."""
         if rejection is None:
             basis_ns = command.basis_stamp_ns
-            if not 0 <= now_ns - basis_ns <= self._limits.age_ns:
+            if not 0 <= now_ns - basis_ns <= self._age_ns:
                 age = (now_ns - basis_ns) * 1e-9
                 self._note(now_ns, "stale", f"accepted a command {age:.3f} s old")
-            self._fresh_until_ns = basis_ns + self._limits.age_ns
+            self._fresh_until_ns = basis_ns + self._age_ns
             if command.plan:
                 end_ns = command.planned_ns + (len(command.plan) + 1) * PLAN_STEP_NS
-                end_ns = min(end_ns, now_ns + self._limits.plan_ns)
+                end_ns = min(end_ns, now_ns + self._plan_ns)
                 self._fresh_until_ns = max(self._fresh_until_ns, end_ns)
             if self._armed:
                 self._goes_back = basis_ns < self._basis_ns
@@ -294,11 +305,11 @@ class RobotInvariants:
         speed = sqrt(vx * vx + vy * vy + vz * vz)
         if speed > self._watch.speed:
             self._watch.speed = speed
-        if not speed <= self._limits.speed + SLACK:  # or it is NaN
+        if not speed <= self._limits.speed_max_mps + SLACK:  # or it is NaN
             self._note(now_ns, "cap", f"reference {speed:.3f} m/s")
         if ramped:  # braking is not limited: at the fence, or after a collision
             grown, after = growth(self._before, reference), now_ns < self._ramp_until_ns
-            if not grown <= (RAMP if after else self._limits.acceleration) * STEP + SLACK:
+            if not grown <= (RAMP if after else self._limits.acceleration_max_mps2) * STEP + SLACK:
                 text = f"reference grows by {grown:.9f} m/s in a tick"
                 self._note(now_ns, "cap", f"{text}{' after a HOLD' if after else ''}")
 
@@ -411,8 +422,8 @@ class RobotInvariants:
     def _wait_ns(self, state: GuardState) -> float:
         """Return how long a robot in a mission may wait for commands [ns]."""
         if state is GROUND:
-            return max(self._limits.hold_ns, GROUND_NS)
-        return self._limits.hold_ns if state is HOLD else inf
+            return max(self._hold_ns, GROUND_NS)
+        return self._hold_ns if state is HOLD else inf
 
 
 def can_stop(speed: float, below: float, above: float) -> bool:

@@ -19,11 +19,9 @@ from cloudrc.records import (
     GuardChange,
     Record,
     SessionOpened,
-    TelemetrySent,
 )
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
-from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD
 
 AGE_MAX = 0.252 + 1e-9
 """When a HOLD begins, the odometry behind the newest command is at most this old [s]: the limit
@@ -57,27 +55,13 @@ def reading(
     flight: Flight, role: str, name: str, *labels: str, until: float | None = None
 ) -> float:
     """Return a metric's value at `until` [s], for a histogram its mean; NaN if there is none."""
-    shown = _read(flight, role, name, until)
+    live = LiveMetrics(role)
+    live.see(seen_by(flight, role, until))
+    shown: Any = live.read().get(f"cloudrc_{name}", {})
     if isinstance(shown, Histogram):
         count = shown.cumulative()[-1]
         return shown.total / count if count else nan
     return float(shown.get(labels, nan))
-
-
-def above(
-    flight: Flight, role: str, name: str, bound: float, until: float | None = None
-) -> tuple[int, float]:
-    """Return number and share of a histogram's values above `bound`, at the time `until` [s]."""
-    shown: Histogram = _read(flight, role, name, until)
-    counts = shown.cumulative()
-    count = counts[-1] - counts[shown.bounds.index(bound)]
-    return count, count / counts[-1] if counts[-1] else nan
-
-
-def _read(flight: Flight, role: str, name: str, until: float | None) -> Any:
-    live = LiveMetrics(role)
-    live.see(seen_by(flight, role, until))
-    return live.read().get(f"cloudrc_{name}", {})
 
 
 def moves(
@@ -123,17 +107,12 @@ def held_in_time(outcome: Outcome, flight: Flight, text: str = "HOLD after") -> 
 
 def basis_age_at_hold(flight: Flight) -> float:
     """Return the largest age that the last command's odometry had when a HOLD began [s]."""
-    return max((age for _, age in _ages_at_hold(flight) if age == age), default=nan)
-
-
-def _ages_at_hold(flight: Flight) -> list[tuple[GuardChange, float]]:
-    """Return each HOLD with the age of the last command's odometry [s]; NaN without a command."""
-    applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
+    applied = [(r.stamp_ns, r.basis_stamp_ns) for r in flight.of_world if type(r) is CommandApplied]
     ages = []
     for change in held(flight):
-        before = [r.basis_stamp_ns for r in applied if r.stamp_ns <= change.stamp_ns]
-        ages.append((change, (change.stamp_ns - max(before)) * 1e-9 if before else nan))
-    return ages
+        before = [basis_ns for stamp_ns, basis_ns in applied if stamp_ns <= change.stamp_ns]
+        ages += [(change.stamp_ns - max(before)) * 1e-9] if before else []
+    return max(ages, default=nan)
 
 
 def resumed_after(flight: Flight, back: float) -> float:
@@ -164,52 +143,6 @@ def events_of_missions(flight: Flight, name: str) -> list[dict[str, Any]]:
     return [event for event in events if event["event"] == name]
 
 
-def causes_told(outcome: Outcome, flight: Flight, what: str = "") -> None:
-    """Check that records and telemetry state the cause of each HOLD and each TRACK.
-
-    The text of each check begins with `what`.
-    """
-    ages, limit = _ages_at_hold(flight), flight.experiment.guard.command_age_max_ms * 1e-3
-    texts = [(c.cause, f"command age {age:.3f} s above {limit:.3f} s") for c, age in ages]
-    right = bool(texts) and all(cause == text for cause, text in texts)
-    outcome.true(f"{what}each HOLD tells the age of its command, to 1 ms", right)
-    changes = changes_into(flight, GuardState.TRACK)
-    causes = [c.cause for c in changes if ages and c.stamp_ns > ages[0][0].stamp_ns]
-    right = bool(causes) and all("fresh commands within" in cause for cause in causes)
-    outcome.true(f"{what}each TRACK after it tells of fresh commands", right)
-    sent = [r.telemetry for r in flight.of_world if isinstance(r, TelemetrySent)]
-    shown = {telemetry.cause for telemetry in sent if telemetry.guard is GuardState.HOLD}
-    right = Cause.SILENCE in shown <= {Cause.SILENCE, Cause.SESSION, Cause.ENDED}
-    outcome.true(f"{what}so does telemetry: {Cause.SILENCE.words}", right)
-
-
-def status(flight: Flight) -> dict[str, Any]:
-    """Return teleop's present status, as its API shows it."""
-    assert flight.teleop.service is not None
-    return flight.teleop.service.state(flight.cloud.clock.at(flight.run.now_ns))
-
-
-def silence_told(
-    outcome: Outcome, flight: Flight, at: float, silent: float, what: str = "", *, cloud: bool
-) -> None:
-    """Check that teleop's status reports a silence that began at `at` [s], `silent` [s] before.
-
-    The robot is silent. If `cloud` is false, cloud is silent, too. `what` begins each check's text.
-    """
-
-    def check(now_ns: int) -> None:
-        shown = status(flight)
-        seen, wrong = shown["seen"], abs(shown["seen"]["age_s"] - silent)
-        outcome.most(f"{what}the status says for how long, off by", wrong, 0.2, "s")
-        outcome.true(f"{what}it shows the guard's state as past", seen["guard_for_s"] is None)
-        wrong = abs(shown["cloud_age_s"] - (0.0 if cloud else silent))
-        outcome.most(f"{what}it says when cloud was heard last, off by", wrong, 0.25, "s")
-        right = seen["next_step"] == (NOT_HEARD if cloud else NO_CLOUD)
-        outcome.true(f"{what}its next step is to look after the one that is silent", right)
-
-    flight.cloud.at(at + silent, check)
-
-
 # The path.
 
 
@@ -234,12 +167,6 @@ def number(flight: Flight, name: str) -> float:
 
 
 # Commands, sessions, missions.
-
-
-def applied_in_order(flight: Flight) -> bool:
-    """Return whether (epoch, counter) of the applied commands always rises."""
-    order = [(r.epoch, r.counter) for r in flight.of_world if isinstance(r, CommandApplied)]
-    return all(first < second for first, second in pairwise(order))
 
 
 def epochs(flight: Flight) -> list[int]:

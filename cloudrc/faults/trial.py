@@ -7,7 +7,6 @@ During the last part of the flight, without faults, the robot must fly again; ot
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ from cloudrc.faults.models import Action, Call, RestartableEndpoint, Tamper
 from cloudrc.faults.scenario import generator
 from cloudrc.faults.schedule import Event, Schedule, shaped
 from cloudrc.messages import Command, GuardState
-from cloudrc.records import CommandApplied, Control, GuardChange, Record, SessionOpened
+from cloudrc.records import Control, GuardChange, Record
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.wire import QUEUED
 from cloudrc.tunnel.keys import Key, KeySet
@@ -86,14 +85,14 @@ def fly(schedule: Schedule, *settings: str, keep: bool = False) -> Finding:
         BadInputError: If the schedule names an unknown profile or policy.
     """
     flight = _prepare(schedule, settings, keep)
-    watch, operator, order = flight.watch, Operator(flight, schedule), OrderInvariant(flight)
+    watch, operator = flight.watch, Operator(flight, schedule)
     inject(flight, schedule)
     try:
         flight.fly(schedule.duration)
     except Exception as error:  # world and cloud must survive every fault
         watch.note(flight.run.now_ns, "error", f"{type(error).__name__}: {error}")
     checks: dict[str, Callable[[], None]] = {
-        "waypoint": order.check_waypoints,
+        "waypoint": lambda: _check_waypoints(flight),
         "stuck": operator.check_stuck,
         "obeyed": operator.check_stops,
         "alarm": lambda: _check_alarms(flight),
@@ -196,42 +195,15 @@ class Operator:
             flight.order_if_possible(now_ns)
 
 
-class OrderInvariant:
-    """Checks that commands are applied, and waypoints are reached, once and in order."""
-
-    def __init__(self, flight: Flight) -> None:
-        self._flight = flight
-        self._newest = (0, 0, -1)  # process of world, epoch and counter
-        flight.listeners.append(self.see)
-
-    def see(self, records: list[Record], now_ns: int) -> None:
-        """Check that each applied command is newer than the last, and not of an old session.
-
-        A restarted world continues from the last epoch that cloud knows. If cloud knows no epoch,
-        world starts with the first epoch again, which is allowed.
-        """
-        for record in records:
-            if isinstance(record, CommandApplied):
-                self._check(record.epoch, record.counter, record.stamp_ns)
-            elif isinstance(record, SessionOpened):
-                self._check(record.epoch, -1, record.stamp_ns)
-
-    def check_waypoints(self) -> None:
-        """Check the order of the waypoints of each mission in teleop's log."""
-        reached: dict[str, list[int]] = {}
-        for event in events_of_missions(self._flight, "reached"):
-            reached.setdefault(event["mission"], []).append(event["waypoint"])
-        for mission, waypoints in reached.items():
-            if waypoints != list(range(len(waypoints))):
-                text = f"{mission} reached its waypoints as {waypoints}"
-                self._flight.watch.note(self._flight.run.now_ns, "waypoint", text)
-
-    def _check(self, epoch: int, counter: int, stamp_ns: int) -> None:
-        this = bisect_right(self._flight.world_starts_ns, stamp_ns), epoch, counter
-        if this <= self._newest:
-            text = f"command {counter} of epoch {epoch} after {self._newest[1:]}"
-            self._flight.watch.note(stamp_ns, "order", text)
-        self._newest = max(self._newest, this)
+def _check_waypoints(flight: Flight) -> None:
+    """Check the order of the waypoints of each mission in teleop's log."""
+    reached: dict[str, list[int]] = {}
+    for event in events_of_missions(flight, "reached"):
+        reached.setdefault(event["mission"], []).append(event["waypoint"])
+    for mission, waypoints in reached.items():
+        if waypoints != list(range(len(waypoints))):
+            text = f"{mission} reached its waypoints as {waypoints}"
+            flight.watch.note(flight.run.now_ns, "waypoint", text)
 
 
 def _check_alarms(flight: Flight) -> None:

@@ -32,7 +32,6 @@ from cloudrc.records import (
     CommandApplied,
     Contact,
     Counted,
-    Fault,
     GroundTruth,
     SessionOpened,
     TelemetrySent,
@@ -121,42 +120,14 @@ class Orders:
             raise DecodeError("future")
 
 
-REPORT_AGAIN_NS = 10_000_000_000
-"""World reports a slowdown as a new fault only after this time without a slowdown [ns]."""
-
-
-class PaceMonitor:
-    """Report that simulated time runs slower than real time; cloud would blame the network."""
-
-    def __init__(self) -> None:
-        self._checked_ns = self._slip_ns = self._slow_ns = NEVER_NS
-
-    def check(self, now_ns: int, slip_ns: int) -> list[Fault]:
-        """Return a fault if simulated time ran too slowly since the last call; call once a second.
-
-        `now_ns` is world's clock [ns], `slip_ns` its lag behind the machine's monotonic clock [ns].
-        """
-        passed_ns, slipped_ns = now_ns - self._checked_ns, slip_ns - self._slip_ns
-        is_first = self._checked_ns == NEVER_NS
-        self._checked_ns, self._slip_ns = now_ns, slip_ns
-        factor = passed_ns / (passed_ns + slipped_ns)
-        if is_first or factor >= REAL_TIME_FACTOR_MIN:
-            return []
-        is_news = self._slow_ns == NEVER_NS or now_ns - self._slow_ns > REPORT_AGAIN_NS
-        self._slow_ns = now_ns
-        text = (
-            f"real-time factor {factor:.2f} over {(passed_ns + slipped_ns) * 1e-9:.1f} s: "
-            "simulated time is too slow; give world more processor time"
-        )
-        return [Fault(now_ns, "late", text)] if is_news else []
-
-
 ODOMETRY_PERIOD_NS = 10_000_000
 """Time between two odometry samples, unless an experiment sets another rate, and longest time
 between two records of the true state [ns]. Source: docs/reference/plant.md, "Odometry"."""
 CATCH_UP_NS = 50_000_000
 """Largest lag of world's clock that world makes up after a stall [ns]; further lag stays."""
 COUNT_PERIOD_NS = 1_000_000_000
+"""Time between two records of the counters [ns]."""
+SLOW_TEXT = "simulated time is slower than real time; give world more processor time"
 TRACK, HOLD = GuardState.TRACK, GuardState.HOLD  # looking up a member of an enum is slow
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
 _new = tuple.__new__  # makes a named tuple in half the time of its own constructor
@@ -186,7 +157,6 @@ class WorldEndpoint(TunnelEnd):
         super().__init__(identity, Direction.UPLINK, newest_wins)
         self.robot, self._sensors = robot, sensors
         self._tick_ns, self._slip_ns = start_ns, 0  # world's clock and its lag
-        self._pace = PaceMonitor()
         self._door = ServerHandshake(
             self._session, identity.nonce, identity.clock_id, command_age_max_ns
         )
@@ -196,6 +166,7 @@ class WorldEndpoint(TunnelEnd):
         self._odometry_period_ns = odometry_period_ns
         self._sample_period_ns = min(odometry_period_ns, ODOMETRY_PERIOD_NS)
         self._count_ns = start_ns + COUNT_PERIOD_NS
+        self._counted_slip_ns: int | None = None
         self._waiting: tuple[int, int, Command] | None = None
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
         self._orders = Orders(robot.guard, self._counts, command_age_max_ns)
@@ -326,12 +297,19 @@ class WorldEndpoint(TunnelEnd):
             self._send_message(TELEMETRY, telemetry)
             records.append(_new(TelemetrySent, (now_ns, epoch, counter, telemetry)))
         if now_ns >= self._count_ns:
-            self._count_ns += COUNT_PERIOD_NS
-            self._counts["held_seconds"] += guard.armed and guard.state is HOLD
-            for name, count in sorted((self._counts | guard.counts).items()):
-                records.append(Counted(now_ns, "world", name, count))
-            records += self._pace.check(now_ns, self._slip_ns)
+            self._record_counts(now_ns)
         self._sample_ns += self._sample_period_ns
+
+    def _record_counts(self, now_ns: int) -> None:
+        """Record the counters and, once per session, that simulated time is too slow."""
+        guard, before_ns = self.robot.guard, self._counted_slip_ns
+        self._count_ns, self._counted_slip_ns = self._count_ns + COUNT_PERIOD_NS, self._slip_ns
+        self._counts["held_seconds"] += guard.armed and guard.state is HOLD
+        for name, count in sorted((self._counts | guard.counts).items()):
+            self._records.append(Counted(now_ns, "world", name, count))
+        passed_ns = COUNT_PERIOD_NS + self._slip_ns - (before_ns or 0)
+        if before_ns is not None and COUNT_PERIOD_NS < REAL_TIME_FACTOR_MIN * passed_ns:
+            self._records += self._complaints.say("late", SLOW_TEXT, now_ns)
 
     def _receive_hello(self, hello: Hello, counter: int, now_ns: int) -> None:
         if now_ns == self._stalled_wake_ns:

@@ -132,14 +132,9 @@ class Simulator:
     ) -> None:
         """Continue after steps that `native/step.c` has run on `data`.
 
-        Args:
-            rotor_speeds: Actual rotor speeds [rad/s], shape (4,).
-            tip_force_peak: The attribute of this name [N].
-            tip_impulse: The attribute of this name [N s].
-            contacts: The attribute of this name.
-            steps: The attribute of this name.
-            before: None, or the readings at the beginning of the last step if its contacts have to
-                be checked.
+        `rotor_speeds` are the actual speeds [rad/s], shape (4,). `tip_force_peak` [N],
+        `tip_impulse` [N s], `contacts` and `steps` are the new values of the attributes. `before`
+        has the readings at the beginning of the last step if its contacts have to be checked.
         """
         self._rotors.speeds, self._readings = rotor_speeds, None
         self.tip_force_peak, self.tip_impulse = tip_force_peak, tip_impulse

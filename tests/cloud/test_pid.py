@@ -80,18 +80,3 @@ def test_yaw_turns_the_short_way_round():
     heading = Odometry(0, ZERO, (0.08715574274765817, 0.0, 0.0, 0.9961946980917455), ZERO, ZERO)
     output = pid.build(gain_yaw=2.0).update(heading, Setpoint(ZERO, yaw=-170 * pi / 180), DT)
     assert output.yaw_rate == pytest.approx(2.0 * 20 * pi / 180)
-
-
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ({"gain_p": (0.8, -0.8, 1.5)}, r"gain_p\[y\]: -0.8 .*not negative"),
-        ({"gain_i": (0.0, 0.0, float("nan"))}, r"gain_i\[z\]: nan .*finite"),
-        ({"gain_d": (0.5, 0.5)}, r"gain_d: \(0.5, 0.5\) .*three numbers"),
-        ({"velocity_max": "abc"}, r"velocity_max: 'abc' .*three numbers"),
-        ({"speed_max": True}, r"speed_max: True is not a number"),
-    ],
-)
-def test_an_invalid_parameter_is_named_with_value_and_reason(parameters, message):
-    with pytest.raises(ValueError, match=rf"^{message}"):
-        pid.build(**parameters)

@@ -1,14 +1,23 @@
 """A robot for the invariants to watch, which does whatever a test has it do."""
 
+from functools import cache
 from types import SimpleNamespace
 
-from cloudrc.faults.invariants import FLOWN, TRACK, Limits, Watch
+from cloudrc.config.load import load_experiment
+from cloudrc.faults.invariants import FLOWN, TRACK, Watch
 from cloudrc.messages import ZERO, Cause, Command, OperatorRequest, Request, Start
 from cloudrc.records import Contact
 from cloudrc.world.rotors import STOPPED
 
 MS = 1_000_000
 TURNING = (900.0,) * 4
+
+
+@cache
+def guard(hold_ms=60_000):
+    """Return the limits of the guard."""
+    settings = f"guard.hold_max_s={hold_ms / 1000}", "guard.plan_max_s=0.8"
+    return load_experiment("hover", ["link.profile=ideal", *settings]).guard
 
 
 class FakeRobot:
@@ -22,7 +31,7 @@ class FakeRobot:
         self.observers = []
         self.position, self.velocity = (1.0, 1.0, 1.0), ZERO
         self.now_ns = 0
-        self.watch = Watch(Limits(hold_ns=hold_ms * MS, plan_ns=800 * MS))
+        self.watch = Watch(guard(hold_ms))
         self.watch.attach(self, 0, honest=honest)
         (self.observer,) = self.observers
         self.request(Request.START)

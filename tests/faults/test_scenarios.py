@@ -10,9 +10,7 @@ import pytest
 
 from cloudrc.cli import faults as command
 from cloudrc.cli.main import main
-from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenarios import SCENARIOS, find
-from cloudrc.faults.scenarios.intruder import HostileSender
 from tests.conftest import nightly
 
 NUMBERS = (*range(1, 14), 15, 17, *range(20, 26), 27, 28, 40)
@@ -37,8 +35,7 @@ def test_a_fault_passes_its_checks(scenario):
     ("name", "broken", "value", "said"),
     [
         ("F13", "cloudrc.world.guard.state.SETTLE_NS", 3 * 10**9, "TRACK again after its start"),
-        ("F15", "cloudrc.teleop.service.SILENCE", 1e9, "shows the guard's state as past"),
-        ("F40", "cloudrc.world.endpoint.REAL_TIME_FACTOR_MIN", 0.0, "times that world tells"),
+        ("F40", "cloudrc.world.endpoint.REAL_TIME_FACTOR_MIN", 0.0, "times that world reports"),
         ("F13", "cloudrc.faults.invariants.HIGH", (1.2, 1.2, 1.2), "breaches of an invariant"),
     ],
 )
@@ -96,18 +93,3 @@ def test_bad_input_is_told_in_one_line(words, said, capsys):
     out, err = capsys.readouterr()
     assert said in err
     assert (out, err.count("\n")) == ("", 1)
-
-
-@pytest.mark.parametrize("taken", [False, True])
-def test_a_hostile_datagram_that_has_an_effect_is_noticed(taken):
-    flight, heard = Flight().fly(3.0), []
-
-    def tamper(data, now_ns):
-        heard.append(data)
-        return [data] if now_ns < 3.1e9 else []
-
-    flight.world.tamper = tamper
-    flight.fly(3.2 if taken else 3.09)  # then world has not heard the last one yet
-    sender = HostileSender()
-    sender.send(flight.world, heard[-1], flight.run.now_ns)
-    assert (sender.sent, sender.taken) == (1, taken)

@@ -7,15 +7,16 @@ from types import SimpleNamespace
 import pytest
 
 from cloudrc.faults.adversary import POLICIES, choose
-from cloudrc.faults.invariants import Limits, Watch
+from cloudrc.faults.invariants import OrderInvariant, Watch
 from cloudrc.faults.schedule import Event, Schedule, compose, load
-from cloudrc.faults.trial import FORGETFUL, OrderInvariant, checked_in, fly
+from cloudrc.faults.trial import FORGETFUL, _check_waypoints, checked_in, fly
 from cloudrc.messages import ZERO
 from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
 from cloudrc.tunnel.channel import LATE, USED, Channel
 from cloudrc.world.guard.limits import Limits as GuardLimits
 from tests.conftest import nightly
+from tests.faults.conftest import guard
 
 MS = 1_000_000
 REGRESSIONS = sorted((Path(__file__).parent / "regressions").glob("*.yaml"))
@@ -122,12 +123,12 @@ def test_a_broken_part_is_found(breaks, kind, schedule, monkeypatch):
     ],
 )
 def test_a_command_is_applied_once_and_in_order(commands, kinds):
-    flight = SimpleNamespace(listeners=[], watch=Watch(Limits()), world_starts_ns=[0, 3])
-    order = OrderInvariant(flight)
+    watch = Watch(guard())
+    order = OrderInvariant(watch, [0, 3])
     for at, (epoch, counter) in enumerate(commands):
         opened = SessionOpened(at, "world", epoch, "cloud said hello")
         order.see([opened if counter is None else CommandApplied(at, epoch, counter, 0, ZERO)], 0)
-    assert set(flight.watch.counts) == kinds
+    assert set(watch.counts) == kinds
 
 
 @pytest.mark.parametrize(
@@ -139,6 +140,6 @@ def test_a_waypoint_is_reached_once_and_in_order(waypoints, kinds):
     events.append({"mission": "n", "event": "reached", "waypoint": 0})
     book = SimpleNamespace(events_after=lambda number: events)
     teleop, run = SimpleNamespace(service=SimpleNamespace(book=book)), SimpleNamespace(now_ns=0)
-    flight = SimpleNamespace(listeners=[], watch=Watch(Limits()), teleop=teleop, run=run)
-    OrderInvariant(flight).check_waypoints()
+    flight = SimpleNamespace(listeners=[], watch=Watch(guard()), teleop=teleop, run=run)
+    _check_waypoints(flight)
     assert set(flight.watch.counts) == kinds

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.records import CommandApplied, GroundTruth, TelemetrySent
+from cloudrc.records import CommandApplied, Fault, GroundTruth, TelemetrySent
 from tests.flights.conftest import HOVER, MS, join, talking
 
 
@@ -61,4 +61,11 @@ def test_after_a_stall_waiting_commands_are_stale(talk):
     talk.send(data)
     assert talk.world.slip_ns > 4_000 * MS
     assert talk.counts()["stale"] == 1
+    talk.now_ns += 5_000 * MS
+    talk.world.handle_deadline(talk.now_ns)
+    talk.counts()
+    talk.now_ns += 5_000 * MS
+    talk.world.handle_deadline(talk.now_ns)
+    talk.counts()
+    assert [fault.code for fault in talk.take(Fault)] == ["late"], "reported once"
     assert talk.take(CommandApplied) == []

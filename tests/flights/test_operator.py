@@ -55,7 +55,7 @@ def test_requests_that_arm_nothing_are_always_passed_on(ends):
     old = ends.cloud._session.epoch - 1
     said = [OperatorRequest(99, each, epoch=old) for each in Request if each != Request.START]
     assert say(ends, *said) == [Kind.OPERATOR] * len(said)
-    ends.cloud._loop.reset()  # as a new session does: no telemetry yet
+    ends.cloud._loop.reset(ends.run.now_ns)  # as a new session does: no telemetry yet
     start, stop = OperatorRequest(99, Request.START), OperatorRequest(99, Request.END)
     assert (say(ends, start), say(ends, stop)) == ([], [Kind.OPERATOR])
 

@@ -5,12 +5,11 @@ Source: the paper, eqs. (4) and (5); gains: docs/reference/plant.md, "Cloud cont
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from math import atan2, hypot, inf, remainder, tau
 from operator import add
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
-from cloudrc.cloud.parameters import not_negative, vector
+from cloudrc.config.schema import NotNegative, NotNegatives
 from cloudrc.messages import ZERO, Odometry, Setpoint, Vector
 
 UNLIMITED: Vector = (inf, inf, inf)
@@ -110,13 +109,13 @@ class Pid(Controller):
 
 
 def build(
-    gain_p: Sequence[float] = (0.8, 0.8, 1.5),
-    gain_i: Sequence[float] = ZERO,
-    gain_d: Sequence[float] = ZERO,
-    gain_yaw: float = 0.0,
-    integral_limit: Sequence[float] | None = None,
-    velocity_max: Sequence[float] | None = None,
-    speed_max: float | None = None,
+    gain_p: NotNegatives = (0.8, 0.8, 1.5),
+    gain_i: NotNegatives = ZERO,
+    gain_d: NotNegatives = ZERO,
+    gain_yaw: NotNegative = 0.0,
+    integral_limit: NotNegatives | None = None,
+    velocity_max: NotNegatives | None = None,
+    speed_max: NotNegative | None = None,
 ) -> Pid:
     """Make the controller; the defaults are the published gains.
 
@@ -132,16 +131,13 @@ def build(
         speed_max: Largest speed [m/s]; the limit keeps the direction. None: no limit. With an
             integral gain, `speed_max` should not exceed the guard's speed cap, because the
             anti-windup does not take the guard into account.
-
-    Raises:
-        ValueError: If a parameter is infinite, NaN or negative; the message names it.
     """
     return Pid(
-        vector("gain_p", gain_p),
-        vector("gain_i", gain_i),
-        vector("gain_d", gain_d),
-        not_negative("gain_yaw", gain_yaw),
-        UNLIMITED if integral_limit is None else vector("integral_limit", integral_limit),
-        UNLIMITED if velocity_max is None else vector("velocity_max", velocity_max),
-        inf if speed_max is None else not_negative("speed_max", speed_max),
+        gain_p,
+        gain_i,
+        gain_d,
+        gain_yaw,
+        integral_limit or UNLIMITED,
+        velocity_max or UNLIMITED,
+        inf if speed_max is None else speed_max,
     )

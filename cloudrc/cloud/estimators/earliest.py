@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 
 from cloudrc.cloud.estimators import Estimator
+from cloudrc.config.schema import Count
 
 
 class Earliest(Estimator):
@@ -28,15 +29,10 @@ class Earliest(Estimator):
         return max(0.0, age + min(self._offsets)) if self._offsets else 0.0
 
 
-def build(count: int = 200) -> Earliest:
+def build(count: Count = 200) -> Earliest:
     """Make the estimator.
 
     Args:
         count: Number of commands in the minimum [1], at least 1.
-
-    Raises:
-        ValueError: If `count` is below 1.
     """
-    if count < 1:
-        raise ValueError(f"count: {count} must be at least 1")
     return Earliest(count)

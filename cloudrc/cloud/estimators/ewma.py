@@ -6,8 +6,8 @@ step of the delay three times as well as eq. (1) of the paper. At a constant del
 
 from __future__ import annotations
 
-from cloudrc.cloud import parameters
 from cloudrc.cloud.estimators import DelaySample, Estimator
+from cloudrc.config.schema import Gain
 
 
 class Ewma(Estimator):
@@ -30,13 +30,10 @@ class Ewma(Estimator):
         return 0.0 if self._average is None else max(0.0, self._average)
 
 
-def build(gain: float = 0.05) -> Ewma:
+def build(gain: Gain = 0.05) -> Ewma:
     """Make the estimator.
 
     Args:
         gain: Weight of a new sample [1]; 0.05 forgets within about 20 samples, 0.2 s at 100 Hz.
-
-    Raises:
-        ValueError: If `gain` is not above 0 and at most 1.
     """
-    return Ewma(parameters.gain("gain", gain))
+    return Ewma(gain)

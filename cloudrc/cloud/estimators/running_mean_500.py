@@ -8,18 +8,13 @@ an exponential average.
 from __future__ import annotations
 
 from cloudrc.cloud.estimators.running_mean import RunningMean
-from cloudrc.cloud.parameters import positive
+from cloudrc.config.schema import Count
 
 
-def build(count_max: int = 500) -> RunningMean:
+def build(count_max: Count = 500) -> RunningMean:
     """Make the authors' estimator.
 
     Args:
         count_max: Number of samples after which the gain stays at 1/count_max.
-
-    Raises:
-        ValueError: If `count_max` is not a whole number above 0.
     """
-    if positive("count_max", count_max) % 1:
-        raise ValueError(f"count_max: {count_max!r} must be a whole number")
-    return RunningMean(int(count_max))
+    return RunningMean(count_max)

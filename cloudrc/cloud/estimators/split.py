@@ -13,8 +13,8 @@ and the sum is the time from the measurement to the application of the command.
 
 from __future__ import annotations
 
-from cloudrc.cloud import parameters
 from cloudrc.cloud.estimators import Estimator
+from cloudrc.config.schema import Gain
 
 
 class Split(Estimator):
@@ -41,13 +41,10 @@ class Split(Estimator):
         return max(0.0, age + self._applied_minus_stamp)
 
 
-def build(gain: float = 0.05) -> Split:
+def build(gain: Gain = 0.05) -> Split:
     """Make the estimator.
 
     Args:
         gain: Weight of a new sample of the downlink [1].
-
-    Raises:
-        ValueError: If `gain` is not above 0 and at most 1.
     """
-    return Split(parameters.gain("gain", gain))
+    return Split(gain)

@@ -6,14 +6,16 @@ Source: docs/reference/control.md, "Predictors", (e1).
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterable
 from copy import copy
-from math import ceil, exp
+from math import ceil, exp, inf
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
-from cloudrc.cloud.parameters import positive, read_model, vector
 from cloudrc.cloud.predictors._history import COUNT, PERIOD_NS, Body, Replay, approach
+from cloudrc.config.document import read_document
+from cloudrc.config.schema import NotNegatives, Positive, Positives
+from cloudrc.errors import CloudrcError
 from cloudrc.messages import ZERO, Command, Odometry, Vector
 
 Axes: TypeAlias = tuple[Vector, ...]
@@ -111,10 +113,10 @@ class CommandHistory(Replay):
 
 
 def build(
-    time_constant: Sequence[float] = (0.25, 0.25, 0.12),
-    dead_time: Sequence[float] = (0.10, 0.10, 0.01),
-    gain: Sequence[float] = (1.0, 1.0, 1.0),
-    acceleration_max: float = 12.0,
+    time_constant: Positives = (0.25, 0.25, 0.12),
+    dead_time: NotNegatives = (0.10, 0.10, 0.01),
+    gain: NotNegatives = (1.0, 1.0, 1.0),
+    acceleration_max: Positive = 12.0,
     model: Path | None = None,
 ) -> CommandHistory:
     """Make the predictor; the defaults fit the shipped robot.
@@ -127,13 +129,27 @@ def build(
         model: File from `cloudrc identify`, whose values replace the first three parameters.
 
     Raises:
-        ValueError: If a value is infinite, NaN or negative, if a time constant or the cap is 0, or
-            if the file is not a model; the message names it.
+        ValueError: If the file is not a model.
     """
-    values = {"time_constant": time_constant, "dead_time": dead_time, "gain": gain}
+    values: dict[str, Vector] = dict(time_constant=time_constant, dead_time=dead_time, gain=gain)
     if model is not None:
-        values = read_model(model, values)
-    constants, deads, gains = (vector(name, value) for name, value in values.items())
-    positive("time_constant", min(constants))
-    axes = tuple(zip(constants, deads, gains, strict=True))
-    return CommandHistory(axes, positive("acceleration_max", acceleration_max))
+        values = _read_model(Path(model), values)
+    return CommandHistory(tuple(zip(*values.values(), strict=True)), acceleration_max)
+
+
+def _read_model(path: Path, names: Iterable[str]) -> dict[str, Vector]:
+    """Return the values with these names from a file of `cloudrc identify`."""
+    hint = "'cloudrc identify' writes a file that fits"
+    try:
+        tree = read_document(path, str(path)).tree
+    except CloudrcError as error:
+        raise ValueError(f"model: {error}; {hint}") from error
+    for name in names:
+        value = tree.get(name)
+        if not (isinstance(value, list) and len(value) == 3 and all(map(_fits, value))):
+            raise ValueError(f"model: {path}: {name} is {value}, not three numbers >= 0; {hint}")
+    return {name: tuple(map(float, tree[name])) for name in names}  # type: ignore[misc]
+
+
+def _fits(value: Any) -> bool:
+    return isinstance(value, int | float) and 0.0 <= value < inf

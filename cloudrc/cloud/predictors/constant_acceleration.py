@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections import deque
 
-from cloudrc.cloud.parameters import positive
 from cloudrc.cloud.predictors import Predictor, rotate_ahead
+from cloudrc.config.schema import Positive
 from cloudrc.messages import ZERO, Odometry, Vector
 
 
@@ -74,15 +74,12 @@ def _mean_acceleration(start: Odometry, end: Odometry) -> Vector:
     return ((bx - ax) * per_second, (by - ay) * per_second, (bz - az) * per_second)
 
 
-def build(window: float = 0.05) -> ConstantAcceleration:
+def build(window: Positive = 0.05) -> ConstantAcceleration:
     """Make the predictor.
 
     Args:
         window: Longest time between the two compared velocities [s]; at least one period of the
             odometry. A longer window reduces the noise, but the acceleration lags by half the
             window.
-
-    Raises:
-        ValueError: If `window` is not above 0.
     """
-    return ConstantAcceleration(positive("window", window))
+    return ConstantAcceleration(window)

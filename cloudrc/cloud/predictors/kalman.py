@@ -8,16 +8,16 @@ Source: docs/reference/control.md, "Predictors", (f).
 
 from __future__ import annotations
 
-from inspect import signature
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.cloud.parameters import positive
-from cloudrc.cloud.predictors import Model, Predictor, command_history, model_based
+from cloudrc.cloud.predictors import Model, Predictor
 from cloudrc.cloud.predictors._history import Replay
+from cloudrc.config.overrides import build_plugin
+from cloudrc.config.schema import PlugIn, Positive
 from cloudrc.messages import Command, Odometry
 
 Array: TypeAlias = NDArray[np.float64]
@@ -97,9 +97,9 @@ def build(
     model: Literal["white_box", "first_order"] = "white_box",
     parameters: dict[str, Any] | None = None,
     model_file: Path | None = None,
-    position_noise: float = 0.005,
-    velocity_noise: float = 0.02,
-    acceleration_error: float = 0.5,
+    position_noise: Positive = 0.005,
+    velocity_noise: Positive = 0.02,
+    acceleration_error: Positive = 0.5,
 ) -> Kalman:
     """Make the predictor; the default noise is that of a good motion capture system.
 
@@ -113,20 +113,16 @@ def build(
             trusts the odometry more.
 
     Raises:
-        ValueError: If a standard deviation is not above 0, or the predictor refuses a parameter.
+        ValueError: If a file or a parameter is given in the wrong place.
+        BadInputError: If the predictor refuses a parameter.
     """
-    build_replay: Any = model_based.build if model == "white_box" else command_history.build
-    given, names = dict(parameters or {}), [*signature(build_replay).parameters]
+    given = dict(parameters or {})
     if model_file is not None and model == "white_box":
         raise ValueError("model_file: is for model: first_order; set that, or leave it out")
     if "model" in given:  # the experiment file makes a relative model_file absolute
         raise ValueError("parameters: give the file of a model as model_file, beside parameters")
-    if unknown := sorted(given.keys() - names):
-        raise ValueError(f"parameters: no {unknown[0]!r}; available: {', '.join(names)}")
-    replay = build_replay(**given, **({} if model_file is None else {"model": model_file}))
-    return Kalman(
-        replay,
-        positive("position_noise", position_noise),
-        positive("velocity_noise", velocity_noise),
-        positive("acceleration_error", acceleration_error),
-    )
+    if model_file is not None:
+        given["model"] = str(model_file)
+    name = "model_based" if model == "white_box" else "command_history"
+    replay = build_plugin("predictors", PlugIn(name=name, **given))
+    return Kalman(replay, position_noise, velocity_noise, acceleration_error)

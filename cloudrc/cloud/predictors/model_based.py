@@ -11,12 +11,11 @@ controller".
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import copy
 from math import ceil, sqrt
 
-from cloudrc.cloud.parameters import not_negative, positive, vector
 from cloudrc.cloud.predictors._history import Body, Replay, approach
+from cloudrc.config.schema import NotNegative, NotNegatives, Positive
 from cloudrc.messages import ZERO, Odometry, Vector
 
 STEP = 0.010
@@ -222,12 +221,12 @@ class ModelBased(Replay):
 
 
 def build(
-    gain_p: Sequence[float] = (4.0, 4.0, 10.0),
-    gain_i: Sequence[float] = (1.0, 1.0, 2.5),
-    gain_d: Sequence[float] = (0.30, 0.30, 0.50),
-    integral_limit_xy: float = 0.10,
-    integral_limit_z: float = 0.40,
-    acceleration_max: float = 12.0,
+    gain_p: NotNegatives = (4.0, 4.0, 10.0),
+    gain_i: NotNegatives = (1.0, 1.0, 2.5),
+    gain_d: NotNegatives = (0.30, 0.30, 0.50),
+    integral_limit_xy: NotNegative = 0.10,
+    integral_limit_z: NotNegative = 0.40,
+    acceleration_max: Positive = 12.0,
 ) -> ModelBased:
     """Make the predictor; the defaults are those of `world.low_level` and `guard`.
 
@@ -238,11 +237,6 @@ def build(
         integral_limit_xy: Limit of its integrated velocity error in x and y [m].
         integral_limit_z: The same limit in z [m].
         acceleration_max: The guard's cap on the acceleration [m/s^2].
-
-    Raises:
-        ValueError: If a value is infinite, NaN or negative, or the cap is 0; the message names it.
     """
-    gains = vector("gain_p", gain_p) + vector("gain_i", gain_i) + vector("gain_d", gain_d)
-    xy = not_negative("integral_limit_xy", integral_limit_xy)
-    z = not_negative("integral_limit_z", integral_limit_z)
-    return ModelBased((*gains, xy, xy, z), positive("acceleration_max", acceleration_max))
+    limits = integral_limit_xy, integral_limit_xy, integral_limit_z
+    return ModelBased((*gain_p, *gain_i, *gain_d, *limits), acceleration_max)

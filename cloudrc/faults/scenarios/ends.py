@@ -32,16 +32,8 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
     again = min((t for t in commands if t > down), default=nan)
     outcome.most("the new process commands after", again, 2.0, "s")
     outcome.most("TRACK again after its start", measures.resumed_after(flight, at + down), 1.0, "s")
-    opened = _check_epochs(outcome, flight)
     moves(outcome, flight, "world session_epoch", since=at)
-    outcome.least("epochs opened", len(opened), 3)
-
-
-def _check_epochs(outcome: Outcome, flight: Flight) -> list[int]:
-    """Check that the epochs of world's sessions rise; return them."""
-    opened = measures.epochs(flight)
-    outcome.true("a new epoch, higher than all before", opened == sorted(set(opened)))
-    return opened
+    outcome.least("epochs opened", len(measures.epochs(flight)), 3)
 
 
 @scenario(
@@ -51,19 +43,16 @@ def _check_epochs(outcome: Outcome, flight: Flight) -> list[int]:
     expects="HOLD; of what it computed before nothing is applied",
 )
 def _cloud_paused(outcome: Outcome, seed: int) -> None:
-    at, missed = measures.instant(seed), "loop_missed_periods_total"
+    at = measures.instant(seed)
     flight = Flight(seed=seed, separate=True)
     flight.cloud.at(at, partial(flight.cloud.freeze, duration=5.0))
-    measures.silence_told(outcome, flight, at, 4.0, cloud=False)
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
-    measures.causes_told(outcome, flight)
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
     old = [r for r in applied if r.stamp_ns - r.basis_stamp_ns > measures.AGE_MAX * 1e9]
     outcome.same("commands applied that were too old", len(old), 0)
     moves(outcome, flight, "world guard_transitions_total hold", since=at)
-    moves(outcome, flight, f"cloud {missed}", since=at, over=at + 5.0)
-    outcome.least(f"metric {missed} at the end", measures.reading(flight, "cloud", missed), 490)
+    moves(outcome, flight, "cloud loop_missed_periods_total", since=at, over=at + 5.0)
 
 
 @scenario(
@@ -89,7 +78,6 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
     outcome.true("mission failed", flight.mission.state == "failed")
     coded = "world_restarted" in str(flight.mission.verdict)
     outcome.true("with the code world_restarted", coded)
-    _check_epochs(outcome, flight)
     refused = "world datagrams_total downlink old_epoch"  # commands for the old world
     failed = "cloud missions_total world_restarted"
     moves(outcome, flight, refused, "world session_epoch", failed, since=at + 2.0)
@@ -126,7 +114,6 @@ def _two_clouds(outcome: Outcome, seed: int) -> None:
     measures.held_in_time(outcome, flight, "HOLD once the first is gone")
     later = [epoch for epoch in measures.epochs(flight) if epoch > 2]
     outcome.true("then the second gets a higher epoch", bool(later))
-    outcome.true("commands applied in order, none twice", measures.applied_in_order(flight))
 
 
 @scenario(
@@ -154,7 +141,6 @@ def _swizzle(outcome: Outcome, seed: int) -> None:
     flight.cloud.at(sum(teleop), flight.teleop.start)
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
-    measures.causes_told(outcome, flight)
     metrics = (
         *("cloud datagrams_lost_total uplink", "world datagrams_lost_total downlink"),
         *("cloud loop_missed_periods_total", "world world_slip_seconds_total"),
@@ -162,6 +148,4 @@ def _swizzle(outcome: Outcome, seed: int) -> None:
     )
     moves(outcome, flight, *metrics, since=uplink[0], over=max(ends))
     for end, records in (("cloud", flight.of_cloud), ("world", flight.of_world)):
-        outcome.least(f"times that {end} tells: late", len(measures.told(records, "late")), 1)
-    restarted = measures.events_of_missions(flight, "restarted")
-    outcome.least("the log tells: restarted", len(restarted), 1)
+        outcome.least(f"times that {end} reports: late", len(measures.told(records, "late")), 1)

@@ -13,7 +13,6 @@ from cloudrc.link.profile import Change
 from cloudrc.records import Arrival, Control
 
 HOUR_NS = 3_600_000_000_000
-AGE = "command_age_seconds"  # metric of the age of the command in use, on world's clock
 
 
 @scenario(
@@ -25,7 +24,6 @@ AGE = "command_age_seconds"  # metric of the age of the command in use, on world
 def _disorder(outcome: Outcome, seed: int) -> None:
     shape = conditions(delay=0.05, jitter=0.0, reorder=0.25)
     flight = fly_safely(outcome, Flight(seed=seed, link=shape))
-    outcome.true("commands applied in order, none twice", measures.applied_in_order(flight))
     metrics = "datagrams_reordered_total downlink", "datagrams_total downlink late"
     moves(outcome, flight, *(f"world {metric}" for metric in metrics), since=0.0)
     outcome.least("late commands dropped", flight.count("late"), 100)
@@ -82,14 +80,7 @@ def _delay_step(outcome: Outcome, seed: int) -> None:
     ]
     outcome.most("delay estimate off after 0.5 s, share", max(off, default=nan), 0.2)
     outcome.same("HOLDs", len(measures.held(flight)), 0)
-    soon, estimate = at + measures.SOON, "delay_estimate_seconds"
-    moves(outcome, flight, f"cloud {estimate}", since=at)
-    shown = measures.reading(flight, "cloud", estimate, until=soon)
-    outcome.least(f"metric {estimate}", shown, 0.15, "s")
-    before, after = (measures.above(flight, "cloud", "rtt_seconds", 0.15, t) for t in (at, soon))
-    text = "metric rtt_seconds: round trips above 0.15 s"
-    outcome.same(f"{text} before the step", before[0], 0)
-    outcome.least(f"{text} within 5 s of it", after[0], 200)
+    moves(outcome, flight, "cloud delay_estimate_seconds", "cloud rtt_seconds", since=at)
 
 
 @scenario(
@@ -115,21 +106,10 @@ def _asymmetry(outcome: Outcome, seed: int) -> None:
     expects="first TRACK, then HOLD and TRACK without chatter: <= 2 changes in any second",
 )
 def _jitter(outcome: Outcome, seed: int) -> None:
-    def older(flight: Flight, age: float) -> float:
-        """Return the share of applied commands [1] that were older than `age` [s]."""
-        return measures.above(flight, "world", AGE, age)[1]
-
     flight = fly_safely(outcome, Flight("link.profile=paper-p3", seed=seed))
     outcome.same("jitter 40 ms: HOLDs", len(measures.held(flight)), 0)
-    without = Flight("link.profile=paper-p3", seed=seed, link=conditions(jitter=0.0)).fly_mission()
-    outside = 1 - older(without, 0.1) + older(without, 0.15)
-    outcome.most(f"no jitter: metric {AGE}: share outside 0.1 to 0.15 s", outside, 0.01)
-    outcome.most(f"jitter 40 ms: metric {AGE}: share above 0.1 s", older(flight, 0.1), 0.95)
-    outcome.least(f"jitter 40 ms: metric {AGE}: share above 0.15 s", older(flight, 0.15), 0.05)
     flight = Flight(seed=seed, link=conditions(delay=0.15, jitter=0.15)).fly(60.0)
     measures.safe(outcome, flight)
     moves(outcome, flight, "world guard_transitions_total hold", since=0.0)
-    outcome.least(f"jitter 150 ms: metric {AGE}: share above 0.15 s", older(flight, 0.15), 0.25)
-    outcome.same(f"jitter 150 ms: metric {AGE}: share above 0.25 s", older(flight, 0.25), 0.0)
     busiest = measures.busiest_second(flight.changes)
     outcome.most("jitter 150 ms: changes of the guard in any second", busiest, 2)

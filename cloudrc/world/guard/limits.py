@@ -236,7 +236,6 @@ class Limits:
 
         Each limit has to be finite and above 0, `plan_max_ns` may be 0. The robot has to stop in
         time from `speed_max` with a command as old as `command_age_max_ns` and the rest of a plan.
-        The fence has to be larger than its margins.
         """
         for name in self.__slots__[2:-1]:
             value = getattr(self, name)
@@ -253,9 +252,6 @@ class Limits:
                 f"guard: speed_max is {self.speed_max:g} m/s; with this command age the robot needs"
                 f" {way:.2f} m to stop, and at most {STOPPING_DISTANCE:g} m are allowed"
             )
-        for low, high in zip(self.fence_low, self.fence_high, strict=True):
-            if not (isfinite(low) and isfinite(high) and high - low > FLOOR_MARGIN + FENCE_MARGIN):
-                raise ValueError(f"guard: a fence from {low:g} to {high:g} m leaves no room")
 
     @property
     def ramp_ns(self) -> int:

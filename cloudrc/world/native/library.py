@@ -69,7 +69,7 @@ def compile_to(file: Path, command: list[str]) -> None:
         made = Path(folder, file.name)
         words = [*command, *FLAGS, "-o", str(made), str(SOURCE)]
         subprocess.run(words, check=True, capture_output=True, text=True, timeout=COMPILE_MAX)
-        made.chmod(0o755)  # whatever the umask is, see _refuse_shared
+        made.chmod(0o755)
         os.replace(made, file)
 
 
@@ -99,7 +99,6 @@ def _load() -> Library:
                 raise OSError("no cache folder; set XDG_CACHE_HOME")
             if not file.exists():
                 compile_to(file, command)
-            _refuse_shared(cached, file)
         except (OSError, subprocess.SubprocessError) as error:
             said = getattr(error, "stderr", None) or str(error)
             found = Library(None, f"{name}: {' '.join(said.split())[:100]}")
@@ -108,14 +107,6 @@ def _load() -> Library:
         if found.run is not None:
             break
     return found
-
-
-def _refuse_shared(*paths: Path) -> None:
-    """Raise a PermissionError if another user may write to a path and so plant machine code."""
-    for path in paths:
-        status = path.stat()
-        if status.st_uid != os.geteuid() or status.st_mode & 0o022:
-            raise PermissionError(f"set XDG_CACHE_HOME, other users may write to {path}")
 
 
 def _open(file: Path, origin: str) -> Library:

@@ -8,11 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.hold import brake_start
-from cloudrc.world.guard.limits import FENCE_MARGIN, Limits
+from cloudrc.world.guard.limits import Limits
 from tests.world.guard.conftest import LIMITS, MS, SECOND, TICK, armed, command, run
 
 NUMBERS = [field.name for field in fields(Limits) if not field.name.startswith("fence")]
@@ -58,22 +57,6 @@ def test_on_the_ground_it_waits_for_a_mission_for_10_s_at_least(hold_s, waited_s
     assert guard.take_changes()[-1].cause == f"held for {waited_s} s without the cloud"
     guard.acknowledge(62 * SECOND)
     assert guard.state is GuardState.GROUND, "without a touch-down"
-
-
-THIN = FLOOR_MARGIN + FENCE_MARGIN
-
-
-@pytest.mark.parametrize("axis", range(3))
-def test_a_fence_has_room_between_its_margins(axis):
-    corner = [9.0] * 3
-    corner[axis] = THIN + 0.01
-    Limits((0.0, 0.0, 0.0), tuple(corner))
-    for high in (-inf, inf, nan, 0.0, THIN):
-        corner[axis] = high
-        with pytest.raises(ValueError, match="leaves no room"):
-            Limits((0.0, 0.0, 0.0), tuple(corner))
-    with pytest.raises(ValueError, match="zip"):
-        Limits((0.0, 0.0), (5.0, 5.0, 5.0))
 
 
 def test_the_inner_corners_have_the_margins_taken_off():

@@ -1,6 +1,7 @@
 """Flights in C and in Python have the same bits, whatever the cloud sends."""
 
 import logging
+from functools import partial
 from math import inf
 
 import numpy as np
@@ -83,15 +84,39 @@ def scaled(seed, scale):
     return lambda pilot: UP if pilot.now_ns < SECOND else tuple(scale * v for v in policy(pilot))
 
 
-@pytest.mark.parametrize(("scale", "least"), [(1.0, 10), (0.1, 1000)])
-@pytest.mark.parametrize("seed", range(4))
-def test_hostile_commands_fly_the_same_in_c(seed, scale, least):
-    """Large ones reach caps, fence and floor; small ones stay where C flies."""
-    python, c = both()
+def silence(pilot):
+    """Command in jumps, with a pause that leads to HOLD, and at the end no commands at all."""
+    second = pilot.now_ns * 1e-9
+    if 2.0 < second < 3.5 or second > 5.5:
+        return None
+    return (1.0, -1.5, 1.0 if second < 1.0 else 0.0)
+
+
+TOUCHING, IN_PIPE = (8.0, -6.42, 0.9), (-1.0, 0.5, 0.5)
+HOLDS = Limits(fence.LOW, fence.HIGH, hold_max_ns=2000 * MS)
+
+
+@pytest.mark.parametrize(
+    ("make", "seconds", "spawn", "limits", "least"),
+    [
+        # Large velocities reach caps, fence and floor; small ones stay where C flies.
+        *((partial(scaled, seed, 1.0), 7.0, None, LIMITS, 10) for seed in range(4)),
+        *((partial(scaled, seed, 0.1), 7.0, None, LIMITS, 1000) for seed in range(4)),
+        *((partial(scaled, seed, 0.1), 4.0, IN_PIPE, LIMITS, 500) for seed in range(3)),
+        (lambda: lambda pilot: (0.3, 0.0, 0.1), 1.5, TOUCHING, LIMITS, 500),
+        (lambda: silence, 14.0, None, HOLDS, 900),
+    ],
+)
+def test_commands_fly_the_same_in_c(make, seconds, spawn, limits, least, scene_at):
+    python, c = both(scene_at(*spawn) if spawn else "empty", limits)
     count = Count(c)
-    pilots = [Pilot(robot).fly(7.0, scaled(seed, scale)) for robot in (python, c)]
+    pilots = [Pilot(robot).fly(seconds, make()) for robot in (python, c)]
     assert pilots[0].seen == pilots[1].seen
     assert count.steps >= least
+    if limits is HOLDS:
+        assert {GuardState.TRACK, GuardState.HOLD, GuardState.LAND} <= pilots[1].states
+    if spawn is TOUCHING:
+        assert any(touches and touches[0].body == "board" for touches in pilots[1].seen[7::8])
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -133,43 +158,6 @@ def test_a_micrometre_of_room_means_that_no_fence_limits(monkeypatch):
             found += 1
             assert rules.limit_to_fence(velocity, place, low, high) == tuple(velocity)
     assert found > 1000
-
-
-def silence(pilot):
-    """Command in jumps, with a pause that leads to HOLD, and at the end no commands at all."""
-    second = pilot.now_ns * 1e-9
-    if 2.0 < second < 3.5 or second > 5.5:
-        return None
-    return (1.0, -1.5, 1.0 if second < 1.0 else 0.0)
-
-
-def test_hold_and_land_fly_the_same_in_c():
-    limits = Limits(fence.LOW, fence.HIGH, hold_max_ns=2000 * MS)
-    python, c = both(limits=limits)
-    count = Count(c)
-    pilots = [Pilot(robot).fly(14.0, silence) for robot in (python, c)]
-    assert pilots[0].seen == pilots[1].seen
-    assert {GuardState.TRACK, GuardState.HOLD, GuardState.LAND} <= pilots[1].states
-    assert count.steps > 900
-
-
-def test_a_contact_with_the_board_flies_the_same_in_c(scene_at):
-    python, c = both(scene_at(8.0, -6.42, 0.9))
-    count = Count(c)
-    policy = lambda pilot: (0.3, 0.0, 0.1)  # noqa: E731
-    pilots = [Pilot(robot).fly(1.5, policy, parts=(10,)) for robot in (python, c)]
-    assert pilots[0].seen == pilots[1].seen
-    assert count.steps > 500
-    assert any(touches and touches[0].body == "board" for touches in pilots[1].seen[7::8])
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_flight_against_the_walls_of_a_pipe_is_the_same_in_c(seed, scene_at):
-    python, c = both(scene_at(-1.0, 0.5, 0.5))
-    count = Count(c)
-    pilots = [Pilot(robot).fly(4.0, scaled(seed, 0.1)) for robot in (python, c)]
-    assert pilots[0].seen == pilots[1].seen
-    assert count.steps > 500
 
 
 def test_c_leaves_the_model_as_it_was():
@@ -216,17 +204,6 @@ def test_a_tether_holds_the_robot_in_c_too(tmp_path):
     pilots = [Pilot(robot).fly(2.0, lambda pilot: UP) for robot in robots]
     assert pilots[0].seen == pilots[1].seen
     assert pilots[1].robot.simulator.readings.position[2] < 1.1
-
-
-@pytest.mark.parametrize("field", ["dof_damping", "jnt_stiffness"])
-def test_springs_and_dampers_act_in_c_too(field):
-    seen = []
-    for kind in (Robot, NativeRobot):
-        parts = Simulator("pelican", "empty"), LowLevel(), Guard(LIMITS)
-        getattr(parts[0].model, field)[:] = 0.1
-        robot = NativeRobot(*parts, LIMITS) if kind is NativeRobot else Robot(*parts)
-        seen.append(Pilot(robot).fly(2.0, lambda pilot: UP).seen)
-    assert seen[0] == seen[1]
 
 
 @pytest.mark.parametrize("setting", [{"density": 1.2}, {"viscosity": 1e-5}])
