@@ -75,7 +75,6 @@ def execute(options: argparse.Namespace) -> int:
     """Shape one direction of the link until SIGTERM."""
     stop = StopSignal()  # first: until then, process 1 of a container ignores SIGTERM
     from cloudrc.link.follow import HANDED_FILE, PEER_PAUSE, PROFILE_PERIOD, PeerName, Profiles
-    from cloudrc.link.netem import write_tables
     from cloudrc.link.sidecar import Sidecar
 
     warn_if_exposed(options.listen)
@@ -84,7 +83,6 @@ def execute(options: argparse.Namespace) -> int:
     profiles = Profiles(options.profile, document, make_profile_loader(options.direction), log)
     profile, peer = profiles.first(), PeerName(options.peer, ipv4_addresses, log)
     with TemporaryDirectory(prefix="tc-", dir=options.route.parent) as tables:
-        write_tables(Path(tables))
         programs = Programs(tables)
         sidecar = Sidecar(
             _machine(options, programs, Path(tables)),
