@@ -12,6 +12,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from cloudrc.errors import BadInputError
 from cloudrc.files import read, version
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.state import CHANGE_FILE, Change, read_change
+from cloudrc.link.state import CHANGE_FILE, Change, parse, read_change
 
 if TYPE_CHECKING:
     from cloudrc.link.relay import Address
@@ -105,7 +106,8 @@ class ProfileFile:
         return loaded._replace(change=read_change(note))
 
 
-class Handed(NamedTuple):
+@dataclass(frozen=True)
+class Handed:
     """A change that `cloudrc link set` writes directly into a pod, as a JSON document.
 
     Attributes:
@@ -119,23 +121,18 @@ class Handed(NamedTuple):
 
 def write_handed(handed: Handed) -> str:
     """Format a change as the text of the JSON document."""
-    return json.dumps(handed._asdict())
+    return json.dumps(asdict(handed))
 
 
-def read_handed(text: str) -> Handed:
+def read_handed(text: bytes | str) -> Handed:
     """Parse the text of the JSON document.
 
     Raises:
         ValueError: If the text is invalid, or if a file name could lead to another folder.
     """
-    found = json.loads(text)
-    try:
-        files = {str(name): str(content) for name, content in found["files"].items()}
-        handed = Handed(str(found["change"]), files)
-    except (TypeError, KeyError, AttributeError) as error:
-        raise ValueError(f"not a profile that was handed over: {error}") from error
-    if PROFILE not in files or not all(map(_NAME.fullmatch, files)):
-        raise ValueError(f"not a profile's files: {', '.join(sorted(files))}")
+    handed = parse(Handed, text)
+    if PROFILE not in handed.files or not all(map(_NAME.fullmatch, handed.files)):
+        raise ValueError(f"not a profile's files: {', '.join(sorted(handed.files))}")
     return handed
 
 
@@ -158,7 +155,7 @@ class _HandedFile(ProfileFile):
         """
         if self._path.lstat().st_uid != os.geteuid():
             raise ValueError(f"{self._path} belongs to another user")
-        handed = read_handed(read(self._path, SIZE_MAX).decode())
+        handed = read_handed(read(self._path, SIZE_MAX))
         with TemporaryDirectory(prefix="handed-", dir=self._path.parent) as folder:
             for name, text in handed.files.items():
                 (Path(folder) / name).write_text(text, encoding="utf-8")

@@ -120,18 +120,20 @@ def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
     """Convert the failed call of a program into an error with cause and remedy."""
     text = " ".join((answer.error or answer.output).split()) or f"exit code {answer.code}"
     unknown = "kind is unknown", "classifier not found", "answers: No such file"
-    cause = f"'{program} {' '.join(words)}' failed: {text}"
+    cause, remedy = f"'{program} {' '.join(words)}' failed: {text}", ""
     if answer.code == NOT_FOUND:
-        cause = f"no program {program} (package iproute2); install it"
+        cause, remedy = f"no program {program} (package iproute2)", "install it, or "
     elif "Operation not permitted" in text:
-        cause = "tc may not change the network of this container; give it NET_ADMIN and uid 0"
+        cause = "tc may not change the network of this container"
+        remedy = "give it NET_ADMIN and uid 0, or "
     elif "add" in words and any(sign in text for sign in unknown):
-        cause = (
-            "this kernel lacks sch_netem, sch_prio or cls_u32; use nodes whose kernel has them "
-            "('modprobe -a sch_netem sch_prio cls_u32' there) and a namespace for privileged pods"
+        cause = "this kernel lacks sch_netem, sch_prio or cls_u32"
+        remedy = (
+            "use nodes whose kernel has them ('modprobe -a sch_netem sch_prio cls_u32' there) and "
+            "a namespace for privileged pods, or "
         )
     return MissingPrerequisiteError(
-        f"{cause}, or set link.mode=relay, which needs nothing of the kernel"
+        f"{cause}; {remedy}set link.mode=relay, which needs nothing of the kernel"
     )
 
 

@@ -8,9 +8,11 @@ effect. All files are written atomically, because other processes may read them 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
 
 from cloudrc.files import write_atomically
 from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
@@ -92,14 +94,20 @@ def to_text(state: LinkState) -> str:
     return json.dumps(asdict(state), indent=2) + "\n"
 
 
-def from_text(text: str) -> LinkState:
-    """Parse a state; raise a ValueError if the text is invalid."""
-    found = json.loads(text)
-    names = {item.name for item in fields(LinkState)}
+T = TypeVar("T")
+
+
+def parse(kind: type[T], text: bytes | str) -> T:
+    """Parse JSON as a dataclass; raise a ValueError with one line if the text is invalid."""
     try:
-        return LinkState(**{name: value for name, value in found.items() if name in names})
-    except (TypeError, AttributeError) as error:
-        raise ValueError(f"not the state of a link: {error}") from error
+        return TypeAdapter(kind).validate_json(text)
+    except ValidationError as error:
+        raise ValueError(f"not a {kind.__name__}: {error.errors()[0]['msg']}") from None
+
+
+def from_text(text: bytes | str) -> LinkState:
+    """Parse a state; raise a ValueError if the text is invalid."""
+    return parse(LinkState, text)
 
 
 def read_change(text: str) -> Change:
