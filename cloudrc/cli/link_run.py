@@ -36,8 +36,7 @@ if TYPE_CHECKING:
     from cloudrc.link.sidecar import Machine, Sidecar
 
 EPILOG = ""
-TOOL_TIMEOUT = 5.0
-"""Time limit of one call of tc or ip [s]."""
+TOOL_TIMEOUT = 5.0  # time limit of one call of tc or ip [s]
 _BATCH = ("tc", "-s", "-j", "-force", "-batch", "-")
 _END = "qdisc show dev lo"
 """Command that is sent to tc after each change. Its answer, a list, marks the end of the change's

@@ -42,8 +42,7 @@ anew; single values leave them running. The change is recorded. It lasts until
 the next change, the end of the run, or 'helm upgrade'."""
 COLUMNS = ("delay_ms", "jitter_ms", "distribution", "loss", "rate_kbit")
 """Keys of a direction that have columns of their own; the column OTHER shows all other keys."""
-LOCAL_TIMEOUT = 5.0
-"""Time limit for a local relay to apply a change [s]; a relay needs about 0.2 s."""
+LOCAL_TIMEOUT = 5.0  # time limit for a local relay to apply a change [s]; a relay needs about 0.2 s
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

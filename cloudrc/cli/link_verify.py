@@ -62,8 +62,7 @@ from cloudrc.link.verify.judge import UNITS, Expected, Flow, Plan, Row, look_twi
 from cloudrc.link.verify.probe import PROBE, ProbeEnd, plan_probes, send_probes
 from cloudrc.tunnel.codec import SIZES, Kind
 
-RELEASE_TIMEOUT = 270.0
-"""Default time limit for the verdict on a release [s]."""
+RELEASE_TIMEOUT = 270.0  # default time limit for the verdict on a release [s]
 START_LIMIT = 90.0
 """Time limit for the processes of both directions to start, long enough for a slow disk [s]."""
 COUNTS_WAIT = 1.3

@@ -29,14 +29,10 @@ from numpy.typing import NDArray
 
 from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
 
-BLOCK = 256
-"""Number of packets whose random numbers are generated together."""
-CHAIN_BLOCKS = 64
-"""Number of blocks after which bursts and correlated jitter restart."""
-OVERTAKES = -(1 << 62)
-"""Entry of a packet that skips both queue and delay (`reorder`)."""
-PARETO_CUT = 1e-3
-"""Probability of the tail that is cut off the Pareto distribution, in [0, 1]."""
+BLOCK = 256  # number of packets whose random numbers are generated together
+CHAIN_BLOCKS = 64  # number of blocks after which bursts and correlated jitter restart
+OVERTAKES = -(1 << 62)  # entry of a packet that skips both queue and delay (`reorder`)
+PARETO_CUT = 1e-3  # probability of the tail that is cut off the Pareto distribution, in [0, 1]
 
 _CACHED = 256
 _OUTPUTS_PER_COUNT = 4

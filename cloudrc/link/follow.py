@@ -25,16 +25,14 @@ from cloudrc.link.state import CHANGE_FILE, Change, parse, read_change
 if TYPE_CHECKING:
     from cloudrc.link.relay import Address
 
-PROFILE_PERIOD = 0.05
-"""Time between two checks whether the profile's file has changed [s]."""
+PROFILE_PERIOD = 0.05  # time between two checks whether the profile's file has changed [s]
 PEER_PAUSE = (0.5, 1.0)
 """Shortest and longest pause before the peer's name is resolved again [s]. The pause is random, so
 that the links of many releases do not query their name server at the same time.
 Source: docs/reference/faults.md, "F19"."""
 HANDED_FILE = "asked.json"
 """Name of the JSON document that `cloudrc link set` writes, in the folder of the route file."""
-SIZE_MAX = 1_200_000
-"""Size limit of the JSON document [bytes]: room for the content of a ConfigMap."""
+SIZE_MAX = 1_200_000  # size limit of the JSON document [bytes]: room for the content of a ConfigMap
 PROFILE = "profile.yaml"
 _NAME = re.compile(r"[a-zA-Z0-9_][-._a-zA-Z0-9]{0,252}")
 _KNOWN = 64
@@ -42,17 +40,11 @@ _KNOWN = 64
 
 
 class Loaded(NamedTuple):
-    """A profile as read from its file.
+    """A profile as read from its file."""
 
-    Attributes:
-        direction: Profile of the direction that this process shapes, in SI units.
-        values: Content of the file, without defaults, to show to users.
-        change: The last change of the profile: its number and cause.
-    """
-
-    direction: DirectionProfile
-    values: dict[str, Any]
-    change: Change = Change()
+    direction: DirectionProfile  # profile of the direction that this process shapes, in SI units
+    values: dict[str, Any]  # content of the file, without defaults, to show to users
+    change: Change = Change()  # the last change of the profile: its number and cause
 
 
 Load = Callable[[Path], Loaded]
@@ -108,15 +100,10 @@ class ProfileFile:
 
 @dataclass(frozen=True)
 class Handed:
-    """A change that `cloudrc link set` writes directly into a pod, as a JSON document.
+    """A change that `cloudrc link set` writes directly into a pod, as a JSON document."""
 
-    Attributes:
-        change: Number and cause of the change, as the text of `CHANGE_FILE`.
-        files: File name -> text, for `profile.yaml` and the traces that the profile names.
-    """
-
-    change: str
-    files: dict[str, str]
+    change: str  # number and cause of the change, as the text of `CHANGE_FILE`
+    files: dict[str, str]  # file name -> text: `profile.yaml` and the traces that it names
 
 
 def write_handed(handed: Handed) -> str:

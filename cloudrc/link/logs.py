@@ -37,8 +37,7 @@ from cloudrc.link.traces import Row, looks_lost, read_rows
 Direction: TypeAlias = Literal["uplink", "downlink"]
 Entry: TypeAlias = tuple[float, float | None]
 """Time of sending [s] and delay [s]; the delay is None if the packet was lost."""
-LONGEST = 5.0
-"""Largest plausible median delay [s]; a larger median suggests that the unit is wrong."""
+LONGEST = 5.0  # largest plausible median delay [s]; a larger median suggests that the unit is wrong
 UNUSABLE_MAX = 0.01
 """Largest share of rows that may be left out, in [0, 1]; with more, the log is rejected."""
 GAP, GAP_MIN = 5, 1.0
@@ -58,19 +57,12 @@ HALVE = (
 
 @dataclass(frozen=True, slots=True)
 class Packets:
-    """The packets of a log in the order of sending.
+    """The packets of a log in the order of sending."""
 
-    Attributes:
-        sent: Times of sending on any clock, strictly rising [s], shape (n,).
-        delays: One-way delays [s], None for lost packets, shape (n,).
-        notes: Texts such as "3 out of order, sorted", for the user.
-        halved: Whether the delays are halves of round trips.
-    """
-
-    sent: tuple[float, ...]
-    delays: tuple[float | None, ...]
-    notes: tuple[str, ...] = ()
-    halved: bool = False
+    sent: tuple[float, ...]  # times of sending on any clock, strictly rising [s], shape (n,)
+    delays: tuple[float | None, ...]  # one-way delays [s], None for lost packets, shape (n,)
+    notes: tuple[str, ...] = ()  # texts such as "3 out of order, sorted", for the user
+    halved: bool = False  # whether the delays are halves of round trips
 
     @property
     def arrived(self) -> list[float]:
@@ -90,18 +82,12 @@ class Packets:
 
 @dataclass(slots=True)
 class Log:
-    """The rows that a reader finds in a log.
-
-    Attributes:
-        entries: The packets in the order of the log.
-        counts: What happened to rows (left out, merged, sorted), as text -> number of rows.
-        unusable: For each row that cannot be used, the reason.
-    """
+    """The rows that a reader finds in a log."""
 
     name: str
-    entries: list[Entry] = field(default_factory=list)
-    counts: Counter[str] = field(default_factory=Counter)
-    unusable: list[str] = field(default_factory=list)
+    entries: list[Entry] = field(default_factory=list)  # the packets in the order of the log
+    counts: Counter[str] = field(default_factory=Counter)  # what happened to rows -> their number
+    unusable: list[str] = field(default_factory=list)  # why a row cannot be used, for each
     halved: bool = False
 
     def packets(self) -> Packets:

@@ -39,36 +39,28 @@ from cloudrc.link.draws import PARETO_CUT, Floats
 from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Loss, Timeline
 from cloudrc.link.relay import Address
 
-NOT_FOUND = 127
-"""Exit code that stands for a program that does not exist."""
+NOT_FOUND = 127  # exit code that stands for a program that does not exist
 ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"
 """Handles of the root qdisc, of its band for the tunnel's datagrams, and of the netem in that
 band."""
-PERIOD_NS = 1_000_000_000
-"""Time between two checks of the qdiscs [ns]."""
+PERIOD_NS = 1_000_000_000  # time between two checks of the qdiscs [ns]
 STEP_NS = 5_000_000
 """Shortest time between two changes that a time line makes to the qdisc [ns]. Of several changes
 within this time, only the last is made."""
-LIMIT = 10_000
-"""Largest number of packets in a qdisc without a bottleneck, as in the relay."""
-DELAY_MAX_MS = 274_000
-"""Longest delay that tc accepts [ms]: 2^32 ticks of 64 ns."""
-ENTRIES = 4096
-"""Number of entries in a table of a delay distribution."""
+LIMIT = 10_000  # largest number of packets in a qdisc without a bottleneck, as in the relay
+DELAY_MAX_MS = 274_000  # longest delay that tc accepts [ms]: 2^32 ticks of 64 ns
+ENTRIES = 4096  # number of entries in a table of a delay distribution
 STRETCH = {"uniform": 1, "normal": 1, "pareto": 4}
 """Distribution -> divisor of the table's entries, so that the tail fits in 16 bits. To compensate,
 tc gets the jitter multiplied by the same factor."""
 _ONE = 8192
-_END_OF_TABLE = 32_767 / _ONE
-"""Largest 16-bit entry of a table, as a multiple of the jitter."""
-_KEPT = 10_000
-"""Number of recent changes from which the percentiles of the lateness are computed."""
+_END_OF_TABLE = 32_767 / _ONE  # largest 16-bit entry of a table, as a multiple of the jitter
+_KEPT = 10_000  # number of recent changes from which the percentiles of the lateness are computed
 _IN_ORDER = "100gbit"
 """Rate too high to limit anything, set because netem keeps packets in order if it has a rate."""
 _ETHERNET_BYTES = 14
 """Length of the Ethernet header, which netem counts and the model does not [bytes]."""
-_RATE_MIN = 8.0
-"""Lowest rate [bit/s]: tc treats less than 1 byte/s as no limit, without a message."""
+_RATE_MIN = 8.0  # lowest rate [bit/s]: tc treats less than 1 byte/s as no limit, without a message
 _CHANCE_MIN = 2.0**-32
 """Lowest probability above 0: tc rounds smaller values to 0, without a message."""
 _PACKET_BITS = 8 * 116

@@ -40,14 +40,11 @@ Send: TypeAlias = Callable[[bytes], object]
 
 IN_FLIGHT_MAX = 10_000
 """Largest number of datagrams in flight in one direction; more are dropped and counted."""
-DATAGRAM_MAX = 2_048
-"""Largest length of a datagram [bytes], to limit the memory that a lane uses."""
-BATCH = 32
-"""Largest number of datagrams that a lane reads or sends before the next lane's turn."""
+DATAGRAM_MAX = 2_048  # largest length of a datagram [bytes], to limit the memory that a lane uses
+BATCH = 32  # largest number of datagrams that a lane reads or sends before the next lane's turn
 SPIN_NS = 60_000
 """Time before a datagram is due at which the relay starts to read the clock in a loop [ns]."""
-STOP_PERIOD = 0.1
-"""Longest time between two calls of the argument `stop` of `Relay.run` [s]."""
+STOP_PERIOD = 0.1  # longest time between two calls of the argument `stop` of `Relay.run` [s]
 ANCILLARY_SIZE = 64
 """Size of the buffer for the kernel's time stamp and its count of dropped datagrams [bytes]."""
 AGE_MAX_NS = 50_000_000
@@ -55,12 +52,9 @@ AGE_MAX_NS = 50_000_000
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
 """Name -> probability of each percentile of the lateness in reports."""
 
-_BITS = 7
-"""Number of significant bits of a lateness that select its bucket: buckets are 1.6 % wide."""
-_EARLY = -1
-"""Bucket of the datagrams that left before they were due."""
-_RECENT = 10
-"""Number of calls of `Lanes.recent` over which its percentiles are computed."""
+_BITS = 7  # number of significant bits of a lateness that select its bucket: buckets are 1.6 % wide
+_EARLY = -1  # bucket of the datagrams that left before they were due
+_RECENT = 10  # number of calls of `Lanes.recent` over which its percentiles are computed
 _FIFO_PRIORITY = 10
 """Real-time priority, higher than ordinary processes, lower than the kernel's threads (50)."""
 _SWITCH_INTERVAL = 0.0002

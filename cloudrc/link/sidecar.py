@@ -34,8 +34,7 @@ Mode: TypeAlias = Literal["auto", "netem", "relay"]
 """Setting `link.mode`: the only allowed shaper, or "auto": netem if it works, else the relay."""
 COUNT_PERIOD_NS = 1_000_000_000
 """Time between two updates of the metrics and of the file that reports the lateness [ns]."""
-STEP = 0.05
-"""Longest time until `run` reacts to a new peer or profile [s]."""
+STEP = 0.05  # longest time until `run` reacts to a new peer or profile [s]
 
 Shaper: TypeAlias = RelayShaper | Netem
 """Shapes the datagrams that this pod's end of the tunnel sends."""

@@ -17,8 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from cloudrc.files import write_atomically
 from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
 
-STATE_FILE = "link.json"
-"""Name of the state file, in the folder of the route file."""
+STATE_FILE = "link.json"  # name of the state file, in the folder of the route file
 PROFILE_FILE = "profile.json"
 """Name of the profile file for the relay of a local run, in the folder of the state files."""
 STATE_MAX = 1 << 16
@@ -39,54 +38,32 @@ CHANGE_FILE = "change.json"
 class Change:
     """Number and cause of a profile's change, as `cloudrc link set` writes them to `CHANGE_FILE`.
 
-    Attributes:
-        number: Identifies the change; "" if unknown.
-        cause: Why the profile was changed, in words.
-        restart: True: the time line starts again when the profile takes effect. False: the time
-            line continues.
+    With `restart`, the time line starts again when the profile takes effect.
     """
 
-    number: str = ""
-    cause: str = "the profile's file changed"
+    number: str = ""  # identifies the change; "" if unknown
+    cause: str = "the profile's file changed"  # why the profile was changed, in words
     restart: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class LinkState:
-    """Shaper, profile and last change of one direction.
+    """Shaper, profile and last change of one direction; times on the machine's monotonic clock."""
 
-    Attributes:
-        shaper: "relay" or "netem".
-        reason: Why this shaper was chosen, in words.
-        mode: Requested shaper: "auto", "relay" or "netem".
-        direction: "uplink" or "downlink".
-        profile: Profiles of both directions, as in the file, without defaults.
-        since: When the profile took effect, UTC, to show to users.
-        since_ns: When the profile took effect, on the machine's monotonic clock [ns].
-        changes: Number of changes since the link came up.
-        change: Number of the last change that took effect; "" if unknown.
-        cause: Why the profile was changed, in words; "" before the first change.
-        asked: Requested conditions at the start of the time line: the result of `summary`.
-        origin_ns: Start of the time line on the monotonic clock [ns]; None if the change did not
-            restart the time line.
-        refused: Number of the last refused change; "" if no change was refused.
-        refusal: Why the last refused change was refused, in words.
-    """
-
-    shaper: str
-    reason: str
-    mode: str
-    direction: str
-    profile: dict[str, Any]
-    since: str
-    since_ns: int
-    changes: int = 0
-    change: str = ""
-    cause: str = ""
-    asked: dict[str, float | None] = field(default_factory=dict)
-    origin_ns: int | None = None
-    refused: str = ""
-    refusal: str = ""
+    shaper: str  # "relay" or "netem"
+    reason: str  # why this shaper was chosen, in words
+    mode: str  # requested shaper: "auto", "relay" or "netem"
+    direction: str  # "uplink" or "downlink"
+    profile: dict[str, Any]  # profiles of both directions, as in the file, without defaults
+    since: str  # when the profile took effect, UTC, to show to users
+    since_ns: int  # when the profile took effect [ns]
+    changes: int = 0  # number of changes since the link came up
+    change: str = ""  # number of the last change that took effect; "" if unknown
+    cause: str = ""  # why the profile was changed, in words; "" before the first change
+    asked: dict[str, float | None] = field(default_factory=dict)  # the result of `summary`
+    origin_ns: int | None = None  # start of the time line [ns]; None: the old one continues
+    refused: str = ""  # number of the last refused change; "" if no change was refused
+    refusal: str = ""  # why the last refused change was refused, in words
 
 
 def to_text(state: LinkState) -> str:

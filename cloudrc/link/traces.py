@@ -22,8 +22,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.files import read
 from cloudrc.link.profile import Trace
 
-SIZE_MAX = 64 << 20
-"""Size limit of a file [bytes]: half a day at 100 packets a second."""
+SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a second
 START_MAX = 600.0
 """Latest time of a trace's first row [s]: until this time a flight uses only the first row."""
 UNIX_TIME = 1e8

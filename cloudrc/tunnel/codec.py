@@ -35,12 +35,10 @@ from cloudrc.messages import (
 
 VERSION = 6
 """Version of the wire format. Each release of cloudrc uses one version and refuses all others."""
-PLAN_MAX = 80
-"""Largest number of velocities in a command's plan."""
+PLAN_MAX = 80  # largest number of velocities in a command's plan
 DATAGRAM_MAX = 1200
 """Size of the receive buffer [bytes]; every valid datagram is shorter, and fits into a packet."""
-NUMBER_MAX = 2**32 - 1
-"""Highest number of an operator request."""
+NUMBER_MAX = 2**32 - 1  # highest number of an operator request
 
 
 class Kind(IntEnum):
@@ -101,8 +99,7 @@ class Accept(NamedTuple):
     clock: bytes
 
 
-COOKIE_SIZE = 13
-"""Size of a cookie [bytes]."""
+COOKIE_SIZE = 13  # size of a cookie [bytes]
 _HEADER = struct.Struct("<BBIxBQ")  # the pad byte is 0
 _BODIES = {
     Kind.HELLO: struct.Struct("<16s16s13sI"),

@@ -38,10 +38,8 @@ from cloudrc.tunnel.channel import REPEATED, Channel
 from cloudrc.tunnel.codec import Accept, DecodeError, Hello, Kind
 from cloudrc.tunnel.session import NO_EPOCH, Session
 
-EPOCH_MAX = 2**32 - 1
-"""Largest session number that the header can hold; the next number is 1."""
-CHALLENGE_NS = 100_000_000
-"""Shortest time between two challenges [ns]."""
+EPOCH_MAX = 2**32 - 1  # largest session number that the header can hold; the next number is 1
+CHALLENGE_NS = 100_000_000  # shortest time between two challenges [ns]
 COOKIE_NS = 2_000_000_000
 """Length of the time slot of a cookie [ns]. A cookie is valid in its slot and in the next slot."""
 GRACE_NS = 1_000_000_000
@@ -50,14 +48,11 @@ REPEATS_MAX = 3
 """Number of times that world repeats its ACCEPT to a cloud that sends no encrypted datagrams."""
 CLOUDS_MAX = 64
 """World remembers the counter of the newest hello for at most this many cloud processes."""
-NO_COOKIE = bytes(codec.COOKIE_SIZE)
-"""Cookie in a hello for which cloud has no cookie from world."""
-REPLIES_MAX = 3
-"""Largest number of challenges that cloud answers per periodic hello."""
+NO_COOKIE = bytes(codec.COOKIE_SIZE)  # cookie in a hello for which cloud has no cookie from world
+REPLIES_MAX = 3  # largest number of challenges that cloud answers per periodic hello
 COOKIES_MAX = 4096
 """Number of cookies that cloud remembers: at one cookie every 2 s, those of more than two hours."""
-WORLDS_MAX = 64
-"""Cloud ignores late answers from at most this many earlier world processes."""
+WORLDS_MAX = 64  # cloud ignores late answers from at most this many earlier world processes
 
 
 def is_newer(epoch: int, than: int) -> bool:

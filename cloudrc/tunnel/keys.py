@@ -16,8 +16,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from cloudrc.tunnel.codec import TAG_SIZE, VERSION
 
-KEY_SIZE = 32
-"""Size of a pre-shared key and of a derived key [bytes]."""
+KEY_SIZE = 32  # size of a pre-shared key and of a derived key [bytes]
 _LABEL = b"cloudrc %d " % VERSION
 
 

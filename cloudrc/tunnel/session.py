@@ -33,8 +33,7 @@ from cloudrc.tunnel.codec import (
 )
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 
-NO_EPOCH = 0
-"""Epoch of an end without a session, and of every HELLO, CHALLENGE and BUSY datagram."""
+NO_EPOCH = 0  # epoch of an end without a session, and of every HELLO, CHALLENGE and BUSY datagram
 TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}
 """Kinds of handshake datagrams that belong to no session: all except ACCEPT."""
 _PUBLIC_KEY = b"nothing is secret in one process"

@@ -18,8 +18,7 @@ LATE, UNREAD, STOPPED = 1.5e-3, 0.003, 0.01
 datagrams not read in time; share of CPU periods in which the shaper was throttled."""
 RAISED = ("mean", "round_trip", "deviation", "loss")
 """Quantities that rise if the shaper lacks CPU time."""
-PASSED = 0.9
-"""If the shaper counts less than this share of the arrived datagrams, some bypass it."""
+PASSED = 0.9  # if the shaper counts less than this share of the arrived datagrams, some bypass it
 
 
 class Evidence(NamedTuple):
