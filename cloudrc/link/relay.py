@@ -54,7 +54,7 @@ QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
 
 _BITS = 7  # number of significant bits of a lateness that select its bucket: buckets are 1.6 % wide
 _EARLY = -1  # bucket of the datagrams that left before they were due
-_RECENT = 10  # number of calls of `Lanes.recent` over which its percentiles are computed
+_RECENT = 10  # number of calls of `Lanes.counts` over which its percentiles are computed
 _FIFO_PRIORITY = 10
 """Real-time priority, higher than ordinary processes, lower than the kernel's threads (50)."""
 _SWITCH_INTERVAL = 0.0002
@@ -202,7 +202,7 @@ class Lane:
                 self._counts["unsent"] += 1
 
     def counts(self) -> dict[str, int]:
-        """Return the number of datagrams by outcome; `Lanes.outcomes` explains the outcomes."""
+        """Return the number of datagrams by outcome; `Lanes.counts` explains the outcomes."""
         return {**self._counts, "unread": self._stamps.dropped}
 
     def released(self) -> dict[str, int]:
@@ -213,9 +213,8 @@ class Lane:
             because too many were in flight (`overflow`), or that waited `AGE_MAX_NS` or longer to
             be read (`stalled`). Empty before the first datagram.
         """
-        told = self.errors.in_ns()
         more = {"overflow": self._counts["overflow"], "stalled": self._stalled}
-        return {**told, **more} if told else {}
+        return told | more if (told := self.errors.in_ns()) else {}
 
     def _put_on_link(
         self, data: bytes, kind: int, epoch: int, counter: int, received_ns: int
@@ -297,35 +296,24 @@ class Lanes:
                     for other in self._lanes:
                         other.origin_ns = lane.origin_ns
 
-    def outcomes(self) -> dict[str, int]:
-        """Return the number of datagrams of all lanes by outcome.
+    def counts(self) -> dict[str, int]:
+        """Return the number of datagrams of all lanes by outcome, and the recent lateness.
 
         The outcomes are `received`; `forwarded` (including copies); `lost` on the link; `malformed`
         (not from the tunnel); `overflow` (too many in flight, see `IN_FLIGHT_MAX`); `unread` (the
         socket's buffer was full); `unsent` (the receiver is unknown or the kernel refused).
+
+        Call this method once a second; the percentiles of the lateness [ns] then cover the last
+        10 s. `released_early` counts since the start.
         """
-        outcomes: Counter[str] = Counter()
+        outcomes, errors = Counter[str](), ReleaseErrors()
         for lane in self._lanes:
             outcomes.update(lane.counts())
-        return dict(outcomes)
-
-    def recent(self) -> dict[str, int]:
-        """Return percentiles of the recent lateness [ns], and `released_early` since the start.
-
-        Call this method once a second; the percentiles then cover the last 10 s.
-        """
-        errors = self.errors()
+            errors.update(lane.errors.copy())
         recent = ReleaseErrors(errors - self._past[0]).in_ns()
         self._past.append(errors)
         recent.pop("released", None)
-        return {**recent, "released_early": errors[_EARLY]}
-
-    def errors(self) -> ReleaseErrors:
-        """Return the sum of the lateness histograms of all lanes."""
-        whole = ReleaseErrors()
-        for lane in self._lanes:
-            whole.update(lane.errors.copy())
-        return whole
+        return {**outcomes, **recent, "released_early": errors[_EARLY]}
 
 
 class Relay(Lanes):
@@ -363,10 +351,6 @@ class Relay(Lanes):
         tighten_slack()
         while not stop():
             self.step(STOP_PERIOD)
-
-    def counts(self) -> dict[str, int]:
-        """Return `Lanes.outcomes`, and the lateness since the start (`ReleaseErrors.in_ns`)."""
-        return {**self.outcomes(), **self.errors().in_ns()}
 
     def released(self, way: str) -> dict[str, int]:
         """Return `Lane.released` of one direction, "uplink" or "downlink"."""
@@ -418,10 +402,6 @@ class RelayShaper(Lanes):
         """Use this profile from now on; `restart` as in `LinkDirection.replace_profile`."""
         self.take_in()  # datagrams that have arrived belong to the old profile
         self._lane.direction.replace_profile(profile, restart=restart)
-
-    def counts(self) -> dict[str, int]:
-        """Return `Lanes.outcomes` and `Lanes.recent`."""
-        return self.outcomes() | self.recent()
 
     def released(self) -> dict[str, int]:
         """Return `Lane.released` of this direction."""

@@ -74,29 +74,20 @@ Header: TypeAlias = tuple[int, int, int, int, int]
 
 
 class Hello(NamedTuple):
-    """Cloud's request for a session.
+    """Cloud's request for a session."""
 
-    `nonce` has 16 random bytes that identify the cloud process. `clock` has 16 bytes that identify
-    cloud's monotonic clock. `cookie` has the 13 bytes of world's challenge, or zeros. `epoch` is
-    the newest session number that cloud knows; world gives the new session a higher number.
-    """
-
-    nonce: bytes
-    clock: bytes
-    cookie: bytes
-    epoch: int
+    nonce: bytes  # 16 random bytes that identify the cloud process
+    clock: bytes  # 16 bytes that identify cloud's monotonic clock
+    cookie: bytes  # the 13 bytes of world's challenge, or zeros
+    epoch: int  # newest session number that cloud knows; the new session gets a higher number
 
 
 class Accept(NamedTuple):
-    """World's answer that opens a session.
+    """World's answer that opens a session."""
 
-    `nonce` is copied from the answered hello. `world_nonce` has 16 random bytes that identify the
-    world process. `clock` has 16 bytes that identify world's monotonic clock.
-    """
-
-    nonce: bytes
-    world_nonce: bytes
-    clock: bytes
+    nonce: bytes  # copied from the answered hello
+    world_nonce: bytes  # 16 random bytes that identify the world process
+    clock: bytes  # 16 bytes that identify world's monotonic clock
 
 
 COOKIE_SIZE = 13  # size of a cookie [bytes]
@@ -247,25 +238,25 @@ def encode_hello(hello: Hello) -> bytes:
     return _HELLO.pack(*hello)
 
 
-def decode_hello(body: bytes) -> Hello:
-    """Decode the body of a HELLO datagram."""
-    return Hello(*_HELLO.unpack(body))
-
-
 def encode_accept(accept: Accept) -> bytes:
     """Encode the body of an ACCEPT datagram."""
     return _ACCEPT.pack(*accept)
-
-
-def decode_accept(body: bytes) -> Accept:
-    """Decode the body of an ACCEPT datagram."""
-    return Accept(*_ACCEPT.unpack(body))
 
 
 encode_challenge: Callable[[bytes], bytes] = _CHALLENGE.pack
 """Encode the body of a CHALLENGE datagram: a cookie, padded with zeros."""
 encode_busy: Callable[[bytes], bytes] = _BUSY.pack
 """Encode the body of a BUSY datagram: the nonce of the hello that it answers."""
+
+
+def decode_hello(body: bytes) -> Hello:
+    """Decode the body of a HELLO datagram."""
+    return Hello(*_HELLO.unpack(body))
+
+
+def decode_accept(body: bytes) -> Accept:
+    """Decode the body of an ACCEPT datagram."""
+    return Accept(*_ACCEPT.unpack(body))
 
 
 def decode_challenge(body: bytes) -> bytes:

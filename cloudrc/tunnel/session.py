@@ -1,8 +1,7 @@
 """Encrypt outgoing datagrams and verify incoming datagrams with the keys of a session.
 
 Each direction of a session has one key. HKDF derives this key from a pre-shared key, the nonces of
-both ends, and the epoch (session number). The keys need no change within a session, because 2^32
-datagrams take more than a year. A datagram changes no state before its tag is verified.
+both ends, and the epoch (session number). A datagram changes no state before its tag is verified.
 
 Counters restart with every session, except those of handshake datagrams outside of a session. The
 link decides from epoch and counter whether a datagram is lost. With a restarted counter it would
