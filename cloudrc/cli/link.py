@@ -1,8 +1,7 @@
-"""Run `cloudrc link ACTION`.
+"""Run `cloudrc link ACTION`: the action `show`, and the arguments of `verify`.
 
-This module contains the action `show`; the modules `cli/link_<action>.py` contain the others. The
-arguments of `verify` are here, too: the module of `verify` imports large packages, which would slow
-down `cloudrc link --help`.
+The modules `cli/link_<action>.py` contain the other actions. The module of `verify` imports large
+packages, which would slow down `cloudrc link --help`.
 """
 
 from __future__ import annotations

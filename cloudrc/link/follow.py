@@ -1,9 +1,9 @@
 """Follow changes of a link in flight: of its profile and of the peer's address.
 
 `cloudrc link set` changes the release's ConfigMap, so that the change is permanent. A kubelet may
-need a minute to copy the ConfigMap to a pod. Therefore `cloudrc link set` also writes the same
-files, as one JSON document, into the pod, beside the route file. ConfigMap and document contain
-the same number of the change: the first to arrive takes effect, and the other is ignored.
+need a minute to copy it to a pod. Therefore the command also writes the same files, as one JSON
+document, into the pod. ConfigMap and document contain the same number of the change: the first to
+arrive takes effect, and the other is ignored.
 """
 
 from __future__ import annotations

@@ -3,13 +3,9 @@
     ping -D -O HOST, ping --apple-time HOST, fping -D HOST
     irtt client -i 10ms -l 204 -d 1m -o irtt.json HOST
 
-irtt's option -l sets the packet size: a telemetry datagram has 204 bytes, a command datagram 88.
-irtt measures each direction if the clocks of the two hosts agree. ping measures round trips; with
-`halve`, half of each round trip counts as the delay. The columns of a CSV log name their units,
-such as `time_ms,delay_us,loss` or `timestamp_ns,rtt_ms`.
-
 Every reader fills a `Log`, and `Log.packets` checks it in the same way. `Packets.notes` counts the
 rows that are left out, merged or sorted. A log with more than 1 % unusable rows is rejected.
+docs/link.md describes the formats.
 
 Source: ping(8) of iputils, macOS and BusyBox; fping(8); irtt-client(1), JSON format 1.
 """

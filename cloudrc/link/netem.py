@@ -8,9 +8,6 @@ After a restart, `Netem` finds its qdiscs by their handles. In flight it changes
 change`, which keeps queued packets. An option that is missing in this command keeps its old value,
 so every call contains all options.
 
-`Netem` never touches a root qdisc of another program. If another program removes or changes the
-qdiscs of `Netem`, `Netem` logs an error and counts it in a metric.
-
 netem draws jitter from a table of 16-bit integers, in which 8192 stands for one times the jitter.
 The tables that come with tc differ from the distributions of the link's model.
 

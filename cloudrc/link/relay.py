@@ -7,10 +7,8 @@ datagrams that the pod sends:
     tunnel end > [listen]  RelayShaper  [any port] > the other pod's tunnel end
 
 A datagram is due at its time of arrival at the kernel plus the delay from the model. It never
-leaves before it is due. The relay sleeps in `select` until shortly before the next datagram is due,
-then reads the clock in a loop, because a sleeping thread wakes 15 to 50 us late.
-
-Each socket is connected to one end of the tunnel, so the kernel drops datagrams from other senders.
+leaves before it is due. A sleeping thread wakes 15 to 50 us late; so the relay sleeps until shortly
+before the next datagram is due, and then reads the clock in a loop.
 """
 
 from __future__ import annotations

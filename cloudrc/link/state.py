@@ -1,8 +1,7 @@
 """Publish the state of one direction of the link in a file: its shaper, profile and last change.
 
-The state file is in the folder of the route file. World or cloud on the same machine reads the
-state file and records its changes. `cloudrc link set` reads it to see whether a change has taken
-effect. All files are written atomically, because other processes may read them at the same time.
+The state file is in the folder of the route file. World or cloud on the same machine records its
+changes; `cloudrc link set` reads there whether a change has taken effect.
 """
 
 from __future__ import annotations

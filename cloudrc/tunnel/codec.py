@@ -1,12 +1,7 @@
 """Encode messages as datagrams and decode them, with a fixed little-endian layout per kind.
 
-A datagram has a 16-byte header (version, direction, epoch, kind, counter), a body with a fixed
-length for each kind, and a 16-byte authentication tag, which `session` adds and verifies. Only a
-command may be longer, by a plan. The epoch is the number of the session. The functions raise no
-exception except DecodeError.
-
-The header is authenticated but not encrypted, because the link reads it. Its last 12 bytes are the
-nonce of the cipher: no two datagrams of one direction and epoch have the same kind and counter.
+docs/wire.md describes the layout. `session` encrypts the bodies and makes the tags. The functions
+raise no exception except DecodeError.
 
 Deviation: the paper's tunnel sends pickled ROS messages, which have 1 kB and can execute code.
 """

@@ -7,19 +7,7 @@
                                         <--    ACCEPT (nonce, world's nonce, clock), a new epoch
                                             or BUSY (nonce)
 
-Each of these datagrams has a tag made with a pre-shared key; world answers with the key of the
-hello. No answer is longer than its hello. The cookie is a MAC over the present time slot, so world
-stores nothing for a hello without a cookie. A captured hello is useless after two slots, because
-its cookie has expired. World ignores a hello whose counter is not higher than the last counter from
-the same cloud.
-
-World sends at most ten challenges per second. A challenge is not addressed to one cloud: the true
-cloud can also use a challenge that answers an attacker's hello.
-
-A cloud keeps its session while world receives at least one new encrypted datagram from this cloud
-per `command_age_max`. After a longer silence another cloud can get a session. Each session has a
-higher number than the last one, its epoch, even after a restart of world, because each hello
-contains the newest epoch that its cloud knows.
+docs/wire.md explains cookies, epochs, keys, and which cloud gets the session.
 
 Deviation: WireGuard also derives session keys by Diffie-Hellman. This tunnel uses only the
 pre-shared key: one owner has both ends, and anybody with the key can command the robot anyway.

@@ -1,8 +1,4 @@
-"""Pre-shared keys, and the format of a key file.
-
-`repr` of a `Key` hides the secret. The tunnel uses keys that HKDF-SHA256 (RFC 5869) derives from
-the pre-shared key; each derived key is for one wire version and one use.
-"""
+"""Pre-shared keys, the keys that HKDF-SHA256 (RFC 5869) derives from them, and the key file."""
 
 from __future__ import annotations
 

@@ -1,15 +1,11 @@
 """Encrypt outgoing datagrams and verify incoming datagrams with the keys of a session.
 
-Each direction of a session has one key. HKDF derives this key from a pre-shared key, the nonces of
-both ends, and the epoch (session number). A datagram changes no state before its tag is verified.
-
-Counters restart with every session, except those of handshake datagrams outside of a session. The
-link decides from epoch and counter whether a datagram is lost. With a restarted counter it would
-lose the same handshake datagrams in every attempt.
+A datagram changes no state before its tag is verified. Counters restart with every session, except
+those of HELLO, CHALLENGE and BUSY: the link draws losses by epoch and counter, and with a restarted
+counter it would lose the same handshake datagrams in every attempt.
 
 Two ends in one process need no keys: their datagrams reach no network, and encryption would take
-5 % of the run time. Drivers with a socket refuse a session without keys (`Endpoint.sealed`), so a
-missing key never leads to plaintext in a network.
+5 % of the run time. Drivers with a socket refuse a session without keys (`Endpoint.sealed`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Monitor the link in flight: every 5 s, compare the received datagrams with the prediction.
 
-World judges the downlink. Cloud judges the uplink and, if the machines of world and cloud share no
-clock, the round trips. A separate thread does the work, so that the control loop is not delayed.
+World judges the downlink. Cloud judges the uplink and, if world and cloud share no clock, the round
+trips. A separate thread does the work, so that the control loop is not delayed.
 """
 
 from __future__ import annotations
