@@ -81,11 +81,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "packets": (1, PACKETS_MAX),
 }
 """Option of `show` -> its least and largest value."""
-ROWS = 1000
-"""Smallest number of packets in the picture of a trace. If the trace has fewer rows,
-several packets follow each row."""
-SECONDS = 30.0
-"""Shortest time that the picture shows by default [s]; a longer time line is shown in full."""
+ROWS = 1000  # least packets in a picture of a trace; several follow each row of a short trace
+SECONDS = 30.0  # shortest time shown by default; a longer time line is shown in full [s]
 KINDS = ("png", "svg", "pdf")
 
 

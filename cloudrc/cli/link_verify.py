@@ -63,25 +63,19 @@ from cloudrc.link.verify.probe import PROBE, ProbeEnd, plan_probes, send_probes
 from cloudrc.tunnel.codec import SIZES, Kind
 
 RELEASE_TIMEOUT = 270.0  # default time limit for the verdict on a release [s]
-START_LIMIT = 90.0
-"""Time limit for the processes of both directions to start, long enough for a slow disk [s]."""
-COUNTS_WAIT = 1.3
-"""Wait after the last probe [s]: the link's processes update their counts once a second."""
-POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0
-"""Pause between two polls of a release, and time limit of one HTTP request [s]."""
+START_LIMIT = 90.0  # for the processes of both directions to start, on a slow disk [s]
+COUNTS_WAIT = 1.3  # after the last probe: processes update their counts once a second [s]
+POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0  # of a release; of one HTTP request [s]
 PORTS = METRICS["world"]["world"], METRICS["world"]["link"]
 LOOPBACK, DEVICE = "127.0.0.1", "tunnel"
-HOSTS = {"uplink": "10.79.7.1", "downlink": "10.79.7.2"}
-"""Direction -> IPv4 address of the sender, in the sender's network namespace."""
+HOSTS = {"uplink": "10.79.7.1", "downlink": "10.79.7.2"}  # addresses of the senders
 WAYS = {
     "uplink": ("world", "cloud", Kind.TELEMETRY),
     "downlink": ("cloud", "world", Kind.COMMAND),
 }
 """Direction -> sender, receiver, and the kind of datagram that the sender sends."""
-KEYS = ("asked", "measured", "low", "high")
-"""Keys of the values in a row of the report, in the order of the table's columns."""
-NOT_JUDGED = "NOT JUDGED"
-"""Words in a note about a quantity of the profile that the command could not verify."""
+KEYS = ("asked", "measured", "low", "high")  # values of a row, in the order of the table's columns
+NOT_JUDGED = "NOT JUDGED"  # in a note about a quantity that could not be verified
 TOLD = {
     "correlation": f"correlation {NOT_JUDGED}: netem realises almost none of it",
     "rate": f"rate {NOT_JUDGED}: only trains of probes measure it, up to 100 Mbit/s",

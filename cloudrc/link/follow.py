@@ -30,13 +30,10 @@ PEER_PAUSE = (0.5, 1.0)
 """Shortest and longest pause before the peer's name is resolved again [s]. The pause is random, so
 that the links of many releases do not query their name server at the same time.
 Source: docs/reference/faults.md, "F19"."""
-HANDED_FILE = "asked.json"
-"""Name of the JSON document that `cloudrc link set` writes, in the folder of the route file."""
+HANDED_FILE = "asked.json"  # JSON document of `cloudrc link set`, in the folder of the route
 SIZE_MAX = 1_200_000  # size limit of the JSON document [bytes]: room for the content of a ConfigMap
 PROFILE = "profile.yaml"
 _NAME = re.compile(r"[a-zA-Z0-9_][-._a-zA-Z0-9]{0,252}")
-_KNOWN = 64
-"""Number of recent changes that are remembered, to recognise a change that arrives twice."""
 
 
 class Loaded(NamedTuple):
@@ -184,8 +181,6 @@ class Profiles:
         if not number:
             return False
         before, self._known[number] = self._known.get(number), loaded.values
-        if len(self._known) > _KNOWN:
-            del self._known[next(iter(self._known))]
         return before == loaded.values
 
 

@@ -34,17 +34,12 @@ Direction: TypeAlias = Literal["uplink", "downlink"]
 Entry: TypeAlias = tuple[float, float | None]
 """Time of sending [s] and delay [s]; the delay is None if the packet was lost."""
 LONGEST = 5.0  # largest plausible median delay [s]; a larger median suggests that the unit is wrong
-UNUSABLE_MAX = 0.01
-"""Largest share of rows that may be left out, in [0, 1]; with more, the log is rejected."""
+UNUSABLE_MAX = 0.01  # largest share of rows that may be left out, in [0, 1]
 GAP, GAP_MIN = 5, 1.0
 """A gap between packets is reported if it is longer than GAP_MIN [s] and longer than GAP times the
 median time between packets."""
-STEPS_MAX = 3
-"""Largest number of jumps back in time that count as clock steps or new sessions, which are errors.
-A log with more jumps is regarded as unordered, and its rows are sorted."""
-PACKETS_MAX = 10_000_000
-"""Largest number of packets in a log of ping: three weeks at five packets per second. The limit
-rejects wrong sequence numbers before they use up the memory."""
+STEPS_MAX = 3  # more jumps back in time than this are no clock steps: the rows are unordered
+PACKETS_MAX = 10_000_000  # packets in a log of ping; more are a wrong sequence number
 HALVE = (
     "a trace is one way; if both directions are alike, use half of each round trip with "
     "--halve-rtt; otherwise measure one way with irtt between synchronised clocks"
@@ -293,12 +288,9 @@ _LOST_WORDS = {
     *("lost", "loss", "timeout", "timed out", "request timed out", "no answer yet"),
 }
 """Words in the delay column that mark a lost packet."""
-_LOST_NUMBERS = (-1.0, -999.0, -9999.0)
-"""Numbers in the delay column that may mark a lost packet [unit of the column]. The number is a
-mark only if the column has no other negative number."""
+_LOST_NUMBERS = (-1.0, -999.0, -9999.0)  # mark a lost packet if no other delay is negative
 _FLAGS = {"0": False, "1": True, "false": False, "true": True, "no": False, "yes": True}
-LATEST = 1e11
-"""Largest plausible time since 1970 [s], about the year 5000; a larger time has another unit."""
+LATEST = 1e11  # largest plausible time since 1970 [s]; a larger time has another unit
 
 
 def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool) -> Packets:

@@ -17,11 +17,7 @@ from numpy.typing import NDArray
 from cloudrc.link.draws import BLOCK, OVERTAKES, Fate, bit_flips, impairments, stream_key
 from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
 
-HEADER_BYTES = 28
-"""Size of the IPv4 and UDP headers [bytes], which also take time on the wire.
-
-Source: RFC 791, RFC 768.
-"""
+HEADER_BYTES = 28  # size of the IPv4 and UDP headers (RFC 791, RFC 768), also on the wire [bytes]
 _TABLES = 64  # number of blocks of impairments that are kept in memory
 
 

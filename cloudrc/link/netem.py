@@ -37,13 +37,9 @@ from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, L
 from cloudrc.link.relay import Address
 
 NOT_FOUND = 127  # exit code that stands for a program that does not exist
-ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"
-"""Handles of the root qdisc, of its band for the tunnel's datagrams, and of the netem in that
-band."""
+ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"  # root qdisc, band of the tunnel, its netem
 PERIOD_NS = 1_000_000_000  # time between two checks of the qdiscs [ns]
-STEP_NS = 5_000_000
-"""Shortest time between two changes that a time line makes to the qdisc [ns]. Of several changes
-within this time, only the last is made."""
+STEP_NS = 5_000_000  # shortest time between two changes by a time line; only the last counts [ns]
 LIMIT = 10_000  # largest number of packets in a qdisc without a bottleneck, as in the relay
 DELAY_MAX_MS = 274_000  # longest delay that tc accepts [ms]: 2^32 ticks of 64 ns
 ENTRIES = 4096  # number of entries in a table of a delay distribution
@@ -53,17 +49,12 @@ tc gets the jitter multiplied by the same factor."""
 _ONE = 8192
 _END_OF_TABLE = 32_767 / _ONE  # largest 16-bit entry of a table, as a multiple of the jitter
 _KEPT = 10_000  # number of recent changes from which the percentiles of the lateness are computed
-_IN_ORDER = "100gbit"
-"""Rate too high to limit anything, set because netem keeps packets in order if it has a rate."""
-_ETHERNET_BYTES = 14
-"""Length of the Ethernet header, which netem counts and the model does not [bytes]."""
+_IN_ORDER = "100gbit"  # limits nothing; netem keeps packets in order if it has a rate
+_ETHERNET_BYTES = 14  # Ethernet header, which netem counts and the model does not [bytes]
 _RATE_MIN = 8.0  # lowest rate [bit/s]: tc treats less than 1 byte/s as no limit, without a message
-_CHANCE_MIN = 2.0**-32
-"""Lowest probability above 0: tc rounds smaller values to 0, without a message."""
-_PACKET_BITS = 8 * 116
-"""Size of a command datagram with its headers [bit]; telemetry datagrams are larger."""
-_PACKETS = 1_000
-"""Assumed packet rate if there is no bottleneck [1/s]; tunnel and probes send fewer packets."""
+_CHANCE_MIN = 2.0**-32  # lowest probability above 0: tc rounds smaller values to 0, silently
+_PACKET_BITS = 8 * 116  # size of a command with its headers [bit]; telemetry is larger
+_PACKETS = 1_000  # assumed packet rate without a bottleneck [1/s]; tunnel and probes send fewer
 # The kernel's default for three bands: no type of service selects the fourth band.
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
 

@@ -36,29 +36,21 @@ Peek: TypeAlias = Callable[[bytes], tuple[int, int, int]]
 Send: TypeAlias = Callable[[bytes], object]
 """Function that sends a datagram; raises an OSError if the kernel refuses."""
 
-IN_FLIGHT_MAX = 10_000
-"""Largest number of datagrams in flight in one direction; more are dropped and counted."""
+IN_FLIGHT_MAX = 10_000  # datagrams in flight in one direction; more are dropped and counted
 DATAGRAM_MAX = 2_048  # largest length of a datagram [bytes], to limit the memory that a lane uses
 BATCH = 32  # largest number of datagrams that a lane reads or sends before the next lane's turn
-SPIN_NS = 60_000
-"""Time before a datagram is due at which the relay starts to read the clock in a loop [ns]."""
+SPIN_NS = 60_000  # the relay reads the clock in a loop for this time before a datagram is due [ns]
 STOP_PERIOD = 0.1  # longest time between two calls of the argument `stop` of `Relay.run` [s]
-ANCILLARY_SIZE = 64
-"""Size of the buffer for the kernel's time stamp and its count of dropped datagrams [bytes]."""
-AGE_MAX_NS = 50_000_000
-"""Largest time between arrival and reading of a datagram for which the relay compensates [ns]."""
-QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
-"""Name -> probability of each percentile of the lateness in reports."""
+ANCILLARY_SIZE = 64  # buffer for the kernel's time stamp and count of dropped datagrams [bytes]
+AGE_MAX_NS = 50_000_000  # largest time from arrival to reading that the relay compensates [ns]
+QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}  # percentiles of the lateness
 
 _BITS = 7  # number of significant bits of a lateness that select its bucket: buckets are 1.6 % wide
 _EARLY = -1  # bucket of the datagrams that left before they were due
 _RECENT = 10  # number of calls of `Lanes.counts` over which its percentiles are computed
-_FIFO_PRIORITY = 10
-"""Real-time priority, higher than ordinary processes, lower than the kernel's threads (50)."""
-_SWITCH_INTERVAL = 0.0002
-"""Longest time for which another thread of this process can block the relay's thread [s]."""
-_COLLECT_AFTER = 50_000
-"""Number of new objects that starts a garbage collection; most objects are datagrams in flight."""
+_FIFO_PRIORITY = 10  # above ordinary processes, below the kernel's threads (50)
+_SWITCH_INTERVAL = 0.0002  # longest time for which another thread can block the relay's thread [s]
+_COLLECT_AFTER = 50_000  # new objects before a garbage collection; most are datagrams in flight
 # Source: Linux, include/uapi/asm-generic/socket.h, prctl.h; Python has no names for them.
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SET_TIMERSLACK = 35, 40, 29
 

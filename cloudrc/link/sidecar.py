@@ -32,8 +32,7 @@ from cloudrc.records import Counted
 
 Mode: TypeAlias = Literal["auto", "netem", "relay"]
 """Setting `link.mode`: the only allowed shaper, or "auto": netem if it works, else the relay."""
-COUNT_PERIOD_NS = 1_000_000_000
-"""Time between two updates of the metrics and of the file that reports the lateness [ns]."""
+COUNT_PERIOD_NS = 1_000_000_000  # between two updates of the metrics and the lateness file [ns]
 STEP = 0.05  # longest time until `run` reacts to a new peer or profile [s]
 
 Shaper: TypeAlias = RelayShaper | Netem

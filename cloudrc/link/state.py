@@ -17,8 +17,7 @@ from cloudrc.files import write_atomically
 from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
 
 STATE_FILE = "link.json"  # name of the state file, in the folder of the route file
-PROFILE_FILE = "profile.json"
-"""Name of the profile file for the relay of a local run, in the folder of the state files."""
+PROFILE_FILE = "profile.json"  # profile of a local run's relay, in the folder of the state files
 STATE_MAX = 1 << 16
 """Size limit of a state file that world or cloud reads [bytes]: room for a time line of about 800
 changes. Reading a file of 1 MiB could block the control loop for 2 s."""
@@ -29,8 +28,7 @@ RELEASED = frozenset(
     | {f"release_error_{quantile}_ns" for quantile in ("p50", "p99", "p999")}
 )
 """Names in the file with the suffix `RELEASED_SUFFIX`."""
-CHANGE_FILE = "change.json"
-"""Name of the file with the last `Change` of a profile, in the profile's folder."""
+CHANGE_FILE = "change.json"  # last `Change` of a profile, in the profile's folder
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,15 +23,10 @@ from cloudrc.files import read
 from cloudrc.link.profile import Trace
 
 SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a second
-START_MAX = 600.0
-"""Latest time of a trace's first row [s]: until this time a flight uses only the first row."""
-UNIX_TIME = 1e8
-"""If the time of the first row is at least this large, all times are Unix times [s] (1e8 is in
-March 1973). Then the time of the first row is subtracted."""
+START_MAX = 600.0  # latest time of the first row; until then a flight uses this row alone [s]
+UNIX_TIME = 1e8  # from here on, times are Unix times (1e8 is in March 1973) [s]
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
-_ROWS_TO_JUDGE = 10
-"""Smallest number of rows with which a delay of 0 may mark a lost packet. Shorter traces are
-probably typed by hand."""
+_ROWS_TO_JUDGE = 10  # fewer rows are typed by hand: there a delay of 0 marks no lost packet
 
 
 def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:

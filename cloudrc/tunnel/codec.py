@@ -28,11 +28,9 @@ from cloudrc.messages import (
     Vector,
 )
 
-VERSION = 6
-"""Version of the wire format. Each release of cloudrc uses one version and refuses all others."""
+VERSION = 6  # of the wire format; a release of cloudrc refuses all other versions
 PLAN_MAX = 80  # largest number of velocities in a command's plan
-DATAGRAM_MAX = 1200
-"""Size of the receive buffer [bytes]; every valid datagram is shorter, and fits into a packet."""
+DATAGRAM_MAX = 1200  # size of the receive buffer; valid datagrams fit into one packet [bytes]
 NUMBER_MAX = 2**32 - 1  # highest number of an operator request
 
 

@@ -28,18 +28,13 @@ from cloudrc.tunnel.session import NO_EPOCH, Session
 
 EPOCH_MAX = 2**32 - 1  # largest session number that the header can hold; the next number is 1
 CHALLENGE_NS = 100_000_000  # shortest time between two challenges [ns]
-COOKIE_NS = 2_000_000_000
-"""Length of the time slot of a cookie [ns]. A cookie is valid in its slot and in the next slot."""
-GRACE_NS = 1_000_000_000
-"""Time for which a cloud keeps a new session before world has its first encrypted datagram [ns]."""
-REPEATS_MAX = 3
-"""Number of times that world repeats its ACCEPT to a cloud that sends no encrypted datagrams."""
-CLOUDS_MAX = 64
-"""World remembers the counter of the newest hello for at most this many cloud processes."""
+COOKIE_NS = 2_000_000_000  # length of a time slot; a cookie is valid in its slot and the next [ns]
+GRACE_NS = 1_000_000_000  # a new session waits so long for its first encrypted datagram [ns]
+REPEATS_MAX = 3  # repeats of ACCEPT to a cloud that sends no encrypted datagrams
+CLOUDS_MAX = 64  # cloud processes whose newest hello world remembers
 NO_COOKIE = bytes(codec.COOKIE_SIZE)  # cookie in a hello for which cloud has no cookie from world
 REPLIES_MAX = 3  # largest number of challenges that cloud answers per periodic hello
-COOKIES_MAX = 4096
-"""Number of cookies that cloud remembers: at one cookie every 2 s, those of more than two hours."""
+COOKIES_MAX = 4096  # cookies that cloud remembers: at one every 2 s, of more than two hours
 WORLDS_MAX = 64  # cloud ignores late answers from at most this many earlier world processes
 
 

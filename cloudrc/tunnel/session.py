@@ -29,8 +29,7 @@ from cloudrc.tunnel.codec import (
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 
 NO_EPOCH = 0  # epoch of an end without a session, and of every HELLO, CHALLENGE and BUSY datagram
-TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}
-"""Kinds of handshake datagrams that belong to no session: all except ACCEPT."""
+TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}  # belong to no session
 _PUBLIC_KEY = b"nothing is secret in one process"
 _NO_TAG = bytes(TAG_SIZE)
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does

@@ -26,8 +26,7 @@ from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline, mea
 RUNS, RUN_LENGTH = 200, 1000
 """Number of simulated links for a band, and number of datagrams on each simulated link. The band is
 scaled for measurements with another number of datagrams."""
-TAIL = 1e-3
-"""Share of correct links with a value below a band, and share with a value above it, in [0, 1]."""
+TAIL = 1e-3  # share of correct links below a band, and share above it, in [0, 1]
 SAME_DELAYS, SAME_LOSSES = 0.5, 0.97
 """Limits above which a link counts as a relay with the predicted random numbers: correlation of
 measured and predicted delays; share of datagrams whose loss or arrival was predicted."""
@@ -43,8 +42,7 @@ TOLERANCES = {
 }
 """Quantity -> tolerance in the unit of the quantity, and tolerance as a share of the requested
 value. The larger tolerance applies. For the deviation on a relay, half the share is used."""
-SHARE_TOLERANCE = (0.02, 0.25)
-"""Tolerance of loss, reordering and duplication: absolute [1], and as a share of the request."""
+SHARE_TOLERANCE = (0.02, 0.25)  # of shares: absolute [1], and relative to the request
 UNITS = {"mean": "s", "round_trip": "s", "deviation": "s", "rate": "bit/s"}
 """Quantity -> unit; quantities that are not listed are shares with the unit "1"."""
 FEWEST, CHANCE_MAX = 300, 1.6
