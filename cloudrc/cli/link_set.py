@@ -108,11 +108,8 @@ def set_here(
 ) -> tuple[Edit, list[LinkState]]:
     """Write a new profile into the relay's folder, and wait until the relay has applied it.
 
-    Args:
-        folder: Folder that a local run's relay and `cloudrc link set` share.
-        profile: Name or file of a profile that replaces the present one; None keeps it.
-        settings: Changed values, each "uplink.KEY=VALUE" or "downlink.KEY=VALUE".
-        number: Identifies the change.
+    `profile` is the name or file of a profile that replaces the present one; None keeps it.
+    `settings` are changed values, each "uplink.KEY=VALUE". `number` identifies the change.
 
     Raises:
         BadInputError: If there is no link yet, or if a value cannot be used.

@@ -188,10 +188,8 @@ class PeerName:
     """Resolves the name of the other pod, whose address changes when the pod is replaced.
 
     While an old and a new pod overlap, a headless Service returns the addresses of both pods. The
-    address that appeared last belongs to the new pod; this class uses that address.
-
-    Attributes:
-        failures: Number of failed resolutions.
+    address that appeared last belongs to the new pod; this class uses that address. `failures`
+    counts failed resolutions.
     """
 
     def __init__(

@@ -297,9 +297,7 @@ def _is_ours(root: dict[str, Any]) -> bool:
 class Steps:
     """Counts the changes that a time line makes to a qdisc, and how late each change is.
 
-    Attributes:
-        applied: Number of changes made.
-        passed_over: Number of changes skipped because the next change was already due.
+    `applied` changes were made; `passed_over` were skipped, because the next was already due.
     """
 
     def __init__(self) -> None:
@@ -321,11 +319,7 @@ class Steps:
 
 
 class Netem:
-    """Shapes one direction of the link with the kernel's netem.
-
-    Attributes:
-        steps: Number and lateness of the changes that the time line has made.
-    """
+    """Shapes one direction of the link with the kernel's netem."""
 
     name = "netem"
 

@@ -128,11 +128,8 @@ class Stamps:
 class Lane:
     """One direction of the relay: reads datagrams, and sends them when they are due.
 
-    Attributes:
-        source: Bound UDP socket at which the datagrams arrive; the caller closes it.
-        direction: Model of this direction of the link.
-        origin_ns: Start of the model's time [ns], monotonic; None until the first datagram sets it.
-        errors: Histogram of how late datagrams left.
+    The datagrams arrive at the bound UDP socket `source`, which the caller closes. `origin_ns` is
+    the start of the model's time [ns], monotonic; None until the first datagram sets it.
     """
 
     def __init__(
@@ -320,13 +317,10 @@ class Relay(Lanes):
         world_peer: Address,
         cloud_peer: Address,
     ) -> None:
-        """Connect the sockets of both sides to world and cloud.
+        """Connect both sockets; raise an OSError if one cannot reach world or cloud.
 
         The caller has bound the sockets and closes them. Both models must have the origin 0. World
         and cloud must send from the address at which they receive.
-
-        Raises:
-            OSError: If world or cloud cannot be reached from its socket's address.
         """
         world_side.connect(world_peer)
         cloud_side.connect(cloud_peer)
@@ -355,16 +349,10 @@ class RelayShaper(Lanes):
     def __init__(
         self, listen: Address, direction: LinkDirection, peek: Peek, end: Address | None = None
     ) -> None:
-        """Open the two sockets.
+        """Open the two sockets; raise an OSError if `listen` is in use or `end` cannot reach it.
 
-        Args:
-            listen: Address to which this pod's end of the tunnel sends; port 0: the kernel chooses.
-            direction: Model of the link, whose origin is a time on the monotonic clock.
-            peek: Function that reads kind, epoch and counter of a datagram.
-            end: Address from which this pod's end of the tunnel sends. None accepts any sender.
-
-        Raises:
-            OSError: If `listen` is in use, or cannot be reached from `end`.
+        This pod's end of the tunnel sends from `end` (None: any address) to `listen` (port 0: the
+        kernel chooses). The origin of the model `direction` is a time on the monotonic clock.
         """
         self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._inside.bind(listen)

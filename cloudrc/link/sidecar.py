@@ -1,7 +1,6 @@
 """Run a pod's `link` container: choose relay or netem, and follow changes of profile and peer.
 
-The route file contains the address to which this pod's end of the tunnel has to send. Other threads
-set the attributes `peer` and `profile` of the `Sidecar`. Only the thread in `run` uses the shaper.
+The route file contains the address to which this pod's end of the tunnel has to send.
 """
 
 from __future__ import annotations
@@ -89,9 +88,8 @@ class Metrics(Protocol):
 class Sidecar:
     """Shapes the datagrams that this pod's end of the tunnel sends.
 
-    Attributes:
-        peer: Address of the other pod's end of the tunnel; set by another thread.
-        profile: The requested profile; set by another thread.
+    Another thread sets `peer`, the address of the other pod's end, and `profile`, the requested
+    profile.
     """
 
     def __init__(

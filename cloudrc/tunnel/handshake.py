@@ -55,13 +55,10 @@ class ServerHandshake:
     """World's side of the handshake: decide which cloud gets a session, and number sessions."""
 
     def __init__(self, session: Session, nonce: bytes, clock: bytes, age_max_ns: int) -> None:
-        """Begin without a session.
+        """Begin without a session; this class begins the sessions of `session`.
 
-        Args:
-            session: Keys and counters of world's session; this class begins the sessions.
-            nonce: 16 bytes that identify this process, new at every start.
-            clock: 16 bytes that identify the monotonic clock of this machine.
-            age_max_ns: Silence of a cloud after which another cloud can get a session [ns].
+        `nonce` and `clock` have 16 bytes each, which identify this process and the monotonic clock
+        of this machine. After a silence of `age_max_ns` [ns] another cloud can get a session.
         """
         self._session = session
         self._nonce, self._clock, self._epoch = nonce, clock, NO_EPOCH

@@ -18,19 +18,15 @@ _LABEL = b"cloudrc %d " % VERSION
 
 @dataclass(frozen=True, repr=False, slots=True)
 class Key:
-    """A secret pre-shared key of 32 bytes.
-
-    Attributes:
-        name: Short public name, which tells keys apart in logs.
+    """A secret pre-shared key of 32 bytes. `repr` and messages of errors do not show the secret.
 
     Raises:
-        ValueError: If the secret is not 32 bytes long, or if all bytes are zero. The message does
-            not contain the secret.
+        ValueError: If the secret is not 32 bytes long, or if all bytes are zero.
     """
 
     _secret: bytes
     _tag_key: bytes = field(init=False, compare=False)
-    name: str = field(init=False, compare=False)
+    name: str = field(init=False, compare=False)  # short and public, to tell keys apart in logs
 
     def __post_init__(self) -> None:
         if len(self._secret) != KEY_SIZE:

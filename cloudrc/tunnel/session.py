@@ -50,13 +50,9 @@ class NoCipher:
 class Session:
     """Keys and counters of one end in the present session.
 
-    Attributes:
-        epoch: Number of the session; `NO_EPOCH` without a session.
-        sealed: Whether datagrams of the session are encrypted and authenticated.
-        ring: The pre-shared keys; `follow_keys` adopts changes.
-        greeting_key: Pre-shared key that verified the last handshake datagram.
-        epoch_key: Pre-shared key of the session.
-        is_outdated: Whether the key file has a newer key than the session.
+    `epoch` is the number of the session, or `NO_EPOCH`. `epoch_key` is the pre-shared key of the
+    session; `is_outdated` tells whether the key file has a newer one. `greeting_key` is the
+    pre-shared key that verified the last handshake datagram.
     """
 
     def __init__(self, sends: Direction, ring: KeyRing | None) -> None:
