@@ -51,8 +51,6 @@ _END_OF_TABLE = 32_767 / _ONE  # largest 16-bit entry of a table, as a multiple 
 _KEPT = 10_000  # number of recent changes from which the percentiles of the lateness are computed
 _IN_ORDER = "100gbit"  # limits nothing; netem keeps packets in order if it has a rate
 _ETHERNET_BYTES = 14  # Ethernet header, which netem counts and the model does not [bytes]
-_RATE_MIN = 8.0  # lowest rate [bit/s]: tc treats less than 1 byte/s as no limit, without a message
-_CHANCE_MIN = 2.0**-32  # lowest probability above 0: tc rounds smaller values to 0, silently
 _PACKET_BITS = 8 * 116  # size of a command with its headers [bit]; telemetry is larger
 _PACKETS = 1_000  # assumed packet rate without a bottleneck [1/s]; tunnel and probes send fewer
 # The kernel's default for three bands: no type of service selects the fourth band.
@@ -177,20 +175,13 @@ def write_table(folder: Path, profile: DirectionProfile) -> None:
 def check(profile: DirectionProfile) -> None:
     """Raise a BadInputError with the reason if netem cannot realise a profile."""
     pieces = Timeline(profile).pieces
-    losses = [piece.loss for piece in pieces]
-    chances = [chance for loss in losses for chance in _chances(loss)]
-    chances += [profile.duplicate, profile.reorder, profile.corrupt]
-    bottleneck = any(piece.rate and piece.jitter for piece in pieces) and not profile.keep_order
     refused = {
         "a trace with loop": profile.trace is not None and profile.trace.loop,
         "loss.delay_bad_ms (more delay while a burst of losses lasts)": any(
-            isinstance(loss, GilbertElliott) and loss.delay_bad for loss in losses
+            isinstance(piece.loss, GilbertElliott) and piece.loss.delay_bad for piece in pieces
         ),
-        "rate_kbit with jitter_ms but without keep_order": bottleneck,
-        f"rate_kbit below {_RATE_MIN * 1e-3:g}": any(
-            0.0 < (piece.rate or inf) < _RATE_MIN for piece in pieces
-        ),
-        "a probability below 2**-32": any(0.0 < chance < _CHANCE_MIN for chance in chances),
+        "rate_kbit with jitter_ms but without keep_order": not profile.keep_order
+        and any(piece.rate and piece.jitter for piece in pieces),
         f"delay_ms above {DELAY_MAX_MS}": any(
             piece.delay_ns > DELAY_MAX_MS * 1e6 for piece in pieces
         ),
@@ -261,15 +252,10 @@ def limit(profile: DirectionProfile) -> int:
 
 
 def _loss(loss: Loss) -> list[str]:
-    kind = "gemodel" if isinstance(loss, GilbertElliott) else "random"
-    return [kind, *map(_percent, _chances(loss))]
-
-
-def _chances(loss: Loss) -> tuple[float, ...]:
-    """Return the loss probabilities in the order of tc's arguments, in [0, 1]."""
-    if isinstance(loss, GilbertElliott):
-        return loss.bad_start, loss.bad_end, loss.loss_bad, loss.loss_good
-    return (loss,)
+    if not isinstance(loss, GilbertElliott):
+        return ["random", _percent(loss)]
+    chances = (loss.bad_start, loss.bad_end, loss.loss_bad, loss.loss_good)
+    return ["gemodel", *map(_percent, chances)]
 
 
 def _microseconds(duration_ns: float) -> str:

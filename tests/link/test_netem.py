@@ -163,8 +163,6 @@ def test_a_profile_is_put_into_tcs_words(profile, at, words):
         (DirectionProfile(trace=Trace((0.0, 9.0), (0.1, 0.3), loop=True)), "a trace with loop"),
         (DirectionProfile(changes=(Change(1.0, loss=BURSTS),)), "loss.delay_bad_ms"),
         (DirectionProfile(rate=1e6, changes=(Change(1.0, jitter=0.1),)), "without keep_order"),
-        (DirectionProfile(rate=4.0), "rate_kbit below 0.008"),
-        (DirectionProfile(loss=GilbertElliott(0.1, 1e-11)), "a probability below 2**-32"),
         (DirectionProfile(blackouts=(Blackout(1.0, 0.004),)), "blackouts shorter than 5 ms"),
     ],
 )
