@@ -1,8 +1,7 @@
-"""Run `cloudrc link ACTION`.
+"""Run `cloudrc link ACTION`: the action `show`, and the arguments of `verify`.
 
-This module contains the action `show`; the modules `cli/link_<action>.py` contain the others. The
-arguments of `verify` are here, too: the module of `verify` imports large packages, which would slow
-down `cloudrc link --help`.
+The modules `cli/link_<action>.py` contain the other actions. The module of `verify` imports large
+packages, which would slow down `cloudrc link --help`.
 """
 
 from __future__ import annotations
@@ -82,11 +81,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "packets": (1, PACKETS_MAX),
 }
 """Option of `show` -> its least and largest value."""
-ROWS = 1000
-"""Smallest number of packets in the picture of a trace. If the trace has fewer rows,
-several packets follow each row."""
-SECONDS = 30.0
-"""Shortest time that the picture shows by default [s]; a longer time line is shown in full."""
+ROWS = 1000  # least packets in a picture of a trace; several follow each row of a short trace
+SECONDS = 30.0  # shortest time shown by default; a longer time line is shown in full [s]
 KINDS = ("png", "svg", "pdf")
 
 

@@ -37,8 +37,6 @@ examples:
 A trace describes one direction. A run has two: without --direction the command
 writes both, and adds the direction to each file name."""
 DIRECTIONS: tuple[Direction, ...] = ("uplink", "downlink")
-UNPACKED_MAX = 64 << 20
-"""Largest size of an unpacked log [bytes]: 10 min of irtt at 100 Hz."""
 SETTLING_NS = 2_000_000_000
 """Length of the last part of a session [ns]. A datagram sent in this part never counts as lost: it
 may have been on its way when the session ended."""
@@ -117,31 +115,13 @@ def _from_log(path: Path, options: argparse.Namespace) -> Packets:
 
     name, halve = str(path), options.halve_rtt
     remedy = "give a run, a log of ping or irtt, or a CSV file"
-    lines = _unpack(path) if path.suffix == ".gz" else read_lines(path, name, remedy)
+    lines = read_lines(path, name, remedy)
     refuse_others(lines, name)
     if lines and lines[0].lstrip().startswith(("{", "[{")):
         return read_irtt("\n".join(lines), name, options.direction, halve=halve)
     if is_ping(lines):
         return read_ping(lines, name, halve=halve)
     return read_csv(lines, name, halve=halve, trust_units=options.trust_units)
-
-
-def _unpack(path: Path) -> list[str]:
-    import gzip
-    import zlib
-
-    from cloudrc.link.traces import decode
-
-    try:
-        with gzip.open(path) as file:
-            data = file.read(UNPACKED_MAX + 1)
-        if len(data) > UNPACKED_MAX:
-            raise OSError(f"it holds more than {UNPACKED_MAX >> 20} MiB")
-        return decode(data)
-    except (OSError, EOFError, ValueError, zlib.error) as error:
-        raise BadInputError(
-            f"{path}: cannot be unpacked: {error}; give the unpacked file"
-        ) from None
 
 
 def _recording(path: Path) -> Recording:

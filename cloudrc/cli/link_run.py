@@ -1,24 +1,24 @@
 """Run `cloudrc link run`: the process in a pod's link container, which shapes one direction.
 
-GET /link.json on the metrics port returns the state of the shaper. The process calls tc and ip for
-this answer, and caches the answer for one second.
+GET /link.json on the metrics port returns the state of the shaper and the pod's netem qdiscs. The
+process calls tc and ip for this answer, at most once a second.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import random
-import select
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.output import print_line
 from cloudrc.cli.processes import (
@@ -33,19 +33,14 @@ from cloudrc.drivers.process import StopSignal
 if TYPE_CHECKING:
     from cloudrc.link.follow import Load
     from cloudrc.link.netem import Answer
-    from cloudrc.link.sidecar import Machine, Near, Sidecar
+    from cloudrc.link.sidecar import Machine, Sidecar
 
 EPILOG = ""
-STATUS_PERIOD = 1.0
-"""Time for which the process caches the answer to GET /link.json [s]."""
-EMPTY_STATUS = "{}\n"
-"""Answer to GET /link.json before the shaper has started."""
-TOOL_TIMEOUT = 5.0
-"""Time limit of one call of tc or ip [s]."""
+TOOL_TIMEOUT = 5.0  # time limit of one call of tc or ip [s]
 _BATCH = ("tc", "-s", "-j", "-force", "-batch", "-")
 _END = "qdisc show dev lo"
-"""Command that is sent to tc after each other command. When its answer arrives, the answer to the
-other command is complete; tc itself does not mark the end of an answer."""
+"""Command that is sent to tc after each change. Its answer, a list, marks the end of the change's
+answer; tc itself does not mark it."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,7 +70,6 @@ def execute(options: argparse.Namespace) -> int:
     """Shape one direction of the link until SIGTERM."""
     stop = StopSignal()  # first: until then, process 1 of a container ignores SIGTERM
     from cloudrc.link.follow import HANDED_FILE, PEER_PAUSE, PROFILE_PERIOD, PeerName, Profiles
-    from cloudrc.link.netem import write_tables
     from cloudrc.link.sidecar import Sidecar
 
     warn_if_exposed(options.listen)
@@ -84,7 +78,6 @@ def execute(options: argparse.Namespace) -> int:
     profiles = Profiles(options.profile, document, make_profile_loader(options.direction), log)
     profile, peer = profiles.first(), PeerName(options.peer, ipv4_addresses, log)
     with TemporaryDirectory(prefix="tc-", dir=options.route.parent) as tables:
-        write_tables(Path(tables))
         programs = Programs(tables)
         sidecar = Sidecar(
             _machine(options, programs, Path(tables)),
@@ -104,7 +97,7 @@ def execute(options: argparse.Namespace) -> int:
                 exporter.unresolved(peer.failures)
 
         if exporter:
-            exporter.link.tell = LinkStatusSource(sidecar).text
+            exporter.link.tell = lambda: status_page(sidecar)
         try:
             _repeat(poll_profile, PROFILE_PERIOD, PROFILE_PERIOD)
             _repeat(resolve_peer, *PEER_PAUSE)
@@ -169,36 +162,19 @@ def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None
     threading.Thread(target=work, daemon=True).start()
 
 
-def inspect_network(host: str) -> Near | None:
-    """Find the netem qdiscs of this network namespace and the route to `host`, an IPv4 address."""
-    from cloudrc.link.sidecar import look_near
+def status_page(sidecar: Sidecar) -> str:
+    """Return the state of a sidecar as JSON. Any thread may call this function."""
+    peer = sidecar.peer
+    netems = _find_netems(peer[0], int(time.monotonic())) if peer else {}
+    return json.dumps(sidecar.status() | netems) + "\n"
 
-    return look_near(run_tool, host)
 
+@lru_cache(maxsize=1)
+def _find_netems(host: str, second: int) -> dict[str, Any]:
+    """Find the netem qdiscs of this pod, once in each `second` on the monotonic clock [s]."""
+    from cloudrc.link.sidecar import find_netems
 
-class LinkStatusSource:
-    """Caches the state of a sidecar as JSON. Any thread may call `text`."""
-
-    def __init__(
-        self,
-        sidecar: Sidecar,
-        look: Callable[[str], Near | None] = inspect_network,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._sidecar, self._look, self._clock = sidecar, look, clock
-        self._lock, self._text, self._valid_until = threading.Lock(), EMPTY_STATUS, -STATUS_PERIOD
-
-    def text(self) -> str:
-        """Return the state as JSON; call tc and ip at most once a second."""
-        from cloudrc.link.sidecar import write_told
-
-        with self._lock:
-            if self._clock() >= self._valid_until:
-                status, peer = self._sidecar.told(), self._sidecar.peer
-                if status is not None and peer is not None:
-                    self._text = write_told(replace(status, near=self._look(peer[0])))
-                self._valid_until = self._clock() + STATUS_PERIOD
-            return self._text
+    return find_netems(run_tool, host)
 
 
 def run_tool(words: Sequence[str], environment: dict[str, str] | None = None) -> Answer:
@@ -220,24 +196,21 @@ class Programs:
     """Runs tc and ip.
 
     The steps of a time line have to take effect within milliseconds; starting a process takes
-    longer. Therefore one `tc -batch -` process stays open for all changes and lists of qdiscs.
+    longer. Therefore one `tc -batch -` process stays open for all changes.
     """
 
     def __init__(self, tables: str = "") -> None:
         """Set the folder with the distribution tables of tc; start no process yet."""
         self._environment = {**os.environ, "TC_LIB_DIR": tables, "LC_ALL": "C"}
-        self._tc: subprocess.Popen[bytes] | None = None
+        self._tc: subprocess.Popen[str] | None = None
 
     def __call__(self, words: Sequence[str]) -> Answer:
         """Run a command of tc or ip, and return its answer."""
-        try:
-            match list(words):
-                case ["tc", "qdisc", "change", *_]:
-                    return self._ask(" ".join(words[1:]), lists=False)
-                case ["tc", "-s", "-j", "qdisc", "show", *_]:
-                    return self._ask(" ".join(words[3:]), lists=True)
-        except OSError:  # tc was killed or is too old for -batch: start it for this command alone
-            self.close()
+        if tuple(words[:3]) == ("tc", "qdisc", "change"):
+            try:
+                return self._change(" ".join(words[1:]))
+            except OSError:  # tc was killed or is too old for -batch: start it for this command
+                self.close()
         return run_tool(words, self._environment)
 
     def close(self) -> None:
@@ -247,34 +220,24 @@ class Programs:
             self._tc.communicate()
             self._tc = None
 
-    def _ask(self, line: str, *, lists: bool) -> Answer:
-        """Send a command to the open tc process; `lists` tells whether the command lists qdiscs.
-
-        Raise an OSError if tc does not answer.
-        """
+    def _change(self, line: str) -> Answer:
+        """Send a command to the open tc process; raise an OSError if tc has ended."""
         from cloudrc.link.netem import Answer
 
-        tc, pipe = self._tc, subprocess.PIPE
-        if tc is None:
-            self._tc = tc = subprocess.Popen(
-                _BATCH, 0, stdin=pipe, stdout=pipe, stderr=subprocess.STDOUT, env=self._environment
+        if self._tc is None:
+            pipe, merged = subprocess.PIPE, subprocess.STDOUT
+            self._tc = subprocess.Popen(
+                _BATCH, 1, stdin=pipe, stdout=pipe, stderr=merged, text=True, env=self._environment
             )
-        assert tc.stdin is not None
-        assert tc.stdout is not None
-        tc.stdin.write(f"{line}\n{_END}\n".encode())
-        deadline, text = time.monotonic() + TOOL_TIMEOUT, b""
-        while True:
-            lines = text.decode(errors="replace").splitlines() if text.endswith(b"\n") else []
-            failed = any(one.startswith("Command failed -:") for one in lines)
-            listings = [one for one in lines if one.startswith("[")]
-            if len(listings) == 1 + (lists and not failed):
-                break
-            ready, _, _ = select.select([tc.stdout], [], [], deadline - time.monotonic())
-            data = tc.stdout.read(1 << 16) if ready else b""
-            if not data:
-                raise OSError("no answer of tc")
-            text += data
-        if failed:
-            said = [one for one in lines if not one.startswith(("[", "Command failed"))]
-            return Answer(2, "", "\n".join(said))
-        return Answer(0, listings[0] if lists else "", "")
+        assert self._tc.stdin is not None
+        assert self._tc.stdout is not None
+        self._tc.stdin.write(f"{line}\n{_END}\n")
+        self._tc.stdin.flush()
+        said = list[str]()
+        while not (answer := self._tc.stdout.readline()).startswith("["):
+            if not answer:
+                raise OSError("tc has ended")
+            said.append(answer.strip())
+        failed = any(one.startswith("Command failed") for one in said)
+        errors = [one for one in said if not one.startswith("Command failed")]
+        return Answer(2 if failed else 0, "", "\n".join(errors))

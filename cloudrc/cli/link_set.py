@@ -42,8 +42,7 @@ anew; single values leave them running. The change is recorded. It lasts until
 the next change, the end of the run, or 'helm upgrade'."""
 COLUMNS = ("delay_ms", "jitter_ms", "distribution", "loss", "rate_kbit")
 """Keys of a direction that have columns of their own; the column OTHER shows all other keys."""
-LOCAL_TIMEOUT = 5.0
-"""Time limit for a local relay to apply a change [s]; a relay needs about 0.2 s."""
+LOCAL_TIMEOUT = 5.0  # time limit for a local relay to apply a change [s]; a relay needs about 0.2 s
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -109,11 +108,8 @@ def set_here(
 ) -> tuple[Edit, list[LinkState]]:
     """Write a new profile into the relay's folder, and wait until the relay has applied it.
 
-    Args:
-        folder: Folder that a local run's relay and `cloudrc link set` share.
-        profile: Name or file of a profile that replaces the present one; None keeps it.
-        settings: Changed values, each "uplink.KEY=VALUE" or "downlink.KEY=VALUE".
-        number: Identifies the change.
+    `profile` is the name or file of a profile that replaces the present one; None keeps it.
+    `settings` are changed values, each "uplink.KEY=VALUE". `number` identifies the change.
 
     Raises:
         BadInputError: If there is no link yet, or if a value cannot be used.

@@ -29,7 +29,7 @@ import numpy as np
 from cloudrc.assembly import link_profile
 from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.link import VERIFY_DEFAULT
-from cloudrc.cli.link_run import Programs, inspect_network
+from cloudrc.cli.link_run import run_tool
 from cloudrc.cli.output import escape, format_document, paint, table
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.cluster.client import end_process
@@ -49,7 +49,7 @@ from cloudrc.errors import (
     TimedOutError,
 )
 from cloudrc.link.netem import check
-from cloudrc.link.sidecar import Told, read_told
+from cloudrc.link.sidecar import find_netems
 from cloudrc.link.state import STATE_FILE, from_text
 from cloudrc.link.verify.causes import (
     Findings,
@@ -62,27 +62,20 @@ from cloudrc.link.verify.judge import UNITS, Expected, Flow, Plan, Row, look_twi
 from cloudrc.link.verify.probe import PROBE, ProbeEnd, plan_probes, send_probes
 from cloudrc.tunnel.codec import SIZES, Kind
 
-RELEASE_TIMEOUT = 270.0
-"""Default time limit for the verdict on a release [s]."""
-START_LIMIT = 90.0
-"""Time limit for the processes of both directions to start, long enough for a slow disk [s]."""
-COUNTS_WAIT = 1.3
-"""Wait after the last probe [s]: the link's processes update their counts once a second."""
-POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0
-"""Pause between two polls of a release, and time limit of one HTTP request [s]."""
+RELEASE_TIMEOUT = 270.0  # default time limit for the verdict on a release [s]
+START_LIMIT = 90.0  # for the processes of both directions to start, on a slow disk [s]
+COUNTS_WAIT = 1.3  # after the last probe: processes update their counts once a second [s]
+POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0  # of a release; of one HTTP request [s]
 PORTS = METRICS["world"]["world"], METRICS["world"]["link"]
 LOOPBACK, DEVICE = "127.0.0.1", "tunnel"
-HOSTS = {"uplink": "10.79.7.1", "downlink": "10.79.7.2"}
-"""Direction -> IPv4 address of the sender, in the sender's network namespace."""
+HOSTS = {"uplink": "10.79.7.1", "downlink": "10.79.7.2"}  # addresses of the senders
 WAYS = {
     "uplink": ("world", "cloud", Kind.TELEMETRY),
     "downlink": ("cloud", "world", Kind.COMMAND),
 }
 """Direction -> sender, receiver, and the kind of datagram that the sender sends."""
-KEYS = ("asked", "measured", "low", "high")
-"""Keys of the values in a row of the report, in the order of the table's columns."""
-NOT_JUDGED = "NOT JUDGED"
-"""Words in a note about a quantity of the profile that the command could not verify."""
+KEYS = ("asked", "measured", "low", "high")  # values of a row, in the order of the table's columns
+NOT_JUDGED = "NOT JUDGED"  # in a note about a quantity that could not be verified
 TOLD = {
     "correlation": f"correlation {NOT_JUDGED}: netem realises almost none of it",
     "rate": f"rate {NOT_JUDGED}: only trains of probes measure it, up to 100 Mbit/s",
@@ -202,10 +195,10 @@ def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, 
     time.sleep(COUNTS_WAIT)
     for (name, way), stream in zip(ways.items(), streams, strict=True):
         with inside(way.namespace):
-            near = inspect_network(way.peer[0])
+            page = {"shaper": states[name].shaper, "reason": states[name].reason}
+            page |= find_netems(run_tool, way.peer[0])
             metrics = read_metrics(fetch(f"http://{LOOPBACK}:{way.ports[1]}/metrics"))
-        told = Told(states[name].shaper, states[name].reason, None, near)
-        known = read_evidence(told, metrics, len(stream.sent))
+        known = read_evidence(page, metrics, len(stream.sent))
         found[name] = Findings(plans[name].judge(stream), known)
     return found
 
@@ -306,7 +299,7 @@ def _namespaces() -> Iterator[dict[str, str]]:
 
 
 def _ip(*words: str) -> None:
-    if (answer := Programs()(("ip", *words))).code:
+    if (answer := run_tool(("ip", *words))).code:
         failure = " ".join(answer.error.split()) or "no program ip (package iproute2)"
         raise MissingPrerequisiteError(f"ip {' '.join(words)}: {failure}; use --shaper relay")
 
@@ -392,19 +385,17 @@ def _may_change(found: Mapping[str, Any]) -> bool:
 
 def _findings(found: Mapping[str, Any], link: str) -> Findings:
     """Combine the receiver's verdict with the report of the link container at the URL `link`."""
-    told, rows = Told("", "", None), []
-    with contextlib.suppress(ValueError):
-        told = read_told(fetch(f"{link}/link.json"))
+    page, rows = json.loads(fetch(f"{link}/link.json") or "{}"), []
     for one in found["rows"]:
         name, values = one["quantity"], (one.get(key, nan) for key in KEYS)
         asked, measured, low, high = map(float, values)
         row = Row(name, UNITS.get(name, "1"), asked, measured, low, high, one["verdict"])
         # The datagrams of a flight do not show the rate. Take the rate that the shaper reports.
-        if name == "rate" and told.applied:
+        if name == "rate" and "rate" in page:
             expected = Expected({name: (asked, asked, asked)}, np.zeros(0), known=True)
-            row = expected.judge(name, told.applied.rate or inf)
+            row = expected.judge(name, page["rate"] or inf)
         rows.append(row)
-    return Findings(rows, read_evidence(told, read_metrics(fetch(f"{link}/metrics"))))
+    return Findings(rows, read_evidence(page, read_metrics(fetch(f"{link}/metrics"))))
 
 
 def _notes(way: str, rows: Sequence[Row]) -> Iterator[str]:

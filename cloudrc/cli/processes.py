@@ -478,8 +478,7 @@ def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Cal
         nonlocal due
         if time.monotonic() >= due:
             due = time.monotonic() + PERIOD
-            counts = relay.outcomes() | relay.recent()
-            exporter.see([Counted(0, "link", name, n) for name, n in counts.items()])
+            exporter.see([Counted(0, "link", name, n) for name, n in relay.counts().items()])
         return stop()
 
     return ask

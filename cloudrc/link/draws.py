@@ -2,13 +2,11 @@
 
 Seed, direction, session (epoch) and kind of datagram select a stream of random numbers. The counter
 of the packet is its position in the stream. So its impairment does not depend on earlier calls.
-
-Random numbers are generated for blocks of 256 packets. Loss, jitter and each other purpose have a
-separate column of numbers, so that adding loss to a profile does not change the jitter. The
-functions are pure; a cache makes them fast.
+Loss, jitter and each other purpose have a separate column of numbers, so that adding loss to a
+profile does not change the jitter.
 
 Bursts and correlated jitter depend on the packet before. To limit this recursion, they restart from
-their stationary distribution every 64 blocks (16,384 packets).
+their stationary distribution every 64 blocks of 256 packets.
 
 The impairment of a packet is a tuple with one entry for each copy that arrives: no entry for a lost
 packet, two entries for a duplicated packet. An entry is the constant OVERTAKES, or the extra delay
@@ -29,14 +27,10 @@ from numpy.typing import NDArray
 
 from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
 
-BLOCK = 256
-"""Number of packets whose random numbers are generated together."""
-CHAIN_BLOCKS = 64
-"""Number of blocks after which bursts and correlated jitter restart."""
-OVERTAKES = -(1 << 62)
-"""Entry of a packet that skips both queue and delay (`reorder`)."""
-PARETO_CUT = 1e-3
-"""Probability of the tail that is cut off the Pareto distribution, in [0, 1]."""
+BLOCK = 256  # number of packets whose random numbers are generated together
+CHAIN_BLOCKS = 64  # number of blocks after which bursts and correlated jitter restart
+OVERTAKES = -(1 << 62)  # entry of a packet that skips both queue and delay (`reorder`)
+PARETO_CUT = 1e-3  # probability of the tail that is cut off the Pareto distribution, in [0, 1]
 
 _CACHED = 256
 _OUTPUTS_PER_COUNT = 4

@@ -1,9 +1,9 @@
 """Follow changes of a link in flight: of its profile and of the peer's address.
 
 `cloudrc link set` changes the release's ConfigMap, so that the change is permanent. A kubelet may
-need a minute to copy the ConfigMap to a pod. Therefore `cloudrc link set` also writes the same
-files, as one JSON document, into the pod, beside the route file. ConfigMap and document contain
-the same number of the change: the first to arrive takes effect, and the other is ignored.
+need a minute to copy it to a pod. Therefore the command also writes the same files, as one JSON
+document, into the pod. ConfigMap and document contain the same number of the change: the first to
+arrive takes effect, and the other is ignored.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,39 +20,28 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from cloudrc.errors import BadInputError
 from cloudrc.files import read, version
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.state import CHANGE_FILE, Change, read_change
+from cloudrc.link.state import CHANGE_FILE, Change, parse, read_change
 
 if TYPE_CHECKING:
     from cloudrc.link.relay import Address
 
-PROFILE_PERIOD = 0.05
-"""Time between two checks whether the profile's file has changed [s]."""
+PROFILE_PERIOD = 0.05  # time between two checks whether the profile's file has changed [s]
 PEER_PAUSE = (0.5, 1.0)
 """Shortest and longest pause before the peer's name is resolved again [s]. The pause is random, so
 that the links of many releases do not query their name server at the same time.
 Source: docs/reference/faults.md, "F19"."""
-HANDED_FILE = "asked.json"
-"""Name of the JSON document that `cloudrc link set` writes, in the folder of the route file."""
-SIZE_MAX = 1_200_000
-"""Size limit of the JSON document [bytes]: room for the content of a ConfigMap."""
+HANDED_FILE = "asked.json"  # JSON document of `cloudrc link set`, in the folder of the route
+SIZE_MAX = 1_200_000  # size limit of the JSON document [bytes]: room for the content of a ConfigMap
 PROFILE = "profile.yaml"
 _NAME = re.compile(r"[a-zA-Z0-9_][-._a-zA-Z0-9]{0,252}")
-_KNOWN = 64
-"""Number of recent changes that are remembered, to recognise a change that arrives twice."""
 
 
 class Loaded(NamedTuple):
-    """A profile as read from its file.
+    """A profile as read from its file."""
 
-    Attributes:
-        direction: Profile of the direction that this process shapes, in SI units.
-        values: Content of the file, without defaults, to show to users.
-        change: The last change of the profile: its number and cause.
-    """
-
-    direction: DirectionProfile
-    values: dict[str, Any]
-    change: Change = Change()
+    direction: DirectionProfile  # profile of the direction that this process shapes, in SI units
+    values: dict[str, Any]  # content of the file, without defaults, to show to users
+    change: Change = Change()  # the last change of the profile: its number and cause
 
 
 Load = Callable[[Path], Loaded]
@@ -105,37 +95,28 @@ class ProfileFile:
         return loaded._replace(change=read_change(note))
 
 
-class Handed(NamedTuple):
-    """A change that `cloudrc link set` writes directly into a pod, as a JSON document.
+@dataclass(frozen=True)
+class Handed:
+    """A change that `cloudrc link set` writes directly into a pod, as a JSON document."""
 
-    Attributes:
-        change: Number and cause of the change, as the text of `CHANGE_FILE`.
-        files: File name -> text, for `profile.yaml` and the traces that the profile names.
-    """
-
-    change: str
-    files: dict[str, str]
+    change: str  # number and cause of the change, as the text of `CHANGE_FILE`
+    files: dict[str, str]  # file name -> text: `profile.yaml` and the traces that it names
 
 
 def write_handed(handed: Handed) -> str:
     """Format a change as the text of the JSON document."""
-    return json.dumps(handed._asdict())
+    return json.dumps(asdict(handed))
 
 
-def read_handed(text: str) -> Handed:
+def read_handed(text: bytes | str) -> Handed:
     """Parse the text of the JSON document.
 
     Raises:
         ValueError: If the text is invalid, or if a file name could lead to another folder.
     """
-    found = json.loads(text)
-    try:
-        files = {str(name): str(content) for name, content in found["files"].items()}
-        handed = Handed(str(found["change"]), files)
-    except (TypeError, KeyError, AttributeError) as error:
-        raise ValueError(f"not a profile that was handed over: {error}") from error
-    if PROFILE not in files or not all(map(_NAME.fullmatch, files)):
-        raise ValueError(f"not a profile's files: {', '.join(sorted(files))}")
+    handed = parse(Handed, text)
+    if PROFILE not in handed.files or not all(map(_NAME.fullmatch, handed.files)):
+        raise ValueError(f"not a profile's files: {', '.join(sorted(handed.files))}")
     return handed
 
 
@@ -158,7 +139,7 @@ class _HandedFile(ProfileFile):
         """
         if self._path.lstat().st_uid != os.geteuid():
             raise ValueError(f"{self._path} belongs to another user")
-        handed = read_handed(read(self._path, SIZE_MAX).decode())
+        handed = read_handed(read(self._path, SIZE_MAX))
         with TemporaryDirectory(prefix="handed-", dir=self._path.parent) as folder:
             for name, text in handed.files.items():
                 (Path(folder) / name).write_text(text, encoding="utf-8")
@@ -200,8 +181,6 @@ class Profiles:
         if not number:
             return False
         before, self._known[number] = self._known.get(number), loaded.values
-        if len(self._known) > _KNOWN:
-            del self._known[next(iter(self._known))]
         return before == loaded.values
 
 
@@ -209,10 +188,8 @@ class PeerName:
     """Resolves the name of the other pod, whose address changes when the pod is replaced.
 
     While an old and a new pod overlap, a headless Service returns the addresses of both pods. The
-    address that appeared last belongs to the new pod; this class uses that address.
-
-    Attributes:
-        failures: Number of failed resolutions.
+    address that appeared last belongs to the new pod; this class uses that address. `failures`
+    counts failed resolutions.
     """
 
     def __init__(

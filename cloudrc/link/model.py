@@ -7,7 +7,7 @@ relay use the same model, so both get the same delays and losses.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -17,13 +17,8 @@ from numpy.typing import NDArray
 from cloudrc.link.draws import BLOCK, OVERTAKES, Fate, bit_flips, impairments, stream_key
 from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
 
-HEADER_BYTES = 28
-"""Size of the IPv4 and UDP headers [bytes], which also take time on the wire.
-
-Source: RFC 791, RFC 768.
-"""
-_TABLES = 64
-"""Number of blocks of impairments that are kept in memory."""
+HEADER_BYTES = 28  # size of the IPv4 and UDP headers (RFC 791, RFC 768), also on the wire [bytes]
+_TABLES = 64  # number of blocks of impairments that are kept in memory
 
 
 class LinkDirection:
@@ -172,55 +167,58 @@ Array: TypeAlias = NDArray[Any]
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """n packets of one direction in the order of sending.
+    """n packets of one direction in the order of sending; each array has the shape (n,)."""
 
-    Attributes:
-        sent: Times of sending, since the link came up [s], shape (n,).
-        delays: One-way delay of the copy that arrives first [s], NaN for lost packets, shape (n,).
-        copies: Number of copies of each packet that arrived [1], shape (n,).
-    """
-
-    sent: Array
-    delays: Array
-    copies: Array
+    sent: Array  # times of sending, since the link came up [s]
+    delays: Array  # one-way delay of the copy that arrives first [s]; NaN for lost packets
+    copies: Array  # number of copies of each packet that arrived [1]
 
 
 @dataclass(frozen=True, slots=True)
 class Numbers:
     """Statistics of a stream; an unknown value is NaN.
 
-    Attributes:
-        mean: Mean delay [s].
-        correlation: Correlation of the delays of successive packets [1].
-        loss: Share of packets that did not arrive, in [0, 1].
-        runs: Length of each run of successive losses.
-        overtaken: Share of arrived packets that a later packet overtook, in [0, 1]. Source: RFC
-            4737, section 3.
-        duplicated: Share of packets of which two copies arrived, in [0, 1].
+    Source: RFC 4737, section 3, for `overtaken`.
     """
 
-    mean: float
+    mean: float  # mean delay [s]
     deviation: float  # standard deviation of the delay [s]
     least: float  # [s]
     median: float  # [s]
     p99: float  # [s]
     most: float  # [s]
-    correlation: float
-    loss: float
-    runs: tuple[int, ...]
-    overtaken: float
-    duplicated: float
+    correlation: float  # correlation of the delays of successive packets [1]
+    loss: float  # share of packets that did not arrive, in [0, 1]
+    runs: tuple[int, ...]  # length of each run of successive losses
+    overtaken: float  # share of arrived packets that a later packet overtook, in [0, 1]
+    duplicated: float  # share of packets of which two copies arrived, in [0, 1]
 
 
-def sample(link: LinkDirection, kind: int, sent_ns: Sequence[int], size: int) -> Stream:
-    """Send packets of `size` bytes at rising times [ns] through a link that came up at time 0."""
-    delays = np.full(len(sent_ns), np.nan)
-    copies = np.zeros(len(sent_ns), dtype=np.int64)
+def sample(
+    link: LinkDirection,
+    kind: int,
+    sent_ns: Sequence[int],
+    size: int,
+    *,
+    epoch: int = 1,
+    first: int = 0,
+    pause: Callable[[], None] = lambda: None,
+) -> Stream:
+    """Send packets of `size` bytes at rising times [ns] through a link that came up at time 0.
+
+    Damaged packets count as lost, because the receiver rejects them. `first` is the counter of the
+    first packet. `pause` is called every few hundred microseconds.
+    """
+    delays, copies = np.full(len(sent_ns), np.nan), np.zeros(len(sent_ns), dtype=np.int64)
+    whole = bytes(size)
     for n, now_ns in enumerate(sent_ns):
-        releases = link.send(1, kind, n, size, now_ns)
+        releases = link.send(epoch, kind, first + n, size, now_ns)
+        if link.corrupts and link.corrupted(epoch, kind, first + n, whole) != whole:
+            continue
         if releases:
-            delays[n] = (min(releases) - now_ns) * 1e-9
-            copies[n] = len(releases)
+            delays[n], copies[n] = (min(releases) - now_ns) * 1e-9, len(releases)
+        if n % 128 == 0:
+            pause()
     return Stream(np.array(sent_ns) * 1e-9, delays, copies)
 
 

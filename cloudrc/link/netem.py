@@ -8,11 +8,8 @@ After a restart, `Netem` finds its qdiscs by their handles. In flight it changes
 change`, which keeps queued packets. An option that is missing in this command keeps its old value,
 so every call contains all options.
 
-`Netem` never touches a root qdisc of another program. If another program removes or changes the
-qdiscs of `Netem`, `Netem` logs an error and counts it in a metric.
-
-netem draws jitter from a table of at most 16,384 integers of 16 bits, in which 8192 stands for one
-times the jitter. The tables that come with tc differ from the distributions of the link's model.
+netem draws jitter from a table of 16-bit integers, in which 8192 stands for one times the jitter.
+The tables that come with tc differ from the distributions of the link's model.
 
 Source: tc-prio(8), tc-netem(8), tc-u32(8); iproute2 netem/README.distribution; Linux,
 net/sched/sch_netem.c (tabledist).
@@ -39,45 +36,25 @@ from cloudrc.link.draws import PARETO_CUT, Floats
 from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Loss, Timeline
 from cloudrc.link.relay import Address
 
-NOT_FOUND = 127
-"""Exit code that stands for a program that does not exist."""
-ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"
-"""Handles of the root qdisc, of its band for the tunnel's datagrams, and of the netem in that
-band."""
-PERIOD_NS = 1_000_000_000
-"""Time between two checks of the qdiscs [ns]."""
-STEP_NS = 5_000_000
-"""Shortest time between two changes that a time line makes to the qdisc [ns]. Of several changes
-within this time, only the last is made."""
-LIMIT = 10_000
-"""Largest number of packets in a qdisc without a bottleneck, as in the relay."""
-DELAY_MAX_MS = 274_000
-"""Longest delay that tc accepts [ms]: 2^32 ticks of 64 ns."""
-ENTRIES = 4096
-"""Number of entries in a table of a delay distribution."""
+NOT_FOUND = 127  # exit code that stands for a program that does not exist
+ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"  # root qdisc, band of the tunnel, its netem
+PERIOD_NS = 1_000_000_000  # time between two checks of the qdiscs [ns]
+STEP_NS = 5_000_000  # shortest time between two changes by a time line; only the last counts [ns]
+LIMIT = 10_000  # largest number of packets in a qdisc without a bottleneck, as in the relay
+DELAY_MAX_MS = 274_000  # longest delay that tc accepts [ms]: 2^32 ticks of 64 ns
+ENTRIES = 4096  # number of entries in a table of a delay distribution
 STRETCH = {"uniform": 1, "normal": 1, "pareto": 4}
 """Distribution -> divisor of the table's entries, so that the tail fits in 16 bits. To compensate,
 tc gets the jitter multiplied by the same factor."""
 _ONE = 8192
-_END_OF_TABLE = 32_767 / _ONE
-"""Largest 16-bit entry of a table, as a multiple of the jitter."""
-_KEPT = 10_000
-"""Number of recent changes from which the percentiles of the lateness are computed."""
-_IN_ORDER = "100gbit"
-"""Rate too high to limit anything, set because netem keeps packets in order if it has a rate."""
-_ETHERNET_BYTES = 14
-"""Length of the Ethernet header, which netem counts and the model does not [bytes]."""
-_RATE_MIN = 8.0
-"""Lowest rate [bit/s]: tc treats less than 1 byte/s as no limit, without a message."""
-_CHANCE_MIN = 2.0**-32
-"""Lowest probability above 0: tc rounds smaller values to 0, without a message."""
-_PACKET_BITS = 8 * 116
-"""Size of a command datagram with its headers [bit]; telemetry datagrams are larger."""
-_PACKETS = 1_000
-"""Assumed packet rate if there is no bottleneck [1/s]; tunnel and probes send fewer packets."""
+_END_OF_TABLE = 32_767 / _ONE  # largest 16-bit entry of a table, as a multiple of the jitter
+_KEPT = 10_000  # number of recent changes from which the percentiles of the lateness are computed
+_IN_ORDER = "100gbit"  # limits nothing; netem keeps packets in order if it has a rate
+_ETHERNET_BYTES = 14  # Ethernet header, which netem counts and the model does not [bytes]
+_PACKET_BITS = 8 * 116  # size of a command with its headers [bit]; telemetry is larger
+_PACKETS = 1_000  # assumed packet rate without a bottleneck [1/s]; tunnel and probes send fewer
 # The kernel's default for three bands: no type of service selects the fourth band.
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
-_INSTEAD = "set link.mode=relay, which needs nothing of the kernel"
 
 
 class Answer(NamedTuple):
@@ -119,25 +96,23 @@ class Iproute2:
 
 def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
     """Convert the failed call of a program into an error with cause and remedy."""
-    text = " ".join((answer.error or answer.output).split())
+    text = " ".join((answer.error or answer.output).split()) or f"exit code {answer.code}"
     unknown = "kind is unknown", "classifier not found", "answers: No such file"
+    cause, remedy = f"'{program} {' '.join(words)}' failed: {text}", ""
     if answer.code == NOT_FOUND:
-        cause = f"no program {program} (package iproute2); install it, or {_INSTEAD}"
+        cause, remedy = f"no program {program} (package iproute2)", "install it, or "
     elif "Operation not permitted" in text:
-        cause = (
-            "tc may not change the network of this container; give it NET_ADMIN and uid 0, or "
-            f"{_INSTEAD}"
-        )
+        cause = "tc may not change the network of this container"
+        remedy = "give it NET_ADMIN and uid 0, or "
     elif "add" in words and any(sign in text for sign in unknown):
-        cause = (
-            f"this kernel lacks sch_netem, sch_prio or cls_u32; {_INSTEAD}, or use nodes whose "
-            "kernel has them ('modprobe -a sch_netem sch_prio cls_u32' there) and a namespace for "
-            "privileged pods"
+        cause = "this kernel lacks sch_netem, sch_prio or cls_u32"
+        remedy = (
+            "use nodes whose kernel has them ('modprobe -a sch_netem sch_prio cls_u32' there) and "
+            "a namespace for privileged pods, or "
         )
-    else:
-        reason = text or f"exit code {answer.code}"
-        cause = f"'{program} {' '.join(words)}' failed: {reason}; {_INSTEAD}"
-    return MissingPrerequisiteError(cause)
+    return MissingPrerequisiteError(
+        f"{cause}; {remedy}set link.mode=relay, which needs nothing of the kernel"
+    )
 
 
 def may_shape(status: str) -> bool:
@@ -157,25 +132,29 @@ _QUANTILES: dict[str, Callable[[Floats], Floats]] = {
 }
 
 
-def table(distribution: str) -> list[int]:
-    """Compute netem's table for the distribution "uniform", "normal" or "pareto".
-
-    Returns:
-        Rounded quantiles at the probabilities (n + 0.5) / 4096, rising, shape (4096,). A value of
-        8192 / STRETCH stands for one times the jitter.
-    """
-    values = _QUANTILES[distribution]((np.arange(ENTRIES) + 0.5) / ENTRIES)
-    if distribution != "uniform":  # mean 0, standard deviation 1
-        values = (values - values.mean()) / values.std()
-    entries: list[int] = np.rint(values * _ONE / STRETCH[distribution]).astype(int).tolist()
-    return entries
-
-
 def stretch(profile: DirectionProfile) -> int:
     """Return the factor by which tc's jitter is larger than the profile's, as in `STRETCH`."""
     if profile.distribution != "table":
         return STRETCH[profile.distribution]
     return ceil(max(map(abs, profile.table)) / _END_OF_TABLE) or 1
+
+
+def table(profile: DirectionProfile) -> list[int]:
+    """Compute netem's table for the distribution of a profile.
+
+    Returns:
+        Rounded quantiles at the probabilities (n + 0.5) / 4096, rising, shape (4096,). A value of
+        8192 / `stretch` stands for one times the jitter.
+    """
+    if profile.distribution == "table":
+        places = (2 * np.arange(ENTRIES) + 1) * len(profile.table) // (2 * ENTRIES)
+        values = np.sort(profile.table)[places]
+    else:
+        values = _QUANTILES[profile.distribution]((np.arange(ENTRIES) + 0.5) / ENTRIES)
+        if profile.distribution != "uniform":  # mean 0, standard deviation 1
+            values = (values - values.mean()) / values.std()
+    entries: list[int] = np.rint(values * _ONE / stretch(profile)).astype(int).tolist()
+    return entries
 
 
 def distribution_name(profile: DirectionProfile) -> str:
@@ -186,71 +165,51 @@ def distribution_name(profile: DirectionProfile) -> str:
     return "table" + blake2b(repr(profile.table).encode(), digest_size=8).hexdigest()
 
 
-def write_tables(folder: Path) -> None:
-    """Write the tables of all distributions to a folder; TC_LIB_DIR tells tc the folder."""
-    for distribution in STRETCH:
-        _write(folder, distribution, table(distribution))
-
-
-def write_measured(folder: Path, profile: DirectionProfile) -> None:
-    """Write the table of a profile with a measured distribution; ignore other profiles."""
-    if profile.distribution == "table":
-        unit, values = _ONE / stretch(profile), sorted(profile.table)
-        picked = [values[(2 * i + 1) * len(values) // (2 * ENTRIES)] for i in range(ENTRIES)]
-        _write(folder, distribution_name(profile), [round(value * unit) for value in picked])
-
-
-def _write(folder: Path, name: str, entries: Sequence[int]) -> None:
-    (folder / f"{name}.dist").write_text("\n".join([f"# {name}", *map(str, entries), ""]))
+def write_table(folder: Path, profile: DirectionProfile) -> None:
+    """Write the table of a profile's distribution; TC_LIB_DIR tells tc the folder."""
+    name = distribution_name(profile)
+    text = "\n".join([f"# {name}", *map(str, table(profile)), ""])
+    (folder / f"{name}.dist").write_text(text)
 
 
 def check(profile: DirectionProfile) -> None:
     """Raise a BadInputError with the reason if netem cannot realise a profile."""
     pieces = Timeline(profile).pieces
-    losses = [piece.loss for piece in pieces]
-    chances = [chance for loss in losses for chance in _chances(loss)]
-    chances += [profile.duplicate, profile.reorder, profile.corrupt]
-    slowest_ms = max(piece.delay_ns for piece in pieces) * 1e-6
-    found = ""
-    if profile.trace is not None and profile.trace.loop:
-        found = "loop (a trace that begins again)"
-    if any(isinstance(loss, GilbertElliott) and loss.delay_bad for loss in losses):
-        found = "loss.delay_bad_ms (more delay while a burst of losses lasts)"
-    if any(piece.rate and piece.jitter for piece in pieces) and not profile.keep_order:
-        found = "rate_kbit with jitter_ms but without keep_order (overtaking behind a bottleneck)"
-    if any(0.0 < (piece.rate or inf) < _RATE_MIN for piece in pieces):
-        found = f"rate_kbit below {_RATE_MIN * 1e-3:g} (tc takes it for no limit)"
-    if any(0.0 < chance < _CHANCE_MIN for chance in chances):
-        found = "a probability below 2**-32 (tc takes it for 0)"
-    if slowest_ms > DELAY_MAX_MS:
-        found = f"delay_ms above {DELAY_MAX_MS} (its clock ends there, here {slowest_ms:g} ms)"
-    for one in profile.blackouts:
-        if one.duration * 1e9 < STEP_NS:
-            here = f"here {one.duration * 1e3:g} ms at {one.start:g} s"
-            found = f"blackouts shorter than {STEP_NS * 1e-6:g} ms ({here})"
-    if found:
-        raise BadInputError(
-            f"netem cannot do {found}; set link.mode=relay, which can, or leave it out"
-        )
+    refused = {
+        "a trace with loop": profile.trace is not None and profile.trace.loop,
+        "loss.delay_bad_ms (more delay while a burst of losses lasts)": any(
+            isinstance(piece.loss, GilbertElliott) and piece.loss.delay_bad for piece in pieces
+        ),
+        "rate_kbit with jitter_ms but without keep_order": not profile.keep_order
+        and any(piece.rate and piece.jitter for piece in pieces),
+        f"delay_ms above {DELAY_MAX_MS}": any(
+            piece.delay_ns > DELAY_MAX_MS * 1e6 for piece in pieces
+        ),
+        f"blackouts shorter than {STEP_NS * 1e-6:g} ms": any(
+            one.duration * 1e9 < STEP_NS for one in profile.blackouts
+        ),
+    }
+    for what, holds in refused.items():
+        if holds:
+            raise BadInputError(
+                f"netem cannot do {what}; set link.mode=relay, which can, or leave it out"
+            )
 
 
 def notes(profile: DirectionProfile) -> list[str]:
     """Describe the parts of a profile that netem realises differently than the relay."""
-    said = []
-    if profile.jitter and profile.correlation:
-        said.append(f"netem realises next to nothing of correlation {profile.correlation:g}")
-    if profile.corrupt:
-        said.append(
-            "netem corrupts frames, not datagrams: the receiving kernel drops most of them by "
-            f"their checksums, so that corrupt {profile.corrupt:g} is seen as loss"
-        )
     starts = Timeline(profile).pass_ns
-    if passed_over := sum(after - before < STEP_NS for before, after in pairwise(starts)):
-        said.append(
-            f"netem is stepped every {STEP_NS * 1e-6:g} ms at most: {passed_over} of "
-            f"{len(starts)} steps of the time line come sooner, and some are passed over"
-        )
-    return said
+    passed_over = sum(after - before < STEP_NS for before, after in pairwise(starts))
+    differences = {
+        f"netem realises next to nothing of correlation {profile.correlation:g}": (
+            profile.jitter and profile.correlation
+        ),
+        "netem corrupts frames, not datagrams: the receiving kernel drops most of them by their "
+        f"checksums, so that corrupt {profile.corrupt:g} is seen as loss": profile.corrupt,
+        f"netem changes at most every {STEP_NS * 1e-6:g} ms: {passed_over} of {len(starts)} steps "
+        "of the time line come sooner, and some are passed over": passed_over,
+    }
+    return [text for text, holds in differences.items() if holds]
 
 
 def options(profile: DirectionProfile, conditions: Conditions, room: int) -> list[str]:
@@ -293,15 +252,10 @@ def limit(profile: DirectionProfile) -> int:
 
 
 def _loss(loss: Loss) -> list[str]:
-    kind = "gemodel" if isinstance(loss, GilbertElliott) else "random"
-    return [kind, *map(_percent, _chances(loss))]
-
-
-def _chances(loss: Loss) -> tuple[float, ...]:
-    """Return the loss probabilities in the order of tc's arguments, in [0, 1]."""
-    if isinstance(loss, GilbertElliott):
-        return loss.bad_start, loss.bad_end, loss.loss_bad, loss.loss_good
-    return (loss,)
+    if not isinstance(loss, GilbertElliott):
+        return ["random", _percent(loss)]
+    chances = (loss.bad_start, loss.bad_end, loss.loss_bad, loss.loss_good)
+    return ["gemodel", *map(_percent, chances)]
 
 
 def _microseconds(duration_ns: float) -> str:
@@ -326,25 +280,10 @@ def _is_ours(root: dict[str, Any]) -> bool:
     return root["handle"] == ROOT and root.get("kind") == "prio"
 
 
-def counters(qdiscs: Sequence[dict[str, Any]]) -> dict[str, int]:
-    """Read netem's counts from the objects of `tc -s -j qdisc show`; {} if the qdisc is missing.
-
-    Returns:
-        Numbers of datagrams: `forwarded` (including copies), `lost` (dropped at random or because
-        the queue was full), and `held` (in the queue now).
-    """
-    leaf = leaf_of(qdiscs)
-    if leaf is None:
-        return {}
-    return {"forwarded": leaf["packets"], "lost": leaf["drops"], "held": leaf["qlen"]}
-
-
 class Steps:
-    """Records the changes that a time line makes to a qdisc, and how late each change is.
+    """Counts the changes that a time line makes to a qdisc, and how late each change is.
 
-    Attributes:
-        applied: Number of changes made.
-        passed_over: Number of changes skipped because the next change was already due.
+    `applied` changes were made; `passed_over` were skipped, because the next was already due.
     """
 
     def __init__(self) -> None:
@@ -352,10 +291,7 @@ class Steps:
         self._lateness_ns: deque[int] = deque(maxlen=_KEPT)
 
     def note(self, lateness_ns: int, passed_over: int) -> None:
-        """Count one change, and the skipped changes just before it.
-
-        `lateness_ns` [ns] is the time from the due time until tc has made the change.
-        """
+        """Count one change, `lateness_ns` [ns] after it was due, and the skipped changes before."""
         self.applied += 1
         self.passed_over += passed_over
         self._lateness_ns.append(lateness_ns)
@@ -367,22 +303,9 @@ class Steps:
         found = np.quantile(self._lateness_ns, (0.5, 0.99), method="inverted_cdf").tolist()
         return {"step_lateness_p50_ns": found[0], "step_lateness_p99_ns": found[1]}
 
-    def in_words(self) -> str:
-        """Describe how late the changes were, for the log; needs at least one change."""
-        median_ns, worst_ns = self.counts().values()
-        return (
-            f"{self.applied} steps of the time line, late by {median_ns * 1e-6:.2f} ms in the "
-            f"median and {worst_ns * 1e-6:.2f} ms at the 99th percentile, {self.passed_over} "
-            "passed over"
-        )
-
 
 class Netem:
-    """Shapes one direction of the link with the kernel's netem.
-
-    Attributes:
-        steps: Number and lateness of the changes that the time line has made.
-    """
+    """Shapes one direction of the link with the kernel's netem."""
 
     name = "netem"
 
@@ -394,13 +317,13 @@ class Netem:
         origin_ns: int,
         clock: Callable[[], int],
         wait: Callable[[float], None],
-        tables: Path | None = None,
-        log: Callable[[str], None] = lambda line: None,
+        tables: Path,
+        log: Callable[[str], None],
     ) -> None:
         """Store the arguments; the network does not change yet.
 
         `origin_ns` is the time on `clock` at which the link came up [ns]; `wait` sleeps for a time
-        [s]; `tables` is the folder for the table of a measured distribution.
+        [s]; `tables` is the folder for the tables of distributions.
         """
         self._iproute2 = Iproute2(run)
         self._clock, self._wait = clock, wait
@@ -416,8 +339,8 @@ class Netem:
         self._profile, self._timeline = profile, Timeline(profile)
         self._origin_ns, self._piece = origin_ns, -1
         self._room = self._least_room = limit(profile)
-        if self._tables is not None:
-            write_measured(self._tables, profile)
+        if any(piece.jitter for piece in self._timeline.pieces):
+            write_table(self._tables, profile)
 
     def follow_peer(self, peer: Address) -> Address:
         """Shape datagrams to this peer from now on, on the interface that leads to the peer.
@@ -450,13 +373,13 @@ class Netem:
         in force and the method raises a CloudrcError.
         """
         check(profile)
-        qdiscs = self._look()
+        held = self._look().get("held", 0)
         if self._damage:
             raise MissingPrerequisiteError(self._damage)
         before, room = (self._profile, self._origin_ns), self._room
         self._take(profile, self._clock() if restart else self._origin_ns)
         if self._room < room:  # netem drops all packets while it holds more than its limit
-            self._room += counters(qdiscs).get("held", 0)
+            self._room += held
         try:
             self._apply("change")
         except CloudrcError:
@@ -469,7 +392,7 @@ class Netem:
         until_ns = self._clock() + round(timeout * 1e9)
         if self._clock() - self._looked_ns >= PERIOD_NS:
             # Restore the limit when packets from before the change have left.
-            if counters(self._look()).get("held", 0) < self._least_room:
+            if self._look().get("held", 0) < self._least_room:
                 self._room = self._least_room
         while True:
             self._step()
@@ -479,12 +402,14 @@ class Netem:
                 return
 
     def counts(self) -> dict[str, int]:
-        """Return the values of `counters` and `Steps.counts`, and the count `restored`.
+        """Return numbers of datagrams, the values of `Steps.counts`, and the count `restored`.
 
-        `restored` is the number of times that another program removed or changed the qdiscs. The
-        name is historical: `Netem` does not restore them.
+        The datagrams are `forwarded` (including copies), `lost` (dropped at random or because the
+        queue was full) and `held` (in the queue now); absent if the qdisc is missing. `restored` is
+        the number of times that another program removed or changed the qdiscs. The name is
+        historical: `Netem` does not restore them.
         """
-        return counters(self._look()) | self.steps.counts() | {"restored": self._damages}
+        return self._look() | self.steps.counts() | {"restored": self._damages}
 
     def released(self) -> dict[str, int]:
         """Return an empty dict: the kernel does not report when datagrams leave the queue."""
@@ -496,10 +421,9 @@ class Netem:
             self._iproute2.tc("qdisc", "del", "dev", self._device, "root")
         self._device, self._applied = "", []
 
-    def _look(self) -> list[dict[str, Any]]:
-        """Read the qdiscs; log and count changes by other programs."""
-        self._looked_ns, qdiscs = self._clock(), self._qdiscs()
-        leaf = leaf_of(qdiscs)
+    def _look(self) -> dict[str, int]:
+        """Read the counts of the qdisc; log and count changes by other programs."""
+        self._looked_ns, leaf = self._clock(), leaf_of(self._qdiscs())
         found = leaf and leaf.get("options")
         self._listed = found if self._listed is None and found else self._listed
         said = ""
@@ -513,7 +437,8 @@ class Netem:
             self._damages += 1
             self._log(f"error: {said}")
         self._damage = said
-        return qdiscs
+        names = {"forwarded": "packets", "lost": "drops", "held": "qlen"}
+        return {name: leaf[key] for name, key in names.items()} if leaf else {}
 
     def _set_up(self) -> None:
         """Add the qdiscs, or take over the qdiscs of an earlier process."""
@@ -550,8 +475,6 @@ class Netem:
             self._stepped_ns = self._clock()
             due_ns = self._origin_ns + starts_ns[self._piece]
             self.steps.note(self._stepped_ns - due_ns, self._piece - before - 1)
-            if self._piece == len(starts_ns) - 1:
-                self._log(self.steps.in_words())
 
     def _next_ns(self) -> float:
         """Return the time of the next change on `clock` [ns]; infinite after the last change."""

@@ -18,20 +18,13 @@ class GilbertElliott:
 
     Source: E. N. Gilbert, Bell Syst. Tech. J. 39, 1960; E. O. Elliott, ibid. 42, 1963. In the terms
     of tc-netem's `gemodel`: p = bad_start, r = bad_end, 1-h = loss_bad, 1-k = loss_good.
-
-    Attributes:
-        bad_start: Probability per packet to go from the good to the bad state, in [0, 1].
-        bad_end: Probability per packet to go from the bad to the good state, in [0, 1].
-        loss_bad: Loss in the bad state, in [0, 1].
-        loss_good: Loss in the good state, in [0, 1].
-        delay_bad: Extra delay in the bad state, one way [s].
     """
 
-    bad_start: float
-    bad_end: float
-    loss_bad: float = 1.0
-    loss_good: float = 0.0
-    delay_bad: float = 0.0
+    bad_start: float  # probability per packet to go from the good to the bad state, in [0, 1]
+    bad_end: float  # probability per packet to go from the bad to the good state, in [0, 1]
+    loss_bad: float = 1.0  # loss in the bad state, in [0, 1]
+    loss_good: float = 0.0  # loss in the good state, in [0, 1]
+    delay_bad: float = 0.0  # extra delay in the bad state, one way [s]
 
 
 Loss: TypeAlias = float | GilbertElliott
@@ -73,18 +66,15 @@ class Trace:
     has losses, they replace the profile's `loss`. The last row applies forever. In a trace that
     loops, it lasts as long as the other rows on average; then the trace begins again.
 
-    Attributes:
-        times: Time since the link came up, strictly rising [s], shape (n,), n >= 1. The first row
-            also applies before its time.
-        delays: One-way delay of each row [s], shape (n,).
-        losses: Loss of each row in [0, 1], shape (n,), or None.
-        loop: Whether the trace begins again after its end.
+    The first row also applies before its time.
     """
 
-    times: tuple[float, ...]
-    delays: tuple[float, ...]
-    losses: tuple[float, ...] | None = None
-    loop: bool = False
+    times: tuple[
+        float, ...
+    ]  # times since the link came up, strictly rising [s], shape (n,), n >= 1
+    delays: tuple[float, ...]  # one-way delay of each row [s], shape (n,)
+    losses: tuple[float, ...] | None = None  # loss of each row in [0, 1], shape (n,)
+    loop: bool = False  # whether the trace begins again after its end
 
     @property
     def period(self) -> float | None:
@@ -98,42 +88,28 @@ class Trace:
 class DirectionProfile:
     """Requested conditions of one direction.
 
-    Attributes:
-        delay: Mean one-way delay [s].
-        jitter: Half width (uniform) or standard deviation (normal, pareto, table) of the delay [s].
-            A negative sum of delay and jitter counts as 0.
-        distribution: Distribution of the delay about its mean.
-        correlation: Correlation of the jitter of successive packets, in [0, 1].
-        loss: Probability of an independent loss, or model of loss in bursts.
-        duplicate: Probability in [0, 1] that a packet arrives twice; the copy has its own delay.
-        reorder: Probability in [0, 1] that a packet has no delay, and skips the queue.
-        corrupt: Probability in [0, 1] that one bit of the datagram is flipped, in all its copies.
-        keep_order: Whether packets arrive in the order of sending (this disables `reorder`).
-        rate: Rate of the bottleneck [bit/s]; None without a bottleneck.
-        queue_packets: Capacity of the bottleneck [packets], including the packet on the wire; a
-            packet that finds the queue full is dropped.
-        changes: Changes of the conditions, strictly rising in `at`.
-        trace: Measured delay over time.
-        blackouts: Blackouts in any order; they may overlap.
-        table: Equally probable values of the distribution "table", as multiples of `jitter` [1]:
-            mean 0, standard deviation 1, rising, shape (n,). () for other distributions.
+    A negative sum of delay and jitter counts as 0. `keep_order` disables `reorder`. A packet that
+    finds the bottleneck's queue full is dropped. `table` has equally probable values, with mean 0
+    and standard deviation 1, rising, shape (n,); it is () for other distributions.
     """
 
-    delay: float = 0.0
-    jitter: float = 0.0
+    delay: float = 0.0  # mean one-way delay [s]
+    jitter: float = 0.0  # half width (uniform) or standard deviation (others) of the delay [s]
     distribution: Literal["uniform", "normal", "pareto", "table"] = "uniform"
-    correlation: float = 0.0
+    correlation: float = 0.0  # correlation of the jitter of successive packets, in [0, 1]
     loss: Loss = 0.0
-    duplicate: float = 0.0
-    reorder: float = 0.0
-    corrupt: float = 0.0
-    keep_order: bool = False
-    rate: float | None = None
-    queue_packets: int = 1000
-    changes: tuple[Change, ...] = ()
+    duplicate: float = 0.0  # probability of a copy with its own delay, in [0, 1]
+    reorder: float = 0.0  # probability that a packet has no delay and skips the queue, in [0, 1]
+    corrupt: float = 0.0  # probability of a flipped bit, the same in all copies, in [0, 1]
+    keep_order: bool = False  # whether packets arrive in the order of sending
+    rate: float | None = None  # rate of the bottleneck [bit/s]; None without a bottleneck
+    queue_packets: int = 1000  # capacity of the bottleneck, including the packet on the wire
+    changes: tuple[Change, ...] = ()  # strictly rising in `at`
     trace: Trace | None = None
-    blackouts: tuple[Blackout, ...] = ()
-    table: tuple[float, ...] = ()
+    blackouts: tuple[Blackout, ...] = ()  # in any order; they may overlap
+    table: tuple[
+        float, ...
+    ] = ()  # values of the distribution "table", as multiples of `jitter` [1]
 
 
 class Conditions(NamedTuple):

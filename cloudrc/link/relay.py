@@ -7,10 +7,8 @@ datagrams that the pod sends:
     tunnel end > [listen]  RelayShaper  [any port] > the other pod's tunnel end
 
 A datagram is due at its time of arrival at the kernel plus the delay from the model. It never
-leaves before it is due. The relay sleeps in `select` until shortly before the next datagram is due,
-then reads the clock in a loop, because a sleeping thread wakes 15 to 50 us late.
-
-Each socket is connected to one end of the tunnel, so the kernel drops datagrams from other senders.
+leaves before it is due. A sleeping thread wakes 15 to 50 us late; so the relay sleeps until shortly
+before the next datagram is due, and then reads the clock in a loop.
 """
 
 from __future__ import annotations
@@ -38,35 +36,21 @@ Peek: TypeAlias = Callable[[bytes], tuple[int, int, int]]
 Send: TypeAlias = Callable[[bytes], object]
 """Function that sends a datagram; raises an OSError if the kernel refuses."""
 
-IN_FLIGHT_MAX = 10_000
-"""Largest number of datagrams in flight in one direction; more are dropped and counted."""
-DATAGRAM_MAX = 2_048
-"""Largest length of a datagram [bytes], to limit the memory that a lane uses."""
-BATCH = 32
-"""Largest number of datagrams that a lane reads or sends before the next lane's turn."""
-SPIN_NS = 60_000
-"""Time before a datagram is due at which the relay starts to read the clock in a loop [ns]."""
-STOP_PERIOD = 0.1
-"""Longest time between two calls of the argument `stop` of `Relay.run` [s]."""
-ANCILLARY_SIZE = 64
-"""Size of the buffer for the kernel's time stamp and its count of dropped datagrams [bytes]."""
-AGE_MAX_NS = 50_000_000
-"""Largest time between arrival and reading of a datagram for which the relay compensates [ns]."""
-QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}
-"""Name -> probability of each percentile of the lateness in reports."""
+IN_FLIGHT_MAX = 10_000  # datagrams in flight in one direction; more are dropped and counted
+DATAGRAM_MAX = 2_048  # largest length of a datagram [bytes], to limit the memory that a lane uses
+BATCH = 32  # largest number of datagrams that a lane reads or sends before the next lane's turn
+SPIN_NS = 60_000  # the relay reads the clock in a loop for this time before a datagram is due [ns]
+STOP_PERIOD = 0.1  # longest time between two calls of the argument `stop` of `Relay.run` [s]
+ANCILLARY_SIZE = 64  # buffer for the kernel's time stamp and count of dropped datagrams [bytes]
+AGE_MAX_NS = 50_000_000  # largest time from arrival to reading that the relay compensates [ns]
+QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}  # percentiles of the lateness
 
-_BITS = 7
-"""Number of significant bits of a lateness that select its bucket: buckets are 1.6 % wide."""
-_EARLY = -1
-"""Bucket of the datagrams that left before they were due."""
-_RECENT = 10
-"""Number of calls of `Lanes.recent` over which its percentiles are computed."""
-_FIFO_PRIORITY = 10
-"""Real-time priority, higher than ordinary processes, lower than the kernel's threads (50)."""
-_SWITCH_INTERVAL = 0.0002
-"""Longest time for which another thread of this process can block the relay's thread [s]."""
-_COLLECT_AFTER = 50_000
-"""Number of new objects that starts a garbage collection; most objects are datagrams in flight."""
+_BITS = 7  # number of significant bits of a lateness that select its bucket: buckets are 1.6 % wide
+_EARLY = -1  # bucket of the datagrams that left before they were due
+_RECENT = 10  # number of calls of `Lanes.counts` over which its percentiles are computed
+_FIFO_PRIORITY = 10  # above ordinary processes, below the kernel's threads (50)
+_SWITCH_INTERVAL = 0.0002  # longest time for which another thread can block the relay's thread [s]
+_COLLECT_AFTER = 50_000  # new objects before a garbage collection; most are datagrams in flight
 # Source: Linux, include/uapi/asm-generic/socket.h, prctl.h; Python has no names for them.
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SET_TIMERSLACK = 35, 40, 29
 
@@ -144,11 +128,8 @@ class Stamps:
 class Lane:
     """One direction of the relay: reads datagrams, and sends them when they are due.
 
-    Attributes:
-        source: Bound UDP socket at which the datagrams arrive; the caller closes it.
-        direction: Model of this direction of the link.
-        origin_ns: Start of the model's time [ns], monotonic; None until the first datagram sets it.
-        errors: Histogram of how late datagrams left.
+    The datagrams arrive at the bound UDP socket `source`, which the caller closes. `origin_ns` is
+    the start of the model's time [ns], monotonic; None until the first datagram sets it.
     """
 
     def __init__(
@@ -208,7 +189,7 @@ class Lane:
                 self._counts["unsent"] += 1
 
     def counts(self) -> dict[str, int]:
-        """Return the number of datagrams by outcome; `Lanes.outcomes` explains the outcomes."""
+        """Return the number of datagrams by outcome; `Lanes.counts` explains the outcomes."""
         return {**self._counts, "unread": self._stamps.dropped}
 
     def released(self) -> dict[str, int]:
@@ -219,9 +200,8 @@ class Lane:
             because too many were in flight (`overflow`), or that waited `AGE_MAX_NS` or longer to
             be read (`stalled`). Empty before the first datagram.
         """
-        told = self.errors.in_ns()
         more = {"overflow": self._counts["overflow"], "stalled": self._stalled}
-        return {**told, **more} if told else {}
+        return told | more if (told := self.errors.in_ns()) else {}
 
     def _put_on_link(
         self, data: bytes, kind: int, epoch: int, counter: int, received_ns: int
@@ -303,35 +283,24 @@ class Lanes:
                     for other in self._lanes:
                         other.origin_ns = lane.origin_ns
 
-    def outcomes(self) -> dict[str, int]:
-        """Return the number of datagrams of all lanes by outcome.
+    def counts(self) -> dict[str, int]:
+        """Return the number of datagrams of all lanes by outcome, and the recent lateness.
 
         The outcomes are `received`; `forwarded` (including copies); `lost` on the link; `malformed`
         (not from the tunnel); `overflow` (too many in flight, see `IN_FLIGHT_MAX`); `unread` (the
         socket's buffer was full); `unsent` (the receiver is unknown or the kernel refused).
+
+        Call this method once a second; the percentiles of the lateness [ns] then cover the last
+        10 s. `released_early` counts since the start.
         """
-        outcomes: Counter[str] = Counter()
+        outcomes, errors = Counter[str](), ReleaseErrors()
         for lane in self._lanes:
             outcomes.update(lane.counts())
-        return dict(outcomes)
-
-    def recent(self) -> dict[str, int]:
-        """Return percentiles of the recent lateness [ns], and `released_early` since the start.
-
-        Call this method once a second; the percentiles then cover the last 10 s.
-        """
-        errors = self.errors()
+            errors.update(lane.errors.copy())
         recent = ReleaseErrors(errors - self._past[0]).in_ns()
         self._past.append(errors)
         recent.pop("released", None)
-        return {**recent, "released_early": errors[_EARLY]}
-
-    def errors(self) -> ReleaseErrors:
-        """Return the sum of the lateness histograms of all lanes."""
-        whole = ReleaseErrors()
-        for lane in self._lanes:
-            whole.update(lane.errors.copy())
-        return whole
+        return {**outcomes, **recent, "released_early": errors[_EARLY]}
 
 
 class Relay(Lanes):
@@ -348,13 +317,10 @@ class Relay(Lanes):
         world_peer: Address,
         cloud_peer: Address,
     ) -> None:
-        """Connect the sockets of both sides to world and cloud.
+        """Connect both sockets; raise an OSError if one cannot reach world or cloud.
 
         The caller has bound the sockets and closes them. Both models must have the origin 0. World
         and cloud must send from the address at which they receive.
-
-        Raises:
-            OSError: If world or cloud cannot be reached from its socket's address.
         """
         world_side.connect(world_peer)
         cloud_side.connect(cloud_peer)
@@ -370,10 +336,6 @@ class Relay(Lanes):
         while not stop():
             self.step(STOP_PERIOD)
 
-    def counts(self) -> dict[str, int]:
-        """Return `Lanes.outcomes`, and the lateness since the start (`ReleaseErrors.in_ns`)."""
-        return {**self.outcomes(), **self.errors().in_ns()}
-
     def released(self, way: str) -> dict[str, int]:
         """Return `Lane.released` of one direction, "uplink" or "downlink"."""
         return self._ways[way].released()
@@ -387,16 +349,10 @@ class RelayShaper(Lanes):
     def __init__(
         self, listen: Address, direction: LinkDirection, peek: Peek, end: Address | None = None
     ) -> None:
-        """Open the two sockets.
+        """Open the two sockets; raise an OSError if `listen` is in use or `end` cannot reach it.
 
-        Args:
-            listen: Address to which this pod's end of the tunnel sends; port 0: the kernel chooses.
-            direction: Model of the link, whose origin is a time on the monotonic clock.
-            peek: Function that reads kind, epoch and counter of a datagram.
-            end: Address from which this pod's end of the tunnel sends. None accepts any sender.
-
-        Raises:
-            OSError: If `listen` is in use, or cannot be reached from `end`.
+        This pod's end of the tunnel sends from `end` (None: any address) to `listen` (port 0: the
+        kernel chooses). The origin of the model `direction` is a time on the monotonic clock.
         """
         self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._inside.bind(listen)
@@ -424,10 +380,6 @@ class RelayShaper(Lanes):
         """Use this profile from now on; `restart` as in `LinkDirection.replace_profile`."""
         self.take_in()  # datagrams that have arrived belong to the old profile
         self._lane.direction.replace_profile(profile, restart=restart)
-
-    def counts(self) -> dict[str, int]:
-        """Return `Lanes.outcomes` and `Lanes.recent`."""
-        return self.outcomes() | self.recent()
 
     def released(self) -> dict[str, int]:
         """Return `Lane.released` of this direction."""

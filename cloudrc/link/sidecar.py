@@ -1,7 +1,6 @@
 """Run a pod's `link` container: choose relay or netem, and follow changes of profile and peer.
 
-The route file contains the address to which this pod's end of the tunnel has to send. Other threads
-set the attributes `peer` and `profile` of the `Sidecar`. Only the thread in `run` uses the shaper.
+The route file contains the address to which this pod's end of the tunnel has to send.
 """
 
 from __future__ import annotations
@@ -9,12 +8,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
-
-from pydantic import TypeAdapter
 
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.link.follow import Loaded
@@ -34,10 +31,8 @@ from cloudrc.records import Counted
 
 Mode: TypeAlias = Literal["auto", "netem", "relay"]
 """Setting `link.mode`: the only allowed shaper, or "auto": netem if it works, else the relay."""
-COUNT_PERIOD_NS = 1_000_000_000
-"""Time between two updates of the metrics and of the file that reports the lateness [ns]."""
-STEP = 0.05
-"""Longest time until `run` reacts to a new peer or profile [s]."""
+COUNT_PERIOD_NS = 1_000_000_000  # between two updates of the metrics and the lateness file [ns]
+STEP = 0.05  # longest time until `run` reacts to a new peer or profile [s]
 
 Shaper: TypeAlias = RelayShaper | Netem
 """Shapes the datagrams that this pod's end of the tunnel sends."""
@@ -45,38 +40,13 @@ Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
 """Function that makes a shaper from a profile and the start of its time line [ns], monotonic."""
 
 
-@dataclass(frozen=True, slots=True)
-class Near:
-    """All netem qdiscs of a pod, including those of other programs.
+def find_netems(run: Run, host: str) -> dict[str, Any]:
+    """Find the interface to a host, and all netem qdiscs of this pod; {} if the kernel refuses.
 
-    Attributes:
-        interface: Interface through which the tunnel's datagrams leave.
-        netems: Interface -> its netem qdiscs, if any, as objects of `tc -s -j qdisc show`.
+    Returns:
+        `interface`, and `netems`: interface -> its netem qdiscs, if it has any, as objects of
+        `tc -s -j qdisc show`.
     """
-
-    interface: str
-    netems: dict[str, list[dict[str, Any]]]
-
-
-@dataclass(frozen=True, slots=True)
-class Told:
-    """Report of a `link` container about its shaper and the conditions in force.
-
-    Attributes:
-        shaper: "relay" or "netem".
-        why: Why this shaper was chosen, in words.
-        applied: The conditions in force; None while a time line still changes them.
-        near: The pod's netem qdiscs; None if the kernel did not report them.
-    """
-
-    shaper: str
-    why: str
-    applied: DirectionProfile | None
-    near: Near | None = None
-
-
-def look_near(run: Run, host: str) -> Near | None:
-    """List the netem qdiscs and find the interface to a host; return None if that fails."""
     iproute2, netems = Iproute2(run), dict[str, list[dict[str, Any]]]()
     try:
         interface = iproute2.device(host)
@@ -84,38 +54,19 @@ def look_near(run: Run, host: str) -> Near | None:
             if one.get("kind") == "netem":
                 netems.setdefault(str(one["dev"]), []).append(one)
     except (CloudrcError, ValueError, LookupError):
-        return None
-    return Near(interface, netems)
-
-
-def write_told(told: Told) -> str:
-    """Format a report as JSON."""
-    return TypeAdapter(Told).dump_json(told, indent=2).decode() + "\n"
-
-
-def read_told(text: str) -> Told:
-    """Parse a report; raise a ValueError if the text is no report."""
-    return TypeAdapter(Told).validate_json(text)
+        return {}
+    return {"interface": interface, "netems": netems}
 
 
 class Machine(NamedTuple):
-    """Functions that a sidecar calls on its machine, and the permissions that it has there.
+    """Functions that a sidecar calls on its machine, and the permissions that it has there."""
 
-    Attributes:
-        relay: Makes a `RelayShaper`.
-        netem: Makes a `Netem`, without changing the network yet.
-        may_shape: Whether this process is root with NET_ADMIN.
-        clock: Returns the time on the monotonic clock [ns].
-        wait: Sleeps for a time [s].
-        log: Writes one line to the log.
-    """
-
-    relay: Make
-    netem: Make
-    may_shape: bool
-    clock: Callable[[], int]
-    wait: Callable[[float], None]
-    log: Callable[[str], None]
+    relay: Make  # makes a `RelayShaper`
+    netem: Make  # makes a `Netem`, without changing the network yet
+    may_shape: bool  # whether this process is root with NET_ADMIN
+    clock: Callable[[], int]  # returns the time on the monotonic clock [ns]
+    wait: Callable[[float], None]  # sleeps for a time [s]
+    log: Callable[[str], None]  # writes one line to the log
 
 
 class Metrics(Protocol):
@@ -137,9 +88,8 @@ class Metrics(Protocol):
 class Sidecar:
     """Shapes the datagrams that this pod's end of the tunnel sends.
 
-    Attributes:
-        peer: Address of the other pod's end of the tunnel; set by another thread.
-        profile: The requested profile; set by another thread.
+    Another thread sets `peer`, the address of the other pod's end, and `profile`, the requested
+    profile.
     """
 
     def __init__(
@@ -164,7 +114,6 @@ class Sidecar:
         self._released_file = self._state_file.with_suffix(RELEASED_SUFFIX)
         self._reason, self._origin_ns, self._number = "", 0, profile.change.number
         self._in_force: tuple[LinkState, DirectionProfile] | None = None
-        self._published: LinkState | None = None
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Wait until the peer is known, then shape until `stop` returns True.
@@ -185,17 +134,20 @@ class Sidecar:
             for file in (self._route, self._released_file):
                 file.unlink(missing_ok=True)
 
-    def told(self) -> Told | None:
-        """Return the report about shaper and conditions; None before the first shaper.
+    def status(self) -> dict[str, Any]:
+        """Return shaper, reason and rate [bit/s]; {} before the first shaper.
 
-        Any thread may call this method.
+        The rate is None if it is unlimited, and absent while a time line may change it. Any thread
+        may call this method.
         """
         if self._in_force is None:
-            return None
+            return {}
         state, profile = self._in_force
+        found = {"shaper": state.shaper, "reason": state.reason}
         elapsed_ns = self._machine.clock() - (state.origin_ns or 0)
-        over = elapsed_ns >= Timeline(profile).last_ns
-        return Told(state.shaper, state.reason, settled(profile) if over else None)
+        if elapsed_ns < Timeline(profile).last_ns:
+            return found
+        return {**found, "rate": settled(profile).rate}
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
         """Shape with one shaper until `stop` returns True, or a profile needs the other shaper."""
@@ -259,8 +211,7 @@ class Sidecar:
             if self._in_force is not None:
                 state, old = self._in_force
                 state = replace(state, refused=profile.change.number, refusal=str(error))
-                self._in_force = state, old
-                self._publish()
+                self._publish(state, old)
             return True
         if change.restart:
             self._origin_ns = self._machine.clock()
@@ -292,8 +243,8 @@ class Sidecar:
             asked=asked,
             origin_ns=self._origin_ns,
         )
-        self._in_force, self._number = (state, profile.direction), profile.change.number
-        self._publish()
+        self._number = profile.change.number
+        self._publish(state, profile.direction)
         if self._metrics:
             self._metrics.asked(self._direction, asked["delay"] or 0.0)
 
@@ -302,17 +253,15 @@ class Sidecar:
         if self._metrics:
             counts = shaper.counts().items()
             self._metrics.see([Counted(now_ns, "link", name, number) for name, number in counts])
-        self._publish()
         if released := shaper.released():
             with suppress(OSError):  # shaping continues even if the disk is full
                 publish(self._released_file, json.dumps(released))
 
-    def _publish(self) -> None:
-        """Write the state file if the state is new; if the disk is full, try again after 1 s."""
-        if self._in_force is not None and self._in_force[0] is not self._published:
-            with suppress(OSError):
-                publish(self._state_file, to_text(self._in_force[0]))
-                self._published = self._in_force[0]
+    def _publish(self, state: LinkState, profile: DirectionProfile) -> None:
+        """Store the state in force, and write it to the state file."""
+        self._in_force = state, profile
+        with suppress(OSError):
+            publish(self._state_file, to_text(state))
 
     def _publish_route(self, route: Address) -> None:
         publish(self._route, f"{route[0]}:{route[1]}\n")

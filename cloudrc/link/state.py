@@ -1,24 +1,23 @@
 """Publish the state of one direction of the link in a file: its shaper, profile and last change.
 
-The state file is in the folder of the route file. World or cloud on the same machine reads the
-state file and records its changes. `cloudrc link set` reads it to see whether a change has taken
-effect. All files are written atomically, because other processes may read them at the same time.
+The state file is in the folder of the route file. World or cloud on the same machine records its
+changes; `cloudrc link set` reads there whether a change has taken effect.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
 
 from cloudrc.files import write_atomically
 from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
 
-STATE_FILE = "link.json"
-"""Name of the state file, in the folder of the route file."""
-PROFILE_FILE = "profile.json"
-"""Name of the profile file for the relay of a local run, in the folder of the state files."""
+STATE_FILE = "link.json"  # name of the state file, in the folder of the route file
+PROFILE_FILE = "profile.json"  # profile of a local run's relay, in the folder of the state files
 STATE_MAX = 1 << 16
 """Size limit of a state file that world or cloud reads [bytes]: room for a time line of about 800
 changes. Reading a file of 1 MiB could block the control loop for 2 s."""
@@ -29,62 +28,39 @@ RELEASED = frozenset(
     | {f"release_error_{quantile}_ns" for quantile in ("p50", "p99", "p999")}
 )
 """Names in the file with the suffix `RELEASED_SUFFIX`."""
-CHANGE_FILE = "change.json"
-"""Name of the file with the last `Change` of a profile, in the profile's folder."""
+CHANGE_FILE = "change.json"  # last `Change` of a profile, in the profile's folder
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
     """Number and cause of a profile's change, as `cloudrc link set` writes them to `CHANGE_FILE`.
 
-    Attributes:
-        number: Identifies the change; "" if unknown.
-        cause: Why the profile was changed, in words.
-        restart: True: the time line starts again when the profile takes effect. False: the time
-            line continues.
+    With `restart`, the time line starts again when the profile takes effect.
     """
 
-    number: str = ""
-    cause: str = "the profile's file changed"
+    number: str = ""  # identifies the change; "" if unknown
+    cause: str = "the profile's file changed"  # why the profile was changed, in words
     restart: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class LinkState:
-    """Shaper, profile and last change of one direction.
+    """Shaper, profile and last change of one direction; times on the machine's monotonic clock."""
 
-    Attributes:
-        shaper: "relay" or "netem".
-        reason: Why this shaper was chosen, in words.
-        mode: Requested shaper: "auto", "relay" or "netem".
-        direction: "uplink" or "downlink".
-        profile: Profiles of both directions, as in the file, without defaults.
-        since: When the profile took effect, UTC, to show to users.
-        since_ns: When the profile took effect, on the machine's monotonic clock [ns].
-        changes: Number of changes since the link came up.
-        change: Number of the last change that took effect; "" if unknown.
-        cause: Why the profile was changed, in words; "" before the first change.
-        asked: Requested conditions at the start of the time line: the result of `summary`.
-        origin_ns: Start of the time line on the monotonic clock [ns]; None if the change did not
-            restart the time line.
-        refused: Number of the last refused change; "" if no change was refused.
-        refusal: Why the last refused change was refused, in words.
-    """
-
-    shaper: str
-    reason: str
-    mode: str
-    direction: str
-    profile: dict[str, Any]
-    since: str
-    since_ns: int
-    changes: int = 0
-    change: str = ""
-    cause: str = ""
-    asked: dict[str, float | None] = field(default_factory=dict)
-    origin_ns: int | None = None
-    refused: str = ""
-    refusal: str = ""
+    shaper: str  # "relay" or "netem"
+    reason: str  # why this shaper was chosen, in words
+    mode: str  # requested shaper: "auto", "relay" or "netem"
+    direction: str  # "uplink" or "downlink"
+    profile: dict[str, Any]  # profiles of both directions, as in the file, without defaults
+    since: str  # when the profile took effect, UTC, to show to users
+    since_ns: int  # when the profile took effect [ns]
+    changes: int = 0  # number of changes since the link came up
+    change: str = ""  # number of the last change that took effect; "" if unknown
+    cause: str = ""  # why the profile was changed, in words; "" before the first change
+    asked: dict[str, float | None] = field(default_factory=dict)  # the result of `summary`
+    origin_ns: int | None = None  # start of the time line [ns]; None: the old one continues
+    refused: str = ""  # number of the last refused change; "" if no change was refused
+    refusal: str = ""  # why the last refused change was refused, in words
 
 
 def to_text(state: LinkState) -> str:
@@ -92,14 +68,20 @@ def to_text(state: LinkState) -> str:
     return json.dumps(asdict(state), indent=2) + "\n"
 
 
-def from_text(text: str) -> LinkState:
-    """Parse a state; raise a ValueError if the text is invalid."""
-    found = json.loads(text)
-    names = {item.name for item in fields(LinkState)}
+T = TypeVar("T")
+
+
+def parse(kind: type[T], text: bytes | str) -> T:
+    """Parse JSON as a dataclass; raise a ValueError with one line if the text is invalid."""
     try:
-        return LinkState(**{name: value for name, value in found.items() if name in names})
-    except (TypeError, AttributeError) as error:
-        raise ValueError(f"not the state of a link: {error}") from error
+        return TypeAdapter(kind).validate_json(text)
+    except ValidationError as error:
+        raise ValueError(f"not a {kind.__name__}: {error.errors()[0]['msg']}") from None
+
+
+def from_text(text: bytes | str) -> LinkState:
+    """Parse a state; raise a ValueError if the text is invalid."""
+    return parse(LinkState, text)
 
 
 def read_change(text: str) -> Change:

@@ -8,8 +8,11 @@ the logs of other tools to traces.
 from __future__ import annotations
 
 import csv
+import gzip
 import re
-from collections.abc import Collection, Iterable, Iterator
+import zlib
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from io import BytesIO
 from itertools import pairwise
 from math import fsum, inf, sqrt
 from pathlib import Path
@@ -19,17 +22,11 @@ from cloudrc.errors import BadInputError
 from cloudrc.files import read
 from cloudrc.link.profile import Trace
 
-SIZE_MAX = 64 << 20
-"""Size limit of a file [bytes]: half a day at 100 packets a second."""
-START_MAX = 600.0
-"""Latest time of a trace's first row [s]: until this time a flight uses only the first row."""
-UNIX_TIME = 1e8
-"""If the time of the first row is at least this large, all times are Unix times [s] (1e8 is in
-March 1973). Then the time of the first row is subtracted."""
+SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a second
+START_MAX = 600.0  # latest time of the first row; until then a flight uses this row alone [s]
+UNIX_TIME = 1e8  # from here on, times are Unix times (1e8 is in March 1973) [s]
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
-_ROWS_TO_JUDGE = 10
-"""Smallest number of rows with which a delay of 0 may mark a lost packet. Shorter traces are
-probably typed by hand."""
+_ROWS_TO_JUDGE = 10  # fewer rows are typed by hand: there a delay of 0 marks no lost packet
 
 
 def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
@@ -44,20 +41,24 @@ def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
 
 
 def read_lines(path: Path, name: str, remedy: str, size_max: int = SIZE_MAX) -> list[str]:
-    """Read the lines of a text file; if that fails, raise a BadInputError with `remedy`."""
+    """Read the lines of a text file; if that fails, raise a BadInputError with `remedy`.
+
+    A file whose name ends in .gz is unpacked. Accepted encodings are UTF-8, UTF-16 with a byte
+    order mark (Windows writes it if output is redirected), and one byte per character.
+    """
     try:
-        return decode(read(path, size_max))
-    except (OSError, ValueError) as error:
+        data = read(path, size_max)
+        if path.suffix == ".gz":
+            data = gzip.GzipFile(fileobj=BytesIO(data)).read(size_max + 1)
+        if len(data) > size_max:
+            raise ValueError(f"longer than {size_max} bytes when unpacked")
+        return _decode(data)
+    except (OSError, EOFError, ValueError, zlib.error) as error:
         reason = getattr(error, "strerror", None) or str(error).removeprefix(f"{path}: ")
     raise BadInputError(f"{name}: {reason}; {remedy}")
 
 
-def decode(data: bytes) -> list[str]:
-    """Decode text to lines; raise a ValueError if the data are not text.
-
-    Accepted encodings are UTF-8, UTF-16 with a byte order mark (Windows writes it if output is
-    redirected), and encodings with one byte per character.
-    """
+def _decode(data: bytes) -> list[str]:
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return data.decode("utf-16", "replace").splitlines()
     if b"\0" in data:
@@ -94,23 +95,26 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
     """
     place = f"trace {name}"
     columns, rows = read_rows(lines, place)
-    delay = _delay_column(columns, place)
-    times, delays, losses = list[float](), list[float](), list[float]()
+    delay = next((column for column in columns if column in _SCALES), "delay_ms")
+    if sorted(columns) not in (sorted(["time_s", delay]), sorted(["time_s", delay, "loss"])):
+        raise BadInputError(
+            f"{place}, line 1: the columns are {','.join(columns)[:200] or 'missing'}; the header "
+            "is time_s,delay_ms or time_s,delay_us, and may end in ,loss"
+        )
+    found = list[list[float]]()
     for row in rows:
-        times.append(_number(row, "time_s"))
-        delays.append(_number(row, delay))
-        if "loss" in columns:
-            losses.append(_number(row, "loss", 1.0))
-        if len(times) > 1 and times[-1] <= times[-2]:
+        found.append([_number(row, column) for column in ("time_s", delay, "loss")[: len(columns)]])
+        if len(found) > 1 and found[-1][0] <= found[-2][0]:
             raise BadInputError(
-                f"{row.where}: time_s {times[-1]:.12g} does not come after {times[-2]:.12g}; "
-                "sort the rows by time and give each time once"
+                f"{row.where}: time_s {found[-1][0]:.12g} does not come after "
+                f"{found[-2][0]:.12g}; sort the rows by time and give each time once"
             )
-    if not times:
+    if not found:
         raise BadInputError(f"{place}: no rows; give at least one, for example: 0,45")
+    times, delays, *losses = zip(*found, strict=True)
     _check_delays(delays, delay, place, may_be_lost=not losses)
     scaled = tuple(one * _SCALES[delay] for one in delays)
-    return Trace(_from_start(times, name), scaled, tuple(losses) or None)
+    return Trace(_from_start(times, name), scaled, losses[0] if losses else None)
 
 
 def write_trace(trace: Trace) -> str:
@@ -133,17 +137,11 @@ def _short(value: float, digits: int) -> str:
 
 
 class Row(NamedTuple):
-    """One row of a CSV file.
+    """One row of a CSV file."""
 
-    Attributes:
-        where: File and line of the row, for messages.
-        cells: Column -> text without blanks at its ends; the last columns may be missing.
-        decimal: Decimal sign: "," if semicolons or tabs separate the cells, otherwise ".".
-    """
-
-    where: str
-    cells: dict[str, str]
-    decimal: str
+    where: str  # file and line, for messages
+    cells: dict[str, str]  # column -> text without blanks at its ends
+    decimal: str  # "," if semicolons or tabs separate the cells, otherwise "."
 
     def text(self, column: str) -> str:
         """Return a cell's text; raise a BadInputError if the row ends before the column."""
@@ -219,19 +217,14 @@ def _bare_numbers(lines: list[str], name: str) -> BadInputError:
     )
 
 
-def looks_lost(values: Collection[float], decimals: int) -> bool:
+def looks_lost(values: Collection[float]) -> bool:
     """Return whether delays of 0 mark lost packets: all other delays are far from 0.
 
-    `decimals` is the largest number of decimals of any delay: with few decimals, a short delay may
-    be rounded to 0.
+    The delays have any unit. If they have few decimals, 0 may be a short delay that was rounded.
     """
+    decimals = max((len(f"{value:.12g}".partition(".")[2]) for value in values), default=0)
     shortest = min((value for value in values if value > 0.0), default=0.0)
     return 0.0 in values and shortest > 2 * 10.0**-decimals
-
-
-def decimals_of(text: str) -> int:
-    """Count the decimals of a number in text form."""
-    return len(re.sub(r"[eE].*", "", text).replace(",", ".").partition(".")[2])
 
 
 def _parse(text: str) -> float | None:
@@ -246,32 +239,17 @@ def _column(text: str) -> str:
     return words.replace("µ", "u").replace("μ", "u")
 
 
-def _delay_column(columns: list[str], place: str) -> str:
-    """Return the name of the delay column; reject missing, unknown or repeated columns."""
-    given = next((column for column in columns if column in _SCALES), "delay_ms")
-    needed = [column for column in columns if column != "loss"]
-    if sorted(needed) != sorted([given, "time_s"]) or columns.count("loss") > 1:
-        raise BadInputError(
-            f"{place}, line 1: the columns are {','.join(columns)[:200] or 'missing'}; the header "
-            "is time_s,delay_ms or time_s,delay_us, and may end in ,loss"
-        )
-    return given
-
-
-def _number(row: Row, column: str, maximum: float = inf) -> float:
-    """Parse a number of a trace; raise an error if it is not in [0, `maximum`]."""
+def _number(row: Row, column: str) -> float:
+    """Parse a number of a trace; reject negative and infinite numbers, and a loss above 1."""
     value = row.number(column)
-    if value is None:
-        raise row.no_number(column)
-    if not 0.0 <= value < inf or value > maximum:
-        bounds = "from 0 to 1" if maximum == 1.0 else "that is finite and not negative"
+    if value is None or not 0.0 <= value < inf or (column == "loss" and value > 1.0):
+        bounds = "from 0 to 1" if column == "loss" else "that is finite and not negative"
         mark = "; a lost packet has loss 1" if column in _SCALES else ""
-        text = row.text(column)[:40]
-        raise BadInputError(f"{row.where}: {column} is {text}; give a number {bounds}{mark}")
+        raise row.no_number(column, f"a number {bounds}{mark}")
     return value
 
 
-def _from_start(times: list[float], name: str) -> tuple[float, ...]:
+def _from_start(times: tuple[float, ...], name: str) -> tuple[float, ...]:
     """Convert Unix times to times since the first row; reject other times that start too late."""
     start = times[0]
     if start > START_MAX * 1e9:
@@ -283,10 +261,10 @@ def _from_start(times: list[float], name: str) -> tuple[float, ...]:
             f"trace {name}: time_s begins at {start:.15g} s, and until then its first row would "
             f"hold; to begin at 0: cloudrc link record {name} -o NEW.csv"
         )
-    return tuple(times)
+    return times
 
 
-def _check_delays(delays: list[float], column: str, place: str, *, may_be_lost: bool) -> None:
+def _check_delays(delays: Sequence[float], column: str, place: str, *, may_be_lost: bool) -> None:
     """Reject delays that are probably in seconds, and delays of 0 that mark lost packets."""
     longest = max(delays)
     if column == "delay_ms" and 0.0 < longest < 1.0:
@@ -294,8 +272,7 @@ def _check_delays(delays: list[float], column: str, place: str, *, may_be_lost: 
             f"{place}: delay_ms is at most {longest:g}, which looks like seconds; "
             f"multiply by 1000, or name the column delay_us and give {longest * 1e3:g}"
         )
-    decimals = max(decimals_of(f"{delay:g}") for delay in delays)
-    if may_be_lost and len(delays) >= _ROWS_TO_JUDGE and looks_lost(delays, decimals):
+    if may_be_lost and len(delays) >= _ROWS_TO_JUDGE and looks_lost(delays):
         raise BadInputError(
             f"{place}: {column} is 0 in {delays.count(0.0)} of {len(delays)} rows, which "
             "looks like lost packets; add the column loss: 1 where a packet was lost, else 0"

@@ -1,12 +1,7 @@
 """Encode messages as datagrams and decode them, with a fixed little-endian layout per kind.
 
-A datagram has a 16-byte header (version, direction, epoch, kind, counter), a body with a fixed
-length for each kind, and a 16-byte authentication tag, which `session` adds and verifies. Only a
-command may be longer, by a plan. The epoch is the number of the session. The functions raise no
-exception except DecodeError.
-
-The header is authenticated but not encrypted, because the link reads it. Its last 12 bytes are the
-nonce of the cipher: no two datagrams of one direction and epoch have the same kind and counter.
+docs/wire.md describes the layout. `session` encrypts the bodies and makes the tags. The functions
+raise no exception except DecodeError.
 
 Deviation: the paper's tunnel sends pickled ROS messages, which have 1 kB and can execute code.
 """
@@ -33,14 +28,10 @@ from cloudrc.messages import (
     Vector,
 )
 
-VERSION = 6
-"""Version of the wire format. Each release of cloudrc uses one version and refuses all others."""
-PLAN_MAX = 80
-"""Largest number of velocities in a command's plan."""
-DATAGRAM_MAX = 1200
-"""Size of the receive buffer [bytes]; every valid datagram is shorter, and fits into a packet."""
-NUMBER_MAX = 2**32 - 1
-"""Highest number of an operator request."""
+VERSION = 6  # of the wire format; a release of cloudrc refuses all other versions
+PLAN_MAX = 80  # largest number of velocities in a command's plan
+DATAGRAM_MAX = 1200  # size of the receive buffer; valid datagrams fit into one packet [bytes]
+NUMBER_MAX = 2**32 - 1  # highest number of an operator request
 
 
 class Kind(IntEnum):
@@ -76,33 +67,23 @@ Header: TypeAlias = tuple[int, int, int, int, int]
 
 
 class Hello(NamedTuple):
-    """Cloud's request for a session.
+    """Cloud's request for a session."""
 
-    `nonce` has 16 random bytes that identify the cloud process. `clock` has 16 bytes that identify
-    cloud's monotonic clock. `cookie` has the 13 bytes of world's challenge, or zeros. `epoch` is
-    the newest session number that cloud knows; world gives the new session a higher number.
-    """
-
-    nonce: bytes
-    clock: bytes
-    cookie: bytes
-    epoch: int
+    nonce: bytes  # 16 random bytes that identify the cloud process
+    clock: bytes  # 16 bytes that identify cloud's monotonic clock
+    cookie: bytes  # the 13 bytes of world's challenge, or zeros
+    epoch: int  # newest session number that cloud knows; the new session gets a higher number
 
 
 class Accept(NamedTuple):
-    """World's answer that opens a session.
+    """World's answer that opens a session."""
 
-    `nonce` is copied from the answered hello. `world_nonce` has 16 random bytes that identify the
-    world process. `clock` has 16 bytes that identify world's monotonic clock.
-    """
-
-    nonce: bytes
-    world_nonce: bytes
-    clock: bytes
+    nonce: bytes  # copied from the answered hello
+    world_nonce: bytes  # 16 random bytes that identify the world process
+    clock: bytes  # 16 bytes that identify world's monotonic clock
 
 
-COOKIE_SIZE = 13
-"""Size of a cookie [bytes]."""
+COOKIE_SIZE = 13  # size of a cookie [bytes]
 _HEADER = struct.Struct("<BBIxBQ")  # the pad byte is 0
 _BODIES = {
     Kind.HELLO: struct.Struct("<16s16s13sI"),
@@ -250,25 +231,25 @@ def encode_hello(hello: Hello) -> bytes:
     return _HELLO.pack(*hello)
 
 
-def decode_hello(body: bytes) -> Hello:
-    """Decode the body of a HELLO datagram."""
-    return Hello(*_HELLO.unpack(body))
-
-
 def encode_accept(accept: Accept) -> bytes:
     """Encode the body of an ACCEPT datagram."""
     return _ACCEPT.pack(*accept)
-
-
-def decode_accept(body: bytes) -> Accept:
-    """Decode the body of an ACCEPT datagram."""
-    return Accept(*_ACCEPT.unpack(body))
 
 
 encode_challenge: Callable[[bytes], bytes] = _CHALLENGE.pack
 """Encode the body of a CHALLENGE datagram: a cookie, padded with zeros."""
 encode_busy: Callable[[bytes], bytes] = _BUSY.pack
 """Encode the body of a BUSY datagram: the nonce of the hello that it answers."""
+
+
+def decode_hello(body: bytes) -> Hello:
+    """Decode the body of a HELLO datagram."""
+    return Hello(*_HELLO.unpack(body))
+
+
+def decode_accept(body: bytes) -> Accept:
+    """Decode the body of an ACCEPT datagram."""
+    return Accept(*_ACCEPT.unpack(body))
 
 
 def decode_challenge(body: bytes) -> bytes:

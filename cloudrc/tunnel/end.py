@@ -17,19 +17,12 @@ from cloudrc.tunnel.session import Session
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """The identity of one end, fixed when the end's process starts.
+    """The identity of one end, fixed when the end's process starts."""
 
-    Attributes:
-        clock_id: 16 bytes that identify the monotonic clock of this machine.
-        nonce: 16 random bytes that identify this process.
-        ring: The pre-shared keys; None if both ends are in one process.
-        passes: Whether both ends pass their frequent messages on as they are, not as bytes.
-    """
-
-    clock_id: bytes
-    nonce: bytes
-    ring: KeyRing | None = None
-    passes: bool = False
+    clock_id: bytes  # 16 bytes that identify the monotonic clock of this machine
+    nonce: bytes  # 16 random bytes that identify this process
+    ring: KeyRing | None = None  # the pre-shared keys; None if both ends are in one process
+    passes: bool = False  # whether both ends pass frequent messages on as they are, not as bytes
 
 
 class TunnelEnd:

@@ -7,19 +7,7 @@
                                         <--    ACCEPT (nonce, world's nonce, clock), a new epoch
                                             or BUSY (nonce)
 
-Each of these datagrams has a tag made with a pre-shared key; world answers with the key of the
-hello. No answer is longer than its hello. The cookie is a MAC over the present time slot, so world
-stores nothing for a hello without a cookie. A captured hello is useless after two slots, because
-its cookie has expired. World ignores a hello whose counter is not higher than the last counter from
-the same cloud.
-
-World sends at most ten challenges per second. A challenge is not addressed to one cloud: the true
-cloud can also use a challenge that answers an attacker's hello.
-
-A cloud keeps its session while world receives at least one new encrypted datagram from this cloud
-per `command_age_max`. After a longer silence another cloud can get a session. Each session has a
-higher number than the last one, its epoch, even after a restart of world, because each hello
-contains the newest epoch that its cloud knows.
+docs/wire.md explains cookies, epochs, keys, and which cloud gets the session.
 
 Deviation: WireGuard also derives session keys by Diffie-Hellman. This tunnel uses only the
 pre-shared key: one owner has both ends, and anybody with the key can command the robot anyway.
@@ -38,26 +26,16 @@ from cloudrc.tunnel.channel import REPEATED, Channel
 from cloudrc.tunnel.codec import Accept, DecodeError, Hello, Kind
 from cloudrc.tunnel.session import NO_EPOCH, Session
 
-EPOCH_MAX = 2**32 - 1
-"""Largest session number that the header can hold; the next number is 1."""
-CHALLENGE_NS = 100_000_000
-"""Shortest time between two challenges [ns]."""
-COOKIE_NS = 2_000_000_000
-"""Length of the time slot of a cookie [ns]. A cookie is valid in its slot and in the next slot."""
-GRACE_NS = 1_000_000_000
-"""Time for which a cloud keeps a new session before world has its first encrypted datagram [ns]."""
-REPEATS_MAX = 3
-"""Number of times that world repeats its ACCEPT to a cloud that sends no encrypted datagrams."""
-CLOUDS_MAX = 64
-"""World remembers the counter of the newest hello for at most this many cloud processes."""
-NO_COOKIE = bytes(codec.COOKIE_SIZE)
-"""Cookie in a hello for which cloud has no cookie from world."""
-REPLIES_MAX = 3
-"""Largest number of challenges that cloud answers per periodic hello."""
-COOKIES_MAX = 4096
-"""Number of cookies that cloud remembers: at one cookie every 2 s, those of more than two hours."""
-WORLDS_MAX = 64
-"""Cloud ignores late answers from at most this many earlier world processes."""
+EPOCH_MAX = 2**32 - 1  # largest session number that the header can hold; the next number is 1
+CHALLENGE_NS = 100_000_000  # shortest time between two challenges [ns]
+COOKIE_NS = 2_000_000_000  # length of a time slot; a cookie is valid in its slot and the next [ns]
+GRACE_NS = 1_000_000_000  # a new session waits so long for its first encrypted datagram [ns]
+REPEATS_MAX = 3  # repeats of ACCEPT to a cloud that sends no encrypted datagrams
+CLOUDS_MAX = 64  # cloud processes whose newest hello world remembers
+NO_COOKIE = bytes(codec.COOKIE_SIZE)  # cookie in a hello for which cloud has no cookie from world
+REPLIES_MAX = 3  # largest number of challenges that cloud answers per periodic hello
+COOKIES_MAX = 4096  # cookies that cloud remembers: at one every 2 s, of more than two hours
+WORLDS_MAX = 64  # cloud ignores late answers from at most this many earlier world processes
 
 
 def is_newer(epoch: int, than: int) -> bool:
@@ -77,13 +55,10 @@ class ServerHandshake:
     """World's side of the handshake: decide which cloud gets a session, and number sessions."""
 
     def __init__(self, session: Session, nonce: bytes, clock: bytes, age_max_ns: int) -> None:
-        """Begin without a session.
+        """Begin without a session; this class begins the sessions of `session`.
 
-        Args:
-            session: Keys and counters of world's session; this class begins the sessions.
-            nonce: 16 bytes that identify this process, new at every start.
-            clock: 16 bytes that identify the monotonic clock of this machine.
-            age_max_ns: Silence of a cloud after which another cloud can get a session [ns].
+        `nonce` and `clock` have 16 bytes each, which identify this process and the monotonic clock
+        of this machine. After a silence of `age_max_ns` [ns] another cloud can get a session.
         """
         self._session = session
         self._nonce, self._clock, self._epoch = nonce, clock, NO_EPOCH

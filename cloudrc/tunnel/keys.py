@@ -1,8 +1,4 @@
-"""Pre-shared keys, and the format of a key file.
-
-`repr` of a `Key` hides the secret. The tunnel uses keys that HKDF-SHA256 (RFC 5869) derives from
-the pre-shared key; each derived key is for one wire version and one use.
-"""
+"""Pre-shared keys, the keys that HKDF-SHA256 (RFC 5869) derives from them, and the key file."""
 
 from __future__ import annotations
 
@@ -16,26 +12,21 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from cloudrc.tunnel.codec import TAG_SIZE, VERSION
 
-KEY_SIZE = 32
-"""Size of a pre-shared key and of a derived key [bytes]."""
+KEY_SIZE = 32  # size of a pre-shared key and of a derived key [bytes]
 _LABEL = b"cloudrc %d " % VERSION
 
 
 @dataclass(frozen=True, repr=False, slots=True)
 class Key:
-    """A secret pre-shared key of 32 bytes.
-
-    Attributes:
-        name: Short public name, which tells keys apart in logs.
+    """A secret pre-shared key of 32 bytes. `repr` and messages of errors do not show the secret.
 
     Raises:
-        ValueError: If the secret is not 32 bytes long, or if all bytes are zero. The message does
-            not contain the secret.
+        ValueError: If the secret is not 32 bytes long, or if all bytes are zero.
     """
 
     _secret: bytes
     _tag_key: bytes = field(init=False, compare=False)
-    name: str = field(init=False, compare=False)
+    name: str = field(init=False, compare=False)  # short and public, to tell keys apart in logs
 
     def __post_init__(self) -> None:
         if len(self._secret) != KEY_SIZE:

@@ -1,16 +1,11 @@
 """Encrypt outgoing datagrams and verify incoming datagrams with the keys of a session.
 
-Each direction of a session has one key. HKDF derives this key from a pre-shared key, the nonces of
-both ends, and the epoch (session number). The keys need no change within a session, because 2^32
-datagrams take more than a year. A datagram changes no state before its tag is verified.
-
-Counters restart with every session, except those of handshake datagrams outside of a session. The
-link decides from epoch and counter whether a datagram is lost. With a restarted counter it would
-lose the same handshake datagrams in every attempt.
+A datagram changes no state before its tag is verified. Counters restart with every session, except
+those of HELLO, CHALLENGE and BUSY: the link draws losses by epoch and counter, and with a restarted
+counter it would lose the same handshake datagrams in every attempt.
 
 Two ends in one process need no keys: their datagrams reach no network, and encryption would take
-5 % of the run time. Drivers with a socket refuse a session without keys (`Endpoint.sealed`), so a
-missing key never leads to plaintext in a network.
+5 % of the run time. Drivers with a socket refuse a session without keys (`Endpoint.sealed`).
 """
 
 from __future__ import annotations
@@ -33,10 +28,8 @@ from cloudrc.tunnel.codec import (
 )
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 
-NO_EPOCH = 0
-"""Epoch of an end without a session, and of every HELLO, CHALLENGE and BUSY datagram."""
-TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}
-"""Kinds of handshake datagrams that belong to no session: all except ACCEPT."""
+NO_EPOCH = 0  # epoch of an end without a session, and of every HELLO, CHALLENGE and BUSY datagram
+TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}  # belong to no session
 _PUBLIC_KEY = b"nothing is secret in one process"
 _NO_TAG = bytes(TAG_SIZE)
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
@@ -57,13 +50,9 @@ class NoCipher:
 class Session:
     """Keys and counters of one end in the present session.
 
-    Attributes:
-        epoch: Number of the session; `NO_EPOCH` without a session.
-        sealed: Whether datagrams of the session are encrypted and authenticated.
-        ring: The pre-shared keys; `follow_keys` adopts changes.
-        greeting_key: Pre-shared key that verified the last handshake datagram.
-        epoch_key: Pre-shared key of the session.
-        is_outdated: Whether the key file has a newer key than the session.
+    `epoch` is the number of the session, or `NO_EPOCH`. `epoch_key` is the pre-shared key of the
+    session; `is_outdated` tells whether the key file has a newer one. `greeting_key` is the
+    pre-shared key that verified the last handshake datagram.
     """
 
     def __init__(self, sends: Direction, ring: KeyRing | None) -> None:

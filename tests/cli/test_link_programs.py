@@ -41,18 +41,16 @@ def programs(tmp_path, monkeypatch):
     return Programs()
 
 
-def test_changes_and_listings_go_through_one_process(programs, tmp_path):
+def test_changes_go_through_one_process(programs, tmp_path):
     for _ in range(2):
         assert programs((*CHANGE, "delay", "1us")) == (0, "", "")
-        assert programs(SHOW) == (0, '[{"kind":"netem"}]', "")
         code, _, error = programs((*CHANGE, "lacks"))
         assert code
         assert error == "Cannot find device eth0"
-        assert programs((*SHOW, "lacks")).code
-    lines = [line for line in (tmp_path / "log").read_text().splitlines() if line[-2:] != "lo"]
-    assert lines[:2] == ["qdisc change dev eth0 netem delay 1us", "qdisc show dev eth0"]
+    lines = (tmp_path / "log").read_text().splitlines()
+    assert lines[:2] == ["qdisc change dev eth0 netem delay 1us", "qdisc show dev lo"]
     assert programs((*CHANGE, "dies")).code == 0  # repeated in its own process
-    assert programs(SHOW).output == '[{"kind":"netem"}]'
+    assert programs(SHOW).output.strip() == '[{"kind":"netem"}]'
     programs.close()
     assert programs(("tc", "qdisc", "add", "lacks")).code == 2, "not a change"
     assert programs(("no-such-program",)).code == 127

@@ -1,5 +1,6 @@
 """`cloudrc link verify` of a release, which `helm test` runs, over real HTTP."""
 
+import json
 from contextlib import ExitStack, closing
 from math import nan
 from unittest.mock import Mock
@@ -11,11 +12,9 @@ from cloudrc.cli.link_verify import as_text, find_experiment, verify_release
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.errors import TimedOutError
-from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.sidecar import Near, Told, write_told
 from cloudrc.records import LinkChecked
 
-APPLIED = DirectionProfile(0.045, loss=0.02, duplicate=0.01, rate=3e6)
+PAGE = {"shaper": "relay", "reason": "", "rate": 3e6, "interface": "eth0", "netems": {}}
 MEASURED = {"ok": 0.0451, "open": 0.0451, "off": 0.0902}
 
 
@@ -27,7 +26,7 @@ class Release:
         self.links = {way: open_exporter("link") for way in ("uplink", "downlink")}
         for way, link in self.links.items():
             link.shaped("relay", way, "auto")
-            self.shapes(way, Told("relay", "", APPLIED, Near("eth0", {})))
+            self.shapes(way, PAGE)
 
     def hears(self, *, stamp_ns=5, **verdicts):
         """Give ends a verdict on the direction that they receive."""
@@ -44,8 +43,8 @@ class Release:
         row = LinkChecked(5, True, name, asked, measured, 0.0, 0.0, "told", 3300)
         self.ends["cloud"].see([row])
 
-    def shapes(self, way, told):
-        self.links[way].link.tell = lambda: write_told(told)
+    def shapes(self, way, page):
+        self.links[way].link.tell = lambda: json.dumps(page)
 
     def ask(self, limit=30.0):
         pods = {}
@@ -93,9 +92,8 @@ def test_a_fault_names_its_direction(release):
     assert said["verdict"] == "not believed"
     assert causes(said) == [("doubled_delay", "downlink")]
     assert "mean 90.20 ms instead of 45.00 ms" in as_text(said)
-    told = Told("relay", "", APPLIED, Near("eth0", {"eth0": [{"kind": "netem"}]}))
     for way in release.links:
-        release.shapes(way, told)
+        release.shapes(way, PAGE | {"netems": {"eth0": [{"kind": "netem"}]}})
     release.hears(cloud="off")
     assert causes(release.ask()) == [("shaped_twice", "both")], "qdiscs that the links find"
 
@@ -127,7 +125,7 @@ def test_what_is_not_judged_is_noted(release, monkeypatch):
 )
 def test_a_shaper_that_reports_another_rate_is_not_believed(release, applied, code):
     """Single datagrams do not measure the rate."""
-    release.shapes("uplink", Told("relay", "", DirectionProfile(0.045, rate=applied)))
+    release.shapes("uplink", PAGE | {"rate": applied})
     release.hears(world="ok", cloud="ok")
     release.tells("rate", 3e6)
     assert causes(release.ask()) == ([(code, "uplink")] if code else [])

@@ -142,7 +142,7 @@ def test_an_unreachable_or_silent_container_gets_the_change_later(cluster, capsy
     assert said.endswith(f"container link of pod cloud-1{LATER}")
     cluster.states["cloud-1"].clear()
     assert main(LINE) == 5
-    assert "a link container has another version: not the state of a link" in error(capsys)
+    assert "a link container has another version: not a LinkState: " in error(capsys)
 
 
 def test_a_change_that_cannot_be_kept_says_where_it_is(cluster, capsys):

@@ -6,7 +6,6 @@ import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.link.logs import (
-    Log,
     Packets,
     is_ping,
     read_csv,
@@ -124,28 +123,22 @@ def test_up_to_1_percent_may_be_unusable_and_all_is_counted():
     )
     assert packets.notes[3:] == (f"{pause} the clock",)
     assert len(packets.sent) == 199
+    assert packets.sent == tuple(sorted(packets.sent))
     rows[70] = rows[80] = "7"
     with pytest.raises(BadInputError, match=r"line 52: .* \(3 of 200 rows cannot be used\)"):
         read("\n".join(["time_s,delay_ms", *rows]))
 
 
-def test_packets_are_put_in_the_order_of_sending():
-    packets = Log("x", [(2.0, 0.1), (1.0, None)]).packets()
-    assert (packets.sent, packets.delays) == ((1.0, 2.0), (None, 0.1))
-    assert (packets.lost, packets.duration) == (1, 1.0)
-    assert packets.notes == ("1 out of order, sorted",)
-
-
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ('{"start":{"version":"iperf 3.16"}}', "output of iperf, which has no delay of each"),
+        ('{"start":{"version":"iperf 3.16"}}', "iperf"),
         ("Antwort von 192.0.2.7: Bytes=32 Zeit<1ms TTL=57", "ping of Windows"),
         ("traceroute to 192.0.2.1, 30 hops max", "traceroute or mtr"),
     ],
 )
 def test_other_tools_are_called_by_their_names(line, says):
-    with pytest.raises(BadInputError, match=f"x: the output of .*{says}|x: the {says}"):
+    with pytest.raises(BadInputError, match=f"x: the output of {says}, which lacks the number, "):
         refuse_others(["", line], "x")
 
 
@@ -187,9 +180,9 @@ def test_irtt_knows_both_ways(direction, sent, delays):
 
 def test_irtt_without_a_monotonic_clock_is_read():
     trips = [trip(0), trip(1)]
-    for one in reversed(trips):  # first only one packet lacks it: the wall clock counts for all
+    for one in trips:
         del one["timestamps"]["client"]["send"]["monotonic"]
-        assert irtt(trips, "uplink").sent == pytest.approx((0.0, 0.010))
+    assert irtt(trips, "uplink").sent == pytest.approx((0.0, 0.010))
 
 
 STEPPED = [trip(0), trip(1), trip(2)]
@@ -340,7 +333,6 @@ FIVE = [reply(number, number / 5) for number in range(1, 6)]
         (["[1.0] 64 bytes from h: icmp_seq=1 ttl=57 tid=1 xx"], "cannot? ?be read|LC_ALL=C"),
         ([*FIVE, summary(5, 4)], "summary counts 5 sent and 4 received, but it has 5 replies"),
         ([*FIVE[:2], summary(5, 5)], "summary counts 5 sent and 5 received, but it has 2 replies"),
-        ([*FIVE, "rtt min/avg/max/mdev = 9/30/90/1 ms"], "gives a mean of 30 ms, but .* 20 ms"),
         ([HEAD, *FIVE, HEAD], "more than one session of ping .2 beginnings"),
         ([*FIVE, reply(1, 900.0)], "more than one session of ping .number 1 comes twice"),
         (

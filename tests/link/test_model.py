@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from cloudrc.link.draws import (
     BLOCK,
-    CHAIN_BLOCKS,
     Purpose,
     bad_states,
     normals,
@@ -87,17 +86,6 @@ def test_uniforms_stay_inside_the_open_interval(block, purpose):
     values = uniforms(KEY, purpose, block)
     assert values.shape == (BLOCK,)
     assert 0.0 < values.min() < 0.1 < 0.9 < values.max() < 1.0
-
-
-@given(blocks=st.lists(st.integers(0, 2 * CHAIN_BLOCKS), min_size=1, max_size=4))
-@settings(max_examples=10, deadline=None)
-def test_chains_do_not_depend_on_what_was_asked_before(blocks):
-    found = []
-    for order in (blocks, blocks[::-1]):
-        for function in (uniforms, normals, bad_states):
-            function.cache_clear()
-        found.append([(normals(KEY, 0, b, 0.9), bad_states(KEY, b, 0.02, 0.2)) for b in order])
-    assert found[0] == found[1][::-1]
 
 
 def test_chains_are_those_of_the_docstrings():

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from cloudrc.link.netem import (
     notes,
     options,
     table,
-    write_tables,
+    write_table,
 )
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Timeline, Trace
 
@@ -99,7 +100,7 @@ class Kernel:
 
 
 def netem(kernel, profile, log=print):
-    ways = {"clock": kernel.clock, "wait": kernel.wait, "log": log}
+    ways = {"clock": kernel.clock, "wait": kernel.wait, "tables": Path("none"), "log": log}
     return Netem(kernel.run, profile, origin_ns=0, **ways)
 
 
@@ -158,13 +159,11 @@ def test_a_profile_is_put_into_tcs_words(profile, at, words):
 @pytest.mark.parametrize(
     ("profile", "key"),
     [
-        (DirectionProfile(trace=Trace((0.0, 9.0), (0.1, 300.0))), "here 300000 ms"),
-        (DirectionProfile(trace=Trace((0.0, 9.0), (0.1, 0.3), loop=True)), "a trace that begins a"),
+        (DirectionProfile(trace=Trace((0.0, 9.0), (0.1, 300.0))), "delay_ms above 274000"),
+        (DirectionProfile(trace=Trace((0.0, 9.0), (0.1, 0.3), loop=True)), "a trace with loop"),
         (DirectionProfile(changes=(Change(1.0, loss=BURSTS),)), "loss.delay_bad_ms"),
         (DirectionProfile(rate=1e6, changes=(Change(1.0, jitter=0.1),)), "without keep_order"),
-        (DirectionProfile(rate=4.0), "rate_kbit below 0.008"),
-        (DirectionProfile(loss=GilbertElliott(0.1, 1e-11)), "a probability below 2**-32"),
-        (DirectionProfile(blackouts=(Blackout(1.0, 0.004),)), "here 4 ms at 1 s"),
+        (DirectionProfile(blackouts=(Blackout(1.0, 0.004),)), "blackouts shorter than 5 ms"),
     ],
 )
 def test_what_netem_cannot_do_is_refused_by_name(profile, key):
@@ -189,12 +188,12 @@ def test_what_netem_does_differently_is_said():
 
 @pytest.mark.parametrize("distribution", sorted(STRETCH))
 def test_tables_are_the_models_distributions(distribution, tmp_path):
-    write_tables(tmp_path)
+    profile = DirectionProfile(jitter=1.0, distribution=distribution)
+    write_table(tmp_path, profile)
     _, *rows = (tmp_path / f"{distribution}.dist").read_text().splitlines()
-    entries = np.array(table(distribution))
+    entries = np.array(table(profile))
     assert [int(word) for row in rows for word in row.split()] == entries.tolist()
     assert np.abs(entries).max() < 2**15
-    profile = DirectionProfile(jitter=1.0, distribution=distribution)
     key = stream_key(1, True, 1, 3)
     drawn = np.concatenate([shape(key, Purpose.DELAY, block, profile) for block in range(80)])
     found, shares = entries * STRETCH[distribution] / 8192, np.linspace(0.02, 0.9, 25)

@@ -20,7 +20,7 @@ from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.link.model import LinkDirection, numbers, sample
-from cloudrc.link.netem import STRETCH, Netem, table, write_tables
+from cloudrc.link.netem import STRETCH, Netem, table
 from cloudrc.link.profile import Blackout, DirectionProfile, GilbertElliott, Trace
 from cloudrc.tunnel.codec import Kind
 
@@ -134,11 +134,10 @@ def least(error, enough):
 def make(tmp_path_factory):
     """Connect two namespaces; the value makes a netem in the near one."""
     folder = tmp_path_factory.mktemp("tc")
-    write_tables(folder)
     run = NearPrograms(str(folder))
 
     def made(profile, origin_ns=0):
-        ways = {"clock": time.monotonic_ns, "wait": time.sleep, "tables": folder}
+        ways = {"clock": time.monotonic_ns, "wait": time.sleep, "tables": folder, "log": print}
         return Netem(run, profile, origin_ns=origin_ns, **ways)
 
     try:
@@ -183,7 +182,7 @@ def test_jitter_is_distributed_as_asked(shaped, distribution):
     shaped.follow_profile(profile)
     shares = [0.05, 0.25, 0.5, 0.75, 0.95]
     if distribution != "table":
-        measured = np.array(table(distribution)) * STRETCH[distribution] / 8192
+        measured = np.array(table(profile)) * STRETCH[distribution] / 8192
     asked = 0.080 + 0.020 * np.quantile(measured, shares)
 
     def off():

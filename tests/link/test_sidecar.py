@@ -11,7 +11,7 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.follow import Loaded
 from cloudrc.link.profile import Blackout, DirectionProfile, Trace
 from cloudrc.link.profile import Change as Step
-from cloudrc.link.sidecar import Machine, Sidecar, Told
+from cloudrc.link.sidecar import Machine, Sidecar
 from cloudrc.link.state import Change
 
 PEER, NEXT = ("10.244.0.7", 7400), ("10.244.0.9", 7400)
@@ -205,20 +205,21 @@ def test_a_profile_netem_cannot_do_is_refused_or_relayed(tmp_path):
     assert 1.0e9 <= told["origin_ns"] <= 1.2e9, "the relay begins the time line anew"
 
 
-def test_a_sidecar_tells_what_is_in_force(tmp_path):
-    """While a time line runs, nothing is; one that loops is never over."""
-    changes = (Step(1.0, delay=0.08, jitter=0.01),)
-    timed = DirectionProfile(0.04, changes=changes, blackouts=(Blackout(0.2, 0.1),))
+def test_a_sidecar_reports_its_rate_once_it_is_constant(tmp_path):
+    """While a time line runs, the rate is unknown; a time line that loops is never over."""
+    known, unlimited = {"rate": 3e6}, {"rate": None}
     looping = DirectionProfile(trace=Trace((0.0, 1.0), (0.040, 0.050), loop=True))
     for profile, early, late in (
-        (DirectionProfile(0.04), DirectionProfile(0.04), DirectionProfile(0.04)),
-        (timed, None, DirectionProfile(0.08, 0.01)),
-        (looping, None, None),
+        (DirectionProfile(rate=3e6), known, known),
+        (DirectionProfile(changes=(Step(1.0, rate=3e6),)), {}, known),
+        (DirectionProfile(blackouts=(Blackout(0.9, 0.1),)), {}, unlimited),
+        (looping, {}, {}),
     ):
         bench, found = Bench(tmp_path, "relay", profile=profile), []
-        assert bench.sidecar.told() is None
-        bench.at(0.5, lambda bench=bench, found=found: found.append(bench.sidecar.told()))
+        assert bench.sidecar.status() == {}
+        bench.at(0.5, lambda bench=bench, found=found: found.append(bench.sidecar.status()))
         bench.run()
         bench.now_ns = 3_700_000_000_000
-        expected = [Told("relay", "link.mode=relay", one) for one in (early, late)]
-        assert [*found, bench.sidecar.told()] == expected
+        common = {"shaper": "relay", "reason": "link.mode=relay"}
+        expected = [common | one for one in (early, late)]
+        assert [*found, bench.sidecar.status()] == expected

@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cloudrc.link.verify.probe import PROBE
 from cloudrc.messages import (
     Cause,
     Command,
@@ -93,6 +94,15 @@ def test_every_wrong_length_direction_and_version_is_refused(kind):
         assert outcome(codec.check, bytes([version]) + whole[1:]) == "version"
     for size in range(codec.HEADER_SIZE + 1):
         assert outcome(codec.peek, whole[:size]) == ("malformed" if size < 16 else "fine")
+
+
+def test_an_unknown_kind_is_refused_at_every_length():
+    """Such as a probe of `link verify`, which has a header of the tunnel."""
+    for kind in (0, 9, PROBE):
+        for size in sorted({codec.HEADER_SIZE, *codec.SIZES.values(), codec.DATAGRAM_MAX}):
+            data = codec.encode_header(kind, 1, 1, 2).ljust(size, b"\0")
+            assert outcome(codec.check, data) == "malformed"
+            assert codec.peek(data)[0] == kind, "the link tells them apart"
 
 
 LARGEST = codec.encode_operator(OperatorRequest(1, Request.PROGRESS, Start.HERE, 2**63 - 1))

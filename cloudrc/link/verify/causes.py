@@ -9,18 +9,15 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from math import inf, isnan
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from cloudrc.link.sidecar import Near, Told
 from cloudrc.link.verify.judge import Row
 
 LATE, UNREAD, STOPPED = 1.5e-3, 0.003, 0.01
 """Limits of a shaper with enough CPU time: 99 % quantile of its release error [s]; share of
 datagrams not read in time; share of CPU periods in which the shaper was throttled."""
-RAISED = ("mean", "round_trip", "deviation", "loss")
-"""Quantities that rise if the shaper lacks CPU time."""
-PASSED = 0.9
-"""If the shaper counts less than this share of the arrived datagrams, some bypass it."""
+RAISED = ("mean", "round_trip", "deviation", "loss")  # these rise without CPU time
+PASSED = 0.9  # if the shaper counts less than this share of the arrived datagrams, some bypass it
 
 
 class Evidence(NamedTuple):
@@ -44,8 +41,10 @@ def read_metrics(text: str) -> dict[str, float]:
     return {name: float(value) for name, (_, _, value) in zip(names, found, strict=True)}
 
 
-def read_evidence(told: Told, metrics: Mapping[str, float], sent: int | None = None) -> Evidence:
-    """Combine the report of a `link` container (page /link.json) with its metrics.
+def read_evidence(
+    page: Mapping[str, Any], metrics: Mapping[str, float], sent: int | None = None
+) -> Evidence:
+    """Combine the page /link.json of a `link` container with its metrics.
 
     `sent` is the number of datagrams sent to the shaper since it started; None if unknown.
     """
@@ -60,17 +59,18 @@ def read_evidence(told: Told, metrics: Mapping[str, float], sent: int | None = N
         (late > LATE, f"1 % released later than {in_unit(late, 's')}"),
         (stopped > STOPPED * periods, f"stopped in {stopped} of {periods} CPU periods"),
     )
-    near, netem = told.near or Near("", {}), told.shaper == "netem"
-    ways = {near.interface} if netem else {near.interface, "lo"}  # the relay receives through lo
-    here = [one for way in ways for one in near.netems.get(way, ())]
+    shaper, interface = page.get("shaper", ""), page.get("interface", "")
+    netems, netem = page.get("netems", {}), shaper == "netem"
+    ways = {interface} if netem else {interface, "lo"}  # the relay receives through lo
+    here = [one for way in ways for one in netems.get(way, ())]
     passed = received + unread if metrics and not netem else None
     if netem and here:
         passed = max(int(one.get("packets", 0)) + int(one.get("drops", 0)) for one in here)
     return Evidence(
-        shaper="none" if netem and told.near and not here else told.shaper,
-        why=told.why,
-        interface=near.interface,
-        elsewhere=tuple(sorted(near.netems.keys() - ways)) if netem else (),
+        shaper="none" if netem and "netems" in page and not here else shaper,
+        why=page.get("reason", ""),
+        interface=interface,
+        elsewhere=tuple(sorted(netems.keys() - ways)) if netem else (),
         layers=len(here) if netem else 1 + len(here),
         sent=sent,
         passed=passed if sent is not None else None,

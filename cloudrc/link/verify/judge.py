@@ -20,14 +20,13 @@ from typing import NamedTuple
 import numpy as np
 
 from cloudrc.link.draws import Floats
-from cloudrc.link.model import HEADER_BYTES, LinkDirection, Stream, numbers
+from cloudrc.link.model import HEADER_BYTES, LinkDirection, Stream, numbers, sample
 from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline, mean_loss
 
 RUNS, RUN_LENGTH = 200, 1000
 """Number of simulated links for a band, and number of datagrams on each simulated link. The band is
 scaled for measurements with another number of datagrams."""
-TAIL = 1e-3
-"""Share of correct links with a value below a band, and share with a value above it, in [0, 1]."""
+TAIL = 1e-3  # share of correct links below a band, and share above it, in [0, 1]
 SAME_DELAYS, SAME_LOSSES = 0.5, 0.97
 """Limits above which a link counts as a relay with the predicted random numbers: correlation of
 measured and predicted delays; share of datagrams whose loss or arrival was predicted."""
@@ -43,8 +42,7 @@ TOLERANCES = {
 }
 """Quantity -> tolerance in the unit of the quantity, and tolerance as a share of the requested
 value. The larger tolerance applies. For the deviation on a relay, half the share is used."""
-SHARE_TOLERANCE = (0.02, 0.25)
-"""Tolerance of loss, reordering and duplication: absolute [1], and as a share of the request."""
+SHARE_TOLERANCE = (0.02, 0.25)  # of shares: absolute [1], and relative to the request
 UNITS = {"mean": "s", "round_trip": "s", "deviation": "s", "rate": "bit/s"}
 """Quantity -> unit; quantities that are not listed are shares with the unit "1"."""
 FEWEST, CHANCE_MAX = 300, 1.6
@@ -105,39 +103,26 @@ class Expected(NamedTuple):
 class Plan:
     """A measurement of one direction: the requested profile, and the datagrams to send.
 
-    Attributes:
-        profile: Requested conditions.
-        flow: Kind, size and direction of the datagrams.
-        sent: Time of sending of each datagram, since the link came up [s], shape (n,).
-        train: Number of datagrams in a train, which is sent back to back. Before each train, the
-            same number of datagrams is sent one by one. 0 if there are no trains.
-        pause: Function called every few hundred microseconds, so that other threads can run.
+    A train of datagrams is sent back to back. Before each train, the same number of datagrams is
+    sent one by one. `pause` is called every few hundred microseconds: other threads can run then.
     """
 
-    profile: DirectionProfile
+    profile: DirectionProfile  # requested conditions
     flow: Flow
-    sent: Floats
-    train: int = 0
+    sent: Floats  # time of sending of each datagram, since the link came up [s], shape (n,)
+    train: int = 0  # number of datagrams in a train; 0 if there are no trains
     pause: Callable[[], None] = lambda: None
 
     def draw(self, sent: Floats, epoch: int = 1, first: int = 0) -> Stream:
         """Simulate the link for datagrams sent at the times `sent` [s] since the link came up.
 
-        `first` is the counter of the first datagram. Damaged datagrams count as lost, because the
-        receiver rejects them.
+        `first` is the counter of the first datagram.
         """
         seed, uplink, kind, size = self.flow
-        link, whole = LinkDirection(self.profile, seed, uplink), bytes(size)
-        delays, copies = np.full(len(sent), np.nan), np.zeros(len(sent), int)
-        for place, now_ns in enumerate(np.rint(sent * 1e9).astype(np.int64).tolist()):
-            fate = link.send(epoch, kind, first + place, size, now_ns)
-            if link.corrupts and link.corrupted(epoch, kind, first + place, whole) != whole:
-                fate = ()
-            if fate:
-                delays[place], copies[place] = (min(fate) - now_ns) * 1e-9, len(fate)
-            if place % 128 == 0:
-                self.pause()
-        return Stream(sent, delays, copies)
+        link = LinkDirection(self.profile, seed, uplink)
+        sent_ns = np.rint(sent * 1e9).astype(np.int64).tolist()
+        stream = sample(link, kind, sent_ns, size, epoch=epoch, first=first, pause=self.pause)
+        return replace(stream, sent=sent)
 
     @cached_property
     def links(self) -> list[Stream]:

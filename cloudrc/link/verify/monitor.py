@@ -1,7 +1,7 @@
 """Monitor the link in flight: every 5 s, compare the received datagrams with the prediction.
 
-World judges the downlink. Cloud judges the uplink and, if the machines of world and cloud share no
-clock, the round trips. A separate thread does the work, so that the control loop is not delayed.
+World judges the downlink. Cloud judges the uplink and, if world and cloud share no clock, the round
+trips. A separate thread does the work, so that the control loop is not delayed.
 """
 
 from __future__ import annotations
@@ -36,21 +36,13 @@ from cloudrc.link.verify.judge import (
 )
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 
-PERIOD = 0.01
-"""Default period of telemetry and of commands [s]."""
-CHECK_NS, SETTLE_NS = 5_000_000_000, 2_000_000_000
-"""Period of the verdicts [ns]; pause after a change of session or profile [ns]."""
-KEPT, FINAL = 6000, 128
-"""Largest number of datagrams judged; number of newer datagrams after which a missing datagram
-counts as lost."""
-ENDS = 2e-3
-"""Largest delay that world and cloud add to a round trip if they wake on time [s]."""
-FOLLOW_PERIOD = 0.1
-"""Period at which the thread reads new records and the link's state file [s]."""
-UNJUDGED = {"distribution"}
-"""Quantity that is not judged in flight, because late wakes of world and cloud change it."""
-DELAYS = {"mean", "deviation"}
-"""Quantities that can be measured only if world and cloud share a clock."""
+PERIOD = 0.01  # default period of telemetry and of commands [s]
+CHECK_NS, SETTLE_NS = 5_000_000_000, 2_000_000_000  # period; pause after a change [ns]
+KEPT, FINAL = 6000, 128  # most datagrams judged; later datagrams before one counts as lost
+ENDS = 2e-3  # largest delay that world and cloud add to a round trip if they wake on time [s]
+FOLLOW_PERIOD = 0.1  # period at which the thread reads new records and the link's state file [s]
+UNJUDGED = {"distribution"}  # not judged in flight: late wakes of world and cloud change it
+DELAYS = {"mean", "deviation"}  # measurable only if world and cloud share a clock
 
 Asked: TypeAlias = tuple[DirectionProfile, DirectionProfile]
 """Requested profiles of uplink and downlink."""

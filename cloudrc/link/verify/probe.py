@@ -23,19 +23,15 @@ from cloudrc.link.relay import ANCILLARY_SIZE, DATAGRAM_MAX, Stamps, ask_for_sta
 from cloudrc.link.verify.judge import Flow, Plan
 from cloudrc.tunnel.codec import Direction, encode_header, peek
 
-PROBE = 254
-"""Kind of datagram in the header of probes; world and cloud reject this kind."""
-FIRST_PROBE = 1.0
-"""Time from the start of the link to the first probe [s]."""
-COUNT = 1500
-"""Smallest number of probes, if the user does not specify a duration."""
+PROBE = 254  # kind of datagram in the header of probes; world and cloud reject this kind
+FIRST_PROBE = 1.0  # time from the start of the link to the first probe [s]
+COUNT = 1500  # smallest number of probes, if the user does not specify a duration
 LONGEST, AFTER = 120.0, 5.0
 """Longest duration of a measurement; how long it goes on after the profile's last change [s]."""
 RATE, LINK_SHARE = 200.0, 0.4
 """Largest number of probes per second [1/s], halved for netem; largest share of a limited rate that
 single probes use, in [0, 1]."""
-RATE_MAX = 1e8
-"""Largest rate limit of a profile that this process can measure [bit/s]."""
+RATE_MAX = 1e8  # largest rate limit of a profile that this process can measure [bit/s]
 TRAIN_SIZE, TRAIN_SPAN = 1400, 0.06
 """If the profile limits the rate: size of a probe's UDP payload [bytes], one Ethernet frame; and
 shortest transmission time of a train, which is a group of probes sent back to back [s]."""

@@ -2,7 +2,6 @@
 
 import pytest
 
-from cloudrc.link.sidecar import Near, Told
 from cloudrc.link.verify.causes import Evidence, Findings, find_causes, read_evidence, read_metrics
 from cloudrc.link.verify.judge import Row
 
@@ -18,17 +17,17 @@ cloudrc_link_restored_total 2
 
 
 def test_metrics_report_lateness_counts_and_stops():
-    told, found = Told("relay", "link.mode=relay", None), read_metrics(METRICS)
-    known = read_evidence(told, found, 600)
+    page, found = {"shaper": "relay", "reason": "link.mode=relay"}, read_metrics(METRICS)
+    known = read_evidence(page, found, 600)
     assert (known.passed, known.sent, known.restored) == (503, 600, 2)
     assert known.starved == (
         "3 datagrams not read in time, 1 % released later than 2.10 ms, stopped in 40 of 100 CPU"
         " periods"
     )
-    assert read_evidence(told, found).passed is None, "since its start"
+    assert read_evidence(page, found).passed is None, "since its start"
     nothing = Evidence("relay", "link.mode=relay", sent=5)
-    assert read_evidence(told, {}, 5) == nothing, "without tools nothing is claimed"
-    netem = Told("netem", "", None, Near("eth0", {"eth0": [NETEM]}))
+    assert read_evidence(page, {}, 5) == nothing, "without tools nothing is claimed"
+    netem = {"shaper": "netem", "interface": "eth0", "netems": {"eth0": [NETEM]}}
     assert read_evidence(netem, {}, 100).passed == 100, "counted by the kernel"
 
 
@@ -43,6 +42,6 @@ def test_metrics_report_lateness_counts_and_stops():
     ],
 )
 def test_qdiscs_on_the_way_of_the_flow_are_the_cause(shaper, netems, code):
-    known = read_evidence(Told(shaper, "", None, Near("eth0", netems)), {})
+    known = read_evidence({"shaper": shaper, "interface": "eth0", "netems": netems}, {})
     row = Row("mean", "s", 0.045, 0.09, 0.043, 0.047, "off")
     assert [one.code for one in find_causes({"uplink": Findings([row], known)})] == [code]

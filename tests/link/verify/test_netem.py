@@ -93,7 +93,7 @@ def test_what_is_wrong_in_the_kernel_is_named(fault, figure):
     more, commands = FAULTS[fault]
     with running() as ways:
         for way in ways.values():
-            way.process.send_signal(signal.SIGSTOP)  # so that it restores nothing
+            way.process.send_signal(signal.SIGSTOP)  # so that it does not report the change
             for command in commands:
                 change(way, command)
         found = {cause["code"] for cause in verify(ways, planned(*more))["causes"]}
