@@ -64,6 +64,9 @@ RELEASED_PERIOD_NS = 2_000_000_000
 BEGINNINGS = frozenset({SessionOpened, GuardChange, MissionEvent})
 """Types of records at which a mission may begin. The state of the link is recorded again after such
 a record, so that a recording whose earlier part is cut off contains the state, too."""
+CLOCK_STEP = 0.1
+"""Smallest step of the wall clock that is recorded [s]."""
+SINCE_BOOT = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # the former: Linux
 NONSENSE = (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError)
 """Errors that an unreadable or malformed file can raise."""
 
@@ -288,6 +291,7 @@ class EndProcess:
     def __post_init__(self) -> None:
         self._notes = LinkNotes(self.link, uplink=self.end == "world") if self.link else None
         self._trouble, self._dropped = "", 0
+        self._clock_offset = time.time() - time.clock_gettime(SINCE_BOOT)
 
     def run(
         self,
@@ -307,7 +311,7 @@ class EndProcess:
             self.exporter.recording(thread.sync_age)
 
         def sink(records: list[Record]) -> None:
-            records = records + self.look_around(records, slip_ns(), thread.take_steps())
+            records = records + self.look_around(records, slip_ns())
             self.recorder.put(choose(records))
             self.tell(records)
 
@@ -335,31 +339,32 @@ class EndProcess:
                 records = [*records, self._count_losses(records[-1].stamp_ns)]
             self.exporter.see(records)
 
-    def look_around(
-        self, records: list[Record], slip_ns: int, clock_steps: list[float]
-    ) -> list[Record]:
+    def look_around(self, records: list[Record], slip_ns: int) -> list[Record]:
         """Return records about steps of the wall clock, new keys, and the state of the link.
 
         `records` are the newest records of the endpoint. `slip_ns` is the lag of the endpoint's
-        clock behind the machine's monotonic clock [ns]. `clock_steps` are steps
-        of the wall clock [s].
+        clock behind the machine's monotonic clock [ns].
         """
         now_ns = time.monotonic_ns()
-        noted: list[Record] = [
-            Fault(
-                now_ns - slip_ns,
-                CLOCK_SET,
-                f"wall clock stepped by {step:+.1f} s: the flight is not affected;"
-                " do not compare times of day before and after the step",
-            )
-            for step in clock_steps
-        ]
+        noted: list[Record] = []
+        if step := self._clock_step():
+            text = f"wall clock stepped by {step:+.1f} s: the flight is not affected"
+            noted.append(Fault(now_ns - slip_ns, CLOCK_SET, text))
         noted += self.keys.follow(now_ns)
         if self._notes is not None:
             noted += self._notes.after(records, now_ns, slip_ns)
         if self.check is not None:
             noted += self.check.after([*records, *noted], now_ns - slip_ns)
         return noted
+
+    def _clock_step(self) -> float:
+        """Return by how much the wall clock was set since the last call [s]; 0 if it was not."""
+        before, wall = time.clock_gettime(SINCE_BOOT), time.time()
+        boot = time.clock_gettime(SINCE_BOOT)
+        if boot - before > CLOCK_STEP / 2.0:
+            return 0.0  # the process was paused while it read the clocks: the next call compares
+        step, self._clock_offset = wall - boot - self._clock_offset, wall - boot
+        return step if abs(step) > CLOCK_STEP else 0.0
 
     def _count_losses(self, stamp_ns: int) -> Counted:
         return Counted(stamp_ns, self.end, "recorder_dropped", self.recorder.dropped)
