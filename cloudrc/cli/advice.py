@@ -58,17 +58,19 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
     """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection
-    from cloudrc.messages import PLAN_STEP_NS
+    from cloudrc.messages import plan_length
     from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
 
-    plan = round(experiment.cloud.plan_s * 1e9) // PLAN_STEP_NS
+    plan = plan_length(experiment.cloud.plan_s)
     newest_wins = experiment.tunnel.order == "newest" or plan > 0
-    sizes = {**SIZES, Kind.COMMAND: COMMAND_SIZES[plan]}
+    sizes = SIZES[Kind.TELEMETRY], COMMAND_SIZES[plan]
+    profiles = [
+        link_profile(way.model_copy(update={"blackouts": ()}))
+        for way in (experiment.uplink, experiment.downlink)
+    ]
     links = [
-        LinkDirection(
-            link_profile(way.model_copy(update={"blackouts": ()})), experiment.seed, uplink=uplink
-        )
-        for way, uplink in ((experiment.uplink, True), (experiment.downlink, False))
+        LinkDirection(profile, experiment.seed, uplink=uplink)
+        for profile, uplink in zip(profiles, (True, False), strict=True)
     ]
     # Per direction: the newest arrival, as its stamp and the stamp that it contains [ns].
     arrived: list[tuple[int, int] | None] = [None, None]
@@ -95,7 +97,7 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
             if early_ns == 0:
                 datagram = now_ns, -1 if last is None else last[0]
                 leaves_ns = now_ns + way * compute_ns
-                for at_ns in links[way].send(1, kind, period, sizes[kind], leaves_ns):
+                for at_ns in links[way].send(1, kind, period, sizes[way], leaves_ns):
                     heappush(pending, (at_ns, way, datagram))
     return ages, echoes
 

@@ -12,7 +12,6 @@ from cloudrc.drivers import local
 from cloudrc.drivers.local import Child, LocalRun, socket_folder
 from cloudrc.drivers.machine import Deadline
 from cloudrc.drivers.process import to_line
-from cloudrc.errors import BadInputError
 from cloudrc.records import MissionEvent
 
 EVENT = MissionEvent(5, "reached", 1, "waypoint 2 of 7 reached")
@@ -76,21 +75,10 @@ def test_a_bad_feed_line_ends_no_flight(tmp_path):
     assert child.ready
 
 
-@pytest.mark.parametrize(
-    ("tmpdir", "runtime", "chosen"),
-    [("short", "", "short"), ("x" * 90, "run", "run"), ("x" * 90, "y" * 90, "/tmp")],
-)
-def test_sockets_lie_in_a_folder_with_a_short_path(tmpdir, runtime, chosen, monkeypatch):
-    with tempfile.TemporaryDirectory(dir="/tmp", prefix="t") as root:
-        places = {name: Path(root, name) for name in (tmpdir, runtime, chosen) if name}
-        for place in places.values():
-            place.mkdir(exist_ok=True)
-        monkeypatch.setattr(tempfile, "tempdir", str(places[tmpdir]))
-        monkeypatch.setenv("XDG_RUNTIME_DIR", str(places.get(runtime, "")))
-        assert socket_folder() == str(Path(root, chosen))
-        monkeypatch.setattr(os, "access", lambda *asked: False)
-        with pytest.raises(BadInputError, match=r"^TMPDIR .* is too long for a socket"):
-            socket_folder()
+def test_sockets_lie_in_a_folder_with_a_short_path(monkeypatch):
+    for folder, chosen in (("/short", "/short"), ("/" + "x" * 90, "/tmp")):
+        monkeypatch.setattr(tempfile, "tempdir", folder)
+        assert socket_folder() == chosen
 
 
 def test_a_deadline_does_not_count_the_time_in_which_we_stood_still():
