@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from cloudrc.cli.output import print_line
 from cloudrc.drivers.process import EndProcess, Feed, StopSignal
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from cloudrc.link.relay import Relay
     from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.record.recorder import Recorder
+    from cloudrc.tunnel.end import Identity
 
 TRACE_MAX = 2 << 20
 """Maximum size of a trace file whose name comes from the link container [bytes]. World and cloud do
@@ -147,33 +148,29 @@ def show_address(where: Address) -> str:
 
 def read_size(text: str) -> float:
     """Parse a size in the notation of Kubernetes, such as 500M, for argparse; return bytes."""
-    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)(m|k|Ki|M|Mi|G|Gi|T|Ti)?", text)
+    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([kKMGT]?)(i?)", text)
     if found is None:
         raise argparse.ArgumentTypeError(f"'{text}' is not a size such as 500M or 1Gi")
-    number, unit = found.groups(default="")
-    base = 1024.0 if unit.endswith("i") else 1000.0
-    power = {"m": -1, "k": 1, "K": 1, "M": 2, "G": 3, "T": 4}.get(unit[:1], 0)
-    return float(number) * base**power
+    number, unit, binary = found.groups()
+    power = " KMGT".index(unit.upper() or " ")
+    return float(number) * (1024.0 if binary else 1000.0) ** power
 
 
 def ipv4_addresses(name: str) -> list[str]:
     """Return the IPv4 addresses of a host name; relay and netem shape IPv4 only.
 
-    Raises:
-        OSError: If the name has no IPv4 address; the text tells whether it has IPv6 addresses.
+    Raise an OSError if there is none; its text tells whether the name has IPv6 addresses.
     """
     try:
         return _addresses(name, socket.AF_INET)
-    except OSError:
-        others = []
+    except OSError as error:
         with suppress(OSError):
-            others = _addresses(name, socket.AF_INET6)
-        if not others:
-            raise
-        raise OSError(
-            "it has IPv6 addresses alone, and a link is shaped over IPv4; in a cluster with both "
-            "families set ipFamilyPolicy=PreferDualStack"
-        ) from None
+            _addresses(name, socket.AF_INET6)
+            error.strerror = (
+                "it has IPv6 addresses alone, and a link is shaped over IPv4; in a cluster with "
+                "both families set ipFamilyPolicy=PreferDualStack"
+            )
+        raise
 
 
 def _addresses(name: str, family: int) -> list[str]:
@@ -188,10 +185,7 @@ def resolve_address(flag: str, where: Address, listen: Address = ("0.0.0.0", 0))
     """Resolve an address, before the control loop starts: the loop must not wait for DNS.
 
     The result is IPv4 or IPv6, like the address `listen` of this process; if `listen` is [::], both
-    are possible. `flag` names the command-line flag in the error text.
-
-    Raises:
-        BadInputError: If the host cannot be resolved.
+    are possible. Raise a BadInputError, which names `flag`, if the host cannot be resolved.
     """
     host, port = where
     family = socket.AF_INET6 if ":" in listen[0] else socket.AF_INET
@@ -228,10 +222,12 @@ def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
     """Serve the metrics of this process at the address of `--metrics`; without it, return None."""
     if options.metrics is None:
         return None
+    from cloudrc.config.load import fingerprint, read_experiment
     from cloudrc.drivers.exporter import Exporter
 
     warn_if_exposed(options.metrics)
-    exporter = Exporter(role, missions=getattr(options, "teleop", None) is None)
+    config = fingerprint(read_experiment(str(options.config)))
+    exporter = Exporter(role, config, missions=getattr(options, "teleop", None) is None)
     exporter.serve(options.metrics)
     return exporter
 
@@ -239,10 +235,8 @@ def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
 def _run_world(options: argparse.Namespace) -> int:
     stop = StopSignal()
     from cloudrc import assembly
-    from cloudrc.tunnel.end import Identity
 
-    experiment, clock, end = open_end(options, "world")
-    identity = Identity(clock, os.urandom(16), end.keys.ring)
+    experiment, identity, end = open_end(options, "world")
     world = assembly.build_world(experiment, identity, time.monotonic_ns)
     end.run(world, stop, lambda: world.robot.guard.armed, lambda: world.slip_ns)
     return 0
@@ -255,10 +249,9 @@ def _run_cloud(options: argparse.Namespace) -> int:
     from cloudrc.drivers.teleop import LastWord, RemoteTeleop, UnixPeer
     from cloudrc.messages import GuardState
     from cloudrc.teleop import wire
-    from cloudrc.tunnel.end import Identity
 
-    experiment, clock, end = open_end(options, "cloud")
-    identity, teleop = Identity(clock, os.urandom(16), end.keys.ring), None
+    experiment, identity, end = open_end(options, "cloud")
+    teleop = None
     if options.teleop:
         peer = UnixPeer(options.teleop / "cloud.sock", options.teleop / "teleop.sock")
         teleop = RemoteTeleop(peer, wire.encode, wire.decode, time.monotonic_ns())
@@ -276,42 +269,39 @@ def _run_cloud(options: argparse.Namespace) -> int:
 
 def open_end(
     options: argparse.Namespace, name: str
-) -> tuple[ResolvedExperiment, bytes, EndProcess]:
+) -> tuple[ResolvedExperiment, Identity, EndProcess]:
     """Open the files and sockets of world or cloud; `name` is "world" or "cloud".
 
-    Returns:
-        The experiment, the identity of this machine's clock, and the `EndProcess` to run.
+    Return the experiment, the identity of the process in the tunnel, and the `EndProcess` to run.
     """
-    from cloudrc.config.load import fingerprint, load_experiment, read_experiment
+    from cloudrc.config.load import load_experiment, read_experiment
     from cloudrc.drivers.keyfile import KeyFile
     from cloudrc.drivers.machine import clock_id
+    from cloudrc.tunnel.end import Identity
 
     feed = Feed.on_stdout(watched=options.feed)  # before plug-ins are loaded: they may print
-    exporter, path, clock = open_exporter(options, name), str(options.config), clock_id()
-    given = read_experiment(path)
+    path, clock, key = str(options.config), clock_id(), options.key
+    exporter = open_exporter(options, name)
     # Only cloud loads the plug-ins, which fill in their default parameters.
-    experiment = load_experiment(path) if name == "cloud" else given
-    if exporter is not None:
-        exporter.runs(fingerprint(given))
-    keys = KeyFile(options.key, time.monotonic_ns())
-    if readable_by_others(options.key):
-        key = options.key
+    experiment = load_experiment(path) if name == "cloud" else read_experiment(path)
+    keys = KeyFile(key, time.monotonic_ns())
+    if readable_by_others(key):
         print_line(f"cloudrc: warning: {key} can be read by others: chmod 600 {key}", sys.stderr)
-    return (
-        experiment,
-        clock,
-        EndProcess(
-            end=name,
-            peer=open_peer(options),
-            recorder=open_recorder(options, name, clock),  # renames an old recording
-            keys=keys,
-            feed=feed,
-            exporter=exporter,
-            flights_only=options.record_flights,
-            link=_link_state(options),
-            check=link_monitor(options, experiment, uplink=name == "cloud"),
-        ),
+    link = options.link
+    if link is None and options.route is not None:
+        link = Path(options.route).with_name("link.json")
+    end = EndProcess(
+        end=name,
+        peer=open_peer(options),
+        recorder=open_recorder(options, name, clock),  # renames an old recording
+        keys=keys,
+        feed=feed,
+        exporter=exporter,
+        flights_only=options.record_flights,
+        link=link,
+        check=link_monitor(experiment, link, uplink=name == "cloud", trusted=bool(options.link)),
     )
+    return experiment, Identity(clock, os.urandom(16), keys.ring), end
 
 
 def open_peer(options: argparse.Namespace) -> Peer:
@@ -330,8 +320,8 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     """Make the recorder of world or cloud; without `--record` the recorder writes to /dev/null.
 
     The recording of a previous process is kept as NAME.before.mcap, because it may show why that
-    process ended. `--record-max` limits the size of both recordings together. `clock` ("world" or
-    "cloud") names the clock of the stamps; `clock_id` identifies this machine's monotonic clock.
+    process ended. `--record-max` limits the size of both recordings together. `clock` is "world" or
+    "cloud", the clock of the stamps; `clock_id` identifies this machine's monotonic clock.
     """
     from cloudrc.record.recorder import Recorder
     from cloudrc.record.writer import McapWriter
@@ -339,67 +329,58 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     path: Path = options.record or Path(os.devnull)
     kept, size_max = 0, None
     with suppress(OSError):  # the recorder will meet the same error and report it
-        if path.is_file() and (size := path.stat().st_size):
+        if path.is_file() and (kept := path.stat().st_size):
             path.replace(path.with_name(f"{path.stem}.before{path.suffix}"))
-            kept = size
     if options.record_max:
         room = round(0.9 * options.record_max)
         size_max = max(room - kept, room // 10)
-    about: dict[str, Any] = {
-        **{"clock": clock, "clock_id": clock_id.hex()},
-        "wall_offset_ns": time.time_ns() - time.monotonic_ns(),
-    }
+    offset_ns = time.time_ns() - time.monotonic_ns()
     return Recorder(
         path,
-        lambda file: McapWriter(file, **about),
+        lambda file: McapWriter(
+            file, clock=clock, clock_id=clock_id.hex(), wall_offset_ns=offset_ns
+        ),
         size_max=size_max,
     )
 
 
-def _link_state(options: argparse.Namespace) -> Path | None:
-    """Return the file with the state of the link; None if no flag tells its path."""
-    if options.link is None and options.route is not None:
-        return Path(options.route).with_name("link.json")
-    return options.link  # type: ignore[no-any-return]
-
-
 def link_monitor(
-    options: argparse.Namespace, experiment: ResolvedExperiment, *, uplink: bool
+    experiment: ResolvedExperiment, state: Path | None, *, uplink: bool, trusted: bool
 ) -> LinkMonitor:
     """Make the monitor that compares the received datagrams with the link profile.
 
-    `uplink` is True in cloud, False in world. The monitor follows changes of the profile in flight.
+    `uplink` is True in cloud, False in world. The monitor follows the link's file `state` for
+    changes of the profile in flight. Unless the link is `trusted`, limit the traces of the file.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile
     from cloudrc.link.traces import SIZE_MAX
     from cloudrc.link.verify.judge import Flow
     from cloudrc.link.verify.monitor import LinkMonitor
-    from cloudrc.messages import PLAN_STEP_NS
+    from cloudrc.messages import plan_length
     from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
+
+    file_max = SIZE_MAX if trusted else TRACE_MAX
 
     def load(values: object) -> tuple[DirectionProfile, DirectionProfile]:
         profile = Profile.model_validate_json(json.dumps(values))
         return link_profile(profile.uplink, file_max), link_profile(profile.downlink, file_max)
 
-    # Without --link, the link is a container. It is not trusted: limit its files to a smaller size.
-    file_max = TRACE_MAX if options.link is None else SIZE_MAX
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
     rate = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz
-    plan = round(experiment.cloud.plan_s * 1e9) // PLAN_STEP_NS
-    size = SIZES[kind] if uplink else COMMAND_SIZES[plan]
+    size = SIZES[kind] if uplink else COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
     flow = Flow(experiment.seed, uplink, kind, size)
     computes = experiment.cloud.compute_ms > 0
     check = LinkMonitor(uplink=uplink, flow=flow, period=1.0 / rate, computes=computes)
     requested = link_profile(experiment.uplink), link_profile(experiment.downlink)
-    check.begin(requested, _link_state(options), load)
+    check.begin(requested, state, load)
     return check
 
 
 def _run_relay(options: argparse.Namespace) -> int:
     stop, exporter = StopSignal(), open_exporter(options, "link")
     from cloudrc import assembly
-    from cloudrc.config.load import fingerprint, read_experiment
+    from cloudrc.config.load import read_experiment
     from cloudrc.link.relay import ask_for_fifo, settle
 
     experiment = read_experiment(str(options.config))
@@ -408,23 +389,31 @@ def _run_relay(options: argparse.Namespace) -> int:
     if options.fifo:
         refused = ask_for_fifo()
         _log(f"runs at normal priority: {refused}" if refused else "runs under SCHED_FIFO")
-    relay = open_relay(options, *links.values())
-    should_stop: Callable[[], bool] = stop
+    relay, profiles = open_relay(options, *links.values()), read_profiles(experiment)
     if exporter is not None:
-        should_stop = _counting(stop, relay, exporter)
-        for way, loaded in read_profiles(experiment).items():
+        for way, loaded in profiles.items():
             exporter.shaped("relay", way, "relay")
             exporter.asked(way, summary(loaded.direction)["delay"] or 0.0)
-        exporter.runs(fingerprint(experiment))
         exporter.ready(True)
-    feed = Feed.on_stdout(watched=options.feed)
+    feed, control, count_due = Feed.on_stdout(watched=options.feed), None, 0.0
     if options.link:
         asked = exporter.asked if exporter else lambda way, delay: None
-        control = RelayControl(options.link, links, read_profiles(experiment), asked, relay)
+        control = RelayControl(options.link, links, profiles, asked, relay)
         threading.Thread(target=control.follow, name="link control", daemon=True).start()
-        should_stop = control.stop_after(should_stop)
+
+    def over() -> bool:
+        """Apply changes of the link and export counts, if due; return whether to stop."""
+        nonlocal count_due
+        if control is not None:
+            control.swap()
+        if exporter is not None and time.monotonic() >= count_due:
+            count_due = time.monotonic() + PERIOD
+            counts = relay.outcomes() | relay.recent()
+            exporter.see([Counted(0, "link", name, n) for name, n in counts.items()])
+        return stop()
+
     feed.ready()
-    relay.run(feed.alive_while(should_stop))
+    relay.run(feed.alive_while(over))
     _log(", ".join(f"{name} {count:g}" for name, count in relay.counts().items()))
     return 0
 
@@ -434,8 +423,7 @@ def open_relay(
 ) -> Relay:
     """Open the relay's sockets at the addresses of the command line; return the relay.
 
-    Raises:
-        BadInputError: If an address cannot be used.
+    Raise a BadInputError if an address cannot be used.
     """
     from cloudrc.link.relay import Relay
     from cloudrc.tunnel.codec import peek
@@ -470,21 +458,6 @@ def read_profiles(experiment: ResolvedExperiment) -> dict[str, Loaded]:
     return {way: Loaded(link_profile(direction), values) for way, direction in ways.items()}
 
 
-def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Callable[[], bool]:
-    """Return a function that first exports the relay's counts, if due, and then calls `stop`."""
-    due = 0.0
-
-    def ask() -> bool:
-        nonlocal due
-        if time.monotonic() >= due:
-            due = time.monotonic() + PERIOD
-            counts = relay.outcomes() | relay.recent()
-            exporter.see([Counted(0, "link", name, n) for name, n in counts.items()])
-        return stop()
-
-    return ask
-
-
 class RelayControl:
     """Applies the changes of `cloudrc link set` to a relay, and publishes the relay's state.
 
@@ -499,14 +472,11 @@ class RelayControl:
         asked: Callable[[str, float], object],
         relay: Relay,
     ) -> None:
-        """Publish the initial state.
+        """Publish the initial state in `folder`, which is created if missing.
 
-        Args:
-            folder: Folder of the files that the module's docstring lists; created if missing.
-            links: "uplink" and "downlink" -> the link of this direction.
-            first: Direction -> its profile at the start.
-            asked: Called at each change with the direction and its new mean delay [s].
-            relay: The relay of both links.
+        `links` and `first` have the link of each direction, "uplink" and "downlink", and its
+        profile at the start. `asked` is called at each change with the direction and its new mean
+        delay [s].
         """
         from cloudrc.cli.link_run import make_profile_loader
 
@@ -520,19 +490,10 @@ class RelayControl:
         for way, loaded in first.items():
             self._publish(way, loaded, time.monotonic_ns())
 
-    def stop_after(self, stop: Callable[[], bool]) -> Callable[[], bool]:
-        """Return a function that first applies pending changes and then calls `stop`."""
-
-        def ask() -> bool:
-            if self._pending:
-                self.swap()
-            return stop()
-
-        return ask
-
     def swap(self) -> None:
         """Apply the pending profiles, between two datagrams, in the thread of the relay's loop."""
-        self._relay.take_in()
+        if self._pending:
+            self._relay.take_in()
         while self._pending:
             way, loaded = self._pending.popleft()
             self._links[way].replace_profile(loaded.direction, restart=loaded.change.restart)
@@ -546,8 +507,9 @@ class RelayControl:
 
     def look(self) -> None:
         """Read requested changes from the folder; publish applied changes and the lateness."""
-        changes = {way: file.poll() for way, file in self._files.items()}
-        self._pending += [(way, loaded) for way, loaded in changes.items() if loaded is not None]
+        for way, file in self._files.items():
+            if (loaded := file.poll()) is not None:
+                self._pending.append((way, loaded))
         with suppress(OSError):  # such as a full disk: the next check tries again
             while self._applied:
                 self._publish(*self._applied[0])

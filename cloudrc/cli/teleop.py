@@ -79,7 +79,7 @@ def api_address(text: str) -> Address | Path:
 
 def execute(options: argparse.Namespace) -> int:
     """Run teleop until a signal stops the process or, with --start, the mission has ended."""
-    from cloudrc.config.load import fingerprint, read_experiment
+    from cloudrc.config.load import read_experiment
     from cloudrc.drivers.process import StopSignal
     from cloudrc.geometry.scene import load_scene
     from cloudrc.teleop.service import MissionService
@@ -88,8 +88,6 @@ def execute(options: argparse.Namespace) -> int:
         require("the API of teleop", ("api",))
     stop, exporter = StopSignal(), open_exporter(options, "teleop")
     experiment = read_experiment(str(options.config))
-    if exporter is not None:
-        exporter.runs(fingerprint(experiment))
     with ExitStack() as opened:
         scene = load_scene(experiment.world.scene)
         server = serve_api(options, experiment, scene) if options.api else None

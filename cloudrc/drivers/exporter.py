@@ -110,15 +110,16 @@ def read_throttling(path: Path = CPU_COUNTS) -> Readings:
 class Exporter:
     """Collects the metrics of one process and serves them over HTTP."""
 
-    def __init__(self, role: str, *, missions: bool = True) -> None:
+    def __init__(self, role: str, config: str = "", *, missions: bool = True) -> None:
         """Set the role of the process: "world", "cloud", "teleop" or "link".
 
-        `missions` is False in cloud if a separate teleop process exports the metrics of missions.
+        `config` is the hash of the process's configuration. `missions` is False in cloud if a
+        separate teleop process exports the metrics of missions.
         """
         self._role, self._metrics = role, of_role(role)
         self._live = LiveMetrics(role, missions=missions)
         self._sync_age: Callable[[], float | None] = lambda: None
-        self._said_ready, self._config = False, ""
+        self._said_ready, self._config = False, config[:CONFIG_DIGITS]
         self._seen_at: float | None = None  # time of the newest records; None before the first
         self._server: _Server | None = None
         self._registry = CollectorRegistry()
@@ -134,10 +135,6 @@ class Exporter:
         """Set whether teleop or a link is ready. For world and cloud, the records show this."""
         self._seen_at = time.monotonic()
         self._said_ready = ready
-
-    def runs(self, fingerprint: str) -> None:
-        """Set the hash of the configuration that this process runs."""
-        self._config = fingerprint[:CONFIG_DIGITS]
 
     @property
     def link(self) -> Link:
