@@ -54,7 +54,7 @@ RELEASED_PERIOD = 2.0
 
 
 class Command(NamedTuple):
-    """A command that shares its module: the names that other commands have in their own modules."""
+    """A command that shares its module with others; the names are those of a command's module."""
 
     arguments: Callable[[argparse.ArgumentParser], None]
     execute: Callable[[argparse.Namespace], int]
@@ -64,7 +64,10 @@ class Command(NamedTuple):
 def _add(
     parser: argparse._ActionsContainer, flag: str, kind: str, text: str, *, required: bool = False
 ) -> None:
-    """Declare a flag; `kind` is the metavar and tells the type of the flag's value."""
+    """Declare a flag; `kind` is the metavar and tells the type of its value ("": no value)."""
+    if not kind:
+        parser.add_argument(flag, action="store_true", help=text)
+        return
     read: Callable[[str], object] = {"HOST:PORT": read_address, "SIZE": read_size}.get(kind, Path)
     parser.add_argument(flag, type=read, metavar=kind, help=text, required=required)
 
@@ -72,38 +75,28 @@ def _add(
 def process_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags that world, cloud, relay and teleop have in common."""
     _add(parser, "--config", "FILE", "experiment file (YAML)", required=True)
-    feed = "write status for a supervisor to stdout (default: print events only)"
-    parser.add_argument("--feed", action="store_true", help=feed)
-    metrics = "serve /metrics, /healthz and /readyz at this address (default: off)"
-    _add(parser, "--metrics", "HOST:PORT", metrics)
+    _add(parser, "--feed", "", "write status for a supervisor to stdout (default: events only)")
+    _add(parser, "--metrics", "HOST:PORT", "serve metrics and health checks here (default: off)")
 
 
 def _end_arguments(parser: argparse.ArgumentParser) -> None:
     process_arguments(parser)
-    record = "MCAP file to write; an existing one is renamed to NAME.before.mcap"
-    _add(parser, "--record", "FILE", record)
-    flights = "leave out periodic records while the robot is not flying"
-    parser.add_argument("--record-flights", action="store_true", help=flights)
-    size = "size limit, such as 500M or 1Gi, for this recording and the renamed one together;"
-    size += " recording ends at 90 %% of it (default: no limit)"
+    _add(parser, "--record", "FILE", "MCAP file; an existing one becomes NAME.before.mcap")
+    _add(parser, "--record-flights", "", "no periodic records while the robot does not fly")
+    size = "limit of both recordings, such as 500M or 1Gi; at 90 %% the recording ends"
     _add(parser, "--record-max", "SIZE", size)
     _add(parser, "--listen", "HOST:PORT", "address to receive at", required=True)
-    link = "file with the link's state, to be recorded (default: link.json beside --route)"
-    _add(parser, "--link", "FILE", link)
-    key = "the tunnel's pre-shared key ('cloudrc key new FILE'); it may change in flight"
-    _add(parser, "--key", "FILE", key, required=True)
+    _add(parser, "--link", "FILE", "the link's state, to record it (default: beside --route)")
+    _add(parser, "--key", "FILE", "the tunnel's key ('cloudrc key new FILE')", required=True)
     target = parser.add_mutually_exclusive_group(required=True)
     _add(target, "--peer", "HOST:PORT", "address to send to; a name is resolved once")
-    route = "file with the numeric HOST:PORT to send to; it may appear or change later"
-    _add(target, "--route", "FILE", route)
+    _add(target, "--route", "FILE", "file with the numeric HOST:PORT to send to; it may change")
 
 
 def _cloud_arguments(parser: argparse.ArgumentParser) -> None:
     _end_arguments(parser)
-    teleop = "take missions from 'cloudrc teleop --socket DIR' (default: fly the experiment's)"
-    _add(parser, "--teleop", "DIR", teleop)
-    tap = "send samples to a console that listens at this Unix socket (default: off)"
-    _add(parser, "--tap", "FILE", tap)
+    _add(parser, "--teleop", "DIR", "missions from 'cloudrc teleop --socket DIR' (default: own)")
+    _add(parser, "--tap", "FILE", "Unix socket of a console, for samples (default: off)")
 
 
 def _relay_arguments(parser: argparse.ArgumentParser) -> None:
@@ -111,13 +104,10 @@ def _relay_arguments(parser: argparse.ArgumentParser) -> None:
     for end in ("world", "cloud"):
         text = f"address to receive from {end} at"
         _add(parser, f"--{end}-side", "HOST:PORT", text, required=True)
-    for end in ("world", "cloud"):
         text = f"address at which {end} receives; a name is resolved once"
         _add(parser, f"--{end}", "HOST:PORT", text, required=True)
-    link = "folder to write the link's state to and to read changes of 'cloudrc link set' from"
-    _add(parser, "--link", "DIR", link)
-    fifo = "use real-time priority (SCHED_FIFO), if permitted: less timing error"
-    parser.add_argument("--fifo", action="store_true", help=fifo)
+    _add(parser, "--link", "DIR", "folder of the link's state and of changes by 'link set'")
+    _add(parser, "--fifo", "", "use real-time priority (SCHED_FIFO), if permitted")
 
 
 def read_address(text: str) -> Address:
@@ -207,7 +197,7 @@ def warn_if_exposed(listen: Address) -> None:
 
 @contextmanager
 def _listening(flag: str, listen: Address) -> Iterator[None]:
-    """Warn of an exposed address; if the block cannot bind `listen`, name `flag` in the error."""
+    """Warn if `listen` is exposed; name `flag` in the error if the block cannot bind it."""
     warn_if_exposed(listen)
     try:
         yield
@@ -306,12 +296,11 @@ def open_end(
 
 def open_peer(options: argparse.Namespace) -> Peer:
     """Bind the socket of world or cloud. `--peer` or the file `--route` has the peer's address."""
-    if options.route is None:
-        target: Address | Path = resolve_address("--peer", options.peer, options.listen)
-    else:
-        target = options.route
-        if not options.route.exists():
-            print(f"cloudrc: sends nothing until {options.route} exists", file=sys.stderr)
+    target: Address | Path = options.route
+    if target is None:
+        target = resolve_address("--peer", options.peer, options.listen)
+    elif not options.route.exists():
+        print(f"cloudrc: sends nothing until {target} exists", file=sys.stderr)
     with _listening("--listen", options.listen):
         return Peer.bind(options.listen, target)
 
