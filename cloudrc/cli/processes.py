@@ -296,7 +296,7 @@ def open_end(
 
 def open_peer(options: argparse.Namespace) -> Peer:
     """Bind the socket of world or cloud. `--peer` or the file `--route` has the peer's address."""
-    target: Address | Path = options.route
+    target: Address | Path | None = options.route
     if target is None:
         target = resolve_address("--peer", options.peer, options.listen)
     elif not options.route.exists():
