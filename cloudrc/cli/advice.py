@@ -38,10 +38,10 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     yield from _hover(experiment)
     carrot, cap = experiment.mission.carrot, experiment.guard.speed_max_mps
     if carrot is not None and carrot.speed_mps > cap:
+        fits = f"--set mission.carrot.speed_mps={int(cap * 10) / 10:g}"
         yield (
             f"the carrot moves at {cap:.3g} instead of {carrot.speed_mps:g} m/s, because the guard "
-            "caps the speed; a value that fits: "
-            f"--set mission.carrot.speed_mps={int(cap * 10) / 10:g}"
+            f"caps the speed; a value that fits: {fits}"
         )
     ages, echoes = simulate_ages(experiment)
     if ages:
@@ -52,9 +52,8 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
 def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]:
     """Exchange telemetry and commands over the link, without its blackouts.
 
-    Returns:
-        Ages just before each telemetry and each command: of the odometry behind the command in
-        force [s], and of the newest command that telemetry has echoed to cloud [s].
+    Return ages just before each telemetry and each command: of the odometry behind the command in
+    force [s], and of the newest command that telemetry has echoed to cloud [s].
     """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection

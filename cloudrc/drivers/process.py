@@ -1,7 +1,7 @@
 """Run world or cloud as a process: record its data, report to the supervisor, stop on signals.
 
 The process ends on SIGTERM or SIGINT, or when its parent process has ended. It prints its feed to
-standard output: a line of JSON per record. Prints of plug-ins go to standard error, the log.
+standard output: a line of JSON per record. Prints of plug-ins go to standard error.
 """
 
 from __future__ import annotations
@@ -134,9 +134,10 @@ class Feed:
     def tell(self, records: Iterable[Record]) -> None:
         """Write the records that belong to the feed: all of `EVENTS`, some of `SAMPLED`."""
         for record in records:
+            if isinstance(record, LinkChanged) and not self._is_news(record):
+                continue
             if isinstance(record, EVENTS):
-                if not isinstance(record, LinkChanged) or self._is_news(record):
-                    self._write(to_line(record) if self._watched else in_words(record))
+                self._write(to_line(record) if self._watched else in_words(record))
             elif self._watched and isinstance(record, SAMPLED) and self._is_due(record):
                 self._write(to_line(record))
 
@@ -218,7 +219,7 @@ class LinkNotes:
     def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
         """Return records about the link that are due at `now_ns` [ns, machine's monotonic clock].
 
-        `records` are new records of world or cloud; some types make the state due at once.
+        `records` are new records of world or cloud; the `BEGINNINGS` make the state due at once.
         `slip_ns` is the lag of the records' clock behind the machine's clock [ns].
         """
         noted: list[Record] = []
@@ -302,8 +303,8 @@ class EndProcess:
     ) -> None:
         """Run the endpoint until `stop()` returns true, then complete the recording.
 
-        `flies` returns whether the robot follows cloud. `slip_ns` returns the time by which the
-        endpoint's clock lags behind the machine's monotonic clock [ns].
+        `flies` returns whether the robot follows cloud; `slip_ns` returns the lag of the endpoint's
+        clock behind the machine's monotonic clock [ns].
         """
         thread = RecordingThread(self.recorder)
         choose = FlightsOnly(flies) if self.flights_only else list
