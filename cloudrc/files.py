@@ -82,7 +82,7 @@ def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
     existing file stays unchanged, and an OSError is raised.
     """
     new = path.with_name(f".{path.name}.{os.urandom(8).hex()}")
-    alone = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+    alone = os.O_WRONLY | os.O_CREAT | os.O_EXCL
     file = open(os.open(new, alone, mode), "wb")
     try:
         with file:
