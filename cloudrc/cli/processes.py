@@ -474,7 +474,6 @@ class RelayControl:
         file, self._released_at = folder / PROFILE_FILE, 0.0
         self._files = {way: ProfileFile(file, make_profile_loader(way), _log) for way in links}
         self._pending: deque[tuple[str, Loaded]] = deque()
-        self._applied: deque[tuple[str, Loaded, int]] = deque()
         self._changes = dict.fromkeys(links, -1)
         for way, loaded in first.items():
             self._publish(way, loaded, time.monotonic_ns())
@@ -486,36 +485,31 @@ class RelayControl:
         while self._pending:
             way, loaded = self._pending.popleft()
             self._links[way].replace_profile(loaded.direction, restart=loaded.change.restart)
-            self._applied.append((way, loaded, time.monotonic_ns()))
+            with suppress(OSError):  # such as a full disk: `link set` says that it has no answer
+                self._publish(way, loaded, time.monotonic_ns())
 
     def follow(self) -> None:
         """Call `look` periodically, in a thread that never ends."""
         while True:
             self.look()
-            time.sleep(PROFILE_PERIOD / 2 if self._pending else PROFILE_PERIOD)
+            time.sleep(PROFILE_PERIOD)
 
     def look(self) -> None:
-        """Read requested changes from the folder; publish applied changes and the lateness."""
+        """Read requested changes from the folder; publish the lateness of the datagrams."""
         for way, file in self._files.items():
             if (loaded := file.poll()) is not None:
                 self._pending.append((way, loaded))
-        with suppress(OSError):  # such as a full disk: the next check tries again
-            while self._applied:
-                self._publish(*self._applied[0])
-                self._applied.popleft()
-            if time.monotonic() - self._released_at >= RELEASED_PERIOD:
-                self._released_at = time.monotonic()
-                for way in self._links:
+        if time.monotonic() - self._released_at >= RELEASED_PERIOD:
+            self._released_at = time.monotonic()
+            for way in self._links:
+                with suppress(OSError):  # such as a full disk: the next time tries again
                     if released := self._relay.released(way):
                         publish(self._folder / f"{way}{RELEASED_SUFFIX}", json.dumps(released))
 
     def _publish(self, way: str, loaded: Loaded, since_ns: int) -> None:
         changes, requested = self._changes[way] + 1, summary(loaded.direction)
         state = LinkState(
-            shaper="relay",
-            reason="local mode",
-            mode="relay",
-            direction=way,
+            *("relay", "local mode", "relay", way),
             profile=loaded.values,
             since=datetime.now(UTC).isoformat(timespec="seconds"),
             since_ns=since_ns,

@@ -57,10 +57,7 @@ RELAY_LOG = "relay.log"
 """File in the folder of every run in real time."""
 RUN, SESSION = "run", "session"
 """Kinds of flights: of `cloudrc run`, which end with their mission, and of `cloudrc up`."""
-UNANNOUNCED = (
-    "'cloudrc mission' and 'cloudrc link set' cannot find this run: no folder for its flight file "
-    "(XDG_STATE_HOME); give 'cloudrc mission' --api {}"
-)
+UNANNOUNCED = "no folder for the flight file (XDG_STATE_HOME); use: cloudrc mission --api {}"
 
 
 def places() -> list[Path]:
@@ -134,8 +131,7 @@ def flight_files() -> dict[Path, FlightFile]:
 def end_session(run: Path, limit: float) -> None:
     """End the session in the folder `run`, and wait until it has written its report.
 
-    Raises:
-        TimedOutError: If the session has not ended within `limit` [s].
+    Raise a TimedOutError if this takes longer than `limit` [s].
     """
     deadline = time.monotonic() + limit
     if flight := flight_files().get(run):  # the file is locked, so `pid` is the supervisor
@@ -159,23 +155,14 @@ class ProcessDiedError(InvalidRunError):
 
 @dataclass
 class Child:
-    """A process that the supervisor has started.
+    """A process that the supervisor has started."""
 
-    Attributes:
-        name: Command of the process, such as "relay".
-        process: The process, which may have ended.
-        log: File with the process's standard error.
-        unread: Start of a line of the process's output whose end has not arrived yet.
-        heard: Time at which the last line arrived [s], monotonic clock.
-        ready: Whether the process can receive datagrams.
-    """
-
-    name: str
+    name: str  # command of the process, such as "relay"
     process: subprocess.Popen[bytes]
-    log: Path
-    unread: bytes = b""
-    heard: float = 0.0
-    ready: bool = False
+    log: Path  # file with the process's standard error
+    unread: bytes = b""  # start of a line of output whose end has not arrived yet
+    heard: float = 0.0  # time at which the last line arrived [s], monotonic clock
+    ready: bool = False  # whether the process can receive datagrams
 
     def take(self, data: bytes) -> list[Record]:
         """Process the next piece of the process's output; return the records in complete lines."""

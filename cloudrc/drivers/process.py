@@ -263,31 +263,18 @@ class LinkNotes:
 
 @dataclass
 class EndProcess:
-    """Runs world or cloud as a process.
+    """Runs world or cloud as a process."""
 
-    Attributes:
-        end: "world" or "cloud".
-        peer: Socket of the process, and address of its peer.
-        recorder: Writes the records to a file.
-        keys: Key file, which is reloaded when it changes.
-        feed: Sends records to the supervisor.
-        exporter: Turns the records into metrics; None for no metrics.
-        flights_only: Whether to record events but no samples while the robot does not fly.
-        link: File with the state of the link; None if the state is not recorded.
-        check: Compares the received datagrams with the link profile; None for no comparison.
-        tap: Sends records to a console; None for no console.
-    """
-
-    end: str
+    end: str  # "world" or "cloud"
     peer: Peer
     recorder: Recorder
-    keys: KeyFile
-    feed: Feed
-    exporter: Exporter | None = None
-    flights_only: bool = False
-    link: Path | None = None
-    check: LinkMonitor | None = None
-    tap: Tap | None = None
+    keys: KeyFile  # reloaded when it changes
+    feed: Feed  # sends records to the supervisor
+    exporter: Exporter | None = None  # turns records into metrics
+    flights_only: bool = False  # whether to record no samples while the robot does not fly
+    link: Path | None = None  # file with the state of the link
+    check: LinkMonitor | None = None  # compares the received datagrams with the link profile
+    tap: Tap | None = None  # sends records to a console
 
     def __post_init__(self) -> None:
         self._notes = LinkNotes(self.link, uplink=self.end == "world") if self.link else None
