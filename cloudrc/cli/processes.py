@@ -374,11 +374,15 @@ def _run_relay(options: argparse.Namespace) -> int:
 
     experiment = read_experiment(str(options.config))
     links = dict(zip(("uplink", "downlink"), assembly.build_links(experiment), strict=True))
+    profiles = {}
+    for way, direction in (("uplink", experiment.uplink), ("downlink", experiment.downlink)):
+        values = direction.model_dump(mode="json", exclude_defaults=True)
+        profiles[way] = Loaded(assembly.link_profile(direction), values)
     settle()
     if options.fifo:
         refused = ask_for_fifo()
         _log(f"runs at normal priority: {refused}" if refused else "runs under SCHED_FIFO")
-    relay, profiles = open_relay(options, *links.values()), read_profiles(experiment)
+    relay = open_relay(options, *links.values())
     if exporter is not None:
         for way, loaded in profiles.items():
             exporter.shaped("relay", way, "relay")
@@ -436,15 +440,6 @@ def open_relay(
             ) from error
         opened.pop_all()  # they stay open until this process ends
         return relay
-
-
-def read_profiles(experiment: ResolvedExperiment) -> dict[str, Loaded]:
-    """Return "uplink" and "downlink" -> the profile of this direction when the relay starts."""
-    from cloudrc.assembly import link_profile
-
-    ways = {"uplink": experiment.uplink, "downlink": experiment.downlink}
-    values = {way: d.model_dump(mode="json", exclude_defaults=True) for way, d in ways.items()}
-    return {way: Loaded(link_profile(direction), values) for way, direction in ways.items()}
 
 
 class RelayControl:

@@ -154,7 +154,7 @@ def _moves_robot(output: Any) -> bool:
 
 
 class LastWord:
-    """Delays the end of cloud's process in flight: cloud still forwards teleop's request to hold."""
+    """Delays the end of cloud in flight, so that cloud forwards teleop's request to hold."""
 
     def __init__(
         self,
