@@ -33,9 +33,8 @@ def version(path: Path | str) -> tuple[int, int, int] | None:
 def read(path: Path, size_max: int = SIZE_MAX) -> bytes:
     """Read a whole file of at most `size_max` bytes; never block, even if the file is a pipe.
 
-    Raises:
-        OSError: If the file cannot be read.
-        ValueError: If `path` is no regular file; as TooLongError, if the file is too large.
+    Raise an OSError if the file cannot be read, a ValueError if it is no regular file, and a
+    TooLongError if it is too large.
     """
     with BufferedReader(open_file(path)) as file:
         status = os.fstat(file.fileno())
@@ -82,7 +81,7 @@ def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
     existing file stays unchanged, and an OSError is raised.
     """
     new = path.with_name(f".{path.name}.{os.urandom(8).hex()}")
-    alone = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+    alone = os.O_WRONLY | os.O_CREAT | os.O_EXCL
     file = open(os.open(new, alone, mode), "wb")
     try:
         with file:

@@ -151,6 +151,11 @@ PLAN_STEP_NS = 10_000_000
 """Time between two velocities of a plan [ns]."""
 
 
+def plan_length(duration: float) -> int:
+    """Return the number of velocities in a plan of `duration` [s]."""
+    return round(duration * 1e9) // PLAN_STEP_NS
+
+
 class Command(NamedTuple):
     """Message from cloud to world, at 100 Hz; it may contain a plan of future velocities.
 

@@ -58,10 +58,7 @@ def signature(kind: str, name: str) -> inspect.Signature:
 
 
 def load(kind: str, name: str, **parameters: Any) -> Any:
-    """Find a plug-in and build it with these parameters.
-
-    Raise a BadInputError if the plug-in does not exist, or if its `build` fails.
-    """
+    """Find a plug-in and build it; raise a BadInputError if it is missing or its `build` fails."""
     build = _build(kind, name)
     try:
         return build(**parameters)
@@ -70,10 +67,7 @@ def load(kind: str, name: str, **parameters: Any) -> Any:
 
 
 def find(kind: str, name: str) -> Any:
-    """Import a plug-in by its kind (a key of `PACKAGES`) and by its name or path.
-
-    Return the plug-in's module, or the object of its entry point.
-    """
+    """Import a plug-in by its kind and its name or path; return its module or entry point."""
     try:
         if is_path(name):
             return _load_file(kind, Path(name))
@@ -97,8 +91,8 @@ def is_path(name: str) -> bool:
 
 def unknown_name_text(what: str, name: str, available: list[str]) -> str:
     """Return an error text for an unknown name: all known names, and the most similar name."""
-    there = ", ".join(available) or "none"
-    return f"no {what} named {name!r}; available: {there}{suggest_name(name, available)}"
+    known = ", ".join(available) or "none"
+    return f"no {what} named {name!r}; available: {known}{suggest_name(name, available)}"
 
 
 def suggest_name(name: str, available: list[str]) -> str:

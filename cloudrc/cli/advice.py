@@ -38,10 +38,10 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     yield from _hover(experiment)
     carrot, cap = experiment.mission.carrot, experiment.guard.speed_max_mps
     if carrot is not None and carrot.speed_mps > cap:
+        fits = f"--set mission.carrot.speed_mps={int(cap * 10) / 10:g}"
         yield (
             f"the carrot moves at {cap:.3g} instead of {carrot.speed_mps:g} m/s, because the guard "
-            "caps the speed; a value that fits: "
-            f"--set mission.carrot.speed_mps={int(cap * 10) / 10:g}"
+            f"caps the speed; a value that fits: {fits}"
         )
     ages, echoes = simulate_ages(experiment)
     if ages:
@@ -52,23 +52,24 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
 def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]:
     """Exchange telemetry and commands over the link, without its blackouts.
 
-    Returns:
-        Ages just before each telemetry and each command: of the odometry behind the command in
-        force [s], and of the newest command that telemetry has echoed to cloud [s].
+    Return ages just before each telemetry and each command: of the odometry behind the command in
+    force [s], and of the newest command that telemetry has echoed to cloud [s].
     """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection
-    from cloudrc.messages import PLAN_STEP_NS
+    from cloudrc.messages import plan_length
     from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
 
-    plan = round(experiment.cloud.plan_s * 1e9) // PLAN_STEP_NS
+    plan = plan_length(experiment.cloud.plan_s)
     newest_wins = experiment.tunnel.order == "newest" or plan > 0
-    sizes = {**SIZES, Kind.COMMAND: COMMAND_SIZES[plan]}
+    sizes = SIZES[Kind.TELEMETRY], COMMAND_SIZES[plan]
+    profiles = [
+        link_profile(way.model_copy(update={"blackouts": ()}))
+        for way in (experiment.uplink, experiment.downlink)
+    ]
     links = [
-        LinkDirection(
-            link_profile(way.model_copy(update={"blackouts": ()})), experiment.seed, uplink=uplink
-        )
-        for way, uplink in ((experiment.uplink, True), (experiment.downlink, False))
+        LinkDirection(profile, experiment.seed, uplink=uplink)
+        for profile, uplink in zip(profiles, (True, False), strict=True)
     ]
     # Per direction: the newest arrival, as its stamp and the stamp that it contains [ns].
     arrived: list[tuple[int, int] | None] = [None, None]
@@ -95,7 +96,7 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
             if early_ns == 0:
                 datagram = now_ns, -1 if last is None else last[0]
                 leaves_ns = now_ns + way * compute_ns
-                for at_ns in links[way].send(1, kind, period, sizes[kind], leaves_ns):
+                for at_ns in links[way].send(1, kind, period, sizes[way], leaves_ns):
                     heappush(pending, (at_ns, way, datagram))
     return ages, echoes
 

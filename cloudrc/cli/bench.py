@@ -49,9 +49,20 @@ def execute(options: argparse.Namespace) -> int:
     """Measure the closed loop and the raw physics; print the processor time of both."""
     require("the bench", ("world",))
     from cloudrc.config.load import load_experiment
+    from cloudrc.sweep.flight import fly_point
     from cloudrc.world.native.robot import usable
 
-    costs = _measure(load_experiment("paper"), options.repeats)
+    experiment = load_experiment("paper")
+    replay = _replay(experiment)
+    count = replay()
+    parts: dict[str, Part] = {
+        "raw mj_step": lambda mark: replay,
+        LOOP: lambda mark: flight(experiment, mark),
+        "flight of a sweep, with its numbers": lambda mark: (
+            lambda: (fly_point(experiment), count)[1]
+        ),
+    }
+    costs = measure(parts, options.repeats)
     raw, steps = costs["raw mj_step"], usable().text
     if options.output != "table":
         figures = {
@@ -67,22 +78,6 @@ def execute(options: argparse.Namespace) -> int:
     print(table(rows, right=(1, 2, 3)))
     print(f"\nraw replayed the same controls and ended in the same bits; usual steps: {steps}")
     return 0
-
-
-def _measure(experiment: ResolvedExperiment, repeats: int) -> dict[str, float]:
-    """Return the shortest processor time per physics step [s], by name of the measured part."""
-    from cloudrc.sweep.flight import fly_point
-
-    replay = _replay(experiment)
-    count = replay()
-    parts: dict[str, Part] = {
-        "raw mj_step": lambda mark: replay,
-        LOOP: lambda mark: flight(experiment, mark),
-        "flight of a sweep, with its numbers": lambda mark: (
-            lambda: (fly_point(experiment), count)[1]
-        ),
-    }
-    return measure(parts, repeats)
 
 
 def measure(parts: dict[str, Part], repeats: int) -> dict[str, float]:
@@ -135,9 +130,9 @@ def _replay(experiment: ResolvedExperiment) -> Callable[[], int]:
 
 
 def flight(experiment: ResolvedExperiment, mark: Callable[[], None]) -> Callable[[], int]:
-    """Prepare a flight; return a function that flies, and returns the number of physics steps.
+    """Prepare a flight that keeps its records; return a function that flies and counts steps.
 
-    The flight keeps its records, and calls `mark` every 100 ms of virtual time.
+    The flight calls `mark` every 100 ms of virtual time.
     """
     from cloudrc.assembly import assemble
 

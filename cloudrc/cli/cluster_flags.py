@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
+from cloudrc.cli.parser import number
 from cloudrc.cluster.client import DEFAULT_RELEASE
 
 if TYPE_CHECKING:
@@ -23,12 +24,10 @@ def release_arguments(parser: argparse.ArgumentParser) -> Callable[..., argparse
     """
     group = parser.add_argument_group("in a cluster (uses KUBECONFIG)")
     group.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
-    group.add_argument(
-        "-n", "--namespace", metavar="NAME", help="namespace (default: the context's, or default)"
-    )
-    group.add_argument(
-        "--release", metavar="NAME", help=f"Helm release (default: {DEFAULT_RELEASE})"
-    )
+    about = "namespace (default: the context's, or default)"
+    group.add_argument("-n", "--namespace", metavar="NAME", help=about)
+    about = f"Helm release (default: {DEFAULT_RELEASE})"
+    group.add_argument("--release", metavar="NAME", help=about)
     return group.add_argument
 
 
@@ -36,7 +35,7 @@ def timeout_argument(parser: argparse.ArgumentParser) -> None:
     """Declare `--timeout`, the time limit for a release to become ready."""
     parser.add_argument(
         "--timeout",
-        type=_seconds,
+        type=number(1e-3, 86_400, "seconds"),
         default=READY_LIMIT,
         metavar="S",
         help=f"seconds to wait until the release is ready (default: {READY_LIMIT:g})",
@@ -46,20 +45,9 @@ def timeout_argument(parser: argparse.ArgumentParser) -> None:
 def release_from_flags(options: argparse.Namespace) -> Release:
     """Return the release that the flags name; by default "cloudrc" in the current context.
 
-    Raises:
-        MissingPrerequisiteError: If the Kubernetes client or a kubeconfig is missing.
+    Raise a MissingPrerequisiteError if the Kubernetes client or a kubeconfig is missing.
     """
     require("a cluster", ("kube",))
     from cloudrc.cluster.client import connect
 
     return connect(options.context, options.namespace, options.release or DEFAULT_RELEASE)
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text.removesuffix("s"))
-    except ValueError:
-        value = 0.0
-    if not 0 < value <= 86_400:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of seconds above 0")
-    return value

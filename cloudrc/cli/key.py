@@ -47,14 +47,11 @@ def execute(options: argparse.Namespace) -> int:
             print(f"cloudrc: {text}", file=sys.stderr)
         keys = KeySet(Key(os.urandom(KEY_SIZE)), old.current if old else None)
         said = f", beside {keys.previous.name} until 'cloudrc key drop'" if keys.previous else ""
-    elif old.previous:
-        keys, said = KeySet(old.current), f" is the only key now, {old.previous.name} is removed"
     else:
-        keys, said = old, " is the only key already"
+        keys, said = KeySet(old.current), " is the only key"
     target = Path(os.path.realpath(path))  # keep a symbolic link: replace the file it points to
     try:
-        if keys != old:
-            write_atomically(target, write(keys).encode("ascii"), 0o600)
+        write_atomically(target, write(keys).encode("ascii"), 0o600)
     except OSError as error:
         remedy = "name a file in an existing, writable folder"
         raise BadInputError(f"{path}: {error.strerror or error}; {remedy}") from None

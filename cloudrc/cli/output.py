@@ -71,7 +71,7 @@ def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
     from rich.text import Text
 
     grid = Table.grid(padding=(0, 2, 0, 0))
-    for i in range(len(rows[0])):
+    for i in range(len(rows[0]) if rows else 0):
         grid.add_column(justify="right" if i in right else "left")
     for row in rows:
         grid.add_row(*(Text(escape(cell)) for cell in row))

@@ -80,15 +80,10 @@ class Parser(argparse.ArgumentParser):
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Refuse an unknown choice and suggest the most similar one; argparse would list all."""
         if action.choices is not None and value not in action.choices:
-            raise argparse.ArgumentError(action, describe_unknown(value, action.choices))
-
-
-def describe_unknown(given: str, names: Iterable[str]) -> str:
-    """Return an error text that suggests a name similar to `given`, or else lists all `names`."""
-    known = sorted(names)
-    if near := difflib.get_close_matches(given, known, n=1, cutoff=0.5):
-        return f"no '{given}'; did you mean '{near[0]}'?"
-    return f"no '{given}'; choose one of {', '.join(known)}"
+            near = difflib.get_close_matches(value, action.choices, n=1, cutoff=0.5)
+            known = ", ".join(sorted(action.choices))
+            hint = f"did you mean '{near[0]}'?" if near else f"choose one of {known}"
+            raise argparse.ArgumentError(action, f"no '{value}'; {hint}")
 
 
 def whole_number(low: int, high: int) -> Callable[[str], int]:
@@ -105,12 +100,15 @@ def whole_number(low: int, high: int) -> Callable[[str], int]:
 read_count = whole_number(1, COUNT_MAX)
 
 
-def _between(low: float, high: float, unit: str) -> Callable[[str], float]:
-    """Make a type for argparse that parses a number from `low` to `high`, any unit."""
+def number(low: float, high: float, unit: str) -> Callable[[str], float]:
+    """Return a type for argparse: a function that parses a number from `low` to `high`.
+
+    `unit` is the name of the unit; its first letter may follow the number, as in "300s".
+    """
 
     def parse(text: str) -> float:
         try:
-            value = float(text)
+            value = float(text.removesuffix(unit[0]))
         except ValueError:
             value = -1.0
         if not low <= value <= high:  # or it is NaN
@@ -124,26 +122,23 @@ def figure_arguments(parser: argparse.ArgumentParser, width: float) -> None:
     """Declare the arguments for the size of figures, by default of `width` [in]."""
     add = parser.add_argument
     about = f"width of figures in inches: one column of a paper has 3.5 (default: {width})"
-    add("--width", type=_between(2, 20, "inches"), default=width, metavar="IN", help=about)
+    add("--width", type=number(2, 20, "inches"), default=width, metavar="IN", help=about)
     about = "size of the text of figures in points (default: 9)"
-    add("--font-size", type=_between(5, 24, "points"), default=9.0, metavar="PT", help=about)
+    add("--font-size", type=number(5, 24, "points"), default=9.0, metavar="PT", help=about)
 
 
 def input_file(text: str) -> Path:
-    """Parse the path of an input file, as a type for argparse.
-
-    Refuse pipes and devices, because opening them could block forever.
-    """
+    """Parse the path of an input file for argparse; refuse pipes and devices, which could block."""
     if os.path.exists(text) and not os.path.isfile(text):
         raise argparse.ArgumentTypeError(f"{text}: not a regular file")
     return Path(text)
 
 
 def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:
-    """Build the parser, which knows all commands, but only the arguments of the `wanted` commands.
+    """Build the parser of all commands, with the arguments of the `wanted` commands only.
 
-    Therefore only the modules of the `wanted` commands are imported. With `for_completion`, the
-    help also contains argparse's list of commands, which the completion script needs.
+    So only the modules of the `wanted` commands are imported. With `for_completion`, the help also
+    contains argparse's list of commands, which the completion script needs.
     """
     common, about = Parser(add_help=False), "show the traceback of an error"
     common.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=about)

@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from cloudrc.cli.output import print_line
 from cloudrc.drivers.process import EndProcess, Feed, StopSignal
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from cloudrc.link.relay import Relay
     from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.record.recorder import Recorder
+    from cloudrc.tunnel.end import Identity
 
 TRACE_MAX = 2 << 20
 """Maximum size of a trace file whose name comes from the link container [bytes]. World and cloud do
@@ -53,7 +54,7 @@ RELEASED_PERIOD = 2.0
 
 
 class Command(NamedTuple):
-    """A command that shares its module: the names that other commands have in their own modules."""
+    """A command that shares its module with others; the names are those of a command's module."""
 
     arguments: Callable[[argparse.ArgumentParser], None]
     execute: Callable[[argparse.Namespace], int]
@@ -63,7 +64,10 @@ class Command(NamedTuple):
 def _add(
     parser: argparse._ActionsContainer, flag: str, kind: str, text: str, *, required: bool = False
 ) -> None:
-    """Declare a flag; `kind` is the metavar and tells the type of the flag's value."""
+    """Declare a flag; `kind` is the metavar and tells the type of its value ("": no value)."""
+    if not kind:
+        parser.add_argument(flag, action="store_true", help=text)
+        return
     read: Callable[[str], object] = {"HOST:PORT": read_address, "SIZE": read_size}.get(kind, Path)
     parser.add_argument(flag, type=read, metavar=kind, help=text, required=required)
 
@@ -71,38 +75,28 @@ def _add(
 def process_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the flags that world, cloud, relay and teleop have in common."""
     _add(parser, "--config", "FILE", "experiment file (YAML)", required=True)
-    feed = "write status for a supervisor to stdout (default: print events only)"
-    parser.add_argument("--feed", action="store_true", help=feed)
-    metrics = "serve /metrics, /healthz and /readyz at this address (default: off)"
-    _add(parser, "--metrics", "HOST:PORT", metrics)
+    _add(parser, "--feed", "", "write status for a supervisor to stdout (default: events only)")
+    _add(parser, "--metrics", "HOST:PORT", "serve metrics and health checks here (default: off)")
 
 
 def _end_arguments(parser: argparse.ArgumentParser) -> None:
     process_arguments(parser)
-    record = "MCAP file to write; an existing one is renamed to NAME.before.mcap"
-    _add(parser, "--record", "FILE", record)
-    flights = "leave out periodic records while the robot is not flying"
-    parser.add_argument("--record-flights", action="store_true", help=flights)
-    size = "size limit, such as 500M or 1Gi, for this recording and the renamed one together;"
-    size += " recording ends at 90 %% of it (default: no limit)"
+    _add(parser, "--record", "FILE", "MCAP file; an existing one becomes NAME.before.mcap")
+    _add(parser, "--record-flights", "", "no periodic records while the robot does not fly")
+    size = "limit of both recordings, such as 500M or 1Gi; at 90 %% the recording ends"
     _add(parser, "--record-max", "SIZE", size)
     _add(parser, "--listen", "HOST:PORT", "address to receive at", required=True)
-    link = "file with the link's state, to be recorded (default: link.json beside --route)"
-    _add(parser, "--link", "FILE", link)
-    key = "the tunnel's pre-shared key ('cloudrc key new FILE'); it may change in flight"
-    _add(parser, "--key", "FILE", key, required=True)
+    _add(parser, "--link", "FILE", "the link's state, to record it (default: beside --route)")
+    _add(parser, "--key", "FILE", "the tunnel's key ('cloudrc key new FILE')", required=True)
     target = parser.add_mutually_exclusive_group(required=True)
     _add(target, "--peer", "HOST:PORT", "address to send to; a name is resolved once")
-    route = "file with the numeric HOST:PORT to send to; it may appear or change later"
-    _add(target, "--route", "FILE", route)
+    _add(target, "--route", "FILE", "file with the numeric HOST:PORT to send to; it may change")
 
 
 def _cloud_arguments(parser: argparse.ArgumentParser) -> None:
     _end_arguments(parser)
-    teleop = "take missions from 'cloudrc teleop --socket DIR' (default: fly the experiment's)"
-    _add(parser, "--teleop", "DIR", teleop)
-    tap = "send samples to a console that listens at this Unix socket (default: off)"
-    _add(parser, "--tap", "FILE", tap)
+    _add(parser, "--teleop", "DIR", "missions from 'cloudrc teleop --socket DIR' (default: own)")
+    _add(parser, "--tap", "FILE", "Unix socket of a console, for samples (default: off)")
 
 
 def _relay_arguments(parser: argparse.ArgumentParser) -> None:
@@ -110,13 +104,10 @@ def _relay_arguments(parser: argparse.ArgumentParser) -> None:
     for end in ("world", "cloud"):
         text = f"address to receive from {end} at"
         _add(parser, f"--{end}-side", "HOST:PORT", text, required=True)
-    for end in ("world", "cloud"):
         text = f"address at which {end} receives; a name is resolved once"
         _add(parser, f"--{end}", "HOST:PORT", text, required=True)
-    link = "folder to write the link's state to and to read changes of 'cloudrc link set' from"
-    _add(parser, "--link", "DIR", link)
-    fifo = "use real-time priority (SCHED_FIFO), if permitted: less timing error"
-    parser.add_argument("--fifo", action="store_true", help=fifo)
+    _add(parser, "--link", "DIR", "folder of the link's state and of changes by 'link set'")
+    _add(parser, "--fifo", "", "use real-time priority (SCHED_FIFO), if permitted")
 
 
 def read_address(text: str) -> Address:
@@ -147,33 +138,29 @@ def show_address(where: Address) -> str:
 
 def read_size(text: str) -> float:
     """Parse a size in the notation of Kubernetes, such as 500M, for argparse; return bytes."""
-    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)(m|k|Ki|M|Mi|G|Gi|T|Ti)?", text)
+    found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?)([kKMGT]?)(i?)", text)
     if found is None:
         raise argparse.ArgumentTypeError(f"'{text}' is not a size such as 500M or 1Gi")
-    number, unit = found.groups(default="")
-    base = 1024.0 if unit.endswith("i") else 1000.0
-    power = {"m": -1, "k": 1, "K": 1, "M": 2, "G": 3, "T": 4}.get(unit[:1], 0)
-    return float(number) * base**power
+    number, unit, binary = found.groups()
+    power = " KMGT".index(unit.upper() or " ")
+    return float(number) * (1024.0 if binary else 1000.0) ** power
 
 
 def ipv4_addresses(name: str) -> list[str]:
     """Return the IPv4 addresses of a host name; relay and netem shape IPv4 only.
 
-    Raises:
-        OSError: If the name has no IPv4 address; the text tells whether it has IPv6 addresses.
+    Raise an OSError if there is none; its text tells whether the name has IPv6 addresses.
     """
     try:
         return _addresses(name, socket.AF_INET)
-    except OSError:
-        others = []
+    except OSError as error:
         with suppress(OSError):
-            others = _addresses(name, socket.AF_INET6)
-        if not others:
-            raise
-        raise OSError(
-            "it has IPv6 addresses alone, and a link is shaped over IPv4; in a cluster with both "
-            "families set ipFamilyPolicy=PreferDualStack"
-        ) from None
+            _addresses(name, socket.AF_INET6)
+            error.strerror = (
+                "it has IPv6 addresses alone, and a link is shaped over IPv4; in a cluster with "
+                "both families set ipFamilyPolicy=PreferDualStack"
+            )
+        raise
 
 
 def _addresses(name: str, family: int) -> list[str]:
@@ -188,10 +175,7 @@ def resolve_address(flag: str, where: Address, listen: Address = ("0.0.0.0", 0))
     """Resolve an address, before the control loop starts: the loop must not wait for DNS.
 
     The result is IPv4 or IPv6, like the address `listen` of this process; if `listen` is [::], both
-    are possible. `flag` names the command-line flag in the error text.
-
-    Raises:
-        BadInputError: If the host cannot be resolved.
+    are possible. Raise a BadInputError, which names `flag`, if the host cannot be resolved.
     """
     host, port = where
     family = socket.AF_INET6 if ":" in listen[0] else socket.AF_INET
@@ -213,7 +197,7 @@ def warn_if_exposed(listen: Address) -> None:
 
 @contextmanager
 def _listening(flag: str, listen: Address) -> Iterator[None]:
-    """Warn of an exposed address; if the block cannot bind `listen`, name `flag` in the error."""
+    """Warn if `listen` is exposed; name `flag` in the error if the block cannot bind it."""
     warn_if_exposed(listen)
     try:
         yield
@@ -228,10 +212,12 @@ def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
     """Serve the metrics of this process at the address of `--metrics`; without it, return None."""
     if options.metrics is None:
         return None
+    from cloudrc.config.load import fingerprint, read_experiment
     from cloudrc.drivers.exporter import Exporter
 
     warn_if_exposed(options.metrics)
-    exporter = Exporter(role, missions=getattr(options, "teleop", None) is None)
+    config = fingerprint(read_experiment(str(options.config)))
+    exporter = Exporter(role, config, missions=getattr(options, "teleop", None) is None)
     exporter.serve(options.metrics)
     return exporter
 
@@ -239,10 +225,8 @@ def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
 def _run_world(options: argparse.Namespace) -> int:
     stop = StopSignal()
     from cloudrc import assembly
-    from cloudrc.tunnel.end import Identity
 
-    experiment, clock, end = open_end(options, "world")
-    identity = Identity(clock, os.urandom(16), end.keys.ring)
+    experiment, identity, end = open_end(options, "world")
     world = assembly.build_world(experiment, identity, time.monotonic_ns)
     end.run(world, stop, lambda: world.robot.guard.armed, lambda: world.slip_ns)
     return 0
@@ -255,10 +239,9 @@ def _run_cloud(options: argparse.Namespace) -> int:
     from cloudrc.drivers.teleop import LastWord, RemoteTeleop, UnixPeer
     from cloudrc.messages import GuardState
     from cloudrc.teleop import wire
-    from cloudrc.tunnel.end import Identity
 
-    experiment, clock, end = open_end(options, "cloud")
-    identity, teleop = Identity(clock, os.urandom(16), end.keys.ring), None
+    experiment, identity, end = open_end(options, "cloud")
+    teleop = None
     if options.teleop:
         peer = UnixPeer(options.teleop / "cloud.sock", options.teleop / "teleop.sock")
         teleop = RemoteTeleop(peer, wire.encode, wire.decode, time.monotonic_ns())
@@ -276,52 +259,48 @@ def _run_cloud(options: argparse.Namespace) -> int:
 
 def open_end(
     options: argparse.Namespace, name: str
-) -> tuple[ResolvedExperiment, bytes, EndProcess]:
+) -> tuple[ResolvedExperiment, Identity, EndProcess]:
     """Open the files and sockets of world or cloud; `name` is "world" or "cloud".
 
-    Returns:
-        The experiment, the identity of this machine's clock, and the `EndProcess` to run.
+    Return the experiment, the identity of the process in the tunnel, and the `EndProcess` to run.
     """
-    from cloudrc.config.load import fingerprint, load_experiment, read_experiment
+    from cloudrc.config.load import load_experiment, read_experiment
     from cloudrc.drivers.keyfile import KeyFile
     from cloudrc.drivers.machine import clock_id
+    from cloudrc.tunnel.end import Identity
 
     feed = Feed.on_stdout(watched=options.feed)  # before plug-ins are loaded: they may print
-    exporter, path, clock = open_exporter(options, name), str(options.config), clock_id()
-    given = read_experiment(path)
+    path, clock, key = str(options.config), clock_id(), options.key
+    exporter = open_exporter(options, name)
     # Only cloud loads the plug-ins, which fill in their default parameters.
-    experiment = load_experiment(path) if name == "cloud" else given
-    if exporter is not None:
-        exporter.runs(fingerprint(given))
-    keys = KeyFile(options.key, time.monotonic_ns())
-    if readable_by_others(options.key):
-        key = options.key
+    experiment = load_experiment(path) if name == "cloud" else read_experiment(path)
+    keys = KeyFile(key, time.monotonic_ns())
+    if readable_by_others(key):
         print_line(f"cloudrc: warning: {key} can be read by others: chmod 600 {key}", sys.stderr)
-    return (
-        experiment,
-        clock,
-        EndProcess(
-            end=name,
-            peer=open_peer(options),
-            recorder=open_recorder(options, name, clock),  # renames an old recording
-            keys=keys,
-            feed=feed,
-            exporter=exporter,
-            flights_only=options.record_flights,
-            link=_link_state(options),
-            check=link_monitor(options, experiment, uplink=name == "cloud"),
-        ),
+    link = options.link
+    if link is None and options.route is not None:
+        link = Path(options.route).with_name("link.json")
+    end = EndProcess(
+        end=name,
+        peer=open_peer(options),
+        recorder=open_recorder(options, name, clock),  # renames an old recording
+        keys=keys,
+        feed=feed,
+        exporter=exporter,
+        flights_only=options.record_flights,
+        link=link,
+        check=link_monitor(experiment, link, uplink=name == "cloud", trusted=bool(options.link)),
     )
+    return experiment, Identity(clock, os.urandom(16), keys.ring), end
 
 
 def open_peer(options: argparse.Namespace) -> Peer:
     """Bind the socket of world or cloud. `--peer` or the file `--route` has the peer's address."""
-    if options.route is None:
-        target: Address | Path = resolve_address("--peer", options.peer, options.listen)
-    else:
-        target = options.route
-        if not options.route.exists():
-            print(f"cloudrc: sends nothing until {options.route} exists", file=sys.stderr)
+    target: Address | Path | None = options.route
+    if target is None:
+        target = resolve_address("--peer", options.peer, options.listen)
+    elif not options.route.exists():
+        print(f"cloudrc: sends nothing until {target} exists", file=sys.stderr)
     with _listening("--listen", options.listen):
         return Peer.bind(options.listen, target)
 
@@ -330,8 +309,8 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     """Make the recorder of world or cloud; without `--record` the recorder writes to /dev/null.
 
     The recording of a previous process is kept as NAME.before.mcap, because it may show why that
-    process ended. `--record-max` limits the size of both recordings together. `clock` ("world" or
-    "cloud") names the clock of the stamps; `clock_id` identifies this machine's monotonic clock.
+    process ended. `--record-max` limits the size of both recordings together. `clock` is "world" or
+    "cloud", the clock of the stamps; `clock_id` identifies this machine's monotonic clock.
     """
     from cloudrc.record.recorder import Recorder
     from cloudrc.record.writer import McapWriter
@@ -339,92 +318,94 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     path: Path = options.record or Path(os.devnull)
     kept, size_max = 0, None
     with suppress(OSError):  # the recorder will meet the same error and report it
-        if path.is_file() and (size := path.stat().st_size):
+        if path.is_file() and (kept := path.stat().st_size):
             path.replace(path.with_name(f"{path.stem}.before{path.suffix}"))
-            kept = size
     if options.record_max:
         room = round(0.9 * options.record_max)
         size_max = max(room - kept, room // 10)
-    about: dict[str, Any] = {
-        **{"clock": clock, "clock_id": clock_id.hex()},
-        "wall_offset_ns": time.time_ns() - time.monotonic_ns(),
-    }
+    offset_ns = time.time_ns() - time.monotonic_ns()
     return Recorder(
         path,
-        lambda file: McapWriter(file, **about),
+        lambda file: McapWriter(
+            file, clock=clock, clock_id=clock_id.hex(), wall_offset_ns=offset_ns
+        ),
         size_max=size_max,
     )
 
 
-def _link_state(options: argparse.Namespace) -> Path | None:
-    """Return the file with the state of the link; None if no flag tells its path."""
-    if options.link is None and options.route is not None:
-        return Path(options.route).with_name("link.json")
-    return options.link  # type: ignore[no-any-return]
-
-
 def link_monitor(
-    options: argparse.Namespace, experiment: ResolvedExperiment, *, uplink: bool
+    experiment: ResolvedExperiment, state: Path | None, *, uplink: bool, trusted: bool
 ) -> LinkMonitor:
     """Make the monitor that compares the received datagrams with the link profile.
 
-    `uplink` is True in cloud, False in world. The monitor follows changes of the profile in flight.
+    `uplink` is True in cloud, False in world. The monitor follows the link's file `state` for
+    changes of the profile in flight. Unless the link is `trusted`, limit the traces of the file.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile
     from cloudrc.link.traces import SIZE_MAX
     from cloudrc.link.verify.judge import Flow
     from cloudrc.link.verify.monitor import LinkMonitor
-    from cloudrc.messages import PLAN_STEP_NS
+    from cloudrc.messages import plan_length
     from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
+
+    file_max = SIZE_MAX if trusted else TRACE_MAX
 
     def load(values: object) -> tuple[DirectionProfile, DirectionProfile]:
         profile = Profile.model_validate_json(json.dumps(values))
         return link_profile(profile.uplink, file_max), link_profile(profile.downlink, file_max)
 
-    # Without --link, the link is a container. It is not trusted: limit its files to a smaller size.
-    file_max = TRACE_MAX if options.link is None else SIZE_MAX
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
     rate = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz
-    plan = round(experiment.cloud.plan_s * 1e9) // PLAN_STEP_NS
-    size = SIZES[kind] if uplink else COMMAND_SIZES[plan]
+    size = SIZES[kind] if uplink else COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
     flow = Flow(experiment.seed, uplink, kind, size)
     computes = experiment.cloud.compute_ms > 0
     check = LinkMonitor(uplink=uplink, flow=flow, period=1.0 / rate, computes=computes)
     requested = link_profile(experiment.uplink), link_profile(experiment.downlink)
-    check.begin(requested, _link_state(options), load)
+    check.begin(requested, state, load)
     return check
 
 
 def _run_relay(options: argparse.Namespace) -> int:
     stop, exporter = StopSignal(), open_exporter(options, "link")
     from cloudrc import assembly
-    from cloudrc.config.load import fingerprint, read_experiment
+    from cloudrc.config.load import read_experiment
     from cloudrc.link.relay import ask_for_fifo, settle
 
     experiment = read_experiment(str(options.config))
     links = dict(zip(("uplink", "downlink"), assembly.build_links(experiment), strict=True))
+    profiles = {}
+    for way, direction in (("uplink", experiment.uplink), ("downlink", experiment.downlink)):
+        values = direction.model_dump(mode="json", exclude_defaults=True)
+        profiles[way] = Loaded(assembly.link_profile(direction), values)
     settle()
     if options.fifo:
         refused = ask_for_fifo()
         _log(f"runs at normal priority: {refused}" if refused else "runs under SCHED_FIFO")
     relay = open_relay(options, *links.values())
-    should_stop: Callable[[], bool] = stop
     if exporter is not None:
-        should_stop = _counting(stop, relay, exporter)
-        for way, loaded in read_profiles(experiment).items():
+        for way, loaded in profiles.items():
             exporter.shaped("relay", way, "relay")
             exporter.asked(way, summary(loaded.direction)["delay"] or 0.0)
-        exporter.runs(fingerprint(experiment))
         exporter.ready(True)
-    feed = Feed.on_stdout(watched=options.feed)
+    feed, control, count_due = Feed.on_stdout(watched=options.feed), None, 0.0
     if options.link:
         asked = exporter.asked if exporter else lambda way, delay: None
-        control = RelayControl(options.link, links, read_profiles(experiment), asked, relay)
+        control = RelayControl(options.link, links, profiles, asked, relay)
         threading.Thread(target=control.follow, name="link control", daemon=True).start()
-        should_stop = control.stop_after(should_stop)
+
+    def over() -> bool:
+        """Apply changes of the link and export counts, if due; return whether to stop."""
+        nonlocal count_due
+        if control is not None:
+            control.swap()
+        if exporter is not None and time.monotonic() >= count_due:
+            count_due = time.monotonic() + PERIOD
+            exporter.see([Counted(0, "link", name, n) for name, n in relay.counts().items()])
+        return stop()
+
     feed.ready()
-    relay.run(feed.alive_while(should_stop))
+    relay.run(feed.alive_while(over))
     _log(", ".join(f"{name} {count:g}" for name, count in relay.counts().items()))
     return 0
 
@@ -434,8 +415,7 @@ def open_relay(
 ) -> Relay:
     """Open the relay's sockets at the addresses of the command line; return the relay.
 
-    Raises:
-        BadInputError: If an address cannot be used.
+    Raise a BadInputError if an address cannot be used.
     """
     from cloudrc.link.relay import Relay
     from cloudrc.tunnel.codec import peek
@@ -461,29 +441,6 @@ def open_relay(
         return relay
 
 
-def read_profiles(experiment: ResolvedExperiment) -> dict[str, Loaded]:
-    """Return "uplink" and "downlink" -> the profile of this direction when the relay starts."""
-    from cloudrc.assembly import link_profile
-
-    ways = {"uplink": experiment.uplink, "downlink": experiment.downlink}
-    values = {way: d.model_dump(mode="json", exclude_defaults=True) for way, d in ways.items()}
-    return {way: Loaded(link_profile(direction), values) for way, direction in ways.items()}
-
-
-def _counting(stop: Callable[[], bool], relay: Relay, exporter: Exporter) -> Callable[[], bool]:
-    """Return a function that first exports the relay's counts, if due, and then calls `stop`."""
-    due = 0.0
-
-    def ask() -> bool:
-        nonlocal due
-        if time.monotonic() >= due:
-            due = time.monotonic() + PERIOD
-            exporter.see([Counted(0, "link", name, n) for name, n in relay.counts().items()])
-        return stop()
-
-    return ask
-
-
 class RelayControl:
     """Applies the changes of `cloudrc link set` to a relay, and publishes the relay's state.
 
@@ -498,14 +455,11 @@ class RelayControl:
         asked: Callable[[str, float], object],
         relay: Relay,
     ) -> None:
-        """Publish the initial state.
+        """Publish the initial state in `folder`, which is created if missing.
 
-        Args:
-            folder: Folder of the files that the module's docstring lists; created if missing.
-            links: "uplink" and "downlink" -> the link of this direction.
-            first: Direction -> its profile at the start.
-            asked: Called at each change with the direction and its new mean delay [s].
-            relay: The relay of both links.
+        `links` and `first` have the link of each direction, "uplink" and "downlink", and its
+        profile at the start. `asked` is called at each change with the direction and its new mean
+        delay [s].
         """
         from cloudrc.cli.link_run import make_profile_loader
 
@@ -514,56 +468,42 @@ class RelayControl:
         file, self._released_at = folder / PROFILE_FILE, 0.0
         self._files = {way: ProfileFile(file, make_profile_loader(way), _log) for way in links}
         self._pending: deque[tuple[str, Loaded]] = deque()
-        self._applied: deque[tuple[str, Loaded, int]] = deque()
         self._changes = dict.fromkeys(links, -1)
         for way, loaded in first.items():
             self._publish(way, loaded, time.monotonic_ns())
 
-    def stop_after(self, stop: Callable[[], bool]) -> Callable[[], bool]:
-        """Return a function that first applies pending changes and then calls `stop`."""
-
-        def ask() -> bool:
-            if self._pending:
-                self.swap()
-            return stop()
-
-        return ask
-
     def swap(self) -> None:
         """Apply the pending profiles, between two datagrams, in the thread of the relay's loop."""
-        self._relay.take_in()
+        if self._pending:
+            self._relay.take_in()
         while self._pending:
             way, loaded = self._pending.popleft()
             self._links[way].replace_profile(loaded.direction, restart=loaded.change.restart)
-            self._applied.append((way, loaded, time.monotonic_ns()))
+            with suppress(OSError):  # such as a full disk: `link set` says that it has no answer
+                self._publish(way, loaded, time.monotonic_ns())
 
     def follow(self) -> None:
         """Call `look` periodically, in a thread that never ends."""
         while True:
             self.look()
-            time.sleep(PROFILE_PERIOD / 2 if self._pending else PROFILE_PERIOD)
+            time.sleep(PROFILE_PERIOD)
 
     def look(self) -> None:
-        """Read requested changes from the folder; publish applied changes and the lateness."""
-        changes = {way: file.poll() for way, file in self._files.items()}
-        self._pending += [(way, loaded) for way, loaded in changes.items() if loaded is not None]
-        with suppress(OSError):  # such as a full disk: the next check tries again
-            while self._applied:
-                self._publish(*self._applied[0])
-                self._applied.popleft()
-            if time.monotonic() - self._released_at >= RELEASED_PERIOD:
-                self._released_at = time.monotonic()
-                for way in self._links:
+        """Read requested changes from the folder; publish the lateness of the datagrams."""
+        for way, file in self._files.items():
+            if (loaded := file.poll()) is not None:
+                self._pending.append((way, loaded))
+        if time.monotonic() - self._released_at >= RELEASED_PERIOD:
+            self._released_at = time.monotonic()
+            for way in self._links:
+                with suppress(OSError):  # such as a full disk: the next time tries again
                     if released := self._relay.released(way):
                         publish(self._folder / f"{way}{RELEASED_SUFFIX}", json.dumps(released))
 
     def _publish(self, way: str, loaded: Loaded, since_ns: int) -> None:
         changes, requested = self._changes[way] + 1, summary(loaded.direction)
         state = LinkState(
-            shaper="relay",
-            reason="local mode",
-            mode="relay",
-            direction=way,
+            *("relay", "local mode", "relay", way),
             profile=loaded.values,
             since=datetime.now(UTC).isoformat(timespec="seconds"),
             since_ns=since_ns,

@@ -154,8 +154,8 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
             with contextlib.suppress(OSError):
                 folder.rmdir()
         if folder.exists():
-            unwritten = isinstance(error, KeyboardInterrupt)
-            remedy = f"; 'cloudrc report {folder}' writes its report" if unwritten else ""
+            remedy = f"; 'cloudrc report {folder}' writes its report"
+            remedy *= isinstance(error, KeyboardInterrupt)
             print_line(f"the recording is in {folder}{remedy}", sys.stderr)
         raise
     finally:
@@ -171,10 +171,8 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
 def new_folder(out: Path | None, name: str, link: str = "latest") -> Path:
     """Make the folder of a run: `out`, or the next free `runs/<name>-<n>`.
 
-    Without `out`, point the symbolic link `runs/<link>` to the new folder; "" for no link.
-
-    Raises:
-        BadInputError: If `out` exists and is not an empty folder, or if no folder can be made.
+    Without `out`, point the symbolic link `runs/<link>` to the new folder; "" for no link. Raise a
+    BadInputError if `out` exists and is not an empty folder, or if no folder can be made.
     """
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise BadInputError(
@@ -184,23 +182,18 @@ def new_folder(out: Path | None, name: str, link: str = "latest") -> Path:
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
             return out
-        folder = _next_folder(name)
+        RUNS.mkdir(exist_ok=True)
+        for n in itertools.count(1):
+            folder = RUNS / f"{name}-{n}"
+            with contextlib.suppress(FileExistsError):  # another process may make it first
+                folder.mkdir()
+                break
     except OSError as error:
         where = f"--out {out}" if out else f"{RUNS}/ in the working folder"
-        remedy = "name another folder" if out else "name a writable folder with --out"
-        raise BadInputError(f"{where}: cannot be made: {error.strerror}; {remedy}") from error
+        text = f"{where}: cannot be made: {error.strerror}; name a writable folder with --out"
+        raise BadInputError(text) from error
     if link:
         point_to(folder, link)
-    return folder
-
-
-def _next_folder(name: str) -> Path:
-    RUNS.mkdir(exist_ok=True)
-    for n in itertools.count(1):
-        with contextlib.suppress(FileExistsError):  # another process may make this folder first
-            folder = RUNS / f"{name}-{n}"
-            folder.mkdir()
-            break
     return folder
 
 
@@ -219,10 +212,9 @@ def _local_flight(
     """Return a function that flies on this machine and shows the progress on `stream`."""
     from cloudrc.cli.progress import FlightView
 
-    if stream is sys.stderr and not is_live(stream):
-        return lambda folder: fly(experiment, mode, folder)
-
     def flight(folder: Path) -> dict[str, Any]:
+        if stream is sys.stderr and not is_live(stream):
+            return fly(experiment, mode, folder)
         with contextlib.ExitStack() as stack:
             view = stack.enter_context(contextlib.closing(FlightView(stream, waypoints)))
             session = partial(ready, folder, view.say, stack) if ready else None
@@ -244,11 +236,9 @@ def _cluster_flight(
     for name in ("helm", "kubectl"):
         program(name)
     refuse_second_flight(release, lambda url, token: Api(url, lambda: token).get("/v1/state"))
-
-    def tell(text: str) -> None:
-        print_line(f"  {text}", stream)
-
-    return lambda folder: fly_in_cluster(experiment, folder, release, options.timeout, tell)
+    return lambda folder: fly_in_cluster(
+        experiment, folder, release, options.timeout, lambda text: print_line(f"  {text}", stream)
+    )
 
 
 def fly(
@@ -262,9 +252,9 @@ def fly(
 ) -> dict[str, Any]:
     """Fly in mode "virtual" or "local"; write all files into `folder`, and return the report.
 
-    During the flight `see` is called with new records; in local mode some records are left out. An
-    interrupted flight also gets a report, with the verdict "interrupted". Without `page`, write no
-    report.html. In a session (see `LocalRun`), the report is that of the last mission.
+    During the flight `see` is called with new records; in local mode some are left out. An
+    interrupted flight also gets a report. Without `page`, write no report.html. In a session (see
+    `LocalRun`), the report is that of the last mission.
     """
     from cloudrc.config.load import dump
     from cloudrc.report.write import write_report
@@ -282,10 +272,12 @@ def fly(
         raise CloudrcError(f"{where}: {error.strerror or error}; choose another folder") from error
 
 
-def _is_nominal(experiment: ResolvedExperiment) -> bool:
+def _physics_steps(experiment: ResolvedExperiment, usual: str) -> str:
+    """Return where the physics steps run; `usual` says where the usual steps run."""
     from cloudrc.config.schema import Plant
 
-    return experiment.world.plant == Plant() and not experiment.world.wind.blows
+    is_usual = experiment.world.plant == Plant() and not experiment.world.wind.blows
+    return usual if is_usual else NO_C
 
 
 @contextlib.contextmanager
@@ -294,8 +286,7 @@ def _record_virtual(
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
     """Fly in virtual time, and yield the recording, the experiment and facts about the run.
 
-    Use as a context manager, in whose block the caller writes the report. When the block ends, this
-    function attaches the report to the file of the recording.
+    In the block, the caller writes the report; it is then attached to the file of the recording.
     """
     from cloudrc import assembly
     from cloudrc.record.columns import RecordStore, merged
@@ -324,10 +315,8 @@ def _record_virtual(
         except KeyboardInterrupt:
             interrupted = True
         try:
-            notes = assembly.virtual_notes(experiment)
-            steps = usable().text if _is_nominal(experiment) else NO_C
-            found = store.hexdigest(), interrupted, notes
-            run = Run("virtual", "virtual", *found, physics_steps=steps)
+            facts = store.hexdigest(), interrupted, assembly.virtual_notes(experiment)
+            run = Run("virtual", "virtual", *facts, _physics_steps(experiment, usable().text))
             recording = store.recording()
             writer.write_views(views(recording, experiment))
             yield recording, experiment, run
@@ -356,11 +345,7 @@ def _record_local(
     see: See,
     session: Callable[[str, dict[str, str]], None] | None = None,
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
-    """Fly in real time, and yield the merged recording, the experiment and facts about the run.
-
-    Use as a context manager, in whose block the caller writes the report. When the block ends, this
-    function attaches the report to the file of the recording.
-    """
+    """Fly in real time; otherwise as `_record_virtual`, with the merged recording of both ends."""
     from cloudrc.assembly import flight_limit
     from cloudrc.cli.session import read_last_mission
     from cloudrc.drivers.local import LocalRun
@@ -371,8 +356,8 @@ def _record_local(
     from cloudrc.report.write import attachments
     from cloudrc.world.native.library import library
 
-    local, broken = LocalRun(folder, see, api=_prepare(experiment), session=session), None
-    interrupted = True
+    local = LocalRun(folder, see, api=_prepare(experiment), session=session)
+    broken, interrupted = None, True
     try:
         local.fly(inf if session else flight_limit(experiment))
         interrupted = False
@@ -391,10 +376,10 @@ def _record_local(
             raise broken or nothing from None
         raise error
     notes = (*local.notes, *([str(broken)] if broken else ()))
-    digest = messages_sha256(mission.messages)
+    facts = messages_sha256(mission.messages), interrupted, notes
+    run = Run("local", "relay", *facts, _physics_steps(experiment, library().text))
     try:
-        facts = digest, interrupted, notes, library().text if _is_nominal(experiment) else NO_C
-        yield add_views(mission, experiment), experiment, Run("local", "relay", *facts)
+        yield add_views(mission, experiment), experiment, run
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))
         local.announcement.close()

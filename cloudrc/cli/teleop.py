@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from cloudrc.teleop.store import MissionStore
 
 FILES_MAX = 8_192
-"""Limit of open files of this process. It is high, because idle connections must not prevent an
-emergency stop."""
+"""Limit of open files: high, because idle connections must not prevent an emergency stop."""
 LOCK_PERIOD = 0.2
 """Time between two attempts to open the journal while another teleop process locks it [s]."""
 PAUSE_LIMIT_NS = 500_000_000
@@ -79,7 +78,7 @@ def api_address(text: str) -> Address | Path:
 
 def execute(options: argparse.Namespace) -> int:
     """Run teleop until a signal stops the process or, with --start, the mission has ended."""
-    from cloudrc.config.load import fingerprint, read_experiment
+    from cloudrc.config.load import read_experiment
     from cloudrc.drivers.process import StopSignal
     from cloudrc.geometry.scene import load_scene
     from cloudrc.teleop.service import MissionService
@@ -88,8 +87,6 @@ def execute(options: argparse.Namespace) -> int:
         require("the API of teleop", ("api",))
     stop, exporter = StopSignal(), open_exporter(options, "teleop")
     experiment = read_experiment(str(options.config))
-    if exporter is not None:
-        exporter.runs(fingerprint(experiment))
     with ExitStack() as opened:
         scene = load_scene(experiment.world.scene)
         server = serve_api(options, experiment, scene) if options.api else None
@@ -99,9 +96,7 @@ def execute(options: argparse.Namespace) -> int:
         if book is not None:  # None: stopped while another teleop process locked the journal
             opened.callback(book.close)
             service = MissionService(experiment.criteria.contact_speed_max_mps, book, scene)
-            single_mission = _start(options, experiment, service)
-            may_end = ending(service, stop)
-            over = lambda: may_end() or (single_mission and service.over)  # noqa: E731
+            over = ending(service, stop, single=_start(options, experiment, service))
             _fly(options, service, server, exporter, over)
     return 0
 
@@ -118,17 +113,14 @@ def serve_api(
 
     if not isinstance(options.api, Path):
         warn_if_exposed(options.api)
-    criteria = experiment.criteria
-    plan = partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps)
+    criteria, bridge = experiment.criteria, Bridge()
     order = partial(
         read_order, scene=scene, time_limit=criteria.time_limit_s, contact=bool(criteria.contact),
-        plan=plan,
+        plan=partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps),
     )  # fmt: skip
-    goto = partial(read_goto, scene=scene)
     tokens = Tokens(options.tokens, log_line) if options.tokens else None
     audit = Audit(options.audit, log_line) if options.audit else None
-    bridge = Bridge()
-    app = create_app(bridge, order, goto, log_line)
+    app = create_app(bridge, order, partial(read_goto, scene=scene), log_line)
     server = ApiServer(Gate(app, tokens, audit), bridge, options.api)
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     files = FILES_MAX if hard == resource.RLIM_INFINITY else min(FILES_MAX, hard)
@@ -144,21 +136,24 @@ def log_line(text: str) -> None:
     print_line(f"cloudrc teleop: {text}", sys.stderr)
 
 
-def ending(service: MissionService, asked: Callable[[], bool]) -> Callable[[], bool]:
+def ending(
+    service: MissionService, asked: Callable[[], bool], *, single: bool = False
+) -> Callable[[], bool]:
     """Return a function that tells whether teleop's process may end.
 
     Once `asked()` is true, the function pauses the mission. The process may end when the robot
-    holds its position, or after `PAUSE_LIMIT_NS`.
+    holds its position, or after `PAUSE_LIMIT_NS`; with `single`, also after its mission.
     """
-    until_ns: list[int] = []
+    until_ns = 0
 
     def may_end() -> bool:
+        nonlocal until_ns
         if not asked():
-            return False
+            return single and service.over
         if not until_ns:
             service.pause(time.monotonic_ns())
-            until_ns.append(time.monotonic_ns() + PAUSE_LIMIT_NS)  # pause() may take long
-        return service.settled or time.monotonic_ns() > until_ns[0]
+            until_ns = time.monotonic_ns() + PAUSE_LIMIT_NS  # pause() may take long
+        return service.settled or time.monotonic_ns() > until_ns
 
     return may_end
 
@@ -191,8 +186,10 @@ def _fly(
     def is_over() -> bool:
         if exporter is not None:
             exporter.ready(service.seen is not None)
-            counts = {"api_events_dropped": service.book.dropped}
-            counts |= server.counts if server else {}
+            counts = {
+                "api_events_dropped": service.book.dropped,
+                **(server.counts if server else {}),
+            }
             exporter.see([Counted(0, "teleop", name, count) for name, count in counts.items()])
         return over()
 
@@ -225,9 +222,9 @@ def _open_store(
         except StoreLockedError as error:
             if not reported:
                 log_line(str(error))
-                reported = True
-            if server is not None:
-                server.bridge.close(str(error))
+                if server is not None:
+                    server.bridge.close(str(error))
+            reported = True
             time.sleep(LOCK_PERIOD)
     return None
 

@@ -29,13 +29,13 @@ from cloudrc.cloud.predictors import Predictor
 from cloudrc.errors import describe_error
 from cloudrc.messages import (
     NEVER_NS,
-    PLAN_STEP_NS,
     ZERO,
     Command,
     Odometry,
     Setpoint,
     Telemetry,
     Vector,
+    plan_length,
 )
 from cloudrc.records import Control, Fault
 from cloudrc.teleop.carrot import setpoint_at
@@ -181,7 +181,7 @@ class ControlLoop:
         self._controller = controller
         self._horizon_max, self._freeze_after_ns = horizon_max, freeze_after * 1e9
         self.period_ns = period_ns
-        self._planned = round(plan * 1e9) // PLAN_STEP_NS  # velocities per plan
+        self._planned = plan_length(plan)
         self.faults: list[Fault] = []
         self.counts: Counter[str] = Counter()
         self._now_ns = 0  # stamp of faults

@@ -1,9 +1,7 @@
 """Run relay, world, teleop and cloud as processes on this machine and supervise them.
 
-The supervisor (this process) starts the others in the order of their dependencies, and reads the
-records that they print. It ends all processes when teleop ends after the mission, when another
-process ends or hangs, or when the user interrupts. In a session, teleop waits for missions and
-never ends by itself.
+The supervisor (this process) reads the records that the others print. It ends all processes when
+teleop ends after the mission, when a process dies or hangs, or when the user interrupts.
 
 During a flight, the flight file names the folder of the run and the address of the operator's API.
 It is a locked file in a private folder of this user. Commands trust the flight file, but not the
@@ -33,7 +31,7 @@ from cloudrc.drivers.process import PARENT, READY, from_line
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.tap import TAP_FILE
 from cloudrc.drivers.teleop import PATH_MAX
-from cloudrc.errors import BadInputError, InvalidRunError, TimedOutError
+from cloudrc.errors import InvalidRunError, TimedOutError
 from cloudrc.records import Fault, Record
 from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
 
@@ -45,26 +43,21 @@ SILENCE_LIMIT = 5.0
 """Time after the last printed line at which a process counts as hung [s]. Every process prints a
 line at least once a second."""
 PAUSE = 1.0
-"""Longest turn of the supervisor's loop [s]. After a longer turn, the supervisor itself was paused,
-perhaps by an overload of the machine; the time of this turn does not count for time limits."""
+"""Longest turn of the supervisor's loop [s]. If a turn was longer, the supervisor was paused, and
+the time of this turn does not count for time limits."""
 SOCKET_NAME = "/cloudrc-12345678/teleop.sock"
-"""A socket's path, relative to the folder for temporary files, is at most as long as this text."""
-API_FILE = "api.json"
-"""File in a run's folder with the address of the run's API, for programs of other authors."""
-AUDIT_FILE = "audit.jsonl"
-"""File in a run's folder: a log of the commands that the API received, and of their senders."""
+"""Longest path of a socket, relative to the folder for temporary files."""
+API_FILE, AUDIT_FILE = "api.json", "audit.jsonl"
+"""Files in a run's folder: the API's address, and a log of its commands and their callers."""
 LINK_FOLDER = "link"
 """Folder in a run's folder, for the relay's state and the profile from `cloudrc link set`."""
 JOURNAL_FILE = "missions.journal"
 """File in a session's folder: teleop's store of the missions."""
 RELAY_LOG = "relay.log"
-"""File in the folder of every run of this kind, which runs in virtual time do not have."""
+"""File in the folder of every run in real time."""
 RUN, SESSION = "run", "session"
 """Kinds of flights: of `cloudrc run`, which end with their mission, and of `cloudrc up`."""
-UNANNOUNCED = (
-    "'cloudrc mission' and 'cloudrc link set' cannot find this run: no folder for its flight file "
-    "(XDG_STATE_HOME); give 'cloudrc mission' --api {}"
-)
+UNANNOUNCED = "no folder for the flight file (XDG_STATE_HOME); use: cloudrc mission --api {}"
 
 
 def places() -> list[Path]:
@@ -78,7 +71,7 @@ def places() -> list[Path]:
 
 
 class FlightFile(NamedTuple):
-    """What a flight file says, besides the folder of the run."""
+    """Content of a flight file, besides the folder of the run."""
 
     api: str  # address of the operator's API; "" for none
     kind: str  # RUN or SESSION
@@ -138,8 +131,7 @@ def flight_files() -> dict[Path, FlightFile]:
 def end_session(run: Path, limit: float) -> None:
     """End the session in the folder `run`, and wait until it has written its report.
 
-    Raises:
-        TimedOutError: If the session has not ended within `limit` [s].
+    Raise a TimedOutError if this takes longer than `limit` [s].
     """
     deadline = time.monotonic() + limit
     if flight := flight_files().get(run):  # the file is locked, so `pid` is the supervisor
@@ -163,23 +155,14 @@ class ProcessDiedError(InvalidRunError):
 
 @dataclass
 class Child:
-    """A process that the supervisor has started.
+    """A process that the supervisor has started."""
 
-    Attributes:
-        name: Command of the process, such as "relay".
-        process: The process, running or ended.
-        log: File with the process's standard error.
-        unread: Start of a line of the process's output whose end has not arrived yet.
-        heard: Time at which the last line arrived [s], monotonic clock.
-        ready: Whether the process can receive datagrams.
-    """
-
-    name: str
+    name: str  # command of the process, such as "relay"
     process: subprocess.Popen[bytes]
-    log: Path
-    unread: bytes = b""
-    heard: float = 0.0
-    ready: bool = False
+    log: Path  # file with the process's standard error
+    unread: bytes = b""  # start of a line of output whose end has not arrived yet
+    heard: float = 0.0  # time at which the last line arrived [s], monotonic clock
+    ready: bool = False  # whether the process can receive datagrams
 
     def take(self, data: bytes) -> list[Record]:
         """Process the next piece of the process's output; return the records in complete lines."""
@@ -212,12 +195,11 @@ class LocalRun:
         """Prepare a run in `folder`, which contains config.yaml; start no process yet.
 
         The run adds world.mcap, cloud.mcap and four logs. `see` is called with the records that the
-        processes print; `api` tells whether teleop serves the operator's API during the flight.
+        processes print; `api` tells whether teleop serves the operator's API.
 
-        With `session`, teleop waits for missions instead of flying the experiment's, and stores
-        them in a journal. Every process serves metrics, and recordings contain the flights only.
-        `session` is called when everything is ready, with the address of the API, and the
-        addresses HOST:PORT of the metrics by the names of the processes.
+        With `session`, teleop waits for missions and stores them in a journal. Every process serves
+        metrics, and recordings contain the flights only. `session` is called when everything is
+        ready, with the address of the API, and the addresses HOST:PORT of the metrics by process.
         """
         self._folder, self._see, self._api, self._session = folder, see, api, session
         self._metrics: dict[str, str] = {}
@@ -232,11 +214,10 @@ class LocalRun:
         Raises:
             ProcessDiedError: If a process ends too early; the message names the process.
             TimedOutError: If the limit is reached, or if a process hangs; the message names it.
-            BadInputError: If the path of every folder for sockets is too long.
             KeyboardInterrupt: If the user interrupts.
         """
-        # A Unix socket's path must be short; the path of the run's folder may be long.
-        # The folder is private, since it also holds this run's key.
+        # The sockets are not in the run's folder, whose path may be too long for a Unix socket.
+        # Their folder is private: it also contains this run's key.
         with tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder()) as sockets:
             url = f"unix:{sockets}/api.sock" if self._api else ""
             with contextlib.ExitStack() as stack:
@@ -263,21 +244,21 @@ class LocalRun:
         self._metrics = dict(zip(("world", "cloud", "teleop", "relay"), places[4:], strict=False))
         sides = {"world-side": from_world, "cloud-side": from_cloud, "world": world, "cloud": cloud}
         self._start("relay", "--fifo", **sides, link=link)
-        record, key = folder / "world.mcap", sockets / "key"
-        state = link / "uplink.json"
-        flights = ("--record-flights",) if session else ()
-        ways = {"listen": world, "peer": from_world, "key": key, "link": state}
-        self._start("world", *flights, **ways, record=record)
+
+        def start_end(name: str, listen: str, peer: str, way: str, **more: object) -> None:
+            more |= {"key": sockets / "key", "link": link / f"{way}.json"}
+            more |= {"record": folder / f"{name}.mcap"}
+            flags = ("--record-flights",) if session else ()
+            self._start(name, *flags, listen=listen, peer=peer, **more)
+
+        start_end("world", world, from_world, "uplink")
         # Only this user can open the socket of the API: no token is needed.
         files = {"api-file": folder / API_FILE, "audit": folder / AUDIT_FILE}
         given: dict[str, object] = {"api": url, **files} if url else {}
         given |= {"journal": folder / JOURNAL_FILE} if session else {}
         self._start("teleop", *(() if session else ("--start",)), socket=sockets, **given)
         self._wait_until_ready()
-        record, state = folder / "cloud.mcap", link / "downlink.json"
-        ways = {"listen": cloud, "peer": from_cloud, "key": key, "link": state}
-        ways |= {"record": record, "teleop": sockets, "tap": sockets / TAP_FILE}
-        self._start("cloud", *flights, **ways)
+        start_end("cloud", cloud, from_cloud, "downlink", teleop=sockets, tap=sockets / TAP_FILE)
         self._wait_until_ready()
         if session:
             session(url, self._metrics)
@@ -371,16 +352,6 @@ class LocalRun:
 
 
 def socket_folder() -> str:
-    """Choose a folder for temporary files whose path is short enough for Unix sockets.
-
-    Raise a BadInputError if there is no such folder.
-    """
+    """Choose a folder for temporary files whose path is short enough for Unix sockets."""
     given = tempfile.gettempdir()
-    for folder in dict.fromkeys((given, os.environ.get("XDG_RUNTIME_DIR", ""), "/tmp")):
-        fits = len(os.fsencode(folder)) + len(SOCKET_NAME) <= PATH_MAX
-        if folder and fits and os.access(folder, os.W_OK | os.X_OK):
-            return folder
-    raise BadInputError(
-        f"TMPDIR {given} is too long for a socket: its path may have "
-        f"{PATH_MAX - len(SOCKET_NAME)} bytes; run with TMPDIR=/tmp"
-    )
+    return given if len(os.fsencode(given)) + len(SOCKET_NAME) <= PATH_MAX else "/tmp"

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+import uuid
 from collections.abc import Callable
 from contextlib import suppress
 from math import ceil
@@ -24,22 +25,19 @@ def clock_id() -> bytes:
     boot id, the bytes are random: world and cloud differ, and measure no one-way delays.
     """
     try:
-        boot = bytes.fromhex(_boot_id().replace("-", "").strip())
+        if LINUX_BOOT_ID.exists():
+            text = LINUX_BOOT_ID.read_text()
+        else:
+            text = subprocess.run(MACOS_BOOT_ID, capture_output=True, text=True, timeout=5).stdout
+        return uuid.UUID(text.strip()).bytes
     except (OSError, subprocess.SubprocessError, ValueError):
-        boot = b""
-    return boot if len(boot) == 16 else os.urandom(16)
-
-
-def _boot_id() -> str:
-    if LINUX_BOOT_ID.exists():
-        return LINUX_BOOT_ID.read_text()
-    return subprocess.run(MACOS_BOOT_ID, capture_output=True, text=True, timeout=5).stdout
+        return os.urandom(16)
 
 
 def usable_cores() -> int:
     """Return how many cores this process may use: by its affinity and by its CPU limit.
 
-    The CPU limit of a container is that of its control group (version 2) or of a group above.
+    The CPU limit is the lowest of its control group (version 2) and of the groups above.
     """
     affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1

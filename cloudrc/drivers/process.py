@@ -1,7 +1,7 @@
 """Run world or cloud as a process: record its data, report to the supervisor, stop on signals.
 
 The process ends on SIGTERM or SIGINT, or when its parent process has ended. It prints its feed to
-standard output: a line of JSON per record. Prints of plug-ins go to standard error, the log.
+standard output: a line of JSON per record. Prints of plug-ins go to standard error.
 """
 
 from __future__ import annotations
@@ -64,6 +64,9 @@ RELEASED_PERIOD_NS = 2_000_000_000
 BEGINNINGS = frozenset({SessionOpened, GuardChange, MissionEvent})
 """Types of records at which a mission may begin. The state of the link is recorded again after such
 a record, so that a recording whose earlier part is cut off contains the state, too."""
+CLOCK_STEP = 0.1
+"""Smallest step of the wall clock that is recorded [s]."""
+SINCE_BOOT = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # the former: Linux
 NONSENSE = (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError)
 """Errors that an unreadable or malformed file can raise."""
 
@@ -131,9 +134,10 @@ class Feed:
     def tell(self, records: Iterable[Record]) -> None:
         """Write the records that belong to the feed: all of `EVENTS`, some of `SAMPLED`."""
         for record in records:
+            if isinstance(record, LinkChanged) and not self._is_news(record):
+                continue
             if isinstance(record, EVENTS):
-                if not isinstance(record, LinkChanged) or self._is_news(record):
-                    self._write(to_line(record) if self._watched else in_words(record))
+                self._write(to_line(record) if self._watched else in_words(record))
             elif self._watched and isinstance(record, SAMPLED) and self._is_due(record):
                 self._write(to_line(record))
 
@@ -215,7 +219,7 @@ class LinkNotes:
     def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
         """Return records about the link that are due at `now_ns` [ns, machine's monotonic clock].
 
-        `records` are new records of world or cloud; some types make the state due at once.
+        `records` are new records of world or cloud; the `BEGINNINGS` make the state due at once.
         `slip_ns` is the lag of the records' clock behind the machine's clock [ns].
         """
         noted: list[Record] = []
@@ -259,35 +263,23 @@ class LinkNotes:
 
 @dataclass
 class EndProcess:
-    """Runs world or cloud as a process.
+    """Runs world or cloud as a process."""
 
-    Attributes:
-        end: "world" or "cloud".
-        peer: Socket of the process, and address of its peer.
-        recorder: Writes the records to a file.
-        keys: Key file, which is reloaded when it changes.
-        feed: Sends records to the supervisor.
-        exporter: Turns the records into metrics; None for no metrics.
-        flights_only: Whether to record events but no samples while the robot does not fly.
-        link: File with the state of the link; None if the state is not recorded.
-        check: Compares the received datagrams with the link profile; None for no comparison.
-        tap: Sends records to a console; None for no console.
-    """
-
-    end: str
+    end: str  # "world" or "cloud"
     peer: Peer
     recorder: Recorder
-    keys: KeyFile
-    feed: Feed
-    exporter: Exporter | None = None
-    flights_only: bool = False
-    link: Path | None = None
-    check: LinkMonitor | None = None
-    tap: Tap | None = None
+    keys: KeyFile  # reloaded when it changes
+    feed: Feed  # sends records to the supervisor
+    exporter: Exporter | None = None  # turns records into metrics
+    flights_only: bool = False  # whether to record no samples while the robot does not fly
+    link: Path | None = None  # file with the state of the link
+    check: LinkMonitor | None = None  # compares the received datagrams with the link profile
+    tap: Tap | None = None  # sends records to a console
 
     def __post_init__(self) -> None:
         self._notes = LinkNotes(self.link, uplink=self.end == "world") if self.link else None
         self._trouble, self._dropped = "", 0
+        self._clock_offset = time.time() - time.clock_gettime(SINCE_BOOT)
 
     def run(
         self,
@@ -298,8 +290,8 @@ class EndProcess:
     ) -> None:
         """Run the endpoint until `stop()` returns true, then complete the recording.
 
-        `flies` returns whether the robot follows cloud. `slip_ns` returns the time by which the
-        endpoint's clock lags behind the machine's monotonic clock [ns].
+        `flies` returns whether the robot follows cloud; `slip_ns` returns the lag of the endpoint's
+        clock behind the machine's monotonic clock [ns].
         """
         thread = RecordingThread(self.recorder)
         choose = FlightsOnly(flies) if self.flights_only else list
@@ -307,7 +299,7 @@ class EndProcess:
             self.exporter.recording(thread.sync_age)
 
         def sink(records: list[Record]) -> None:
-            records = records + self.look_around(records, slip_ns(), thread.take_steps())
+            records = records + self.look_around(records, slip_ns())
             self.recorder.put(choose(records))
             self.tell(records)
 
@@ -335,31 +327,32 @@ class EndProcess:
                 records = [*records, self._count_losses(records[-1].stamp_ns)]
             self.exporter.see(records)
 
-    def look_around(
-        self, records: list[Record], slip_ns: int, clock_steps: list[float]
-    ) -> list[Record]:
+    def look_around(self, records: list[Record], slip_ns: int) -> list[Record]:
         """Return records about steps of the wall clock, new keys, and the state of the link.
 
         `records` are the newest records of the endpoint. `slip_ns` is the lag of the endpoint's
-        clock behind the machine's monotonic clock [ns]. `clock_steps` are steps
-        of the wall clock [s].
+        clock behind the machine's monotonic clock [ns].
         """
         now_ns = time.monotonic_ns()
-        noted: list[Record] = [
-            Fault(
-                now_ns - slip_ns,
-                CLOCK_SET,
-                f"wall clock stepped by {step:+.1f} s: the flight is not affected;"
-                " do not compare times of day before and after the step",
-            )
-            for step in clock_steps
-        ]
+        noted: list[Record] = []
+        if step := self._clock_step():
+            text = f"wall clock stepped by {step:+.1f} s: the flight is not affected"
+            noted.append(Fault(now_ns - slip_ns, CLOCK_SET, text))
         noted += self.keys.follow(now_ns)
         if self._notes is not None:
             noted += self._notes.after(records, now_ns, slip_ns)
         if self.check is not None:
             noted += self.check.after([*records, *noted], now_ns - slip_ns)
         return noted
+
+    def _clock_step(self) -> float:
+        """Return by how much the wall clock was set since the last call [s]; 0 if it was not."""
+        before, wall = time.clock_gettime(SINCE_BOOT), time.time()
+        boot = time.clock_gettime(SINCE_BOOT)
+        if boot - before > CLOCK_STEP / 2.0:
+            return 0.0  # the process was paused while it read the clocks: the next call compares
+        step, self._clock_offset = wall - boot - self._clock_offset, wall - boot
+        return step if abs(step) > CLOCK_STEP else 0.0
 
     def _count_losses(self, stamp_ns: int) -> Counted:
         return Counted(stamp_ns, self.end, "recorder_dropped", self.recorder.dropped)

@@ -26,7 +26,7 @@ from cloudrc.tunnel.codec import DATAGRAM_MAX
 Address = tuple[str, int]
 
 DRAIN_MAX = 256
-"""Largest number of datagrams per wake. The limit keeps a flood from delaying the deadlines."""
+"""Largest number of datagrams per wake, so that a flood does not delay the deadlines."""
 RECEIVE_BUFFER = 1 << 22
 """Requested size of the receive buffer [bytes], large enough for a flood and valid datagrams."""
 BACKLOG_MAX = 2 * RECEIVE_BUFFER // 512
@@ -65,8 +65,7 @@ class Peer:
     Attributes:
         socket: The socket, bound and not blocking.
         address: Address of the peer: world, cloud or the relay; None while it is unknown.
-        route: File from which `address` is read, as HOST:PORT; None if the address is fixed. The
-            process of the link writes the file when the link is up or the address changes.
+        route: File of the link with `address`, as HOST:PORT; None if the address is fixed.
     """
 
     socket: socket.socket
@@ -150,9 +149,7 @@ def bind(listen: Address) -> socket.socket:
 def free_ports(count: int) -> list[int]:
     """Choose random ports on 127.0.0.1 that are unused for both UDP and TCP.
 
-    All are below the range from which the kernel takes ports for outgoing connections: the kernel
-    could use such a port before the caller does. Raise a MissingPrerequisiteError if fewer than
-    `count` ports are unused.
+    The kernel does not use ports of this range for outgoing connections in the meantime.
     """
     found: list[int] = []
     for port in random.SystemRandom().sample(PORTS, len(PORTS)):
@@ -163,10 +160,7 @@ def free_ports(count: int) -> list[int]:
                 found.append(port)
         if len(found) == count:
             return found
-    raise MissingPrerequisiteError(
-        f"only {len(found)} of {count} ports from {PORTS[0]} to {PORTS[-1]} of 127.0.0.1 are free;"
-        " end a program that uses them"
-    )
+    raise MissingPrerequisiteError(f"127.0.0.1 has fewer than {count} free ports in {PORTS}")
 
 
 def serve(
@@ -178,18 +172,15 @@ def serve(
     stop: Callable[[], bool],
     slip_ns: Callable[[], int] = lambda: 0,
 ) -> None:
-    """Run an endpoint in real time until `stop()` is true.
+    """Run an endpoint, the `end` "world" or "cloud", in real time until `stop()` is true.
 
     Args:
-        endpoint: World or cloud.
+        endpoint: World or cloud; without a key, raise a ValueError.
         peer: Socket of the endpoint, and address of its peer.
         end: "world" or "cloud", for the records.
         sink: Called with new records, at least every 20 ms if there are any. It must not block.
         stop: Called at every wake, at least every 100 ms.
         slip_ns: Returns the lag of the endpoint's clock behind the machine's monotonic clock [ns].
-
-    Raises:
-        ValueError: If the endpoint has no key and therefore cannot seal its datagrams.
     """
     if not endpoint.sealed:
         raise ValueError(f"{end} has no key; a process must seal all its datagrams")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -26,13 +25,9 @@ from cloudrc.records import (
 if TYPE_CHECKING:
     from cloudrc.record.recorder import Recorder
 
-STEP = 0.1
-"""Smallest difference between the wall clock and the clock since boot that counts as a step [s]."""
-DRIFT_MAX = 1e-3
-"""Largest relative drift between the two clocks that does not count as a step."""
 AFTERWARDS_NS = 90_000_000_000
-"""When the robot stops following cloud, all records are kept for this time [ns]. It is long enough
-for the landing after a loss of the link."""
+"""Time for which all records are still kept after the robot has stopped following cloud [ns]: long
+enough for the landing after a loss of the link."""
 PERIODIC = (Arrival, CommandApplied, Control, GroundTruth, Lateness, TelemetrySent)
 """Types of records that world and cloud make all the time, even between flights."""
 BATCH = 16
@@ -43,31 +38,6 @@ BUSY = 0.001
 """Sleep of the thread while more records wait [s]."""
 FLUSH = 0.25
 """Shortest time between two flushes [s]. A killed process loses records of less than 0.5 s."""
-_SINCE_BOOT = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # the former: Linux
-
-
-class WallClock:
-    """Detects steps of the wall clock, by comparison with the clock since boot."""
-
-    def __init__(self) -> None:
-        self._wall, self._boot = _read_clocks()
-
-    def step(self) -> float:
-        """Return by how much the wall clock was set since the last call [s]; 0 if it was not."""
-        wall, boot = _read_clocks()
-        elapsed = boot - self._boot
-        step = wall - self._wall - elapsed
-        self._wall, self._boot = wall, boot
-        return step if abs(step) > STEP + DRIFT_MAX * elapsed else 0.0
-
-
-def _read_clocks() -> tuple[float, float]:
-    """Read the wall clock and the clock since boot [s]; repeat this if the process was paused."""
-    while True:
-        before, wall = time.clock_gettime(_SINCE_BOOT), time.time()
-        boot = time.clock_gettime(_SINCE_BOOT)
-        if boot - before < STEP / 2.0:
-            return wall, boot
 
 
 class FlightsOnly:
@@ -77,7 +47,7 @@ class FlightsOnly:
     """
 
     def __init__(self, flies: Callable[[], bool]) -> None:
-        """Store the function that tells whether the robot follows the commands of cloud."""
+        """Set the function that tells whether the robot follows the commands of cloud."""
         self._flies, self._until_ns = flies, 0
 
     def __call__(self, records: list[Record]) -> list[Record]:
@@ -102,7 +72,6 @@ class RecordingThread:
         self._writing = threading.Thread(target=self._write, name="recording", daemon=True)
         self._syncing = threading.Thread(target=self._sync, name="recording-sync", daemon=True)
         self._safe_since: float | None = None
-        self._wall, self._steps = WallClock(), deque[float]()
 
     def start(self) -> None:
         """Start the threads that write the file and sync it to the disk."""
@@ -112,10 +81,6 @@ class RecordingThread:
     def sync_age(self) -> float | None:
         """Return the time since the last sync to disk began [s]; None before the first sync."""
         return None if self._safe_since is None else time.monotonic() - self._safe_since
-
-    def take_steps(self) -> list[float]:
-        """Return the steps of the wall clock since the last call [s]."""
-        return [self._steps.popleft() for _ in range(len(self._steps))]
 
     def stop(self, timeout: float = 1.5) -> bool:
         """Complete the file; return whether this took at most `timeout` [s]."""
@@ -131,8 +96,6 @@ class RecordingThread:
                 recorder.flush(sync=False)
                 self._flushed.set()
                 flushed = time.monotonic()
-                if step := self._wall.step():
-                    self._steps.append(step)
         recorder.close()
         self._over = True
         self._flushed.set()

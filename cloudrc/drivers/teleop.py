@@ -1,7 +1,5 @@
 """Run teleop in its own process, and connect the processes of teleop and cloud by Unix sockets.
 
-    cloud: CloudEndpoint - RemoteTeleop  <- two Unix sockets ->  teleop: serve_teleop - machine
-
 No call blocks. A datagram is lost if the socket of the receiver is full or missing. Each process
 may restart while the other runs: teleop repeats its setpoint and requests, and stores mission
 events until cloud accepts them.
@@ -24,7 +22,7 @@ from cloudrc.records import Fault, MissionEvent
 DATAGRAM_MAX = 8_192
 """Size limit of a datagram between teleop and cloud [bytes]; all messages are smaller."""
 DRAIN_MAX = 1024
-"""Largest number of datagrams that one call of `receive` returns: more than a socket can queue."""
+"""Largest number of datagrams that `receive` returns at once: more than a socket can queue."""
 PATH_MAX = 107
 """Longest path of a socket, without its final zero [bytes]. Source: unix(7), `sun_path`."""
 PERIOD_NS = 20_000_000
@@ -42,8 +40,8 @@ SILENCE_NS = 1_000_000_000
 EVENTS_KEPT = 256
 """Largest number of mission events that teleop stores while cloud does not accept them."""
 LAST_WORD_NS = 800_000_000
-"""Time for which cloud, when asked to end, still forwards teleop's request to hold [ns]. Teleop
-repeats the request for a shorter time; a process has 1.5 s to end."""
+"""Time for which cloud, when asked to end, still forwards teleop's request to hold [ns]; a process
+has 1.5 s to end."""
 Encode = Callable[[Any], bytes]
 Decode = Callable[[bytes], Any]
 """Function that decodes a message; it raises a ValueError if the bytes are not a message."""
@@ -156,7 +154,7 @@ def _moves_robot(output: Any) -> bool:
 
 
 class LastWord:
-    """Delays the end of cloud's process in flight, so that it forwards teleop's request to hold."""
+    """Delays the end of cloud in flight, so that cloud forwards teleop's request to hold."""
 
     def __init__(
         self,
@@ -202,9 +200,8 @@ def serve_teleop(
         now_ns = time.monotonic_ns()
         late_ns = now_ns - deadline_ns
         deadline_ns += (late_ns // PERIOD_NS + 1) * PERIOD_NS
-        blind = turn(
-            machine, peer, decode, calls, stops=stops, blind=blind, late_ns=late_ns, now_ns=now_ns
-        )
+        how = {"blind": blind, "late_ns": late_ns, "now_ns": now_ns}
+        blind = turn(machine, peer, decode, calls, stops=stops, **how)
         if not blind and (reports := send(machine.take_outputs(), unsent, peer, encode)):
             tell(reports)
 
@@ -222,12 +219,12 @@ def turn(
 ) -> int:
     """Run one period of teleop's loop: receive states of the robot, and make the queued calls.
 
-    The period begins at `now_ns`, later than planned by `late_ns` [ns]. For the other arguments
-    see `serve_teleop`. After a stall, teleop waits for a new state of the robot, for at most
-    `BLIND_WAKES` periods. Return the number of periods for which teleop still waits, and pass it as
-    `blind` in the next period; `blind` is 0 at first.
+    The period begins at `now_ns`, later than planned by `late_ns` [ns]. After a stall, the socket
+    contains old states. Calls may depend on the robot's position; so teleop discards the old states
+    and waits for a new one, for at most `BLIND_WAKES` periods. Return the number of periods for
+    which teleop still waits, to be passed as `blind` in the next period; it is 0 at first.
     """
-    arrived, was_blind = peer.receive(), blind
+    arrived = peer.receive()
     states = [data for data in arrived if data]  # an empty datagram carries no state
     if blind:  # ignore `late_ns`: otherwise a loop that is always late would wait forever
         blind = 0 if states else blind - 1
@@ -237,18 +234,13 @@ def turn(
         return blind
     if arrived:
         machine.hear(now_ns)
-    # Make calls before the machine sees the state, which may already show the effect of a call.
-    # After a stall, make calls after that: they may depend on the robot's position. Emergency stops
-    # do not depend on it and come first.
+    # An emergency stop is queued before a state can show its effect, so stops come first.
     for stop in stops():
         stop(now_ns)
-    seen = _newest(states, decode)
-    if was_blind and seen is not None:
+    if (seen := _newest(states, decode)) is not None:
         machine.see(seen, now_ns)
     for call in calls():
         call(now_ns)
-    if not was_blind and seen is not None:
-        machine.see(seen, now_ns)
     machine.handle_deadline(now_ns)
     return 0
 

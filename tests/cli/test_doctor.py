@@ -13,7 +13,7 @@ from cloudrc.errors import MissingPrerequisiteError
 
 GOOD = Check("python", "ok", "3.12.1", "", ("local", "virtual"))
 NO_HELM = Check("helm", "missing", "not in PATH", "https://helm.sh", ("cluster",))
-NO_UDP = Check("udp loopback", "missing", "refused", "allow UDP", ("local",))
+NO_PHYSICS = Check("physics", "missing", "aborted", "install mujoco", ("local", "virtual"))
 
 
 @pytest.mark.parametrize(
@@ -21,8 +21,7 @@ NO_UDP = Check("udp loopback", "missing", "refused", "allow UDP", ("local",))
     [
         ("local", [GOOD, NO_HELM], 0),
         ("cluster", [GOOD, NO_HELM], 3),
-        ("local", [GOOD, NO_UDP], 3),
-        ("virtual", [GOOD, NO_UDP], 0),
+        ("virtual", [NO_PHYSICS], 3),
     ],
 )
 def test_only_a_needed_check_gives_exit_code_3(mode, found, code, monkeypatch, capsys):

@@ -37,8 +37,8 @@ def test_a_key_is_made_rotated_and_dropped(tmp_path, key):
     assert error.startswith("cloudrc: --overlap is ignored: ")
     follower.follow(PERIOD_NS)
     assert follower.ring.keys == (new, first)
-    for only in (f"now, {first.name} is removed", "already"):
-        assert key("drop").out == f"key {new.name} is the only key {only}: {path}\n"
+    for _ in range(2):
+        assert key("drop").out == f"key {new.name} is the only key: {path}\n"
         assert read_keys(path) == KeySet(new)
     follower.follow(2 * PERIOD_NS)
     assert follower.ring.keys.accepted == (new,)

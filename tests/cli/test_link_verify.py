@@ -60,7 +60,6 @@ def release(monkeypatch):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")  # a proxy is not used
     monkeypatch.setattr(link_verify.time, "sleep", lambda seconds: None)
-    monkeypatch.setattr("cloudrc.drivers.exporter.KEPT", 0.0)  # as no time passes
     with ExitStack() as stack:
 
         def open_exporter(role):

@@ -134,7 +134,7 @@ def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch):
 
 
 def test_sizes_are_read_as_in_kubernetes():
-    sizes = {"1Gi": 2**30, "500M": 5e8, "1.5Ki": 1536, "4096": 4096, "1m": 1e-3}
+    sizes = {"1Gi": 2**30, "500M": 5e8, "1.5Ki": 1536, "4096": 4096, "1k": 1e3}
     assert {text: read_size(text) for text in sizes} == sizes
     for text in ("", "1GB", "-1", "1 Gi", "nan"):
         with pytest.raises(argparse.ArgumentTypeError, match="such as 500M or 1Gi"):
@@ -182,20 +182,18 @@ def test_a_restart_keeps_the_recording_of_a_crash(tmp_path):
 
 
 @pytest.mark.parametrize(("plan_s", "size"), [(0.0, 88), (0.4, 576)])
-def test_the_link_is_expected_to_carry_the_plans(plan_s, size, monkeypatch, tmp_path):
+def test_the_link_is_expected_to_carry_the_plans(plan_s, size, monkeypatch):
     monitor = Mock()
     monkeypatch.setattr("cloudrc.link.verify.monitor.LinkMonitor", monitor)
-    options = argparse.Namespace(link=None, route=tmp_path / "route")
     experiment = load_experiment("fast", [f"cloud.plan_s={plan_s}"])
-    processes.link_monitor(options, experiment, uplink=False)
+    processes.link_monitor(experiment, None, uplink=False, trusted=False)
     assert monitor.call_args.kwargs["flow"].size == size
 
 
 def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch):
     loads, path = [], tmp_path / "trace.csv"
     monkeypatch.setattr(LinkMonitor, "begin", lambda self, asked, path, load: loads.append(load))
-    options = argparse.Namespace(link=None, route=tmp_path / "route")
-    processes.link_monitor(options, load_experiment("paper"), uplink=False)
+    processes.link_monitor(load_experiment("paper"), None, uplink=False, trusted=False)
 
     def load(**uplink):
         return loads[0]({"uplink": uplink})[0]

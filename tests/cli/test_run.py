@@ -150,8 +150,8 @@ def test_a_full_disk_is_named_and_is_no_failed_mission(monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("out", "said"),
     [
-        (None, r"^runs/ in the working folder: .*with --out$"),
-        (Path("runs/x"), r"^--out runs/x: .*name another folder$"),
+        (None, r"^runs/ in the working folder.*with --out$"),
+        (Path("runs/x"), r"^--out runs/x: .*name a writable folder"),
         (Path("runs"), "never overwritten"),
         (Path("full"), "never overwritten"),
     ],

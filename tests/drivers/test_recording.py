@@ -1,12 +1,9 @@
-"""The recorder with its threads, what a pod records, and steps of the wall clock."""
+"""The recorder with its threads, and what a pod records."""
 
 import threading
 import time
-from pathlib import Path
 
-import pytest
-
-from cloudrc.drivers.recording import AFTERWARDS_NS, FlightsOnly, RecordingThread, WallClock
+from cloudrc.drivers.recording import AFTERWARDS_NS, FlightsOnly, RecordingThread
 from cloudrc.messages import GuardState
 from cloudrc.record.recorder import Recorder
 from cloudrc.records import GuardChange, Lateness
@@ -65,39 +62,3 @@ def test_a_pod_records_flights_whole_and_events_between_them():
     assert whole == set(range(100, 102 + AFTERWARDS_NS // 1_000_000_000 + 1))
     assert {kept[index] for index in kept.keys() - whole} == {1}
     assert choose([]) == []
-
-
-def test_a_step_of_the_wall_clock_is_noticed_once(monkeypatch):
-    offset, true = [0.0], time.time
-    monkeypatch.setattr(time, "time", lambda: true() + offset[0])
-    thread = RecordingThread(Recorder(Path("x"), lambda path: Shelf()))
-    thread.start()
-    offset[0] = -1.0
-    steps, until = [], time.monotonic() + 10.0
-    while not steps and time.monotonic() < until:
-        time.sleep(0.01)
-        steps = thread.take_steps()
-    assert steps == [pytest.approx(-1.0, abs=0.1)]
-    assert thread.take_steps() == []
-    assert thread.stop(10.0)
-
-
-@pytest.mark.parametrize("stopped", ["never", "before", "after"])
-def test_a_clock_that_drifts_or_whose_reader_was_stopped_has_not_been_set(stopped, monkeypatch):
-    """A stop of a second before or after the read of the wall clock, by SIGSTOP or a CPU quota."""
-    boot, stops = [0.0], [stopped]
-
-    def look():
-        stop = stops.pop() if stops and boot[0] > 0.0 else ""
-        boot[0] += stop == "before"
-        shown = 1.7e9 + boot[0] * 1.0005
-        boot[0] += stop == "after"
-        return shown
-
-    monkeypatch.setattr(time, "clock_gettime", lambda clock: boot[0])
-    monkeypatch.setattr(time, "time", look)
-    seen, steps = WallClock(), []
-    for later in (1.0, 60.0, 3600.0, 86_400.0):
-        boot[0] += later
-        steps.append(seen.step())
-    assert steps == [0.0] * 4

@@ -73,11 +73,9 @@ def run(tmp_path):
 def test_an_old_report_is_used_completely_or_not_at_all(run):
     _, _, anew = read_run(run)
     good = {"mode": "local", "shaper": "netem", "notes": ["seen"], "records_sha256": "f" * 64}
-    wrong = ({"notes": [1]}, {"notes": None}, {"mode": "elsewhere"}, {"mode": ["local"]},
-             {"records_sha256": {"a": 1}}, {"verdict": ["interrupted"]})  # fmt: skip
-    broken = ["[" * 100_000, "null", '{"mode":', "\udcff"]
-    for before in (*(json.dumps(good | changed) for changed in wrong), *broken):
-        (run / "report.json").write_text(before, errors="surrogateescape")
+    wrong = {"notes": [1]}, {"mode": "elsewhere"}, {"records_sha256": {"a": 1}}
+    for before in (*(json.dumps(good | changed) for changed in wrong), "null", '{"mode":'):
+        (run / "report.json").write_text(before)
         assert read_run(run)[2] == anew, before[:99]
     (run / "report.json").write_text(json.dumps(good))
     assert read_run(run)[2].notes == ("seen",)
@@ -124,19 +122,13 @@ WRITERS = [
 
 
 @pytest.mark.parametrize("writes", WRITERS)
-def test_a_link_is_replaced_and_its_target_kept(theirs, mine, monkeypatch, writes):
+def test_a_link_is_replaced_and_its_target_kept(theirs, mine, writes):
     path = theirs / "file"
     path.symlink_to(mine)
     writes(path)
     assert mine.read_text() == "mine"
     assert not path.is_symlink()
     assert path.stat().st_size
-    # Even a link with the name of the temporary file is refused, not followed.
-    monkeypatch.setattr(os, "urandom", lambda size: b"\xab" * 8)
-    (theirs / f".file.{'ab' * 8}").symlink_to(mine)
-    with pytest.raises(FileExistsError):
-        writes(path)
-    assert mine.read_text() == "mine"
 
 
 def test_a_secret_file_has_its_mode_from_the_start(theirs):
