@@ -1,11 +1,8 @@
 """Load an experiment and resolve it: replace names and defaults by values.
 
-Loading reads the file, applies `--set`, inserts the mission and the link profile, and fills in the
-parameters of the plug-ins. It then checks the result against the schema, the scene and the files
-on disk. One error lists all problems, each with its file and line.
-
 A resolved experiment contains its mission, both directions of the link, all parameters of the
-plug-ins and all limits. If `dump` writes it to a file, `cloudrc run FILE` repeats the flight.
+plug-ins and all limits. If `dump` writes it to a file, `cloudrc run FILE` repeats the flight. One
+error lists all problems of an experiment, each with its file and line.
 """
 
 from __future__ import annotations
@@ -126,12 +123,12 @@ class ResolvedExperiment(Experiment):
 
     @property
     def uplink(self) -> Direction:
-        """All conditions of the link from world to cloud."""
+        """Conditions of the link from world to cloud."""
         return self.link.uplink
 
     @property
     def downlink(self) -> Direction:
-        """All conditions of the link from cloud to world."""
+        """Conditions of the link from cloud to world."""
         return self.link.downlink
 
 
@@ -140,11 +137,8 @@ def load_experiment(
 ) -> ResolvedExperiment:
     """Load an experiment for a flight by name or path, and import the plug-ins that it names.
 
-    The `settings`, or their texts `key=value`, override values of the file. Relative paths become
-    absolute. Without `build`, neither import nor check the plug-ins.
-
-    Raises:
-        BadInputError: If the experiment has problems. The text lists each problem on its own line.
+    The `settings`, or their texts `key=value`, override values of the file. Without `build`, do not
+    import or check the plug-ins. Raise a BadInputError that lists the experiment's problems.
     """
     name = str(name)
     document = shipped.read("experiment", name, Path())
@@ -170,9 +164,12 @@ def load_experiment(
     _default(document, ("guard", "plan_max_s"), PLAN_MAX_S if has_plans else 0.0)
     for key in overrides.KINDS:
         _default(document, ("cloud", key), getattr(Cloud(), key))
-    found += overrides.resolve_plugins(document, build=build)
-    found += _resolve_traces(document, ("link",)) + _resolve_files(document)
-    found += _resolve_setpoints(document, replace=("mission", "setpoints") in inner)
+    if ("mission", "setpoints") in inner and document.get("mission", "setpoints"):
+        for key in ("waypoints", "steps", "carrot"):  # the setpoints replace them
+            document.tree["mission"].pop(key, None)
+    if isinstance(names := document.get("report", "metrics"), str):  # one metric without a list
+        document.tree["report"]["metrics"] = [names]
+    found += overrides.resolve_plugins(document, build=build) + _resolve_paths(document)
     experiment = validate(document, ResolvedExperiment, name, found)
     scene, mission = load_scene(experiment.world.scene), experiment.mission
     wrong = check_mission(mission, scene)
@@ -186,10 +183,9 @@ def load_experiment(
 
 
 def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
-    """Load an experiment without importing or checking its plug-ins, for all processes but cloud.
+    """Load an experiment without importing its plug-ins, for all processes but cloud.
 
-    The plug-ins have only the parameters that the file gives. The config.yaml of a run gives all
-    parameters.
+    The plug-ins have only the parameters that the file gives.
     """
     return load_experiment(name, settings, build=False)
 
@@ -201,15 +197,11 @@ def load_profile(name: str | Path, folder: Path | None = None) -> Profile:
 
 def check_profile(document: Document, name: str) -> Profile:
     """Check a link profile that was built in memory; raises BadInputError."""
-    return validate(document, Profile, name, _resolve_traces(document, ()))
+    return validate(document, Profile, name, _resolve_paths(document))
 
 
 def dump(experiment: ResolvedExperiment) -> str:
-    """Format an experiment as YAML; loading this YAML returns an equal experiment.
-
-    The YAML contains mission and link profile. Traces, and plug-ins outside the
-    package, appear as absolute paths.
-    """
+    """Format an experiment as YAML; loading this YAML returns an equal experiment."""
     return write_yaml(experiment.model_dump(mode="json"))
 
 
@@ -229,7 +221,7 @@ def local_files(value: Any, key: str = "") -> dict[str, str]:
 
 
 def _is_inside_name(path: KeyPath) -> bool:
-    """Whether a key is inside mission or profile, instead of which a file may give a name."""
+    """Whether a key is part of the mission or the profile, for which a file may give a name."""
     is_direction = path[0] == "link" and len(path) > 2 and path[1] in DIRECTIONS
     return is_direction or (path[0] == "mission" and len(path) > 1)
 
@@ -349,46 +341,26 @@ def _remove_cap(document: Document, age_max: object) -> None:
             del document.tree["guard"]["speed_max_mps"]
 
 
-def _resolve_traces(document: Document, above: KeyPath) -> list[Problem]:
-    """Make the paths of traces and tables absolute, and read these files; return problems."""
-    paths = ((*above, way, key) for way in DIRECTIONS for key in ("trace", "table"))
-    return [problem for path in paths for problem in _resolve_read(document, path)]
-
-
-def _resolve_setpoints(document: Document, *, replace: bool) -> list[Problem]:
-    """Read the mission's setpoints; if they `replace` its waypoints, remove these."""
-    if replace and isinstance(document.get("mission", "setpoints"), str):
-        for key in ("waypoints", "steps", "carrot"):
-            document.tree["mission"].pop(key, None)
-    return _resolve_read(document, ("mission", "setpoints"))
-
-
-def _resolve_read(document: Document, path: KeyPath) -> list[Problem]:
-    """Make the path of one file absolute, and read the file; return problems."""
-    given, source, found = document.get(*path), document.source(path), list[Problem]()
-    if isinstance(given, str):
-        absolute = source.absolute(given)
-        document.set_value(path, str(absolute), source)
-        with _collect(found, path):
-            FILE_READERS[path[-1]](absolute)
-    return found
-
-
-def _resolve_files(document: Document) -> list[Problem]:
+def _resolve_paths(document: Document) -> list[Problem]:
+    """Make the paths of an experiment or a profile absolute; return problems of the files."""
     found: list[Problem] = []
-    for key in ("robot", "scene"):
-        path, name = ("world", key), document.get("world", key)
-        if isinstance(name, str):
-            with _collect(found, path):
-                folder = document.source(path).folder
-                document.tree["world"][key] = shipped.model_path(key, name, folder)
-    names = document.get("report", "metrics")
-    if isinstance(names, str):  # one metric without a list
-        names = document.tree["report"]["metrics"] = [names]
-    for index, name in enumerate(names if isinstance(names, list) else ()):
-        if isinstance(name, str) and plugins.is_path(name):
-            source = document.source(("report", "metrics", str(index)))
-            names[index] = str(source.absolute(name))
+    ways = [(*above, way) for above in ((), ("link",)) for way in DIRECTIONS]
+    paths = [(*way, key) for way in ways for key in ("trace", "table")]
+    paths += [("mission", "setpoints"), ("world", "robot"), ("world", "scene")]
+    metrics = document.get("report", "metrics")
+    for index in range(len(metrics) if isinstance(metrics, list) else 0):
+        paths.append(("report", "metrics", str(index)))
+    for path in paths:
+        name, key, source = document.get(*path), path[-1], document.source(path)
+        with _collect(found, path):
+            if not isinstance(name, str) or (key.isdecimal() and not plugins.is_path(name)):
+                continue
+            if key in ("robot", "scene"):
+                name = shipped.model_path(key, name, source.folder)
+            else:
+                name = str(source.absolute(name))
+                FILE_READERS.get(key, Path)(Path(name))
+            document.set_value(path, name, source)
     return found
 
 
@@ -413,10 +385,7 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
     """Set values in the link profile `before`, or in the profile named `profile` if it is given.
 
     The time line (changes, trace) no longer changes a key that the user sets, and still changes
-    other keys.
-
-    Raises:
-        BadInputError: If the request is empty or invalid.
+    other keys. Raise a BadInputError if the request is empty or invalid.
     """
     if profile is None and not settings:
         raise BadInputError(f"nothing to set; name a value, {_EXAMPLE}")
