@@ -79,10 +79,9 @@ def parse_settings(texts: Iterable[str]) -> Settings:
     given, source = list[tuple[str, Any, Source]](), Source(SET_LABEL, Path.cwd())
     for text in texts:
         key, equals, value = text.partition("=")
-        if not equals or not all(part.strip() for part in key.split(".")):
-            raise BadInputError(
-                f"{SET_LABEL} {text}: must be key=value; for example cloud.predictor=last_sample"
-            )
+        if not equals:
+            example = "cloud.predictor=last_sample"
+            raise BadInputError(f"{SET_LABEL} {text}: must be key=value; for example {example}")
         given.append((key, parse_value(value, f"{SET_LABEL} {key}"), source))
     return collect_settings(given)
 

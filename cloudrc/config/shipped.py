@@ -60,10 +60,8 @@ def model_path(kind: str, name: str, folder: Path) -> str:
         check_name(kind, name)
         return name
     path = Path(os.path.realpath(folder / os.path.expanduser(name)))
-    if path.suffix != ".xml":
-        raise _no_file("not an .xml file", kind, path)
-    if not os.path.isfile(path):
-        raise _no_file("no such file", kind, path)
+    if path.suffix != ".xml" or not os.path.isfile(path):
+        raise _no_file("no such .xml file", kind, path)
     return str(path)
 
 
