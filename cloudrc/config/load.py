@@ -60,6 +60,8 @@ PLAN_MAX_S = 0.8
 """Default of guard.plan_max_s if cloud sends plans [s].
 Source: docs/reference/plant.md, "Plan"."""
 DIRECTIONS = ("uplink", "downlink")
+_PROFILE_KEYS = {("link",), ("link", "profile")}
+"""Keys whose settings replace the link profile."""
 FILE_READERS: dict[str, Callable[[Path], object]] = {
     **{"trace": read_trace, "table": read_table, "setpoints": read_setpoints}
 }
@@ -145,10 +147,8 @@ def load_experiment(
     changes = settings if isinstance(settings, dict) else overrides.parse_settings(settings)
     inner = {path: value for path, value in changes.items() if _is_inside_name(path)}
     _default(document, ("name",), Path(name).stem)
-    if changes.keys() & {("link",), ("link", "profile")}:
-        _remove_profile_values(document)
-    if ("cloud", "plan_s") in changes:
-        _remove_plan_values(document)
+    if _has_all_values(document):
+        _remove_derived(document, new_profile=bool(changes.keys() & _PROFILE_KEYS))
     outer = {path: value for path, value in changes.items() if path not in inner}
     overrides.apply_overrides(document, outer)
     for key in ("world", "guard", "link", "cloud", "report"):
@@ -159,9 +159,7 @@ def load_experiment(
     with _collect(found, ("link", "profile")):
         _inline_profile(document)
     overrides.apply_overrides(document, inner)
-    plans = document.get("cloud", "plan_s")
-    has_plans = isinstance(plans, float | int) and plans > 0
-    _default(document, ("guard", "plan_max_s"), PLAN_MAX_S if has_plans else 0.0)
+    _default(document, ("guard", "plan_max_s"), _plan_max(document))
     for key in overrides.KINDS:
         _default(document, ("cloud", key), getattr(Cloud(), key))
     if ("mission", "setpoints") in inner and document.get("mission", "setpoints"):
@@ -310,35 +308,32 @@ def _has_all_values(document: Document) -> bool:
     )
 
 
-def _remove_profile_values(document: Document) -> None:
-    """Remove the values of the present profile, before another profile replaces it."""
-    if not _has_all_values(document):
-        return
-    for way in DIRECTIONS:
-        del document.tree["link"][way]
-    profile = Profile()
-    with suppress(BadInputError):  # the profile's file may no longer exist
-        profile = load_profile(str(document.get("link", "profile")))
-    implied = _implied(profile)
-    _remove_cap(document, implied["guard", "command_age_max_ms"])
-    for path, value in implied.items():
-        if document.get(*path) == value:
-            del document.tree[path[0]][path[1]]
+def _plan_max(document: Document) -> float:
+    """Return the default of guard.plan_max_s [s]."""
+    plan = document.get("cloud", "plan_s")
+    return PLAN_MAX_S if isinstance(plan, float | int) and plan > 0 else 0.0
 
 
-def _remove_plan_values(document: Document) -> None:
-    """Remove the guard's limits that follow from cloud.plan_s, before this key changes."""
-    if document.get("guard", "plan_max_s") in (0.0, PLAN_MAX_S):
-        _remove_cap(document, document.get("guard", "command_age_max_ms"))
-        del document.tree["guard"]["plan_max_s"]
+def _remove_derived(document: Document, *, new_profile: bool) -> None:
+    """Remove the values of a resolved file that follow from others, which settings may change.
 
-
-def _remove_cap(document: Document, age_max: object) -> None:
-    """Remove the guard's speed limit if it follows from the age [ms] and the plans."""
-    plan_max = document.get("guard", "plan_max_s") or 0.0
-    if isinstance(age_max, float | int) and isinstance(plan_max, float | int):
-        if document.get("guard", "speed_max_mps") == speed_cap(age_max, plan_max):
-            del document.tree["guard"]["speed_max_mps"]
+    With a `new_profile`, also remove the values of the present profile. A value of the experiment
+    itself is different from the value that follows, and stays.
+    """
+    derived: dict[KeyPath, float] = {("guard", "plan_max_s"): _plan_max(document)}
+    limits: Any = (document.get("guard", key) for key in ("command_age_max_ms", "plan_max_s"))
+    with suppress(TypeError):  # a value is missing, or no number
+        derived["guard", "speed_max_mps"] = speed_cap(*limits)
+    if new_profile:
+        profile = Profile()
+        with suppress(BadInputError):  # the profile's file may no longer exist
+            profile = load_profile(str(document.get("link", "profile")))
+        derived |= _implied(profile)
+        for way in DIRECTIONS:
+            del document.tree["link"][way]
+    for (section, key), value in derived.items():
+        if document.get(section, key) == value:
+            del document.tree[section][key]
 
 
 def _resolve_paths(document: Document) -> list[Problem]:
