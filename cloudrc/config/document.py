@@ -25,8 +25,6 @@ SIZE_MAX = 8 << 20
 VALUES_MAX = 300_000
 """Largest number of values in a document. The limit refuses a short file in which nested
 aliases make far more."""
-SET_LABEL = "--set"
-"""`Source.label` of a value from the command line."""
 
 _SCALARS = {
     "null": (r"~|null|Null|NULL|", [*"~nN", ""]),

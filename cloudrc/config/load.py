@@ -26,7 +26,7 @@ from pydantic import (
 
 from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
-from cloudrc.config.document import SET_LABEL, Document, KeyPath, write_yaml
+from cloudrc.config.document import Document, KeyPath, write_yaml
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import Problem
@@ -395,7 +395,7 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
                 "guard keeps the limit that it started with, so the robot may hold"
             )
     changes: Settings = {}
-    for path, setting in overrides.parse_settings(settings).items():
+    for path, setting in overrides.parse_settings(settings, _HERE).items():
         way, *keys = path[1:] if path[0] == "link" else path
         if not keys or way not in DIRECTIONS:
             raise BadInputError(f"{'.'.join(path)}: set a key of uplink or downlink, {_EXAMPLE}")
@@ -403,10 +403,6 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
         restart |= keys[0] in TIME_LINE_KEYS
         notes += _drop_from_time_line(document, way, keys[0])
     overrides.apply_overrides(document, changes)
-    document.sources = {
-        path: source._replace(label=_HERE) if source.label == SET_LABEL else source
-        for path, source in document.sources.items()
-    }
     values = check_profile(document, _HERE).model_dump(mode="json", exclude_defaults=True)
     words = [f"profile {profile}"] if profile else []
     return Edit(values, ", ".join([*words, *settings]), restart, notes)

@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from cloudrc import plugins
 from cloudrc.config import problems
-from cloudrc.config.document import SET_LABEL, Document, KeyPath, Source, child, parse_value
+from cloudrc.config.document import Document, KeyPath, Source, child, parse_value
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Experiment, PlugIn
 from cloudrc.errors import BadInputError
@@ -71,18 +71,18 @@ def _directions(path: KeyPath) -> list[KeyPath]:
     return [(*path[:at], way, *path[at + 1 :]) for way in ("uplink", "downlink")]
 
 
-def parse_settings(texts: Iterable[str]) -> Settings:
+def parse_settings(texts: Iterable[str], label: str = "--set") -> Settings:
     """Parse texts `key=value`, in which a relative path starts at the working folder.
 
-    Raise a BadInputError for a text of another form.
+    Raise a BadInputError for a text of another form; `label` is the beginning of its message.
     """
-    given, source = list[tuple[str, Any, Source]](), Source(SET_LABEL, Path.cwd())
+    given, source = list[tuple[str, Any, Source]](), Source(label, Path.cwd())
     for text in texts:
         key, equals, value = text.partition("=")
         if not equals:
             example = "cloud.predictor=last_sample"
-            raise BadInputError(f"{SET_LABEL} {text}: must be key=value; for example {example}")
-        given.append((key, parse_value(value, f"{SET_LABEL} {key}"), source))
+            raise BadInputError(f"{label} {text}: must be key=value; for example {example}")
+        given.append((key, parse_value(value, f"{label} {key}"), source))
     return collect_settings(given)
 
 
