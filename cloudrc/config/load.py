@@ -188,9 +188,9 @@ def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedE
     return load_experiment(name, settings, build=False)
 
 
-def load_profile(name: str | Path, folder: Path | None = None) -> Profile:
-    """Load a link profile by name, or by path relative to `folder`; raises BadInputError."""
-    return check_profile(shipped.read("profile", str(name), folder or Path()), str(name))
+def load_profile(name: str | Path) -> Profile:
+    """Load a link profile by name or path; raises BadInputError."""
+    return check_profile(shipped.read("profile", str(name), Path()), str(name))
 
 
 def check_profile(document: Document, name: str) -> Profile:
