@@ -54,6 +54,11 @@ GRACE = 30.0
 """A flight is stopped if its mission goes on for this time after its time limit [s]."""
 VIRTUAL_CLOCK = bytes(16)
 """Identity of the virtual clock, which world and cloud share."""
+SAME_KEYS = {
+    *("distribution", "correlation", "duplicate", "reorder", "corrupt", "keep_order"),
+    "queue_packets",
+}
+"""Keys of a direction of a link profile whose values need no conversion."""
 FENCE_SPAN = dist(fence.LOW, fence.HIGH)
 """Length of the longest straight line inside the fence [m]."""
 
@@ -151,14 +156,10 @@ def build_cloud(
 ) -> CloudEndpoint:
     """Build cloud: plug-ins, teleoperation, and cloud's end of the tunnel.
 
-    Args:
-        experiment: The experiment.
-        identity: Identity of cloud's clock and process in the tunnel, with the keys.
-        clock: Cloud's monotonic clock [ns].
-        teleop: Source of setpoints. None: a new `Teleop`, which flies the mission at once.
-        cpu_clock: Clock of the processor time of this thread [ns], for `cloud.compute_measured`.
-            None in real time, where the computation takes its time anyway.
-        make_loop: Makes the control loop from the arguments of `ControlLoop`.
+    `clock` is cloud's monotonic clock [ns]. Without `teleop`, the source of setpoints, a new
+    `Teleop` flies the mission at once. `cpu_clock` is the processor time of this thread [ns], for
+    `cloud.compute_measured`; None in real time, where the computation takes its time anyway.
+    `make_loop` makes the control loop from the arguments of `ControlLoop`.
     """
     cloud = experiment.cloud
     loop = make_loop(
@@ -230,20 +231,16 @@ def with_order(
     legs, carrot = order.plan.legs, None
     if speed := max(leg.speed for leg in legs):
         carrot = schema.Carrot(speed_mps=speed, acceleration_mps2=legs[0].acceleration)
-    waypoints = (
-        ()
-        if order.plan.by_hand
-        else tuple(
-            schema.Waypoint(
-                position_m=leg.position,
-                yaw_deg=round(degrees(leg.yaw), 9),
-                tolerance_m=leg.tolerance,
-                dwell_s=leg.dwell,
-                time_limit_s=leg.time_limit,
-                speed_mps=leg.speed or None,
-            )
-            for leg in legs
+    waypoints = tuple(
+        schema.Waypoint(
+            position_m=leg.position,
+            yaw_deg=round(degrees(leg.yaw), 9),
+            tolerance_m=leg.tolerance,
+            dwell_s=leg.dwell,
+            time_limit_s=leg.time_limit,
+            speed_mps=leg.speed or None,
         )
+        for leg in ([] if order.plan.by_hand else legs)
     )
     mission = schema.Mission(
         start="spawn" if order.plan.start is Start.SPAWN else "here",
@@ -264,18 +261,13 @@ def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> Direc
     """
     trace = read_trace(Path(direction.trace), file_max) if direction.trace else None
     table = direction.distribution == "table" and direction.table
+    same = direction.model_dump(include=SAME_KEYS)
     return DirectionProfile(
+        **same,
         delay=direction.delay_ms * 1e-3,
         jitter=direction.jitter_ms * 1e-3,
-        distribution=direction.distribution,
-        correlation=direction.correlation,
         loss=_loss(direction.loss),
-        duplicate=direction.duplicate,
-        reorder=direction.reorder,
-        corrupt=direction.corrupt,
-        keep_order=direction.keep_order,
         rate=_scaled(direction.rate_kbit, 1e3),
-        queue_packets=direction.queue_packets,
         changes=tuple(_change(change) for change in direction.changes),
         trace=None if trace is None else replace(trace, loop=direction.loop),
         blackouts=tuple(Blackout(b.start_s, b.duration_s) for b in direction.blackouts),

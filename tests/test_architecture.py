@@ -6,8 +6,6 @@ import sys
 import tomllib
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "cloudrc"
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -129,18 +127,6 @@ def violations(place, tree):
 def test_a_file_imports_only_allowed_modules():
     found = {place_of(path): violations(place_of(path), tree) for path, tree in TREES.items()}
     assert {place: breaches for place, breaches in found.items() if breaches} == {}
-
-
-@pytest.mark.parametrize(
-    ("place", "code"),
-    [
-        ("world/guard/state.py", "from cloudrc.cloud import endpoint"),
-        ("link/model.py", "def f():\n    import random"),
-        ("record/mcap.py", "eval('1')"),
-    ],
-)
-def test_a_forbidden_import_is_found(place, code):
-    assert violations(place, ast.parse(code))
 
 
 def foreign(trees):

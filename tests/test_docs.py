@@ -103,16 +103,3 @@ def test_every_source_resolves():
     assert cited
     wrong = [(str(path), found) for path, entry in cited if (found := unresolved(entry))]
     assert wrong == []
-
-
-@pytest.mark.parametrize(
-    ("text", "found"),
-    [
-        ('X = 1\n"""A limit. Source:\nDESIGN, section 5."""', ["DESIGN", "DESIGN, section 5."]),
-        ('# Source: docs/reference/plant.md, "Robot",\n# "Wings".', ["Wings"]),
-        ("# Source: plant.md", ["plant.md"]),
-        ('# Source: docs/reference/faults.md, "F5"; RFC 791. Deviation: DESIGN', []),
-    ],
-)
-def test_a_source_that_leads_nowhere_is_found(text, found):
-    assert [part for entry in entries(text, ".py") for part in unresolved(entry)] == found

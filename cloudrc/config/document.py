@@ -25,8 +25,6 @@ SIZE_MAX = 8 << 20
 VALUES_MAX = 300_000
 """Largest number of values in a document. The limit refuses a short file in which nested
 aliases make far more."""
-SET_LABEL = "--set"
-"""`Source.label` of a value from the command line."""
 
 _SCALARS = {
     "null": (r"~|null|Null|NULL|", [*"~nN", ""]),
@@ -68,12 +66,8 @@ _Loader.add_constructor(f"{_TAG}int", lambda loader, node: int(node.value))
 def parse_yaml(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
     """Parse one YAML document; `name` is the document's name in error messages.
 
-    Returns:
-        The document as dictionaries with text keys, lists and scalars. Also the line number of each
-        value; the first line has the number 1.
-
-    Raises:
-        BadInputError: If the text is not YAML, repeats a key or contains tags of other types.
+    Return the document as dictionaries with text keys, lists and scalars, and the line number of
+    each value. Raise a BadInputError if the text is not YAML or repeats a key.
     """
     lines: dict[KeyPath, int] = {}
     try:
@@ -96,10 +90,7 @@ def parse_value(text: str, name: str) -> Any:
     """Parse a value from the command line; `name` is the value's name in error messages.
 
     Text without quotes and brackets is one scalar, even if it contains ` #` or `: `. A value of
-    several lines is a YAML document.
-
-    Raises:
-        BadInputError: If a value in brackets or quotes is not YAML, or if more text follows it.
+    several lines is a YAML document. Raise a BadInputError if the value is not YAML.
     """
     stripped = text.strip()
     if "\n" in stripped:
@@ -169,13 +160,10 @@ class Source(NamedTuple):
 class Document:
     """Values of a configuration file, possibly combined from several files.
 
-    Attributes:
-        tree: Dictionaries with text keys, lists and scalars.
-        sources: Keys of a value -> source of the value. A value without an entry comes from the
-            same source as its parent.
+    A value without an entry in `sources` comes from the same source as its parent.
     """
 
-    tree: dict[str, Any]
+    tree: dict[str, Any]  # dictionaries with text keys, lists and scalars
     sources: dict[KeyPath, Source] = field(default_factory=dict)
 
     def source(self, path: KeyPath) -> Source:
@@ -219,8 +207,7 @@ def child(node: Any, key: str) -> Any:
 def read_document(path: Path, name: str) -> Document:
     """Read a YAML file whose top level is a mapping; `name` is its name in error messages.
 
-    Raises:
-        BadInputError: If the file cannot be read, is too large, or is not a YAML mapping.
+    Raise a BadInputError if the file cannot be read or is not such a file.
     """
     try:
         text = files.read(path, SIZE_MAX).decode("utf-8")

@@ -1,11 +1,8 @@
 """Load an experiment and resolve it: replace names and defaults by values.
 
-Loading reads the file, applies `--set`, inserts the mission and the link profile, and fills in the
-parameters of the plug-ins. It then checks the result against the schema, the scene and the files
-on disk. One error lists all problems, each with its file and line.
-
 A resolved experiment contains its mission, both directions of the link, all parameters of the
-plug-ins and all limits. If `dump` writes it to a file, `cloudrc run FILE` repeats the flight.
+plug-ins and all limits. If `dump` writes it to a file, `cloudrc run FILE` repeats the flight. One
+error lists all problems of an experiment, each with its file and line.
 """
 
 from __future__ import annotations
@@ -29,7 +26,7 @@ from pydantic import (
 
 from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
-from cloudrc.config.document import SET_LABEL, Document, KeyPath, write_yaml
+from cloudrc.config.document import Document, KeyPath, write_yaml
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import Problem
@@ -63,6 +60,8 @@ PLAN_MAX_S = 0.8
 """Default of guard.plan_max_s if cloud sends plans [s].
 Source: docs/reference/plant.md, "Plan"."""
 DIRECTIONS = ("uplink", "downlink")
+_PROFILE_KEYS = {("link",), ("link", "profile")}
+"""Keys whose settings replace the link profile."""
 FILE_READERS: dict[str, Callable[[Path], object]] = {
     **{"trace": read_trace, "table": read_table, "setpoints": read_setpoints}
 }
@@ -126,12 +125,12 @@ class ResolvedExperiment(Experiment):
 
     @property
     def uplink(self) -> Direction:
-        """All conditions of the link from world to cloud."""
+        """Conditions of the link from world to cloud."""
         return self.link.uplink
 
     @property
     def downlink(self) -> Direction:
-        """All conditions of the link from cloud to world."""
+        """Conditions of the link from cloud to world."""
         return self.link.downlink
 
 
@@ -140,21 +139,16 @@ def load_experiment(
 ) -> ResolvedExperiment:
     """Load an experiment for a flight by name or path, and import the plug-ins that it names.
 
-    The `settings`, or their texts `key=value`, override values of the file. Relative paths become
-    absolute. Without `build`, neither import nor check the plug-ins.
-
-    Raises:
-        BadInputError: If the experiment has problems. The text lists each problem on its own line.
+    The `settings`, or their texts `key=value`, override values of the file. Without `build`, do not
+    import or check the plug-ins. Raise a BadInputError that lists the experiment's problems.
     """
     name = str(name)
     document = shipped.read("experiment", name, Path())
     changes = settings if isinstance(settings, dict) else overrides.parse_settings(settings)
     inner = {path: value for path, value in changes.items() if _is_inside_name(path)}
     _default(document, ("name",), Path(name).stem)
-    if changes.keys() & {("link",), ("link", "profile")}:
-        _remove_profile_values(document)
-    if ("cloud", "plan_s") in changes:
-        _remove_plan_values(document)
+    if _has_all_values(document):
+        _remove_derived(document, new_profile=bool(changes.keys() & _PROFILE_KEYS))
     outer = {path: value for path, value in changes.items() if path not in inner}
     overrides.apply_overrides(document, outer)
     for key in ("world", "guard", "link", "cloud", "report"):
@@ -165,14 +159,15 @@ def load_experiment(
     with _collect(found, ("link", "profile")):
         _inline_profile(document)
     overrides.apply_overrides(document, inner)
-    plans = document.get("cloud", "plan_s")
-    has_plans = isinstance(plans, float | int) and plans > 0
-    _default(document, ("guard", "plan_max_s"), PLAN_MAX_S if has_plans else 0.0)
+    _default(document, ("guard", "plan_max_s"), _plan_max(document))
     for key in overrides.KINDS:
         _default(document, ("cloud", key), getattr(Cloud(), key))
-    found += overrides.resolve_plugins(document, build=build)
-    found += _resolve_traces(document, ("link",)) + _resolve_files(document)
-    found += _resolve_setpoints(document, replace=("mission", "setpoints") in inner)
+    if ("mission", "setpoints") in inner and document.get("mission", "setpoints"):
+        for key in ("waypoints", "steps", "carrot"):  # the setpoints replace them
+            document.tree["mission"].pop(key, None)
+    if isinstance(names := document.get("report", "metrics"), str):  # one metric without a list
+        document.tree["report"]["metrics"] = [names]
+    found += overrides.resolve_plugins(document, build=build) + _resolve_paths(document)
     experiment = validate(document, ResolvedExperiment, name, found)
     scene, mission = load_scene(experiment.world.scene), experiment.mission
     wrong = check_mission(mission, scene)
@@ -186,30 +181,25 @@ def load_experiment(
 
 
 def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
-    """Load an experiment without importing or checking its plug-ins, for all processes but cloud.
+    """Load an experiment without importing its plug-ins, for all processes but cloud.
 
-    The plug-ins have only the parameters that the file gives. The config.yaml of a run gives all
-    parameters.
+    The plug-ins have only the parameters that the file gives.
     """
     return load_experiment(name, settings, build=False)
 
 
-def load_profile(name: str | Path, folder: Path | None = None) -> Profile:
-    """Load a link profile by name, or by path relative to `folder`; raises BadInputError."""
-    return check_profile(shipped.read("profile", str(name), folder or Path()), str(name))
+def load_profile(name: str | Path) -> Profile:
+    """Load a link profile by name or path; raises BadInputError."""
+    return check_profile(shipped.read("profile", str(name), Path()), str(name))
 
 
 def check_profile(document: Document, name: str) -> Profile:
     """Check a link profile that was built in memory; raises BadInputError."""
-    return validate(document, Profile, name, _resolve_traces(document, ()))
+    return validate(document, Profile, name, _resolve_paths(document))
 
 
 def dump(experiment: ResolvedExperiment) -> str:
-    """Format an experiment as YAML; loading this YAML returns an equal experiment.
-
-    The YAML contains mission and link profile. Traces, and plug-ins outside the
-    package, appear as absolute paths.
-    """
+    """Format an experiment as YAML; loading this YAML returns an equal experiment."""
     return write_yaml(experiment.model_dump(mode="json"))
 
 
@@ -229,7 +219,7 @@ def local_files(value: Any, key: str = "") -> dict[str, str]:
 
 
 def _is_inside_name(path: KeyPath) -> bool:
-    """Whether a key is inside mission or profile, instead of which a file may give a name."""
+    """Whether a key is part of the mission or the profile, for which a file may give a name."""
     is_direction = path[0] == "link" and len(path) > 2 and path[1] in DIRECTIONS
     return is_direction or (path[0] == "mission" and len(path) > 1)
 
@@ -318,77 +308,54 @@ def _has_all_values(document: Document) -> bool:
     )
 
 
-def _remove_profile_values(document: Document) -> None:
-    """Remove the values of the present profile, before another profile replaces it."""
-    if not _has_all_values(document):
-        return
-    for way in DIRECTIONS:
-        del document.tree["link"][way]
-    profile = Profile()
-    with suppress(BadInputError):  # the profile's file may no longer exist
-        profile = load_profile(str(document.get("link", "profile")))
-    implied = _implied(profile)
-    _remove_cap(document, implied["guard", "command_age_max_ms"])
-    for path, value in implied.items():
-        if document.get(*path) == value:
-            del document.tree[path[0]][path[1]]
+def _plan_max(document: Document) -> float:
+    """Return the default of guard.plan_max_s [s]."""
+    plan = document.get("cloud", "plan_s")
+    return PLAN_MAX_S if isinstance(plan, float | int) and plan > 0 else 0.0
 
 
-def _remove_plan_values(document: Document) -> None:
-    """Remove the guard's limits that follow from cloud.plan_s, before this key changes."""
-    if document.get("guard", "plan_max_s") in (0.0, PLAN_MAX_S):
-        _remove_cap(document, document.get("guard", "command_age_max_ms"))
-        del document.tree["guard"]["plan_max_s"]
+def _remove_derived(document: Document, *, new_profile: bool) -> None:
+    """Remove the values of a resolved file that follow from others, which settings may change.
+
+    With a `new_profile`, also remove the values of the present profile. A value of the experiment
+    itself is different from the value that follows, and stays.
+    """
+    derived: dict[KeyPath, float] = {("guard", "plan_max_s"): _plan_max(document)}
+    limits: Any = (document.get("guard", key) for key in ("command_age_max_ms", "plan_max_s"))
+    with suppress(TypeError):  # a value is missing, or no number
+        derived["guard", "speed_max_mps"] = speed_cap(*limits)
+    if new_profile:
+        profile = Profile()
+        with suppress(BadInputError):  # the profile's file may no longer exist
+            profile = load_profile(str(document.get("link", "profile")))
+        derived |= _implied(profile)
+        for way in DIRECTIONS:
+            del document.tree["link"][way]
+    for (section, key), value in derived.items():
+        if document.get(section, key) == value:
+            del document.tree[section][key]
 
 
-def _remove_cap(document: Document, age_max: object) -> None:
-    """Remove the guard's speed limit if it follows from the age [ms] and the plans."""
-    plan_max = document.get("guard", "plan_max_s") or 0.0
-    if isinstance(age_max, float | int) and isinstance(plan_max, float | int):
-        if document.get("guard", "speed_max_mps") == speed_cap(age_max, plan_max):
-            del document.tree["guard"]["speed_max_mps"]
-
-
-def _resolve_traces(document: Document, above: KeyPath) -> list[Problem]:
-    """Make the paths of traces and tables absolute, and read these files; return problems."""
-    paths = ((*above, way, key) for way in DIRECTIONS for key in ("trace", "table"))
-    return [problem for path in paths for problem in _resolve_read(document, path)]
-
-
-def _resolve_setpoints(document: Document, *, replace: bool) -> list[Problem]:
-    """Read the mission's setpoints; if they `replace` its waypoints, remove these."""
-    if replace and isinstance(document.get("mission", "setpoints"), str):
-        for key in ("waypoints", "steps", "carrot"):
-            document.tree["mission"].pop(key, None)
-    return _resolve_read(document, ("mission", "setpoints"))
-
-
-def _resolve_read(document: Document, path: KeyPath) -> list[Problem]:
-    """Make the path of one file absolute, and read the file; return problems."""
-    given, source, found = document.get(*path), document.source(path), list[Problem]()
-    if isinstance(given, str):
-        absolute = source.absolute(given)
-        document.set_value(path, str(absolute), source)
-        with _collect(found, path):
-            FILE_READERS[path[-1]](absolute)
-    return found
-
-
-def _resolve_files(document: Document) -> list[Problem]:
+def _resolve_paths(document: Document) -> list[Problem]:
+    """Make the paths of an experiment or a profile absolute; return problems of the files."""
     found: list[Problem] = []
-    for key in ("robot", "scene"):
-        path, name = ("world", key), document.get("world", key)
-        if isinstance(name, str):
-            with _collect(found, path):
-                folder = document.source(path).folder
-                document.tree["world"][key] = shipped.model_path(key, name, folder)
-    names = document.get("report", "metrics")
-    if isinstance(names, str):  # one metric without a list
-        names = document.tree["report"]["metrics"] = [names]
-    for index, name in enumerate(names if isinstance(names, list) else ()):
-        if isinstance(name, str) and plugins.is_path(name):
-            source = document.source(("report", "metrics", str(index)))
-            names[index] = str(source.absolute(name))
+    ways = [(*above, way) for above in ((), ("link",)) for way in DIRECTIONS]
+    paths = [(*way, key) for way in ways for key in ("trace", "table")]
+    paths += [("mission", "setpoints"), ("world", "robot"), ("world", "scene")]
+    metrics = document.get("report", "metrics")
+    for index in range(len(metrics) if isinstance(metrics, list) else 0):
+        paths.append(("report", "metrics", str(index)))
+    for path in paths:
+        name, key, source = document.get(*path), path[-1], document.source(path)
+        with _collect(found, path):
+            if not isinstance(name, str) or (key.isdecimal() and not plugins.is_path(name)):
+                continue
+            if key in ("robot", "scene"):
+                name = shipped.model_path(key, name, source.folder)
+            else:
+                name = str(source.absolute(name))
+                FILE_READERS.get(key, Path)(Path(name))
+            document.set_value(path, name, source)
     return found
 
 
@@ -413,10 +380,7 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
     """Set values in the link profile `before`, or in the profile named `profile` if it is given.
 
     The time line (changes, trace) no longer changes a key that the user sets, and still changes
-    other keys.
-
-    Raises:
-        BadInputError: If the request is empty or invalid.
+    other keys. Raise a BadInputError if the request is empty or invalid.
     """
     if profile is None and not settings:
         raise BadInputError(f"nothing to set; name a value, {_EXAMPLE}")
@@ -431,7 +395,7 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
                 "guard keeps the limit that it started with, so the robot may hold"
             )
     changes: Settings = {}
-    for path, setting in overrides.parse_settings(settings).items():
+    for path, setting in overrides.parse_settings(settings, _HERE).items():
         way, *keys = path[1:] if path[0] == "link" else path
         if not keys or way not in DIRECTIONS:
             raise BadInputError(f"{'.'.join(path)}: set a key of uplink or downlink, {_EXAMPLE}")
@@ -439,10 +403,6 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
         restart |= keys[0] in TIME_LINE_KEYS
         notes += _drop_from_time_line(document, way, keys[0])
     overrides.apply_overrides(document, changes)
-    document.sources = {
-        path: source._replace(label=_HERE) if source.label == SET_LABEL else source
-        for path, source in document.sources.items()
-    }
     values = check_profile(document, _HERE).model_dump(mode="json", exclude_defaults=True)
     words = [f"profile {profile}"] if profile else []
     return Edit(values, ", ".join([*words, *settings]), restart, notes)

@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from cloudrc import plugins
 from cloudrc.config import problems
-from cloudrc.config.document import SET_LABEL, Document, KeyPath, Source, child, parse_value
+from cloudrc.config.document import Document, KeyPath, Source, child, parse_value
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Experiment, PlugIn
 from cloudrc.errors import BadInputError
@@ -49,8 +49,7 @@ Settings: TypeAlias = dict[KeyPath, Setting]
 def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
     """Collect settings from their keys, such as `link.both.delay_ms`, values and sources.
 
-    Raises:
-        BadInputError: If a key has an empty part or is set twice.
+    Raise a BadInputError if a key has an empty part or is set twice.
     """
     found: Settings = {}
     for key, value, source in given:
@@ -72,30 +71,23 @@ def _directions(path: KeyPath) -> list[KeyPath]:
     return [(*path[:at], way, *path[at + 1 :]) for way in ("uplink", "downlink")]
 
 
-def parse_settings(texts: Iterable[str]) -> Settings:
+def parse_settings(texts: Iterable[str], label: str = "--set") -> Settings:
     """Parse texts `key=value`, in which a relative path starts at the working folder.
 
-    Raises:
-        BadInputError: If a text has no key or no `=`, if a key is set twice, or if a value is not
-            YAML.
+    Raise a BadInputError for a text of another form; `label` is the beginning of its message.
     """
-    given, source = list[tuple[str, Any, Source]](), Source(SET_LABEL, Path.cwd())
+    given, source = list[tuple[str, Any, Source]](), Source(label, Path.cwd())
     for text in texts:
         key, equals, value = text.partition("=")
-        if not equals or not all(part.strip() for part in key.split(".")):
-            raise BadInputError(
-                f"{SET_LABEL} {text}: must be key=value; for example cloud.predictor=last_sample"
-            )
-        given.append((key, parse_value(value, f"{SET_LABEL} {key}"), source))
+        if not equals:
+            example = "cloud.predictor=last_sample"
+            raise BadInputError(f"{label} {text}: must be key=value; for example {example}")
+        given.append((key, parse_value(value, f"{label} {key}"), source))
     return collect_settings(given)
 
 
 def apply_overrides(document: Document, settings: Settings) -> None:
-    """Set values in a document, in the order of `settings`.
-
-    Raises:
-        BadInputError: If an index is not a number or beyond the end of its list.
-    """
+    """Set values in a document; raise a BadInputError if an index is beyond the end of its list."""
     for path, (value, source) in settings.items():
         default: Any = _DEFAULTS
         for depth, (key, below) in enumerate(pairwise(path), start=1):
@@ -129,8 +121,7 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
     """Replace each plug-in of an experiment by a mapping with its name and its parameters.
 
     With `build`, check the parameters, add defaults, and build each plug-in once as a test. Without
-    `build`, import no plug-in: importing runs its code, which may be somebody else's. Return the
-    problems.
+    `build`, import no plug-in: importing runs its code, which may be somebody else's.
     """
     found: list[Problem] = []
     for key, kind in KINDS.items():

@@ -34,8 +34,6 @@ COMMAND_AGE_MS = 1, 10_000
 CommandAge = Annotated[float, Field(ge=COMMAND_AGE_MS[0], le=COMMAND_AGE_MS[1])]
 Speed = Annotated[float, Field(ge=0.01, le=10)]
 Acceleration = Annotated[float, Field(ge=0.1, le=100)]
-YawRate = Annotated[float, Field(ge=0.01, le=10)]
-CarrotSpeed = Annotated[float, Field(ge=0.01, le=10)]
 CloudTime = Annotated[float, Field(gt=0, le=10)]
 PlanTime = Annotated[float, Field(ge=0, le=0.8)]
 PlanMax = Annotated[float, Field(ge=0, le=2)]
@@ -228,7 +226,7 @@ class Waypoint(Section):
     time_limit_s: TimeLimit | None = None
     """Time limit for the flight to this point [s], not counting time in HOLD; after it the
     mission fails. null: 3 times the expected time"""
-    speed_mps: CarrotSpeed | None = None
+    speed_mps: Speed | None = None
     """Speed of the carrot on the way to this point [m/s]; only with carrot. null: the carrot's"""
 
 
@@ -238,7 +236,7 @@ class Carrot(Section):
     It moves by time alone, so that delays do not prolong the mission.
     """
 
-    speed_mps: CarrotSpeed = 2.0
+    speed_mps: Speed = 2.0
     """Largest speed of the setpoint [m/s]"""
     acceleration_mps2: Annotated[float, Field(ge=0.1, le=10)] = 2.0
     """Acceleration and deceleration of the setpoint [m/s^2]"""
@@ -410,7 +408,7 @@ class Guard(Section):
     from which the robot stops within 8.7 m, 6 m/s if command_age_max_ms is 250 and plan_max_s 0"""
     acceleration_max_mps2: Acceleration = 12.0
     """Cap on the acceleration that the guard lets the onboard controller follow [m/s^2]"""
-    yaw_rate_max_radps: YawRate = 1.0
+    yaw_rate_max_radps: Speed = 1.0
     """Cap on the commanded yaw rate [rad/s]; a faster command is shortened"""
     hold_max_s: HoldTime = 60.0
     """Time in HOLD during a mission after which the robot lands [s]. On the ground, a mission ends
@@ -486,16 +484,6 @@ class Cloud(Section):
     """By how much cloud's clock is ahead of world's at the start [s]; virtual time only"""
     clock_drift_ppm: Annotated[int, Field(ge=-1000, le=1000)] = 0
     """By how much cloud's clock is faster than world's [ppm]; virtual time only"""
-
-    @field_validator("command_rate_hz", mode="before")
-    @classmethod
-    def _check_rate(cls, rate: Any) -> Any:
-        if isinstance(rate, int) and rate < COMMAND_RATE_MIN_HZ:
-            raise ValueError(
-                f"must be a whole number >= {COMMAND_RATE_MIN_HZ} and <= {COMMAND_RATE_MAX_HZ} "
-                "[Hz]: the guard leaves HOLD only after 10 commands within 500 ms"
-            )
-        return rate
 
     @model_validator(mode="after")
     def _check_compute(self) -> Cloud:

@@ -26,9 +26,8 @@ TimedPosition: TypeAlias = tuple[float, Vector]
 def read_setpoints(path: Path) -> tuple[TimedPosition, ...]:
     """Read the setpoints of a mission; the time of the first row becomes 0.
 
-    Raises:
-        BadInputError: If the file cannot be read, has a wrong value, has less than two rows, or
-            leads out of the box in which the guard lets the robot fly.
+    Raise a BadInputError if the file is not usable, or if it leads out of the box in which the
+    guard lets the robot fly.
     """
     name, found = f"setpoints {path}", list[TimedPosition]()
     columns, rows = read_rows(read_lines(path, name, f"give a CSV file: {','.join(COLUMNS)}"), name)

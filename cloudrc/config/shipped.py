@@ -34,8 +34,7 @@ def describe(kind: str, name: str) -> str:
 def read(kind: str, name: str, folder: Path) -> Document:
     """Read an experiment, mission or profile by name, or by path relative to `folder`.
 
-    Raises:
-        BadInputError: If there is no such file, or the file cannot be read.
+    Raise a BadInputError if this is not possible.
     """
     if not is_path(name):
         check_name(kind, name)
@@ -55,17 +54,14 @@ def check_name(kind: str, name: str) -> None:
 def model_path(kind: str, name: str, folder: Path) -> str:
     """Return the name of a shipped robot or scene, or the absolute path of an .xml file.
 
-    Raises:
-        BadInputError: If there is no such file.
+    Raise a BadInputError if there is no such file.
     """
     if not (is_path(name) or name.endswith(".xml")):
         check_name(kind, name)
         return name
     path = Path(os.path.realpath(folder / os.path.expanduser(name)))
-    if path.suffix != ".xml":
-        raise _no_file("not an .xml file", kind, path)
-    if not os.path.isfile(path):
-        raise _no_file("no such file", kind, path)
+    if path.suffix != ".xml" or not os.path.isfile(path):
+        raise _no_file("no such .xml file", kind, path)
     return str(path)
 
 

@@ -54,10 +54,8 @@ def robot_points() -> Spheres:
 def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) -> Array:
     """Return the robot's points in the world frame [m], for n poses, shape (n, k, 3).
 
-    Args:
-        points: Points in the body frame.
-        positions: Positions of the base [m], world frame, shape (n, 3).
-        orientations_wxyz: Orientations, each a unit quaternion, body to world, shape (n, 4).
+    `positions` are those of the base [m], world frame, shape (n, 3). Each row of
+    `orientations_wxyz` is a unit quaternion, body to world, shape (n, 4).
     """
     w, x, y, z = np.moveaxis(orientations_wxyz, -1, 0)
     rows = (
@@ -96,16 +94,11 @@ def clearance_per_pipe(
     orientations_wxyz: ArrayLike,
     points: Spheres | None = None,
 ) -> Array:
-    """Compute the robot's distance from the wall of each pipe.
+    """Compute the robot's distance from the wall of each pipe [m], shape (n, number of pipes).
 
-    Args:
-        scene: The scene.
-        positions: Positions of the base [m], world frame, shape (n, 3).
-        orientations_wxyz: Orientations of the base, unit quaternions, body to world, shape (n, 4).
-        points: Points that represent the robot; default: `key_points()`.
-
-    Returns:
-        Distance of the nearest point [m], negative in a wall, shape (n, number of pipes).
+    The distance is that of the nearest point, negative in a wall. `positions` [m] and
+    `orientations_wxyz` (unit quaternions) are as for `place_points`. `points` represent the robot;
+    default: `key_points()`.
     """
     points = points or key_points()
     at = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
@@ -135,9 +128,9 @@ def least_clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: Array
 
     The result is that of all poses, to the bit, but most poses are skipped. Between two poses no
     point of the robot moves further than s = |dp| + 2 R |dq| (base position p, quaternion q, and
-    R the distance of the farthest point from the base), and the clearance changes by at most s. So
-    between poses with the clearances a and b it is at least (a + b - s) / 2. An interval is halved
-    only if this bound is below the smallest clearance found so far.
+    R the distance of the farthest point from the base). So between poses with the clearances a and
+    b the clearance is at least (a + b - s) / 2. An interval is halved only if this bound is below
+    the smallest clearance found so far.
     """
     at = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
     facing = np.asarray(orientations_wxyz, dtype=np.float64).reshape(-1, 4)

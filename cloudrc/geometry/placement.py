@@ -38,10 +38,8 @@ def outside_fence(positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]
 def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.int64]:
     """Return the index of the nearest pipe if it is within `CLEARANCE_MIN`, else -1, shape (n,).
 
-    Args:
-        scene: The scene; its board does not count.
-        positions: Positions of the base [m], world frame, shape (n, 3).
-        yaws: Headings of the level robot [rad], shape (n,).
+    `positions` are those of the base [m], world frame, shape (n, 3); `yaws` are the headings of the
+    level robot [rad], shape (n,). The board does not count.
     """
     if not scene.pipes:
         return np.full(len(positions), -1, dtype=np.int64)
@@ -53,15 +51,11 @@ def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.in
     """Find the first pipe that the robot, level and with yaw 0, would touch on a straight way.
 
     The check moves along each way in steps as long as the robot's distance from the nearest wall. A
-    way may begin nearer to a wall than `CLEARANCE_MIN` if it leads away from this wall.
+    way may begin nearer to a wall than `CLEARANCE_MIN` if it leads away from this wall. The board
+    does not count.
 
-    Args:
-        scene: The scene; its board does not count.
-        starts: Starts of the ways [m], world frame, not far outside the fence, shape (n, 3).
-        ends: Ends of the ways [m], world frame, not far outside the fence, shape (n, 3).
-
-    Returns:
-        Index of the pipe, or -1, shape (n,).
+    `starts` and `ends` are in [m], world frame, not far outside the fence, shape (n, 3). Return the
+    index of the pipe of each way, or -1, shape (n,).
     """
     result = np.full(len(starts), -1, dtype=np.int64)
     length = np.linalg.norm(ends - starts, axis=1)
@@ -89,14 +83,11 @@ def find_nearest_legal(
 ) -> Vector | None:
     """Find a point within 1.5 m that the guard lets the robot reach, clear of pipes; else None.
 
-    The search goes along x, y and z, and towards and away from the axes of the pipes. All
-    candidates are whole centimetres, so that a message shows the checked point without rounding.
+    The search goes along x, y and z, and towards and away from the axes of the pipes. Candidates
+    are whole centimetres, so that a message shows the checked point without rounding.
 
-    Args:
-        scene: The scene.
-        position: Position of the base [m], world frame, shape (3,).
-        yaw: Heading of the level robot [rad].
-        before: Start of the straight way to the point [m], shape (3,); None if it is unknown.
+    `position` is that of the base [m], world frame; `yaw` is the heading of the level robot [rad].
+    The straight way to the point starts at `before` [m]; None if the start is unknown.
     """
     start = np.clip(position, fence.INNER_LOW, fence.INNER_HIGH)
     directions = [*np.eye(3), *-np.eye(3)]

@@ -27,65 +27,41 @@ SCENES = Path(__file__).parents[1] / "world" / "scenes"
 
 @dataclass(frozen=True, slots=True)
 class Pipe:
-    """A hollow cylinder with flat ends.
+    """A hollow cylinder with flat ends."""
 
-    Attributes:
-        name: Name of the body.
-        centre: Midpoint of the axis [m], world frame, shape (3,).
-        axis: Unit vector along the axis, world frame, shape (3,).
-        length: Length [m].
-        inner: Inner radius [m].
-        outer: Outer radius [m].
-    """
-
-    name: str
-    centre: Vector
-    axis: Vector
-    length: float
-    inner: float
-    outer: float
+    name: str  # of the body
+    centre: Vector  # midpoint of the axis [m], world frame
+    axis: Vector  # unit vector along the axis, world frame
+    length: float  # [m]
+    inner: float  # inner radius [m]
+    outer: float  # outer radius [m]
 
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A wall that the robot can touch with its arm; the front face points along -x.
+    """A wall that the robot can touch with its arm; the front face points along -x."""
 
-    Attributes:
-        x: Position of the front face [m], world frame.
-        y: Smallest and largest y [m], world frame.
-        z: Smallest and largest z [m], world frame.
-    """
-
-    x: float
-    y: tuple[float, float]
-    z: tuple[float, float]
+    x: float  # position of the front face [m], world frame
+    y: tuple[float, float]  # smallest and largest y [m], world frame
+    z: tuple[float, float]  # smallest and largest z [m], world frame
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """The obstacles of a scene.
+    """The obstacles of a scene."""
 
-    Attributes:
-        name: File name without .xml.
-        pipes: The pipes, in the order of the file.
-        board: The board; None if the scene has none.
-        floor: z of the floor [m], world frame.
-        spawn: Position of the base at the start of a mission [m], world frame, shape (3,).
-    """
-
-    name: str
-    pipes: tuple[Pipe, ...] = ()
+    name: str  # file name without .xml
+    pipes: tuple[Pipe, ...] = ()  # in the order of the file
     board: Board | None = None
-    floor: float = 0.0
-    spawn: Vector = SPAWN
+    floor: float = 0.0  # z of the floor [m], world frame
+    spawn: Vector = SPAWN  # position of the base at the start of a mission [m], world frame
 
 
 def load_scene(name: str) -> Scene:
     """Read a scene by the path of an .xml file, or a shipped scene by its file name without .xml.
 
-    Raises:
-        BadInputError: If the file does not exist, or if its numbers have another form than in the
-            table of this module's docstring.
+    Raise a BadInputError if the file does not exist, or if its numbers have another form than in
+    the table above.
     """
     path = Path(name) if name.endswith(".xml") else SCENES / f"{name}.xml"
     try:

@@ -4,11 +4,7 @@
     recording["/odometry"]["position"]  # shape (n, 3)
 
 A recording comes from a file or from records in memory; both give the same tables. A topic without
-records has a table without rows. A `RecordStore` keeps records as columns, which is the fastest
-way from a flight to its tables.
-
-The log time of a row is its stamp, or the previous row's log time if that is later. So log times
-never decrease within world's rows or within cloud's rows, which can then be merged.
+records has a table without rows.
 """
 
 from __future__ import annotations
@@ -31,7 +27,6 @@ if TYPE_CHECKING:
     from cloudrc.record.reader import Contents
 
 Column: TypeAlias = NDArray[Any]
-_Rows: TypeAlias = dict[str, list[tuple[int, Values]]]
 _TYPES: dict[Kind, tuple[type, tuple[int, ...]]] = {
     "int": (np.int64, ()),
     "float": (np.float64, ()),
@@ -43,25 +38,23 @@ _TYPES: dict[Kind, tuple[type, tuple[int, ...]]] = {
 
 
 def merged(
-    world_records: Iterable[Record], cloud_records: Iterable[Record], offset_ns: int = 0
+    world_records: Iterable[Record], cloud_records: Iterable[Record]
 ) -> Iterator[tuple[int, Row]]:
-    """Merge the records of world and cloud, each oldest first, into rows on world's clock.
+    """Merge the records of world and cloud, each oldest first and all on one clock, into rows.
 
     Yield the log time [ns] and the row, in order of log time. If two log times are equal, world's
-    row comes first. `offset_ns` is world's clock minus cloud's clock [ns]. Only the stamp of a
-    cloud row is converted; other times in the row stay on the clock that their description names.
+    row comes first. The log time of a row is its stamp, or the log time of the previous row of its
+    end if that is later.
     """
-    world, cloud = _logged(world_records, 0), _logged(cloud_records, offset_ns)
-    return heapq.merge(world, cloud, key=itemgetter(0))
+    return heapq.merge(_logged(world_records), _logged(cloud_records), key=itemgetter(0))
 
 
-def _logged(records: Iterable[Record], offset_ns: int) -> Iterator[tuple[int, Row]]:
-    latest = -(2**63)
+def _logged(records: Iterable[Record]) -> Iterator[tuple[int, Row]]:
+    latest = 0
     for record in records:
-        for topic, stamp_ns, values in rows(record):
-            stamp_ns += offset_ns
-            latest = max(latest, stamp_ns)
-            yield latest, (topic, stamp_ns, values)
+        for row in rows(record):
+            latest = max(latest, row[1])
+            yield latest, row
 
 
 class Table:
@@ -106,12 +99,7 @@ class Table:
 class Recording:
     """The tables of a flight by topic.
 
-    Attributes:
-        metadata: The file's metadata, such as its clock; empty if made from records.
-        attachments: Name -> content of an attached file.
-        note: What is missing, in words; "" if nothing is missing.
-        lacking: Damaged, removed or added messages, as in `Contents`; "" if there are none.
-        remarks: What was ignored or sorted, as in `Contents`.
+    A recording from a file also has the metadata, attachments, note and remarks of its `Contents`.
     """
 
     def __init__(
@@ -132,17 +120,11 @@ class Recording:
         return not self.note
 
     @classmethod
-    def from_records(
-        cls,
-        world_records: Iterable[Record],
-        cloud_records: Iterable[Record] = (),
-        offset_ns: int = 0,
-    ) -> Self:
-        """Make a recording from records in memory; `offset_ns` [ns] is as for `merged`."""
-        rows: _Rows = {name: [] for name in TOPICS}
-        for _, (topic, stamp_ns, values) in merged(world_records, cloud_records, offset_ns):
-            rows[topic].append((stamp_ns, values))
-        return cls(lambda topic: Table.from_rows(topic, rows[topic.name]))
+    def from_records(cls, world: Iterable[Record], cloud: Iterable[Record] = ()) -> Recording:
+        """Make a recording from the records of each end, oldest first and all on one clock."""
+        store = RecordStore()
+        store.add(world, cloud)
+        return store.recording()
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -161,7 +143,7 @@ class Recording:
         """Decode the contents of a file."""
         from cloudrc.record.ros import decode
 
-        rows: _Rows = {name: [] for name in TOPICS}
+        rows: dict[str, list[tuple[int, Values]]] = {name: [] for name in TOPICS}
         unreadable = 0
         for topic, _, data in contents.messages:
             try:
@@ -171,8 +153,8 @@ class Recording:
         recording = cls(lambda topic: Table.from_rows(topic, rows[topic.name]), contents)
         if unreadable:
             text = f"{unreadable} messages are not readable"
-            recording.note = "; ".join(filter(None, [recording.note, text]))
-            recording.lacking = "; ".join(filter(None, [recording.lacking, text]))
+            recording.note = f"{recording.note}; {text}".removeprefix("; ")
+            recording.lacking = f"{recording.lacking}; {text}".removeprefix("; ")
         return recording
 
     def __getitem__(self, topic: str) -> Table:

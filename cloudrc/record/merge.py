@@ -75,23 +75,17 @@ def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
     return ClockOffset((downlink - uplink) // 2, uncertainty_ns, "packets")
 
 
-def _share_clock(world: Contents, cloud: Contents) -> bool:
-    clock_id = world.metadata.get("clock_id")
-    return bool(clock_id) and clock_id == cloud.metadata.get("clock_id")
-
-
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
     """Return the smallest difference of arrival and departure [ns], including the clock offset."""
 
-    def packets(table: Table) -> list[tuple[tuple[int, int], int]]:
-        epochs, counters, stamps_ns = (
-            table[name].tolist() for name in ("epoch", "counter", "stamp_ns")
-        )
-        return list(zip(zip(epochs, counters, strict=True), stamps_ns, strict=True))
+    def packets(table: Table) -> dict[tuple[int, int], int]:
+        numbers = zip(table["epoch"].tolist(), table["counter"].tolist(), strict=True)
+        # In reverse: of a datagram that arrived twice, the first arrival counts.
+        return dict(reversed([*zip(numbers, table["stamp_ns"].tolist(), strict=True)]))
 
-    sent_ns = dict(packets(sent))
-    return min((at_ns - sent_ns[one] for one, at_ns in packets(arrived) if one in sent_ns),
-               default=None)  # fmt: skip
+    sent_ns, arrived_ns = packets(sent), packets(arrived)
+    differences = (at_ns - sent_ns[one] for one, at_ns in arrived_ns.items() if one in sent_ns)
+    return min(differences, default=None)
 
 
 def _first_ns(recording: Recording) -> int:
@@ -119,11 +113,8 @@ def world_time_ns(telemetry: Table, machine_ns: NDArray[np.int64]) -> NDArray[np
 def merge(world: Path, cloud: Path) -> Contents:
     """Merge the files of world and cloud, complete or torn, into one mission on world's clock.
 
-    If one file cannot be read, the result contains only the other file, on that file's own clock.
-    The note of the result says so.
-
-    Raises:
-        BadInputError: If neither file can be read.
+    If one file cannot be read, the result contains only the other file, on that file's own clock,
+    and a note. Raise a BadInputError if neither file can be read.
     """
     read: dict[str, Contents] = {}
     failures = []
@@ -150,7 +141,8 @@ def _set_note(mission: Contents, notes: list[str]) -> None:
 
 def _join(world: Contents, cloud: Contents) -> Contents:
     logged_ns = np.array([message[1] for message in cloud.messages], dtype=np.int64)
-    if _share_clock(world, cloud):
+    clock_id = world.metadata.get("clock_id")
+    if clock_id and clock_id == cloud.metadata.get("clock_id"):
         offset, moved_ns = SAME_CLOCK, world_time_ns(_table(world, "/telemetry"), logged_ns)
     else:
         offset = clock_offset(world.recording(), cloud.recording())

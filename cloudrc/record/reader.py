@@ -1,11 +1,8 @@
 """Read or repair an MCAP file, up to its end or to its first damaged part.
 
 A killed process leaves a file without an end; such a file is read up to its last complete chunk.
-`Records` yields the records of any MCAP file. `read_contents` collects the topics of cloudrc.
-`recover` writes a complete copy.
-
-The package `mcap` parses the format. This module adds a limit to the unpacked size of a file and a
-description of what is missing.
+The package `mcap` parses the format. This module adds a limit to the unpacked size of a file, and
+describes what is missing.
 """
 
 from __future__ import annotations
@@ -57,7 +54,6 @@ LISTED_MAX = 3
 """Largest number of topics that an error message lists."""
 LOSSY_SHARE_MAX = 0.999
 """Largest value of `Recovery.share` if something is missing."""
-_MEDIA_TYPES = {".json": "application/json", ".yaml": "application/yaml"}
 KINDS = {
     b"": "is empty; name a recording (.mcap)",
     b"#ROSBAG V": "is a ROS 1 bag, not an MCAP file; convert it with: rosbags-convert",
@@ -86,43 +82,27 @@ used, because they allocate whatever size the file claims."""
 
 
 class Records:
-    """Yields the records of one MCAP file; the records inside chunks are unpacked.
-
-    Attributes:
-        path: The file, for messages.
-        size: Size of the file [bytes].
-        position: End of the last intact record in the file [bytes].
-        schemas: The schemas so far, by their number.
-        channels: The channels so far, by their number.
-        data_ended: Whether all data were read; only the index follows.
-        ended: Whether the whole file was read.
-        fault: Why reading stopped or what is wrong, in words; "" if nothing is wrong.
-        cut: Whether the file breaks off at the fault, for example because the process was killed.
-        stated: Number of messages according to the index; None if the index was not reached.
-    """
+    """Yields the records of one MCAP file; the records inside chunks are unpacked."""
 
     def __init__(self, path: Path) -> None:
-        """Open a file; use `with` to close it.
-
-        Raises:
-            BadInputError: If the file cannot be opened.
-        """
+        """Open a file; use `with` to close it. Raise a BadInputError if it cannot be opened."""
         self.path = path
         try:
             self._stream = BufferedReader(open_file(path))
-        except OSError as error:
+        except (OSError, ValueError) as error:  # ValueError: a pipe or a device
+            reason = getattr(error, "strerror", "not a file")
             raise BadInputError(
-                f"{path}: cannot be read ({error.strerror}); name a recording (.mcap)"
+                f"{path}: cannot be read: {reason}; name a recording (.mcap)"
             ) from error
-        except ValueError as error:  # a pipe or a device
-            raise BadInputError(f"{error}; name a recording (.mcap)") from error
-        self.size = os.fstat(self._stream.fileno()).st_size
-        self.position = 0
+        self.size = os.fstat(self._stream.fileno()).st_size  # [bytes]
+        self.position = 0  # end of the last intact record in the file [bytes]
         self.schemas: dict[int, mcap.Schema] = {}
         self.channels: dict[int, mcap.Channel] = {}
-        self.data_ended = self.ended = self.cut = False
-        self.fault = ""
-        self.stated: int | None = None
+        self.data_ended = False  # whether all data were read; only the index follows
+        self.ended = False  # whether the whole file was read
+        self.fault = ""  # why reading stopped or what is wrong, in words; "" if nothing is wrong
+        self.cut = False  # whether the file breaks off at the fault, as after a kill
+        self.stated: int | None = None  # number of messages according to the index
         self._room = UNPACKED_MAX * max(self.size, 1 << 20)
 
     def __enter__(self) -> Self:
@@ -134,8 +114,7 @@ class Records:
     def __iter__(self) -> Iterator[mcap.McapRecord]:
         """Yield the records up to the file's end or to its first damaged part.
 
-        Raises:
-            BadInputError: If the file is not MCAP.
+        Raise a BadInputError if the file is not MCAP.
         """
         head = self._stream.read(16)
         if not head.startswith(MCAP0_MAGIC):
@@ -147,10 +126,7 @@ class Records:
             yield from self._read()
         except CRCValidationError as error:
             self.fault = "damaged: a checksum is wrong"
-            if isinstance(error.record, mcap.DataEnd):  # everything was read
-                self.data_ended = self.ended = True
-                self.position = self.size
-                self.fault = "damaged: a byte outside the chunks is wrong"
+            self.data_ended = isinstance(error.record, mcap.DataEnd)
         except (EndOfFile, RecordLengthLimitExceeded):  # a record longer than the rest of the file
             self.fault, self.cut = "cut short", True
         except _StopError as error:
@@ -166,8 +142,6 @@ class Records:
             self._stream, emit_chunks=True, validate_crcs=True, record_size_limit=self.size
         )
         for record in reader.records:
-            if isinstance(record, mcap.Header) == (self.position > 0):
-                raise ValueError("the first record, and only the first, must be a header")
             if isinstance(record, mcap.Chunk):
                 yield from map(self._check, self._unpack(record))
             elif not self.data_ended:  # records after the data repeat the definitions
@@ -189,8 +163,7 @@ class Records:
     def _take_room(self, size: int) -> None:
         self._room -= size
         if self._room < 0:
-            text = f"unpacks to more than {UNPACKED_MAX} times its size, as no recording does"
-            raise _StopError(text)
+            raise _StopError(f"unpacks to more than {UNPACKED_MAX} times its size")
 
     def _check(self, record: mcap.McapRecord) -> mcap.McapRecord:
         """Store definitions of schemas and channels; check that each number is defined once."""
@@ -231,36 +204,25 @@ class Records:
 class Contents:
     """The contents of a file.
 
-    Attributes:
-        messages: Topic, log time [ns] and CDR bytes of each message, in the order of log times.
-        metadata: All metadata of the file; later values of a key replace earlier values.
-        attachments: Name -> content of an attached file.
-        views: Messages for viewers (`VIEWS`), in the same form as `messages`.
-        note: What is missing, in words; "" if nothing is missing.
-        lacking: The part of `note` about damaged, removed or added messages. Messages that are
-            missing only because the process was killed are not in it. "" if there is none.
-        remarks: What was ignored or sorted, although nothing is missing. Each remark continues "The
-            recording ...".
+    `lacking` is the part of `note` about damaged, removed or added messages. Messages that are
+    missing only because the process was killed are not in it.
     """
 
+    # Topic, log time [ns] and CDR bytes of each message, in the order of log times.
     messages: list[tuple[str, int, bytes]] = field(default_factory=list)
-    metadata: dict[str, str] = field(default_factory=dict)
-    attachments: dict[str, bytes] = field(default_factory=dict)
-    views: list[tuple[str, int, bytes]] = field(default_factory=list)
-    note: str = ""
+    metadata: dict[str, str] = field(default_factory=dict)  # a later value of a key counts
+    attachments: dict[str, bytes] = field(default_factory=dict)  # name -> content of a file
+    views: list[tuple[str, int, bytes]] = field(default_factory=list)  # messages of `VIEWS`
+    note: str = ""  # what is missing, in words; "" if nothing is missing
     lacking: str = ""
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()  # what was ignored or sorted; each continues "The recording ..."
 
     def recording(self) -> Recording:
         """Convert the messages to tables."""
         return Recording.from_contents(self)
 
     def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
-        """Write the contents and further `attachments` to an MCAP file, atomically.
-
-        Raises:
-            OSError: If the file cannot be written.
-        """
+        """Write the contents and further `attachments` to a file, atomically; may raise OSError."""
         clock, clock_id = self.metadata.get(CLOCK, ""), self.metadata.get("clock_id", "")
         with (
             atomic_file(target) as file,
@@ -273,15 +235,13 @@ class Contents:
                 writer.write_message(*message)
             writer.write_views(self.views)
             for name, data in {**self.attachments, **(attachments or {})}.items():
-                media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
-                writer.attach(name, data, media_type)
+                writer.attach(name, data)
 
 
 def read_contents(path: Path) -> Contents:
     """Read cloudrc's topics from a file, up to its end or to its first damaged part.
 
-    Raises:
-        BadInputError: If nothing in the file can be read.
+    Raise a BadInputError if nothing in the file can be read.
     """
     return _read(path)[0]
 
@@ -314,7 +274,7 @@ def _read(path: Path) -> tuple[Contents, Records, int]:
         order = sorted(range(len(messages)), key=lambda n: (messages[n][1], sequences[n]))
         contents.messages = [messages[n] for n in order]
         contents.remarks += (f"was not in order of time: {late} messages were sorted",)
-    _note(contents, records, ours, total)
+    _note(contents, records, ours)
     known = len(messages) + len(contents.views)
     return contents, records, max(records.stated or 0, total) - known
 
@@ -328,20 +288,18 @@ def _is_ours(channel: mcap.Channel, schema: mcap.Schema | None) -> bool:
     return is_known(ros_type, schema.data.decode("utf-8", "replace"))
 
 
-def _note(contents: Contents, records: Records, ours: dict[int, bool], total: int) -> None:
+def _note(contents: Contents, records: Records, ours: dict[int, bool]) -> None:
     """Describe what is missing in the contents.
 
-    `ours` maps the number of each channel with messages to whether cloudrc records it. `total` is
-    the number of messages on all channels.
+    `ours` maps the number of each channel with messages to whether cloudrc records it.
     """
-    faults, changed, metadata = list[str](), list[str](), contents.metadata
+    changed, metadata, fault = list[str](), contents.metadata, records.fault
     if records.data_ended and records.cut:
         contents.remarks += ("had a torn index: all its messages were read",)
-    elif fault := records.fault:
-        if not records.data_ended:
-            count, until = len(contents.messages), contents.messages[-1][1] * 1e-9
-            fault += f": {count} messages were read, the last at {until:.2f} s"
-        faults.append(fault)
+        fault = ""
+    elif fault and not records.data_ended:
+        count, until = len(contents.messages), contents.messages[-1][1] * 1e-9
+        fault += f": {count} messages were read, the last at {until:.2f} s"
     channels = Counter((records.channels[number].topic, known) for number, known in ours.items())
     others = {name for name, known in channels if not known}
     if foreign := sorted(others - TOPICS.keys()):
@@ -354,17 +312,16 @@ def _note(contents: Contents, records: Records, ours: dict[int, bool], total: in
         changed.append(f"two robots or two recordings are in one file: {', '.join(double)}")
     if not metadata.get(CLOCK):
         changed.append("the metadata of cloudrc, which names the clock, is not there")
-    if records.ended and records.stated not in (None, total):
-        changed.append(f"the index states {records.stated} messages, {total} were read")
-    changed += _changed(contents) if records.data_ended else ()
+    if records.data_ended:
+        changed += _changed(contents)
     if before := to_one_line(metadata.get(CHANGED, "")):  # noted by an earlier reader of the file
         changed.append(before)
     if changed:
         metadata[CHANGED] = "; ".join(changed)
     told = to_one_line(metadata.get(MISSING, ""))
-    contents.lacking = "; ".join([*(faults if not records.cut else []), *changed])
+    contents.lacking = "; ".join(filter(None, ["" if records.cut else fault, *changed]))
     anew = [text for text in changed if text not in told]
-    contents.note = "; ".join(filter(None, [*faults, *anew, told]))
+    contents.note = "; ".join(filter(None, [fault, *anew, told]))
 
 
 def _changed(contents: Contents) -> Iterator[str]:
@@ -403,10 +360,9 @@ class Recovery:
 
     @property
     def share(self) -> float:
-        """Share of the messages that were kept, in [0, 1].
+        """Share of the messages that were kept, else of the bytes, in [0, 1]; 1 only if complete.
 
-        If the number of messages is unknown, it is the share of the bytes. The share is below 1 if
-        anything is missing.
+        The share of the bytes counts if the number of messages is unknown.
         """
         if self.complete:
             return 1.0
@@ -419,11 +375,8 @@ def recover(source: Path, target: Path) -> Recovery:
     """Write a complete copy of a recording that may be torn or damaged.
 
     The copy contains the topics that cloudrc records, the attachments, the metadata, and a note
-    about what is missing. It ends before the first damaged part. It replaces `target` atomically.
-
-    Raises:
-        BadInputError: If the file contains no readable message.
-        OSError: If the new file cannot be written.
+    about what is missing. It ends before the first damaged part. Raise a BadInputError if the file
+    has no readable message, or an OSError if the new file cannot be written.
     """
     contents, records, lost = _read(source)
     if not contents.messages:
@@ -438,10 +391,7 @@ def recover(source: Path, target: Path) -> Recovery:
         contents.metadata[MISSING] = "; ".join(notes)
     contents.write(target)
     counts = Counter(topic for topic, _, _ in contents.messages)
-    kept = {
-        "messages": counts.total(),
-        "attachments": len(contents.attachments),
-        "topics": len(counts),
-    }
+    kept = {"messages": counts.total(), "attachments": len(contents.attachments)}
+    kept["topics"] = len(counts)
     dropped = {"messages": lost} if lost else {}
     return Recovery(records.size, kept, dropped, records.unread, notes, not records.ended)

@@ -20,20 +20,13 @@ from cloudrc.records import Record
 if TYPE_CHECKING:
     from cloudrc.record.writer import McapWriter
 
-TROUBLE = {
-    **DISK_FULL,
-    errno.EROFS: "disk is read-only",
-}
+TROUBLE = {**DISK_FULL, errno.EROFS: "disk is read-only"}
 CAPACITY = 20_000
 """Number of records in the queue: world or cloud makes as many in about 30 s."""
 
 
 class Recorder:
-    """Queue of records: one thread calls `put`, another calls `drain`, and a third may call `sync`.
-
-    Attributes:
-        error: Why records are missing from the file, in words; "" if there was no error.
-    """
+    """Queue of records: one thread calls `put`, another calls `drain`, a third may call `sync`."""
 
     def __init__(
         self,
@@ -46,7 +39,7 @@ class Recorder:
 
         When the file reaches `size_max` [bytes], recording ends; None means no limit.
         """
-        self.error = ""
+        self.error = ""  # why records are missing from the file, in words
         self._path = path
         self._open_sink = open_sink
         self._capacity = capacity

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -36,8 +35,6 @@ _ROS_NAMES: dict[Kind, str] = {
     "vector": "geometry_msgs/Vector3",
     "quaternion": "geometry_msgs/Quaternion",
 }
-TEXT_MAX = 1 << 16
-"""Longest type definition that is parsed [characters]; those of cloudrc and ROS are shorter."""
 STORE = get_typestore(Stores.ROS2_JAZZY)
 """All message types that rosbags can encode: those of ROS 2 Jazzy and of cloudrc."""
 
@@ -52,7 +49,7 @@ def _own_definition(ros_type: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-_NAMES = {topic.ros_type for topic in TOPICS.values()}
+_NAMES = {topic.ros_type for topic in TOPICS.values()} | {*VIEWS.values()}
 _OWN = {name: _own_definition(name) for name in _NAMES if name.startswith(_OURS)}
 for _name, _text in _OWN.items():
     STORE.register(get_types_from_msg(_text, _name))
@@ -74,21 +71,18 @@ for _name in _NAMES:
 
 def definition(ros_type: str) -> str:
     """Return a message type's definition as `ros2msg`, including the types that it uses."""
-    return _DEFINITIONS.get(ros_type) or _whole_definition(ros_type)
+    return _DEFINITIONS[ros_type]
 
 
 def type_hash(ros_type: str) -> str:
     """Return the RIHS01 hash by which ROS 2 identifies a message type."""
-    return _HASHES.get(ros_type) or STORE.hash_rihs01(ros_type)
+    return _HASHES[ros_type]
 
 
-@lru_cache(maxsize=256)
 def is_known(ros_type: str, text: str) -> bool:
     """Check whether a definition from a file has the layout that `decode` expects of the type."""
     if text == definition(ros_type):
         return True
-    if len(text) > TEXT_MAX:  # its parser is slow
-        return False
     try:
         found = get_types_from_msg(text, ros_type)
     except Exception:  # rosbags' parser may raise anything on a foreign text

@@ -235,17 +235,14 @@ Foxglove and Lichtblick can show (`cloudrc/report/views.py`). A report does not 
 _Extract: TypeAlias = tuple[str, Callable[[Record], int], Callable[[Record], Values]]
 
 
-def values_getter(paths: list[str]) -> Callable[[Any], Values]:
-    """Make a function that returns the values at dotted paths in a record, as a tuple."""
-    if not paths:
-        return lambda record: ()
+def _values_getter(paths: list[str]) -> Callable[[Any], Values]:
     get = attrgetter(*paths)
     return get if len(paths) > 1 else lambda record: (get(record),)
 
 
 _EXTRACT: dict[type[Record], tuple[_Extract, ...]] = {
     source: tuple(
-        (topic.name, attrgetter(topic.stamp_path), values_getter(topic.paths()))
+        (topic.name, attrgetter(topic.stamp_path), _values_getter(topic.paths()))
         for topic in _TABLE
         if topic.source is source
     )

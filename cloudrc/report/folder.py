@@ -49,11 +49,8 @@ class _EarlierReport(BaseModel):
 def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     """Read the folder of a run; return arguments for `write_report`.
 
-    The run may be incomplete. If the recordings of world and cloud are not merged yet, merge them.
-
-    Raises:
-        BadInputError: If the folder has no experiment or no readable recording, or if data that a
-            report needs is missing from the recording.
+    If the recordings of world and cloud are not merged yet, merge them. Raise a BadInputError if
+    the folder has no experiment, or no recording that is sufficient for a report.
     """
     config, merged = folder / "config.yaml", folder / "mission.mcap"
     if not config.is_file():

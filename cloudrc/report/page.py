@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from html import escape
 from importlib.resources import files
@@ -57,66 +58,30 @@ SHARES = ("loss_", "late_", "overshoot_")
 """Prefixes of the names of metrics that the page shows in per cent."""
 
 
+SENTENCES = (
+    "The drone reached {waypoints_reached:.0f} of {waypoints} waypoints in {duration:.1f} s.",
+    "It flew {distance_flown:.1f} m.",
+    "In the pipes, its smallest distance from a wall was {min_clearance:.3f} m.",
+    "Its arm touched the board after {contact_time:.1f} s at {tip_speed:.2f} m/s.",
+    "It then pressed against the board with {steady_contact_force:.2f} N.",
+    "The mean round trip was {rtt_mean:.3f} s. The remote controller predicted the robot's "
+    "position with an error of {prediction_error_rms:.3f} m (RMS).",
+    "The guard on board took over {hold_count:.0f} times, for {hold_time:.1f} s in total.",
+)
+"""Sentences of the summary with names of metrics; one with an unknown metric is left out."""
+
+
 def summary(flight: Flight, numbers: Mapping[str, Number]) -> str:
-    """Summarize the flight in a few sentences, from the known values of metrics."""
+    """Summarize the flight in a few sentences."""
     if flight.start_ns is None:
         return "The robot never left the ground."
-    known = {name: number.value for name, number in numbers.items()}
-    return " ".join(filter(None, (part(flight, known) for part in SENTENCES)))
-
-
-def _waypoints(flight: Flight, known: Mapping[str, float]) -> str:
-    reached, count = round(known.get("waypoints_reached", 0)), flight.waypoints
-    goal = "its waypoint" if count == 1 else f"all {count} waypoints"
-    if reached != count:
-        goal = f"{reached} of {count} waypoints"
-    duration = f" in {known['duration']:.1f} s" if "duration" in known else ""
-    distance = f" and flew {known['distance_flown']:.1f} m" if "distance_flown" in known else ""
-    return f"The drone reached {goal}{duration}{distance}."
-
-
-def _pipes(flight: Flight, known: Mapping[str, float]) -> str:
-    if not flight.pipes_flown or "min_clearance" not in known:
-        return ""
-    pipes = "one pipe" if flight.pipes_flown == 1 else f"{flight.pipes_flown} pipes"
-    if touched := known.get("pipe_contacts", 0):
-        return f"It flew through {pipes} and touched a wall {_times(touched)}."
-    nearest = known["min_clearance"] * 1e3
-    return f"It flew through {pipes} and never came closer than {nearest:.0f} mm to a wall."
-
-
-def _contact(flight: Flight, known: Mapping[str, float]) -> str:
-    if "contact_time" not in known or "tip_speed" not in known:
-        return "It never touched the board." if flight.criteria.contact else ""
-    time, speed = known["contact_time"], known["tip_speed"]
-    text = f"Its arm touched the board after {time:.1f} s at {speed:.2f} m/s"
-    if "steady_contact_force" in known:
-        text += f" and then pressed against it with {known['steady_contact_force']:.2f} N"
-    return text + "."
-
-
-def _link(flight: Flight, known: Mapping[str, float]) -> str:
-    if "prediction_error_rms" not in known or "rtt_mean" not in known:
-        return ""
-    return (
-        f"The mean round trip was {known['rtt_mean'] * 1e3:.0f} ms. The remote controller "
-        f"predicted the robot's position with an error of "
-        f"{known['prediction_error_rms'] * 1e3:.0f} mm (RMS)."
-    )
-
-
-def _guard(flight: Flight, known: Mapping[str, float]) -> str:
-    if not known.get("hold_count"):
-        return "The guard on board never took over." if "hold_count" in known else ""
-    times, total = _times(known["hold_count"]), known.get("hold_time", 0)
-    return f"The guard on board took over {times}, for {total:.1f} s in total."
-
-
-def _times(count: float) -> str:
-    return "once" if count == 1 else f"{count:.0f} times"
-
-
-SENTENCES = (_waypoints, _pipes, _contact, _link, _guard)
+    known: dict[str, float] = {name: number.value for name, number in numbers.items()}
+    known["waypoints"] = flight.waypoints
+    found: list[str] = []
+    for sentence in SENTENCES:
+        with suppress(KeyError):
+            found.append(sentence.format_map(known))
+    return " ".join(found)
 
 
 def render(

@@ -69,14 +69,9 @@ def write_report(
     """Write report.json and environment.json and, if `page`, report.html with its figures.
 
     `folder` is the folder of the run, in which files of an earlier report are replaced. `look` is
-    the size of the figures. For the other arguments see `assess`.
-
-    Returns:
-        Content of report.json.
-
-    Raises:
-        MissingPrerequisiteError: If `page` is True and matplotlib is not installed; report.json is
-            written before the error.
+    the size of the figures. For the other arguments see `assess`. Return the content of
+    report.json. Raise a MissingPrerequisiteError if the page needs matplotlib, which is not
+    installed; report.json is written before the error.
     """
     assessment = assess(recording, experiment, run, own)
     document, environment = assessment.document, environment_document(run.physics_steps)

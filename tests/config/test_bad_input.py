@@ -104,7 +104,7 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
     ("text", "reason"),
     [
         ("seed", "--set seed: must be key=value"),
-        ("a..b=1", "--set"),
+        ("a..b=1", "is no key"),
         ("seed=[", "--set seed"),
         ("seed=[1], [2]", "--set seed: [1], [2]: text behind the value"),
         ("mission.waypoints.9.dwell_s=1", "entries 0 to 6; use one of these, or 7 to append"),
@@ -116,7 +116,7 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ("mission.waypoints.2.speed_mps=1", "waypoints.2.speed_mps: 1: is the speed of a carrot;"),
         ('mission={"steps": {}, "carrot": {}}', "mission.carrot: random steps jump"),
         ("world.robot=./no.xml", "no.xml; names of shipped robots: pelican"),
-        ("world.robot=/x/q", "world.robot: not an .xml file: /x/q"),
+        ("world.robot=/x/q", "world.robot: no such .xml file: /x/q"),
         # A limit of the guard cannot be switched off.
         ("guard.command_age_max_ms=true", "--set: guard.command_age_max_ms: "),
         ("guard.speed_max_mps=1e-320", "--set: guard.speed_max_mps: "),
@@ -124,7 +124,6 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ("world.plant.mass_factor=1e9", "world.plant.mass_factor: "),
         ("world.plant={payload_kg: 10, thrust_factor: 0.5}", "thrust-to-weight ratio is 0.62"),
         ("world.plant.thrust_factor=[1, 1, 1]", "world.plant.thrust_factor"),
-        ("cloud.command_rate_hz=19", "the guard leaves HOLD only after 10 commands within 500 ms"),
         ("cloud.compute_deviation_ms=1", "needs compute_ms"),
     ],
 )

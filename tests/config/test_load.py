@@ -30,9 +30,12 @@ def test_a_dump_loads_to_the_same(experiment, profile, tmp_path):
     assert loaded.link.profile == profile
     assert loaded.uplink == load_profile(profile).uplink
     assert loaded.downlink == load_profile(profile).downlink
-    # A new profile on a resolved file replaces the old one's values and limits.
-    changed = again(loaded, tmp_path, "link.profile=paper-p3")
-    assert changed == load_experiment(experiment, ["link.profile=paper-p3"])
+    # A setting on a resolved file replaces the values and limits that follow from the old value.
+    for setting in ("link.profile=paper-p3", "cloud.plan_s=0.4", "guard.command_age_max_ms=300"):
+        sets = [setting, "cloud.predictor=kalman"]
+        before = [f"link.profile={profile}"] * (not setting.startswith("link."))
+        changed = again(loaded, tmp_path, *sets)
+        assert changed == load_experiment(experiment, [*before, *sets])
 
 
 def test_paper_is_the_published_scheme():

@@ -16,6 +16,7 @@ from cloudrc.messages import Passed
 from cloudrc.record.columns import Recording
 from cloudrc.record.hash import RecordHash
 from tests.flights.conftest import LIMIT_NS, digest, fly_on, join, records
+from tests.record.conftest import later
 
 SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 1.0}]", "criteria.contact=false")
 ROOT = Path(__file__).resolve().parents[2]
@@ -94,7 +95,8 @@ def test_the_clocks_of_the_ends_need_not_agree():
     """Cloud depends on ages only, never on the value of its clock."""
     offset_ns = 86_400_000_000_001
     ours = Recording.from_records(*records(short()))
-    theirs = Recording.from_records(*records(short(), offset_ns=offset_ns), offset_ns=-offset_ns)
+    world, cloud = records(short(), offset_ns=offset_ns)
+    theirs = Recording.from_records(world, later(cloud, -offset_ns))
     for topic in ("/ground_truth", "/command_applied", "/estimated_odometry", "/pid"):
         assert len(ours[topic]) > 0
         assert np.array_equal(ours[topic]["stamp_ns"], theirs[topic]["stamp_ns"])

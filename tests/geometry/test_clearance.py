@@ -41,16 +41,6 @@ def test_distance_to_a_hollow_cylinder(point, distance):
     assert found == pytest.approx([distance], abs=1e-9)
 
 
-PLACES = st.tuples(*[st.floats(-4, 4)] * 3)
-
-
-@settings(max_examples=50, deadline=None)
-@given(PLACES, PLACES)
-def test_distance_changes_no_faster_than_the_point(one, other):
-    a, b = distance_to_pipe(PIPES.pipes[1], np.array([one, other]))
-    assert abs(a - b) <= math.dist(one, other) + 1e-9
-
-
 def test_clearance_on_the_axis_is_that_of_the_plant():
     """Source: docs/reference/plant.md, "Clearance on the axis"."""
     for height, expected in ((0.8, (0.217, 0.326, 0.320)), (0.7, (0.246, 0.365, 0.320))):

@@ -2,6 +2,7 @@
 
 import math
 from enum import IntEnum
+from operator import attrgetter
 from typing import get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -74,7 +75,8 @@ def world_records(count, start_ns=0):
                 rec.CommandApplied(now + 4 * MS, 1, n - 3, now - 60 * MS, velocity),
             ]
     contact = rec.Contact(now, "board", position, velocity, (0.1, 0.0, 0.0), True)
-    return [*records, contact, rec.Counted(now, "world", "sent", count)]
+    records += [contact, rec.Counted(now, "world", "sent", count)]
+    return sorted(records, key=attrgetter("stamp_ns"))
 
 
 def cloud_records(count, start_ns=0, up_ns=40 * MS):
@@ -92,7 +94,13 @@ def cloud_records(count, start_ns=0, up_ns=40 * MS):
             )
         )
     records.append(rec.MissionEvent(period, "done", 2, "mission done — ça va"))
-    return [*records, rec.Fault(period, "horizon_clamped", ""), rec.Counted(period, "cloud", "", 3)]
+    records += [rec.Fault(period, "late", ""), rec.Counted(period, "cloud", "", 3)]
+    return sorted(records, key=attrgetter("stamp_ns"))
+
+
+def later(records, offset_ns):
+    """Add `offset_ns` to the stamps of cloud's records."""
+    return [record._replace(stamp_ns=record.stamp_ns + offset_ns) for record in records]
 
 
 def write(path, records, clock="world", clock_id=""):

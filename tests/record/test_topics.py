@@ -1,15 +1,13 @@
 """The topics contain all values of the records, with their names and units."""
 
 import re
-from operator import attrgetter
 from typing import get_type_hints
 
 import pytest
-from hypothesis import given, settings
 
 from cloudrc import records as rec
-from cloudrc.record.topics import TOPICS, rows
-from tests.record.conftest import CLASSES, any_record
+from cloudrc.record.topics import TOPICS
+from tests.record.conftest import CLASSES
 
 
 def leaves(cls, prefix=""):
@@ -17,23 +15,6 @@ def leaves(cls, prefix=""):
     for name, kind in get_type_hints(cls).items():
         found |= leaves(kind, f"{prefix}{name}.") if hasattr(kind, "_fields") else {prefix + name}
     return found
-
-
-@given(any_record())
-@settings(max_examples=60, deadline=None)
-def test_rows_hold_the_records_own_values(record):
-    found = rows(record)
-    assert found
-    if isinstance(record, rec.Arrival):
-        assert [name for name, *_ in found] == [
-            "/uplink_delay" if record.uplink else "/downlink_delay"
-        ]
-    for name, stamp_ns, values in found:
-        topic = TOPICS[name]
-        assert type(record) is topic.source
-        assert stamp_ns == attrgetter(topic.stamp_path)(record)
-        for path, value in zip(topic.paths(), values, strict=True):
-            assert value is attrgetter(path)(record)
 
 
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)

@@ -34,7 +34,7 @@ MARGIN = 1.25
 
 def draw_delay(subject: Subject) -> Figure:
     """Draw the one-way delay of each datagram, and the loop delay with cloud's estimate of it."""
-    figure, (one_way, loop) = subject.look.side_by_side(2, 2.6)
+    figure, (one_way, loop) = subject.look.two_panels()
     flight, time = subject.flight, np.linspace(0.0, subject.duration, 600)
     limits = [bounds(subject, time, uplink=uplink) for uplink in (True, False)]
 
@@ -208,18 +208,15 @@ SPAN = 0.5
 
 def draw_error(subject: Subject) -> Figure:
     """Draw the distance to the setpoint, as in the paper, and the error of position estimates."""
-    figure, (tracking, accuracy) = subject.look.side_by_side(2, 2.6)
+    figure, (tracking, accuracy) = subject.look.two_panels()
     flight, control, applied = subject.flight, subject.flight.control, subject.flight.applied
 
     panel(tracking, "a")
     time = flight.seconds(control["stamp_ns"])
-    for name, column, colour, width in (
-        ("measured", "measured", style.MEASURED, 1.8),
-        ("estimated", "position", style.ESTIMATED, 1.1),
-    ):
+    for column in ("measured", "position"):
         error = control["setpoint"] - control[column]
-        label = f"{name}{_rms(error, 'm', 1.0)}"
-        tracking.plot(time, np.linalg.norm(error, axis=1), color=colour, lw=width, label=label)
+        look = LINES[column] | {"label": f"{LINES[column]['label']}{_rms(error, 'm', 1.0)}"}
+        tracking.plot(time, np.linalg.norm(error, axis=1), **look)
     tracking.set_ylim(bottom=0.0)
     _finish(tracking, subject, "distance to reference (m)", 2)
 

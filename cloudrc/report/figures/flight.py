@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -55,32 +56,31 @@ def caption(subject: Subject) -> str:
 
 def draw(subject: Subject) -> Figure:
     """Draw the path from above, and z and clearance over the distance flown."""
-    narrow = subject.look.width < NARROW
-    figure = new_figure(5.6 if narrow else 3.5, subject.look.width)
-    if narrow:
-        grid = figure.add_gridspec(3, 1, height_ratios=(1.6, 1.0, 1.0))
-        top, middle, bottom = grid[0], grid[1], grid[2]
+    right = ["side", "margin"] if len(subject.flight.clearance) else ["side"]
+    mosaic: list[Any]
+    ratios: dict[str, Any]
+    if subject.look.width < NARROW:
+        figure = new_figure(5.6, subject.look.width)
+        mosaic = [["top"], *([name] for name in right)]
+        ratios = {"height_ratios": (1.6, *[2.0 / len(right)] * len(right))}
     else:
-        grid = figure.add_gridspec(2, 2, width_ratios=(1.0, 1.05))
-        top, middle, bottom = grid[:, 0], grid[0, 1], grid[1, 1]
+        figure = new_figure(3.5, subject.look.width)
+        mosaic, ratios = [["top", name] for name in right], {"width_ratios": (1.0, 1.05)}
+    axes = figure.subplot_mosaic(mosaic, **ratios)
     position = subject.flight.truth["position"]
     steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
     flown = np.concatenate([np.zeros(min(len(position), 1)), np.cumsum(steps)])
-    coloured = _draw_top(figure.add_subplot(top), subject, position)
-    if not len(subject.flight.clearance):
-        side = figure.add_subplot(grid[1:] if narrow else grid[:, 1])
-        _draw_side(side, subject, flown, position)
-        side.set_xlabel("distance flown (m)")
-        return figure
-    side = figure.add_subplot(middle)
+    coloured, side = _draw_top(axes["top"], subject, position), axes["side"]
     _draw_side(side, subject, flown, position)
-    side.tick_params(labelbottom=False)
-    margin = figure.add_subplot(bottom, sharex=side)
-    _draw_clearance(margin, subject, flown, position)
-    if coloured is not None:
-        bar = figure.colorbar(coloured, ax=[side, margin], extend="max", aspect=40, pad=0.01)
-        bar.set_label("clearance (m)")
-        bar.outline.set_linewidth(0.5)
+    axes[right[-1]].set_xlabel("distance flown (m)")
+    if margin := axes.get("margin"):
+        side.tick_params(labelbottom=False)
+        margin.sharex(side)
+        _draw_clearance(margin, subject, flown, position)
+        if coloured is not None:
+            bar = figure.colorbar(coloured, ax=[side, margin], extend="max", aspect=40, pad=0.01)
+            bar.set_label("clearance (m)")
+            bar.outline.set_linewidth(0.5)
     return figure
 
 
@@ -180,7 +180,6 @@ def _passages(subject: Subject, flown: Array, position: Array) -> list[tuple[Pip
 def _draw_clearance(axes: Axes, subject: Subject, flown: Array, position: Array) -> None:
     panel(axes, "c", "clearance along the path")
     axes.set_ylabel("clearance (m)")
-    axes.set_xlabel("distance flown (m)")
     flight, clearance = subject.flight, subject.flight.clearance
     for _, begin, end in _passages(subject, flown, position):
         axes.axvspan(begin, end, color=BORE, lw=0, zorder=0)

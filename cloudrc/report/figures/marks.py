@@ -39,13 +39,16 @@ LEGEND = (
 
 def delays_of(direction: Direction) -> Timeline | None:
     """Return delay and jitter of a profile over time; None if the file of its trace is missing."""
-    changes = (
-        Change(change.at_s, _seconds(change.delay_ms), _seconds(change.jitter_ms))
+
+    def seconds(milliseconds: float | None) -> float | None:
+        return None if milliseconds is None else milliseconds * 1e-3
+
+    changes = tuple(
+        Change(change.at_s, seconds(change.delay_ms), seconds(change.jitter_ms))
         for change in direction.changes
     )
-    profile = DirectionProfile(
-        direction.delay_ms * 1e-3, direction.jitter_ms * 1e-3, changes=tuple(changes)
-    )
+    delay, jitter = direction.delay_ms * 1e-3, direction.jitter_ms * 1e-3
+    profile = DirectionProfile(delay, jitter, changes=changes)
     if direction.trace:
         try:
             trace = read_trace(Path(direction.trace))
@@ -53,10 +56,6 @@ def delays_of(direction: Direction) -> Timeline | None:
             return None
         profile = replace(profile, trace=replace(trace, loop=direction.loop))
     return Timeline(profile)
-
-
-def _seconds(milliseconds: float | None) -> float | None:
-    return None if milliseconds is None else milliseconds * 1e-3
 
 
 def band(delays: Timeline, time: Array) -> tuple[Array, Array]:
@@ -113,8 +112,7 @@ def _changes(subject: Subject, uplink: bool) -> Iterator[Span]:
 def bounds(subject: Subject, time: Array, *, uplink: bool) -> tuple[Array, Array] | None:
     """Compute the band of delays of the link profile at each `time` [s] since the flight's start.
 
-    Returns:
-        Lower and upper end [s], NaN where the file of a trace is missing; None if all are NaN.
+    Return its lower and upper end [s], NaN where the file of a trace is missing; None if all are.
     """
     low, high = np.full(len(time), np.nan), np.full(len(time), np.nan)
     for span in spans(subject, uplink=uplink):

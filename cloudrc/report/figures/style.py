@@ -66,13 +66,11 @@ class Look:
         small = ("xtick.labelsize", "ytick.labelsize", "legend.fontsize")
         return {**RC, "font.size": self.font_size, **dict.fromkeys(small, self.font_size - 1.0)}
 
-    def side_by_side(self, count: int, height: float) -> tuple[Figure, list[Axes]]:
-        """Make a figure of panels of `height` [in], below each other if it is narrow."""
-        if self.width < NARROW:
-            figure = new_figure(count * height * 0.8, self.width)
-            return figure, [*figure.subplots(count, 1)]
-        figure = new_figure(height, self.width)
-        return figure, [*figure.subplots(1, count)]
+    def two_panels(self) -> tuple[Figure, list[Axes]]:
+        """Make a figure with two panels, below each other if it is narrow."""
+        narrow = self.width < NARROW
+        figure = new_figure(4.16 if narrow else 2.6, self.width)
+        return figure, [*(figure.subplots(2, 1) if narrow else figure.subplots(1, 2))]
 
 
 def new_figure(height: float, width: float = PAGE) -> Figure:
