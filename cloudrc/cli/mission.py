@@ -303,11 +303,11 @@ def _status(options: argparse.Namespace, api: Api) -> int:
     if options.output != "table":
         return _print(state, options.output)
     if options.id:
-        api.say(_describe_mission(state))
+        api.say(describe_mission(state))
         _print_history(state)
         return 0
     if state["mission"]:
-        api.say(_describe_mission(state["mission"]))
+        api.say(describe_mission(state["mission"]))
     else:
         api.say("no mission is under way")
     if state["queue"]:
@@ -324,7 +324,7 @@ def _cancel(options: argparse.Namespace, api: Api) -> int:
             raise BadInputError("no mission is under way; 'cloudrc mission list' shows all")
         mission_id = mission["id"]
     cancelled = api.post(f"{mission_path(mission_id)}/cancel")
-    api.say(f"{_describe_stay(api)}; {_describe_mission(cancelled)}")
+    api.say(f"{_describe_stay(api)}; {describe_mission(cancelled)}")
     return 0
 
 
@@ -351,7 +351,7 @@ def _order(options: argparse.Namespace, api: Api) -> int:
     if verb == "goto":
         to = f"({options.x:g}, {options.y:g}, {options.z:g})"
     action = _describe_stay(api) if verb == "hold" else f"flying to {to}"
-    api.say(f"{action}; {_describe_mission(mission)}")
+    api.say(f"{action}; {describe_mission(mission)}")
     return 0
 
 
@@ -365,7 +365,7 @@ def _describe_stay(api: Api) -> str:
         if seen is not None and seen["guard"] == "GROUND":
             return "waiting on the ground"
         if seen is not None:
-            return f"holding at {_describe_point(seen['position_m'])}"
+            return f"holding at {describe_point(seen['position_m'])}"
     return "holding"
 
 
@@ -406,14 +406,15 @@ API_VERBS: dict[str, Callable[[argparse.Namespace, Api], int]] = {
 }
 
 
-def _describe_mission(mission: Json) -> str:
+def describe_mission(mission: Json) -> str:
+    """Return name, state and waypoint of a mission, and its verdict, as one line of text."""
     where = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
     name = f" ({mission['name']})" if mission["name"] else ""
     verdict = f"; {describe_verdict(mission['verdict'])}" if mission["verdict"] else ""
     return f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}"
 
 
-def _describe_point(position: Sequence[float | None]) -> str:
+def describe_point(position: Sequence[float | None]) -> str:
     """Format a position [m]; None is unknown."""
     return f"({', '.join('?' if value is None else f'{value:.2f}' for value in position)})"
 
@@ -424,7 +425,7 @@ def _print_robot(seen: Json | None, cloud_age: float | None) -> None:
     if seen is None:
         print(f"no telemetry from the robot yet; is the link up? cloud heard {heard}")
         return
-    where = _describe_point(seen["position_m"])
+    where = describe_point(seen["position_m"])
     if seen["guard_for_s"] is None:
         past = f"robot not heard for {seen['age_s']:.1f} s (guard {seen['guard']} then)"
         print_line(f"{past}; cloud heard {heard}")

@@ -6,13 +6,14 @@ Only this module imports mjviser, which converts the shapes of the MuJoCo model 
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from cloudrc.config.schema import Experiment
+from cloudrc.config.load import ResolvedExperiment
 from cloudrc.geometry.clearance import CLEARANCE_SHOWN, Array
 from cloudrc.geometry.scene import Pipe, Scene, load_scene
 from cloudrc.messages import Vector
@@ -28,6 +29,8 @@ FLOOR: dict[str, Any] = {
 }
 """Look of a plane, which is a grid."""
 GHOST_OPACITY, PIPE_OPACITY = 0.35, 0.5
+VIEW, LOOK, NEAREST = np.radians(75.0), np.array([0.7, -0.2, -0.7]), 3.5
+"""Viewer: vertical angle of view [rad], direction, least distance from the middle [m]."""
 VIRIDIS = "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725"
 """Colours of clearance in the figures, evenly spaced from 0 to `CLEARANCE_SHOWN`."""
 LEGEND = (
@@ -44,8 +47,13 @@ class FlightScene:
     The world frame of the scene is that of the flight [m]; its z axis points up.
     """
 
-    def __init__(self, server: viser.ViserServer, experiment: Experiment) -> None:
+    def __init__(
+        self, server: viser.ViserServer, experiment: ResolvedExperiment, aspect: float = 1.5
+    ) -> None:
         """Add the static shapes, and the robot at its spawn.
+
+        The first view shows the whole mission in a window whose width is at least `aspect` times
+        its height.
 
         Raises:
             BadInputError: If robot or scene are missing or unsuitable.
@@ -64,7 +72,9 @@ class FlightScene:
         self._waypoints: list[Any] = []  # spheres
         self._points: Array = np.zeros((0, 3))  # of the waypoints [m]
         self._plan: Array = np.zeros((0, 3))  # waypoints that the line of the plan joins [m]
-        server.initial_camera.position, server.initial_camera.look_at = _camera(geometry)
+        waypoints = [point.position_m for point in experiment.mission.waypoints]
+        camera = server.initial_camera
+        camera.position, camera.look_at = _camera(geometry, waypoints, aspect)
 
     def set_robot(self, position: Vector | Array, orientation_wxyz: Array) -> None:
         """Move the robot to the `position` of its base [m], shape (3,).
@@ -221,9 +231,21 @@ def _surface(
     return np.concatenate(circles), np.concatenate(faces)
 
 
-def _camera(geometry: Scene) -> tuple[Any, Any]:
-    """Choose where the viewer is and where the viewer looks [m], so that the scene is in sight."""
-    spots = np.array([geometry.spawn, *(pipe.centre for pipe in geometry.pipes)])
-    low, high = spots.min(axis=0), spots.max(axis=0)
-    middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.5)
-    return middle + size * np.array([0.44, 0.65, 0.50]), middle
+def _camera(geometry: Scene, waypoints: Sequence[Vector], aspect: float) -> tuple[Array, Array]:
+    """Return the place of the viewer, and the point at which the viewer looks [m], shape (3,).
+
+    The viewer looks along +x, so that the arrow keys fly away from the viewer, to the left and so
+    on, from the nearest place from which spawn, pipes and waypoints are in sight.
+    """
+    pipes = [(pipe.centre, 0.5 * pipe.length * np.array(pipe.axis)) for pipe in geometry.pipes]
+    ends = [centre + sign * half for centre, half in pipes for sign in (-1, 1)]
+    forward = LOOK / np.linalg.norm(LOOK)
+    right = np.cross(forward, (0.0, 0.0, 1.0)) / np.hypot(*forward[:2])
+    axes = np.array([right, np.cross(right, forward), forward])
+    *across, depth = axes @ np.array([geometry.spawn, *ends, *waypoints]).T
+    slope = 0.8 * np.tan(VIEW / 2) * np.array([[aspect], [1.0]])  # with a margin
+    least, most = (across - slope * depth).max(axis=1), (across + slope * depth).min(axis=1)
+    middle = (depth.min() + depth.max()) / 2
+    back = min(((most - least) / (2 * slope[:, 0])).min(), middle - NEAREST)
+    place = (least + most) / 2
+    return np.array([*place, back]) @ axes, np.array([*place, middle]) @ axes

@@ -5,14 +5,13 @@ The report contains the replay as a section; `cloudrc replay` writes it as a pag
 
 from __future__ import annotations
 
-import io
 import json
-from contextlib import redirect_stdout
 from html import escape
 from importlib.resources import files
 from string import Template
 
 import numpy as np
+import rich
 import viser
 
 from cloudrc.config.load import ResolvedExperiment
@@ -37,12 +36,12 @@ def write_section(flight: Flight, experiment: ResolvedExperiment) -> str:
     """
     if not len(flight.truth["stamp_ns"]):
         raise BadInputError("the robot never flew")
-    with redirect_stdout(io.StringIO()):  # viser prints where its server listens
-        server = viser.ViserServer("127.0.0.1", 0, verbose=False)
-        try:
-            player = _record(server, flight, experiment)
-        finally:
-            server.stop()
+    rich.get_console().quiet = True  # viser prints about itself
+    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    try:
+        player = _record(server, flight, experiment)
+    finally:
+        server.stop()
     # Hide that the browser draws without a graphics card: the message would cover the scene.
     style = "<style>.mantine-Notifications-root { display: none }</style></head>"
     player = player.replace("</head>", style, 1)

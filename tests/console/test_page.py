@@ -18,7 +18,7 @@ from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import PANEL_WIDTH, Page, _with_gaps
-from cloudrc.console.steering import Link, Steering
+from cloudrc.console.steering import Steering
 from cloudrc.drivers.local import under_way
 from cloudrc.geometry.scene import Scene, load_scene
 from tests.console.conftest import told
@@ -67,7 +67,7 @@ def filled(api):
         def fill(name):
             page = Page(0)
             opened.callback(page.close)
-            feed, steering = FlightFeed(Scene("empty")), Steering(api, Link(dict, list))
+            feed, steering = FlightFeed(Scene("empty")), Steering(api)
             page.fill(load_experiment(name), feed, steering)
             return page, feed, steering
 
@@ -205,16 +205,15 @@ def test_the_first_view_shows_the_whole_mission(filled):
 
 def test_the_state_tells_a_drive_and_names_buttons(filled):
     page, feed, steering = filled("hover")
-    drive = {"id": "m1", "name": "drive", "state": "held", "reached": [], "waypoints": 1}
+    drive = {"id": "m1", "by_hand": True, "state": "held", "reached": []}
     words = "to continue: cloudrc mission resume, or cancel"
     steering.state = {"mission": drive, "seen": {"next_step": words}}
     feed.take([told(0.1)], 1.0)
     page.update(1.0)
     assert "Mission: drive, waits for keys" in page._status.content
-    assert "to continue: Resume, or Cancel" in page._status.content
-    now = time.monotonic()
-    steering.hold_key("up", (0.0, 0.0, 0.4))
-    page.update(now)
+    assert "to continue: resume, or cancel" in page._status.content
+    steering.hold_key("up", (0.0, 0.0, 0.4), 60.0)
+    page.update(2.0)
     assert "Mission: driving" in page._status.content
 
 
