@@ -1,6 +1,7 @@
 """The console in a browser, on a session of real processes."""
 
 import io
+import socket
 import subprocess
 import sys
 import threading
@@ -20,6 +21,7 @@ from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import PANEL_WIDTH, Page, _with_gaps
 from cloudrc.console.steering import Steering
 from cloudrc.drivers.local import under_way
+from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import Scene, load_scene
 from tests.console.conftest import told
 
@@ -220,6 +222,13 @@ def test_the_state_tells_a_drive_and_names_buttons(filled):
 def test_a_curve_has_gaps_and_an_unknown_one_keeps_its_axis():
     assert _with_gaps(np.array([np.nan, 0.2])) == [None, 0.2]
     assert _with_gaps(np.full(2, np.nan)) == [-1.0, None]
+
+
+def test_a_port_in_use_is_an_error():
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(BadInputError, match=f"--port {port}: is in use"):
+            Page(port)
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys):
