@@ -93,7 +93,7 @@ def _serve(port: int, flight: Flight) -> None:
         opened.callback(page.close)
         from cloudrc.drivers.tap import TapListener
 
-        tap = TapListener(flight.tap, page.url)
+        tap = TapListener(flight.tap)
         opened.callback(tap.close)
         print_line(f"console: {page.url}")
         from cloudrc.config.load import read_experiment

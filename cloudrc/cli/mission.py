@@ -1,8 +1,6 @@
-"""Run `cloudrc mission`: fly and steer missions, in a local run or in a cluster.
+"""Run `cloudrc mission`: fly and steer missions by requests to the API of teleop.
 
-Each verb sends requests to the API of teleop, the process that commands missions. In a cluster,
-`run` instead creates a Kubernetes Job, whose pod posts the mission to the API. A command that waits
-for the end of a mission exits with the code of the mission's verdict.
+In a cluster, `run` creates a Kubernetes Job, whose pod posts the mission to the API.
 """
 
 from __future__ import annotations
@@ -33,7 +31,6 @@ from cloudrc.errors import (
 
 if TYPE_CHECKING:
     from cloudrc.cluster.client import Release
-    from cloudrc.config.document import Document
 
 EPILOG = """\
 where:
@@ -158,12 +155,6 @@ def _metres(text: str) -> float:
         raise argparse.ArgumentTypeError(f"'{text}' is not a number of metres") from None
 
 
-def _read(name: str) -> Document:
-    from cloudrc.config import shipped
-
-    return shipped.read("mission", name, Path())
-
-
 def read_mission(name: str, shown: str = "") -> Json:
     """Read a mission file, or a mission that cloudrc ships; the API checks the content later.
 
@@ -172,7 +163,9 @@ def read_mission(name: str, shown: str = "") -> Json:
     Raises:
         BadInputError: If the file does not exist, or if it contains no mission.
     """
-    mission = dict(_read(name).tree)
+    from cloudrc.config import shipped
+
+    mission = dict(shipped.read("mission", name, Path()).tree)
     if mission.pop("steps", None) is not None:
         raise BadInputError(
             f"{name}: steps are for experiments; fly them with 'cloudrc run', or give waypoints"
@@ -184,14 +177,14 @@ class MissionFollower:
     """Follows one mission until its verdict, even if the API restarts in a new pod meanwhile."""
 
     def __init__(self, api: Api, patience: float) -> None:
-        """Store the API; `patience` is the time limit for an API that does not answer [s]."""
+        """Store the API; `patience` is the time limit for an API that does not answer [s].
+
+        After this time the methods raise a TimedOutError; other errors are those of `Api.post`.
+        """
         self._api, self._patience, self._last_event = api, patience, 0
 
     def post(self, mission: Mapping[str, Any]) -> str:
-        """Post a mission, and repeat the request until the API answers; return the mission's id.
-
-        Raise a TimedOutError if the API does not answer in time; other errors are as in `Api.post`.
-        """
+        """Post a mission; return its id."""
         view = self._retry(lambda: self._api.post("/v1/missions", mission))
         text = f"mission {view['id']}: {view['state']}, waypoints: {view['waypoints']}"
         back = mission.get("start", "spawn") == "spawn"
@@ -211,15 +204,14 @@ class MissionFollower:
             time.sleep(POLL_PERIOD)
 
     def _retry(self, request: Callable[[], _Answer]) -> _Answer:
-        """Repeat a request until the API answers; raise a TimedOutError after `patience`."""
+        """Repeat a request until the API answers."""
         deadline, reported = Deadline(self._patience, TURN_MAX), False
         while True:
             try:
                 return request()
             except UnreachableError as error:
                 if deadline.passed():
-                    waited = f"{error}; gave up after {self._patience:g} s"
-                    raise TimedOutError(waited) from None
+                    raise TimedOutError(f"{error}; gave up after {self._patience:g} s") from None
                 if not reported:
                     print_line(f"{error}; waiting")
                     reported = True
@@ -238,7 +230,7 @@ def _fly(options: argparse.Namespace) -> int:
     if options.api is None:
         raise BadInputError("fly needs --api; without a Job use: cloudrc mission run FILE")
     interrupt_on_signals()
-    api, mission_id = Api(options.api, token_reader(token_file(options))), ""
+    api, mission_id, text = Api(options.api, token_reader(token_file(options))), "", ""
     follower = MissionFollower(api, API_TIMEOUT)
     try:
         mission = read_mission(options.mission)
@@ -252,17 +244,14 @@ def _fly(options: argparse.Namespace) -> int:
         text = "INTERRUPTED: the Job was stopped, its mission is cancelled"
         code = InterruptedRunError.exit_code
     except CloudrcError as error:
-        _write_termination_message(str(error))
+        text = str(error)
         raise
+    finally:
+        with suppress(OSError):  # on failure Kubernetes shows the last line of the log instead
+            if TERMINATION_LOG.exists():
+                TERMINATION_LOG.write_text(escape(text) + "\n", encoding="utf-8")
     print_line(text)
-    _write_termination_message(escape(text))
     return code
-
-
-def _write_termination_message(text: str) -> None:
-    with suppress(OSError):  # on failure Kubernetes shows the last line of the log instead
-        if TERMINATION_LOG.exists():
-            TERMINATION_LOG.write_text(text + "\n", encoding="utf-8")
 
 
 def _run(options: argparse.Namespace, api: Api) -> int:
@@ -283,33 +272,30 @@ def _run(options: argparse.Namespace, api: Api) -> int:
 def _list(options: argparse.Namespace, api: Api) -> int:
     missions = api.get("/v1/missions")["missions"]
     if options.output != "table":
-        return _print({"missions": missions}, options.output)
+        print(format_document({"schemaVersion": 1, "missions": missions}, options.output))
+        return 0
     rows = [("ID", "NAME", "STATE", "WAYPOINTS", "VERDICT")]
     for each in missions:
         done = f"{len(each['reached'])}/{each['waypoints']}"
         verdict = describe_verdict(each["verdict"]) if each["verdict"] else ""
         rows.append((each["id"], each["name"], each["state"], done, verdict))
-    if not missions:
-        api.say("no missions yet")
-        return 0
-    if api.place:
-        api.say("missions, the oldest first")
-    print(table(rows))
+    if api.place or not missions:
+        api.say("missions, the oldest first" if missions else "no missions yet")
+    if missions:
+        print(table(rows))
     return 0
 
 
 def _status(options: argparse.Namespace, api: Api) -> int:
     state = api.get(mission_path(options.id) if options.id else "/v1/state")
     if options.output != "table":
-        return _print(state, options.output)
+        print(format_document({"schemaVersion": 1, **state}, options.output))
+        return 0
+    mission = state if options.id else state["mission"]
+    api.say(describe_mission(mission) if mission else "no mission is under way")
     if options.id:
-        api.say(describe_mission(state))
         _print_history(state)
         return 0
-    if state["mission"]:
-        api.say(describe_mission(state["mission"]))
-    else:
-        api.say("no mission is under way")
     if state["queue"]:
         print_line(f"waiting: {', '.join(state['queue'])}")
     _print_robot(state["seen"], state["cloud_age_s"])
@@ -317,13 +303,10 @@ def _status(options: argparse.Namespace, api: Api) -> int:
 
 
 def _cancel(options: argparse.Namespace, api: Api) -> int:
-    mission_id = options.id
-    if not mission_id:
-        mission = api.get("/v1/state")["mission"]
-        if mission is None:
-            raise BadInputError("no mission is under way; 'cloudrc mission list' shows all")
-        mission_id = mission["id"]
-    cancelled = api.post(f"{mission_path(mission_id)}/cancel")
+    mission = {"id": options.id} if options.id else api.get("/v1/state")["mission"]
+    if mission is None:
+        raise BadInputError("no mission is under way; 'cloudrc mission list' shows all")
+    cancelled = api.post(f"{mission_path(mission['id'])}/cancel")
     api.say(f"{_describe_stay(api)}; {describe_mission(cancelled)}")
     return 0
 
@@ -343,14 +326,14 @@ def _logs(options: argparse.Namespace, api: Api) -> int:
 
 
 def _order(options: argparse.Namespace, api: Api) -> int:
-    point, verb = None, options.verb
-    if verb == "goto":
-        point = {"position_m": [options.x, options.y, options.z]}
-    mission = api.post(f"/v1/{verb}", point)
-    to = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
-    if verb == "goto":
-        to = f"({options.x:g}, {options.y:g}, {options.z:g})"
-    action = _describe_stay(api) if verb == "hold" else f"flying to {to}"
+    if options.verb == "goto":
+        point = options.x, options.y, options.z
+        mission = api.post("/v1/goto", {"position_m": point})
+        action = "flying to ({:g}, {:g}, {:g})".format(*point)
+    else:
+        mission = api.post(f"/v1/{options.verb}")
+        action = f"flying to waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
+        action = _describe_stay(api) if options.verb == "hold" else action
     api.say(f"{action}; {describe_mission(mission)}")
     return 0
 
@@ -427,9 +410,8 @@ def _print_robot(seen: Json | None, cloud_age: float | None) -> None:
         return
     where = describe_point(seen["position_m"])
     if seen["guard_for_s"] is None:
-        past = f"robot not heard for {seen['age_s']:.1f} s (guard {seen['guard']} then)"
-        print_line(f"{past}; cloud heard {heard}")
-        print_line(f"last seen at {where} m: {seen['cause']}")
+        print_line(f"robot not heard for {seen['age_s']:.1f} s; cloud heard {heard}")
+        print_line(f"last seen at {where} m, guard {seen['guard']}: {seen['cause']}")
     else:
         rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
         print_line(f"robot at {where} m, seen {seen['age_s']:.2f} s ago{rtt}")
@@ -446,11 +428,6 @@ def _print_history(mission: Json) -> None:
 def _print_events(events: Iterable[Json]) -> None:
     for event in events:
         print_line(f"{event['mission']:<4}{event['time_s']:8.2f} s  {event['text']}")
-
-
-def _print(document: Json, form: str) -> int:
-    print(format_document({"schemaVersion": 1, **document}, form))
-    return 0
 
 
 def _release(options: argparse.Namespace) -> Release:
@@ -484,13 +461,15 @@ def _time_limit(name: str, mission: Json) -> float:
     """
     from pydantic import ValidationError
 
+    from cloudrc.config import shipped
     from cloudrc.config.problems import from_pydantic, raise_problems
     from cloudrc.teleop.models import MissionRequest
 
     try:
         request = MissionRequest.model_validate_json(json.dumps(mission))
     except ValidationError as error:
-        raise_problems(_read(name), from_pydantic(error, MissionRequest), name)
+        document = shipped.read("mission", name, Path())
+        raise_problems(document, from_pydantic(error, MissionRequest), name)
         raise  # raise_problems found nothing to report
     return request.time_limit_s or LIMIT_MAX
 
@@ -506,14 +485,14 @@ def _run_job(options: argparse.Namespace) -> int:
     # After 'helm install' without --wait, the release needs some seconds to become ready.
     wait_ready(release, timeout=options.timeout, tell=print_line)
     job = run_job(release, mission, limit=limit, queue=options.queue)
-    where = f"on release '{release.name}' in namespace '{release.namespace}'"
-    print(f"Job {job.name} {where}", flush=True)
+    print_line(f"Job {job.name} on release '{release.name}' in namespace '{release.namespace}'")
     try:
         ended = follow(release, job.name, print_line, timeout=follow_limit(limit, options.queue))
     except KeyboardInterrupt:
         command = f"kubectl {' '.join(release.flags)} delete job {job.name}"
-        print(f"Job {job.name} is still running; cancel its mission: {command}", file=sys.stderr)
+        print_line(f"Job {job.name} is still running; cancel its mission: {command}", sys.stderr)
         raise
     if ended.exit_code is None:
         print_line(ended.message)
-    return 1 if ended.exit_code is None else ended.exit_code
+        return 1
+    return ended.exit_code

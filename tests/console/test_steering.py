@@ -8,6 +8,7 @@ import pytest
 from cloudrc.console.steering import Link, Steering
 from cloudrc.errors import BadInputError
 from cloudrc.messages import ZERO
+from tests.console.conftest import wait_for
 
 
 @pytest.fixture
@@ -81,13 +82,6 @@ def test_the_route_is_asked_once_for_each_mission(api, steering):
     del api.answers["/v1/missions/m1"]
     steering.watch()
     assert steering.route == [[1, 1, 1]]
-
-
-def wait_for(condition):
-    limit = time.monotonic() + 10
-    while not condition():
-        assert time.monotonic() < limit
-        time.sleep(0.01)
 
 
 def test_a_stop_is_repeated_until_the_api_answers(api, steering):
