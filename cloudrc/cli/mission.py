@@ -79,10 +79,10 @@ Json = dict[str, Any]
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-
-    def add(name: str, line: str) -> argparse.ArgumentParser:
-        verb = verbs.add_parser(
+    parsers = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs = {}
+    for name, (line, _) in VERBS.items():
+        verbs[name] = verb = parsers.add_parser(
             name,
             help=line,
             description=line[0].upper() + line[1:] + ".",
@@ -97,55 +97,50 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         if name != "fly":
             run_argument(verb)
             release_arguments(verb)
-        return verb
-
-    run = add("run", "fly a mission and show its progress until the verdict")
+    run, fly = verbs["run"], verbs["fly"]
     run.add_argument("mission", metavar="FILE", help="mission file, or name of a shipped mission")
     timeout_argument(run)
     run.add_argument("--name", default="", help="name shown to people (default: the file's name)")
-    output_argument(add("list", "list all missions"))
-    status = add("status", "show the robot's state, or the state of a mission")
-    output_argument(status)
-    status.add_argument("id", nargs="?", metavar="ID", help="mission (default: show the robot)")
-    cancel = add("cancel", "cancel a mission; the robot holds its position")
-    cancel.add_argument("id", nargs="?", metavar="ID", help="mission (default: the current one)")
-    logs = add("logs", "show the events of missions")
-    logs.add_argument("id", nargs="?", metavar="ID", help="mission (default: all)")
-    logs.add_argument("-f", "--follow", action="store_true", help="keep printing new events")
-    goto = add("goto", "fly to a point; a held mission then holds there")
-    for axis in "XYZ":
-        goto.add_argument(axis.lower(), type=_metres, metavar=axis, help="[m], world frame")
-    add("drive", "drive the robot with the keys of this terminal")
-    add("hold", "hold the robot where it is, at least 0.35 m above the ground")
-    add("resume", "resume the held mission")
-    add("estop", "stop the rotors at once: the robot falls and its mission fails")
-    add("acknowledge", "allow flights again after a stop or a landing; does not start the rotors")
-    fly = add("fly", "fly a mission inside a Job: post it, follow it, exit with the verdict")
     fly.add_argument("--mission", required=True, metavar="FILE", help="mission file")
     fly.add_argument("--key", default="", help="a mission posted twice under one key flies once")
+    queue = "wait for the current mission to end"
     for verb in (run, fly):
-        verb.add_argument(
-            "--queue", action="store_true", help="wait for the current mission to end"
+        verb.add_argument("--queue", action="store_true", help=queue)
+    output_argument(verbs["list"])
+    output_argument(verbs["status"])
+    for name, default in (
+        ("status", "show the robot"),
+        ("cancel", "the current one"),
+        ("logs", "all"),
+    ):
+        verbs[name].add_argument(
+            "id", nargs="?", metavar="ID", help=f"mission (default: {default})"
         )
+    follow = "keep printing new events"
+    verbs["logs"].add_argument("-f", "--follow", action="store_true", help=follow)
+    for axis in "XYZ":
+        about = "[m], world frame"
+        verbs["goto"].add_argument(axis.lower(), type=_metres, metavar=axis, help=about)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the chosen verb."""
     verb: str = options.verb
-    if verb == "fly":
-        return _fly(options)
+    _, carry_out = VERBS[verb]
     if options.api:
-        return API_VERBS[verb](options, Api(options.api, token_reader(token_file(options))))
+        return carry_out(options, Api(options.api, token_reader(token_file(options))))
+    if verb == "fly":
+        raise BadInputError("fly needs --api; without a Job use: cloudrc mission run FILE")
 
     def look(run: Path, url: str) -> Api | None:
         return Api(url, place=str(run)) if url else None  # a local run needs no token: send none
 
     if (api := find_local_run(options, look, NO_API, steers=verb not in READS)) is not None:
-        return API_VERBS[verb](options, api)
+        return carry_out(options, api)
     if verb == "run":
         return _run_job(options)
     with _forwarded_api(options) as forwarded:
-        return API_VERBS[verb](options, forwarded)
+        return carry_out(options, forwarded)
 
 
 def _metres(text: str) -> float:
@@ -225,12 +220,10 @@ def describe_verdict(verdict: Mapping[str, Any]) -> str:
     return f"{verdict['outcome'].upper()}: {reasons}"
 
 
-def _fly(options: argparse.Namespace) -> int:
+def _fly(options: argparse.Namespace, api: Api) -> int:
     """Post a mission, wait for its verdict, return the exit code; on Ctrl-C cancel the mission."""
-    if options.api is None:
-        raise BadInputError("fly needs --api; without a Job use: cloudrc mission run FILE")
     interrupt_on_signals()
-    api, mission_id, text = Api(options.api, token_reader(token_file(options))), "", ""
+    mission_id, text = "", ""
     follower = MissionFollower(api, API_TIMEOUT)
     try:
         mission = read_mission(options.mission)
@@ -261,9 +254,8 @@ def _run(options: argparse.Namespace, api: Api) -> int:
     try:
         verdict = follower.follow(mission_id)
     except KeyboardInterrupt:
-        state = "is waiting or flying" if options.queue else "is still flying"
         command = f"cloudrc mission cancel {mission_id}"
-        print_line(f"mission {mission_id} {state}; cancel it: {command}", sys.stderr)
+        print_line(f"mission {mission_id} goes on; cancel it: {command}", sys.stderr)
         raise
     print_line(describe_verdict(verdict))
     return int(verdict["exit_code"])
@@ -370,23 +362,30 @@ def _acknowledge(options: argparse.Namespace, api: Api) -> int:
     return 0
 
 
-def _drive(options: argparse.Namespace, api: Api) -> int:
+def _drive(_: argparse.Namespace, api: Api) -> int:
     from cloudrc.cli.drive import drive
 
     return drive(api)
 
 
-API_VERBS: dict[str, Callable[[argparse.Namespace, Api], int]] = {
-    "run": _run,
-    "list": _list,
-    "status": _status,
-    "cancel": _cancel,
-    "logs": _logs,
-    **dict.fromkeys(("goto", "hold", "resume"), _order),
-    "drive": _drive,
-    "estop": _estop,
-    "acknowledge": _acknowledge,
+VERBS: dict[str, tuple[str, Callable[[argparse.Namespace, Api], int]]] = {
+    "run": ("fly a mission and show its progress until the verdict", _run),
+    "list": ("list all missions", _list),
+    "status": ("show the robot's state, or the state of a mission", _status),
+    "cancel": ("cancel a mission; the robot holds its position", _cancel),
+    "logs": ("show the events of missions", _logs),
+    "goto": ("fly to a point; a held mission then holds there", _order),
+    "drive": ("drive the robot with the keys of this terminal", _drive),
+    "hold": ("hold the robot where it is, at least 0.35 m above the ground", _order),
+    "resume": ("resume the held mission", _order),
+    "estop": ("stop the rotors at once: the robot falls and its mission fails", _estop),
+    "acknowledge": (
+        "allow flights again after a stop or a landing; does not start the rotors",
+        _acknowledge,
+    ),
+    "fly": ("fly a mission inside a Job: post it, follow it, exit with the verdict", _fly),
 }
+"""Verb -> help line, and function that carries it out."""
 
 
 def describe_mission(mission: Json) -> str:

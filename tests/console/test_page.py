@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 import urllib.request
-from contextlib import ExitStack, redirect_stdout
 
 import numpy as np
 import pytest
@@ -51,16 +50,15 @@ def flight(tmp_path):
 @pytest.fixture
 def filled(api):
     """Make the page of an experiment without a browser: the page, its feed and its steering."""
-    with ExitStack() as opened, redirect_stdout(io.StringIO()):
+    page = Page(0)
 
-        def fill(name):
-            page = Page(0)
-            opened.callback(page.close)
-            feed, steering = FlightFeed(Scene("empty")), Steering(api)
-            page.fill(load_experiment(name), feed, steering)
-            return page, feed, steering
+    def fill(name):
+        feed, steering = FlightFeed(Scene("empty")), Steering(api)
+        page.fill(load_experiment(name), feed, steering)
+        return page, feed, steering
 
-        yield fill
+    yield fill
+    page.close()
 
 
 def answers(api):

@@ -1,8 +1,5 @@
 """The 3-D scene: its colours, and the nodes that it shows."""
 
-from contextlib import redirect_stdout
-from io import StringIO
-
 import matplotlib
 import numpy as np
 import pytest
@@ -15,10 +12,9 @@ from cloudrc.geometry.clearance import CLEARANCE_SHOWN
 
 @pytest.fixture
 def server():
-    with redirect_stdout(StringIO()):
-        one = viser.ViserServer("127.0.0.1", 0, verbose=False)
-        yield one
-        one.stop()
+    one = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    yield one
+    one.stop()
 
 
 def test_the_trail_has_the_colours_of_the_figures():
