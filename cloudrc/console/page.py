@@ -143,13 +143,11 @@ class Page:
         with self._server.atomic():
             if feed.telemetry is not None:
                 odometry = feed.telemetry.odometry
-                scene.set_robot(*_visible(odometry.position, odometry.orientation_wxyz))
+                scene.move("robot", *_visible(odometry.position, odometry.orientation_wxyz))
             control = feed.control if feed.controls(now) else None
-            if control is None:
-                scene.set_ghost(None, None)
-            else:
-                scene.set_ghost(*_visible(control.position, control.orientation_wxyz))
-            scene.set_setpoint(control.setpoint if control else None)
+            ghost = control and _visible(control.position, control.orientation_wxyz)
+            scene.move("ghost", *(ghost or (None,)))
+            scene.move("setpoint", control.setpoint if control else None)
         if now < self._due:
             return
         self._due = now + SLOW_PERIOD

@@ -63,12 +63,15 @@ class FlightScene:
         # Without a graphics card, shadows cost more than ten times the rest of a picture.
         self._scene.configure_default_lights(cast_shadow=False)
         self._add_surroundings(model, geometry)
-        self._robot = self._scene.add_frame("/robot", show_axes=False, position=geometry.spawn)
-        self._ghost = self._scene.add_frame("/ghost", show_axes=False, visible=False)
+        add = self._scene.add_frame
+        self._bodies: dict[str, Any] = {
+            "robot": add("/robot", show_axes=False, position=geometry.spawn),
+            "ghost": add("/ghost", show_axes=False, visible=False),
+            "setpoint": self._scene.add_icosphere(
+                "/setpoint", 0.09, SETPOINT, opacity=0.6, visible=False
+            ),
+        }
         self._add_robot(model)
-        self._setpoint = self._scene.add_icosphere(
-            "/setpoint", 0.09, SETPOINT, opacity=0.6, visible=False
-        )
         self._waypoints: list[Any] = []  # spheres
         self._points: Array = np.zeros((0, 3))  # of the waypoints [m]
         self._plan: Array = np.zeros((0, 3))  # waypoints that the line of the plan joins [m]
@@ -76,39 +79,37 @@ class FlightScene:
         camera = server.initial_camera
         camera.position, camera.look_at = _camera(geometry, waypoints, aspect)
 
-    def set_robot(self, position: Vector | Array, orientation_wxyz: Array) -> None:
-        """Move the robot to the `position` of its base [m], shape (3,).
+    def move(
+        self, body: str, position: Vector | Array | None, orientation_wxyz: Array | None = None
+    ) -> None:
+        """Move "robot", "ghost" (the predicted robot) or "setpoint"; position None hides the body.
 
-        `orientation_wxyz` is a unit quaternion, body to world, shape (4,).
+        Args:
+            body: One of the three names.
+            position: Position of the base [m], shape (3,).
+            orientation_wxyz: Unit quaternion, body to world, shape (4,); None keeps the last one.
         """
-        self._robot.position, self._robot.wxyz = np.asarray(position), np.asarray(orientation_wxyz)
-
-    def set_ghost(self, position: Vector | Array | None, orientation_wxyz: Array | None) -> None:
-        """Move the predicted robot to a `position` [m], shape (3,); None hides it.
-
-        `orientation_wxyz` is a unit quaternion, body to world, shape (4,).
-        """
-        if position is not None and orientation_wxyz is not None:
-            self._ghost.position = np.asarray(position)
-            self._ghost.wxyz = np.asarray(orientation_wxyz)
-        self._ghost.visible = position is not None
+        node = self._bodies[body]
+        if position is not None:
+            node.position = np.asarray(position)
+        if orientation_wxyz is not None:
+            node.wxyz = np.asarray(orientation_wxyz)
+        node.visible = position is not None
 
     def set_trail(self, points: Array, clearances: Array) -> None:
         """Draw the flown path, coloured by clearance.
 
         Args:
             points: Positions of the base [m], shape (n, 3).
-            clearances: Distance to the nearest wall at each point [m], shape (n,); NaN or an
-                empty array if unknown.
+            clearances: Distance to the nearest pipe wall at each point [m], shape (n,); infinite
+                without pipes.
         """
         if len(points) < 2:
             self._scene.remove_by_name("/trail")
             return
-        colours = np.tile(np.array(GHOST, dtype=np.uint8), (len(points), 1))
-        if len(clearances) == len(points):
-            known = np.isfinite(clearances)
-            colours[known] = clearance_colours(np.asarray(clearances)[known])
-        ends = [np.stack([each[:-1], each[1:]], axis=1) for each in (np.asarray(points), colours)]
+        near = np.isfinite(clearances)[:, None]
+        colours = np.where(near, clearance_colours(clearances), np.array(GHOST, dtype=np.uint8))
+        ends = [np.stack([each[:-1], each[1:]], axis=1) for each in (points, colours)]
         self._scene.add_line_segments("/trail", *ends, thickness=0.03)
 
     def set_waypoints(self, points: Array, reached: int) -> None:
@@ -141,12 +142,6 @@ class FlightScene:
         else:
             lines = np.stack([points[:-1], points[1:]], axis=1)
             self._scene.add_line_segments("/plan", lines, PLAN, thickness=0.03)
-
-    def set_setpoint(self, position: Vector | Array | None) -> None:
-        """Show the `position` that the controller tracks [m], shape (3,); None hides it."""
-        if position is not None:
-            self._setpoint.position = np.asarray(position)
-        self._setpoint.visible = position is not None
 
     def _add_surroundings(self, model: Any, geometry: Scene) -> None:
         """Add all static shapes: planes as grids, pipes as smooth tubes, the rest as they are."""
