@@ -39,8 +39,8 @@ PERIOD = 0.04
 LOOK_PERIOD = 1.0
 """Time between two looks whether the flight goes on [s]."""
 OWN_S = 150.0
-"""Time for which a pod's page shows a change of the link that it asked for [s]: then Kubernetes has
-written the change, or its refusal, into the file of the profile."""
+"""Time for which a pod's page shows the change of the link that it asked for [s]. Afterwards it
+shows the file of the profile, into which Kubernetes has written the change by then."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:

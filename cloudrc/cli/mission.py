@@ -229,7 +229,7 @@ def _fly(options: argparse.Namespace, api: Api) -> int:
         mission = read_mission(options.mission)
         mission_id = follower.post({**mission, "key": options.key, "queue": options.queue})
         verdict = follower.follow(mission_id)
-        text, code = describe_verdict(verdict), int(verdict["exit_code"])
+        text, code = escape(describe_verdict(verdict)), int(verdict["exit_code"])
     except KeyboardInterrupt:
         if mission_id:
             with suppress(CloudrcError):
@@ -241,8 +241,8 @@ def _fly(options: argparse.Namespace, api: Api) -> int:
         raise
     finally:
         with suppress(OSError):  # on failure Kubernetes shows the last line of the log instead
-            if TERMINATION_LOG.exists():
-                TERMINATION_LOG.write_text(escape(text) + "\n", encoding="utf-8")
+            if text and TERMINATION_LOG.exists():
+                TERMINATION_LOG.write_text(text + "\n", encoding="utf-8")
     print_line(text)
     return code
 

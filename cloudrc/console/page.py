@@ -1,7 +1,7 @@
 """The page of the console: 3-D scene, charts and state for all browsers, controls for the first.
 
-viser draws the page and serves it. Its keyboard API knows no release of a key; therefore a few
-lines of script on the page press the page's own buttons while keys are held.
+viser draws and serves the page. The keyboard API of viser does not report the release of a key.
+Therefore a script on the page presses the buttons of the drive while keys are held.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from cloudrc.messages import ZERO, GuardState, Quaternion, Vector
 
 SLOW_PERIOD = 0.3
 """Time between two updates of all but the moving bodies [s]."""
-ANSWER_SHOWN = 10.0
-"""Time for which a refusal is shown [s]; another answer is shown for half of it."""
+ANSWER_SHOWN = 8.0
+"""Time for which an answer is shown [s]."""
 PANEL_WIDTH = 330
 """Width of each panel beside the scene [px]."""
 NARROW = 900
@@ -195,7 +195,7 @@ class Page:
         feed, state = self._feed, self._steering.state
         if feed.telemetry is None:
             return "**waiting for the robot**"
-        guard, silence = feed.telemetry.guard, feed.silence(now)
+        guard, silence, age = feed.telemetry.guard, feed.silence(now), feed.command_age(now)
         mission = state.get("mission")
         doing = "none"
         if self._steering.velocity(now) != ZERO:
@@ -207,13 +207,13 @@ class Page:
             doing = f"{mission['name'] or mission['id']}, {mission['state']}, {reached}"
         lines = [
             f"**{GuardState(guard).name}**: {feed.telemetry.cause.words}",
-            f"Last command: {_age(feed.command_age(now))}",
+            f"Last command: {'none' if age == inf else f'{age:.2f} s ago'}",
             f"Mission: {doing}",
         ]
         if silence > STALE:
             lines[0] = f"**No telemetry for {silence:.1f} s**, last: {lines[0]}"
         text, is_refusal, at = self._steering.answer
-        if now - at < (ANSWER_SHOWN if is_refusal else ANSWER_SHOWN / 2):
+        if now - at < ANSWER_SHOWN:
             lines.append(f"**Refused** {text}" if is_refusal else text)
         elif seen := state.get("seen"):
             lines.append(seen["next_step"])
@@ -384,13 +384,6 @@ def _with_gaps(curve: Array) -> list[float | None]:
     """Replace NaN by None, a gap in the chart; no axis is drawn for a chart without a number."""
     values = [None if value != value else value for value in curve.tolist()]
     return [-1.0, *values[1:]] if not any(value is not None for value in values) else values
-
-
-def _age(seconds: float) -> str:
-    """Describe an age [s] in words."""
-    if seconds == inf:
-        return "none"
-    return f"{seconds:.1f} s ago" if seconds > 1.0 else f"{seconds * 1e3:.0f} ms ago"
 
 
 def _visible(position: Vector, orientation_wxyz: Quaternion) -> tuple[Any, Any]:

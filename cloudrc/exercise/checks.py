@@ -1,7 +1,7 @@
 """Score the exercise of docs/exercise.md: formulas on given samples, then flights in virtual time.
 
-cloudrc's own plug-ins are the reference. A part flies with them in the other two places, so that a
-wrong part costs no points of another one.
+The reference is cloudrc's own plug-ins. In the flight of a part, the other two parts are those of
+the reference, so that an error in one part costs no points of another part.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def _command(
 ) -> Any:
     """Return the command after `n` updates, 2 ms apart, at a speed [m/s], and one after a reset.
 
-    Without `sign` only their size: a wrong sign shall cost no other points than those of P.
+    Without `sign`, return absolute values, so that a wrong sign costs only the points of P.
     """
     controller, (x, y, z), seen = build(**gains), STATE.position, ZERO
     setpoint = Setpoint((2.0, -1.0, 0.2))
@@ -69,7 +69,7 @@ def _command(
 
 
 class Formula(NamedTuple):
-    """Compares what `measure` sees of the student's plug-in and of the reference."""
+    """A comparison of the results of the student's plug-in with those of the reference."""
 
     test: str
     points: int
@@ -90,7 +90,7 @@ class Formula(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """Flies; a metric gives all points at the value `full` and none at `none`."""
+    """A flight; a metric with the value `full` gives all points, with `none` no points."""
 
     test: str
     points: int

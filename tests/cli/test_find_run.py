@@ -52,7 +52,7 @@ def test_the_only_run_is_used_and_of_several_one_is_named(tmp_path, elsewhere, s
         assert said(0, "mission estop") == f"cloudrc: using the run in {tmp_path / 'a'}\n"
         with flying(elsewhere / "runs" / "latest") as here:
             error = said(2, "mission estop")
-            assert f"--run runs/latest or --run {tmp_path / 'a'}" in error
+            assert f"choose one: --run {tmp_path / 'a'} or --run runs/latest" in error
             assert (len(a.alarms), len(here.alarms)) == (1, 0)
             assert said(0, "mission estop --run", tmp_path / "a") == ""
     with flying(elsewhere / "runs" / "one"):
