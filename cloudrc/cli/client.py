@@ -14,7 +14,7 @@ import re
 import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlsplit
@@ -145,12 +145,12 @@ def mission_path(mission_id: str) -> str:
 
 
 def _refusal(answer: http.client.HTTPResponse, place: str, *, with_token: bool) -> CloudrcError:
-    body: Any = None
-    with suppress(OSError, ValueError, http.client.HTTPException):
+    try:
         body = json.loads(answer.read())
-    body = body if isinstance(body, dict) else {}  # another server may have answered
-    detail = escape(str(body.get("detail") or f"the API answered {answer.status} {answer.reason}"))
-    problems = body.get("problems") or []
+        detail, problems = str(body["detail"]), body.get("problems") or []
+    except (OSError, ValueError, TypeError, KeyError, http.client.HTTPException):
+        detail, problems = f"the API answered {answer.status} {answer.reason}", []
+    detail = escape(detail)
     if len(problems) > 1:
         parts = ([p[k] for k in ("path", "value", "reason") if p[k]] for p in problems)
         lines = [escape(": ".join(words)) for words in parts]
@@ -190,11 +190,11 @@ def token_reader(path: Path | None) -> Callable[[], str]:
 
 def _read(path: Path) -> str:
     try:
-        token = read(path).strip()
+        found = _TOKEN.fullmatch(read(path).strip())
     except OSError as error:
         raise BadInputError(f"--token-file {path}: {error.strerror}; name a file") from None
     except ValueError:  # a pipe, or a file that is too long
-        token = b""
-    if not _TOKEN.fullmatch(token):
+        found = None
+    if found is None:
         raise BadInputError(f"--token-file {path}: holds no token; name another file")
-    return token.decode("ascii")
+    return found[0].decode("ascii")

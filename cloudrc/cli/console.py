@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import io
-import os
-import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, redirect_stdout
-from dataclasses import dataclass
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from secrets import token_hex
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc.cli.client import UNIX, Api, token_argument, token_file, token_reader
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
@@ -43,8 +39,8 @@ PERIOD = 0.04
 LOOK_PERIOD = 1.0
 """Time between two looks whether the flight goes on [s]."""
 OWN_S = 150.0
-"""Time for which a pod's page shows a change of the link that it asked for [s]: then Kubernetes has
-written the change, or its refusal, into the file of the profile."""
+"""Time for which a pod's page shows the change of the link that it asked for [s]. Afterwards it
+shows the file of the profile, into which Kubernetes has written the change by then."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,9 +50,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("run", nargs="?", type=Path, metavar="RUN", help=about)
     port = "port of the page on 127.0.0.1 (default: any free port)"
     add("--port", type=whole_number(0, 65_535), default=0, metavar="N", help=port)
-    about = (
-        "show the page of a release; until Ctrl-C this command carries out its changes of the link"
-    )
+    about = "show the page of a release, and carry out its changes of the link until Ctrl-C"
     add("--cluster", action="store_true", help=about)
     release_arguments(parser)
     pod = parser.add_argument_group("in the container of the chart")
@@ -75,81 +69,61 @@ def execute(options: argparse.Namespace) -> int:
     if options.cluster or options.context or options.namespace or options.release:
         return _show_release(options)
     require("the console", ("console", "world"))
-    _check_port(options.port)
-    with ExitStack() as opened:
-        out = sys.stdout
-        opened.enter_context(redirect_stdout(io.StringIO()))  # viser prints about itself
-        if options.tap:
-            return _serve(options.port, _in_pod(options, out), opened, out)
-        _serve(options.port, _local(options), opened, out)
+    _serve(options.port, _in_pod(options) if options.tap else _local(options))
     print_line("the flight has ended", sys.stderr)
     return 0
 
 
-def _check_port(port: int) -> None:
-    """Raise a BadInputError if the port cannot be used: viser would silently take the next one."""
-    try:
-        socket.create_server(("127.0.0.1", port)).close()
-    except OSError as error:
-        text = f"--port {port}: {os.strerror(error.errno or 0)}; name another port, or none"
-        raise BadInputError(text) from None
+class Flight(NamedTuple):
+    """What the console shows."""
 
-
-@dataclass(frozen=True)
-class Flight:
-    """What the console shows.
-
-    Attributes:
-        config: Experiment file.
-        tap: Socket to which cloud sends its records.
-        api: API of teleop.
-        link: The way to the link.
-        ends: Returns whether the flight has ended.
-    """
-
-    config: Path
-    tap: Path
+    config: Path  # experiment file
+    tap: Path  # socket to which cloud sends its records
     api: Api
     link: Link
-    ends: Callable[[], bool]
+    has_ended: Callable[[], bool]
 
 
-def _serve(port: int, flight: Flight, opened: ExitStack, out: TextIO) -> int:
-    from cloudrc.console.page import Page
+def _serve(port: int, flight: Flight) -> None:
+    """Serve the page of a flight until it has ended."""
+    with ExitStack() as opened:
+        from cloudrc.console.page import Page
 
-    page = Page(port)
-    opened.callback(page.close)
-    from cloudrc.drivers.tap import TapListener
+        page = Page(port)
+        opened.callback(page.close)
+        from cloudrc.drivers.tap import TapListener
 
-    tap = TapListener(flight.tap, page.url)
-    opened.callback(tap.close)
-    print_line(f"console: {page.url}", out)
-    from cloudrc.config.load import read_experiment
-    from cloudrc.console.feed import FlightFeed
-    from cloudrc.console.steering import Steering
-    from cloudrc.geometry.scene import load_scene
+        tap = TapListener(flight.tap)
+        opened.callback(tap.close)
+        print_line(f"console: {page.url}")
+        from cloudrc.config.load import read_experiment
+        from cloudrc.console.feed import FlightFeed
+        from cloudrc.console.steering import Steering
+        from cloudrc.geometry.scene import load_scene
 
-    experiment = read_experiment(str(flight.config))
-    feed = FlightFeed(load_scene(experiment.world.scene))
-    steering = Steering(flight.api, flight.link)
-    steering.watch()
-    steering.start()
-    page.fill(experiment, feed, steering)
-    looked = time.monotonic()
-    while True:
-        records = tap.receive(PERIOD)
-        now = time.monotonic()
-        feed.take(records, now)
-        page.update(now)
-        if now - looked > LOOK_PERIOD:
-            looked = now
-            if flight.ends():
-                return 0
+        experiment = read_experiment(str(flight.config))
+        feed = FlightFeed(load_scene(experiment.world.scene))
+        steering = Steering(flight.api, flight.link)
+        steering.watch()
+        steering.start()
+        page.fill(experiment, feed, steering)
+        looked = time.monotonic()
+        while True:
+            records = tap.receive(PERIOD)
+            now = time.monotonic()
+            feed.take(records, now)
+            page.update(now)
+            if now - looked > LOOK_PERIOD:
+                looked = now
+                if flight.has_ended():
+                    return
 
 
 def _local(options: argparse.Namespace) -> Flight:
     """Return the flight of a run on this machine."""
-    from cloudrc.drivers.local import under_way
+    from cloudrc.cli.link_set import read_states, set_here
+    from cloudrc.console.steering import Link
+    from cloudrc.drivers.local import LINK_FOLDER, under_way
     from cloudrc.drivers.tap import TAP_FILE
 
     found = find_local_run(options, lambda run, api: (run, api), "no run flies there", flag="")
@@ -158,34 +132,39 @@ def _local(options: argparse.Namespace) -> Flight:
     run, url = found[0].resolve(), found[1]
     if not url:
         raise BadInputError(f"{run} flies without an API; the console needs one")
+
+    def read() -> dict[str, Any]:
+        states = read_states(run / LINK_FOLDER)
+        return states[0].profile if states else {}
+
+    link = Link(read, lambda settings: set_here(run / LINK_FOLDER, None, settings, token_hex(4)))
     tap = Path(url.removeprefix(UNIX)).with_name(TAP_FILE)
-    ends = lambda: under_way().get(run) != url  # noqa: E731
-    return Flight(run / "config.yaml", tap, Api(url), _local_link(run), ends)
+    return Flight(run / "config.yaml", tap, Api(url), link, lambda: under_way().get(run) != url)
 
 
-def _in_pod(options: argparse.Namespace, out: TextIO) -> Flight:
+def _in_pod(options: argparse.Namespace) -> Flight:
     """Return the flight of the pod in which this process runs.
 
     The pod has no right to change the link. It prints the changes that the operator asks for, and
     `cloudrc console --cluster` carries them out with the rights of its user.
     """
     from cloudrc.config.document import read_document
-    from cloudrc.config.load import DIRECTIONS
     from cloudrc.console.steering import Link
 
     own: dict[str, tuple[float, float]] = {}  # key -> value that was asked for last, and when [s]
 
-    def read() -> dict[str, float]:
-        tree = read_document(options.profile, str(options.profile)).tree
-        keys = [(way, key) for way in DIRECTIONS for key in ("delay_ms", "jitter_ms", "loss")]
-        found = {f"{way}.{key}": float(tree.get(way, {}).get(key, 0.0)) for way, key in keys}
-        now = time.monotonic()
-        return found | {key: value for key, (value, at) in own.items() if now - at < OWN_S}
+    def read() -> dict[str, Any]:
+        tree = dict(read_document(options.profile, str(options.profile)).tree)
+        for key, (value, at) in own.items():
+            if time.monotonic() - at < OWN_S:
+                way, _, name = key.partition(".")
+                tree[way] = {**tree.get(way, {}), name: value}
+        return tree
 
     def change(settings: Sequence[str]) -> None:
         pairs = (setting.split("=") for setting in settings)
         own.update({key: (float(value), time.monotonic()) for key, value in pairs})
-        print_line(f"{LINK_SET}{' '.join(settings)}", out)
+        print_line(f"{LINK_SET}{' '.join(settings)}")
 
     api = Api(options.api, token_reader(token_file(options)))
     return Flight(options.config, options.tap, api, Link(read, change), lambda: False)
@@ -213,25 +192,3 @@ def _show_release(options: argparse.Namespace) -> int:
         except CloudrcError as error:
             print_line(f"cloudrc: {line}: {error}", sys.stderr)
     raise InterruptedRunError("the container 'console' has ended; see its log")
-
-
-def _local_link(run: Path) -> Link:
-    """Return the way to the link of a run on this machine."""
-    from cloudrc.cli.link_set import read_states, set_here
-    from cloudrc.console.steering import Link
-    from cloudrc.drivers.local import LINK_FOLDER
-
-    folder = run / LINK_FOLDER
-
-    def read() -> dict[str, float]:
-        found: dict[str, float] = {}
-        for state in read_states(folder):
-            delay, jitter, loss = (state.asked.get(k) or 0.0 for k in ("delay", "jitter", "loss"))
-            values = {"delay_ms": delay * 1e3, "jitter_ms": jitter * 1e3, "loss": loss}
-            found |= {f"{state.direction}.{key}": value for key, value in values.items()}
-        return found
-
-    def change(settings: Sequence[str]) -> None:
-        set_here(folder, None, settings, token_hex(4))
-
-    return Link(read, change)

@@ -41,14 +41,20 @@ def find_local_run(
 ) -> _Found | None:
     """Find the run in flight that a command means: the folder of `--run`, else the only run.
 
-    Call `look` with the run's folder and the URL of its API ("" if the run has no API), and return
-    the result of `look`. Return None if no run is in flight or if the flags name a cluster.
-    `steers` tells whether the command changes the flight, `flag` how the user names the run.
+    Args:
+        options: Parsed arguments of the command.
+        look: Gets the run's folder and the URL of its API ("" without an API); its result is
+            returned. None means that the command cannot use this run.
+        nobody: Text of the error if `--run` names no run in flight.
+        steers: Whether the command changes the flight.
+        flag: How the user names the run.
+
+    Returns:
+        None if no run is in flight, or if the flags name a cluster.
 
     Raises:
-        BadInputError: If `--run` names a run that is not in flight, with the text `nobody`; if
-            several runs are in flight; or if the command would steer another flight after
-            ./runs/latest has ended.
+        BadInputError: If `--run` names no run in flight; if several runs are in flight; or if the
+            command would steer another flight after ./runs/latest has ended.
     """
     from cloudrc.drivers.local import under_way
 
@@ -82,15 +88,14 @@ def ask_if_unclear(candidates: Collection[Path], *, steers: bool, flag: str = "-
     names = " or ".join(f"{flag}{short(run)}" for run in sorted(candidates))
     if len(candidates) > 1:
         raise BadInputError(f"{len(candidates)} runs are flying here; choose one: {names}")
-    if latest in candidates:
-        return
-    if steers and (latest / RELAY_LOG).exists():  # a run in real time, so this user steered it
+    is_mine = latest in candidates
+    if steers and not is_mine and (latest / RELAY_LOG).exists():  # this user steered that flight
         names = names or "--release NAME (in a cluster)"
         why = "does not take this command" if latest in under_way() else "has ended"
         raise BadInputError(
             f"{short(latest)} {why}; name another flight: {names}; or start one: cloudrc up"
         )
-    if candidates:
+    if candidates and not is_mine:
         print_line(f"cloudrc: using the run in {names.removeprefix(flag)}", sys.stderr)
 
 

@@ -1,8 +1,6 @@
-"""Run `cloudrc mission`: fly and steer missions, in a local run or in a cluster.
+"""Run `cloudrc mission`: fly and steer missions by requests to the API of teleop.
 
-Each verb sends requests to the API of teleop, the process that commands missions. In a cluster,
-`run` instead creates a Kubernetes Job, whose pod posts the mission to the API. A command that waits
-for the end of a mission exits with the code of the mission's verdict.
+In a cluster, `run` creates a Kubernetes Job, whose pod posts the mission to the API.
 """
 
 from __future__ import annotations
@@ -33,7 +31,6 @@ from cloudrc.errors import (
 
 if TYPE_CHECKING:
     from cloudrc.cluster.client import Release
-    from cloudrc.config.document import Document
 
 EPILOG = """\
 where:
@@ -82,10 +79,10 @@ Json = dict[str, Any]
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-
-    def add(name: str, line: str) -> argparse.ArgumentParser:
-        verb = verbs.add_parser(
+    parsers = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    verbs = {}
+    for name, (line, _) in VERBS.items():
+        verbs[name] = verb = parsers.add_parser(
             name,
             help=line,
             description=line[0].upper() + line[1:] + ".",
@@ -100,55 +97,50 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         if name != "fly":
             run_argument(verb)
             release_arguments(verb)
-        return verb
-
-    run = add("run", "fly a mission and show its progress until the verdict")
+    run, fly = verbs["run"], verbs["fly"]
     run.add_argument("mission", metavar="FILE", help="mission file, or name of a shipped mission")
     timeout_argument(run)
     run.add_argument("--name", default="", help="name shown to people (default: the file's name)")
-    output_argument(add("list", "list all missions"))
-    status = add("status", "show the robot's state, or the state of a mission")
-    output_argument(status)
-    status.add_argument("id", nargs="?", metavar="ID", help="mission (default: show the robot)")
-    cancel = add("cancel", "cancel a mission; the robot holds its position")
-    cancel.add_argument("id", nargs="?", metavar="ID", help="mission (default: the current one)")
-    logs = add("logs", "show the events of missions")
-    logs.add_argument("id", nargs="?", metavar="ID", help="mission (default: all)")
-    logs.add_argument("-f", "--follow", action="store_true", help="keep printing new events")
-    goto = add("goto", "fly to a point; a held mission then holds there")
-    for axis in "XYZ":
-        goto.add_argument(axis.lower(), type=_metres, metavar=axis, help="[m], world frame")
-    add("drive", "drive the robot with the keys of this terminal")
-    add("hold", "hold the robot where it is, at least 0.35 m above the ground")
-    add("resume", "resume the held mission")
-    add("estop", "stop the rotors at once: the robot falls and its mission fails")
-    add("acknowledge", "allow flights again after a stop or a landing; does not start the rotors")
-    fly = add("fly", "fly a mission inside a Job: post it, follow it, exit with the verdict")
     fly.add_argument("--mission", required=True, metavar="FILE", help="mission file")
     fly.add_argument("--key", default="", help="a mission posted twice under one key flies once")
+    queue = "wait for the current mission to end"
     for verb in (run, fly):
-        verb.add_argument(
-            "--queue", action="store_true", help="wait for the current mission to end"
+        verb.add_argument("--queue", action="store_true", help=queue)
+    output_argument(verbs["list"])
+    output_argument(verbs["status"])
+    for name, default in (
+        ("status", "show the robot"),
+        ("cancel", "the current one"),
+        ("logs", "all"),
+    ):
+        verbs[name].add_argument(
+            "id", nargs="?", metavar="ID", help=f"mission (default: {default})"
         )
+    follow = "keep printing new events"
+    verbs["logs"].add_argument("-f", "--follow", action="store_true", help=follow)
+    for axis in "XYZ":
+        about = "[m], world frame"
+        verbs["goto"].add_argument(axis.lower(), type=_metres, metavar=axis, help=about)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the chosen verb."""
     verb: str = options.verb
-    if verb == "fly":
-        return _fly(options)
+    _, carry_out = VERBS[verb]
     if options.api:
-        return API_VERBS[verb](options, Api(options.api, token_reader(token_file(options))))
+        return carry_out(options, Api(options.api, token_reader(token_file(options))))
+    if verb == "fly":
+        raise BadInputError("fly needs --api; without a Job use: cloudrc mission run FILE")
 
     def look(run: Path, url: str) -> Api | None:
         return Api(url, place=str(run)) if url else None  # a local run needs no token: send none
 
     if (api := find_local_run(options, look, NO_API, steers=verb not in READS)) is not None:
-        return API_VERBS[verb](options, api)
+        return carry_out(options, api)
     if verb == "run":
         return _run_job(options)
     with _forwarded_api(options) as forwarded:
-        return API_VERBS[verb](options, forwarded)
+        return carry_out(options, forwarded)
 
 
 def _metres(text: str) -> float:
@@ -156,12 +148,6 @@ def _metres(text: str) -> float:
         return float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is not a number of metres") from None
-
-
-def _read(name: str) -> Document:
-    from cloudrc.config import shipped
-
-    return shipped.read("mission", name, Path())
 
 
 def read_mission(name: str, shown: str = "") -> Json:
@@ -172,7 +158,9 @@ def read_mission(name: str, shown: str = "") -> Json:
     Raises:
         BadInputError: If the file does not exist, or if it contains no mission.
     """
-    mission = dict(_read(name).tree)
+    from cloudrc.config import shipped
+
+    mission = dict(shipped.read("mission", name, Path()).tree)
     if mission.pop("steps", None) is not None:
         raise BadInputError(
             f"{name}: steps are for experiments; fly them with 'cloudrc run', or give waypoints"
@@ -184,14 +172,14 @@ class MissionFollower:
     """Follows one mission until its verdict, even if the API restarts in a new pod meanwhile."""
 
     def __init__(self, api: Api, patience: float) -> None:
-        """Store the API; `patience` is the time limit for an API that does not answer [s]."""
+        """Store the API; `patience` is the time limit for an API that does not answer [s].
+
+        After this time the methods raise a TimedOutError; other errors are those of `Api.post`.
+        """
         self._api, self._patience, self._last_event = api, patience, 0
 
     def post(self, mission: Mapping[str, Any]) -> str:
-        """Post a mission, and repeat the request until the API answers; return the mission's id.
-
-        Raise a TimedOutError if the API does not answer in time; other errors are as in `Api.post`.
-        """
+        """Post a mission; return its id."""
         view = self._retry(lambda: self._api.post("/v1/missions", mission))
         text = f"mission {view['id']}: {view['state']}, waypoints: {view['waypoints']}"
         back = mission.get("start", "spawn") == "spawn"
@@ -211,15 +199,14 @@ class MissionFollower:
             time.sleep(POLL_PERIOD)
 
     def _retry(self, request: Callable[[], _Answer]) -> _Answer:
-        """Repeat a request until the API answers; raise a TimedOutError after `patience`."""
+        """Repeat a request until the API answers."""
         deadline, reported = Deadline(self._patience, TURN_MAX), False
         while True:
             try:
                 return request()
             except UnreachableError as error:
                 if deadline.passed():
-                    waited = f"{error}; gave up after {self._patience:g} s"
-                    raise TimedOutError(waited) from None
+                    raise TimedOutError(f"{error}; gave up after {self._patience:g} s") from None
                 if not reported:
                     print_line(f"{error}; waiting")
                     reported = True
@@ -233,18 +220,16 @@ def describe_verdict(verdict: Mapping[str, Any]) -> str:
     return f"{verdict['outcome'].upper()}: {reasons}"
 
 
-def _fly(options: argparse.Namespace) -> int:
+def _fly(options: argparse.Namespace, api: Api) -> int:
     """Post a mission, wait for its verdict, return the exit code; on Ctrl-C cancel the mission."""
-    if options.api is None:
-        raise BadInputError("fly needs --api; without a Job use: cloudrc mission run FILE")
     interrupt_on_signals()
-    api, mission_id = Api(options.api, token_reader(token_file(options))), ""
+    mission_id, text = "", ""
     follower = MissionFollower(api, API_TIMEOUT)
     try:
         mission = read_mission(options.mission)
         mission_id = follower.post({**mission, "key": options.key, "queue": options.queue})
         verdict = follower.follow(mission_id)
-        text, code = describe_verdict(verdict), int(verdict["exit_code"])
+        text, code = escape(describe_verdict(verdict)), int(verdict["exit_code"])
     except KeyboardInterrupt:
         if mission_id:
             with suppress(CloudrcError):
@@ -252,17 +237,14 @@ def _fly(options: argparse.Namespace) -> int:
         text = "INTERRUPTED: the Job was stopped, its mission is cancelled"
         code = InterruptedRunError.exit_code
     except CloudrcError as error:
-        _write_termination_message(str(error))
+        text = str(error)
         raise
+    finally:
+        with suppress(OSError):  # on failure Kubernetes shows the last line of the log instead
+            if text and TERMINATION_LOG.exists():
+                TERMINATION_LOG.write_text(text + "\n", encoding="utf-8")
     print_line(text)
-    _write_termination_message(escape(text))
     return code
-
-
-def _write_termination_message(text: str) -> None:
-    with suppress(OSError):  # on failure Kubernetes shows the last line of the log instead
-        if TERMINATION_LOG.exists():
-            TERMINATION_LOG.write_text(text + "\n", encoding="utf-8")
 
 
 def _run(options: argparse.Namespace, api: Api) -> int:
@@ -272,9 +254,8 @@ def _run(options: argparse.Namespace, api: Api) -> int:
     try:
         verdict = follower.follow(mission_id)
     except KeyboardInterrupt:
-        state = "is waiting or flying" if options.queue else "is still flying"
         command = f"cloudrc mission cancel {mission_id}"
-        print_line(f"mission {mission_id} {state}; cancel it: {command}", sys.stderr)
+        print_line(f"mission {mission_id} goes on; cancel it: {command}", sys.stderr)
         raise
     print_line(describe_verdict(verdict))
     return int(verdict["exit_code"])
@@ -283,33 +264,30 @@ def _run(options: argparse.Namespace, api: Api) -> int:
 def _list(options: argparse.Namespace, api: Api) -> int:
     missions = api.get("/v1/missions")["missions"]
     if options.output != "table":
-        return _print({"missions": missions}, options.output)
+        print(format_document({"schemaVersion": 1, "missions": missions}, options.output))
+        return 0
     rows = [("ID", "NAME", "STATE", "WAYPOINTS", "VERDICT")]
     for each in missions:
         done = f"{len(each['reached'])}/{each['waypoints']}"
         verdict = describe_verdict(each["verdict"]) if each["verdict"] else ""
         rows.append((each["id"], each["name"], each["state"], done, verdict))
-    if not missions:
-        api.say("no missions yet")
-        return 0
-    if api.place:
-        api.say("missions, the oldest first")
-    print(table(rows))
+    if api.place or not missions:
+        api.say("missions, the oldest first" if missions else "no missions yet")
+    if missions:
+        print(table(rows))
     return 0
 
 
 def _status(options: argparse.Namespace, api: Api) -> int:
     state = api.get(mission_path(options.id) if options.id else "/v1/state")
     if options.output != "table":
-        return _print(state, options.output)
+        print(format_document({"schemaVersion": 1, **state}, options.output))
+        return 0
+    mission = state if options.id else state["mission"]
+    api.say(describe_mission(mission) if mission else "no mission is under way")
     if options.id:
-        api.say(_describe_mission(state))
         _print_history(state)
         return 0
-    if state["mission"]:
-        api.say(_describe_mission(state["mission"]))
-    else:
-        api.say("no mission is under way")
     if state["queue"]:
         print_line(f"waiting: {', '.join(state['queue'])}")
     _print_robot(state["seen"], state["cloud_age_s"])
@@ -317,14 +295,11 @@ def _status(options: argparse.Namespace, api: Api) -> int:
 
 
 def _cancel(options: argparse.Namespace, api: Api) -> int:
-    mission_id = options.id
-    if not mission_id:
-        mission = api.get("/v1/state")["mission"]
-        if mission is None:
-            raise BadInputError("no mission is under way; 'cloudrc mission list' shows all")
-        mission_id = mission["id"]
-    cancelled = api.post(f"{mission_path(mission_id)}/cancel")
-    api.say(f"{_describe_stay(api)}; {_describe_mission(cancelled)}")
+    mission = {"id": options.id} if options.id else api.get("/v1/state")["mission"]
+    if mission is None:
+        raise BadInputError("no mission is under way; 'cloudrc mission list' shows all")
+    cancelled = api.post(f"{mission_path(mission['id'])}/cancel")
+    api.say(f"{_describe_stay(api)}; {describe_mission(cancelled)}")
     return 0
 
 
@@ -343,15 +318,15 @@ def _logs(options: argparse.Namespace, api: Api) -> int:
 
 
 def _order(options: argparse.Namespace, api: Api) -> int:
-    point, verb = None, options.verb
-    if verb == "goto":
-        point = {"position_m": [options.x, options.y, options.z]}
-    mission = api.post(f"/v1/{verb}", point)
-    to = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
-    if verb == "goto":
-        to = f"({options.x:g}, {options.y:g}, {options.z:g})"
-    action = _describe_stay(api) if verb == "hold" else f"flying to {to}"
-    api.say(f"{action}; {_describe_mission(mission)}")
+    if options.verb == "goto":
+        point = options.x, options.y, options.z
+        mission = api.post("/v1/goto", {"position_m": point})
+        action = "flying to ({:g}, {:g}, {:g})".format(*point)
+    else:
+        mission = api.post(f"/v1/{options.verb}")
+        action = f"flying to waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
+        action = _describe_stay(api) if options.verb == "hold" else action
+    api.say(f"{action}; {describe_mission(mission)}")
     return 0
 
 
@@ -365,7 +340,7 @@ def _describe_stay(api: Api) -> str:
         if seen is not None and seen["guard"] == "GROUND":
             return "waiting on the ground"
         if seen is not None:
-            return f"holding at {_describe_point(seen['position_m'])}"
+            return f"holding at {describe_point(seen['position_m'])}"
     return "holding"
 
 
@@ -387,33 +362,41 @@ def _acknowledge(options: argparse.Namespace, api: Api) -> int:
     return 0
 
 
-def _drive(options: argparse.Namespace, api: Api) -> int:
+def _drive(_: argparse.Namespace, api: Api) -> int:
     from cloudrc.cli.drive import drive
 
     return drive(api)
 
 
-API_VERBS: dict[str, Callable[[argparse.Namespace, Api], int]] = {
-    "run": _run,
-    "list": _list,
-    "status": _status,
-    "cancel": _cancel,
-    "logs": _logs,
-    **dict.fromkeys(("goto", "hold", "resume"), _order),
-    "drive": _drive,
-    "estop": _estop,
-    "acknowledge": _acknowledge,
+VERBS: dict[str, tuple[str, Callable[[argparse.Namespace, Api], int]]] = {
+    "run": ("fly a mission and show its progress until the verdict", _run),
+    "list": ("list all missions", _list),
+    "status": ("show the robot's state, or the state of a mission", _status),
+    "cancel": ("cancel a mission; the robot holds its position", _cancel),
+    "logs": ("show the events of missions", _logs),
+    "goto": ("fly to a point; a held mission then holds there", _order),
+    "drive": ("drive the robot with the keys of this terminal", _drive),
+    "hold": ("hold the robot where it is, at least 0.35 m above the ground", _order),
+    "resume": ("resume the held mission", _order),
+    "estop": ("stop the rotors at once: the robot falls and its mission fails", _estop),
+    "acknowledge": (
+        "allow flights again after a stop or a landing; does not start the rotors",
+        _acknowledge,
+    ),
+    "fly": ("fly a mission inside a Job: post it, follow it, exit with the verdict", _fly),
 }
+"""Verb -> help line, and function that carries it out."""
 
 
-def _describe_mission(mission: Json) -> str:
+def describe_mission(mission: Json) -> str:
+    """Return name, state and waypoint of a mission, and its verdict, as one line of text."""
     where = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
     name = f" ({mission['name']})" if mission["name"] else ""
     verdict = f"; {describe_verdict(mission['verdict'])}" if mission["verdict"] else ""
     return f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}"
 
 
-def _describe_point(position: Sequence[float | None]) -> str:
+def describe_point(position: Sequence[float | None]) -> str:
     """Format a position [m]; None is unknown."""
     return f"({', '.join('?' if value is None else f'{value:.2f}' for value in position)})"
 
@@ -424,11 +407,10 @@ def _print_robot(seen: Json | None, cloud_age: float | None) -> None:
     if seen is None:
         print(f"no telemetry from the robot yet; is the link up? cloud heard {heard}")
         return
-    where = _describe_point(seen["position_m"])
+    where = describe_point(seen["position_m"])
     if seen["guard_for_s"] is None:
-        past = f"robot not heard for {seen['age_s']:.1f} s (guard {seen['guard']} then)"
-        print_line(f"{past}; cloud heard {heard}")
-        print_line(f"last seen at {where} m: {seen['cause']}")
+        print_line(f"robot not heard for {seen['age_s']:.1f} s; cloud heard {heard}")
+        print_line(f"last seen at {where} m, guard {seen['guard']}: {seen['cause']}")
     else:
         rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
         print_line(f"robot at {where} m, seen {seen['age_s']:.2f} s ago{rtt}")
@@ -445,11 +427,6 @@ def _print_history(mission: Json) -> None:
 def _print_events(events: Iterable[Json]) -> None:
     for event in events:
         print_line(f"{event['mission']:<4}{event['time_s']:8.2f} s  {event['text']}")
-
-
-def _print(document: Json, form: str) -> int:
-    print(format_document({"schemaVersion": 1, **document}, form))
-    return 0
 
 
 def _release(options: argparse.Namespace) -> Release:
@@ -483,13 +460,15 @@ def _time_limit(name: str, mission: Json) -> float:
     """
     from pydantic import ValidationError
 
+    from cloudrc.config import shipped
     from cloudrc.config.problems import from_pydantic, raise_problems
     from cloudrc.teleop.models import MissionRequest
 
     try:
         request = MissionRequest.model_validate_json(json.dumps(mission))
     except ValidationError as error:
-        raise_problems(_read(name), from_pydantic(error, MissionRequest), name)
+        document = shipped.read("mission", name, Path())
+        raise_problems(document, from_pydantic(error, MissionRequest), name)
         raise  # raise_problems found nothing to report
     return request.time_limit_s or LIMIT_MAX
 
@@ -505,14 +484,14 @@ def _run_job(options: argparse.Namespace) -> int:
     # After 'helm install' without --wait, the release needs some seconds to become ready.
     wait_ready(release, timeout=options.timeout, tell=print_line)
     job = run_job(release, mission, limit=limit, queue=options.queue)
-    where = f"on release '{release.name}' in namespace '{release.namespace}'"
-    print(f"Job {job.name} {where}", flush=True)
+    print_line(f"Job {job.name} on release '{release.name}' in namespace '{release.namespace}'")
     try:
         ended = follow(release, job.name, print_line, timeout=follow_limit(limit, options.queue))
     except KeyboardInterrupt:
         command = f"kubectl {' '.join(release.flags)} delete job {job.name}"
-        print(f"Job {job.name} is still running; cancel its mission: {command}", file=sys.stderr)
+        print_line(f"Job {job.name} is still running; cancel its mission: {command}", sys.stderr)
         raise
     if ended.exit_code is None:
         print_line(ended.message)
-    return 1 if ended.exit_code is None else ended.exit_code
+        return 1
+    return ended.exit_code

@@ -10,10 +10,10 @@ from __future__ import annotations
 import argparse
 import subprocess
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.find_run import ask_if_unclear, run_argument, short
@@ -32,8 +32,6 @@ Say = Callable[[str], None]
 """Function that prints a line beside the progress of a flight."""
 DOWN_LIMIT = 120.0
 """Time limit for a session to end and to write its report [s]."""
-CONSOLE_LIMIT = 2.0
-"""Time limit for the console to end after SIGTERM [s]; then it is killed."""
 NEXT = """\
 in another terminal:
   cloudrc mission run pipes
@@ -88,36 +86,31 @@ def _up(options: argparse.Namespace) -> int:
 @contextmanager
 def _console(folder: Path, say: Say) -> Iterator[None]:
     """Run `cloudrc console` while the block runs; `say` gets its address, or why there is none."""
+    from cloudrc.cluster.client import end_process
     from cloudrc.drivers.machine import interpreter
 
-    process = subprocess.Popen(
+    process: subprocess.Popen[Any] = subprocess.Popen(
         interpreter("-m", "cloudrc", "console", str(folder)),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        errors="replace",
         start_new_session=True,  # Ctrl-C reaches only this process, which ends the console
     )
 
-    def read() -> None:
-        assert process.stdout is not None
-        with process.stdout as lines:
-            for line in lines:
-                if line.startswith(("console:", "cloudrc:")):
-                    say(escape(line.rstrip()))
+    def read(lines: IO[str]) -> None:
+        for line in lines:
+            if line.startswith(("console:", "cloudrc:")):
+                say(escape(line.rstrip()))
 
-    reader = Thread(target=read, daemon=True)
-    reader.start()
-    try:
-        yield
-    finally:
-        process.terminate()
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(CONSOLE_LIMIT)
-        process.kill()
-        process.wait()
-        reader.join(CONSOLE_LIMIT)
+    reader = Thread(target=read, args=[process.stdout], daemon=True)
+    with process:
+        reader.start()
+        try:
+            yield
+        finally:
+            end_process(process)
+            reader.join()
 
 
 def _last_mission(folder: Path) -> Mission | None:
@@ -177,29 +170,26 @@ def _down(options: argparse.Namespace) -> int:
     """End a session, and print the path of its report."""
     from cloudrc.drivers.local import SESSION, end_session, flight_files
 
-    flights = flight_files()
-    found = [run for run, flight in flights.items() if flight.kind == SESSION]
-    others = [short(run) for run in flights if run not in found]
-    note = f"; {' and '.join(others)}: flown by 'cloudrc run', ends by Ctrl-C there" * bool(others)
+    sessions = [run for run, flight in flight_files().items() if flight.kind == SESSION]
     if options.run is not None:
-        found = [run for run in found if run == options.run.resolve()]
-        if not found:
-            raise BadInputError(f"--run {options.run}: no session runs there{note}")
-    if not found:
-        raise MissingPrerequisiteError(f"no session runs here; start one: cloudrc up{note}")
-    if options.run is None:
-        ask_if_unclear(found, steers=True)
-    (run,) = found
+        run = options.run.resolve()
+        if run not in sessions:
+            raise BadInputError(f"--run {options.run}: no session runs there")
+    elif not sessions:
+        text = "start one: cloudrc up; a flight of 'cloudrc run' ends by Ctrl-C there"
+        raise MissingPrerequisiteError(f"no session runs here; {text}")
+    else:
+        ask_if_unclear(sessions, steers=True)
+        (run,) = sessions
     end_session(run, DOWN_LIMIT)
+    name = short(run)
     if (run / "report.json").exists():
         print_line(short(run / "report.html"))
     elif last := _last_mission(run):
-        raise CloudrcError(
-            f"{short(run)}: ended; mission {last.id} flew, but has no report; the output of "
-            f"'cloudrc up' says why; to write it: cloudrc report {short(run)}"
-        )
+        text = f"ended; mission {last.id} flew, but has no report"
+        raise CloudrcError(f"{name}: {text}; to write it: cloudrc report {name}")
     else:
-        print_line(f"{short(run)}: ended; no mission flew")
+        print_line(f"{name}: ended; no mission flew")
     return 0
 
 

@@ -1,7 +1,7 @@
 """Keep what a console shows of a flight: the newest pose, the charts of the last 25 s, the trail.
 
-It takes the records that cloud sends through the tap. Cloud has no record of the downlink's delay.
-It is the newest round trip minus the uplink's delay, if world and cloud share a clock.
+The input is the records that cloud sends through the tap. No record has the delay of the downlink:
+this delay is the newest round trip minus the uplink's delay, if world and cloud share a clock.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from cloudrc.records import Arrival, Control, Record, SessionOpened, TelemetrySe
 WINDOW = 25.0
 """Time that the charts show [s]."""
 STALE = 0.5
-"""Age from which on a record no longer tells the present [s]."""
+"""Age from which a record is too old to be shown [s]."""
 TRAIL_STEP = 0.02
 """Shortest distance between two points of the trail [m]."""
 TRAIL_MAX = 4000
 """Largest number of points of the trail; older points are dropped."""
 JUMP = 0.5
-"""Distance between two poses from which on the robot was reset: a new trail begins [m]."""
+"""Distance between two poses from which a new trail begins, because the robot was reset [m]."""
 
 
 class Sample(NamedTuple):

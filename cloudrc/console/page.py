@@ -1,7 +1,7 @@
 """The page of the console: 3-D scene, charts and state for all browsers, controls for the first.
 
-viser draws the page and serves it. Its keyboard API knows no release of a key; therefore a few
-lines of script on the page press the page's own buttons while keys are held.
+viser draws and serves the page. The keyboard API of viser does not report the release of a key.
+Therefore a script on the page presses the buttons of the drive while keys are held.
 """
 
 from __future__ import annotations
@@ -13,26 +13,28 @@ from math import inf
 from typing import Any
 
 import numpy as np
+import rich
 import viser
 
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.console.feed import STALE, FlightFeed
-from cloudrc.console.steering import Steering, is_drive
+from cloudrc.console.steering import SLIDERS, Steering, is_drive
+from cloudrc.errors import BadInputError
 from cloudrc.geometry import fence
 from cloudrc.geometry.clearance import Array
-from cloudrc.geometry.scene import SPAWN, Scene, load_scene
+from cloudrc.geometry.scene import SPAWN, load_scene
 from cloudrc.messages import ZERO, GuardState, Quaternion, Vector
 
-CHART_PERIOD, TRAIL_PERIOD, TEXT_PERIOD = 0.2, 0.5, 0.25
-"""Times between two updates of the charts, the trail and the texts [s]."""
-ANSWER_SHOWN = 10.0
-"""Time for which a refusal is shown [s]; another answer is shown for half of it."""
+SLOW_PERIOD = 0.3
+"""Time between two updates of all but the moving bodies [s]."""
+ANSWER_SHOWN = 8.0
+"""Time for which an answer is shown [s]."""
 PANEL_WIDTH = 330
 """Width of each panel beside the scene [px]."""
 NARROW = 900
 """Width of the window below which the charts start collapsed [px]."""
-VIEW = np.tan(np.radians(75 / 2)) * np.array([(1280 - 2 * PANEL_WIDTH) / 800, 1.0])
-"""Tangents of half the angles of view, across and up, in a window of 1280 x 800 px."""
+ASPECT = (1280 - 2 * PANEL_WIDTH) / 800
+"""Width of the scene between the panels over its height, in a window of 1280 x 800 px."""
 BLUE, RED, GREEN = "#0072b2", "#d55e00", "#009e73"
 CHARTS: dict[str, tuple[float, float, dict[str, tuple[int, str]]]] = {
     "Delay [ms]": (1e3, 150, {"up": (1, BLUE), "down": (2, RED), "estimate": (3, GREEN)}),
@@ -42,13 +44,6 @@ CHARTS: dict[str, tuple[float, float, dict[str, tuple[int, str]]]] = {
 }
 """Title of a chart -> factor from SI units, smallest range of its axis, and its curves: name ->
 place in `Sample`, and colour."""
-LINK: dict[str, tuple[str, float, float, float]] = {
-    "delay_ms": ("delay [ms]", 500.0, 1.0, 1.0),
-    "jitter_ms": ("jitter [ms]", 100.0, 1.0, 1.0),
-    "loss": ("loss [%]", 50.0, 0.5, 100.0),
-}
-"""Key of a link direction -> label, largest value and step of its slider, and factor from the
-profile's unit to that of the slider."""
 KEYS: dict[str, tuple[str, Vector]] = {
     "KeyW": ("W up", (0.0, 0.0, 1.0)),
     "ArrowUp": ("↑ +x", (1.0, 0.0, 0.0)),
@@ -58,15 +53,9 @@ KEYS: dict[str, tuple[str, Vector]] = {
     "ArrowRight": ("→ -y", (0.0, -1.0, 0.0)),
 }
 """Key, by the name of browsers -> label of its button, and direction of the drive."""
+RELEASED = 0.3
+"""Time without a sign of a held key after which it counts as released [s]."""
 STOP, HOLD = "STOP", "Hold"
-BUTTONS = {
-    "cloudrc mission resume, or cancel": "Resume, or Cancel",
-    "cloudrc mission acknowledge": "Acknowledge",
-    "by 'cloudrc mission goto'": "with Target and Send",
-    "cancel it first, or queue the new one": "press Cancel first",
-    "hold or cancel it first": "press Hold or Cancel first",
-}
-"""What teleop tells the operator to do -> how to do it on the page."""
 SCRIPT = """
 const drive = %s;
 const find = text =>
@@ -107,17 +96,25 @@ class Page:
     """The page of one flight, at `url`."""
 
     def __init__(self, port: int) -> None:
-        """Serve a page on this machine only, at a free port; port 0 means any."""
+        """Serve a page on this machine only; port 0 means any free port.
+
+        Raises:
+            BadInputError: If another program uses the port.
+        """
+        rich.get_console().quiet = True  # viser prints about itself
         self._server = viser.ViserServer("127.0.0.1", port, label="cloudrc", verbose=False)
-        self.url = f"http://127.0.0.1:{self._server.get_port()}"
+        found = self._server.get_port()
+        if found != port and port:  # viser has taken the next free port
+            self._server.stop()
+            raise BadInputError(f"--port {port}: is in use; name another port, or none")
+        self.url = f"http://127.0.0.1:{found}"
         self._server.gui.configure_theme(show_share_button=False, show_logo=False)
         self._lock = threading.Lock()
         self._pilot: int | None = None  # the client that has the controls
-        self._due = dict.fromkeys(("charts", "trail", "texts"), 0.0)
+        self._due = -inf  # time of the next slow update [s]
         self._touched = -inf  # when somebody last moved a slider [s]
         self._sliders: dict[str, Any] = {}
         self._target: tuple[Any, Any] | None = None  # gizmo and its numbers, until somebody moves
-        self._shown: tuple[Any, ...] = ()  # waypoints
         self._drawn = 0  # points of the trail
 
     def fill(self, experiment: ResolvedExperiment, feed: FlightFeed, steering: Steering) -> None:
@@ -125,14 +122,12 @@ class Page:
         self._experiment, self._feed, self._steering = experiment, feed, steering
         from cloudrc.console.scene import LEGEND, FlightScene  # needs MuJoCo, which takes a second
 
-        geometry = load_scene(experiment.world.scene)
-        self._scene = FlightScene(self._server, experiment)
-        self._place_camera(geometry)
+        self._scene = FlightScene(self._server, experiment, ASPECT)
         gui = self._server.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_WIDTH)
         self._status = gui.add_markdown("waiting for the robot", order=2)
-        if geometry.pipes:
+        if load_scene(experiment.world.scene).pipes:
             gui.add_html(LEGEND, order=2.5)
         panel = gui.add_panel()
         with panel.add_tab("Charts"):
@@ -148,66 +143,34 @@ class Page:
         with self._server.atomic():
             if feed.telemetry is not None:
                 odometry = feed.telemetry.odometry
-                scene.set_robot(*_visible(odometry.position, odometry.orientation_wxyz))
+                scene.move("robot", *_visible(odometry.position, odometry.orientation_wxyz))
             control = feed.control if feed.controls(now) else None
-            if control is None:
-                scene.set_ghost(None, None)
-            else:
-                scene.set_ghost(*_visible(control.position, control.orientation_wxyz))
-            scene.set_setpoint(control.setpoint if control else None)
-        if self._is_due("charts", CHART_PERIOD, now):
-            columns = feed.columns()
-            for chart, (factor, _, curves) in zip(self._charts, CHARTS.values(), strict=True):
-                rows = [_with_gaps(columns[place] * factor) for place, _ in curves.values()]
-                # Not chart.data: it would make numbers of the values that are unknown.
-                chart._queue_update("data", (columns[0], *rows))
-        if self._is_due("trail", TRAIL_PERIOD, now):
-            if feed.flown != self._drawn:
-                self._drawn = feed.flown
-                scene.set_trail(*feed.trail())
-            self._show_route()
-        if self._is_due("texts", TEXT_PERIOD, now):
-            self._status.content = self._describe(now)
-            self._follow_link(now)
-            if target := self._target:
-                target[0].position = target[1].value = self._place_target(now)
+            ghost = control and _visible(control.position, control.orientation_wxyz)
+            scene.move("ghost", *(ghost or (None,)))
+            scene.move("setpoint", control.setpoint if control else None)
+        if now < self._due:
+            return
+        self._due = now + SLOW_PERIOD
+        columns = feed.columns()
+        for chart, (factor, _, curves) in zip(self._charts, CHARTS.values(), strict=True):
+            rows = [_with_gaps(columns[place] * factor) for place, _ in curves.values()]
+            # Not chart.data: it would make numbers of the values that are unknown.
+            chart._queue_update("data", (columns[0], *rows))
+        if feed.flown != self._drawn:
+            self._drawn = feed.flown
+            scene.set_trail(*feed.trail())
+        mission, route = self._steering.state.get("mission"), self._steering.route
+        if not (mission and route):
+            route = [point.position_m for point in self._experiment.mission.waypoints]
+        scene.set_waypoints(np.array(route), len(mission["reached"]) if mission else 0)
+        self._status.content = self._describe(now)
+        self._follow_link(now)
+        if target := self._target:
+            target[0].position = target[1].value = self._place_target(now)
 
     def close(self) -> None:
         """Stop serving the page."""
         self._server.stop()
-
-    def _place_camera(self, scene: Scene) -> None:
-        """Look along +x, so that the arrow keys fly away from the viewer, to the left and so on.
-
-        The place is the nearest one from which spawn, pipes and waypoints are in sight.
-        """
-        half = [0.5 * pipe.length * np.array(pipe.axis) for pipe in scene.pipes]
-        ends = [
-            pipe.centre + sign * part
-            for pipe, part in zip(scene.pipes, half, strict=True)
-            for sign in (-1, 1)
-        ]
-        waypoints = [point.position_m for point in self._experiment.mission.waypoints]
-        forward = np.array([0.7, -0.2, -0.7]) / np.linalg.norm([0.7, -0.2, -0.7])
-        right = np.cross(forward, (0.0, 0.0, 1.0)) / np.hypot(*forward[:2])
-        axes = np.array([right, np.cross(right, forward), forward])
-        *across, depth = axes @ np.array([scene.spawn, *ends, *waypoints]).T
-        slope = 0.85 * VIEW[:, None]  # with a margin
-        least, most = (across - slope * depth).max(axis=1), (across + slope * depth).min(axis=1)
-        middle = (depth.min() + depth.max()) / 2
-        back = min(((most - least) / (2 * slope[:, 0])).min(), middle - 3.5)
-        place = (least + most) / 2
-        for _ in range(20):  # until the picture has equal margins
-            seen = (across - place[:, None]) / (depth - back)
-            place += (seen.max(axis=1) + seen.min(axis=1)) / 2 * (depth.min() - back)
-        camera = self._server.initial_camera
-        camera.look_at, camera.position = ((*place, far) @ axes for far in (middle, back))
-
-    def _is_due(self, what: str, period: float, now: float) -> bool:
-        if now < self._due[what]:
-            return False
-        self._due[what] = now + period
-        return True
 
     def _add_chart(self, title: str) -> Any:
         _, span, curves = CHARTS[title]
@@ -227,47 +190,34 @@ class Page:
             height=132,
         )
 
-    def _show_route(self) -> None:
-        mission = self._steering.state.get("mission")
-        route = [point.position_m for point in self._experiment.mission.waypoints]
-        if mission and self._steering.route:
-            route = self._steering.route
-        shown = tuple(map(tuple, route)), len(mission["reached"]) if mission else 0
-        if shown != self._shown:
-            self._shown = shown
-            self._scene.set_waypoints(np.array(route).reshape(-1, 3), shown[1])
-
     def _describe(self, now: float) -> str:
         """Return guard, command age, mission and the newest answer, as Markdown."""
         feed, state = self._feed, self._steering.state
         if feed.telemetry is None:
             return "**waiting for the robot**"
-        guard, silence = feed.telemetry.guard, feed.silence(now)
+        guard, silence, age = feed.telemetry.guard, feed.silence(now), feed.command_age(now)
         mission = state.get("mission")
         doing = "none"
-        if mission:
+        if self._steering.velocity(now) != ZERO:
+            doing = "driving"
+        elif is_drive(mission):
+            doing = "drive, waits for keys"
+        elif mission:
             reached = f"{len(mission['reached'])} of {mission['waypoints']} waypoints"
-            drives = self._steering.velocity(now) != ZERO
-            doing = "driving" if drives else mission["state"]
-            doing = f"{mission['name'] or mission['id']}, {doing}, {reached}"
-            if is_drive(mission):
-                doing = "driving" if drives else "drive, waits for keys"
+            doing = f"{mission['name'] or mission['id']}, {mission['state']}, {reached}"
         lines = [
             f"**{GuardState(guard).name}**: {feed.telemetry.cause.words}",
-            f"Last command: {_age(feed.command_age(now))}",
+            f"Last command: {'none' if age == inf else f'{age:.2f} s ago'}",
             f"Mission: {doing}",
         ]
         if silence > STALE:
             lines[0] = f"**No telemetry for {silence:.1f} s**, last: {lines[0]}"
         text, is_refusal, at = self._steering.answer
-        if now - at < (ANSWER_SHOWN if is_refusal else ANSWER_SHOWN / 2):
+        if now - at < ANSWER_SHOWN:
             lines.append(f"**Refused** {text}" if is_refusal else text)
         elif seen := state.get("seen"):
             lines.append(seen["next_step"])
-        text = "  \n".join(lines)
-        for asked, here in BUTTONS.items():
-            text = text.replace(asked, here)
-        return text
+        return "  \n".join(lines).replace("cloudrc mission ", "")  # buttons have the verbs' names
 
     def _follow_link(self, now: float) -> None:
         """Move the sliders after a change from elsewhere, unless somebody moves them here."""
@@ -276,7 +226,7 @@ class Page:
         for key, slider in self._sliders.items():
             value = self._steering.conditions.get(key)
             if value is not None:
-                shown = min(value * LINK[key.partition(".")[2]][-1], slider.max)
+                shown = min(value * SLIDERS[key.partition(".")[2]][-1], slider.max)
                 if abs(slider.value - shown) > 1e-6:
                     slider.value = shown
 
@@ -402,15 +352,15 @@ class Page:
             @button.on_hold
             async def _(_: object, code: str = code, direction: Vector = direction) -> None:
                 x, y, z = (part * _clamp(speed) for part in direction)
-                steering.hold_key(code, (x, y, z))
+                steering.hold_key(code, (x, y, z), RELEASED)
 
             @button.on_click
             async def _(_: object, code: str = code) -> None:
-                steering.release_key(code)
+                steering.release_keys(code)
 
     def _add_link(self, gui: viser.GuiApi) -> None:
         for way in ("uplink", "downlink"):
-            for name, (label, largest, step, factor) in LINK.items():
+            for name, (label, largest, step, factor) in SLIDERS.items():
                 key = f"{way}.{name}"
                 label = f"{way.removesuffix('link').title()} {label}"
                 slider = self._sliders[key] = gui.add_slider(label, 0.0, largest, step, 0.0)
@@ -434,13 +384,6 @@ def _with_gaps(curve: Array) -> list[float | None]:
     """Replace NaN by None, a gap in the chart; no axis is drawn for a chart without a number."""
     values = [None if value != value else value for value in curve.tolist()]
     return [-1.0, *values[1:]] if not any(value is not None for value in values) else values
-
-
-def _age(seconds: float) -> str:
-    """Describe an age [s] in words."""
-    if seconds == inf:
-        return "none"
-    return f"{seconds:.1f} s ago" if seconds > 1.0 else f"{seconds * 1e3:.0f} ms ago"
 
 
 def _visible(position: Vector, orientation_wxyz: Quaternion) -> tuple[Any, Any]:

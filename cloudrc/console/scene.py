@@ -6,13 +6,14 @@ Only this module imports mjviser, which converts the shapes of the MuJoCo model 
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from cloudrc.config.schema import Experiment
+from cloudrc.config.load import ResolvedExperiment
 from cloudrc.geometry.clearance import CLEARANCE_SHOWN, Array
 from cloudrc.geometry.scene import Pipe, Scene, load_scene
 from cloudrc.messages import Vector
@@ -28,6 +29,8 @@ FLOOR: dict[str, Any] = {
 }
 """Look of a plane, which is a grid."""
 GHOST_OPACITY, PIPE_OPACITY = 0.35, 0.5
+VIEW, LOOK, NEAREST = np.radians(75.0), np.array([0.7, -0.2, -0.7]), 3.5
+"""Viewer: vertical angle of view [rad], direction, least distance from the middle [m]."""
 VIRIDIS = "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725"
 """Colours of clearance in the figures, evenly spaced from 0 to `CLEARANCE_SHOWN`."""
 LEGEND = (
@@ -44,8 +47,13 @@ class FlightScene:
     The world frame of the scene is that of the flight [m]; its z axis points up.
     """
 
-    def __init__(self, server: viser.ViserServer, experiment: Experiment) -> None:
+    def __init__(
+        self, server: viser.ViserServer, experiment: ResolvedExperiment, aspect: float = 1.5
+    ) -> None:
         """Add the static shapes, and the robot at its spawn.
+
+        The first view shows the whole mission in a window whose width is at least `aspect` times
+        its height.
 
         Raises:
             BadInputError: If robot or scene are missing or unsuitable.
@@ -55,50 +63,53 @@ class FlightScene:
         # Without a graphics card, shadows cost more than ten times the rest of a picture.
         self._scene.configure_default_lights(cast_shadow=False)
         self._add_surroundings(model, geometry)
-        self._robot = self._scene.add_frame("/robot", show_axes=False, position=geometry.spawn)
-        self._ghost = self._scene.add_frame("/ghost", show_axes=False, visible=False)
+        add = self._scene.add_frame
+        self._bodies: dict[str, Any] = {
+            "robot": add("/robot", show_axes=False, position=geometry.spawn),
+            "ghost": add("/ghost", show_axes=False, visible=False),
+            "setpoint": self._scene.add_icosphere(
+                "/setpoint", 0.09, SETPOINT, opacity=0.6, visible=False
+            ),
+        }
         self._add_robot(model)
-        self._setpoint = self._scene.add_icosphere(
-            "/setpoint", 0.09, SETPOINT, opacity=0.6, visible=False
-        )
         self._waypoints: list[Any] = []  # spheres
         self._points: Array = np.zeros((0, 3))  # of the waypoints [m]
         self._plan: Array = np.zeros((0, 3))  # waypoints that the line of the plan joins [m]
-        server.initial_camera.position, server.initial_camera.look_at = _camera(geometry)
+        waypoints = [point.position_m for point in experiment.mission.waypoints]
+        camera = server.initial_camera
+        camera.position, camera.look_at = _camera(geometry, waypoints, aspect)
 
-    def set_robot(self, position: Vector | Array, orientation_wxyz: Array) -> None:
-        """Move the robot to the `position` of its base [m], shape (3,).
+    def move(
+        self, body: str, position: Vector | Array | None, orientation_wxyz: Array | None = None
+    ) -> None:
+        """Move "robot", "ghost" (the predicted robot) or "setpoint"; position None hides the body.
 
-        `orientation_wxyz` is a unit quaternion, body to world, shape (4,).
+        Args:
+            body: One of the three names.
+            position: Position of the base [m], shape (3,).
+            orientation_wxyz: Unit quaternion, body to world, shape (4,); None keeps the last one.
         """
-        self._robot.position, self._robot.wxyz = np.asarray(position), np.asarray(orientation_wxyz)
-
-    def set_ghost(self, position: Vector | Array | None, orientation_wxyz: Array | None) -> None:
-        """Move the predicted robot to a `position` [m], shape (3,); None hides it.
-
-        `orientation_wxyz` is a unit quaternion, body to world, shape (4,).
-        """
-        if position is not None and orientation_wxyz is not None:
-            self._ghost.position = np.asarray(position)
-            self._ghost.wxyz = np.asarray(orientation_wxyz)
-        self._ghost.visible = position is not None
+        node = self._bodies[body]
+        if position is not None:
+            node.position = np.asarray(position)
+        if orientation_wxyz is not None:
+            node.wxyz = np.asarray(orientation_wxyz)
+        node.visible = position is not None
 
     def set_trail(self, points: Array, clearances: Array) -> None:
         """Draw the flown path, coloured by clearance.
 
         Args:
             points: Positions of the base [m], shape (n, 3).
-            clearances: Distance to the nearest wall at each point [m], shape (n,); NaN or an
-                empty array if unknown.
+            clearances: Distance to the nearest pipe wall at each point [m], shape (n,); infinite
+                without pipes.
         """
         if len(points) < 2:
             self._scene.remove_by_name("/trail")
             return
-        colours = np.tile(np.array(GHOST, dtype=np.uint8), (len(points), 1))
-        if len(clearances) == len(points):
-            known = np.isfinite(clearances)
-            colours[known] = clearance_colours(np.asarray(clearances)[known])
-        ends = [np.stack([each[:-1], each[1:]], axis=1) for each in (np.asarray(points), colours)]
+        near = np.isfinite(clearances)[:, None]
+        colours = np.where(near, clearance_colours(clearances), np.array(GHOST, dtype=np.uint8))
+        ends = [np.stack([each[:-1], each[1:]], axis=1) for each in (points, colours)]
         self._scene.add_line_segments("/trail", *ends, thickness=0.03)
 
     def set_waypoints(self, points: Array, reached: int) -> None:
@@ -131,12 +142,6 @@ class FlightScene:
         else:
             lines = np.stack([points[:-1], points[1:]], axis=1)
             self._scene.add_line_segments("/plan", lines, PLAN, thickness=0.03)
-
-    def set_setpoint(self, position: Vector | Array | None) -> None:
-        """Show the `position` that the controller tracks [m], shape (3,); None hides it."""
-        if position is not None:
-            self._setpoint.position = np.asarray(position)
-        self._setpoint.visible = position is not None
 
     def _add_surroundings(self, model: Any, geometry: Scene) -> None:
         """Add all static shapes: planes as grids, pipes as smooth tubes, the rest as they are."""
@@ -221,9 +226,21 @@ def _surface(
     return np.concatenate(circles), np.concatenate(faces)
 
 
-def _camera(geometry: Scene) -> tuple[Any, Any]:
-    """Choose where the viewer is and where the viewer looks [m], so that the scene is in sight."""
-    spots = np.array([geometry.spawn, *(pipe.centre for pipe in geometry.pipes)])
-    low, high = spots.min(axis=0), spots.max(axis=0)
-    middle, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 2.5)
-    return middle + size * np.array([0.44, 0.65, 0.50]), middle
+def _camera(geometry: Scene, waypoints: Sequence[Vector], aspect: float) -> tuple[Array, Array]:
+    """Return the place of the viewer, and the point at which the viewer looks [m], shape (3,).
+
+    The viewer looks along +x, so that the arrow keys fly away from the viewer, to the left and so
+    on, from the nearest place from which spawn, pipes and waypoints are in sight.
+    """
+    pipes = [(pipe.centre, 0.5 * pipe.length * np.array(pipe.axis)) for pipe in geometry.pipes]
+    ends = [centre + sign * half for centre, half in pipes for sign in (-1, 1)]
+    forward = LOOK / np.linalg.norm(LOOK)
+    right = np.cross(forward, (0.0, 0.0, 1.0)) / np.hypot(*forward[:2])
+    axes = np.array([right, np.cross(right, forward), forward])
+    *across, depth = axes @ np.array([geometry.spawn, *ends, *waypoints]).T
+    slope = 0.8 * np.tan(VIEW / 2) * np.array([[aspect], [1.0]])  # with a margin
+    least, most = (across - slope * depth).max(axis=1), (across + slope * depth).min(axis=1)
+    middle = (depth.min() + depth.max()) / 2
+    back = min(((most - least) / (2 * slope[:, 0])).min(), middle - NEAREST)
+    place = (least + most) / 2
+    return np.array([*place, back]) @ axes, np.array([*place, middle]) @ axes

@@ -1,4 +1,4 @@
-"""Carry out what the operator asks for on the page, and watch the state of missions and link.
+"""Carry out what the operator asks for on the page or in a terminal, and watch missions and link.
 
 The emergency stop, the drive and the changes of the link have threads of their own, with their own
 connections: none of them waits for the page, or for another request.
@@ -17,13 +17,18 @@ from cloudrc.errors import CloudrcError
 from cloudrc.messages import ZERO, Vector
 
 DRIVE_PERIOD = 0.1
-"""Time between two requests of a drive [s]; each is a heartbeat of the operator."""
-RELEASED = 0.3
-"""Time without a sign of a held key after which it counts as released [s]."""
+"""Longest time between two requests of a drive [s]; each is a heartbeat of the operator."""
 STOP_PERIOD = 0.2
 """Time between two attempts to send an emergency stop that nobody has answered [s]."""
-WATCH_PERIOD = 0.4
+WATCH_PERIOD = 0.3
 """Time between two looks at the state of missions and link [s]."""
+SLIDERS: dict[str, tuple[str, float, float, float]] = {
+    "delay_ms": ("delay [ms]", 500.0, 1.0, 1.0),
+    "jitter_ms": ("jitter [ms]", 100.0, 1.0, 1.0),
+    "loss": ("loss [%]", 50.0, 0.5, 100.0),
+}
+"""Key of a link direction -> label, largest value and step of its slider, and factor from the
+profile's unit to that of the slider."""
 
 
 class Api(Protocol):
@@ -41,17 +46,17 @@ class Link:
     """The way to the emulated link, on this machine or in a cluster.
 
     Attributes:
-        read: Returns "uplink.delay_ms" and the like -> the present value; {} if unknown.
+        read: Returns the present profile, as in its file; {} if unknown.
         change: Applies settings such as "uplink.delay_ms=120"; raises a CloudrcError.
     """
 
-    read: Callable[[], dict[str, float]]
-    change: Callable[[Sequence[str]], object]
+    read: Callable[[], Mapping[str, Any]] = dict
+    change: Callable[[Sequence[str]], object] = list
 
 
 @dataclass
 class Steering:
-    """Sends the operator's requests; `answer` is the newest result in words.
+    """Sends the operator's requests.
 
     Attributes:
         api: Makes no connection that stays open, so that several threads may use it.
@@ -59,26 +64,35 @@ class Steering:
         answer: Newest result in words, whether it is a refusal, and its time [s].
         state: Newest answer of the API's `GET /v1/state`; {} before the first.
         route: Waypoints of the mission under way [m], shape (n, 3); empty if none.
-        conditions: Values that `Link.read` has returned last.
+        conditions: "uplink.delay_ms" and the like -> present value, in the unit of the key.
     """
 
     api: Api
-    link: Link
+    link: Link = Link()
     answer: tuple[str, bool, float] = ("", False, -inf)
     state: dict[str, Any] = field(default_factory=dict)
     route: list[Vector] = field(default_factory=list)
     conditions: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._stops, self._changed = threading.Event(), threading.Event()
-        self._held: dict[str, tuple[Vector, float]] = {}  # key -> velocity and last sign of it
+        self._stops, self._changed, self._moved = (threading.Event() for _ in range(3))
+        self._drive = threading.Thread(target=self._drive_loop, daemon=True)
+        self._drives = True
+        self._held: dict[str, tuple[Vector, float]] = {}  # key -> velocity, and end of the hold
         self._changes: dict[str, float] = {}
         self._mission = ""
 
     def start(self) -> None:
         """Start the threads; they end with the process."""
-        for loop in (self._stop_loop, self._drive_loop, self._link_loop, self._watch_loop):
-            threading.Thread(target=loop, name=loop.__name__, daemon=True).start()
+        self._drive.start()
+        for loop in (self._stop_loop, self._link_loop, self._watch_loop):
+            threading.Thread(target=loop, daemon=True).start()
+
+    def end_drive(self) -> None:
+        """Release all keys, and wait until teleop has been told."""
+        self._drives = False
+        self.release_keys()
+        self._drive.join()
 
     def stop(self) -> None:
         """Stop the rotors, and repeat the request until the API answers; return at once."""
@@ -121,24 +135,48 @@ class Steering:
             return
         self.ask(f"flying to ({x:g}, {y:g}, {z:g})", "/v1/goto", {"position_m": (x, y, z)})
 
-    def hold_key(self, key: str, velocity: Vector) -> None:
-        """Note that `key` is held; it adds `velocity` [m/s] to the drive. Call it repeatedly."""
-        self._held[key] = velocity, time.monotonic()
+    def hold_key(self, key: str, velocity: Vector, lasts: float) -> None:
+        """Add `velocity` [m/s] to the drive while `key` is held: for `lasts` [s] from now on."""
+        before, now = self.velocity(time.monotonic()), time.monotonic()
+        self._held = {**self._held, key: (velocity, now + lasts)}
+        if self.velocity(now) != before:
+            self._moved.set()
 
-    def release_key(self, key: str) -> None:
-        """Note that `key` is released."""
-        self._held.pop(key, None)
+    def release_keys(self, *keys: str) -> None:
+        """Release some keys, or all."""
+        held = self._held
+        self._held = {key: held[key] for key in held.keys() - keys} if keys else {}
+        self._moved.set()
+
+    def velocity(self, now: float) -> Vector:
+        """Return the sum of the velocities of all held keys [m/s]; `now` is the time [s]."""
+        signs = [velocity for velocity, until in self._held.values() if now < until]
+        x, y, z = (sum(parts) for parts in zip(ZERO, *signs, strict=True))
+        return x, y, z
 
     def set_link(self, key: str, value: float) -> None:
         """Set `value` in the unit of `key`, "uplink.delay_ms" [ms], "uplink.loss" [1]; at once."""
         self._changes[key] = value
         self._changed.set()
 
-    def velocity(self, now: float) -> Vector:
-        """Return the sum of the velocities of all held keys [m/s]; `now` is the time [s]."""
-        signs = [velocity for velocity, at in [*self._held.values()] if now - at < RELEASED]
-        x, y, z = (sum(parts) for parts in zip(ZERO, *signs, strict=True))
-        return x, y, z
+    def watch(self) -> None:
+        """Look at the state of missions and link once."""
+        try:
+            self.state = self.api.get("/v1/state")
+            mission = (self.state["mission"] or {"id": ""})["id"]
+            if mission and mission != self._mission:
+                self.route = self.api.get(f"/v1/missions/{mission}")["route_m"]
+            self._mission = mission
+            profile = self.link.read()
+        except CloudrcError as error:
+            self.state, profile = {}, {}
+            self.say(str(error), is_refusal=True)
+        self.conditions = {
+            f"{way}.{name}": float(value)
+            for way in ("uplink", "downlink")
+            for name in SLIDERS
+            if profile and isinstance(value := profile.get(way, {}).get(name, 0.0), int | float)
+        }
 
     def _stop_loop(self) -> None:
         while self._stops.wait():
@@ -149,15 +187,15 @@ class Steering:
 
     def _drive_loop(self) -> None:
         """Send the velocity while a key is held, and once more when the last key is released."""
-        due, last = time.monotonic(), ZERO
-        while True:
-            due = max(due + DRIVE_PERIOD, time.monotonic())
+        last = ZERO
+        while self._drives or last != ZERO:
             velocity = self.velocity(time.monotonic())
             if velocity != ZERO or last != ZERO:
                 words = "driving" if velocity != ZERO else "drive ends: holding"
                 self.ask(words, "/v1/drive", {"velocity_mps": velocity})
             last = velocity
-            time.sleep(max(0.0, due - time.monotonic()))
+            self._moved.wait(DRIVE_PERIOD)
+            self._moved.clear()
 
     def _link_loop(self) -> None:
         """Apply the newest values; while a change is under way, later ones are collected."""
@@ -178,20 +216,7 @@ class Steering:
             self.watch()
             time.sleep(WATCH_PERIOD)
 
-    def watch(self) -> None:
-        """Look at the state of missions and link once."""
-        try:
-            self.state = self.api.get("/v1/state")
-            mission = (self.state["mission"] or {"id": ""})["id"]
-            if mission and mission != self._mission:
-                self.route = self.api.get(f"/v1/missions/{mission}")["route_m"]
-            self._mission = mission
-        except CloudrcError as error:
-            self.state = {}
-            self.say(str(error), is_refusal=True)
-        self.conditions = self.link.read()
-
 
 def is_drive(mission: Mapping[str, Any] | None) -> bool:
     """Return whether a mission is a drive by hand, which waits for keys."""
-    return mission is not None and (mission["name"], mission["state"]) == ("drive", "held")
+    return mission is not None and mission["by_hand"] and mission["state"] == "held"

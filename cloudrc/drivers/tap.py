@@ -77,13 +77,13 @@ class Tap:
 class TapListener:
     """Receives the datagrams of one tap; a tap has at most one listener."""
 
-    def __init__(self, path: Path, about: str) -> None:
-        """Bind the socket at `path`; `about`, one line, tells other listeners who listens here.
+    def __init__(self, path: Path) -> None:
+        """Bind the socket at `path`.
 
         Raises:
-            BadInputError: If another process listens at `path`; the error has its `about`.
+            BadInputError: If another process listens at `path`.
         """
-        self._path, self._about = path, path.with_suffix(".txt")
+        self._path = path
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
             self._socket.connect(os.fspath(path))
@@ -91,12 +91,8 @@ class TapListener:
             path.unlink(missing_ok=True)
         else:
             self._socket.close()
-            said = ""
-            with suppress(OSError):
-                said = self._about.read_text("utf-8").strip()
-            raise BadInputError(f"this run has a console already; open {said}")
+            raise BadInputError("this run has a console already; open its page, or end it first")
         self._socket.bind(os.fspath(path))
-        self._about.write_text(about, "utf-8")
 
     def receive(self, limit: float) -> list[Record]:
         """Wait at most `limit` [s] for a datagram; return the records of all that have arrived."""
@@ -111,7 +107,6 @@ class TapListener:
         return found
 
     def close(self) -> None:
-        """Close the socket and remove its files."""
+        """Close the socket and remove its file."""
         self._socket.close()
-        for path in (self._path, self._about):
-            path.unlink(missing_ok=True)
+        self._path.unlink(missing_ok=True)

@@ -166,10 +166,10 @@ def cut_to_last_mission(mission: Contents) -> bool:
     that the end of the file is missing. It is always missing, because the pod still writes to the
     file when the file is copied.
     """
-    began, ended = _last_mission(mission)
+    began, ended, earlier = _last_mission(mission)
     until = mission.messages[-1][1] if mission.messages else 0
     whole = ended is not None and until > ended
-    first = began - BEFORE_NS if began is not None else 0
+    first = max(began - BEFORE_NS, earlier + 1) if began is not None else 0
     last = ended + AFTER_NS if ended is not None else until
     mission.messages = [message for message in mission.messages if first <= message[1] <= last]
     if whole:
@@ -177,19 +177,22 @@ def cut_to_last_mission(mission: Contents) -> bool:
     return whole
 
 
-def _last_mission(contents: Contents) -> tuple[int | None, int | None]:
-    """Find the stamps [ns] of the last mission's start and end; None if a stamp is missing."""
+def _last_mission(contents: Contents) -> tuple[int | None, int | None, int]:
+    """Find the stamps [ns] of the last mission's start and end, and of the end of the one before.
+
+    None: the stamp is missing; -1: the recording has no earlier mission.
+    """
     table = _table(contents, "/mission")
-    began = ended = None
+    began, ended, earlier = None, None, -1
     for stamp_ns, event in zip(table["stamp_ns"].tolist(), table["event"].tolist(), strict=True):
         if event == "started":
-            began, ended = stamp_ns, None
+            began, ended, earlier = stamp_ns, None, earlier if ended is None else ended
         elif event not in UNDER_WAY and ended is None:
             ended = stamp_ns
         elif event in UNDER_WAY and ended is not None:
             # A later mission whose start is lost: keep all that is later than the earlier mission.
             began, ended = ended + BEFORE_NS + 1, None
-    return began, ended
+    return began, ended, earlier
 
 
 def _table(contents: Contents, topic: str) -> Table:

@@ -5,14 +5,13 @@ The report contains the replay as a section; `cloudrc replay` writes it as a pag
 
 from __future__ import annotations
 
-import io
 import json
-from contextlib import redirect_stdout
 from html import escape
 from importlib.resources import files
 from string import Template
 
 import numpy as np
+import rich
 import viser
 
 from cloudrc.config.load import ResolvedExperiment
@@ -37,12 +36,12 @@ def write_section(flight: Flight, experiment: ResolvedExperiment) -> str:
     """
     if not len(flight.truth["stamp_ns"]):
         raise BadInputError("the robot never flew")
-    with redirect_stdout(io.StringIO()):  # viser prints where its server listens
-        server = viser.ViserServer("127.0.0.1", 0, verbose=False)
-        try:
-            player = _record(server, flight, experiment)
-        finally:
-            server.stop()
+    rich.get_console().quiet = True  # viser prints about itself
+    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    try:
+        player = _record(server, flight, experiment)
+    finally:
+        server.stop()
     # Hide that the browser draws without a graphics card: the message would cover the scene.
     style = "<style>.mantine-Notifications-root { display: none }</style></head>"
     player = player.replace("</head>", style, 1)
@@ -78,18 +77,17 @@ def _record(server: viser.ViserServer, flight: Flight, experiment: ResolvedExper
     true = np.maximum(true, 0)
     reached = np.searchsorted(flight.seconds(np.sort([*reported(flight).values()])), times, "right")
     points = np.array([waypoint.position_m for waypoint in flight.mission.waypoints])
-    scene.set_trail(
-        truth["position"][true], flight.clearance[true] if flight.scene.pipes else np.zeros(0)
-    )
+    near = flight.clearance if flight.scene.pipes else np.full(len(truth["stamp_ns"]), np.inf)
+    scene.set_trail(truth["position"][true], near[true])
     recorded = server.get_scene_serializer()
     for frame, (row, now) in enumerate(zip(true, times, strict=True)):
         if frame:
             recorded.insert_sleep(float(times[1]))
-        scene.set_robot(truth["position"][row], truth["orientation_wxyz"][row])
+        scene.move("robot", truth["position"][row], truth["orientation_wxyz"][row])
         ghost = predicted[frame]
         fresh = ghost >= 0 and now - flight.seconds(applied["stamp_ns"][ghost]) < STALE
         pose = applied["position"], applied["orientation_wxyz"]
-        scene.set_ghost(*(column[ghost] if fresh else None for column in pose))
-        scene.set_setpoint(control["setpoint"][asked[frame]] if asked[frame] >= 0 else None)
+        scene.move("ghost", *(column[ghost] if fresh else None for column in pose))
+        scene.move("setpoint", control["setpoint"][asked[frame]] if asked[frame] >= 0 else None)
         scene.set_waypoints(points, int(reached[frame]))
     return recorded.as_html()

@@ -10,7 +10,6 @@ The times of `estimate` and `setpoint` are those of `/estimated_odometry`: when 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from itertools import product
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -27,6 +26,7 @@ from cloudrc.record.ros import encode_view, header, part
 View: TypeAlias = tuple[str, int, bytes]
 """Topic, log time [ns] on world's clock, CDR bytes of a message."""
 _Colour: TypeAlias = tuple[float, float, float, float]
+_Shape: TypeAlias = tuple[Any, ...]  # arguments of `_marker`, from `name` on
 
 PERIOD_NS = 40_000_000
 """Time between two messages of a topic [ns]. Viewers interpolate poses; with shorter periods the
@@ -60,13 +60,14 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[View]:
     poses, control = _thin({name: truth[name] for name in truth.names}), _thin(flight.control)
     first_ns = int(truth["stamp_ns"][0])
     shapes = [*_robot("robot", "base_link"), *_robot("estimate", "estimate", GHOST)]
-    shapes += [_marker("setpoint", SPHERE, "setpoint", ORIGIN, (0.12,) * 3, GOAL)]
+    shapes += [("setpoint", SPHERE, "setpoint", ORIGIN, (0.12,) * 3, GOAL)]
     shapes += [_pipe(pipe) for pipe in scene.pipes]
     shapes += [_board(scene.board)] if scene.board else []
     if len(path := poses["position"]) > 1:
-        shapes.append(_marker("path", LINE_STRIP, "world", ORIGIN, (0.02,) * 3, PATH, path))
+        shapes.append(("path", LINE_STRIP, "world", ORIGIN, (0.02,) * 3, PATH, path))
+    markers = [_marker(number, first_ns, *shape) for number, shape in enumerate(shapes)]
     return [
-        ("/scene", first_ns, encode_view("/scene", _numbered(shapes, first_ns))),
+        ("/scene", first_ns, encode_view("/scene", markers)),
         *_transforms(poses, base_link=("position", "orientation_wxyz")),
         *_transforms(control, estimate=("position", "orientation_wxyz"), setpoint=("setpoint", "")),
         *_errors("/tracking_error", flight, flight.control, "setpoint"),
@@ -90,7 +91,7 @@ def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:
                 frame,
                 part(
                     "geometry_msgs/msg/Transform",
-                    _vector(columns[place][row].tolist()),
+                    part("geometry_msgs/msg/Vector3", *columns[place][row].tolist()),
                     _quaternion(columns[turn][row].tolist() if turn else LEVEL),
                 ),
             )
@@ -108,16 +109,14 @@ def _errors(topic: str, flight: Flight, columns: Columns, name: str) -> Iterator
         yield topic, stamp_ns, encode_view(topic, error)
 
 
-def _vector(xyz: Iterable[float]) -> Any:
-    return part("geometry_msgs/msg/Vector3", *xyz)
-
-
 def _quaternion(wxyz: Iterable[float]) -> Any:
     w, x, y, z = wxyz
     return part("geometry_msgs/msg/Quaternion", x, y, z, w)
 
 
 def _marker(
+    number: int,
+    stamp_ns: int,
     name: str,
     kind: int,
     frame: str,
@@ -126,7 +125,7 @@ def _marker(
     colour: _Colour,
     points: Any = (),
 ) -> Any:
-    """Make a marker without number and stamp; lengths in [m], `points` have shape (n, 3)."""
+    """Make a marker; lengths in [m], `points` have shape (n, 3)."""
     point, colour_of = "geometry_msgs/msg/Point", part("std_msgs/msg/ColorRGBA", *colour)
     none = np.zeros(0, np.uint8)
     pose = part("geometry_msgs/msg/Pose", part(point, *position), _quaternion(LEVEL))
@@ -136,19 +135,23 @@ def _marker(
     mesh = part("visualization_msgs/msg/MeshFile", "", none)
     return part(
         "visualization_msgs/msg/Marker",
-        *(header(0, frame), name, 0, kind, 0, pose, _vector(scale), colour_of, forever, True),
+        *(
+            header(stamp_ns, frame),
+            name,
+            number,
+            kind,
+            0,
+            pose,
+            part("geometry_msgs/msg/Vector3", *scale),
+            colour_of,
+            forever,
+            True,
+        ),
         *(corners, [], "", picture, [], "", "", mesh, False),
     )
 
 
-def _numbered(markers: list[Any], stamp_ns: int) -> list[Any]:
-    for number, marker in enumerate(markers):
-        marker.id = number
-        marker.header.stamp = header(stamp_ns).stamp
-    return markers
-
-
-def _robot(name: str, frame: str, colour: _Colour | None = None) -> Iterator[Any]:
+def _robot(name: str, frame: str, colour: _Colour | None = None) -> Iterator[_Shape]:
     """Build the robot of simple bodies, in the colours of its parts or in one `colour`."""
     width, rod = 2 * body.ROD_RADIUS, body.ROD_TOP - body.ROD_BOTTOM
     arm, thin, span = body.ARM_LENGTH, 2 * body.ARM_RADIUS, 2 * body.ROTOR_ARM
@@ -161,15 +164,14 @@ def _robot(name: str, frame: str, colour: _Colour | None = None) -> Iterator[Any
         (CUBE, (0.0, 0.0, body.ROTOR_HEIGHT), (span, 0.012, 0.012), ROD),
         (CUBE, (0.0, 0.0, body.ROTOR_HEIGHT), (0.012, span, 0.012), ROD),
     ]
-    for x, y in product((-1, 0, 1), repeat=2):
-        if abs(x) + abs(y) == 1:
-            hub = (x * body.ROTOR_ARM, y * body.ROTOR_ARM, body.ROTOR_HEIGHT)
-            parts.append((CYLINDER, hub, disc, ROTOR))
+    for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1)):
+        hub = (x * body.ROTOR_ARM, y * body.ROTOR_ARM, body.ROTOR_HEIGHT)
+        parts.append((CYLINDER, hub, disc, ROTOR))
     for kind, position, scale, own in parts:
-        yield _marker(name, kind, frame, position, scale, colour or own)
+        yield name, kind, frame, position, scale, colour or own
 
 
-def _pipe(pipe: Pipe) -> Any:
+def _pipe(pipe: Pipe) -> _Shape:
     """Build the inner face of a pipe, open at both ends, of 32 strips."""
     axis = np.array(pipe.axis)
     across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
@@ -179,10 +181,10 @@ def _pipe(pipe: Pipe) -> Any:
     low, high = (ring + pipe.centre + end * pipe.length / 2 * axis for end in (-1, 1))
     corners = np.stack([low[:-1], high[:-1], high[1:], low[:-1], high[1:], low[1:]], axis=1)
     points = corners.reshape(-1, 3)
-    return _marker(pipe.name, TRIANGLE_LIST, "world", ORIGIN, (1.0,) * 3, PIPE, points)
+    return pipe.name, TRIANGLE_LIST, "world", ORIGIN, (1.0,) * 3, PIPE, points
 
 
-def _board(board: Board) -> Any:
+def _board(board: Board) -> _Shape:
     (left, right), (low, high) = board.y, board.z
     middle = (board.x + 0.025, (left + right) / 2, (low + high) / 2)
-    return _marker("board", CUBE, "world", middle, (0.05, right - left, high - low), BOARD)
+    return "board", CUBE, "world", middle, (0.05, right - left, high - low), BOARD

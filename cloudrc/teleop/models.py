@@ -154,6 +154,7 @@ class MissionSummary(_Answer):
     name: str = _field("Name in the order")
     key: str = _field("Key in the order")
     state: Literal["queued", "starting", "flying", "held", "done", "failed", "cancelled"]
+    by_hand: bool = _field("Whether an operator drives the robot by hand")
     waypoint: int = _field("Index of the waypoint to which the robot flies, from 0")
     waypoints: int = _field("Number of waypoints")
     reached: list[Reached] = _field("The reached waypoints")

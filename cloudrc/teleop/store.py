@@ -96,6 +96,7 @@ class Mission:
             "key": self.order.key,
             "state": self.state,
             "waypoint": self.waypoint,
+            "by_hand": self.order.plan.by_hand,
             "waypoints": len(self.order.plan.legs),
             "reached": list(self.reached),
             "verdict": self.verdict,

@@ -40,38 +40,32 @@ def test_a_flown_order_becomes_the_mission_of_the_report(name):
     assert (flown.criteria.contact, flown.name) == (True, "hover")
 
 
-def test_down_ends_sessions_only_and_asks_which(folder, capsys):
-    def said(code, *words):
+@pytest.fixture
+def down(monkeypatch, capsys):
+    """Run `cloudrc down` without ending a session; return what it prints."""
+    monkeypatch.setattr(local, "end_session", lambda run, limit: None)
+
+    def run(code, *words):
         assert main(["down", *words]) == code
-        return capsys.readouterr().err
+        return "".join(capsys.readouterr())
 
-    assert "no session runs here; start one: cloudrc up\n" in said(3)
+    return run
+
+
+def test_down_ends_sessions_only_and_asks_which(folder, down):
+    assert "no session runs here; start one: cloudrc up;" in down(3)
     with local.announced(folder / "r"):
-        assert "r: flown by 'cloudrc run', ends by Ctrl-C there" in said(3)
-        assert "--run r: no session runs there; r: flown by" in said(2, "--run", "r")
-        with (
-            local.announced(folder / "a", "", "session"),
-            local.announced(folder / "b", "", "session"),
-        ):
-            assert "2 runs are flying here; choose one: --run" in said(2)
-
-
-def test_down_leaves_a_session_elsewhere_alone(folder, capsys, monkeypatch):
-    ended = []
-    monkeypatch.setattr(local, "end_session", lambda run, limit: ended.append(run))
+        assert "a flight of 'cloudrc run' ends by Ctrl-C there" in down(3)
+        assert "--run r: no session runs there" in down(2, "--run", "r")
     (folder / "runs/latest").mkdir(parents=True)
     (folder / "runs/latest/relay.log").touch()
     with local.announced(folder / "theirs", "", "session"):
-        assert main(["down"]) == 2
-        assert (
-            "runs/latest has ended; name another flight: --run theirs;" in capsys.readouterr().err
-        )
+        with local.announced(folder / "b", "", "session"):
+            assert "2 runs are flying here; choose one: --run" in down(2)
+        assert "runs/latest has ended; name another flight: --run theirs;" in down(2)
         with local.announced(folder / "runs/latest"):  # by 'cloudrc run'
-            assert main(["down"]) == 2
-            assert "runs/latest does not take this command; name" in capsys.readouterr().err
-        assert ended == []
-        assert main(["down", "--run", "theirs"]) == 0
-        assert ended == [folder / "theirs"]
+            assert "runs/latest does not take this command; name" in down(2)
+        assert "theirs: ended" in down(0, "--run", "theirs")
 
 
 def drive_order():
@@ -90,24 +84,14 @@ def test_a_drive_becomes_a_mission_with_setpoints(folder):
     assert assembly.build_plan(again).track[0][1][1] < 10.0
 
 
-def test_down_tells_a_missing_report_from_no_mission(folder, capsys):
+def test_down_tells_a_missing_report_from_no_mission(folder, down):
     with closing(open_store(folder / "missions.journal", b"")) as store:
         mission = store.add(drive_order())
-
-    def said(code):
-        with (
-            local.announced(folder, "", "session"),
-            pytest.MonkeyPatch.context() as patch,
-        ):
-            patch.setattr(local, "end_session", lambda run, limit: None)
-            assert main(["down"]) == code
-        captured = capsys.readouterr()
-        return captured.out + captured.err
-
-    assert "ended; no mission flew" in said(0)
-    with closing(open_store(folder / "missions.journal", b"")) as store:
-        store.note(store.find(mission.id), "started", "")
-    assert "mission m1 flew, but has no report; the output of 'cloudrc up'" in said(1)
+    with local.announced(folder, "", "session"):
+        assert "ended; no mission flew" in down(0)
+        with closing(open_store(folder / "missions.journal", b"")) as store:
+            store.note(store.find(mission.id), "started", "")
+        assert "mission m1 flew, but has no report; to write it: cloudrc report" in down(1)
 
 
 @pytest.mark.process
@@ -173,7 +157,6 @@ def test_a_session_flies_missions_and_reports_the_last_one(folder, figure):
         assert "guard GROUND" in call("mission", "status", *RUN)
         (folder / "m.yaml").write_text("waypoints: [{position_m: [0.2, 0, 0.6]}]")
         assert "SUCCESS" in call("mission", "run", "m.yaml", *RUN)
-        time.sleep(1.0)  # the recording of a mission begins 1 s before its start
         assert "s: flying to (0.5, 0, 1.2); mission m2" in call(
             "mission", "goto", "0.5", "0", "1.2"
         )

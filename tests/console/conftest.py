@@ -1,5 +1,6 @@
 """Records of cloud, as the tap sends them, and an API that a test answers."""
 
+import time
 from math import nan
 
 import pytest
@@ -8,6 +9,18 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.records import Control, TelemetrySent
+
+LIMIT = 120.0
+"""Time limit for what has no number of its own [s]: a browser without a graphics card is slow."""
+
+
+def wait_for(condition):
+    """Return how long it takes until the condition holds [s]."""
+    began = time.monotonic()
+    while not condition():
+        assert time.monotonic() - began < LIMIT
+        time.sleep(0.02)
+    return time.monotonic() - began
 
 
 def control(at, basis=0.0, **fields):

@@ -1,12 +1,11 @@
 """The console in a browser, on a session of real processes."""
 
 import io
+import socket
 import subprocess
 import sys
 import threading
-import time
 import urllib.request
-from contextlib import ExitStack, redirect_stdout
 
 import numpy as np
 import pytest
@@ -18,28 +17,17 @@ from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import PANEL_WIDTH, Page, _with_gaps
-from cloudrc.console.steering import Link, Steering
+from cloudrc.console.steering import Steering
 from cloudrc.drivers.local import under_way
+from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import Scene, load_scene
-from tests.console.conftest import told
-
-LIMIT = 120.0
-"""Time limit for what has no number of its own [s]: a browser without a graphics card is slow."""
+from tests.console.conftest import LIMIT, told, wait_for
 
 
 def start(folder, *words):
     command = [sys.executable, "-m", "cloudrc", *map(str, words)]
     kinds = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     return subprocess.Popen(command, cwd=folder, **kinds)
-
-
-def wait_for(condition, limit=LIMIT):
-    """Return how long it takes until the condition holds [s]."""
-    began = time.monotonic()
-    while not condition():
-        assert time.monotonic() - began < limit
-        time.sleep(0.02)
-    return time.monotonic() - began
 
 
 @pytest.fixture
@@ -62,16 +50,15 @@ def flight(tmp_path):
 @pytest.fixture
 def filled(api):
     """Make the page of an experiment without a browser: the page, its feed and its steering."""
-    with ExitStack() as opened, redirect_stdout(io.StringIO()):
+    page = Page(0)
 
-        def fill(name):
-            page = Page(0)
-            opened.callback(page.close)
-            feed, steering = FlightFeed(Scene("empty")), Steering(api, Link(dict, list))
-            page.fill(load_experiment(name), feed, steering)
-            return page, feed, steering
+    def fill(name):
+        feed, steering = FlightFeed(Scene("empty")), Steering(api)
+        page.fill(load_experiment(name), feed, steering)
+        return page, feed, steering
 
-        yield fill
+    yield fill
+    page.close()
 
 
 def answers(api):
@@ -107,7 +94,7 @@ def z_arrow(page):
 
 @pytest.mark.process
 def test_drag_and_send_moves_the_setpoint(flight, page):
-    api, address, run = flight
+    api, _, run = flight
     numbers = page.get_by_role("textbox")
 
     def target():
@@ -131,7 +118,7 @@ def test_drag_and_send_moves_the_setpoint(flight, page):
     api.post("/v1/goto", {"position_m": (0.3, 0.2, 0.9)})
     wait_for(lambda: target() == [0.3, 0.2, 0.9])  # after Send it follows the setpoint again
     other = start(run, "console", run)
-    assert address in other.communicate(timeout=LIMIT)[0]
+    assert "has a console already" in other.communicate(timeout=LIMIT)[0]
     assert other.returncode == 2
 
 
@@ -205,22 +192,28 @@ def test_the_first_view_shows_the_whole_mission(filled):
 
 def test_the_state_tells_a_drive_and_names_buttons(filled):
     page, feed, steering = filled("hover")
-    drive = {"id": "m1", "name": "drive", "state": "held", "reached": [], "waypoints": 1}
+    drive = {"id": "m1", "by_hand": True, "state": "held", "reached": []}
     words = "to continue: cloudrc mission resume, or cancel"
     steering.state = {"mission": drive, "seen": {"next_step": words}}
     feed.take([told(0.1)], 1.0)
     page.update(1.0)
     assert "Mission: drive, waits for keys" in page._status.content
-    assert "to continue: Resume, or Cancel" in page._status.content
-    now = time.monotonic()
-    steering.hold_key("up", (0.0, 0.0, 0.4))
-    page.update(now)
+    assert "to continue: resume, or cancel" in page._status.content
+    steering.hold_key("up", (0.0, 0.0, 0.4), 60.0)
+    page.update(2.0)
     assert "Mission: driving" in page._status.content
 
 
 def test_a_curve_has_gaps_and_an_unknown_one_keeps_its_axis():
     assert _with_gaps(np.array([np.nan, 0.2])) == [None, 0.2]
     assert _with_gaps(np.full(2, np.nan)) == [-1.0, None]
+
+
+def test_a_port_in_use_is_an_error():
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(BadInputError, match=f"--port {port}: is in use"):
+            Page(port)
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys):

@@ -1,8 +1,5 @@
 """The 3-D scene: its colours, and the nodes that it shows."""
 
-from contextlib import redirect_stdout
-from io import StringIO
-
 import matplotlib
 import numpy as np
 import pytest
@@ -15,10 +12,9 @@ from cloudrc.geometry.clearance import CLEARANCE_SHOWN
 
 @pytest.fixture
 def server():
-    with redirect_stdout(StringIO()):
-        one = viser.ViserServer("127.0.0.1", 0, verbose=False)
-        yield one
-        one.stop()
+    one = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    yield one
+    one.stop()
 
 
 def test_the_trail_has_the_colours_of_the_figures():
@@ -40,7 +36,7 @@ def test_the_scene_has_the_bodies_of_the_experiment(server, name):
 def test_waypoints_and_trail_of_another_mission_replace_the_first(server):
     scene, points = FlightScene(server, load_experiment("hover")), np.eye(3)
     scene.set_waypoints(points, 1)
-    scene.set_trail(points, np.array([0.1, np.nan, 0.3]))
+    scene.set_trail(points, np.array([0.1, np.inf, 0.3]))
     handles = server.scene._handle_from_node_name
     colours = [handles[f"/waypoints/{number}"].color for number in (1, 2, 3)]
     assert colours[0] != colours[1] == colours[2]

@@ -5,24 +5,44 @@ import time
 
 import pytest
 
-from cloudrc.console.steering import RELEASED, Link, Steering
+from cloudrc.console.steering import Link, Steering
 from cloudrc.errors import BadInputError
 from cloudrc.messages import ZERO
+from tests.console.conftest import wait_for
 
 
 @pytest.fixture
 def steering(api):
-    return Steering(api, Link(dict, list))
+    api.answers["/v1/state"] = {"mission": None}
+    return Steering(api)
 
 
 def test_held_keys_add_up_and_a_released_one_counts_no_more(steering):
-    steering.hold_key("up", (0.0, 0.0, 0.4))
-    steering.hold_key("left", (0.0, 0.4, 0.0))
+    steering.hold_key("up", (0.0, 0.0, 0.4), 0.3)
+    steering.hold_key("left", (0.0, 0.4, 0.0), 0.3)
     now = time.monotonic()
     assert steering.velocity(now) == (0.0, 0.4, 0.4)
-    steering.release_key("up")
+    steering.release_keys("up")
     assert steering.velocity(now) == (0.0, 0.4, 0.0)
-    assert steering.velocity(now + RELEASED) == ZERO, "no sign of a held key"
+    assert steering.velocity(now + 0.3) == ZERO, "no sign of a held key"
+
+
+def test_a_drive_ends_with_a_request_to_rest(api, steering):
+    steering.start()
+    steering.hold_key("up", (0.0, 0.0, 0.4), 60.0)
+    wait_for(lambda: len(api.posted) > 3)
+    steering.end_drive()
+    assert [body["velocity_mps"][2] for _, body in api.posted[-2:]] == [0.4, 0.0]
+
+
+@pytest.mark.parametrize("loss", [0.02, {"good_to_bad": 0.1}])
+def test_sliders_show_the_numbers_of_the_profile(api, loss):
+    api.answers["/v1/state"] = {"mission": None}
+    steering = Steering(api, Link(lambda: {"uplink": {"delay_ms": 40, "loss": loss}}))
+    steering.watch()
+    assert steering.conditions["uplink.delay_ms"] == 40.0
+    assert steering.conditions["downlink.jitter_ms"] == 0.0
+    assert steering.conditions.get("uplink.loss") == (loss if loss == 0.02 else None)
 
 
 def test_a_flying_mission_is_held_before_a_goto(api, steering):
@@ -37,7 +57,7 @@ def test_a_flying_mission_is_held_before_a_goto(api, steering):
 
 
 def test_a_start_ends_a_drive_that_waits_for_keys(api, steering):
-    steering.state = {"mission": {"name": "drive", "state": "held"}}
+    steering.state = {"mission": {"by_hand": True, "state": "held"}}
     steering.fly({"waypoints": []})
     start = ("/v1/missions", {"waypoints": [], "queue": True})
     assert api.posted == [("/v1/resume", None), start]
@@ -56,25 +76,15 @@ def test_a_refusal_is_told_in_the_words_of_the_api(api, steering):
 
 
 def test_the_route_is_asked_once_for_each_mission(api, steering):
-    api.answers = {
-        "/v1/state": {"mission": {"id": "m1"}},
-        "/v1/missions/m1": {"route_m": [[1] * 3]},
-    }
+    api.answers["/v1/state"] = {"mission": {"id": "m1"}}
+    api.answers["/v1/missions/m1"] = {"route_m": [[1] * 3]}
     steering.watch()
     del api.answers["/v1/missions/m1"]
     steering.watch()
     assert steering.route == [[1, 1, 1]]
 
 
-def wait_for(condition):
-    limit = time.monotonic() + 10
-    while not condition():
-        assert time.monotonic() < limit
-        time.sleep(0.01)
-
-
 def test_a_stop_is_repeated_until_the_api_answers(api, steering):
-    api.answers["/v1/state"] = {"mission": None}
     api.refused["/v1/estop"] = "teleop does not answer"
     steering.start()
     steering.stop()
@@ -86,8 +96,7 @@ def test_a_stop_is_repeated_until_the_api_answers(api, steering):
     assert len(api.posted) == count
 
 
-def test_a_slow_link_gets_the_newest_value_of_each_slider(api):
-    api.answers["/v1/state"] = {"mission": None}
+def test_a_slow_link_gets_the_newest_value_of_each_slider(steering):
     applied, go = [], threading.Event()
 
     def change(settings):
@@ -96,7 +105,7 @@ def test_a_slow_link_gets_the_newest_value_of_each_slider(api):
             raise BadInputError("loss: must be at most 1")
         go.wait()
 
-    steering = Steering(api, Link(dict, change))
+    steering.link = Link(change=change)
     steering.start()
     steering.set_link("uplink.delay_ms", 10)
     wait_for(lambda: applied)

@@ -200,3 +200,11 @@ def test_the_last_mission_is_kept_even_if_its_start_is_lost(tmp_path, lost, kept
     assert cut_to_last_mission(mission) is (lost != (5,))
     stamps = mission.recording()["/mission"]["stamp_ns"] // SECOND
     assert stamps.tolist() == kept
+
+
+def test_an_earlier_mission_that_has_just_ended_is_left_out(tmp_path):
+    times = [("started", 1.0), ("done", 9.5), ("started", 10.0), ("done", 12.0)]
+    events = [rec.MissionEvent(round(at * SECOND), event, 0, "") for event, at in times]
+    mission = read_contents(write(tmp_path / "m.mcap", [*events, LATER]))
+    assert cut_to_last_mission(mission)
+    assert mission.recording()["/mission"]["stamp_ns"].tolist() == [10 * SECOND, 12 * SECOND]

@@ -227,17 +227,21 @@ def test_the_api_drives_and_audits_refusals_only():
 
 
 class Terminal:
-    """`cloudrc mission drive` in a terminal of 24 lines."""
+    """`cloudrc mission drive` in a terminal, which shows the state of the robot already."""
 
-    def __init__(self, api):
+    def __init__(self, api, lines=24, columns=90):
         self.screen, (self._keys, end) = "", pty.openpty()
-        environ = {**os.environ, "TERM": "xterm", "LINES": "24", "COLUMNS": "90"}
+        size = {"LINES": str(lines), "COLUMNS": str(columns)}
+        environ = {**os.environ, "TERM": "xterm", **size}
         how = {**dict.fromkeys(("stdin", "stdout", "stderr"), end), "env": environ}
         self.process = subprocess.Popen([*COMMAND, api.url], start_new_session=True, **how)
         os.close(end)
         self._reads = threading.Thread(target=self._read, daemon=True)
         self._closes = False
         self._reads.start()
+        while "GROUND" not in self.screen:  # a busy machine starts it slowly
+            assert self.process.poll() is None, self.screen
+            time.sleep(0.1)
 
     def _read(self):
         with suppress(OSError):  # the process has ended
@@ -258,9 +262,6 @@ class Terminal:
 def test_keys_in_a_terminal_drive_the_robot():
     with running(unix=True) as api:
         flight, terminal = api.flight, Terminal(api)
-        while "GROUND" not in terminal.screen:  # a busy machine starts it slowly
-            assert terminal.process.poll() is None, terminal.screen
-            time.sleep(0.1)
         for key, axis, sign in (("\x1bOA", 0, 1), ("\x1bOC", 1, -1), ("w", 2, 1)):
             terminal.type(key)
             api.until(lambda a=axis, s=sign: s * reference(flight).velocity[a] > 0.1)
@@ -278,12 +279,9 @@ def test_keys_in_a_terminal_drive_the_robot():
 
 
 @pytest.mark.process
-def test_drive_ends_with_its_terminal():
+def test_drive_shows_the_state_in_a_small_terminal_and_ends_with_it():
     with running(unix=True) as api:
-        terminal = Terminal(api)
-        while "GROUND" not in terminal.screen:
-            assert terminal.process.poll() is None, terminal.screen
-            time.sleep(0.1)
+        terminal = Terminal(api, lines=4, columns=20)
         terminal.close()
         terminal.process.wait(10.0)
 
