@@ -73,7 +73,6 @@ def by_label(counts: Mapping[str, float]) -> dict[Labels, float]:
 WINDOW = 128
 """A missing datagram counts as lost after this number of newer datagrams (1.28 s at 100 Hz)."""
 _MASK = (1 << WINDOW) - 1
-_OLDEST = 1 << (WINDOW - 1)
 
 
 class DatagramTally:
@@ -110,12 +109,7 @@ class DatagramTally:
             self._epoch, self._first, self._newest, self._seen = epoch, counter, counter, _MASK
             return True
         ahead = counter - self._newest
-        if ahead == 1:
-            if not self._seen & _OLDEST:
-                self.lost += 1
-            self._seen = (self._seen << 1 | 1) & _MASK
-            self._newest = counter
-        elif ahead > 1:  # the skipped datagrams are lost or late
+        if ahead > 0:  # the skipped datagrams are lost or late
             leaving = min(ahead, WINDOW)
             self.lost += ahead - (self._seen >> (WINDOW - leaving)).bit_count()
             self._seen = (self._seen << ahead | 1) & _MASK if ahead < WINDOW else 1

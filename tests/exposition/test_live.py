@@ -240,7 +240,7 @@ def test_mission_metrics_follow_the_events():
 def test_the_newest_verdict_on_the_link_is_exposed():
     check = LinkVerdict("uplink")
     for stamp_ns, verdict, believed in ((1, "open", None), (2, "ok", 1.0), (2, "off", 0.0)):
-        check._on_check(
+        check._on_linkchecked(
             LinkChecked(stamp_ns, True, "mean", 0.04, math.nan, 0.03, 0.05, verdict, 900)
         )
         found = {("uplink",): believed}
