@@ -133,11 +133,7 @@ SILENCE_NS = 2_000_000_000
 
 
 class End:
-    """Metrics that both world and cloud have: session, datagrams, one-way delay, loop timing.
-
-    Attributes:
-        check: Verdict on the direction of the link that this process receives.
-    """
+    """Metrics that both world and cloud have: session, datagrams, one-way delay, loop timing."""
 
     def __init__(self, role: str, counts: Mapping[str, int]) -> None:
         """Set the role, "world" or "cloud"; `counts` maps `Counted.name` to its newest count."""
@@ -371,14 +367,10 @@ class CloudEnd(End):
 
 
 class Link:
-    """Metrics of a process that shapes one direction of the link or both.
-
-    Attributes:
-        tell: Returns the content of /link.json, the state of the shaper.
-    """
+    """Metrics of a process that shapes one direction of the link or both."""
 
     def __init__(self, counts: Mapping[str, int]) -> None:
-        self.tell: Callable[[], str] = lambda: "{}\n"
+        self.tell: Callable[[], str] = lambda: "{}\n"  # content of /link.json, the shaper's state
         self._counts = counts
         self._shapers: dict[str, Labels] = {}
         self._delays: dict[str, float] = {}
@@ -449,12 +441,7 @@ class Mission:
 
 
 class LiveMetrics:
-    """Current metrics of one process. One thread calls `see`, any other thread may call `read`.
-
-    Attributes:
-        end: Metrics of world or cloud; None in other processes.
-        link: Metrics of the emulated link; None in other processes.
-    """
+    """Current metrics of one process. One thread calls `see`, any other thread may call `read`."""
 
     def __init__(self, role: str, *, missions: bool = True) -> None:
         """Set the role of the process: "world", "cloud", "teleop" or "link".

@@ -61,23 +61,14 @@ class Kind(Enum):
 
 
 class Metric(NamedTuple):
-    """One Prometheus metric.
+    """One Prometheus metric."""
 
-    Attributes:
-        name: Name of the metric; a histogram adds `_bucket`, `_sum` and `_count`.
-        kind: Type of the metric.
-        meaning: The HELP text, one or two sentences.
-        roles: Processes that expose the metric.
-        labels: Label name -> all possible values of the label; () if they are not known.
-        buckets: Upper bounds of a histogram's buckets, rising, in the unit of the metric.
-    """
-
-    name: str
+    name: str  # a histogram adds `_bucket`, `_sum` and `_count`
     kind: Kind
-    meaning: str
-    roles: tuple[str, ...]
-    labels: Mapping[str, Labels] = MappingProxyType({})
-    buckets: tuple[float, ...] = ()
+    meaning: str  # the HELP text, one or two sentences
+    roles: tuple[str, ...]  # processes that expose the metric
+    labels: Mapping[str, Labels]  # label -> all possible values; () if they are not known
+    buckets: tuple[float, ...]  # upper bounds of a histogram's buckets, rising [unit of the metric]
 
 
 def numbered(names: tuple[str, ...]) -> str:

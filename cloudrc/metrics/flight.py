@@ -25,10 +25,7 @@ from cloudrc.records import UNDER_WAY
 Array: TypeAlias = NDArray[Any]
 Columns: TypeAlias = dict[str, Array]
 
-CONTROL_TOPICS = (
-    *("/estimated_odometry", "/setpoint_position", "/cmd_vel"),
-    *("/delay_estimate", "/pid"),
-)
+CONTROL_TOPICS = "/estimated_odometry", "/setpoint_position", "/cmd_vel", "/delay_estimate", "/pid"
 """Topics that the control loop writes in every period."""
 
 
@@ -137,7 +134,7 @@ class Flight:
         totals = count["total"][count["name"] == name]
         return float(totals[-1]) if len(totals) else None
 
-    @cached_property
+    @property
     def pipes_flown(self) -> int:
         """Number of different pipes that the robot's base has entered."""
         return int((np.unique(pipe_index(self.scene, self.truth["position"])) >= 0).sum())

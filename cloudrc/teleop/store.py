@@ -1,10 +1,9 @@
 """Store missions and their progress in an SQLite file; read them after a restart of teleop.
 
-One row holds the order and the status of a mission; each event changes the status. One more row
-holds each reached waypoint, with mission and index as the key, so that no waypoint is stored twice.
-A transaction returns after its data is on the disk, so a killed process loses at most the newest
-event. While the disk refuses to write, flights continue, no new mission starts, and the events stay
-in memory.
+One row holds a mission's order and status; each event changes the status. One row holds each
+reached waypoint; mission and index are its key, so that no waypoint is stored twice. A transaction
+returns after its data is on the disk, so a killed process loses at most the newest event. While the
+disk refuses to write, flights continue, events stay in memory, and no new mission starts.
 """
 
 from __future__ import annotations
@@ -27,8 +26,6 @@ from cloudrc.teleop.wire import ENDED, QUEUED, STATES, Plan
 
 Event: TypeAlias = dict[str, Any]
 """An event of a mission, in the form of the API's model `Event`."""
-MAGIC = b"SQLite format 3\0"
-"""First bytes of a database file of SQLite."""
 SHOWN = 100
 """Largest number of events that the store keeps for each mission: the newest events."""
 
@@ -75,8 +72,7 @@ class Mission:
     ) -> None:
         """Update the mission with an event; `changed` has new values of the mission's attributes.
 
-        `number` is the number of the event among those of all missions. `waypoint` is an index; the
-        default is the current waypoint.
+        `number` counts the events of all missions. The default of `waypoint` is the current one.
         """
         waypoint = self.waypoint if waypoint is None else waypoint
         for name, value in changed.items():
@@ -89,7 +85,7 @@ class Mission:
             self.reached.append({"waypoint": waypoint, "time_s": self.elapsed})
 
     def summary(self) -> dict[str, Any]:
-        """Return the fields that a list of missions shows."""
+        """Return the fields of the API's model `MissionSummary`."""
         return {
             "id": self.id,
             "name": self.order.name,
@@ -102,13 +98,12 @@ class Mission:
         }
 
     def as_json(self) -> dict[str, Any]:
-        """Return all fields that the API shows."""
-        left_out = self.happened.total() - len(self.events)
+        """Return the fields of the API's model `MissionView`."""
         return {
             **self.summary(),
             "route_m": [leg.position for leg in self.order.plan.legs],
             "events": list(self.events),
-            "events_left_out": left_out,
+            "events_left_out": self.happened.total() - len(self.events),
         }
 
 
@@ -117,7 +112,7 @@ class UnknownMissionError(CloudrcError):
 
 
 class UnavailableError(CloudrcError):
-    """Report that teleop cannot act now: its journal is locked or read-only, or teleop ends."""
+    """Report that teleop cannot act now, for example because the disk refuses a mission."""
 
 
 class StoreLockedError(CloudrcError):
@@ -156,28 +151,19 @@ def open_store(path: Path, salt: bytes) -> MissionStore:
         StoreLockedError: If another process has locked the file.
         BadInputError: If the file has another content or version, or cannot be made.
     """
-    if path.exists() and not path.is_file():
-        raise BadInputError(f"--journal {path}: is not a file; name another one")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.touch(0o600)
     try:
         return MissionStore(connect(path), salt)
     except sqlite3.DatabaseError as error:
-        reason = " ".join(str(error).split())
+        reason = str(error)
         code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # without the extended code
-        if code == sqlite3.SQLITE_BUSY:
-            text = f"{path}: another teleop has this journal open; waiting until it ends"
-            raise StoreLockedError(text) from None
-        with path.open("rb") as file:
-            is_sqlite = file.read(len(MAGIC)) == MAGIC
-        if code == sqlite3.SQLITE_NOTADB and not is_sqlite:  # else the header is damaged
-            text = "is no journal; move it away, or name another file"
-            raise BadInputError(f"--journal {path}: {text}") from None
-        if isinstance(error, sqlite3.OperationalError):  # the disk fails; the content is intact
-            text = f"{reason}; free or repair its volume, or name another"
-            raise BadInputError(f"--journal {path}: {text}") from None
+    if code == sqlite3.SQLITE_BUSY:
+        raise StoreLockedError(f"{path}: another teleop has this journal open; waiting for its end")
+    if code not in (0, sqlite3.SQLITE_CORRUPT):  # no database, or a disk that fails
+        raise BadInputError(f"--journal {path}: {reason}; repair or move it, or name another file")
     aside = path.with_name(f"{path.name}.damaged")
-    for ending in ("", "-wal", "-shm", "-journal"):  # the files of one database
+    for ending in ("", "-wal"):  # the files of one database
         with suppress(FileNotFoundError):
             Path(f"{path}{ending}").replace(f"{aside}{ending}")
     text = f"journal repaired: {path}: {reason}; its missions are lost, it is kept as {aside}"
@@ -225,14 +211,7 @@ _STATUS = {"state", "world", "elapsed", "events", "happened", "witness", "verdic
 
 
 class MissionStore:
-    """Missions in memory and on the disk.
-
-    Attributes:
-        missions: Missions by id, oldest first.
-        trouble: Why the disk refuses to write; "" if everything is on the disk.
-        dropped: Number of events that the store had removed before a reader requested them.
-        notice: Where a damaged earlier file is now, and what was wrong; "" without such a file.
-    """
+    """Missions in memory and on the disk."""
 
     def __init__(self, db: sqlite3.Connection, salt: bytes, notice: str = "") -> None:
         """Read all missions of `db`; if that fails, close `db` and raise DatabaseError.
@@ -240,18 +219,21 @@ class MissionStore:
         The ids of every new file begin with "m1". The robot stores progress by mission number;
         the random bytes `salt` make these numbers differ from those of an earlier file.
         """
-        self._db, self._salt, self.notice = db, salt, notice
-        self.missions: dict[str, Mission] = {}
+        self._db, self._salt = db, salt
+        self.notice = notice  # what happened to a damaged earlier file; "" without such a file
+        self.missions: dict[str, Mission] = {}  # by id, oldest first
+        self.trouble = ""  # why the disk refuses to write; "" if everything is on the disk
+        self.dropped = 0  # number of events that were removed before a reader requested them
         self._unsaved: set[str] = set()  # missions with events that are not on the disk
-        self._events = self._keep_ns = self.dropped = 0  # number of the last event
-        self.trouble = ""
+        self._events = self._keep_ns = 0  # number of the last event; time of the next attempt [ns]
         try:
             self._read()
         except (sqlite3.DatabaseError, LookupError, TypeError, ValueError) as error:
             db.close()
             if isinstance(error, sqlite3.DatabaseError):
                 raise
-            raise sqlite3.DatabaseError(f"a row cannot be read: {error!r}") from error
+            text = " ".join(repr(error).split())
+            raise sqlite3.DatabaseError(f"a row cannot be read: {text}") from error
 
     def open(self) -> list[Mission]:
         """Return the missions that have not ended, in the order in which they fly."""
@@ -316,8 +298,6 @@ class MissionStore:
         """Return the events of all missions after the event `number`, oldest first."""
         if number > self._events:  # the reader has a number of an earlier file
             number = 0
-        if number == self._events:
-            return []
         kept = (event for mission in self.missions.values() for event in mission.events)
         found = sorted((e for e in kept if e["id"] > number), key=lambda event: event["id"])
         if number:  # 0 is a new reader, who has missed nothing

@@ -28,7 +28,6 @@ def waypoint(**more):
         (waypoint(tolerance_m=0), "waypoints.0.tolerance_m", 0, "> 0"),
         ({**waypoint(), "time_limit_s": 1e308}, "time_limit_s", None, "and <= 1000000"),
         ({**waypoint(), "key": "k" * 201}, "key", None, "must be text of at most 200 characters"),
-        ({**waypoint(), "key": "to \u202e"}, "key", None, "one line of printable characters"),
         ({**waypoint(), "\u00b3": 1}, "\u00b3", None, ""),  # `int` does not read this digit
         ({"waypoints": [POINT] * 6000 + [{}]},
          "waypoints.6000.position_m", 6000, "is missing"),
@@ -53,7 +52,6 @@ def test_a_value_that_cannot_be_used_is_named(api, body, path, index, words):
     "body",
     [
         b'{"waypoints":' + b"[" * 100_000,
-        b'{"waypoints": [' + b"0," * 100_000 + b"0]}",
         b'{"waypoints": [' + b'{"position_m": [0, 0, 1]},' * 9_000 + b"{}]}",
         b'{"time_limit_s": 1' + b"0" * 200_000 + b"}",
     ],
