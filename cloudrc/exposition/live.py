@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from itertools import product
 from math import nan
 from typing import Any, get_args
 
@@ -44,30 +45,6 @@ from cloudrc.records import (
     TelemetrySent,
 )
 
-COUNTS = {
-    "cloudrc_sessions_refused_total": "busy",
-    "cloudrc_guard_limited_total": "limited_{}",
-    "cloudrc_guard_held_seconds_total": "held_seconds",
-    "cloudrc_guard_starts_refused_total": "start_refused",
-    "cloudrc_world_stalls_total": "stalls",
-    "cloudrc_horizon_clamped_total": "horizon_clamped",
-    "cloudrc_commands_frozen_total": "frozen",
-    "cloudrc_words_dropped_total": "words_dropped",
-    "cloudrc_loop_missed_periods_total": "missed_periods",
-    "cloudrc_plugin_failures_total": "{}_failed",
-    "cloudrc_recorder_dropped_records_total": "recorder_dropped",
-    "cloudrc_api_requests_total": "api_served",
-    "cloudrc_api_rejected_total": "api_{}",
-    "cloudrc_missions_refused_total": "api_order_{}",
-    "cloudrc_stream_dropped_events_total": "api_events_dropped",
-    "cloudrc_audit_dropped_total": "api_audit_dropped",
-    "cloudrc_journal_repaired_total": "journal_repaired",
-    "cloudrc_link_datagrams_total": "{}",
-    "cloudrc_link_restored_total": "restored",
-    "cloudrc_link_released_early_total": "released_early",
-    "cloudrc_dns_errors_total": "unresolved",
-}
-"""Metric -> `Counted.name` of its count; {} stands for the value of the metric's label."""
 ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total")
 """Metrics that only one kind of shaper has; they are left out while there is no count for them."""
 PERCENTILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
@@ -76,19 +53,6 @@ PERCENTILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
 }
 """Metric -> start of the names of its counts, and label value -> next part of the name. An example
 of such a name is `release_error_p50_ns`."""
-
-
-def read_counts(role: str, counts: Mapping[str, int]) -> Iterator[tuple[str, dict[Labels, float]]]:
-    """Yield name and values of each metric that is a count of a process of `role`."""
-    for metric in of_role(role):
-        pattern = COUNTS.get(metric.name)
-        if pattern is None or (metric.name in ONE_SHAPER and pattern not in counts):
-            continue
-        values = next(iter(metric.labels.values()), None)
-        if values is None:
-            yield metric.name, {(): counts.get(pattern, 0)}
-        else:
-            yield metric.name, {(each,): counts.get(pattern.format(each), 0) for each in values}
 
 
 class LinkVerdict:
@@ -476,7 +440,15 @@ class LiveMetrics:
 
     def read(self) -> Readings:
         """Return the current metrics, without metrics whose values are unknown."""
-        readings: Readings = dict(read_counts(self._role, dict(self._counts)))
+        counts = dict(self._counts)
+        readings: Readings = {}
+        for metric in of_role(self._role):
+            known = metric.name not in ONE_SHAPER or metric.counted in counts
+            if metric.counted and known:
+                readings[metric.name] = {
+                    labels: counts.get(metric.counted.replace("*", *labels or [""]), 0)
+                    for labels in product(*metric.labels.values())  # of one label or none
+                }
         for part in self._parts:
             readings |= part.read()
         return readings

@@ -69,6 +69,7 @@ class Metric(NamedTuple):
     roles: tuple[str, ...]  # processes that expose the metric
     labels: Mapping[str, Labels]  # label -> all possible values; () if they are not known
     buckets: tuple[float, ...]  # upper bounds of a histogram's buckets, rising [unit of the metric]
+    counted: str  # `Counted.name` of the value, "" if none; "*" stands for the label's value
 
 
 def numbered(names: tuple[str, ...]) -> str:
@@ -100,14 +101,14 @@ cloudrc_age_of_information_seconds: Age of the newest odometry in cloud, of the 
 cloudrc_loop_period_seconds: Time between two periods of the loop.
 cloudrc_loop_lateness_seconds: Time from the deadline of a period to the wake of the loop.
 cloudrc_loop_busy_seconds_total: Time for which the loop computed.
-cloudrc_recorder_dropped_records_total: Records that did not reach the recording.
+cloudrc_recorder_dropped_records_total = recorder_dropped: Records that did not reach the recording.
 cloudrc_recorder_sync_age_seconds: Time since the last complete sync of the recording to disk began:
     what a power cut would lose; absent without a recording.
 cloudrc_clock_steps_total: Times that somebody set the wall clock, on which no flight depends.
 
 world
 cloudrc_clouds_admitted_total: Cloud processes that got a session, restarted ones included.
-cloudrc_sessions_refused_total: Sessions refused because another cloud controls the robot.
+cloudrc_sessions_refused_total = busy: Sessions refused because another cloud controls the robot.
 cloudrc_downlink_delay_seconds: One-way delay from cloud to world, late datagrams included; absent
     unless both ends prove that they share a clock.
 cloudrc_position_meters[axis]: True position of the base, world frame.
@@ -117,14 +118,17 @@ cloudrc_command_age_seconds: Age of the current command in TRACK, sampled every 
 cloudrc_guard_state: State of the guard: {numbered(GUARD_STATES)}.
 cloudrc_guard_transitions_total[state]: Changes of the guard's state, by new state.
 cloudrc_guard_causes_total[cause]: Changes of the guard's state, by cause.
-cloudrc_guard_limited_total[limit]: Commands that a limit changed; for the fence, physics steps.
-cloudrc_guard_held_seconds_total: Time in HOLD during missions; updated once a second.
-cloudrc_guard_starts_refused_total: Mission starts refused in LAND or ESTOP.
+cloudrc_guard_limited_total[limit] = limited_*: Commands that a limit changed; for the fence,
+    physics steps.
+cloudrc_guard_held_seconds_total = held_seconds: Time in HOLD during missions; updated once a
+    second.
+cloudrc_guard_starts_refused_total = start_refused: Mission starts refused in LAND or ESTOP.
 cloudrc_contacts_total[body]: Contacts of the robot with bodies of the scene, by kind of body.
 cloudrc_real_time_factor: Simulated time divided by machine time over the last 10 s; below 0.95 a
     run is invalid.
 cloudrc_world_slip_seconds_total: Time by which world's clock has fallen behind the machine's clock.
-cloudrc_world_stalls_total: Late wakes of world after which the waiting datagrams were stale.
+cloudrc_world_stalls_total = stalls: Late wakes of world after which the waiting datagrams were
+    stale.
 
 cloud
 cloudrc_uplink_delay_seconds: One-way delay from world to cloud, late datagrams included; absent
@@ -142,12 +146,16 @@ cloudrc_setpoint_meters[axis]: Position setpoint, world frame.
 cloudrc_pid_output[axis, term]: Terms of the controller's output [m/s], in the newest period.
 cloudrc_command_velocity_meters_per_second[axis]: Commanded velocity, world frame.
 cloudrc_command_yaw_rate_radians_per_second: Commanded yaw rate.
-cloudrc_horizon_clamped_total: Delay estimates clamped to the range 0 to cloud.horizon_max_s.
-cloudrc_commands_frozen_total: Commands of zero velocity, because the robot confirmed no newer one.
-cloudrc_plugin_failures_total[plugin]: Plug-in calls that raised, or returned a wrong value.
-cloudrc_words_dropped_total: Teleop messages dropped because they were for another session or no
-    request number was left.
-cloudrc_loop_missed_periods_total: Periods without a command because the loop was late.
+cloudrc_horizon_clamped_total = horizon_clamped: Delay estimates clamped to the range 0 to
+    cloud.horizon_max_s.
+cloudrc_commands_frozen_total = frozen: Commands of zero velocity, because the robot confirmed no
+    newer one.
+cloudrc_plugin_failures_total[plugin] = *_failed: Plug-in calls that raised, or returned a wrong
+    value.
+cloudrc_words_dropped_total = words_dropped: Teleop messages dropped because they were for another
+    session or no request number was left.
+cloudrc_loop_missed_periods_total = missed_periods: Periods without a command because the loop was
+    late.
 
 cloud teleop
 cloudrc_mission_state: State of the mission: {numbered(MISSION_STATES)}.
@@ -156,12 +164,15 @@ cloudrc_waypoints_reached_total: Waypoints reached.
 cloudrc_missions_total[outcome]: Missions ended, by outcome.
 
 teleop
-cloudrc_api_requests_total: Requests that the API has served.
-cloudrc_api_rejected_total[reason]: Requests that the API rejected, by reason.
-cloudrc_missions_refused_total[reason]: Mission orders that the API refused, by reason.
-cloudrc_stream_dropped_events_total: Events that slow readers of the event stream missed.
-cloudrc_audit_dropped_total: Lines of the audit log that the disk refused.
-cloudrc_journal_repaired_total: Times that teleop set a damaged journal aside and began a new one.
+cloudrc_api_requests_total = api_served: Requests that the API has served.
+cloudrc_api_rejected_total[reason] = api_*: Requests that the API rejected, by reason.
+cloudrc_missions_refused_total[reason] = api_order_*: Mission orders that the API refused, by
+    reason.
+cloudrc_stream_dropped_events_total = api_events_dropped: Events that slow readers of the event
+    stream missed.
+cloudrc_audit_dropped_total = api_audit_dropped: Lines of the audit log that the disk refused.
+cloudrc_journal_repaired_total = journal_repaired: Times that teleop set a damaged journal aside and
+    began a new one.
 
 link
 cloudrc_link_info[shaper, direction, mode]: Always 1; the labels name the shaper of a direction of
@@ -169,15 +180,17 @@ cloudrc_link_info[shaper, direction, mode]: Always 1; the labels name the shaper
 cloudrc_link_delay_seconds[direction]: Mean one-way delay that the current link profile sets.
 cloudrc_link_step_lateness_seconds[percentile]: Lateness of netem's last 10,000 changes on the
     profile's time line; absent without changes.
-cloudrc_link_datagrams_total[outcome]: Datagrams at the shaper, by outcome.
-cloudrc_link_restored_total: Times that another program removed or changed netem's settings.
+cloudrc_link_datagrams_total[outcome] = *: Datagrams at the shaper, by outcome.
+cloudrc_link_restored_total = restored: Times that another program removed or changed netem's
+    settings.
 cloudrc_link_release_error_seconds[percentile]: Lateness of datagrams that left the relay in the
     last 10 s; absent with netem.
-cloudrc_link_released_early_total: Datagrams that left the relay too early; above 0 the relay has a
-    bug; absent with netem.
-cloudrc_dns_errors_total: Failed look-ups of the peer's name; the last known address stays in use.
+cloudrc_link_released_early_total = released_early: Datagrams that left the relay too early; above 0
+    the relay has a bug; absent with netem.
+cloudrc_dns_errors_total = unresolved: Failed look-ups of the peer's name; the last known address
+    stays in use.
 """
-"""All metrics: below the names of the processes that expose them, name, labels and meaning."""
+"""All metrics: below the names of the processes that expose them, name[labels] = count: meaning."""
 _LABELS: Mapping[str, Labels] = {
     **dict.fromkeys(("version", "config"), ()),
     "role": ROLES,
@@ -202,13 +215,13 @@ _LABELS: Mapping[str, Labels] = {
     "cloudrc_link_datagrams_total outcome": LINK_OUTCOMES,
 }
 """Label, or metric and label -> all values of the label; () if the values are not known."""
-_DELAYS = ("uplink_delay", "downlink_delay", "age_of_information", "rtt", "loop_delay")
+_DELAYS = "uplink_delay downlink_delay age_of_information rtt loop_delay command_age"
 _BUCKETS: Mapping[str, tuple[float, ...]] = {
     # Jitter causes gaps below 50 ms; after 250 ms the guard holds.
     "cloudrc_link_gap_seconds": (0.05, 0.25),
     **{
         f"cloudrc_{name}_seconds": (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.25, 1.0)
-        for name in (*_DELAYS, "command_age")
+        for name in _DELAYS.split()
     },
     # The nominal period is 10 ms.
     "cloudrc_loop_period_seconds": (0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1),
@@ -217,20 +230,24 @@ _BUCKETS: Mapping[str, tuple[float, ...]] = {
 """Name of a histogram -> upper bounds of its buckets [s]."""
 
 
+_ENTRY = re.compile(r"^(cloudrc_\w+)(?:\[(.*)\])?(?: = (\S+))?: (.*(?:\n .*)*)", re.MULTILINE)
+
+
 def _metrics() -> Iterator[Metric]:
     for section in _TABLE.strip().split("\n\n"):
-        roles, *blocks = re.split(r"\n(?=cloudrc_)", section)
-        for block in blocks:
-            head, _, meaning = block.partition(": ")
-            name, *names = re.findall(r"\w+", head)
-            labels = {each: _LABELS.get(f"{name} {each}") or _LABELS[each] for each in names}
+        roles, _, text = section.partition("\n")
+        for name, names, count, meaning in _ENTRY.findall(text):
+            labels = {
+                each: _LABELS.get(f"{name} {each}") or _LABELS[each]
+                for each in re.findall(r"\w+", names)
+            }
             kind, buckets = Kind.GAUGE, _BUCKETS.get(name, ())
             if buckets:
                 kind = Kind.HISTOGRAM
             elif name.endswith("_total"):
                 kind = Kind.COUNTER
-            text = " ".join(meaning.split())
-            yield Metric(name, kind, text, tuple(roles.split()), labels, buckets)
+            one_line = " ".join(meaning.split())
+            yield Metric(name, kind, one_line, tuple(roles.split()), labels, buckets, count)
 
 
 METRICS: Mapping[str, Metric] = MappingProxyType({metric.name: metric for metric in _metrics()})

@@ -129,15 +129,11 @@ class ConflictError(CloudrcError):
         self.mission = mission
 
 
-APPLICATION, VERSION = 0x43524A32, 1
-"""Numbers in the file's header: the first marks files of cloudrc, the second is the version."""
-SCHEMA = f"""
+SCHEMA = """
 BEGIN;
 CREATE TABLE mission (n INTEGER PRIMARY KEY, plan TEXT NOT NULL, status TEXT NOT NULL);
 CREATE TABLE reached (mission INTEGER REFERENCES mission ON DELETE CASCADE, waypoint INTEGER,
     time_s REAL NOT NULL, PRIMARY KEY (mission, waypoint)) WITHOUT ROWID;
-PRAGMA application_id = {APPLICATION};
-PRAGMA user_version = {VERSION};
 COMMIT;
 """
 
@@ -149,7 +145,7 @@ def open_store(path: Path, salt: bytes) -> MissionStore:
 
     Raises:
         StoreLockedError: If another process has locked the file.
-        BadInputError: If the file has another content or version, or cannot be made.
+        BadInputError: If the file has another content, or cannot be read or made.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     path.touch(0o600)
@@ -173,10 +169,7 @@ def open_store(path: Path, salt: bytes) -> MissionStore:
 def connect(path: Path | None = None, factory: Any = sqlite3.Connection) -> sqlite3.Connection:
     """Open and lock a database of missions, in a file or, without a path, in memory.
 
-    Raises:
-        BadInputError: If the file has another version.
-        sqlite3.OperationalError: If the file is locked, or if its volume fails.
-        sqlite3.DatabaseError: If the file is damaged.
+    Raise a `sqlite3.DatabaseError` if the file is locked or damaged, or if its volume fails.
     """
     # One thread opens the file; another thread may serve the missions.
     how: dict[str, Any] = {"timeout": 0, "isolation_level": None, "check_same_thread": False}
@@ -186,19 +179,12 @@ def connect(path: Path | None = None, factory: Any = sqlite3.Connection) -> sqli
             "PRAGMA locking_mode = EXCLUSIVE; PRAGMA journal_mode = WAL; "
             "PRAGMA synchronous = FULL; PRAGMA foreign_keys = ON; BEGIN EXCLUSIVE; COMMIT;"
         )
-        if not _value(db, "schema_version"):
+        if db.execute("PRAGMA schema_version").fetchone() == (0,):  # a new file
             db.executescript(SCHEMA)
-        if (_value(db, "application_id"), _value(db, "user_version")) != (APPLICATION, VERSION):
-            text = "this version cannot read it; move it away, or name another file"
-            raise BadInputError(f"--journal {path}: {text}")
     except BaseException:
         db.close()
         raise
     return db
-
-
-def _value(db: sqlite3.Connection, pragma: str) -> Any:
-    return db.execute(f"PRAGMA {pragma}").fetchone()[0]
 
 
 KEPT = 100
