@@ -124,8 +124,8 @@ class Flight:
         """Whether the robot's base is inside a pipe, per row of `truth`."""
         return pipe_index(self.scene, self.truth["position"]) >= 0
 
-    def count(self, number: int) -> float | None:
-        """Return `number`, a number of events [1], as a metric; None if the robot never flew."""
+    def count(self, number: float) -> float | None:
+        """Return `number` [any unit] as a metric; None if the robot never flew."""
         return None if self.start_ns is None else float(number)
 
     def last_total(self, name: str) -> float | None:

@@ -341,35 +341,35 @@ async def stream_events(
 ) -> StreamingResponse:
     """Stream the events of all missions after event number `after` as server-sent events.
 
-    A browser that connects again sends the number of its last event as the header Last-Event-ID.
+    The stream ends when the client leaves, its token becomes invalid, or teleop ends. A browser
+    that connects again sends the number of its last event as the header Last-Event-ID.
     """
-    after = max(after, last_event_id)
     await bridge.ask(lambda service, now_ns: None)  # raises an error if teleop cannot answer
-    stream, headers = _stream(request, bridge, after), {"Cache-Control": "no-store"}
-    return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
-
-
-async def _stream(request: Request, bridge: Bridge, number: int) -> AsyncIterator[str]:
-    """Yield new events until the client disconnects, its token becomes invalid, or teleop ends."""
+    number = max(after, last_event_id)
 
     def call(service: MissionService, now_ns: int) -> list[Event]:
         return service.book.events_after(number)
 
-    quiet = 0.0  # time without an event [s]
-    yield ": cloudrc\n\n"
-    while not bridge.closed and await request.scope["caller"]() is not None:
-        try:
-            found = await bridge.ask(call)
-        except CloudrcError:
-            return
-        for event in found:
-            number = event["id"]
-            yield f"id: {number}\nevent: mission\ndata: {json.dumps(event)}\n\n"
-        quiet = 0.0 if found else quiet + LOOK_PERIOD
-        if quiet >= ALIVE_PERIOD:
-            quiet = 0.0
-            yield ": alive\n\n"
-        await asyncio.sleep(LOOK_PERIOD)
+    async def stream() -> AsyncIterator[str]:
+        nonlocal number
+        quiet = 0.0  # time without an event [s]
+        yield ": cloudrc\n\n"
+        while not bridge.closed and await request.scope["caller"]() is not None:
+            try:
+                found = await bridge.ask(call)
+            except CloudrcError:
+                return
+            for event in found:
+                number = event["id"]
+                yield f"id: {number}\nevent: mission\ndata: {json.dumps(event)}\n\n"
+            quiet = 0.0 if found else quiet + LOOK_PERIOD
+            if quiet >= ALIVE_PERIOD:
+                quiet = 0.0
+                yield ": alive\n\n"
+            await asyncio.sleep(LOOK_PERIOD)
+
+    headers = {"Cache-Control": "no-store"}
+    return StreamingResponse(stream(), media_type="text/event-stream", headers=headers)
 
 
 class ApiServer(uvicorn.Server):
