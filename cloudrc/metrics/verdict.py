@@ -331,39 +331,16 @@ def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, N
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """Contacts and slip of world's clock during a mission, as telemetry reports them."""
+    """Contacts in a mission and slip of world's clock, as telemetry reports them."""
 
-    pipe_contacts: int = 0  # last count in telemetry
-    pipe_touches: int = 0  # contacts since the mission began
-    touch_before: float | None = None  # speed of an earlier mission's touch [m/s]
-    touch_speed: float | None = None  # speed of this mission's touch of the board [m/s]
+    pipe_contacts: int = 0  # number of contacts with pipes
+    touch_speed: float | None = None  # of the arm's tip at its first touch of the board [m/s]
     slip_began_ns: int = 0  # world's slip when the mission began [ns]
     slip_ns: int = 0  # world's slip in the last telemetry [ns]
 
-    @classmethod
-    def begin(cls, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
-        """Begin with the first telemetry; `see` describes `touch_speed` [m/s] and the others."""
-        return cls(pipe_contacts, 0, finite_or_none(touch_speed), None, slip_ns, slip_ns)
-
-    def see(self, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
-        """Take the values of new telemetry.
-
-        Args:
-            pipe_contacts: Number of contacts with pipes since the robot was reset.
-            touch_speed: Speed of the arm's tip at the touch of the board [m/s]; NaN before.
-            slip_ns: Lag of world's clock behind its machine's clock [ns].
-        """
-        touch = finite_or_none(touch_speed)
-        if self.touch_speed is not None or touch == self.touch_before:
-            touch = self.touch_speed
-        touches = self.pipe_touches + max(0, pipe_contacts - self.pipe_contacts)
-        return Observations(
-            pipe_contacts, touches, self.touch_before, touch, self.slip_began_ns, slip_ns
-        )
-
     def news(self, before: Observations, elapsed: float) -> Iterator[tuple[str, str]]:
         """Yield event and text of each contact since `before`, at mission time `elapsed` [s]."""
-        if self.pipe_touches > before.pipe_touches:
+        if self.pipe_contacts > before.pipe_contacts:
             yield "pipe_touched", f"the robot touched a pipe at {elapsed:.2f} s"
         if self.touch_speed != before.touch_speed:
             text = f"board touched at {elapsed:.2f} s with {self.touch_speed:.2f} m/s"
@@ -376,7 +353,7 @@ class Observations:
             ending=ending,
             end=Moment(elapsed),
             touch=None if self.touch_speed is None else (self.touch_speed, UNKNOWN),
-            violations=(_pipe_touched("a pipe", self.pipe_touches),) if self.pipe_touches else (),
+            violations=(_pipe_touched("a pipe", self.pipe_contacts),) if self.pipe_contacts else (),
             slow=_too_slow(1.0 - slipped / elapsed) if elapsed > 0 else "",
             **known,
         )

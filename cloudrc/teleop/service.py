@@ -7,6 +7,7 @@ restarted, too. It sends the emergency stop again if an earlier stop has not rea
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import hypot, inf
 from typing import Any
 
@@ -244,9 +245,14 @@ class MissionService:
         self._heard_ns = self._seen_ns = now_ns
         if before is None or (before.world, before.guard) != (seen.world, seen.guard):
             self._guard_ns = now_ns
-        if mission is not None and mission.world and mission.world == seen.world:
+        if mission is not None and (mission.number, mission.world) == (seen.mission_id, seen.world):
             known = mission.witness
-            mission.witness = known.see(*_contacts(seen))
+            mission.witness = replace(
+                known,
+                pipe_contacts=seen.pipe_contacts,
+                touch_speed=finite_or_none(seen.touch_speed),
+                slip_ns=seen.slip_ns,
+            )
             for event, text in mission.witness.news(known, self._teleop.elapsed(now_ns)):
                 self._note(mission, event, text, now_ns)
             if before is not None and before.epoch != seen.epoch:
@@ -394,7 +400,8 @@ class MissionService:
         assert mission is not None, "an event belongs to a mission"
         changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:
-            changed |= {"world": seen.world, "witness": Observations.begin(*_contacts(seen))}
+            slip_ns = seen.slip_ns
+            changed |= {"world": seen.world, "witness": Observations(0, None, slip_ns, slip_ns)}
         if event == self._teleop.outcome:
             evidence = mission.witness.evidence(
                 Ending(event.event, event.text),
@@ -421,7 +428,3 @@ def _busy(mission: Mission, advice: str) -> ConflictError:
 
 def _place(position: Vector) -> str:
     return f"[{', '.join(f'{value:.2f}' for value in position)}]"
-
-
-def _contacts(seen: RobotStatus) -> tuple[int, float, int]:
-    return seen.pipe_contacts, seen.touch_speed, seen.slip_ns

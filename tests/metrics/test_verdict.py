@@ -8,7 +8,6 @@ from cloudrc.messages import GuardState
 from cloudrc.metrics import SHIPPED, Number
 from cloudrc.metrics.verdict import (
     SLIP_MAX,
-    Observations,
     exit_code,
     flight_evidence,
     judge,
@@ -182,15 +181,6 @@ def test_real_time_is_kept_or_the_run_is_invalid(slip, factor, found):
     assert judged(flight).outcome == "success"
     unproven = judged(flight, real_time=True)  # no rows of lateness
     assert (unproven.outcome, codes(unproven)) == ("invalid", ["not_real_time"])
-
-
-def test_only_what_telemetry_shows_during_the_mission_counts():
-    seen = Observations.begin(3, 0.9, 5)
-    assert seen.see(3, 0.9, 5) == seen
-    after = seen.see(5, 0.1, 9).see(5, 0.4, 9)
-    assert (after.pipe_touches, after.touch_speed) == (2, 0.1), "the first touch stays"
-    assert after.slip_ns - after.slip_began_ns == 4
-    assert [event for event, _ in after.news(seen, 1.0)] == ["pipe_touched", "board_touched"]
 
 
 @pytest.mark.parametrize(("failures", "found"), [(4, []), (5, ["plugin_failed"])])
