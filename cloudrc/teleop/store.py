@@ -1,9 +1,8 @@
 """Store missions and their progress in an SQLite file; read them after a restart of teleop.
 
-One row holds a mission's order and status; each event changes the status. One row holds each
-reached waypoint; mission and index are its key, so that no waypoint is stored twice. A transaction
-returns after its data is on the disk, so a killed process loses at most the newest event. While the
-disk refuses to write, flights continue, events stay in memory, and no new mission starts.
+One row holds a mission's order and status; each event changes the status. A transaction returns
+after its data is on the disk, so a killed process loses at most the newest event. While the disk
+refuses to write, flights continue, events stay in memory, and no new mission starts.
 """
 
 from __future__ import annotations
@@ -129,13 +128,7 @@ class ConflictError(CloudrcError):
         self.mission = mission
 
 
-SCHEMA = """
-BEGIN;
-CREATE TABLE mission (n INTEGER PRIMARY KEY, plan TEXT NOT NULL, status TEXT NOT NULL);
-CREATE TABLE reached (mission INTEGER REFERENCES mission ON DELETE CASCADE, waypoint INTEGER,
-    time_s REAL NOT NULL, PRIMARY KEY (mission, waypoint)) WITHOUT ROWID;
-COMMIT;
-"""
+SCHEMA = "CREATE TABLE missions (n INTEGER PRIMARY KEY, plan TEXT NOT NULL, status TEXT NOT NULL)"
 
 
 def open_store(path: Path, salt: bytes) -> MissionStore:
@@ -177,7 +170,7 @@ def connect(path: Path | None = None, factory: Any = sqlite3.Connection) -> sqli
     try:
         db.executescript(
             "PRAGMA locking_mode = EXCLUSIVE; PRAGMA journal_mode = WAL; "
-            "PRAGMA synchronous = FULL; PRAGMA foreign_keys = ON; BEGIN EXCLUSIVE; COMMIT;"
+            "PRAGMA synchronous = FULL; BEGIN EXCLUSIVE; COMMIT;"
         )
         if db.execute("PRAGMA schema_version").fetchone() == (0,):  # a new file
             db.executescript(SCHEMA)
@@ -192,8 +185,8 @@ KEPT = 100
 KEEP_PERIOD_NS = 1_000_000_000
 """Time between two attempts to write events that the disk has refused [ns]."""
 _ORDER, _MISSION = TypeAdapter(Order), TypeAdapter(Mission)
-_STATUS = {"state", "world", "elapsed", "events", "happened", "witness", "verdict"}
-"""Attributes of a mission that its events change; reached waypoints have a table of their own."""
+_STATUS = {"state", "world", "elapsed", "reached", "events", "happened", "witness", "verdict"}
+"""Attributes of a mission that its events change."""
 
 
 class MissionStore:
@@ -251,7 +244,7 @@ class MissionStore:
         Raises:
             UnavailableError: If the disk refuses to write; then there is no new mission.
         """
-        mission_id = f"m{int(next(reversed(self.missions), 'm0')[1:]) + 1}"
+        mission_id = f"m{_row(next(reversed(self.missions), 'm0')) + 1}"
         digest = hashlib.sha256(self._salt + mission_id.encode()).digest()
         number = int.from_bytes(digest[:8], "little") >> 1 or 1
         mission = Mission(mission_id, replace(order, queue=False), number)
@@ -299,13 +292,14 @@ class MissionStore:
         db = self._db
         try:
             db.execute("BEGIN")
-            for mission_id in self._unsaved:
-                self._write(self.missions[mission_id])
+            changed = [(_status(self.missions[each]), _row(each)) for each in self._unsaved]
+            db.executemany("UPDATE missions SET status = ? WHERE n = ?", changed)
             if new is not None:
                 order = json.dumps([new.number, _ORDER.dump_python(new.order, mode="json")])
-                row = int(new.id[1:]), order, _status(new)
-                db.execute("INSERT INTO mission VALUES (?, ?, ?)", row)
-            db.executemany("DELETE FROM mission WHERE n = ?", [(int(each[1:]),) for each in old])
+                db.execute(
+                    "INSERT INTO missions VALUES (?, ?, ?)", (_row(new.id), order, _status(new))
+                )
+            db.executemany("DELETE FROM missions WHERE n = ?", [(_row(each),) for each in old])
             db.commit()
         except sqlite3.DatabaseError as error:
             with suppress(sqlite3.DatabaseError):
@@ -315,24 +309,18 @@ class MissionStore:
         self._unsaved.clear()
         self.trouble = ""
 
-    def _write(self, mission: Mission) -> None:
-        db, row = self._db, int(mission.id[1:])
-        db.execute("UPDATE mission SET status = ? WHERE n = ?", (_status(mission), row))
-        (there,) = db.execute("SELECT count(*) FROM reached WHERE mission = ?", (row,)).fetchone()
-        reached = [(row, each["waypoint"], each["time_s"]) for each in mission.reached[there:]]
-        db.executemany("INSERT INTO reached VALUES (?, ?, ?)", reached)
-
     def _read(self) -> None:
-        for row, ordered, status in self._db.execute("SELECT * FROM mission ORDER BY n"):
+        for row, ordered, status in self._db.execute("SELECT * FROM missions ORDER BY n"):
             number, order = json.loads(ordered)
             known = {"id": f"m{row}", "number": number, "order": order, **json.loads(status)}
             mission = _MISSION.validate_python(known)
             mission.events = deque(mission.events, SHOWN)
             self._events = max(self._events, *(event["id"] for event in mission.events), 0)
             self.missions[mission.id] = mission
-        for row, *reached in self._db.execute("SELECT * FROM reached ORDER BY mission, waypoint"):
-            each = dict(zip(("waypoint", "time_s"), reached, strict=True))
-            self.missions[f"m{row}"].reached.append(each)
+
+
+def _row(mission_id: str) -> int:
+    return int(mission_id.removeprefix("m"))
 
 
 def _status(mission: Mission) -> str:

@@ -65,7 +65,7 @@ def test_missions_are_read_back_exactly(path):
 def test_each_commit_waits_for_the_disk(path):
     open_store(path, b"").close()
     with closing(connect(path)) as database:
-        for name, value in (("synchronous", 2), ("journal_mode", "wal"), ("foreign_keys", 1)):
+        for name, value in (("synchronous", 2), ("journal_mode", "wal")):
             assert database.execute(f"PRAGMA {name}").fetchone()[0] == value
 
 
@@ -93,8 +93,8 @@ def execute(path, statement):
     "damage",
     [
         lambda path: overwrite(path, 4096, os.urandom(9000)),
-        lambda path: execute(path, "UPDATE mission SET status = '{'"),
-        lambda path: execute(path, "UPDATE mission SET plan = '[1, {}]'"),
+        lambda path: execute(path, "UPDATE missions SET status = '{'"),
+        lambda path: execute(path, "UPDATE missions SET plan = '[1, {}]'"),
     ],
 )
 def test_a_damaged_file_is_set_aside_and_named(path, damage):
@@ -115,7 +115,7 @@ def test_a_damaged_file_is_set_aside_and_named(path, damage):
     ("make", "said"),
     [
         (lambda path: path.write_bytes(b"a recording of somebody else"), "not a database"),
-        (lambda path: execute(path, "CREATE TABLE a (b)"), "no such table: mission"),
+        (lambda path: execute(path, "CREATE TABLE a (b)"), "no such table: missions"),
         (lambda path: path.with_name("missions-wal").mkdir(), "disk I/O error"),
     ],
 )
