@@ -24,7 +24,7 @@ from cloudrc.exposition.parts import (
     per_axis,
     unlabelled,
 )
-from cloudrc.exposition.table import Labels, of_role
+from cloudrc.exposition.table import Kind, Labels, Metric, of_role
 from cloudrc.messages import NEVER_NS, Cause, GuardState
 from cloudrc.records import (
     BY_HAND,
@@ -47,12 +47,6 @@ from cloudrc.records import (
 
 ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total")
 """Metrics that only one kind of shaper has; they are left out while there is no count for them."""
-PERCENTILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
-    "cloudrc_link_release_error_seconds": ("release_error", table.RELEASE_PERCENTILES),
-    "cloudrc_link_step_lateness_seconds": ("step_lateness", table.STEP_PERCENTILES),
-}
-"""Metric -> start of the names of its counts, and label value -> next part of the name. An example
-of such a name is `release_error_p50_ns`."""
 
 
 class LinkVerdict:
@@ -333,9 +327,8 @@ class CloudEnd(End):
 class Link:
     """Metrics of a process that shapes one direction of the link or both."""
 
-    def __init__(self, counts: Mapping[str, int]) -> None:
+    def __init__(self) -> None:
         self.tell: Callable[[], str] = lambda: "{}\n"  # content of /link.json, the shaper's state
-        self._counts = counts
         self._shapers: dict[str, Labels] = {}
         self._delays: dict[str, float] = {}
 
@@ -349,17 +342,10 @@ class Link:
 
     def read(self) -> Readings:
         """Return the current metrics, without metrics whose values are unknown."""
-        counts = dict(self._counts)  # an atomic copy: another thread may change the counts
-        readings: Readings = {
+        return {
             "cloudrc_link_info": dict.fromkeys(list(self._shapers.values()), 1.0),
             "cloudrc_link_delay_seconds": by_label(dict(self._delays)),
         }
-        for metric, (quantity, percentiles) in PERCENTILES.items():
-            names = {label: f"{quantity}_{name}_ns" for label, name in percentiles.items()}
-            readings[metric] = {
-                (label,): counts[name] * 1e-9 for label, name in names.items() if name in counts
-            }
-        return readings
 
 
 NO_WAYPOINT = -1
@@ -404,6 +390,17 @@ class Mission:
         }
 
 
+def _read_count(metric: Metric, counts: Mapping[str, int]) -> dict[Labels, float]:
+    """Return the values of a metric that is a count, in s if the count is in ns."""
+    begins_at_0 = metric.kind is Kind.COUNTER and metric.name not in ONE_SHAPER
+    found: dict[Labels, float] = {}
+    for labels in product(*metric.labels.values()):  # of one label or none
+        name = metric.counted.replace("*", *labels or [""]).replace(".", "")
+        if begins_at_0 or name in counts:
+            found[labels] = counts.get(name, 0) * (1e-9 if name.endswith("_ns") else 1)
+    return found
+
+
 class LiveMetrics:
     """Current metrics of one process. One thread calls `see`, any other thread may call `read`."""
 
@@ -416,7 +413,7 @@ class LiveMetrics:
         self._counts: dict[str, int] = {}
         ends: dict[str, type[WorldEnd | CloudEnd]] = {table.WORLD: WorldEnd, table.CLOUD: CloudEnd}
         self.end: End | None = ends[role](self._counts) if role in ends else None
-        self.link = Link(self._counts) if role == table.LINK else None
+        self.link = Link() if role == table.LINK else None
         has_mission = missions and role in (table.CLOUD, table.TELEOP)
         mission = Mission(always=role == table.TELEOP) if has_mission else None
         parts = self.end, self.end and self.end.check, self.link, mission
@@ -443,12 +440,8 @@ class LiveMetrics:
         counts = dict(self._counts)
         readings: Readings = {}
         for metric in of_role(self._role):
-            known = metric.name not in ONE_SHAPER or metric.counted in counts
-            if metric.counted and known:
-                readings[metric.name] = {
-                    labels: counts.get(metric.counted.replace("*", *labels or [""]), 0)
-                    for labels in product(*metric.labels.values())  # of one label or none
-                }
+            if metric.counted and (found := _read_count(metric, counts)):
+                readings[metric.name] = found
         for part in self._parts:
             readings |= part.read()
         return readings

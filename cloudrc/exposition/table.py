@@ -44,10 +44,8 @@ BODIES = ("pipe", "board", "floor", "other")
 """Kinds of bodies that the robot can touch, such as "pipe" for the body `pipe_2`."""
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
 """Outcomes of a datagram at the relay; `cloudrc.link.relay.Lanes.outcomes` explains them."""
-RELEASE_PERCENTILES = {"50": "p50", "99": "p99", "99.9": "p999"}
-"""Value of the label `percentile` -> part of the name of the relay's count `release_error_*`."""
-STEP_PERCENTILES = {"50": "p50", "99": "p99"}
-"""Value of the label `percentile` -> part of the name of netem's count `step_lateness_*`."""
+RELEASE_PERCENTILES = ("50", "99", "99.9")
+"""Percentiles of the relay's release error; its count of "99.9" is `release_error_p999_ns`."""
 
 Labels = tuple[str, ...]
 
@@ -178,13 +176,13 @@ link
 cloudrc_link_info[shaper, direction, mode]: Always 1; the labels name the shaper of a direction of
     the link, and the configured mode.
 cloudrc_link_delay_seconds[direction]: Mean one-way delay that the current link profile sets.
-cloudrc_link_step_lateness_seconds[percentile]: Lateness of netem's last 10,000 changes on the
-    profile's time line; absent without changes.
+cloudrc_link_step_lateness_seconds[percentile] = step_lateness_p*_ns: Lateness of netem's last
+    10,000 changes on the profile's time line; absent without changes.
 cloudrc_link_datagrams_total[outcome] = *: Datagrams at the shaper, by outcome.
 cloudrc_link_restored_total = restored: Times that another program removed or changed netem's
     settings.
-cloudrc_link_release_error_seconds[percentile]: Lateness of datagrams that left the relay in the
-    last 10 s; absent with netem.
+cloudrc_link_release_error_seconds[percentile] = release_error_p*_ns: Lateness of datagrams that
+    left the relay in the last 10 s; absent with netem.
 cloudrc_link_released_early_total = released_early: Datagrams that left the relay too early; above 0
     the relay has a bug; absent with netem.
 cloudrc_dns_errors_total = unresolved: Failed look-ups of the peer's name; the last known address
@@ -210,8 +208,8 @@ _LABELS: Mapping[str, Labels] = {
     "cloudrc_api_rejected_total reason": ("token", "role", "busy"),
     # "conflict": another mission is in the way.
     "cloudrc_missions_refused_total reason": ("invalid", "conflict"),
-    "cloudrc_link_step_lateness_seconds percentile": tuple(STEP_PERCENTILES),
-    "cloudrc_link_release_error_seconds percentile": tuple(RELEASE_PERCENTILES),
+    "cloudrc_link_step_lateness_seconds percentile": ("50", "99"),
+    "cloudrc_link_release_error_seconds percentile": RELEASE_PERCENTILES,
     "cloudrc_link_datagrams_total outcome": LINK_OUTCOMES,
 }
 """Label, or metric and label -> all values of the label; () if the values are not known."""
