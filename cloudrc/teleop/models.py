@@ -305,11 +305,7 @@ def _parse(body: bytes, model: type[_Request]) -> _Request:
     try:
         return model.model_validate_json(body)
     except ValidationError as error:
-        first = error.errors()[0]
-        if first["type"] == "json_invalid":
-            problems = [ConfigProblem((), "", f"not JSON: {first['ctx']['error']}")]
-        elif not first["loc"]:
-            problems = [ConfigProblem((), "", "must be a mapping of keys")]
-        else:
-            problems = from_pydantic(error, model, limit=PROBLEMS_MAX)
-        raise RefusedError(problems) from None
+        problems = from_pydantic(error, model, limit=PROBLEMS_MAX)
+    if not problems[0].path:
+        problems = [ConfigProblem((), "", "must be JSON: a mapping of keys")]
+    raise RefusedError(problems)

@@ -30,8 +30,8 @@ def waypoint(**more):
         ({"waypoints": [POINT] * 6000 + [{}]},
          "waypoints.6000.position_m", 6000, "is missing"),
         (b'{"waypoints": [{"position_m": [0, 0, NaN]}]}', "waypoints.0.position_m.2", 0, "finite"),
-        (b"nonsense", "", None, "not JSON"),
-        (b'{"waypoints":' + b"[" * 100_000, "", None, "not JSON"),
+        (b"nonsense", "", None, "must be JSON"),
+        (b'{"waypoints":' + b"[" * 100_000, "", None, "must be JSON"),
         (b"[]", "", None, "mapping"),
     ],
 )  # fmt: skip
