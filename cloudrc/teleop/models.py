@@ -37,6 +37,7 @@ PROBLEMS_MAX = 50
 
 
 Text = Annotated[str, Field(max_length=200)]
+DEFAULT = "default: as in the experiment"
 
 
 class MissionRequest(Section):
@@ -45,19 +46,13 @@ class MissionRequest(Section):
     name: Text = Field("", description="Shown to people")
     description: str = Field("", description="One line, not kept")
     start: Literal["spawn", "here"] = Field("spawn", description="Where the mission starts")
-    time_limit_s: TimeLimit | None = Field(
-        None, description="For the whole mission, with its holds [s]; default: as in the experiment"
-    )
-    waypoints: tuple[Waypoint, ...] = Field(
-        (), max_length=MAX_WAYPOINTS, description="Points, in order"
-    )
-    carrot: Carrot | None = Field(
-        None, description="Lets the setpoint move along the ways; null: the setpoint jumps"
-    )
+    time_limit_s: TimeLimit | None = Field(None, description=f"With all holds [s]; {DEFAULT}")
+    waypoints: tuple[Waypoint, ...] = Field((), max_length=MAX_WAYPOINTS, description="In order")
+    carrot: Carrot | None = Field(None, description="How the setpoint moves; null: it jumps")
     contact: bool | None = Field(
-        None, description="Whether the arm has to touch the board; default: as in the experiment, "
-        "if a waypoint is at the board",
-    )  # fmt: skip
+        None,
+        description=f"The arm has to touch the board; {DEFAULT}, if a waypoint is at the board",
+    )
     key: Text = Field("", description="Teleop makes one mission for each key")
     queue: bool = Field(False, description="Wait for the mission under way, if there is one")
 
@@ -171,9 +166,7 @@ class Seen(_Answer):
     epoch: int = _field("Number of the session between cloud and world")
     world: str = _field("Identifies world's process")
     position_m: list[float | None] = _field("Measured position of the base [m], world frame")
-    guard: Literal["GROUND", "TRACK", "HOLD", "LAND", "ESTOP"] = _field(
-        "State of the guard on board"
-    )
+    guard: Literal["GROUND", "TRACK", "HOLD", "LAND", "ESTOP"] = _field("State of the guard")
     cause: str = _field("Why the guard is in this state; after a landing, why the robot landed")
     guard_for_s: float | None = _field("Time in this guard state [s]; null if `age_s` is above 1 s")
     next_step: str = _field("What the robot does next, or what the operator has to do")
@@ -189,9 +182,7 @@ class StateView(_Answer):
 
     mission: MissionSummary | None = _field("The mission under way")
     queue: list[str] = _field("Ids of the missions that wait")
-    cloud_age_s: float | None = _field(
-        "Age of the last message from cloud [s], which sends one every 0.2 s; null before the first"
-    )
+    cloud_age_s: float | None = _field("Age of the last message of cloud [s]; null before one")
     seen: Seen | None = _field("Null before the first telemetry")
 
 
@@ -205,10 +196,7 @@ class Stopped(_Answer):
 class Acknowledged(_Answer):
     """Answer to an acknowledgement; the robot may not have received it yet."""
 
-    state: Literal["acknowledged"] = _field(
-        "The next mission can fly. A landing near the ground ends first. The robot takes off again "
-        "only when it has stood still, 0.5 m inside the fence"
-    )
+    state: Literal["acknowledged"] = _field("A mission can fly once the robot stands still")
 
 
 class Problem(_Answer):
