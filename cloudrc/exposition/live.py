@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from math import isfinite, nan
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from itertools import product
+from math import nan
+from typing import Any, get_args
 
 from cloudrc.exposition import table
 from cloudrc.exposition.parts import (
@@ -23,7 +24,7 @@ from cloudrc.exposition.parts import (
     per_axis,
     unlabelled,
 )
-from cloudrc.exposition.table import Labels, of_role
+from cloudrc.exposition.table import Kind, Labels, Metric, of_role
 from cloudrc.messages import NEVER_NS, Cause, GuardState
 from cloudrc.records import (
     BY_HAND,
@@ -44,51 +45,8 @@ from cloudrc.records import (
     TelemetrySent,
 )
 
-COUNTS = {
-    "cloudrc_sessions_refused_total": "busy",
-    "cloudrc_guard_limited_total": "limited_{}",
-    "cloudrc_guard_held_seconds_total": "held_seconds",
-    "cloudrc_guard_starts_refused_total": "start_refused",
-    "cloudrc_world_stalls_total": "stalls",
-    "cloudrc_horizon_clamped_total": "horizon_clamped",
-    "cloudrc_commands_frozen_total": "frozen",
-    "cloudrc_words_dropped_total": "words_dropped",
-    "cloudrc_loop_missed_periods_total": "missed_periods",
-    "cloudrc_plugin_failures_total": "{}_failed",
-    "cloudrc_recorder_dropped_records_total": "recorder_dropped",
-    "cloudrc_api_requests_total": "api_served",
-    "cloudrc_api_rejected_total": "api_{}",
-    "cloudrc_missions_refused_total": "api_order_{}",
-    "cloudrc_stream_dropped_events_total": "api_events_dropped",
-    "cloudrc_audit_dropped_total": "api_audit_dropped",
-    "cloudrc_journal_repaired_total": "journal_repaired",
-    "cloudrc_link_datagrams_total": "{}",
-    "cloudrc_link_restored_total": "restored",
-    "cloudrc_link_released_early_total": "released_early",
-    "cloudrc_dns_errors_total": "unresolved",
-}
-"""Metric -> `Counted.name` of its count; {} stands for the value of the metric's label."""
 ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total")
 """Metrics that only one kind of shaper has; they are left out while there is no count for them."""
-PERCENTILES: Mapping[str, tuple[str, Mapping[str, str]]] = {
-    "cloudrc_link_release_error_seconds": ("release_error", table.RELEASE_PERCENTILES),
-    "cloudrc_link_step_lateness_seconds": ("step_lateness", table.STEP_PERCENTILES),
-}
-"""Metric -> start of the names of its counts, and label value -> next part of the name. An example
-of such a name is `release_error_p50_ns`."""
-
-
-def read_counts(role: str, counts: Mapping[str, int]) -> Iterator[tuple[str, dict[Labels, float]]]:
-    """Yield name and values of each metric that is a count of a process of `role`."""
-    for metric in of_role(role):
-        pattern = COUNTS.get(metric.name)
-        if pattern is None or (metric.name in ONE_SHAPER and pattern not in counts):
-            continue
-        values = next(iter(metric.labels.values()), None)
-        if values is None:
-            yield metric.name, {(): counts.get(pattern, 0)}
-        else:
-            yield metric.name, {(each,): counts.get(pattern.format(each), 0) for each in values}
 
 
 class LinkVerdict:
@@ -99,7 +57,7 @@ class LinkVerdict:
         self._direction = direction
         self._newest: tuple[LinkChecked, ...] = ()
 
-    def _on_check(self, record: LinkChecked) -> None:
+    def _on_linkchecked(self, record: LinkChecked) -> None:
         """Store the verdict on one quantity, and drop verdicts of earlier checks."""
         newest = [one for one in self._newest if one.stamp_ns == record.stamp_ns]
         self._newest = (*newest, record)  # a new tuple: another thread may read the old one
@@ -112,16 +70,11 @@ class LinkVerdict:
 
     def text(self) -> str:
         """Return the content of /link.json: the verdict on the link, and a row per quantity."""
-        left_out = ("stamp_ns", "uplink")  # equal in all rows
-        rows = [
-            {
-                key: value
-                for key, value in record._asdict().items()
-                if key not in left_out and (isinstance(value, str) or isfinite(value))
-            }
-            for record in self._newest
-        ]
-        document = {"direction": self._direction, "verdict": self.verdict, "rows": rows}
+        rows = [record._asdict() for record in self._newest]
+        for row in rows:  # these are equal in all rows
+            del row["stamp_ns"], row["uplink"]
+        known = [{key: value for key, value in row.items() if value == value} for row in rows]
+        document = {"direction": self._direction, "verdict": self.verdict, "rows": known}
         return json.dumps(document, indent=2) + "\n"
 
     def read(self) -> Readings:
@@ -138,17 +91,12 @@ SILENCE_NS = 2_000_000_000
 
 
 class End:
-    """Metrics that both world and cloud have: session, datagrams, one-way delay, loop timing.
-
-    Attributes:
-        check: Verdict on the direction of the link that this process receives.
-    """
+    """Metrics that both world and cloud have: session, datagrams, one-way delay, loop timing."""
 
     def __init__(self, role: str, counts: Mapping[str, int]) -> None:
         """Set the role, "world" or "cloud"; `counts` maps `Counted.name` to its newest count."""
         self._counts, self._stream = counts, DatagramTally()
-        self._outgoing, self._incoming = "uplink", "downlink"
-        others = table.ONLY_CLOUD
+        self._outgoing, self._incoming, others = "uplink", "downlink", table.ONLY_CLOUD
         if role == table.CLOUD:
             self._outgoing, self._incoming, others = "downlink", "uplink", table.ONLY_WORLD
         self._outcomes = tuple(name for name in table.OUTCOMES[1:] if name not in others)
@@ -156,11 +104,6 @@ class End:
         self._histograms = {
             metric.name: Histogram(metric.buckets) for metric in of_role(role) if metric.buckets
         }
-        self._one_way = self._histograms[f"cloudrc_{self._incoming}_delay_seconds"]
-        self._age = self._histograms["cloudrc_age_of_information_seconds"]
-        self._gap = self._histograms["cloudrc_link_gap_seconds"]
-        self._period = self._histograms["cloudrc_loop_period_seconds"]
-        self._lateness = self._histograms["cloudrc_loop_lateness_seconds"]
         self._busy, self._clock_steps = 0.0, 0
         self._sessions, self._epoch, self._opened_ns = 0, 0, NEVER_NS
         self._arrival_ns = self._woke_ns = self._deadline_ns = NEVER_NS
@@ -173,40 +116,44 @@ class End:
         """Whether a new datagram of the peer has arrived in the last 2 s."""
         return self._opened_ns != NEVER_NS and self._woke_ns - self._arrival_ns < SILENCE_NS
 
+    def _observe(self, name: str, seconds: float) -> None:
+        """Count a time [s] in a histogram."""
+        self._histograms[f"cloudrc_{name}_seconds"].observe(seconds)
+
     def _on_arrival(self, record: Arrival) -> None:
         stamp_ns, _, epoch, counter, delay, used = record
         if self._stream.take(epoch, counter):  # not a replay, which anybody can send
             if not self._silent:
-                self._gap.observe((stamp_ns - self._arrival_ns) * 1e-9)
+                self._observe("link_gap", (stamp_ns - self._arrival_ns) * 1e-9)
             self._arrival_ns, self._silent = stamp_ns, False
         if delay == delay:  # not NaN: both ends share a clock
-            self._one_way.observe(delay)
+            self._observe(f"{self._incoming}_delay", delay)
         if used:
             self._newest_ns, self._newest_delay = stamp_ns, delay
 
     def _on_fault(self, record: Fault) -> None:
         self._clock_steps += record.code == CLOCK_SET
 
-    def _on_session(self, record: SessionOpened) -> None:
+    def _on_sessionopened(self, record: SessionOpened) -> None:
         self._sessions += 1
         self._epoch = record.epoch
         self._opened_ns = self._arrival_ns = record.stamp_ns
         self._silent, self._newest_delay = True, nan
 
-    def _on_wake(self, record: Lateness) -> None:
+    def _on_lateness(self, record: Lateness) -> None:
         stamp_ns, _, lateness, busy, slip_ns = record
         now_ns = stamp_ns + slip_ns
         if self._deadline_ns != NEVER_NS:
-            self._period.observe((now_ns - self._deadline_ns) * 1e-9)
+            self._observe("loop_period", (now_ns - self._deadline_ns) * 1e-9)
         self._deadline_ns, self._woke_ns = now_ns, stamp_ns
-        self._lateness.observe(lateness)
+        self._observe("loop_lateness", lateness)
         self._busy += busy
 
     def _count_age(self, now_ns: int) -> None:
         """Store the age of the newest datagram at `now_ns` [ns], this process's clock."""
         delay = self._newest_delay
         if delay == delay:
-            self._age.observe(delay + (now_ns - self._newest_ns) * 1e-9)
+            self._observe("age_of_information", delay + (now_ns - self._newest_ns) * 1e-9)
 
     def read(self) -> Readings:
         """Return the current metrics, without metrics whose values are unknown."""
@@ -226,9 +173,9 @@ class End:
             "cloudrc_loop_busy_seconds_total": unlabelled(self._busy),
             "cloudrc_clock_steps_total": unlabelled(self._clock_steps),
         }
-        if not self._one_way.cumulative()[-1]:  # no shared clock: leave out delays
-            del readings[f"cloudrc_{incoming}_delay_seconds"]
-            del readings["cloudrc_age_of_information_seconds"]
+        one_way = f"cloudrc_{incoming}_delay_seconds"
+        if not self._histograms[one_way].cumulative()[-1]:  # no shared clock: leave out delays
+            del readings[one_way], readings["cloudrc_age_of_information_seconds"]
         return readings
 
 
@@ -251,7 +198,6 @@ class WorldEnd(End):
         self._contacts = dict.fromkeys(table.BODIES, 0)
         self._slip_ns = self._admitted = 0
         self._basis_ns = NEVER_NS
-        self._command_age = self._histograms["cloudrc_command_age_seconds"]
         # Samples of world's clock and of the machine's clock [ns].
         self._instants: deque[tuple[int, int]] = deque(maxlen=STEPS + 1)
 
@@ -263,26 +209,26 @@ class WorldEnd(End):
         """
         return super().has_peer or (self._opened_ns != NEVER_NS and self._silent)
 
-    def _on_session(self, record: SessionOpened) -> None:
-        super()._on_session(record)
+    def _on_sessionopened(self, record: SessionOpened) -> None:
+        super()._on_sessionopened(record)
         self._admitted += record.cause == ADMITTED
 
-    def _on_truth(self, record: GroundTruth) -> None:
+    def _on_groundtruth(self, record: GroundTruth) -> None:
         self._truth = record
 
-    def _on_command(self, record: CommandApplied) -> None:
+    def _on_commandapplied(self, record: CommandApplied) -> None:
         self._basis_ns = record.basis_stamp_ns
 
-    def _on_telemetry(self, record: TelemetrySent) -> None:
+    def _on_telemetrysent(self, record: TelemetrySent) -> None:
         self._count_age(record.stamp_ns)
         reason = record.telemetry.guard, record.telemetry.cause
         if reason != self._reason:
             self._causes[table.GUARD_CAUSES[reason[1]]] += 1
             self._reason = reason
         if record.telemetry.guard is GuardState.TRACK:  # no other state uses commands
-            self._command_age.observe((record.stamp_ns - self._basis_ns) * 1e-9)
+            self._observe("command_age", (record.stamp_ns - self._basis_ns) * 1e-9)
 
-    def _on_guard(self, record: GuardChange) -> None:
+    def _on_guardchange(self, record: GuardChange) -> None:
         if record.state != self._guard or record.state is GuardState.GROUND:
             # A record with the state LAND at touch-down is no change of the state.
             self._changes[table.GUARD_STATES[record.state]] += 1
@@ -292,8 +238,8 @@ class WorldEnd(End):
         kind = record.body.rstrip("_0123456789")
         self._contacts[kind if kind in self._contacts else "other"] += 1
 
-    def _on_wake(self, record: Lateness) -> None:
-        super()._on_wake(record)
+    def _on_lateness(self, record: Lateness) -> None:
+        super()._on_lateness(record)
         self._slip_ns, now_ns = record.slip_ns, self._deadline_ns
         if not self._instants or now_ns >= self._instants[-1][1] + STEP_NS:
             self._instants.append((record.stamp_ns, now_ns))
@@ -324,14 +270,12 @@ class CloudEnd(End):
 
     def __init__(self, counts: Mapping[str, int]) -> None:
         super().__init__(table.CLOUD, counts)
-        self._rtt = self._histograms["cloudrc_rtt_seconds"]
-        self._loop = self._histograms["cloudrc_loop_delay_seconds"]
         self._prediction, self._delay = PredictionJudge(), DelayJudge()
         self._control: Control | None = None
         self._loop_delay, self._used_count = nan, 0
 
-    def _on_session(self, record: SessionOpened) -> None:
-        super()._on_session(record)
+    def _on_sessionopened(self, record: SessionOpened) -> None:
+        super()._on_sessionopened(record)
         self._prediction.reset()
         self._delay.reset()
 
@@ -346,8 +290,8 @@ class CloudEnd(End):
         loop_delay = record.loop_delay
         if loop_delay != self._loop_delay and loop_delay == loop_delay:  # a new echo
             self._loop_delay = loop_delay
-            self._loop.observe(loop_delay)
-            self._rtt.observe(record.rtt)
+            self._observe("loop_delay", loop_delay)
+            self._observe("rtt", record.rtt)
             if self._used_count == 1:  # else it is unknown which odometry had the echo
                 self._delay.echoed(record, self._newest_ns)
         self._used_count = 0
@@ -381,26 +325,15 @@ class CloudEnd(End):
 
 
 class Link:
-    """Metrics of a process that shapes one direction of the link or both.
+    """Metrics of a process that shapes one direction of the link or both."""
 
-    Attributes:
-        tell: Returns the content of /link.json, the state of the shaper.
-    """
-
-    def __init__(self, counts: Mapping[str, int]) -> None:
-        self.tell: Callable[[], str] = lambda: "{}\n"
-        self._counts = counts
+    def __init__(self) -> None:
+        self.tell: Callable[[], str] = lambda: "{}\n"  # content of /link.json, the shaper's state
         self._shapers: dict[str, Labels] = {}
         self._delays: dict[str, float] = {}
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set the shaper of a direction.
-
-        Args:
-            shaper: "relay" or "netem".
-            direction: "uplink" or "downlink".
-            mode: The shaper in the configuration: "auto", "relay" or "netem".
-        """
+        """Set the shaper of a direction, "relay" or "netem", and the mode in the configuration."""
         self._shapers[direction] = (shaper, direction, mode)
 
     def asked(self, direction: str, delay: float) -> None:
@@ -409,17 +342,10 @@ class Link:
 
     def read(self) -> Readings:
         """Return the current metrics, without metrics whose values are unknown."""
-        counts = dict(self._counts)  # an atomic copy: another thread may change the counts
-        readings: Readings = {
+        return {
             "cloudrc_link_info": dict.fromkeys(list(self._shapers.values()), 1.0),
             "cloudrc_link_delay_seconds": by_label(dict(self._delays)),
         }
-        for metric, (quantity, percentiles) in PERCENTILES.items():
-            names = {label: f"{quantity}_{name}_ns" for label, name in percentiles.items()}
-            readings[metric] = {
-                (label,): counts[name] * 1e-9 for label, name in names.items() if name in counts
-            }
-        return readings
 
 
 NO_WAYPOINT = -1
@@ -435,7 +361,7 @@ class Mission:
         self._state, self._waypoint, self._reached = "idle", NO_WAYPOINT, 0
         self._ended = dict.fromkeys(table.MISSION_OUTCOMES, 0)
 
-    def _on_event(self, record: MissionEvent) -> None:
+    def _on_missionevent(self, record: MissionEvent) -> None:
         self._shown = True
         event = record.event
         if event not in UNDER_WAY:
@@ -464,31 +390,19 @@ class Mission:
         }
 
 
-HANDLERS: Mapping[type, str] = {
-    Arrival: "_on_arrival",
-    CommandApplied: "_on_command",
-    Contact: "_on_contact",
-    Control: "_on_control",
-    Counted: "_on_count",
-    Fault: "_on_fault",
-    GroundTruth: "_on_truth",
-    GuardChange: "_on_guard",
-    Lateness: "_on_wake",
-    LinkChecked: "_on_check",
-    MissionEvent: "_on_event",
-    SessionOpened: "_on_session",
-    TelemetrySent: "_on_telemetry",
-}
-"""Type of a record -> name of the method that handles such records, in classes that have it."""
+def _read_count(metric: Metric, counts: Mapping[str, int]) -> dict[Labels, float]:
+    """Return the values of a metric that is a count, in s if the count is in ns."""
+    begins_at_0 = metric.kind is Kind.COUNTER and metric.name not in ONE_SHAPER
+    found: dict[Labels, float] = {}
+    for labels in product(*metric.labels.values()):  # of one label or none
+        name = metric.counted.replace("*", *labels or [""]).replace(".", "")
+        if begins_at_0 or name in counts:
+            found[labels] = counts.get(name, 0) * (1e-9 if name.endswith("_ns") else 1)
+    return found
 
 
 class LiveMetrics:
-    """Current metrics of one process. One thread calls `see`, any other thread may call `read`.
-
-    Attributes:
-        end: Metrics of world or cloud; None in other processes.
-        link: Metrics of the emulated link; None in other processes.
-    """
+    """Current metrics of one process. One thread calls `see`, any other thread may call `read`."""
 
     def __init__(self, role: str, *, missions: bool = True) -> None:
         """Set the role of the process: "world", "cloud", "teleop" or "link".
@@ -499,32 +413,35 @@ class LiveMetrics:
         self._counts: dict[str, int] = {}
         ends: dict[str, type[WorldEnd | CloudEnd]] = {table.WORLD: WorldEnd, table.CLOUD: CloudEnd}
         self.end: End | None = ends[role](self._counts) if role in ends else None
-        self.link = Link(self._counts) if role == table.LINK else None
-        has_mission = missions and role in table.MISSION
+        self.link = Link() if role == table.LINK else None
+        has_mission = missions and role in (table.CLOUD, table.TELEOP)
         mission = Mission(always=role == table.TELEOP) if has_mission else None
         parts = self.end, self.end and self.end.check, self.link, mission
         self._parts = [part for part in parts if part is not None]
+        # The method `_on_NAME` of a part handles the records of the class NAME.
         self._handlers: dict[type, Callable[[Any], None]] = {
             kind: getattr(part, name)
             for part in (self, *self._parts)
-            for kind, name in HANDLERS.items()
-            if hasattr(part, name)
+            for kind in get_args(Record)
+            if hasattr(part, name := f"_on_{kind.__name__.lower()}")
         }
 
-    def _on_count(self, record: Counted) -> None:
+    def _on_counted(self, record: Counted) -> None:
         self._counts[record.name] = record.total
 
     def see(self, records: Iterable[Record]) -> None:
         """Update the metrics with new records of this process, oldest first, without blocking."""
-        handlers = self._handlers
         for record in records:
-            handle = handlers.get(type(record))
-            if handle is not None:
+            if handle := self._handlers.get(type(record)):
                 handle(record)
 
     def read(self) -> Readings:
         """Return the current metrics, without metrics whose values are unknown."""
-        readings: Readings = dict(read_counts(self._role, dict(self._counts)))
+        counts = dict(self._counts)
+        readings: Readings = {}
+        for metric in of_role(self._role):
+            if metric.counted and (found := _read_count(metric, counts)):
+                readings[metric.name] = found
         for part in self._parts:
             readings |= part.read()
         return readings

@@ -19,19 +19,14 @@ from cloudrc.records import Control
 
 
 class Histogram:
-    """Counts values in buckets. One thread calls `observe`, any other thread may read.
-
-    Attributes:
-        bounds: Upper bounds of the buckets, inclusive, in rising order.
-        total: Sum of all observed values.
-    """
+    """Counts values in buckets. One thread calls `observe`, any other thread may read."""
 
     __slots__ = ("_counts", "bounds", "total")
 
     def __init__(self, bounds: tuple[float, ...]) -> None:
-        """Set the upper bounds of the buckets."""
+        """Set the upper bounds of the buckets, inclusive, in rising order."""
         self.bounds = bounds
-        self.total = 0.0
+        self.total = 0.0  # sum of all observed values
         self._counts = [0] * (len(bounds) + 1)
 
     def observe(self, value: float) -> None:
@@ -49,18 +44,12 @@ Readings: TypeAlias = dict[str, "dict[Labels, float] | Histogram"]
 
 
 def unlabelled(value: float) -> dict[Labels, float]:
-    """Make the reading of a metric without labels from `value` [unit of the metric].
-
-    The reading of NaN is empty.
-    """
+    """Make the reading of a metric without labels [unit of the metric]; the one of NaN is empty."""
     return {} if isnan(value) else {(): value}
 
 
 def per_axis(vector: Vector) -> dict[Labels, float]:
-    """Make the reading of a metric with the label `axis` from `vector` [unit of the metric].
-
-    Leave out axes whose value is NaN.
-    """
+    """Make the reading of a metric with the label `axis` [unit of the metric], without NaN."""
     values = zip(AXES, vector, strict=True)
     return {(axis,): value for axis, value in values if not isnan(value)}
 
@@ -73,23 +62,19 @@ def by_label(counts: Mapping[str, float]) -> dict[Labels, float]:
 WINDOW = 128
 """A missing datagram counts as lost after this number of newer datagrams (1.28 s at 100 Hz)."""
 _MASK = (1 << WINDOW) - 1
-_OLDEST = 1 << (WINDOW - 1)
 
 
 class DatagramTally:
     """Counts lost and reordered datagrams of one direction of the link.
 
     The sender numbers datagrams by a counter, which restarts in each epoch (session).
-
-    Attributes:
-        lost: Number of datagrams that had not arrived when the peer had sent `WINDOW` newer ones.
-        reordered: Number of datagrams that arrived after a newer datagram, without repetitions.
     """
 
     __slots__ = ("_before", "_epoch", "_first", "_newest", "_seen", "lost", "reordered")
 
     def __init__(self) -> None:
-        self.lost = self.reordered = 0
+        self.lost = 0  # datagrams that had not arrived when the peer had sent `WINDOW` newer ones
+        self.reordered = 0  # datagrams that arrived after a newer one, without repetitions
         self._before = 0  # value of `expected` at the end of the last epoch
         self._epoch = self._first = self._newest = -1
         self._seen = _MASK  # bit k: the datagram with the counter newest - k has arrived
@@ -110,12 +95,7 @@ class DatagramTally:
             self._epoch, self._first, self._newest, self._seen = epoch, counter, counter, _MASK
             return True
         ahead = counter - self._newest
-        if ahead == 1:
-            if not self._seen & _OLDEST:
-                self.lost += 1
-            self._seen = (self._seen << 1 | 1) & _MASK
-            self._newest = counter
-        elif ahead > 1:  # the skipped datagrams are lost or late
+        if ahead > 0:  # the skipped datagrams are lost or late
             leaving = min(ahead, WINDOW)
             self.lost += ahead - (self._seen >> (WINDOW - leaving)).bit_count()
             self._seen = (self._seen << ahead | 1) & _MASK if ahead < WINDOW else 1
@@ -135,18 +115,12 @@ WAITING_MAX = 256
 
 
 class PredictionJudge:
-    """Compares each predicted position with the position measured at the same instant.
-
-    Attributes:
-        error: Newest error: predicted minus measured position [m], shape (3,); NaN at first.
-        square: Sum of the squared lengths of all errors [m^2].
-        judged: Number of compared predictions.
-    """
+    """Compares each predicted position with the position measured at the same instant."""
 
     def __init__(self) -> None:
-        self.error: Vector = (nan, nan, nan)
-        self.square = 0.0
-        self.judged = 0
+        self.error: Vector = (nan, nan, nan)  # newest error: predicted minus measured position [m]
+        self.square = 0.0  # sum of the squared lengths of all errors [m^2]
+        self.judged = 0  # number of compared predictions
         self.reset()
 
     def reset(self) -> None:
@@ -185,13 +159,10 @@ class DelayJudge:
     The delay is the time from the stamp of the odometry for which cloud computed a command until
     world applies the command. Telemetry contains an echo of the newest command that world has
     applied: the stamp of the command on cloud's clock, and the time since world applied it.
-
-    Attributes:
-        error: Newest error: estimated minus true delay [s]; NaN before the first error.
     """
 
     def __init__(self) -> None:
-        self.error = nan
+        self.error = nan  # newest error: estimated minus true delay [s]
         self.reset()
 
     def reset(self) -> None:
@@ -207,9 +178,7 @@ class DelayJudge:
     def echoed(self, control: Control, arrival_ns: int) -> None:
         """Compute the error of the delay estimate of a command whose echo has arrived.
 
-        Args:
-            control: First control period after the arrival of the echo.
-            arrival_ns: Arrival of the telemetry with the echo [ns], cloud's clock.
+        The echo arrived at `arrival_ns` [ns], cloud's clock; `control` is the next control period.
         """
         sent = self._sent.get(arrival_ns - round(control.loop_delay * 1e9))
         if sent is not None:

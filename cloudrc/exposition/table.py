@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from enum import Enum
-from textwrap import dedent
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -19,7 +18,6 @@ from cloudrc.records import FAILURES
 WORLD, CLOUD, TELEOP, LINK = "world", "cloud", "teleop", "link"
 ROLES = (WORLD, CLOUD, TELEOP, LINK)
 ENDS = (WORLD, CLOUD)
-MISSION = (CLOUD, TELEOP)
 
 AXES = ("x", "y", "z")
 TERMS = ("proportional", "integral", "derivative")
@@ -35,7 +33,6 @@ ONLY_CLOUD = {"accept_ignored"}
 """Outcomes that only cloud counts."""
 LIMITS = ("speed", "yaw_rate", "fence")
 """Limits to which the guard restricts commands."""
-PLUGINS = ("estimator", "predictor", "controller")
 GUARD_STATES = ("ground", "track", "hold", "land", "estop")
 """States of the guard, in the order of `cloudrc.messages.GuardState`."""
 GUARD_CAUSES = {cause: cause.words.partition(",")[0] for cause in Cause}
@@ -43,32 +40,12 @@ GUARD_CAUSES = {cause: cause.words.partition(",")[0] for cause in Cause}
 MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cancelled")
 """States of a mission; the value of `cloudrc_mission_state` is the index of the state."""
 MISSION_OUTCOMES = ("done", "cancelled", *FAILURES, "other")
-API_REFUSALS = ("token", "role", "busy")
-"""Reasons for which the API rejects a request. "token": no valid token; "role": the token does not
-allow this request; "busy": too many requests at the same time."""
-ORDER_REFUSALS = ("invalid", "conflict")
-"""Reasons for which the API refuses a mission. "invalid": a value is invalid; "conflict": another
-mission is active."""
 BODIES = ("pipe", "board", "floor", "other")
 """Kinds of bodies that the robot can touch, such as "pipe" for the body `pipe_2`."""
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
 """Outcomes of a datagram at the relay; `cloudrc.link.relay.Lanes.outcomes` explains them."""
-SHAPERS = ("relay", "netem")
-LINK_MODES = ("auto", "relay", "netem")
-
-DELAY_BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.25, 1.0)
-"""Upper bounds of the buckets of delays and ages [s]."""
-GAP_BUCKETS = (0.05, 0.25)
-"""Upper bounds of the buckets of times between two arrivals [s]: 50 ms, more than jitter can cause,
-and 250 ms, after which the guard holds."""
-PERIOD_BUCKETS = (0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1)
-"""Upper bounds of the buckets of loop periods [s]; the nominal period is 10 ms."""
-LATENESS_BUCKETS = (0.0001, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.05, 0.1)
-"""Upper bounds of the buckets of the lateness of loops [s]."""
-RELEASE_PERCENTILES = {"50": "p50", "99": "p99", "99.9": "p999"}
-"""Value of the label `percentile` -> part of the name of the relay's count `release_error_*`."""
-STEP_PERCENTILES = {"50": "p50", "99": "p99"}
-"""Value of the label `percentile` -> part of the name of netem's count `step_lateness_*`."""
+RELEASE_PERCENTILES = ("50", "99", "99.9")
+"""Percentiles of the relay's release error; its count of "99.9" is `release_error_p999_ns`."""
 
 Labels = tuple[str, ...]
 
@@ -82,23 +59,15 @@ class Kind(Enum):
 
 
 class Metric(NamedTuple):
-    """One Prometheus metric.
+    """One Prometheus metric."""
 
-    Attributes:
-        name: Name of the metric; a histogram adds `_bucket`, `_sum` and `_count`.
-        kind: Type of the metric.
-        meaning: The HELP text, one or two sentences.
-        roles: Processes that expose the metric.
-        labels: Label name -> all possible values of the label.
-        buckets: Upper bounds of a histogram's buckets, rising, in the unit of the metric.
-    """
-
-    name: str
+    name: str  # a histogram adds `_bucket`, `_sum` and `_count`
     kind: Kind
-    meaning: str
-    roles: tuple[str, ...]
-    labels: Mapping[str, Labels] = MappingProxyType({})
-    buckets: tuple[float, ...] = ()
+    meaning: str  # the HELP text, one or two sentences
+    roles: tuple[str, ...]  # processes that expose the metric
+    labels: Mapping[str, Labels]  # label -> all possible values; () if they are not known
+    buckets: tuple[float, ...]  # upper bounds of a histogram's buckets, rising [unit of the metric]
+    counted: str  # `Counted.name` of the value, "" if none; "*" stands for the label's value
 
 
 def numbered(names: tuple[str, ...]) -> str:
@@ -106,213 +75,177 @@ def numbered(names: tuple[str, ...]) -> str:
     return ", ".join(f"{number} {name}" for number, name in enumerate(names))
 
 
-_MEANINGS: tuple[tuple[tuple[str, ...], str], ...] = (
-    (
-        ROLES,
-        """
-        cloudrc_build_info: Always 1; the labels name the process, its version and its
-            configuration. Both ends of a run have the same configuration.
-        cloudrc_ready: 1 while this process receives messages from its peer, else 0.
-        cloudrc_cpu_periods_total: Scheduler periods (CFS) in which this container wanted CPU time.
-        cloudrc_cpu_throttled_periods_total: Scheduler periods (CFS) in which the CPU limit stopped
-            this container.
-        cloudrc_cpu_throttled_seconds_total: Time for which the CPU limit stopped this container.
-        """,
-    ),
-    (
-        ENDS,
-        """
-        cloudrc_session_epoch: Epoch number of the current session.
-        cloudrc_sessions_opened_total: Sessions opened since this process started.
-        cloudrc_datagrams_total: Datagrams by outcome; updated once a second.
-        cloudrc_datagrams_expected_total: Incoming telemetry or command datagrams that have arrived
-            or count as lost.
-        cloudrc_datagrams_lost_total: Datagrams that had not arrived when the peer had sent 128
-            newer ones.
-        cloudrc_datagrams_reordered_total: Telemetry or command datagrams that arrived after a
-            newer one.
-        cloudrc_link_gap_seconds: Time between two arrivals: of telemetry at cloud, of commands at
-            world.
-        cloudrc_link_believed: 1 if the incoming direction of the link matches its profile, 0 if it
-            does not (/link.json on the same port says why); absent while there are too few
-            datagrams to decide.
-        cloudrc_age_of_information_seconds: Age of the newest odometry in cloud, of the newest
-            command in world, sampled every period; absent unless both ends prove that they share a
-            clock.
-        cloudrc_loop_period_seconds: Time between two periods of the loop.
-        cloudrc_loop_lateness_seconds: Time from the deadline of a period to the wake of the loop.
-        cloudrc_loop_busy_seconds_total: Time for which the loop computed.
-        cloudrc_recorder_dropped_records_total: Records that did not reach the recording.
-        cloudrc_recorder_sync_age_seconds: Time since the newest completed sync of the recording to
-            disk began: the part that a power cut would lose; absent without a recording.
-        cloudrc_clock_steps_total: Times that somebody set the wall clock; the flight does not
-            depend on the wall clock.
-        """,
-    ),
-    (
-        (WORLD,),
-        f"""
-        cloudrc_clouds_admitted_total: Cloud processes that got a session, restarted ones included.
-        cloudrc_sessions_refused_total: Session requests refused because another cloud controls
-            the robot.
-        cloudrc_downlink_delay_seconds: One-way delay from cloud to world, late datagrams
-            included; absent unless both ends prove that they share a clock.
-        cloudrc_position_meters: True position of the base, world frame.
-        cloudrc_tip_force_newtons: Force on the touch sensor at the arm's tip.
-        cloudrc_command_age_seconds: Age of the current command in TRACK, sampled every period:
-            time since the odometry from which cloud computed the command, on world's clock.
-        cloudrc_guard_state: State of the guard: {numbered(GUARD_STATES)}.
-        cloudrc_guard_transitions_total: Changes of the guard's state, by new state.
-        cloudrc_guard_causes_total: Changes of the guard's state, by cause.
-        cloudrc_guard_limited_total: Commands that a limit of the guard changed; for the fence,
-            physics steps instead of commands.
-        cloudrc_guard_held_seconds_total: Time in HOLD during missions; updated once a second.
-        cloudrc_guard_starts_refused_total: Mission starts refused because the guard was in LAND or
-            ESTOP.
-        cloudrc_contacts_total: Contacts of the robot with bodies of the scene, by kind of body.
-        cloudrc_real_time_factor: Simulated time divided by machine time over the last 10 s; below
-            0.95 a run is invalid.
-        cloudrc_world_slip_seconds_total: Time by which world's clock has fallen behind the
-            machine's clock.
-        cloudrc_world_stalls_total: Times that world woke up so late that the datagrams waiting in
-            the socket were stale.
-        """,
-    ),
-    (
-        (CLOUD,),
-        """
-        cloudrc_uplink_delay_seconds: One-way delay from world to cloud, late datagrams included;
-            absent unless both ends prove that they share a clock.
-        cloudrc_rtt_seconds: Round trip of applied commands, without their time in world.
-        cloudrc_loop_delay_seconds: Round trip of applied commands, with their time in world: the
-            paper's tau.
-        cloudrc_delay_estimate_seconds: Delay estimate, clamped: how far ahead cloud predicts the
-            newest odometry.
-        cloudrc_delay_estimate_error_seconds: Delay estimate minus the true time from the odometry
-            to the application of the command, for the newest command that the robot confirmed.
-        cloudrc_prediction_error_meters: Newest prediction error: predicted minus measured
-            position at the same instant.
-        cloudrc_prediction_error_square_meters_total: Sum of the squared lengths of all prediction
-            errors.
-        cloudrc_predictions_judged_total: Predictions compared with a measurement.
-        cloudrc_tracking_error_meters: Setpoint minus measured position, in the newest period.
-        cloudrc_setpoint_meters: Position setpoint, world frame.
-        cloudrc_pid_output: Terms of the controller's output [m/s], in the newest period.
-        cloudrc_command_velocity_meters_per_second: Commanded velocity, world frame.
-        cloudrc_command_yaw_rate_radians_per_second: Commanded yaw rate.
-        cloudrc_horizon_clamped_total: Delay estimates above cloud.horizon_max_s or below 0, which
-            were clamped.
-        cloudrc_commands_frozen_total: Zero-velocity commands sent because the robot confirmed no
-            newer command.
-        cloudrc_plugin_failures_total: Plug-in calls that raised an exception or returned a value
-            that is not finite.
-        cloudrc_words_dropped_total: Teleop messages dropped because they were for another session
-            or no request number was left.
-        cloudrc_loop_missed_periods_total: Periods without a command because the loop was late.
-        """,
-    ),
-    (
-        MISSION,
-        f"""
-        cloudrc_mission_state: State of the mission: {numbered(MISSION_STATES)}.
-        cloudrc_mission_waypoint: Index of the next waypoint; -1 if none.
-        cloudrc_waypoints_reached_total: Waypoints reached.
-        cloudrc_missions_total: Missions ended, by outcome.
-        """,
-    ),
-    (
-        (TELEOP,),
-        """
-        cloudrc_api_requests_total: Requests that the API has served.
-        cloudrc_api_rejected_total: Requests that the API rejected, by reason.
-        cloudrc_missions_refused_total: Mission orders that the API refused: invalid, or in
-            conflict with another mission.
-        cloudrc_stream_dropped_events_total: Events that slow readers of the event stream missed.
-        cloudrc_audit_dropped_total: Lines of the audit log that the disk refused.
-        cloudrc_journal_repaired_total: Times that a damaged journal was set aside and a new one
-            begun.
-        """,
-    ),
-    (
-        (LINK,),
-        """
-        cloudrc_link_info: Always 1; the labels name the shaper of a direction of the link, and the
-            configured mode.
-        cloudrc_link_delay_seconds: Mean one-way delay that the current link profile sets.
-        cloudrc_link_step_lateness_seconds: Lateness of the last 10,000 changes of netem's settings
-            on the profile's time line; absent without changes.
-        cloudrc_link_datagrams_total: Datagrams at the shaper, by outcome.
-        cloudrc_link_restored_total: Times that another program removed or changed netem's
-            settings.
-        cloudrc_link_release_error_seconds: Lateness of datagrams that left the relay in the last
-            10 s; absent with netem.
-        cloudrc_link_released_early_total: Datagrams that left the relay too early; above 0 the
-            relay has a bug; absent with netem.
-        cloudrc_dns_errors_total: Failed look-ups of the peer's name; the last known address stays
-            in use.
-        """,
-    ),
-)
-"""Processes -> names and meanings of the metrics that they expose."""
+_TABLE = f"""
+world cloud teleop link
+cloudrc_build_info[version, role, config]: Always 1; the labels name the process, its version and
+    its configuration. Both ends of a run have the same configuration.
+cloudrc_ready: 1 while this process receives messages from its peer, else 0.
+cloudrc_cpu_periods_total: Scheduler periods (CFS) in which this container wanted CPU time.
+cloudrc_cpu_throttled_periods_total: Scheduler periods cut short by the CPU limit.
+cloudrc_cpu_throttled_seconds_total: Time for which the CPU limit stopped this container.
 
-_BY_DIRECTION: Mapping[str, Labels] = {"direction": DIRECTIONS}
-_BY_AXIS: Mapping[str, Labels] = {"axis": AXES}
-_LABELS: Mapping[str, Mapping[str, Labels]] = {
-    "cloudrc_build_info": {"version": (), "role": ROLES, "config": ()},
-    "cloudrc_datagrams_total": {"direction": DIRECTIONS, "outcome": OUTCOMES},
-    "cloudrc_datagrams_expected_total": _BY_DIRECTION,
-    "cloudrc_datagrams_lost_total": _BY_DIRECTION,
-    "cloudrc_datagrams_reordered_total": _BY_DIRECTION,
-    "cloudrc_link_believed": _BY_DIRECTION,
-    "cloudrc_prediction_error_meters": _BY_AXIS,
-    "cloudrc_tracking_error_meters": _BY_AXIS,
-    "cloudrc_setpoint_meters": _BY_AXIS,
-    "cloudrc_pid_output": {"axis": AXES, "term": TERMS},
-    "cloudrc_command_velocity_meters_per_second": _BY_AXIS,
-    "cloudrc_plugin_failures_total": {"plugin": PLUGINS},
-    "cloudrc_position_meters": _BY_AXIS,
-    "cloudrc_guard_transitions_total": {"state": GUARD_STATES},
-    "cloudrc_guard_causes_total": {"cause": tuple(dict.fromkeys(GUARD_CAUSES.values()))},
-    "cloudrc_guard_limited_total": {"limit": LIMITS},
-    "cloudrc_contacts_total": {"body": BODIES},
-    "cloudrc_missions_total": {"outcome": MISSION_OUTCOMES},
-    "cloudrc_api_rejected_total": {"reason": API_REFUSALS},
-    "cloudrc_missions_refused_total": {"reason": ORDER_REFUSALS},
-    "cloudrc_link_info": {"shaper": SHAPERS, "direction": DIRECTIONS, "mode": LINK_MODES},
-    "cloudrc_link_delay_seconds": _BY_DIRECTION,
-    "cloudrc_link_step_lateness_seconds": {"percentile": tuple(STEP_PERCENTILES)},
-    "cloudrc_link_datagrams_total": {"outcome": LINK_OUTCOMES},
-    "cloudrc_link_release_error_seconds": {"percentile": tuple(RELEASE_PERCENTILES)},
+world cloud
+cloudrc_session_epoch: Epoch number of the current session.
+cloudrc_sessions_opened_total: Sessions opened since this process started.
+cloudrc_datagrams_total[direction, outcome]: Datagrams by outcome; updated once a second.
+cloudrc_datagrams_expected_total[direction]: Datagrams that have arrived or count as lost.
+cloudrc_datagrams_lost_total[direction]: Datagrams missing when 128 newer ones had been sent.
+cloudrc_datagrams_reordered_total[direction]: Datagrams that arrived after a newer one.
+cloudrc_link_gap_seconds: Time between two arrivals: of telemetry at cloud, of commands at world.
+cloudrc_link_believed[direction]: 1 if the incoming direction of the link matches its profile, 0 if
+    it does not (/link.json on the same port says why); absent while datagrams are too few.
+cloudrc_age_of_information_seconds: Age of the newest odometry in cloud, of the newest command in
+    world, sampled every period; absent unless both ends prove that they share a clock.
+cloudrc_loop_period_seconds: Time between two periods of the loop.
+cloudrc_loop_lateness_seconds: Time from the deadline of a period to the wake of the loop.
+cloudrc_loop_busy_seconds_total: Time for which the loop computed.
+cloudrc_recorder_dropped_records_total = recorder_dropped: Records that did not reach the recording.
+cloudrc_recorder_sync_age_seconds: Time since the last complete sync of the recording to disk began:
+    what a power cut would lose; absent without a recording.
+cloudrc_clock_steps_total: Times that somebody set the wall clock, on which no flight depends.
+
+world
+cloudrc_clouds_admitted_total: Cloud processes that got a session, restarted ones included.
+cloudrc_sessions_refused_total = busy: Sessions refused because another cloud controls the robot.
+cloudrc_downlink_delay_seconds: One-way delay from cloud to world, late datagrams included; absent
+    unless both ends prove that they share a clock.
+cloudrc_position_meters[axis]: True position of the base, world frame.
+cloudrc_tip_force_newtons: Force on the touch sensor at the arm's tip.
+cloudrc_command_age_seconds: Age of the current command in TRACK, sampled every period: time since
+    the odometry from which cloud computed the command, on world's clock.
+cloudrc_guard_state: State of the guard: {numbered(GUARD_STATES)}.
+cloudrc_guard_transitions_total[state]: Changes of the guard's state, by new state.
+cloudrc_guard_causes_total[cause]: Changes of the guard's state, by cause.
+cloudrc_guard_limited_total[limit] = limited_*: Commands that a limit changed; for the fence,
+    physics steps.
+cloudrc_guard_held_seconds_total = held_seconds: Time in HOLD during missions; updated once a
+    second.
+cloudrc_guard_starts_refused_total = start_refused: Mission starts refused in LAND or ESTOP.
+cloudrc_contacts_total[body]: Contacts of the robot with bodies of the scene, by kind of body.
+cloudrc_real_time_factor: Simulated time divided by machine time over the last 10 s; below 0.95 a
+    run is invalid.
+cloudrc_world_slip_seconds_total: Time by which world's clock has fallen behind the machine's clock.
+cloudrc_world_stalls_total = stalls: Late wakes of world after which the waiting datagrams were
+    stale.
+
+cloud
+cloudrc_uplink_delay_seconds: One-way delay from world to cloud, late datagrams included; absent
+    unless both ends prove that they share a clock.
+cloudrc_rtt_seconds: Round trip of applied commands, without their time in world.
+cloudrc_loop_delay_seconds: Round trip of applied commands, with their time in world: paper's tau.
+cloudrc_delay_estimate_seconds: Clamped delay estimate: how far ahead cloud predicts the odometry.
+cloudrc_delay_estimate_error_seconds: Delay estimate minus the true time from the odometry to the
+    application of the command, for the newest command that the robot confirmed.
+cloudrc_prediction_error_meters[axis]: Newest predicted minus measured position of one instant.
+cloudrc_prediction_error_square_meters_total: Sum of the squared lengths of all prediction errors.
+cloudrc_predictions_judged_total: Predictions compared with a measurement.
+cloudrc_tracking_error_meters[axis]: Setpoint minus measured position, in the newest period.
+cloudrc_setpoint_meters[axis]: Position setpoint, world frame.
+cloudrc_pid_output[axis, term]: Terms of the controller's output [m/s], in the newest period.
+cloudrc_command_velocity_meters_per_second[axis]: Commanded velocity, world frame.
+cloudrc_command_yaw_rate_radians_per_second: Commanded yaw rate.
+cloudrc_horizon_clamped_total = horizon_clamped: Delay estimates clamped to the range 0 to
+    cloud.horizon_max_s.
+cloudrc_commands_frozen_total = frozen: Commands of zero velocity, because the robot confirmed no
+    newer one.
+cloudrc_plugin_failures_total[plugin] = *_failed: Plug-in calls that raised, or returned a wrong
+    value.
+cloudrc_words_dropped_total = words_dropped: Teleop messages dropped because they were for another
+    session or no request number was left.
+cloudrc_loop_missed_periods_total = missed_periods: Periods without a command because the loop was
+    late.
+
+cloud teleop
+cloudrc_mission_state: State of the mission: {numbered(MISSION_STATES)}.
+cloudrc_mission_waypoint: Index of the next waypoint; -1 if none.
+cloudrc_waypoints_reached_total: Waypoints reached.
+cloudrc_missions_total[outcome]: Missions ended, by outcome.
+
+teleop
+cloudrc_api_requests_total = api_served: Requests that the API has served.
+cloudrc_api_rejected_total[reason] = api_*: Requests that the API rejected, by reason.
+cloudrc_missions_refused_total[reason] = api_order_*: Mission orders that the API refused, by
+    reason.
+cloudrc_stream_dropped_events_total = api_events_dropped: Events that slow readers of the event
+    stream missed.
+cloudrc_audit_dropped_total = api_audit_dropped: Lines of the audit log that the disk refused.
+cloudrc_journal_repaired_total = journal_repaired: Times that teleop set a damaged journal aside and
+    began a new one.
+
+link
+cloudrc_link_info[shaper, direction, mode]: Always 1; the labels name the shaper of a direction of
+    the link, and the configured mode.
+cloudrc_link_delay_seconds[direction]: Mean one-way delay that the current link profile sets.
+cloudrc_link_step_lateness_seconds[percentile] = step_lateness_p*_ns: Lateness of netem's last
+    10,000 changes on the profile's time line; absent without changes.
+cloudrc_link_datagrams_total[outcome] = *: Datagrams at the shaper, by outcome.
+cloudrc_link_restored_total = restored: Times that another program removed or changed netem's
+    settings.
+cloudrc_link_release_error_seconds[percentile] = release_error_p*_ns: Lateness of datagrams that
+    left the relay in the last 10 s; absent with netem.
+cloudrc_link_released_early_total = released_early: Datagrams that left the relay too early; above 0
+    the relay has a bug; absent with netem.
+cloudrc_dns_errors_total = unresolved: Failed look-ups of the peer's name; the last known address
+    stays in use.
+"""
+"""All metrics: below the names of the processes that expose them, name[labels] = count: meaning."""
+_LABELS: Mapping[str, Labels] = {
+    **dict.fromkeys(("version", "config"), ()),
+    "role": ROLES,
+    "direction": DIRECTIONS,
+    "axis": AXES,
+    "term": TERMS,
+    "plugin": ("estimator", "predictor", "controller"),
+    "state": GUARD_STATES,
+    "cause": tuple(dict.fromkeys(GUARD_CAUSES.values())),
+    "limit": LIMITS,
+    "body": BODIES,
+    "shaper": ("relay", "netem"),
+    "mode": ("auto", "relay", "netem"),
+    "cloudrc_datagrams_total outcome": OUTCOMES,
+    "cloudrc_missions_total outcome": MISSION_OUTCOMES,
+    # "token": no valid token; "role": a reader's token; "busy": too many requests at a time.
+    "cloudrc_api_rejected_total reason": ("token", "role", "busy"),
+    # "conflict": another mission is in the way.
+    "cloudrc_missions_refused_total reason": ("invalid", "conflict"),
+    "cloudrc_link_step_lateness_seconds percentile": ("50", "99"),
+    "cloudrc_link_release_error_seconds percentile": RELEASE_PERCENTILES,
+    "cloudrc_link_datagrams_total outcome": LINK_OUTCOMES,
 }
-"""Name of a metric -> label -> all values of the label; () if the values are not known."""
+"""Label, or metric and label -> all values of the label; () if the values are not known."""
+_DELAYS = "uplink_delay downlink_delay age_of_information rtt loop_delay command_age"
 _BUCKETS: Mapping[str, tuple[float, ...]] = {
-    "cloudrc_link_gap_seconds": GAP_BUCKETS,
-    "cloudrc_uplink_delay_seconds": DELAY_BUCKETS,
-    "cloudrc_downlink_delay_seconds": DELAY_BUCKETS,
-    "cloudrc_age_of_information_seconds": DELAY_BUCKETS,
-    "cloudrc_rtt_seconds": DELAY_BUCKETS,
-    "cloudrc_loop_delay_seconds": DELAY_BUCKETS,
-    "cloudrc_command_age_seconds": DELAY_BUCKETS,
-    "cloudrc_loop_period_seconds": PERIOD_BUCKETS,
-    "cloudrc_loop_lateness_seconds": LATENESS_BUCKETS,
+    # Jitter causes gaps below 50 ms; after 250 ms the guard holds.
+    "cloudrc_link_gap_seconds": (0.05, 0.25),
+    **{
+        f"cloudrc_{name}_seconds": (0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.25, 1.0)
+        for name in _DELAYS.split()
+    },
+    # The nominal period is 10 ms.
+    "cloudrc_loop_period_seconds": (0.009, 0.0095, 0.0105, 0.011, 0.015, 0.02, 0.05, 0.1),
+    "cloudrc_loop_lateness_seconds": (0.0001, 0.0005, 0.001, 0.002, 0.005, 0.01, 0.05, 0.1),
 }
-"""Name of a histogram -> upper bounds of its buckets."""
+"""Name of a histogram -> upper bounds of its buckets [s]."""
+
+
+_ENTRY = re.compile(r"^(cloudrc_\w+)(?:\[(.*)\])?(?: = (\S+))?: (.*(?:\n .*)*)", re.MULTILINE)
 
 
 def _metrics() -> Iterator[Metric]:
-    for roles, text in _MEANINGS:
-        for block in re.split(r"\n(?=cloudrc_)", dedent(text).strip()):
-            name, _, meaning = block.partition(": ")
-            kind = Kind.COUNTER if name.endswith("_total") else Kind.GAUGE
-            buckets = _BUCKETS.get(name, ())
-            yield Metric(
-                name,
-                Kind.HISTOGRAM if buckets else kind,
-                " ".join(meaning.split()),
-                roles,
-                _LABELS.get(name, {}),
-                buckets,
-            )
+    for section in _TABLE.strip().split("\n\n"):
+        roles, _, text = section.partition("\n")
+        for name, names, count, meaning in _ENTRY.findall(text):
+            labels = {
+                each: _LABELS.get(f"{name} {each}") or _LABELS[each]
+                for each in re.findall(r"\w+", names)
+            }
+            kind, buckets = Kind.GAUGE, _BUCKETS.get(name, ())
+            if buckets:
+                kind = Kind.HISTOGRAM
+            elif name.endswith("_total"):
+                kind = Kind.COUNTER
+            one_line = " ".join(meaning.split())
+            yield Metric(name, kind, one_line, tuple(roles.split()), labels, buckets, count)
 
 
 METRICS: Mapping[str, Metric] = MappingProxyType({metric.name: metric for metric in _metrics()})

@@ -7,6 +7,7 @@ docs/plugins.md explains how to add your own metrics.
 from __future__ import annotations
 
 import inspect
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import isfinite
@@ -66,12 +67,9 @@ def check(own: Iterable[str]) -> None:
     Raises:
         BadInputError: If a metric is invalid, or if two metrics have the same name.
     """
-    found: dict[str, str] = {}
-    for choice in own:
-        name = find(choice).name
-        if name in found:
-            raise BadInputError(f"metrics {found[name]!r} and {choice!r} are both named {name}")
-        found[name] = choice
+    for name, count in Counter(find(choice).name for choice in own).items():
+        if count > 1:
+            raise BadInputError(f"{count} metrics are named {name}; rename a file")
 
 
 def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
@@ -87,9 +85,8 @@ def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
 def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Number], list[str]]:
     """Compute the metrics of cloudrc, of installed packages and of the user (`own`, as for `find`).
 
-    Returns:
-        Numbers by name, sorted, without unknown values; and a note for each metric that failed. An
-        exception in a user's metric affects only this metric.
+    Return the known numbers by name, sorted, and a note for each metric that failed. An exception
+    in a user's metric affects only this metric.
     """
     numbers: dict[str, Number] = {}
     notes: list[str] = []

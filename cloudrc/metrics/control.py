@@ -10,8 +10,7 @@ from cloudrc.metrics.flight import Columns, Flight, add_metrics, mean, percentil
 def round_trips(flight: Flight) -> Columns:
     """Select the control periods in which cloud measured a new round trip.
 
-    In all other periods the values of the last round trip are repeated. If they counted, a silent
-    link would get too much weight, because the last values then repeat for seconds.
+    All other periods repeat the values of the last round trip, for seconds if the link is silent.
     """
     control = flight.control
     pair = np.stack([control["rtt"], control["loop_delay"]], axis=1)

@@ -25,10 +25,7 @@ from cloudrc.records import UNDER_WAY
 Array: TypeAlias = NDArray[Any]
 Columns: TypeAlias = dict[str, Array]
 
-CONTROL_TOPICS = (
-    *("/estimated_odometry", "/setpoint_position", "/cmd_vel"),
-    *("/delay_estimate", "/pid"),
-)
+CONTROL_TOPICS = "/estimated_odometry", "/setpoint_position", "/cmd_vel", "/delay_estimate", "/pid"
 """Topics that the control loop writes in every period."""
 
 
@@ -127,8 +124,8 @@ class Flight:
         """Whether the robot's base is inside a pipe, per row of `truth`."""
         return pipe_index(self.scene, self.truth["position"]) >= 0
 
-    def count(self, number: int) -> float | None:
-        """Return `number`, a number of events [1], as a metric; None if the robot never flew."""
+    def count(self, number: float) -> float | None:
+        """Return `number` [any unit] as a metric; None if the robot never flew."""
         return None if self.start_ns is None else float(number)
 
     def last_total(self, name: str) -> float | None:
@@ -137,7 +134,7 @@ class Flight:
         totals = count["total"][count["name"] == name]
         return float(totals[-1]) if len(totals) else None
 
-    @cached_property
+    @property
     def pipes_flown(self) -> int:
         """Number of different pipes that the robot's base has entered."""
         return int((np.unique(pipe_index(self.scene, self.truth["position"])) >= 0).sum())

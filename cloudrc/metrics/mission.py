@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
 from cloudrc.config.schema import Waypoint
 from cloudrc.messages import GuardState
-from cloudrc.metrics.flight import Array, Flight, add_metrics, mean
+from cloudrc.metrics.flight import Array, Flight, Measure, add_metrics, mean
 
 BOARD = "board"
 """Name of the board, which the arm must touch, in the scene."""
@@ -82,40 +83,40 @@ def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
     return bool((stays_ns >= dwell * 1e9 - ODOMETRY_NS).any())
 
 
-def _contact_time(flight: Flight) -> float | None:
-    touch = first_touch(flight)
-    return None if touch is None else float(flight.seconds(touch["stamp_ns"]))
+def _of_touch(measure: Callable[[Flight, dict[str, Array]], float | None]) -> Measure:
+    """Make a metric of the first touch of the board, unknown without a touch."""
+
+    def measured(flight: Flight) -> float | None:
+        touch = first_touch(flight)
+        return None if touch is None else measure(flight, touch)
+
+    return measured
 
 
-def _tip_speed(flight: Flight) -> float | None:
-    touch = first_touch(flight)
-    return None if touch is None else float(np.linalg.norm(touch["tip_velocity"]))
-
-
-def _peak_force(flight: Flight) -> float | None:
+@_of_touch
+def _peak_force(flight: Flight, touch: dict[str, Array]) -> float | None:
     """Find the largest contact force [N]; it depends on the simulator's contact parameters."""
     force = flight.during("/contact_force")["tip_force_peak"]
-    return None if first_touch(flight) is None or not len(force) else float(force.max())
+    return float(force.max()) if len(force) else None
 
 
-def _impulse(flight: Flight) -> float | None:
+@_of_touch
+def _impulse(flight: Flight, touch: dict[str, Array]) -> float:
     """Integrate the force of the impact over time [N s].
 
     Unlike the peak force, the impulse does not depend on the simulator's contact parameters.
 
     Source: docs/reference/plant.md, "Contact".
     """
-    touch, force = first_touch(flight), flight.during("/contact_force")
-    if touch is None:
-        return None
+    force = flight.during("/contact_force")
     since_ns = force["stamp_ns"] - touch["stamp_ns"]
     return float(force["tip_impulse"][(since_ns >= 0) & (since_ns < IMPACT_NS)].sum())
 
 
-def _steady_force(flight: Flight) -> float | None:
+@_of_touch
+def _steady_force(flight: Flight, touch: dict[str, Array]) -> float | None:
     """Average the final contact force [N]; the simulator's contact parameters do not matter."""
-    touch = first_touch(flight)
-    if touch is None or flight.ending is None or flight.ending[1] != "done":
+    if flight.ending is None or flight.ending[1] != "done":
         return None
     begin_ns = flight.ending[0] - PRESSING_NS
     if touch["stamp_ns"] > begin_ns:
@@ -151,12 +152,6 @@ def _steady_error(flight: Flight, axis: int) -> float | None:
     return float(np.abs(flight.truth["position"][rows, axis] - still[-1, axis]).mean())
 
 
-def _hold_time(flight: Flight) -> float | None:
-    if flight.start_ns is None:
-        return None
-    return sum(end - start for start, end in holds(flight)) * 1e-9
-
-
 def _fault_count(flight: Flight) -> float | None:
     """Count the faults. Repetitions are in the fault's counter; the fault is recorded only once."""
     totals, count = dict.fromkeys(flight.recording["/fault"]["code"], 1), flight.recording["/count"]
@@ -177,9 +172,9 @@ add_metrics(
     ("waypoints_reached", "1", "Number of waypoints at which the true position stayed within the "
      "tolerance for the dwell time.", _waypoints_reached),
     ("contact_time", "s", "Time from the start of the mission to the arm's first touch of the "
-     "board.", _contact_time),
+     "board.", _of_touch(lambda flight, touch: float(flight.seconds(touch["stamp_ns"])))),
     ("tip_speed", "m/s", "Speed of the arm's tip just before it first touches the board.",
-     _tip_speed),
+     _of_touch(lambda flight, touch: float(np.linalg.norm(touch["tip_velocity"])))),
     ("peak_contact_force", "N", "Largest force on the arm's tip in any physics step.", _peak_force),
     ("contact_impulse", "N s", "Force on the arm's tip times time, over the first 0.1 s of the "
      "first touch.", _impulse),
@@ -191,7 +186,7 @@ add_metrics(
     ("hold_count", "1", "Number of times that the guard went to HOLD because fresh commands were "
      "missing.", lambda flight: flight.count(len(holds(flight)))),
     ("hold_time", "s", "Total time in HOLD, in which the guard flies without commands.",
-     _hold_time),
+     lambda flight: flight.count(sum(end - start for start, end in holds(flight)) * 1e-9)),
     ("fault_count", "1", "Number of faults that did not stop the flight, such as an exception in a "
      "predictor.", _fault_count),
     ("recorder_dropped", "1", "Number of records that the recorder dropped because the loop must "

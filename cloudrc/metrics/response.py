@@ -27,33 +27,19 @@ GROWTH_MIN = 0.15
 
 
 class Step(NamedTuple):
-    """The response to one step; a value is None if the step does not show it.
+    """The response to one step; a value is None if the step does not show it."""
 
-    Attributes:
-        waypoint: Index of the waypoint or step.
-        start: Time of the step since the start of the mission [s].
-        length: Distance from the position at the start of the step to the setpoint [m].
-        overshoot: Distance beyond the setpoint, as a share of `length` [1].
-        rise_time: Time from 10 % to 90 % of the way [s].
-        settling_time: Time after which the error stays within 5 % of `length` [s].
-        iae: Integral of the error over time [m s].
-        ise: Integral of the squared error over time [m^2 s].
-        effort: Integral of the squared commanded velocity over time [m^2/s].
-        last_error: Largest error in the last 0.5 s [m].
-        unstable: Whether the error oscillates without decay.
-    """
-
-    waypoint: int
-    start: float
-    length: float
-    overshoot: float
-    rise_time: float | None
-    settling_time: float | None
-    iae: float
-    ise: float
-    effort: float
-    last_error: float
-    unstable: bool
+    waypoint: int  # index of the waypoint or step
+    start: float  # time of the step since the start of the mission [s]
+    length: float  # distance from the position at the start of the step to the setpoint [m]
+    overshoot: float  # distance beyond the setpoint, as a share of `length` [1]
+    rise_time: float | None  # time from 10 % to 90 % of the way [s]
+    settling_time: float | None  # time after which the error stays within 5 % of `length` [s]
+    iae: float  # integral of the error over time [m s]
+    ise: float  # integral of the squared error over time [m^2 s]
+    effort: float  # integral of the squared commanded velocity over time [m^2/s]
+    last_error: float  # largest error in the last 0.5 s [m]
+    unstable: bool  # whether the error oscillates without decay
 
 
 @lru_cache(maxsize=1)  # ten metrics and the verdict ask for the same flight
@@ -146,14 +132,6 @@ def _mean_of(flight: Flight, name: str) -> float | None:
     return mean(np.array([value for value in values if value is not None], dtype=float))
 
 
-def _overshoot_max(flight: Flight) -> float | None:
-    return max((step.overshoot for step in steps(flight)), default=None)
-
-
-def _unstable_steps(flight: Flight) -> float | None:
-    return flight.count(sum(step.unstable for step in steps(flight)))
-
-
 def _tracking_errors(flight: Flight) -> Array:
     control = flight.control
     errors = control["setpoint"] - flight.true_position(control["stamp_ns"])
@@ -163,7 +141,8 @@ def _tracking_errors(flight: Flight) -> Array:
 add_metrics(
     ("overshoot_mean", "1", "Mean overshoot of the steps, as a share of the step.",
      partial(_mean_of, name="overshoot")),
-    ("overshoot_max", "1", "Largest overshoot of a step, as a share of the step.", _overshoot_max),
+    ("overshoot_max", "1", "Largest overshoot of a step, as a share of the step.",
+     lambda flight: max((step.overshoot for step in steps(flight)), default=None)),
     ("rise_time_mean", "s", "Mean time from 10 % to 90 % of a step.",
      partial(_mean_of, name="rise_time")),
     ("settling_time_mean", "s", "Mean time until the error stays within 5 % of the step; steps "
@@ -179,5 +158,5 @@ add_metrics(
     ("tracking_error_peak", "m", "Largest distance from the setpoint to the true position.",
      lambda flight: percentile(_tracking_errors(flight), 100.0)),
     ("unstable_steps", "1", "Number of steps in which the error oscillates without decay.",
-     _unstable_steps),
+     lambda flight: flight.count(sum(step.unstable for step in steps(flight)))),
 )  # fmt: skip

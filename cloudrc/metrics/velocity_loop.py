@@ -36,17 +36,11 @@ DURATION_MIN, DEVIATION_MIN, SHARE_MIN = 20.0, 0.1, 0.8
 
 
 class Fit(NamedTuple):
-    """The model of one axis, and how certain it is.
+    """The model of one axis, and how certain it is."""
 
-    Attributes:
-        values: Time constant [s], dead time [s] and gain [1], shape (3,).
-        half_widths: Half of the 95 % intervals of `values` [s], [s] and [1], shape (3,).
-        share: Share of the variance of the velocity that the model explains [1].
-    """
-
-    values: Array
-    half_widths: Array
-    share: float
+    values: Array  # time constant [s], dead time [s] and gain [1], shape (3,)
+    half_widths: Array  # half of the 95 % intervals of `values` [s], [s] and [1], shape (3,)
+    share: float  # share of the variance of the velocity that the model explains [1]
 
 
 def series(recording: Recording, name: str) -> tuple[Array, Array, tuple[str, str]]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from math import inf, isfinite
+from math import inf, isfinite, nan
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -36,6 +36,8 @@ EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
 """Exit code of each outcome. Source: docs/reference/control.md, "Exit codes"."""
 PLUGIN_FAILURES_MAX = 0.01
 """Largest share of periods in which a plug-in may fail in a valid flight, in [0, 1]."""
+BROKEN_OFF = ("interrupted", "cancelled", "disk_full")
+"""Codes of an `Ending` after which unmet goals are no failure."""
 ADVICE = "close other programs or give the run more cores"
 
 Outcome = Literal["success", "failure", "invalid", "interrupted"]
@@ -113,11 +115,7 @@ def judge(evidence: Evidence) -> Verdict:
         key = f"criteria.contact_speed_max_mps {limit:g}"
         text = f"the tip met the board at {speed:.2f} m/s, not below {key}"
         violations = (Failure("contact_too_fast", text, *moment), *violations)
-    if evidence.ending.code in (
-        "interrupted",
-        "cancelled",
-        "disk_full",
-    ):  # unmet goals are no failure
+    if evidence.ending.code in BROKEN_OFF:
         return Verdict("interrupted", (Failure(*evidence.ending, *evidence.end), *violations))
     codes = {failure.code for failure in violations}
     failures = [*violations, *(f for f in _unmet_goals(evidence) if f.code not in codes)]
@@ -161,11 +159,8 @@ def flight_evidence(
 ) -> Evidence:
     """Collect the evidence from the recorded truth and from the metrics of a flight.
 
-    Args:
-        flight: The recorded flight.
-        numbers: The metrics of the flight.
-        real_time: True if the run had to keep real time: in all modes except virtual.
-        interrupted: True if the run was stopped, or if its recording has no end.
+    `real_time` is True if the run had to keep real time: in all modes except virtual. `interrupted`
+    is True if the run was stopped, or if its recording has no end.
     """
     criteria, end_ns = flight.criteria, flight.end_ns
     reached, touch = numbers.get("waypoints_reached"), None
@@ -218,7 +213,7 @@ def _moment(flight: Flight, stamp_ns: int) -> Moment:
 
 
 def _pipes(flight: Flight, until_ns: float = inf) -> Iterator[Failure]:
-    """Yield a failure for each pipe that the robot touched up to a stamp [ns]."""
+    """Yield a failure for each pipe that the robot touched, up to a stamp [ns]."""
     contact = flight.during("/contact")
     for body in sorted({str(body) for body in contact["body"] if str(body).startswith("pipe")}):
         stamps = contact["stamp_ns"][contact["body"] == body]
@@ -298,20 +293,16 @@ def _not_real_time(numbers: Mapping[str, Number]) -> str:
 def _why_grounded(flight: Flight) -> str:
     """Describe why the guard applied no command, so that the flight never started."""
     arrivals = flight.recording["/downlink_delay"]
-    if not len(flight.recording["/delay_estimate"]):
-        return "its telemetry or cloud's answers were lost, so cloud computed no command"
     if not len(arrivals):
-        return "no command arrived"
+        return "no command arrived; its telemetry or cloud's commands were lost"
     # The start of a mission opens a new session: commands of older sessions do not count.
     last = arrivals["epoch"] == arrivals["epoch"].max()
     if arrivals["used"][last].any():
         return "fresh commands arrived, but no request to start"
     commands = flight.join_control({name: arrivals[name][last] for name in arrivals.names})
-    ages_ns = commands["stamp_ns"] - commands["basis_stamp_ns"]
-    if not len(ages_ns):
-        return "no fresh command arrived"
+    age_ns = min(commands["stamp_ns"] - commands["basis_stamp_ns"], default=nan)
     return (
-        f"the odometry behind each command was {min(ages_ns) * 1e-9:.3f} s old or older when the"
+        f"the odometry behind each command was {age_ns * 1e-9:.3f} s old or older when the"
         " command arrived, above the limit guard.command_age_max_ms; shorten the delay or raise"
         " the limit"
     )
@@ -338,56 +329,18 @@ def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, N
     return judge(seen)
 
 
-AWAY = -1
-"""Value for an unknown slip of world's clock [ns]: after a restart of teleop, before telemetry."""
-
-
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """Contacts and slip of world's clock during a mission, as telemetry reports them."""
+    """Contacts in a mission and slip of world's clock, as telemetry reports them."""
 
-    pipe_contacts: int = 0  # last count in telemetry
-    pipe_touches: int = 0  # contacts since the mission began
-    touch_before: float | None = None  # speed of an earlier mission's touch [m/s]
-    touch_speed: float | None = None  # speed of this mission's touch of the board [m/s]
-    slip_began_ns: int = 0  # slip that does not count: before the mission, in restarts of teleop
-    slip_ns: int = 0  # world's slip in the last telemetry; AWAY after a restart of teleop
-
-    @classmethod
-    def begin(cls, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
-        """Begin with the first telemetry; `see` describes `touch_speed` [m/s] and the others."""
-        return cls(pipe_contacts, 0, finite_or_none(touch_speed), None, slip_ns, slip_ns)
-
-    def see(self, pipe_contacts: int, touch_speed: float, slip_ns: int) -> Observations:
-        """Take the values of new telemetry.
-
-        Args:
-            pipe_contacts: Number of contacts with pipes since the robot was reset.
-            touch_speed: Speed of the arm's tip at the touch of the board [m/s]; NaN before.
-            slip_ns: Lag of world's clock behind its machine's clock [ns].
-        """
-        touch = finite_or_none(touch_speed)
-        if self.touch_speed is not None or touch == self.touch_before:
-            touch = self.touch_speed
-        new = pipe_contacts - self.pipe_contacts
-        if new < 0:  # the robot was reset to its spawn and counts from 0
-            new = pipe_contacts
-        return replace(
-            self,
-            pipe_contacts=pipe_contacts,
-            pipe_touches=self.pipe_touches + new,
-            touch_speed=touch,
-            slip_began_ns=self.slip_began_ns + (slip_ns if self.slip_ns == AWAY else 0),
-            slip_ns=slip_ns,
-        )
-
-    def after_restart(self) -> Observations:
-        """Continue after a restart of teleop; slip during the restart is not counted."""
-        return replace(self, slip_began_ns=self.slip_began_ns - self.slip_ns, slip_ns=AWAY)
+    pipe_contacts: int = 0  # number of contacts with pipes
+    touch_speed: float | None = None  # of the arm's tip at its first touch of the board [m/s]
+    slip_began_ns: int = 0  # world's slip when the mission began [ns]
+    slip_ns: int = 0  # world's slip in the last telemetry [ns]
 
     def news(self, before: Observations, elapsed: float) -> Iterator[tuple[str, str]]:
         """Yield event and text of each contact since `before`, at mission time `elapsed` [s]."""
-        if self.pipe_touches > before.pipe_touches:
+        if self.pipe_contacts > before.pipe_contacts:
             yield "pipe_touched", f"the robot touched a pipe at {elapsed:.2f} s"
         if self.touch_speed != before.touch_speed:
             text = f"board touched at {elapsed:.2f} s with {self.touch_speed:.2f} m/s"
@@ -400,7 +353,7 @@ class Observations:
             ending=ending,
             end=Moment(elapsed),
             touch=None if self.touch_speed is None else (self.touch_speed, UNKNOWN),
-            violations=(_pipe_touched("a pipe", self.pipe_touches),) if self.pipe_touches else (),
+            violations=(_pipe_touched("a pipe", self.pipe_contacts),) if self.pipe_contacts else (),
             slow=_too_slow(1.0 - slipped / elapsed) if elapsed > 0 else "",
             **known,
         )

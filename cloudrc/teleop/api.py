@@ -83,20 +83,14 @@ Address: TypeAlias = tuple[str, int] | Path
 
 
 class Bridge:
-    """Queue the API's calls of the mission service for teleop's loop.
-
-    Attributes:
-        closed: Why the bridge refuses calls, in words; "" while it accepts calls.
-        alarm: Function that sends an emergency stop to cloud at once, without teleop's loop.
-        overtakings: Number of stops and holds so far; they overtake all other calls.
-    """
+    """Queue the API's calls of the mission service for teleop's loop."""
 
     def __init__(self) -> None:
-        self.closed, self.overtakings = STARTING, 0
-        self.alarm: Callable[[], Any] = lambda: None
-        self._lanes: dict[str, deque[tuple[Call, Future[Any]]]] = {
-            lane: deque() for lane in ("stop", "hold", "")
-        }
+        self.closed = STARTING  # why the bridge refuses calls, in words; "" while it accepts calls
+        self.alarm: Callable[[], Any] = lambda: None  # sends an emergency stop to cloud at once
+        self.overtakings = 0  # number of stops and holds so far, which overtake all other calls
+        self._urgent: deque[tuple[Call, Future[Any]]] = deque()  # stops and holds
+        self._calls: deque[tuple[Call, Future[Any]]] = deque()
         self._service: MissionService | None = None
 
     def open(self, service: MissionService) -> None:
@@ -105,31 +99,28 @@ class Bridge:
 
     def close(self, why: str) -> None:
         """Refuse all calls from now on; answer the waiting emergency stops with an error."""
-        self.closed, stops = why, self._lanes["stop"]
-        while stops:
-            stops.popleft()[1].set_exception(UnavailableError(why))
+        self.closed = why
+        while self._urgent:
+            self._urgent.popleft()[1].set_exception(UnavailableError(why))
 
     def submit(self, call: Call, urgent: Urgent = "") -> Future[Any]:
-        """Queue a call for teleop's loop; the loop makes urgent calls ("stop", "hold") first.
+        """Queue a call for teleop's loop; the loop makes stops and holds first.
 
-        While teleop starts, the bridge accepts emergency stops only.
-
-        Raises:
-            UnavailableError: If the bridge is closed.
+        Raise an UnavailableError if the bridge is closed. While teleop starts, the bridge accepts
+        emergency stops only.
         """
         if self.closed and not (urgent == "stop" and self.closed == STARTING):
             raise UnavailableError(self.closed)
         self.overtakings += bool(urgent)
         future: Future[Any] = Future()
-        self._lanes[urgent].append((call, future))
+        (self._urgent if urgent else self._calls).append((call, future))
         return future
 
     async def ask(self, call: Call, urgent: Urgent = "") -> Any:
         """Queue a call and return its result; for a stop, also send the alarm at once.
 
-        Raises:
-            UnavailableError: If the bridge is closed, or if the loop does not answer within
-                `ANSWER_LIMIT`. An urgent call then stays queued; any other call is withdrawn.
+        Raise an UnavailableError if the bridge is closed, or if the loop does not answer within
+        `ANSWER_LIMIT`. An urgent call then stays queued; any other call is withdrawn.
         """
         try:  # queue the stop first: later, telemetry may show it already
             asked = asyncio.wrap_future(self.submit(call, urgent))
@@ -153,16 +144,15 @@ class Bridge:
 
         return await self.ask(checked)
 
-    def take(self) -> list[Callable[[int], None]]:
-        """Remove and return all queued calls: first stops, then holds, then all others."""
-        return [call for lane in self._lanes for call in self._take(lane)]
-
     def take_stops(self) -> list[Callable[[int], None]]:
-        """Remove and return the queued stops, which the loop makes before it reads telemetry."""
-        return self._take("stop")
+        """Remove and return stops and holds, which the loop makes before it reads telemetry."""
+        return self._take(self._urgent)
 
-    def _take(self, lane: str) -> list[Callable[[int], None]]:
-        calls = self._lanes[lane]
+    def take(self) -> list[Callable[[int], None]]:
+        """Remove and return all queued calls, the urgent ones first."""
+        return [*self.take_stops(), *self._take(self._calls)]
+
+    def _take(self, calls: deque[tuple[Call, Future[Any]]]) -> list[Callable[[int], None]]:
         return [partial(self._make, *calls.popleft()) for _ in range(len(calls))]
 
     def _make(self, call: Call, future: Future[Any], now_ns: int) -> None:
@@ -183,11 +173,8 @@ def create_app(
 ) -> FastAPI:
     """Make the ASGI application of the API; run it behind a `Gate`, which checks the tokens.
 
-    Args:
-        bridge: Bridge to the mission service.
-        read_order: Reads and checks the body of a request that orders a mission.
-        read_goto: Reads and checks the body of a request to fly to a point.
-        complain: Receives one line about each internal error.
+    `read_order` and `read_goto` read and check the body of a request that orders a mission, or a
+    flight to a point. `complain` receives one line about each internal error.
     """
     app = FastAPI(
         title="cloudrc teleop",
@@ -354,51 +341,44 @@ async def stream_events(
 ) -> StreamingResponse:
     """Stream the events of all missions after event number `after` as server-sent events.
 
-    A browser that connects again sends the number of its last event as the header Last-Event-ID.
+    The stream ends when the client leaves, its token becomes invalid, or teleop ends. A browser
+    that connects again sends the number of its last event as the header Last-Event-ID.
     """
-    after = max(after, last_event_id)
     await bridge.ask(lambda service, now_ns: None)  # raises an error if teleop cannot answer
-    stream, headers = _stream(request, bridge, after), {"Cache-Control": "no-store"}
-    return StreamingResponse(stream, media_type="text/event-stream", headers=headers)
-
-
-async def _stream(request: Request, bridge: Bridge, number: int) -> AsyncIterator[str]:
-    """Yield new events until the client disconnects, its token becomes invalid, or teleop ends."""
+    number = max(after, last_event_id)
 
     def call(service: MissionService, now_ns: int) -> list[Event]:
         return service.book.events_after(number)
 
-    looks = 0
-    yield ": cloudrc\n\n"
-    while not bridge.closed and await request.scope["caller"]() is not None:
-        try:
-            found = await bridge.ask(call)
-        except CloudrcError:
-            return
-        for event in found:
-            number = event["id"]
-            yield f"id: {number}\nevent: mission\ndata: {json.dumps(event)}\n\n"
-        looks = 0 if found else looks + 1
-        if looks * LOOK_PERIOD >= ALIVE_PERIOD:
-            looks = 0
-            yield ": alive\n\n"
-        await asyncio.sleep(LOOK_PERIOD)
+    async def stream() -> AsyncIterator[str]:
+        nonlocal number
+        quiet = 0.0  # time without an event [s]
+        yield ": cloudrc\n\n"
+        while not bridge.closed and await request.scope["caller"]() is not None:
+            try:
+                found = await bridge.ask(call)
+            except CloudrcError:
+                return
+            for event in found:
+                number = event["id"]
+                yield f"id: {number}\nevent: mission\ndata: {json.dumps(event)}\n\n"
+            quiet = 0.0 if found else quiet + LOOK_PERIOD
+            if quiet >= ALIVE_PERIOD:
+                quiet = 0.0
+                yield ": alive\n\n"
+            await asyncio.sleep(LOOK_PERIOD)
+
+    headers = {"Cache-Control": "no-store"}
+    return StreamingResponse(stream(), media_type="text/event-stream", headers=headers)
 
 
 class ApiServer(uvicorn.Server):
-    """Serve the API in a separate thread, from `start` to `stop`.
-
-    Attributes:
-        url: "http://HOST:PORT", or "unix:PATH" for a Unix socket.
-        gate: Application that the server serves: the API behind the check of tokens.
-        bridge: Queue of calls to teleop's loop.
-    """
+    """Serve the API in a separate thread, from `start` to `stop`."""
 
     def __init__(self, gate: Gate, bridge: Bridge, address: Address) -> None:
         """Bind the address; with port 0 the kernel chooses a port.
 
-        Raises:
-            BadInputError: If the address cannot be bound, or if a TCP address has no tokens.
+        Raise a BadInputError if the address cannot be bound, or if a TCP address has no tokens.
         """
         if gate.tokens is None and not isinstance(address, Path):
             raise BadInputError(
@@ -420,6 +400,7 @@ class ApiServer(uvicorn.Server):
             )
         )
         self.gate, self.bridge = gate, bridge
+        # The URL is "http://HOST:PORT", or "unix:PATH" for a Unix socket.
         self._socket, self.url = _bind(address)
         # A daemon, so that a client that hangs cannot keep the process from ending.
         self._thread = threading.Thread(target=self.run, args=([self._socket],), daemon=True)
@@ -445,8 +426,7 @@ class ApiServer(uvicorn.Server):
 
 
 def _bind(address: Address) -> tuple[socket.socket, str]:
-    unix = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    url = f"unix:{address}"
+    unix, url = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM), f"unix:{address}"
     try:
         if isinstance(address, Path):
             if address.is_socket():  # an earlier server left it there

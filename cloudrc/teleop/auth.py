@@ -27,13 +27,11 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cloudrc.errors import BadInputError
-from cloudrc.files import read, readable_by_others, version
+from cloudrc.files import read, readable_by_others
 
 OPERATOR, READER = "operator", "reader"
 """Roles of callers; the token of a role is in a file with the name of the role."""
 BEARER = HTTPBearer(auto_error=False, description="An operator's token, or a reader's for GET")
-TOKEN_SIZE_MAX = 4096
-"""Largest size of a token file [bytes], including white space around the token."""
 _TOKEN = re.compile(rb"[!-~]{16,512}")
 READS = ("GET", "HEAD")
 URGENT = ("/v1/estop", "/v1/hold")
@@ -78,10 +76,9 @@ class Tokens:
         Raises:
             BadInputError: If a file has no valid token; the message does not contain the token.
         """
-        self._folder, self._paths = folder, [folder / role for role in (READER, OPERATOR)]
-        self._versions = [version(path) for path in self._paths]
-        self._known = self._read()
-        for path in filter(readable_by_others, reversed(self._paths)):
+        self._folder = folder
+        self._read()
+        for path in filter(readable_by_others, (folder / OPERATOR, folder / READER)):
             warn(f"warning: {path} can be read by others: chmod 600 {path}")
 
     def caller(self, token: str) -> Caller | None:
@@ -89,28 +86,27 @@ class Tokens:
 
         A change of a file takes effect at once. While a file has no valid token, no token is valid.
         """
-        versions = [version(path) for path in self._paths]
-        if versions != self._versions:
-            self._known, self._versions = {}, []
-            with suppress(BadInputError):
-                self._known, self._versions = self._read(), versions
-        return self._known.get(hashlib.sha256(token.encode()).digest())
+        try:
+            return self._read().get(hashlib.sha256(token.encode()).digest())
+        except BadInputError:
+            return None
 
     def _read(self) -> dict[bytes, Caller]:
         known: dict[bytes, Caller] = {}
-        for path in self._paths:
-            if path.name == OPERATOR or path.exists():
+        for role in (OPERATOR, READER):
+            path = self._folder / role
+            if role == OPERATOR or path.exists():
                 digest = hashlib.sha256(_read_token(path)).digest()
                 if digest in known:  # then a reader's token would allow commands
                     raise BadInputError(f"--tokens {self._folder}: both roles have the same token")
-                known[digest] = Caller(path.name, f"{path.name}-{digest.hex()[:8]}")
+                known[digest] = Caller(role, f"{role}-{digest.hex()[:8]}")
         return known
 
 
 def _read_token(path: Path) -> bytes:
     reason = "a token is 16 to 512 visible ASCII characters"
     try:
-        token = read(path, TOKEN_SIZE_MAX).strip()
+        token = read(path).strip()
     except (OSError, ValueError) as error:
         token, reason = b"", getattr(error, "strerror", None) or str(error)
     if not _TOKEN.fullmatch(token):
@@ -120,16 +116,12 @@ def _read_token(path: Path) -> bytes:
 
 
 class Audit(RotatingFileHandler):
-    """Log commands as lines of JSON, in a separate thread. Only the owner can read the files.
-
-    Attributes:
-        dropped: Number of lines that could not be written.
-    """
+    """Log commands as lines of JSON, in a separate thread. Only the owner can read the files."""
 
     def __init__(self, path: Path, complain: Callable[[str], None]) -> None:
         """Start the thread; `complain` receives one line if the file cannot be written."""
         super().__init__(path, maxBytes=AUDIT_MAX, backupCount=1, encoding="utf-8", delay=True)
-        self.dropped, self._complain = 0, complain
+        self.dropped, self._complain = 0, complain  # `dropped`: lines that could not be written
         waiting: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._queue, self._listener = QueueHandler(waiting), QueueListener(waiting, self)
         self._listener.start()
@@ -169,23 +161,17 @@ class Audit(RotatingFileHandler):
 
 
 class Gate:
-    """Check token and role of every request before the application gets the request.
-
-    Attributes:
-        tokens: The valid tokens; None if everybody who can connect may command.
-        audit: Log of the operators' commands; None without a log.
-        counts: Number of requests by outcome; "served" counts those that the application answered.
-    """
+    """Check token and role of every request before the application gets the request."""
 
     def __init__(self, app: ASGIApp, tokens: Tokens | None, audit: Audit | None = None) -> None:
-        """Put a gate in front of the application `app`."""
+        """Put a gate in front of `app`; without `tokens`, everybody who can connect may command."""
         self._app, self.tokens, self.audit = app, tokens, audit
         self._in_flight: Counter[str] = Counter()
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()  # requests by outcome; "served": answered by `app`
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse a request, or remove a slash at its path's end and pass it to the application."""
-        scope["path"] = scope["path"].rstrip("/") or "/"
+        path = scope["path"] = scope["path"].rstrip("/") or "/"
         # An event stream calls `caller` again, because the stream can outlast its token.
         caller, scope["caller"] = await self.caller(scope), lambda: self.caller(scope)
         status = self._refusal(caller, scope)
@@ -207,9 +193,9 @@ class Gate:
         finally:
             self._in_flight[caller.role] -= 1
             self.counts["served"] += 1
-            if scope["path"] in ORDERS and answer["status"] in COUNTED:
+            if path in ORDERS and answer["status"] in COUNTED:
                 self.counts[COUNTED[answer["status"]]] += 1
-            steers = scope["path"] == STEERING and answer["status"] == 200
+            steers = path == STEERING and answer["status"] == 200
             if self.audit is not None and scope["method"] not in READS and not steers:
                 self.audit.note(caller, scope, answer)
 

@@ -8,15 +8,12 @@
 
 The command cancel leads from STARTING, FLYING and HELD to CANCELLED. A time limit, a restart of
 world, a guard in LAND or an emergency stop leads to FAILED. At the end of a mission teleop asks the
-robot to hold. Until the robot gets this request, it flies to the setpoint; therefore teleop also
-makes the robot's position the setpoint.
+robot to hold. The request may be late or lost; therefore teleop also makes the robot's position the
+setpoint.
 
-In a mission with a carrot the setpoint moves along the way by time alone, so that the duration of
-the mission does not depend on the network. The carrot waits at the robot while the guard does not
-follow cloud's commands, and leaves a waypoint only if telemetry shows the robot near it.
-
-During a held mission the operator may drive the setpoint by hand. Teleop then lets it rest at the
-robot while the guard does not follow cloud's commands.
+In a mission with a carrot the setpoint moves by time alone, so that the network does not change the
+duration. The carrot leaves a waypoint only if telemetry shows the robot near it. While the guard
+does not follow cloud's commands, a carrot or a setpoint that is driven by hand rests at the robot.
 """
 
 from __future__ import annotations
@@ -77,19 +74,13 @@ UNSEEN_MAX_NS = 2_000_000_000
 """Time without telemetry after which the dwell time at a waypoint starts again [ns]."""
 JUMP_SPEED = 6.0
 """On a part of a track that is faster than this, the setpoint jumps [m/s]."""
-# Looking up a member of an enum is slow.
-GROUND, TRACK, HOLD, ESTOP = (
-    GuardState.GROUND,
-    GuardState.TRACK,
-    GuardState.HOLD,
-    GuardState.ESTOP,
-)
+GROUND, TRACK, HOLD, _, ESTOP = GuardState  # to look up a member takes time
 
 
 class LegWatch:
     """Measure the time of flight to a waypoint, and detect when the robot has reached the waypoint.
 
-    Only time in which the robot follows cloud's commands counts as time of flight.
+    Time in which the robot does not follow cloud's commands does not count.
     """
 
     def __init__(self) -> None:
@@ -130,26 +121,18 @@ class Teleop:
     Call `see` for new telemetry, `handle_deadline` at 10 Hz or faster, and another method for each
     command of the operator. After each call, send the messages of `take_outputs`. A setpoint is
     valid until the next setpoint or session. All times `now_ns` are on the caller's clock [ns].
-
-    Attributes:
-        state: State of the mission; "idle" before the first mission.
-        leg: Index of the current waypoint; the number of waypoints once all are reached.
-        outcome: Last event of the mission; None before the first mission and during a mission.
-        seen: The newest telemetry; None before the first telemetry.
-        requests: Sender of the requests to the robot.
-        stopping: Whether an emergency stop was requested, and telemetry does not show ESTOP yet.
-        outputs: Messages since the last `take_outputs`.
     """
 
     def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
         """Begin without a mission; `ended` tells whether a mission (by its number) has ended."""
-        self.state, self.leg = "idle", 0
-        self.outcome: MissionEvent | None = None
-        self.outputs: list[Output] = []
+        self.state = "idle"  # of the mission
+        self.leg = 0  # index of the current waypoint; their number once all are reached
+        self.outcome: MissionEvent | None = None  # event that ended the newest mission
+        self.seen: RobotStatus | None = None  # newest telemetry
         self.requests = RequestSender()
-        self.stopping, self._stop_ns = False, 0
-        self._is_ended = ended
-        self.seen: RobotStatus | None = None
+        self.outputs: list[Output] = []  # since the last `take_outputs`
+        self.stopping = False  # whether telemetry has not yet shown a requested ESTOP
+        self._stop_ns, self._is_ended = 0, ended
         self._plan, self._mission_id, self._began_ns = NO_PLAN, 0, 0
         self._continued = self._was_held = False  # by an earlier teleop
         self._world = ""  # process of world in which the mission started; "": any
@@ -202,7 +185,7 @@ class Teleop:
             self.see(self.seen, now_ns)  # the mission may be over, or world restarted
 
     def go_to(self, now_ns: int, leg: Leg) -> None:
-        """Fly to a point during a held mission; raise BadInputError unless the mission is held."""
+        """Fly to a point; raise BadInputError unless the mission is held."""
         self._check("goto", HELD)
         x, y, z = leg.position
         self._report("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
@@ -217,8 +200,8 @@ class Teleop:
     def drive(self, now_ns: int, velocity: Vector) -> None:
         """Move the setpoint with a velocity [m/s], world frame, while the operator repeats this.
 
-        Nothing moves before the mission is held, and while telemetry does not show that the robot
-        follows commands. Raise BadInputError unless the mission is held or will be.
+        The setpoint moves only while telemetry shows that the robot follows commands. Raise
+        BadInputError unless the mission is held or begins held.
         """
         if self._plan.by_hand and self.state == STARTING:
             return
@@ -248,8 +231,7 @@ class Teleop:
     def stop(self, now_ns: int) -> None:
         """Stop the rotors at once in any state, and drop all earlier requests to the robot.
 
-        Teleop sends `ALARM` to cloud until telemetry shows ESTOP. Cloud repeats the stop to the
-        robot until the robot has carried out this stop.
+        Teleop sends `ALARM` to cloud until telemetry shows ESTOP; cloud repeats it to the robot.
         """
         if self.state in UNDER_WAY:
             self._end("emergency_stopped", "emergency stop", now_ns, where=True)
@@ -347,10 +329,10 @@ class Teleop:
         return None
 
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
-        """Keep the robot from flying a mission that this teleop does not fly.
+        """Keep the robot at its position, because its mission is not one of this teleop.
 
-        The robot's position becomes the setpoint. If the robot stands on the ground, or if the
-        foreign mission has ended, teleop also asks the robot to end that mission.
+        If the robot stands on the ground, or if its mission has ended, teleop also asks it to end
+        that mission.
         """
         mission_id = seen.mission_id
         over = self._is_ended(mission_id) or (seen.guard is GROUND and mission_id != 0)
@@ -402,7 +384,7 @@ class Teleop:
     def _lead(self, seen: RobotStatus, now_ns: int) -> None:
         """Let the carrot wait at the robot, or start it again from there, if that is necessary.
 
-        Before the robot has taken off, the carrot does not wait: a round trip would be lost.
+        The carrot does not wait for the take-off: a round trip would be lost.
         """
         self._followed = self._followed or seen.guard is TRACK
         if seen.guard is not TRACK and (self._followed or seen.guard is not GROUND):
@@ -495,10 +477,7 @@ class Teleop:
             self._select_leg(leg, now_ns)
 
     def _repeat_setpoint(self, now_ns: int) -> None:
-        """Send the setpoint again in a new session, for which cloud does not have it.
-
-        If the mission has not started and the robot may move, the setpoint is the robot's position.
-        """
+        """Send the setpoint again in a new session, or the robot's position while it may move."""
         if self.state == STARTING and self._may_move:
             self._is_pending = True
             self._select_here()

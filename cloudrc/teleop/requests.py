@@ -5,8 +5,7 @@ from __future__ import annotations
 from cloudrc.messages import GuardState, OperatorRequest, Request, Start
 from cloudrc.teleop.wire import RobotStatus
 
-# Looking up a member of an enum is slow.
-GROUND, HOLD = GuardState.GROUND, GuardState.HOLD
+GROUND, HOLD = GuardState.GROUND, GuardState.HOLD  # to look up a member takes time
 
 REPEAT_NS = 100_000_000
 """Time between two copies of a request [ns]."""
@@ -15,23 +14,23 @@ UNNUMBERED = 0
 NOT_ENDED = (-1, 0)
 """Epoch and request number that mean: the robot has not ended a mission."""
 IDLE_NS = 3_000_000_000
-"""Longest time for which a robot may hold or stand during a mission [ns]. After this time teleop
-sends the start again, because somebody else has probably stopped the robot."""
+"""Time for which a robot may hold or stand during a mission [ns]. Then teleop sends the start
+again, because somebody else has probably stopped the robot."""
 PREDECESSORS = 1_000
-"""A new teleop process starts at least this far above the newest request number in telemetry. The
-earlier process may have sent requests that telemetry does not show yet."""
+"""Smallest rise of the request number by a new teleop process: telemetry may not show the last
+requests of the earlier process yet."""
 CLOCK_MAX = 65_536
-"""The first number of a new teleop process also contains the time in units of 100 ms, modulo this
-value, so that two new processes have different numbers."""
+"""A new teleop process adds the time in units of 100 ms, modulo this value, to its first request
+number, so that two new processes have different numbers."""
 
 
 class RequestSender:
     """Repeat the newest request at 10 Hz until telemetry shows that the robot has carried it out.
 
     A new request replaces the previous request and gets a higher number, because the robot carries
-    out requests with rising numbers only. Before the first telemetry, nothing is sent. While no
-    request is pending, the sender repeats the mission's progress until the robot has stored the
-    progress. Emergency stops are not sent here: cloud numbers and repeats them.
+    out requests with rising numbers only. Nothing is sent before the first telemetry. While no
+    request is pending, the sender repeats the mission's progress until the robot has stored it.
+    Cloud, not this class, numbers and repeats emergency stops.
     """
 
     def __init__(self) -> None:

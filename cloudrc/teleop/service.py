@@ -1,13 +1,13 @@
 """Queue and fly missions, carry out the operator's commands, and report the robot's state.
 
-When teleop restarts, the new process continues the mission under way at the same waypoint, unless
-world has restarted, too. If an emergency stop has ended the mission but has not reached the robot,
-the new process sends the stop again.
+A new teleop process continues the mission under way at the same waypoint, unless world has
+restarted, too. It sends the emergency stop again if an earlier stop has not reached the robot.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import hypot, inf
 from typing import Any
 
@@ -84,15 +84,12 @@ class MissionService:
     All times `now_ns` are on this process's monotonic clock [ns]. The methods for the operator's
     commands raise ConflictError if the state of mission or robot forbids the command. They raise
     UnavailableError if the disk refuses the mission, or if this process ends.
-
-    Attributes:
-        book: Store of all missions.
     """
 
     def __init__(
         self, contact_speed_max: float, book: MissionStore, scene: Scene | None = None
     ) -> None:
-        """Begin with the missions of a store; the first `handle_deadline` starts or continues one.
+        """Begin with the missions of a store, the `book`.
 
         `contact_speed_max` limits the speed of the arm's tip when it touches the board [m/s]. With
         a `scene`, the service refuses straight ways through the walls of pipes.
@@ -160,9 +157,6 @@ class MissionService:
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
         verdict = Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
         self._note(mission, "cancelled", NEVER_BEGAN, now_ns, verdict=verdict)
-        if self.book.trouble:
-            text = f"{mission.id} is cancelled, but waits again if teleop restarts"
-            raise UnavailableError(f"{text}: {self.book.trouble}")
         return mission
 
     def hold(self, now_ns: int) -> Mission:
@@ -190,11 +184,10 @@ class MissionService:
         return self._operate(lambda now: self._teleop.go_to(now, leg), now_ns)
 
     def drive(self, velocity: Vector, now_ns: int) -> Mission:
-        """Drive the setpoint by hand, during a held mission or in a new one.
+        """Drive the setpoint with `velocity` [m/s], in a held mission or in a new one.
 
-        The setpoint takes up `velocity` [m/s], world frame. It brakes and rests if the next request
-        does not come within `HEARTBEAT_NS`. After a hold or the end of a mission, the operator has
-        to let go first.
+        The setpoint brakes and rests if the next request does not come within `HEARTBEAT_NS`. After
+        a hold or the end of a mission, the operator has to let go first.
         """
         pause_ns, self._driven_ns = now_ns - self._driven_ns, now_ns
         x, y, z = velocity
@@ -211,7 +204,8 @@ class MissionService:
                 raise ConflictError(f"no mission is under way; {TAKES_OFF}")
             x, y, z = seen.position
             leg = Leg((x, y, max(z, HELD_LOWEST)), tolerance=inf, dwell=0.0)
-            self.create(Order(Plan((leg,), Start.HERE, DRIVE_LIMIT, by_hand=True), "drive"), now_ns)
+            plan = Plan((leg,), Start.HERE, DRIVE_LIMIT, by_hand=True)
+            self.create(Order(plan, "drive"), now_ns)
         elif waiting[0].state != HELD and not waiting[0].order.plan.by_hand:
             raise _busy(waiting[0], "hold or cancel it first")
         return self._operate(lambda now: self._teleop.drive(now, velocity), now_ns)
@@ -251,15 +245,19 @@ class MissionService:
         self._heard_ns = self._seen_ns = now_ns
         if before is None or (before.world, before.guard) != (seen.world, seen.guard):
             self._guard_ns = now_ns
-        if mission is not None and mission.world and mission.world == seen.world:
+        if mission is not None and (mission.number, mission.world) == (seen.mission_id, seen.world):
             known = mission.witness
-            mission.witness = known.see(*_contacts(seen))
+            mission.witness = replace(
+                known,
+                pipe_contacts=seen.pipe_contacts,
+                touch_speed=finite_or_none(seen.touch_speed),
+                slip_ns=seen.slip_ns,
+            )
             for event, text in mission.witness.news(known, self._teleop.elapsed(now_ns)):
                 self._note(mission, event, text, now_ns)
             if before is not None and before.epoch != seen.epoch:
-                text = "the controller has a new session, as after a restart; the mission is"
-                text = f"{text} {mission.state} {self._teleop.where}"
-                self._note(mission, "new_session", text, now_ns)
+                text = f"cloud has a new session; the mission is {mission.state}"
+                self._note(mission, "new_session", f"{text} {self._teleop.where}", now_ns)
         self._teleop.see(seen, now_ns)
         self._collect(now_ns)
 
@@ -379,7 +377,6 @@ class MissionService:
         if mission.world:  # an earlier teleop has begun it
             self._current = mission
             self._teleop.continue_mission(now_ns, mission)
-            mission.witness = mission.witness.after_restart()
             self._note(mission, "restarted", RESTARTED, now_ns)
         elif mission.state != QUEUED and not self.book.trouble:
             self._current = mission
@@ -403,7 +400,8 @@ class MissionService:
         assert mission is not None, "an event belongs to a mission"
         changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:
-            changed |= {"world": seen.world, "witness": Observations.begin(*_contacts(seen))}
+            slip_ns = seen.slip_ns
+            changed |= {"world": seen.world, "witness": Observations(0, None, slip_ns, slip_ns)}
         if event == self._teleop.outcome:
             evidence = mission.witness.evidence(
                 Ending(event.event, event.text),
@@ -430,7 +428,3 @@ def _busy(mission: Mission, advice: str) -> ConflictError:
 
 def _place(position: Vector) -> str:
     return f"[{', '.join(f'{value:.2f}' for value in position)}]"
-
-
-def _contacts(seen: RobotStatus) -> tuple[int, float, int]:
-    return seen.pipe_contacts, seen.touch_speed, seen.slip_ns

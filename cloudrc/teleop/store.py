@@ -1,10 +1,8 @@
 """Store missions and their progress in an SQLite file; read them after a restart of teleop.
 
-One row holds the order and the status of a mission; each event changes the status. One more row
-holds each reached waypoint, with mission and index as the key, so that no waypoint is stored twice.
-A transaction returns after its data is on the disk, so a killed process loses at most the newest
-event. While the disk refuses to write, flights continue, no new mission starts, and the events stay
-in memory.
+One row holds a mission's order and status; each event changes the status. A transaction returns
+after its data is on the disk, so a killed process loses at most the newest event. While the disk
+refuses to write, flights continue, events stay in memory, and no new mission starts.
 """
 
 from __future__ import annotations
@@ -27,8 +25,6 @@ from cloudrc.teleop.wire import ENDED, QUEUED, STATES, Plan
 
 Event: TypeAlias = dict[str, Any]
 """An event of a mission, in the form of the API's model `Event`."""
-MAGIC = b"SQLite format 3\0"
-"""First bytes of a database file of SQLite."""
 SHOWN = 100
 """Largest number of events that the store keeps for each mission: the newest events."""
 
@@ -75,8 +71,7 @@ class Mission:
     ) -> None:
         """Update the mission with an event; `changed` has new values of the mission's attributes.
 
-        `number` is the number of the event among those of all missions. `waypoint` is an index; the
-        default is the current waypoint.
+        `number` counts the events of all missions. The default of `waypoint` is the current one.
         """
         waypoint = self.waypoint if waypoint is None else waypoint
         for name, value in changed.items():
@@ -89,7 +84,7 @@ class Mission:
             self.reached.append({"waypoint": waypoint, "time_s": self.elapsed})
 
     def summary(self) -> dict[str, Any]:
-        """Return the fields that a list of missions shows."""
+        """Return the fields of the API's model `MissionSummary`."""
         return {
             "id": self.id,
             "name": self.order.name,
@@ -103,13 +98,12 @@ class Mission:
         }
 
     def as_json(self) -> dict[str, Any]:
-        """Return all fields that the API shows."""
-        left_out = self.happened.total() - len(self.events)
+        """Return the fields of the API's model `MissionView`."""
         return {
             **self.summary(),
             "route_m": [leg.position for leg in self.order.plan.legs],
             "events": list(self.events),
-            "events_left_out": left_out,
+            "events_left_out": self.happened.total() - len(self.events),
         }
 
 
@@ -118,7 +112,7 @@ class UnknownMissionError(CloudrcError):
 
 
 class UnavailableError(CloudrcError):
-    """Report that teleop cannot act now: its journal is locked or read-only, or teleop ends."""
+    """Report that teleop cannot act now, for example because the disk refuses a mission."""
 
 
 class StoreLockedError(CloudrcError):
@@ -135,17 +129,7 @@ class ConflictError(CloudrcError):
         self.mission = mission
 
 
-APPLICATION, VERSION = 0x43524A32, 1
-"""Numbers in the file's header: the first marks files of cloudrc, the second is the version."""
-SCHEMA = f"""
-BEGIN;
-CREATE TABLE mission (n INTEGER PRIMARY KEY, plan TEXT NOT NULL, status TEXT NOT NULL);
-CREATE TABLE reached (mission INTEGER REFERENCES mission ON DELETE CASCADE, waypoint INTEGER,
-    time_s REAL NOT NULL, PRIMARY KEY (mission, waypoint)) WITHOUT ROWID;
-PRAGMA application_id = {APPLICATION};
-PRAGMA user_version = {VERSION};
-COMMIT;
-"""
+SCHEMA = "CREATE TABLE missions (n INTEGER PRIMARY KEY, plan TEXT NOT NULL, status TEXT NOT NULL)"
 
 
 def open_store(path: Path, salt: bytes) -> MissionStore:
@@ -155,30 +139,21 @@ def open_store(path: Path, salt: bytes) -> MissionStore:
 
     Raises:
         StoreLockedError: If another process has locked the file.
-        BadInputError: If the file has another content or version, or cannot be made.
+        BadInputError: If the file has another content, or cannot be read or made.
     """
-    if path.exists() and not path.is_file():
-        raise BadInputError(f"--journal {path}: is not a file; name another one")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.touch(0o600)
     try:
         return MissionStore(connect(path), salt)
     except sqlite3.DatabaseError as error:
-        reason = " ".join(str(error).split())
+        reason = str(error)
         code = getattr(error, "sqlite_errorcode", 0) & 0xFF  # without the extended code
-        if code == sqlite3.SQLITE_BUSY:
-            text = f"{path}: another teleop has this journal open; waiting until it ends"
-            raise StoreLockedError(text) from None
-        with path.open("rb") as file:
-            is_sqlite = file.read(len(MAGIC)) == MAGIC
-        if code == sqlite3.SQLITE_NOTADB and not is_sqlite:  # else the header is damaged
-            text = "is no journal; move it away, or name another file"
-            raise BadInputError(f"--journal {path}: {text}") from None
-        if isinstance(error, sqlite3.OperationalError):  # the disk fails; the content is intact
-            text = f"{reason}; free or repair its volume, or name another"
-            raise BadInputError(f"--journal {path}: {text}") from None
+    if code == sqlite3.SQLITE_BUSY:
+        raise StoreLockedError(f"{path}: another teleop has this journal open; waiting for its end")
+    if code not in (0, sqlite3.SQLITE_CORRUPT):  # no database, or a disk that fails
+        raise BadInputError(f"--journal {path}: {reason}; repair or move it, or name another file")
     aside = path.with_name(f"{path.name}.damaged")
-    for ending in ("", "-wal", "-shm", "-journal"):  # the files of one database
+    for ending in ("", "-wal"):  # the files of one database
         with suppress(FileNotFoundError):
             Path(f"{path}{ending}").replace(f"{aside}{ending}")
     text = f"journal repaired: {path}: {reason}; its missions are lost, it is kept as {aside}"
@@ -188,10 +163,7 @@ def open_store(path: Path, salt: bytes) -> MissionStore:
 def connect(path: Path | None = None, factory: Any = sqlite3.Connection) -> sqlite3.Connection:
     """Open and lock a database of missions, in a file or, without a path, in memory.
 
-    Raises:
-        BadInputError: If the file has another version.
-        sqlite3.OperationalError: If the file is locked, or if its volume fails.
-        sqlite3.DatabaseError: If the file is damaged.
+    Raise a `sqlite3.DatabaseError` if the file is locked or damaged, or if its volume fails.
     """
     # One thread opens the file; another thread may serve the missions.
     how: dict[str, Any] = {"timeout": 0, "isolation_level": None, "check_same_thread": False}
@@ -199,21 +171,14 @@ def connect(path: Path | None = None, factory: Any = sqlite3.Connection) -> sqli
     try:
         db.executescript(
             "PRAGMA locking_mode = EXCLUSIVE; PRAGMA journal_mode = WAL; "
-            "PRAGMA synchronous = FULL; PRAGMA foreign_keys = ON; BEGIN EXCLUSIVE; COMMIT;"
+            "PRAGMA synchronous = FULL; BEGIN EXCLUSIVE; COMMIT;"
         )
-        if not _value(db, "schema_version"):
+        if db.execute("PRAGMA schema_version").fetchone() == (0,):  # a new file
             db.executescript(SCHEMA)
-        if (_value(db, "application_id"), _value(db, "user_version")) != (APPLICATION, VERSION):
-            text = "this version cannot read it; move it away, or name another file"
-            raise BadInputError(f"--journal {path}: {text}")
     except BaseException:
         db.close()
         raise
     return db
-
-
-def _value(db: sqlite3.Connection, pragma: str) -> Any:
-    return db.execute(f"PRAGMA {pragma}").fetchone()[0]
 
 
 KEPT = 100
@@ -221,19 +186,12 @@ KEPT = 100
 KEEP_PERIOD_NS = 1_000_000_000
 """Time between two attempts to write events that the disk has refused [ns]."""
 _ORDER, _MISSION = TypeAdapter(Order), TypeAdapter(Mission)
-_STATUS = {"state", "world", "elapsed", "events", "happened", "witness", "verdict"}
-"""Attributes of a mission that its events change; reached waypoints have a table of their own."""
+_STATUS = {"state", "world", "elapsed", "reached", "events", "happened", "witness", "verdict"}
+"""Attributes of a mission that its events change."""
 
 
 class MissionStore:
-    """Missions in memory and on the disk.
-
-    Attributes:
-        missions: Missions by id, oldest first.
-        trouble: Why the disk refuses to write; "" if everything is on the disk.
-        dropped: Number of events that the store had removed before a reader requested them.
-        notice: Where a damaged earlier file is now, and what was wrong; "" without such a file.
-    """
+    """Missions in memory and on the disk."""
 
     def __init__(self, db: sqlite3.Connection, salt: bytes, notice: str = "") -> None:
         """Read all missions of `db`; if that fails, close `db` and raise DatabaseError.
@@ -241,18 +199,21 @@ class MissionStore:
         The ids of every new file begin with "m1". The robot stores progress by mission number;
         the random bytes `salt` make these numbers differ from those of an earlier file.
         """
-        self._db, self._salt, self.notice = db, salt, notice
-        self.missions: dict[str, Mission] = {}
+        self._db, self._salt = db, salt
+        self.notice = notice  # what happened to a damaged earlier file; "" without such a file
+        self.missions: dict[str, Mission] = {}  # by id, oldest first
+        self.trouble = ""  # why the disk refuses to write; "" if everything is on the disk
+        self.dropped = 0  # number of events that were removed before a reader requested them
         self._unsaved: set[str] = set()  # missions with events that are not on the disk
-        self._events = self._keep_ns = self.dropped = 0  # number of the last event
-        self.trouble = ""
+        self._events = self._keep_ns = 0  # number of the last event; time of the next attempt [ns]
         try:
             self._read()
         except (sqlite3.DatabaseError, LookupError, TypeError, ValueError) as error:
             db.close()
             if isinstance(error, sqlite3.DatabaseError):
                 raise
-            raise sqlite3.DatabaseError(f"a row cannot be read: {error!r}") from error
+            text = " ".join(repr(error).split())
+            raise sqlite3.DatabaseError(f"a row cannot be read: {text}") from error
 
     def open(self) -> list[Mission]:
         """Return the missions that have not ended, in the order in which they fly."""
@@ -284,7 +245,7 @@ class MissionStore:
         Raises:
             UnavailableError: If the disk refuses to write; then there is no new mission.
         """
-        mission_id = f"m{int(next(reversed(self.missions), 'm0')[1:]) + 1}"
+        mission_id = f"m{_row(next(reversed(self.missions), 'm0')) + 1}"
         digest = hashlib.sha256(self._salt + mission_id.encode()).digest()
         number = int.from_bytes(digest[:8], "little") >> 1 or 1
         mission = Mission(mission_id, replace(order, queue=False), number)
@@ -317,8 +278,6 @@ class MissionStore:
         """Return the events of all missions after the event `number`, oldest first."""
         if number > self._events:  # the reader has a number of an earlier file
             number = 0
-        if number == self._events:
-            return []
         kept = (event for mission in self.missions.values() for event in mission.events)
         found = sorted((e for e in kept if e["id"] > number), key=lambda event: event["id"])
         if number:  # 0 is a new reader, who has missed nothing
@@ -334,13 +293,14 @@ class MissionStore:
         db = self._db
         try:
             db.execute("BEGIN")
-            for mission_id in self._unsaved:
-                self._write(self.missions[mission_id])
+            changed = [(_status(self.missions[each]), _row(each)) for each in self._unsaved]
+            db.executemany("UPDATE missions SET status = ? WHERE n = ?", changed)
             if new is not None:
                 order = json.dumps([new.number, _ORDER.dump_python(new.order, mode="json")])
-                row = int(new.id[1:]), order, _status(new)
-                db.execute("INSERT INTO mission VALUES (?, ?, ?)", row)
-            db.executemany("DELETE FROM mission WHERE n = ?", [(int(each[1:]),) for each in old])
+                db.execute(
+                    "INSERT INTO missions VALUES (?, ?, ?)", (_row(new.id), order, _status(new))
+                )
+            db.executemany("DELETE FROM missions WHERE n = ?", [(_row(each),) for each in old])
             db.commit()
         except sqlite3.DatabaseError as error:
             with suppress(sqlite3.DatabaseError):
@@ -350,24 +310,18 @@ class MissionStore:
         self._unsaved.clear()
         self.trouble = ""
 
-    def _write(self, mission: Mission) -> None:
-        db, row = self._db, int(mission.id[1:])
-        db.execute("UPDATE mission SET status = ? WHERE n = ?", (_status(mission), row))
-        (there,) = db.execute("SELECT count(*) FROM reached WHERE mission = ?", (row,)).fetchone()
-        reached = [(row, each["waypoint"], each["time_s"]) for each in mission.reached[there:]]
-        db.executemany("INSERT INTO reached VALUES (?, ?, ?)", reached)
-
     def _read(self) -> None:
-        for row, ordered, status in self._db.execute("SELECT * FROM mission ORDER BY n"):
+        for row, ordered, status in self._db.execute("SELECT * FROM missions ORDER BY n"):
             number, order = json.loads(ordered)
             known = {"id": f"m{row}", "number": number, "order": order, **json.loads(status)}
             mission = _MISSION.validate_python(known)
             mission.events = deque(mission.events, SHOWN)
             self._events = max(self._events, *(event["id"] for event in mission.events), 0)
             self.missions[mission.id] = mission
-        for row, *reached in self._db.execute("SELECT * FROM reached ORDER BY mission, waypoint"):
-            each = dict(zip(("waypoint", "time_s"), reached, strict=True))
-            self.missions[f"m{row}"].reached.append(each)
+
+
+def _row(mission_id: str) -> int:
+    return int(mission_id.removeprefix("m"))
 
 
 def _status(mission: Mission) -> str:

@@ -74,8 +74,8 @@ class RobotStatus(NamedTuple):
     guard: GuardState
     mission: int  # number of the last operator request that world has acted on; 0 if none
     world: str = ""  # identifies world's process; a restart of world changes it
-    pipe_contacts: int = 0  # number of contacts with pipes so far
-    touch_speed: float = nan  # of the arm's tip when it touched the board [m/s]
+    pipe_contacts: int = 0  # number of contacts with pipes in the mission
+    touch_speed: float = nan  # of the arm's tip at its first touch of the board in it [m/s]
     slip_ns: int = 0  # lag of world's clock behind its machine's clock [ns]
     horizon: float = nan  # prediction horizon of cloud's last command [s]
     rtt: float = nan  # last round trip without the hold time on board [s]

@@ -75,7 +75,7 @@ def test_a_later_report_measures_a_file_only_if_named(folder):
         (["bad.py"], "def measure(flight): ...", "needs a text UNIT"),
         (["bad.py"], "import nowhere", "cannot be imported: ModuleNotFoundError"),
         (["duration.py"], OVERSHOOT, "duration is a metric already; rename the file"),
-        (["bad.py", "mine/../bad.py"], OVERSHOOT, "are both named bad"),
+        (["bad.py", "mine/../bad.py"], OVERSHOOT, "2 metrics are named bad"),
         (["overshoot"], "", "no metric named 'overshoot'; available: age_of_"),
     ],
 )

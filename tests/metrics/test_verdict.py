@@ -1,7 +1,5 @@
 """Each rule of the verdict: what breaks it, its time and place, and the order of outcomes."""
 
-from math import nan
-
 import pytest
 
 from cloudrc.config.schema import Mission, Waypoint
@@ -10,7 +8,6 @@ from cloudrc.messages import GuardState
 from cloudrc.metrics import SHIPPED, Number
 from cloudrc.metrics.verdict import (
     SLIP_MAX,
-    Observations,
     exit_code,
     flight_evidence,
     judge,
@@ -19,7 +16,6 @@ from cloudrc.metrics.verdict import (
 from cloudrc.records import (
     REAL_TIME_FACTOR_MIN,
     Arrival,
-    Control,
     Counted,
     Fault,
     GuardChange,
@@ -126,7 +122,6 @@ def test_a_failure_says_what_when_and_where(log, code, text, time):
         # The start opens a new session: commands of older sessions do not count.
         (Arrival, lambda n, a: a._replace(used=n < 9, epoch=1 + (n > 8)), "command_age_max_ms"),
         (Arrival, lambda n, a: a if a.uplink else None, "no command arrived"),
-        (Control, lambda n, c: None, "cloud computed no command"),
     ],
 )
 def test_why_the_robot_never_flew(kind, change, words):
@@ -186,16 +181,6 @@ def test_real_time_is_kept_or_the_run_is_invalid(slip, factor, found):
     assert judged(flight).outcome == "success"
     unproven = judged(flight, real_time=True)  # no rows of lateness
     assert (unproven.outcome, codes(unproven)) == ("invalid", ["not_real_time"])
-
-
-def test_only_what_telemetry_shows_during_the_mission_counts():
-    seen = Observations.begin(3, 0.9, 5)
-    assert seen.see(3, 0.9, 5) == seen
-    after = seen.see(5, 0.1, 9).see(5, 0.4, 9)
-    assert (after.pipe_touches, after.touch_speed) == (2, 0.1), "the first touch stays"
-    assert after.slip_ns - after.slip_began_ns == 4
-    assert Observations.begin(4, nan, 0).see(1, nan, 0).pipe_touches == 1, "it begins again at 0"
-    assert [event for event, _ in after.news(seen, 1.0)] == ["pipe_touched", "board_touched"]
 
 
 @pytest.mark.parametrize(("failures", "found"), [(4, []), (5, ["plugin_failed"])])

@@ -15,7 +15,7 @@ from cloudrc.messages import Cause, GuardState, Setpoint, Start
 from cloudrc.teleop import wire
 from cloudrc.teleop.api import Bridge
 from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX, next_step
-from cloudrc.teleop.store import ConflictError, Order, UnavailableError
+from cloudrc.teleop.store import ConflictError, Order
 from cloudrc.teleop.wire import ENDED, STATES, Leg, Plan
 from tests.teleop.conftest import (
     FROM_SPAWN,
@@ -179,14 +179,13 @@ def test_what_follows_from_a_script(name, script, expected):
         ("create 0.05 A", "resume", "resume: the mission is flying; it must be held"),
         ("mute stop", "create", "an emergency stop is on its way to the robot; find the cause"),
         ("stop 0.1", "create", "the guard is in ESTOP (emergency stop) and lets nothing fly; find"),
-        ("create queue full", "cancelm2", "m2 is cancelled, but waits again if teleop restarts"),
     ],
 )
 def test_a_refusal_says_why(script, action, said):
     flight = ServiceFlight()
     flight.step()
     play(flight, script)
-    with pytest.raises((ConflictError, UnavailableError), match=re.escape(said)):
+    with pytest.raises(ConflictError, match=re.escape(said)):
         play(flight, action)
 
 
@@ -239,9 +238,8 @@ def test_a_key_is_that_of_one_order_for_ever():
 def test_the_queue_of_missions_is_bounded():
     flight, _ = service_flying()
     play(flight, "queue " * QUEUE_MAX)
-    with pytest.raises(ConflictError, match=f"{QUEUE_MAX} missions wait already") as refused:
+    with pytest.raises(ConflictError, match=f"{QUEUE_MAX} missions wait already"):
         flight.create(queue=True)
-    assert refused.value.mission == "m1"
 
 
 def test_the_setpoint_is_repeated_at_10_hz():
@@ -263,7 +261,7 @@ def test_the_setpoint_is_repeated_at_10_hz():
 )
 @pytest.mark.parametrize("restarted", [False, True])
 def test_what_the_robot_touched_decides(seen, codes, exit_code, restarted):
-    """Also what it touched while teleop was away; but not the time that world lost then."""
+    """Also while teleop was away."""
     flight, mission_id = service_flying(contact=True)
     if restarted:
         flight.restart_teleop()
@@ -272,8 +270,6 @@ def test_what_the_robot_touched_decides(seen, codes, exit_code, restarted):
     assert ("board_touched" in flight.names(mission_id)) == ("touch_speed" in seen)
     finish(flight)
     verdict = flight.view(mission_id)["verdict"]
-    if restarted and "slip_ns" in seen:
-        codes, exit_code = [], 0
     assert verdict["exit_code"] == exit_code
     assert [failure["code"] for failure in verdict["failures"]] == codes
 
@@ -310,11 +306,9 @@ def test_the_state_is_shown_with_cause_and_since_when_in_this_world():
     assert (shown(flight)["guard_for_s"], shown(flight)["cause"]) == (None, "no fresh commands")
     assert shown(flight)["age_s"] == pytest.approx(2.0)
     flight.uplink = True
-    flight.restart_cloud()
     flight.step(position=(nan, 0.0, inf))
-    assert shown(flight)["guard_for_s"] == pytest.approx(2.01)
     assert shown(flight)["position_m"] == [None, 0.0, None], "JSON has no such numbers"
-    assert (shown(flight)["touch_speed_mps"], shown(flight)["loop_delay_s"]) == (None, None)
+    assert shown(flight)["guard_for_s"] == pytest.approx(2.01)
     flight.restart()
     flight.guard = HOLD
     flight.step()
