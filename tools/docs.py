@@ -14,8 +14,7 @@ from __future__ import annotations
 import inspect
 import json
 import re
-import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
