@@ -26,7 +26,6 @@ from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.cli.sweep_pods import (
     cluster_arguments,
     print_rows,
-    refuse_local_files,
     rows_from_pods,
 )
 from cloudrc.errors import BadInputError, InvalidRunError
@@ -182,7 +181,10 @@ def _plan(options: argparse.Namespace) -> Plan:
         raise BadInputError("--shard needs --out, the folder that all shards share")
     plan = read_plan(options.file)
     if options.on:
-        refuse_local_files(plan)
+        from cloudrc.cluster.pods import refuse_local_files
+
+        for point in plan.points:
+            refuse_local_files(point.model_dump(mode="json"), "or fly without --on")
     advice = list(dict.fromkeys(text for point in plan.points for text in advise(point)))
     more = [f"{len(advice)} warnings; the others are alike"] if len(advice) > WARNINGS_MAX else []
     for text in advice[:WARNINGS_MAX] + more:

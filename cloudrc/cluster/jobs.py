@@ -233,8 +233,6 @@ def failure_of(job: Any) -> str | None:
         if condition.status == "True" and condition.type == "Complete":
             return ""
         if condition.status == "True" and condition.type == "Failed":
-            if condition.reason == "DeadlineExceeded":
-                return "the Job took longer than its activeDeadlineSeconds"
             where = f" (index {job.status.failed_indexes})" if job.status.failed_indexes else ""
             return f"{condition.reason}: {condition.message}{where}"
     return None
@@ -265,12 +263,6 @@ def follow(
         time.sleep(LOOK_PERIOD)
 
 
-def _log(release: Release, pod: Any) -> list[str]:
-    if pod is None or pod.status.phase == "Pending":
-        return []
-    return pod_log(release, pod.metadata.name, COMPONENT).splitlines()
-
-
 def _look(release: Release, name: str) -> tuple[JobStatus, list[str]]:
     """Read a Job's state and log; raise a ClusterError if the Job's pod will never run."""
     job = release.request("get", "jobs", name=name)
@@ -278,7 +270,9 @@ def _look(release: Release, name: str) -> tuple[JobStatus, list[str]]:
     pod = next((pod for pod, uid in uids if uid == job.metadata.uid), None)
     status = _status(job, pod)
     if status.state != "pending":
-        return status, _log(release, pod)
+        if pod is None or pod.status.phase == "Pending":
+            return status, []
+        return status, pod_log(release, pod.metadata.name, COMPONENT).splitlines()
     if pod is not None:
         why = pod_failure(pod)
     else:  # the cluster may refuse the pod, for example for a quota

@@ -1,4 +1,4 @@
-"""`cloudrc run --seeds N`: one table of all seeds, or of the finished ones; its folder is a sweep."""
+"""`cloudrc run --seeds N`: one table of all seeds, or of the finished ones, and a sweep."""
 
 import json
 import os
@@ -34,7 +34,7 @@ def test_many_seeds_become_one_table_and_a_sweep(folder, monkeypatch, capsys):
     assert not (folder / "runs/latest").exists()
     summary = json.loads((folder / "runs/latest-sweep/sweep.json").read_text())
     assert (summary["seeds"], summary["counts"]) == ([1, 2], {"failure": 2})
-    assert summary["overrides"][-1] == "criteria.contact=true"
+    assert "criteria.contact=true" in summary["overrides"]
     assert len((folder / "runs/latest-sweep/table.csv").read_text().splitlines()) == 3
     key = json.loads((folder / "runs/latest-sweep/rows.jsonl").read_text().splitlines()[1])["key"]
     assert main(["sweep", "fly", "runs/latest-sweep", key]) == 0

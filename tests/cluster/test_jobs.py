@@ -100,8 +100,8 @@ def test_follow_ends_when_the_pod_cannot_run(running, release):
 
 def test_a_deadline_is_named_and_bounded(running, release):
     run_job(release, MISSION, name="first")
-    running.end("first", "Failed", reason="DeadlineExceeded", message="...")
-    assert "activeDeadlineSeconds" in follow(release, "first", print, timeout=10.0).message
+    running.end("first", "Failed", reason="DeadlineExceeded", message="too long")
+    assert "DeadlineExceeded: too long" in follow(release, "first", print, timeout=10.0).message
     assert follow_limit(1e300, queue=True) < 2**31 + 100
 
 
