@@ -57,17 +57,11 @@ class UnavailableError(ClusterError):
 
 @dataclass(frozen=True)
 class Release:
-    """One release of the chart: one robot and its cloud.
+    """One release of the chart: one robot and its cloud."""
 
-    Attributes:
-        context: Context of the kubeconfig; None for the current context.
-        namespace: Namespace of the release; None (with kubectl only) for the context's namespace.
-        name: Name of the Helm release.
-    """
-
-    context: str | None
-    namespace: str | None
-    name: str
+    context: str | None  # of the kubeconfig; None: the current one
+    namespace: str | None  # None (with kubectl only): that of the context
+    name: str  # of the Helm release
 
     @property
     def where(self) -> str:
