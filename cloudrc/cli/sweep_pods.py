@@ -39,8 +39,8 @@ def rows_from_pods(
 ) -> Generator[Row]:
     """Fly flights of a plan on a cluster, and yield each row once.
 
-    A pod that is deleted just after its last flight takes its log along, and Kubernetes counts its
-    shard as flown. So another Job flies what is missing, as long as rows arrive.
+    If a pod is deleted just after its last flight, its log is lost, but Kubernetes counts its shard
+    as complete. Therefore another Job flies the missing flights, as long as rows arrive.
 
     Raises:
         ClusterError: If the Job fails, or if a pod will never run.

@@ -1,7 +1,7 @@
 """Fly the flights of a sweep as an Indexed Job; their rows come back in the logs of the pods.
 
-No pod keeps a state: if a pod is lost, Kubernetes starts its index again, and the same flights give
-the same rows. So the cluster needs no volume, and nothing but the Job and a ConfigMap.
+If a pod is lost, Kubernetes starts its index again, and the same flights give the same rows.
+Therefore the sweep needs only the Job and a ConfigMap, and no volume.
 """
 
 from __future__ import annotations

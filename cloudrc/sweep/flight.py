@@ -47,7 +47,7 @@ def measure(experiment: ResolvedExperiment) -> Row:
 def counts(row: Row) -> bool:
     """Return whether the numbers of a flight are those of its experiment.
 
-    They are not if the flight did not end, or if a plug-in failed: then another one took over.
+    They are not if the flight did not end, or if a plug-in failed and another one replaced it.
     """
     return row["verdict"] in ("success", "failure") and "plugin_failed" not in row["failures"]
 
