@@ -17,9 +17,9 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from multiprocessing import get_context
@@ -42,6 +42,8 @@ from cloudrc.tunnel.codec import Kind, encode_header
 
 Address: TypeAlias = tuple[str, int]
 Array: TypeAlias = NDArray[np.float64]
+Link: TypeAlias = dict[str, object]
+"""Section `link` of an experiment."""
 
 DELAY = 0.020
 """Delay of the link whose release errors are measured [s]."""
@@ -74,19 +76,16 @@ class Flow:
 
 
 class Judged(NamedTuple):
-    """Comparison of a flow with the model.
+    """Comparison of a flow with the model."""
 
-    `errors` are measured minus modelled delays of the datagrams that arrived, including copies [s].
-    """
-
-    errors: Array
+    errors: Array  # measured minus modelled delays of all that arrived, copies included [s]
     wrongly_lost: int
     wrongly_arrived: int
     swapped: int
 
 
 class Line(NamedTuple):
-    """One result: what is measured, its limit, its value, and whether the limit is kept."""
+    """One result."""
 
     what: str
     asked: str
@@ -94,30 +93,22 @@ class Line(NamedTuple):
     held: bool
 
 
-class RelayProcess:
-    """A running `cloudrc relay`; its `ways` are uplink and downlink."""
-
-    def __init__(self, folder: Path, link: dict[str, object], *, fifo: bool = False) -> None:
-        """Start a relay for `link`, the section of an experiment, and wait until it runs."""
-        config = _write(folder, link)
-        world_side, cloud_side, world, cloud = (("127.0.0.1", port) for port in free_ports(4))
-        addresses = {
-            "world-side": world_side, "cloud-side": cloud_side, "world": world, "cloud": cloud
-        }  # fmt: skip
-        command = [sys.executable, "-m", "cloudrc", "relay", f"--config={config}", "--feed"]
-        command += [f"--{name}={host}:{port}" for name, (host, port) in addresses.items()]
-        command += ["--fifo"] if fifo else []
-        self.ways = [Way(True, world_side, cloud, world), Way(False, cloud_side, world, cloud)]
-        self._process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        assert self._process.stdout is not None
-        self._process.stdout.readline()
-
-    def stop(self) -> None:
-        """End the process."""
-        self._process.terminate()
-        self._process.communicate(timeout=10)
+@contextmanager
+def run_relay(folder: Path, link: Link, *, fifo: bool) -> Iterator[list[Way]]:
+    """Run `cloudrc relay` for a link; yield uplink and downlink once it runs."""
+    world_side, cloud_side, world, cloud = (("127.0.0.1", port) for port in free_ports(4))
+    places = {"world-side": world_side, "cloud-side": cloud_side, "world": world, "cloud": cloud}
+    words = [f"--{name}={host}:{port}" for name, (host, port) in places.items()]
+    words += [f"--config={_write(folder, link)}", "--feed", *(["--fifo"] if fifo else [])]
+    command, pipe = [sys.executable, "-m", "cloudrc", "relay", *words], subprocess.PIPE
+    process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True)
+    try:
+        assert process.stdout is not None
+        process.stdout.readline()
+        yield [Way(True, world_side, cloud, world), Way(False, cloud_side, world, cloud)]
+    finally:
+        process.terminate()
+        process.communicate(timeout=10)
 
 
 def main() -> int:
@@ -156,15 +147,15 @@ def releases(folder: Path, rounds: int, duration: float) -> list[Line]:
         )
     program, source = folder / "wake_lateness", Path(__file__).with_name("wake_lateness.c")
     subprocess.run(["cc", "-O2", "-o", str(program), str(source)], check=True)
-    fifo, link = fifo_allowed(), {"profile": "ideal", "uplink": {"delay_ms": DELAY * 1e3}}
+    link: Link = {"profile": "ideal", "uplink": {"delay_ms": DELAY * 1e3}}
+    fifo = fifo_allowed()
     command = [*(("chrt", "-f", "10") if fifo else ()), str(program), str(round(1000 * duration))]
     wakes, errors = list[Array](), list[Array]()
     for _ in range(rounds):
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         wakes.append(np.array(done.stdout.split(), dtype=float) * 1e-9)
-        relay = RelayProcess(folder, link, fifo=fifo)
-        (flow,) = run_flow(relay.ways[:1], 1000.0, duration, 2 * DELAY)
-        relay.stop()
+        with run_relay(folder, link, fifo=fifo) as ways:
+            (flow,) = run_flow(ways[:1], 1000.0, duration, 2 * DELAY)
         errors.append(judge(flow, DirectionProfile(DELAY), min(flow.sent.values())).errors)
 
     def quantile(values: list[Array], share: float) -> float:
@@ -208,27 +199,22 @@ def measure_profiles(folder: Path, chosen: Iterable[str], duration: float) -> di
     Returns:
         Name and direction of a profile -> comparison with the model.
     """
-    fifo, links = fifo_allowed(), {name: dict[str, object](profile=name) for name in chosen}
-    relays = {name: RelayProcess(folder, link, fifo=fifo) for name, link in links.items()}
-    # When all senders run: the start of one takes 0.6 s of CPU time from the others.
-    begin = time.monotonic() + 0.6 * (len(links) + 1)
-    tasks = [(relay.ways, duration, begin) for relay in relays.values()]
-    with ProcessPoolExecutor(len(tasks), mp_context=get_context("spawn")) as pool:
-        flows = dict(zip(relays, pool.map(_send, tasks), strict=True))
+    fifo, links = fifo_allowed(), {name: Link(profile=name) for name in chosen}
+    with ExitStack() as stack:
+        ways = [stack.enter_context(run_relay(folder, link, fifo=fifo)) for link in links.values()]
+        # When all senders run: the start of one takes 0.6 s of CPU time from the others.
+        begin = time.monotonic() + 0.6 * (len(links) + 1)
+        with ProcessPoolExecutor(len(ways), mp_context=get_context("spawn")) as pool:
+            tasks = [(each, duration, begin) for each in ways]
+            flows = dict(zip(links, pool.map(_send, tasks), strict=True))
     judged = {}
-    for name, relay in relays.items():
-        relay.stop()
+    for name, link in links.items():
+        experiment = load_experiment(str(_write(folder, link)))
         origin_ns = min(min(flow.sent.values()) for flow in flows[name])
-        for flow, profile in zip(flows[name], profiles_of(folder, links[name]), strict=True):
-            direction = "uplink" if flow.uplink else "downlink"
-            judged[f"{name} {direction}"] = judge(flow, profile, origin_ns)
+        for flow, way in zip(flows[name], ("uplink", "downlink"), strict=True):
+            profile = link_profile(getattr(experiment, way))
+            judged[f"{name} {way}"] = judge(flow, profile, origin_ns)
     return judged
-
-
-def profiles_of(folder: Path, link: dict[str, object]) -> tuple[DirectionProfile, DirectionProfile]:
-    """Read the uplink and downlink profiles of a link."""
-    experiment = load_experiment(str(_write(folder, link)))
-    return link_profile(experiment.uplink), link_profile(experiment.downlink)
 
 
 def fifo_allowed() -> bool:
@@ -259,7 +245,10 @@ def run_flow(
         start_ns = max(time.monotonic_ns() + 10_000_000, round(begin * 1e9))
         for number in range(round(rate * duration)):
             for turn, way in enumerate(ways):
-                due_ns = start_ns + since_first_ns(number, turn, len(ways), period_ns)
+                # The first datagram starts the link's time. The others avoid whole periods, at
+                # which a trace may change while the datagram is on its way to the relay.
+                shift_ns = period_ns // 4 if number or turn else 0
+                due_ns = start_ns + number * period_ns + turn * period_ns // len(ways) + shift_ns
                 time.sleep(max(0.0, (due_ns - time.monotonic_ns()) * 1e-9))
                 header = encode_header(_kind(way.uplink), int(not way.uplink), EPOCH, number)
                 ends[way.source].sendto(header.ljust(SIZE, b"\0"), way.target)
@@ -269,18 +258,6 @@ def run_flow(
             time.sleep(0.02)
             drain()
     return flows
-
-
-def since_first_ns(number: int, turn: int, turns: int, period_ns: int) -> int:
-    """Return when to send a datagram, as time since the first datagram [ns].
-
-    The first datagram starts the link's time. A trace may change at whole periods. Datagrams are
-    not sent near a whole period, because the relay receives them a microsecond later and could then
-    correctly use the trace's next row, unlike the model here.
-    """
-    if number == turn == 0:
-        return 0
-    return number * period_ns + turn * period_ns // turns + period_ns // 4
 
 
 def judge(flow: Flow, profile: DirectionProfile, origin_ns: int) -> Judged:
@@ -307,7 +284,7 @@ def _send(task: tuple[list[Way], float, float]) -> list[Flow]:
     return run_flow(ways, 100.0, duration, 1.2, begin)
 
 
-def _write(folder: Path, link: dict[str, object]) -> Path:
+def _write(folder: Path, link: Link) -> Path:
     path = folder / f"{link.get('profile', 'link')}-{len(list(folder.iterdir()))}.yaml"
     world = {"mission": "hover", "world": {"scene": "empty"}}
     path.write_text(json.dumps({"seed": SEED, **world, "link": link}))

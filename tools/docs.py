@@ -5,8 +5,8 @@ signatures of the shipped plug-ins. The tables of docs/topics.md come from
 `cloudrc/record/topics.py`, those of docs/metrics.md from `cloudrc/exposition/table.py`. The text
 around the tables is written by hand.
 
-`tools/chart_values.py` defines the chart's values, schema and table. Shipped profiles and missions
-are copied, because a chart can read only its own files.
+The chart's schema and table come from its `values.yaml`. Shipped profiles and missions are copied,
+because a chart can read only its own files.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from __future__ import annotations
 import inspect
 import json
 import re
-import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +27,7 @@ from cloudrc.config.overrides import KINDS
 from cloudrc.config.schema import Direction, Experiment, Mission, Profile
 from cloudrc.exposition.table import METRICS, ROLES
 from cloudrc.record.topics import TOPICS
-from tools import chart_values
-from tools.chart_values import ChartValues, Quantities, Resources, Values
+from tools.chart_values import make_schema, table_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 CHART = ROOT / "charts" / "cloudrc"
@@ -78,14 +76,14 @@ COPIED = ("profile", "mission")
 
 def outputs() -> dict[Path, str]:
     """Generate everything that `make docs` writes: file -> text."""
-    values = table("key | default | meaning", _values(ChartValues()))
+    values = (CHART / "values.yaml").read_text()
+    rows = table("key | default | meaning", table_rows(values))
     return {
         **_insert(ROOT / "docs" / "experiment.md", _experiment()),
         **_insert(ROOT / "docs" / "topics.md", _topics()),
         **_insert(ROOT / "docs" / "metrics.md", _metrics()),
-        **_insert(CHART / "README.md", f"\n{values}"),
-        CHART / "values.yaml": VALUES_HEAD + _values_text(ChartValues()),
-        CHART / "values.schema.json": json.dumps(_chart_schema(), indent=2) + "\n",
+        **_insert(CHART / "README.md", f"\n{rows}"),
+        CHART / "values.schema.json": json.dumps(make_schema(values), indent=2) + "\n",
         **{
             CHART / "files" / f"{kind}s" / path.name: path.read_text()
             for kind in COPIED
@@ -285,84 +283,6 @@ def _metrics() -> str:
     ]
     head = "## Buckets\n\nUpper bounds of the buckets of each histogram [s]:\n"
     return f"\n{table('metric | type | from | meaning', rows)}\n{head}{''.join(buckets)}"
-
-
-VALUES_HEAD = "# Written by `make docs` from tools/chart_values.py: edit that file.\n"
-WIDTH = 96
-COMPACT = (Resources, Quantities)
-"""Parts of the values whose keys Kubernetes defines; each part is written on one line."""
-
-
-def _values_text(part: BaseModel, depth: int = 0) -> str:
-    """Format a part of the values as YAML, with the description above each key."""
-    lines = []
-    for key, value, text in _keys_of(part):
-        if key == "global":
-            continue
-        lines += [f"# {line}" for line in textwrap.wrap(text, WIDTH - 2 * depth)]
-        if isinstance(value, Experiment):
-            lines.append(f"{key}: {{}}")
-        elif isinstance(value, BaseModel) and not isinstance(value, COMPACT):
-            lines += [f"{key}:", _values_text(value, depth + 1).rstrip("\n")]
-        elif isinstance(value, Resources):
-            lines += [f"{key}:", *(f"  {k}: {flow(v)}" for k, v in plain(value).items())]
-        else:
-            lines.append(f"{key}: {flow(plain(value))}")
-        if depth == 0:
-            lines.append("")
-    return textwrap.indent("\n".join(lines).rstrip("\n"), "  " if depth else "") + "\n"
-
-
-def _keys_of(part: BaseModel) -> Iterator[tuple[str, Any, str]]:
-    """Yield name, default and description of each value."""
-    for name, info in type(part).model_fields.items():
-        yield info.alias or name, getattr(part, name), " ".join((info.description or "").split())
-
-
-def _chart_schema() -> dict[str, Any]:
-    """Generate the JSON schema of the values: draft 7, unknown keys are not allowed."""
-    made = ChartValues.model_json_schema(by_alias=True)
-    made = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "cloudrc", **made}
-    made["$defs"] = {name: _adapt(part) for name, part in made.pop("$defs").items()}
-    kinds = ((getattr(chart_values, name, object), part) for name, part in made["$defs"].items())
-    own = [part for kind, part in kinds if issubclass(kind, Values) and kind not in COMPACT]
-    for part in (made, *own):
-        # Templates need the parts as mappings: the schema refuses null for them.
-        needed = [key for key, value in part["properties"].items() if "$ref" in value]
-        part["required"] = sorted({*part.get("required", ()), *needed})
-    made["$defs"]["PlugIn"]["additionalProperties"] = {
-        "description": "A parameter of the plug-in, in the unit that its `build` documents",
-        "type": ["number", "string", "boolean", "array", "null"],
-    }
-    return dict(_adapt(made))
-
-
-def _adapt(part: Any) -> Any:
-    """Remove pydantic's titles and defaults; convert tuples of fixed length to draft 7."""
-    if isinstance(part, list):
-        return [_adapt(item) for item in part]
-    if not isinstance(part, dict):
-        return part
-    kept: dict[str, Any] = {}
-    for key, value in part.items():
-        if key == "properties":
-            kept[key] = {name: _adapt(inner) for name, inner in value.items()}
-        elif key == "description":
-            kept[key] = " ".join(value.split())
-        elif key != "default" and not (key == "title" and value != "cloudrc"):
-            kept[key] = _adapt(value)
-    if "prefixItems" in kept:  # a vector: all items have one type
-        kept["items"] = kept.pop("prefixItems")[0]
-    return kept
-
-
-def _values(part: BaseModel, above: str = "") -> Iterator[tuple[str, str, str]]:
-    for key, value, text in _keys_of(part):
-        if isinstance(value, BaseModel) and not isinstance(value, (*COMPACT, Experiment)):
-            yield from _values(value, f"{above}{key}.")
-        else:
-            shown = {} if isinstance(value, Experiment) else plain(value)
-            yield f"`{above}{key}`", f"`{json.dumps(shown)}`", text
 
 
 if __name__ == "__main__":

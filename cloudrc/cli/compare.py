@@ -95,8 +95,8 @@ def execute(options: argparse.Namespace) -> int:
 def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
     """Fly A and B with each seed; return the pairs, and why and with which code it ended early."""
     from cloudrc.cli.advice import warn
+    from cloudrc.cli.progress import SweepView
     from cloudrc.cli.run import load
-    from cloudrc.cli.sweep import Progress
     from cloudrc.sweep.compare import Pair
     from cloudrc.sweep.flight import fly_point, units
     from cloudrc.sweep.pairs import Found
@@ -121,7 +121,7 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
     flights: list[Row] = []
     head = f"{sides[0].name}: A and B, each with seeds 1 to {options.seeds}"
     stream = sys.stdout if options.output == "table" else sys.stderr
-    view = Progress(stream, f"{head}, {len(jobs)} flights", len(jobs))
+    view = SweepView(stream, f"{head}, {len(jobs)} flights", len(jobs))
 
     def take(flight: Row) -> None:
         flights.append(flight)

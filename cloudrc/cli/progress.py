@@ -1,11 +1,11 @@
-"""Show the progress of a flight: a line per event and, on a terminal, a status line."""
+"""Show the progress of a flight or of a sweep; on a terminal, in a status line."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
 from time import monotonic
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from rich.console import Console
 from rich.live import Live
@@ -24,7 +24,12 @@ from cloudrc.records import (
     TelemetrySent,
 )
 
+if TYPE_CHECKING:
+    from cloudrc.sweep.flight import Row
+
 ENDINGS = ("done", "cancelled", "timed_out")
+PLAIN_PERIOD = 30.0
+"""Time between two lines of progress of a sweep that is not shown on a terminal [s]."""
 
 
 class FlightView:
@@ -114,3 +119,41 @@ class FlightView:
 
 def _joined(cells: Iterable[str]) -> str:
     return "  ".join(cell for cell in cells if cell).rstrip()
+
+
+class SweepView:
+    """Shows how many flights are done: in a line on a terminal, else in a line every 30 s."""
+
+    def __init__(self, stream: TextIO, head: str, total: int) -> None:
+        """Print `head`; set the number of flights to fly."""
+        self._stream, self._total = stream, total
+        self._done, self._failed, self._told = 0, 0, set[str]()
+        self._began = self._printed = monotonic()
+        print_or_drop(escape(head), stream)
+        self._status = Console(file=stream).status("") if is_live(stream) else None
+        if self._status:
+            self._status.start()
+
+    def see(self, row: Row) -> None:
+        """Count a new row; print the first text of each verdict."""
+        self._done += 1
+        self._failed += row["verdict"] != "success"
+        if row["text"] and row["verdict"] not in self._told:
+            self._told.add(row["verdict"])
+            text = f"{row['key']}: {row['verdict']}: {row['text']}"
+            print_or_drop(escape(text), self._stream)
+        rate = self._done / max(monotonic() - self._began, 1e-3)
+        left = (self._total - self._done) / rate
+        time = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
+        line = f"{self._done}/{self._total}  {rate:.1f} flights/s, {time} left"
+        line += f", {self._failed} failed" if self._failed else ""
+        if self._status:
+            self._status.update(line)
+        elif monotonic() - self._printed >= PLAIN_PERIOD:
+            self._printed = monotonic()
+            print_or_drop(line, self._stream)
+
+    def close(self) -> None:
+        """Erase the line on a terminal."""
+        if self._status:
+            self._status.stop()

@@ -9,15 +9,13 @@ from collections import Counter
 from collections.abc import Generator, Iterable
 from contextlib import closing
 from pathlib import Path
-from time import monotonic
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.advice import advise
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.output import (
     escape,
     format_document,
-    is_live,
     output_argument,
     print_line,
     print_or_drop,
@@ -28,7 +26,6 @@ from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.cli.sweep_pods import (
     cluster_arguments,
     print_rows,
-    refuse_local_files,
     rows_from_pods,
 )
 from cloudrc.errors import BadInputError, InvalidRunError
@@ -62,8 +59,6 @@ ARRAYS = {
 index, which is 0 without a variable."""
 WARNINGS_MAX = 3
 """Largest number of warnings about points."""
-PLAIN_PERIOD = 30.0
-"""Time between two lines of progress that is not shown on a terminal [s]."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -131,6 +126,7 @@ def execute(options: argparse.Namespace) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Fly the flights of a sweep that have no row yet; return the exit code of the worst row."""
+    from cloudrc.cli.progress import SweepView
     from cloudrc.cli.run import new_folder
     from cloudrc.sweep import store
 
@@ -151,7 +147,7 @@ def run(options: argparse.Namespace) -> int:
     head = f"{len(plan.points)} points x {len(plan.seeds)} seeds{part}: {len(mine)} flights"
     stream = sys.stdout if options.output == "table" else sys.stderr
     head += f", {len(mine) - len(jobs)} done before" if len(jobs) < len(mine) else ""
-    view = Progress(stream, f"{plan.points[0].name}: {head}", len(jobs))
+    view = SweepView(stream, f"{plan.points[0].name}: {head}", len(jobs))
     with store.append_rows(folder, shard) as append, closing(view):
 
         def take(row: Row) -> None:
@@ -185,7 +181,10 @@ def _plan(options: argparse.Namespace) -> Plan:
         raise BadInputError("--shard needs --out, the folder that all shards share")
     plan = read_plan(options.file)
     if options.on:
-        refuse_local_files(plan)
+        from cloudrc.cluster.pods import refuse_local_files
+
+        for point in plan.points:
+            refuse_local_files(point.model_dump(mode="json"), "or fly without --on")
     advice = list(dict.fromkeys(text for point in plan.points for text in advise(point)))
     more = [f"{len(advice)} warnings; the others are alike"] if len(advice) > WARNINGS_MAX else []
     for text in advice[:WARNINGS_MAX] + more:
@@ -305,44 +304,3 @@ def draw_figure(options: argparse.Namespace) -> int:
 def _verdicts(rows: Iterable[Row]) -> str:
     counts = Counter(row["verdict"] for row in rows)
     return ", ".join(f"{count} {name}" for name, count in sorted(counts.items())[::-1]) or "none"
-
-
-class Progress:
-    """Shows how many flights are done: in a line on a terminal, else in a line every 30 s."""
-
-    def __init__(self, stream: TextIO, head: str, total: int) -> None:
-        """Print `head`; set the number of flights to fly."""
-        self._stream, self._total = stream, total
-        self._done, self._failed, self._began = 0, 0, monotonic()
-        self._printed, self._told = self._began, set[str]()
-        print_or_drop(escape(head), stream)
-        self._status = None
-        if is_live(stream):
-            from rich.console import Console
-
-            self._status = Console(file=stream).status("")
-            self._status.start()
-
-    def see(self, row: Row) -> None:
-        """Count a new row; print the first text of each verdict."""
-        self._done += 1
-        self._failed += row["verdict"] != "success"
-        if row["text"] and row["verdict"] not in self._told:
-            self._told.add(row["verdict"])
-            text = f"{row['key']}: {row['verdict']}: {row['text']}"
-            print_or_drop(escape(text), self._stream)
-        rate = self._done / max(monotonic() - self._began, 1e-3)
-        left = (self._total - self._done) / rate
-        time = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
-        line = f"{self._done}/{self._total}  {rate:.1f} flights/s, {time} left"
-        line += f", {self._failed} failed" if self._failed else ""
-        if self._status:
-            self._status.update(line)
-        elif monotonic() - self._printed >= PLAIN_PERIOD:
-            self._printed = monotonic()
-            print_or_drop(line, self._stream)
-
-    def close(self) -> None:
-        """Erase the line on a terminal."""
-        if self._status:
-            self._status.stop()

@@ -14,7 +14,6 @@ from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
 from cloudrc.cli.output import print_line
 from cloudrc.cli.parser import read_count
 from cloudrc.cli.pool import interrupt_on_signals
-from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
     from cloudrc.sweep.flight import Row
@@ -35,23 +34,13 @@ def cluster_arguments(parser: argparse.ArgumentParser) -> None:
     add("--queue", metavar="NAME", help="queue of Kueue that admits the Job")
 
 
-def refuse_local_files(plan: Plan) -> None:
-    """Raise a BadInputError if a point needs a file of this machine, which no pod has."""
-    from cloudrc.config.load import local_files
-
-    for point in plan.points:
-        for key, path in local_files(point.model_dump(mode="json")).items():
-            text = "the pods do not have this file; fly without --on; docs/sweeps.md says more"
-            raise BadInputError(f"{key}: {path}: {text}")
-
-
 def rows_from_pods(
     options: argparse.Namespace, plan: Plan, flights: Sequence[Flight]
 ) -> Generator[Row]:
     """Fly flights of a plan on a cluster, and yield each row once.
 
-    A pod that is deleted just after its last flight takes its log along, and Kubernetes counts its
-    shard as flown. So another Job flies what is missing, as long as rows arrive.
+    If a pod is deleted just after its last flight, its log is lost, but Kubernetes counts its shard
+    as complete. Therefore another Job flies the missing flights, as long as rows arrive.
 
     Raises:
         ClusterError: If the Job fails, or if a pod will never run.

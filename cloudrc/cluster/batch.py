@@ -1,7 +1,7 @@
 """Fly the flights of a sweep as an Indexed Job; their rows come back in the logs of the pods.
 
-No pod keeps a state: if a pod is lost, Kubernetes starts its index again, and the same flights give
-the same rows. So the cluster needs no volume, and nothing but the Job and a ConfigMap.
+If a pod is lost, Kubernetes starts its index again, and the same flights give the same rows.
+Therefore the sweep needs only the Job and a ConfigMap, and no volume.
 """
 
 from __future__ import annotations
@@ -42,16 +42,10 @@ def start(
     cpu: str,
     queue: str | None,
 ) -> None:
-    """Create the Job `name` of a file of flights, unless it flies already.
+    """Create the Job `name` of a file of flights, with `shards` pods, unless it flies already.
 
-    Args:
-        release: Namespace and login; the Job belongs to no Helm release.
-        name: Name of the Job; each sweep has its own.
-        flights: Content of the file of flights, from `cloudrc.sweep.parcel`.
-        shards: Number of pods.
-        image: Image of the world pod, which has the simulator.
-        cpu: CPU request of a pod, as in Kubernetes.
-        queue: Name of a queue of Kueue, which admits the Job; None without Kueue.
+    `flights` is from `cloudrc.sweep.parcel`, `image` has the simulator, `cpu` is the request of a
+    pod, and `queue` is a queue of Kueue. The Job belongs to no Helm release.
 
     Raises:
         ClusterError: If the cluster refuses the Job, or if the sweep is too large.

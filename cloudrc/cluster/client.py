@@ -6,7 +6,6 @@ Every error of the cluster or of a program becomes a message of one sentence.
 from __future__ import annotations
 
 import json
-import logging
 import re
 import shutil
 import subprocess
@@ -25,8 +24,6 @@ COMPONENTS = ("world", "cloud")
 """Components of a release that have a pod of their own."""
 REQUEST_TIMEOUT = 15.0
 """Time limit for one request to the API server [s]."""
-VERSION_TIMEOUT = 5.0
-"""Time limit for the API server to return its version [s]."""
 OUTAGE_MAX = 30.0
 """Longest time for which a request is tried again while the API server does not answer [s]."""
 OUTAGE_PERIOD = 1.0
@@ -35,11 +32,6 @@ STOP_LIMIT = 2.0
 """Time from SIGTERM to SIGKILL, in which a program can end by itself [s]."""
 OLDEST = (1, 29)
 """Oldest Kubernetes version that the chart supports (`kubeVersion` in Chart.yaml)."""
-WHERE_TO_GET = {
-    "kubectl": "https://kubernetes.io/docs/tasks/tools/",
-    "helm": "https://helm.sh/docs/intro/install/",
-}
-"""Program -> web page that explains the installation."""
 PACKAGE = Path(__file__).resolve().parents[1]
 _KINDS = {
     **{name: ("CoreV1Api", name[:-1]) for name in ("pods", "services", "secrets", "events")},
@@ -65,17 +57,11 @@ class UnavailableError(ClusterError):
 
 @dataclass(frozen=True)
 class Release:
-    """One release of the chart: one robot and its cloud.
+    """One release of the chart: one robot and its cloud."""
 
-    Attributes:
-        context: Context of the kubeconfig; None for the current context.
-        namespace: Namespace of the release; None (with kubectl only) for the context's namespace.
-        name: Name of the Helm release.
-    """
-
-    context: str | None
-    namespace: str | None
-    name: str
+    context: str | None  # of the kubeconfig; None: the current one
+    namespace: str | None  # None (with kubectl only): that of the context
+    name: str  # of the Helm release
 
     @property
     def where(self) -> str:
@@ -113,7 +99,7 @@ class Release:
         from kubernetes import client, config
 
         configuration = client.Configuration()
-        with explain_errors("read the kubeconfig", self.where), _login_errors(self.where):
+        with explain_errors("read the kubeconfig", self.where):
             load: Any = config.load_kube_config  # not annotated
             load(context=self.context, client_configuration=configuration)
         configuration.retries = False  # callers repeat a request themselves, with a message
@@ -147,24 +133,6 @@ class Release:
         selector = ",".join(f"{name}={value}" for name, value in self.labels(component).items())
         found: list[Any] = self.request("list", kind, label_selector=selector)
         return found
-
-
-@contextmanager
-def _login_errors(where: str) -> Iterator[None]:
-    """Raise an error if the login program of the kubeconfig fails, which the client only logs."""
-
-    def refuse(record: logging.LogRecord) -> bool:
-        raise MissingPrerequisiteError(
-            f"cannot log in to the cluster {where}: the kubeconfig's login program failed: "
-            f"{' '.join(record.getMessage().split())}; install it, or run it by hand to see why"
-        )
-
-    root = logging.getLogger()  # the client's module for kubeconfigs uses it
-    root.addFilter(refuse)
-    try:
-        yield
-    finally:
-        root.removeFilter(refuse)
 
 
 def connect(
@@ -204,7 +172,7 @@ def server_version(release: Release) -> tuple[int, int]:
     from kubernetes import client
 
     with explain_errors("get the version", release.where):
-        code = client.VersionApi(release.client).get_code(_request_timeout=VERSION_TIMEOUT)
+        code = client.VersionApi(release.client).get_code(_request_timeout=REQUEST_TIMEOUT)
     # The minor version of some vendors has a suffix: "29+".
     major, minor = (int(re.sub(r"\D.*", "", text) or 0) for text in (code.major, code.minor))
     return major, minor
@@ -245,9 +213,7 @@ def _refusal(error: Any, status: int, doing: str) -> str:
     message = " ".join(str(message).split())
     if status == 401:
         return "the API server does not know you; log in to the cluster again"
-    if status == 403 and "exceeded quota" in message:
-        return f"{message}; free some of the namespace's quota"
-    if status == 403:
+    if status == 403 and "exceeded quota" not in message:
         return f"{message}; ask for the permission, and check it: kubectl auth can-i {doing}"
     return message
 
@@ -282,7 +248,8 @@ def program(name: str) -> str:
     """Find a program on the PATH; raise MissingPrerequisiteError if it is missing."""
     path = shutil.which(name)
     if path is None:
-        raise MissingPrerequisiteError(f"{name} is not installed; install it: {WHERE_TO_GET[name]}")
+        text = "is not installed; 'cloudrc doctor --mode cluster' says how to install it"
+        raise MissingPrerequisiteError(f"{name} {text}")
     return path
 
 

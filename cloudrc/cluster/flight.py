@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,15 +38,6 @@ FETCHES = 4
 """Largest number of attempts to fetch recordings that contain the end of the mission."""
 FLOWN = (0, 1, 6, 130)
 """Exit codes of a Job whose mission was flown: success, failure, invalid, interrupted."""
-HINTS = {
-    "cluster unreachable": "is the cluster up? ask it: kubectl cluster-info",
-    "incompatible with Kubernetes": "make a newer one: kind create cluster",
-    "forbidden": "ask for the permission, and check it: kubectl auth can-i --list",
-    "another operation": "end that one first: helm history, then helm rollback",
-    "the specifications of the schema": "see what there is: helm show values charts/cloudrc",
-    "already exists": "is it another release's? see: helm list --all-namespaces",
-}
-"""Words in an error message of helm -> advice to the user."""
 
 
 def install(release: Release, values: Mapping[str, Any], timeout: float, tell: Tell) -> None:
@@ -60,25 +51,17 @@ def install(release: Release, values: Mapping[str, Any], timeout: float, tell: T
     """
     arguments = ["upgrade", "--install", release.name, str(chart_folder()), *release.helm_flags]
     arguments += ["--create-namespace", "--values=-"]
-    _helm(arguments, given=json.dumps(values))
+    run("helm", arguments, timeout=HELM_LIMIT, given=json.dumps(values))
     wait_ready(release, timeout=timeout, tell=tell)
 
 
 def current_values(release: Release) -> dict[str, Any]:
     """Read the values with which a release was installed; {} if the release does not exist."""
     arguments = ["list", "--output=json", f"--filter=^{release.name}$", *release.helm_flags]
-    if not json.loads(_helm(arguments) or "[]"):
+    if not json.loads(run("helm", arguments, timeout=HELM_LIMIT) or "[]"):
         return {}
     arguments = ["get", "values", release.name, "--output=json", *release.helm_flags]
-    return json.loads(_helm(arguments)) or {}
-
-
-def _helm(arguments: Sequence[str], given: str = "") -> str:
-    try:
-        return run("helm", arguments, timeout=HELM_LIMIT, given=given)
-    except ClusterError as error:
-        hints = [f"; {hint}" for words, hint in HINTS.items() if words in str(error)]
-        raise ClusterError(f"{error}{''.join(hints[:1])}") from error
+    return json.loads(run("helm", arguments, timeout=HELM_LIMIT)) or {}
 
 
 def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: None) -> None:
@@ -183,17 +166,11 @@ def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> d
 def refuse_local_files(experiment: ResolvedExperiment) -> None:
     """Raise a BadInputError if an experiment names local files, or if its mission has steps.
 
-    The pods cannot read files of this machine, and the API accepts missions with waypoints only.
-    Own metrics are evaluated on this machine, and a link profile is part of the experiment.
+    The API accepts missions with waypoints only. Own metrics are evaluated on this machine, and a
+    link profile is part of the experiment.
     """
-    from cloudrc.config.load import local_files
-
     flown = experiment.model_dump(mode="json", exclude={"report": True, "link": {"profile"}})
-    for key, path in local_files(flown).items():
-        raise BadInputError(
-            f"{key}: {path}: the pods do not have this file; build it into an image, "
-            "or fly with --mode local"
-        )
+    pods.refuse_local_files(flown, "or fly with --mode local")
     if experiment.mission.steps is not None:
         raise BadInputError(
             "mission.steps: a mission in a cluster has waypoints; fly steps with --mode local "

@@ -48,8 +48,6 @@ START_ALLOWANCE = 120
 """Time to start the pod and to get the robot's state, added to the mission's time limit [s]."""
 QUEUE_ALLOWANCE = 3600
 """Time for earlier missions to end, added to the time limit of a Job that may wait [s]."""
-DEADLINE_MAX = 2**31 - 1
-"""Largest time limit that Kubernetes accepts for a Job [s]."""
 END_ALLOWANCE = 60.0
 """Time in which Kubernetes ends a Job after the Job's time limit [s]."""
 KEEP_FINISHED = 3600
@@ -66,19 +64,12 @@ ENDED = ("complete", "failed")
 
 @dataclass(frozen=True, slots=True)
 class JobStatus:
-    """State of a mission's Job.
-
-    Attributes:
-        name: Name of the Job.
-        state: "pending", "flying", "complete" or "failed".
-        exit_code: Exit code of the container; None until the container has ended.
-        message: Verdict in words; "" until the verdict is known.
-    """
+    """State of a mission's Job."""
 
     name: str
-    state: str
-    exit_code: int | None
-    message: str
+    state: str  # "pending", "flying", "complete" or "failed"
+    exit_code: int | None  # of the container; None until the container has ended
+    message: str  # verdict in words; "" until it is known
 
 
 def run_job(
@@ -174,7 +165,7 @@ def _api_address(release: Release) -> str:
 
 def deadline_of(limit: float, queue: bool) -> int:
     """Compute the time limit of a Job [s] from the time limit of its mission [s]."""
-    return min(ceil(limit) + START_ALLOWANCE + queue * QUEUE_ALLOWANCE, DEADLINE_MAX)
+    return ceil(limit) + START_ALLOWANCE + queue * QUEUE_ALLOWANCE
 
 
 def follow_limit(limit: float, queue: bool) -> float:
@@ -233,8 +224,6 @@ def failure_of(job: Any) -> str | None:
         if condition.status == "True" and condition.type == "Complete":
             return ""
         if condition.status == "True" and condition.type == "Failed":
-            if condition.reason == "DeadlineExceeded":
-                return "the Job took longer than its activeDeadlineSeconds"
             where = f" (index {job.status.failed_indexes})" if job.status.failed_indexes else ""
             return f"{condition.reason}: {condition.message}{where}"
     return None
@@ -265,12 +254,6 @@ def follow(
         time.sleep(LOOK_PERIOD)
 
 
-def _log(release: Release, pod: Any) -> list[str]:
-    if pod is None or pod.status.phase == "Pending":
-        return []
-    return pod_log(release, pod.metadata.name, COMPONENT).splitlines()
-
-
 def _look(release: Release, name: str) -> tuple[JobStatus, list[str]]:
     """Read a Job's state and log; raise a ClusterError if the Job's pod will never run."""
     job = release.request("get", "jobs", name=name)
@@ -278,7 +261,9 @@ def _look(release: Release, name: str) -> tuple[JobStatus, list[str]]:
     pod = next((pod for pod, uid in uids if uid == job.metadata.uid), None)
     status = _status(job, pod)
     if status.state != "pending":
-        return status, _log(release, pod)
+        if pod is None or pod.status.phase == "Pending":
+            return status, []
+        return status, pod_log(release, pod.metadata.name, COMPONENT).splitlines()
     if pod is not None:
         why = pod_failure(pod)
     else:  # the cluster may refuse the pod, for example for a quota

@@ -43,17 +43,11 @@ _LOOK_PERIOD = 0.02
 
 @dataclass(frozen=True)
 class LinkParts:
-    """ConfigMap and pods of a release's link.
+    """ConfigMap and pods of a release's link."""
 
-    Attributes:
-        name: Name of the ConfigMap that the link containers follow.
-        files: Files of the ConfigMap by name: profile, traces, record of the last change.
-        pods: Component -> name of its newest running pod.
-    """
-
-    name: str
-    files: dict[str, str]
-    pods: dict[str, str]
+    name: str  # of the ConfigMap that the link containers follow
+    files: dict[str, str]  # of the ConfigMap: profile, traces, record of the last change
+    pods: dict[str, str]  # component -> name of its newest running pod
 
 
 def read_link(release: Release) -> LinkParts | None:
@@ -103,19 +97,12 @@ def send_change(release: Release, pod: str, handed: Handed) -> str:
 
 
 class Sent(NamedTuple):
-    """A change that was sent to both link containers, and that neither container has refused.
+    """A change that was sent to both link containers, and that neither container has refused."""
 
-    Attributes:
-        edit: The edited profile.
-        files: Files for the ConfigMap.
-        states: States of the containers that have answered, after the change.
-        failed: Errors of the containers that have not answered.
-    """
-
-    edit: Edit
-    files: dict[str, str]
-    states: list[LinkState]
-    failed: list[CloudrcError]
+    edit: Edit  # the edited profile
+    files: dict[str, str]  # for the ConfigMap
+    states: list[LinkState]  # of the containers that have answered, after the change
+    failed: list[CloudrcError]  # of the containers that have not answered
 
 
 def send(

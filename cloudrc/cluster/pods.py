@@ -13,20 +13,13 @@ import subprocess
 import tempfile
 import time
 import urllib.request
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from cloudrc.cluster.client import (
-    ClusterError,
-    Release,
-    end_process,
-    last_words,
-    program,
-    run,
-)
-from cloudrc.errors import TimedOutError
+from cloudrc.cluster.client import ClusterError, Release, end_process, last_words, program, run
+from cloudrc.errors import BadInputError, TimedOutError
 
 FATAL = {
     **dict.fromkeys(
@@ -123,6 +116,15 @@ def pod_failure(pod: Any) -> str:
         if (condition.type, condition.status) == ("PodScheduled", "False") and not waits_for_volume:
             return f"no node takes it: {message}"
     return ""
+
+
+def refuse_local_files(values: Mapping[str, Any], remedy: str) -> None:
+    """Raise a BadInputError if values of an experiment name a file that the pods do not have."""
+    from cloudrc.config.load import local_files
+
+    for key, path in local_files(values).items():
+        text = f"the pods do not have this file; build it into an image, {remedy}"
+        raise BadInputError(f"{key}: {path}: {text}")
 
 
 def container_statuses(pod: Any) -> list[Any]:

@@ -24,10 +24,15 @@ A row of a sweep also has `key`, `point` and `seed`."""
 def fly_point(experiment: ResolvedExperiment) -> Row:
     """Fly an experiment in virtual time and measure it; an exception becomes the verdict ERROR."""
     try:
-        found = fly_in_memory(experiment)
+        return measure(experiment)
     except (Exception, SystemExit) as error:  # one point that cannot fly must not stop the others
         text, none = describe_error(error), {"numbers": {}, "records_sha256": ""}
         return {"verdict": ERROR, "failures": [ERROR], "text": text, **none}
+
+
+def measure(experiment: ResolvedExperiment) -> Row:
+    """Fly an experiment in virtual time and measure it."""
+    found = fly_in_memory(experiment)
     failures = found.verdict.failures
     notes = (note for note in found.notes if note.startswith(metrics.METRIC_NOTE))
     return {
@@ -42,7 +47,7 @@ def fly_point(experiment: ResolvedExperiment) -> Row:
 def counts(row: Row) -> bool:
     """Return whether the numbers of a flight are those of its experiment.
 
-    They are not if the flight did not end, or if a plug-in failed: then another one took over.
+    They are not if the flight did not end, or if a plug-in failed and another one replaced it.
     """
     return row["verdict"] in ("success", "failure") and "plugin_failed" not in row["failures"]
 

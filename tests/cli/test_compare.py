@@ -40,20 +40,17 @@ def test_short_flights_are_compared_for_real(capsys):
     assert (number["interval"], number["decided"]) == (None, False)
 
 
-def test_the_last_line_is_the_answer(monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("seeds", "answer"),
+    [
+        ("8", "B has a lower prediction_error_rms: by 5.850 mm (2.600 .. 9.100), p = 0.0078, in 8 "
+              "of 8 pairs."),
+        ("5", "Undecided: prediction_error_rms after 5 pairs, p = 0.062; about 11 pairs needed."),
+    ],
+)  # fmt: skip
+def test_the_last_line_is_the_answer(seeds, answer, monkeypatch, capsys):
     fly_with(monkeypatch, lambda a, n: ("success", 0.01 + 0.0013 * n * ("last_sample" in a)))
-    assert sentence(capsys, "--seeds", "8") == (
-        0,
-        "B has a lower prediction_error_rms: by 5.850 mm (2.600 .. 9.100), p = 0.0078, in 8 of 8 "
-        "pairs.",
-    )
-
-
-def test_an_answer_without_proof_says_how_many_pairs_decide(monkeypatch, capsys):
-    fly_with(monkeypatch, lambda a, n: ("success", 0.01 + 0.0013 * n * ("last_sample" in a)))
-    assert sentence(capsys, "--seeds", "5")[1] == (
-        "Undecided: prediction_error_rms after 5 pairs, p = 0.062; about 11 pairs needed."
-    )
+    assert sentence(capsys, "--seeds", seeds) == (0, answer)
 
 
 def test_success_comes_before_every_number(monkeypatch, capsys):
@@ -86,24 +83,19 @@ def test_what_cannot_be_compared_is_refused(arguments, text, capsys):
     assert text in capsys.readouterr().err
 
 
-def test_ctrl_c_compares_the_finished_pairs(monkeypatch, capsys):
+@pytest.mark.parametrize("pairs", [2, 0])
+def test_ctrl_c_compares_the_finished_pairs(pairs, monkeypatch, capsys):
     def measure(predictor, seed):
-        if seed == 3:
+        if seed > pairs:
             raise KeyboardInterrupt
         return "success", 0.01
 
     fly_with(monkeypatch, measure)
-    assert sentence(capsys, "--seeds", "9", "-o", "json")[0] == 130
-
-
-def test_ctrl_c_before_the_first_pair_is_no_bad_input(monkeypatch, capsys):
-    def measure(predictor, seed):
-        raise KeyboardInterrupt
-
-    fly_with(monkeypatch, measure)
     sides = "cloud.predictor=last_sample", "cloud.predictor=constant_velocity"
-    assert main(["compare", *sides, "--seeds", "2"]) == 130
-    assert "interrupted: 0 pairs are finished" in capsys.readouterr().err
+    assert main(["compare", *sides, "--seeds", "9", "-o", "json"]) == 130
+    captured = capsys.readouterr()
+    assert f"interrupted: {pairs} pairs are finished" in captured.err
+    assert bool(captured.out) == bool(pairs)
 
 
 @pytest.mark.full

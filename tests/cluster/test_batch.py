@@ -33,7 +33,7 @@ def lines(release):
     return [*batch.read_lines(release, "sweep-1", told.append)], told
 
 
-def test_the_job_flies_each_index_with_its_flights(started, api):
+def test_the_job_flies_each_index_with_its_flights(started, api, release):
     job, data = api.get("jobs", "sweep-1"), api.get("configmaps", "sweep-1")
     assert base64.b64decode(data["binaryData"]["flights.json.gz"]) == b"flights"
     assert data["metadata"]["ownerReferences"][0]["uid"] == job["metadata"]["uid"]
@@ -42,11 +42,8 @@ def test_the_job_flies_each_index_with_its_flights(started, api):
     (container,) = spec["template"]["spec"]["containers"]
     assert container["args"] == ["sweep", "rows", "/flights/flights.json.gz", "--shard=auto/4"]
     assert "kueue.x-k8s.io/queue-name" not in job["metadata"]["labels"]
-
-
-def test_a_queue_is_a_label_of_the_job(api, release):
-    batch.start(release, "sweep-1", b"flights", 4, **{**WORDS, "queue": "lab"})
-    assert api.get("jobs", "sweep-1")["metadata"]["labels"]["kueue.x-k8s.io/queue-name"] == "lab"
+    batch.start(release, "sweep-2", b"flights", 4, **{**WORDS, "queue": "lab"})
+    assert api.get("jobs", "sweep-2")["metadata"]["labels"]["kueue.x-k8s.io/queue-name"] == "lab"
 
 
 def test_a_job_that_flies_is_found_again_and_a_failed_one_is_replaced(started, api, release):

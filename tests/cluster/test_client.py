@@ -1,7 +1,6 @@
 """The selection of a release, its requests, and calls of kubectl and helm; errors in one line."""
 
 import pytest
-import yaml
 
 from cloudrc.cluster import client
 from cloudrc.cluster.client import ClusterError, Release, UnavailableError, connect
@@ -9,7 +8,7 @@ from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.pods import find_pod, list_pods
 from cloudrc.errors import MissingPrerequisiteError, TimedOutError
-from tests.cluster.conftest import CONFIG_PLACE, MISSION, kubeconfig, pod, terminated
+from tests.cluster.conftest import CONFIG_PLACE, MISSION, pod, terminated
 
 
 def test_flags_override_the_kubeconfig(api):
@@ -32,23 +31,11 @@ def test_a_missing_or_broken_kubeconfig_is_reported_with_a_remedy(tmp_path, monk
         path.write_text(":\n  - x: [")
 
 
-def test_a_failing_login_program_is_named(tmp_path, monkeypatch):
-    config = yaml.safe_load(kubeconfig("http://127.0.0.1:9"))
-    version = "client.authentication.k8s.io/v1"
-    login = {"apiVersion": version, "command": "false", "interactiveMode": "Never"}
-    config["users"][0]["user"] = {"exec": login}
-    (tmp_path / "config").write_text(yaml.safe_dump(config))
-    monkeypatch.setattr(CONFIG_PLACE, str(tmp_path / "config"))
-    words = r"cannot log in to the cluster in namespace 'demo': .* returned 1; install it"
-    with pytest.raises(MissingPrerequisiteError, match=words):
-        list_pods(connect(), "cloud")
-
-
 @pytest.mark.parametrize(
     ("code", "said", "expected"),
     [
         (401, "Unauthorized", "log in"),
-        (403, "exceeded quota: compute", "free some of the namespace's quota"),
+        (403, "exceeded quota: compute", "exceeded quota: compute$"),
         (500, "etcd\nis gone", "etcd is gone"),
     ],
 )
@@ -118,5 +105,5 @@ def test_the_error_of_a_program_becomes_one_line(pretend, monkeypatch, script, k
         client.run("helm", ["list", "--all"], timeout=0.3 if "sleep" in script else 10.0)
     assert "\n" not in str(caught.value)
     monkeypatch.setenv("PATH", "")
-    with pytest.raises(MissingPrerequisiteError, match=r"helm is not installed; .* http"):
+    with pytest.raises(MissingPrerequisiteError, match=r"helm is not installed; .*doctor"):
         client.run("helm", ["version"], timeout=1.0)

@@ -7,7 +7,7 @@ import pytest
 
 from cloudrc.cluster import pods
 from cloudrc.cluster.client import ClusterError
-from cloudrc.cluster.flight import install, wait_ready
+from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.pods import list_pods, operator_token, pod_failure
 from cloudrc.errors import TimedOutError
 from tests.cluster.conftest import TOKEN, deployment, pod, terminated
@@ -104,9 +104,3 @@ def test_ports_are_forwarded_while_the_block_runs(release, pretend, monkeypatch,
         pretend("kubectl", script)
         with pytest.raises(error, match=words), pods.forwarded(release, "cloud-1", [8080]):
             pytest.fail("there is no way")
-
-
-def test_a_refusal_of_helm_has_a_hint(release, pretend):
-    pretend("helm", "echo 'Error: Kubernetes cluster unreachable: refused' >&2; exit 1")
-    with pytest.raises(ClusterError, match=r"unreachable.*ask it: kubectl cluster-info"):
-        install(release, {}, 1.0, print)

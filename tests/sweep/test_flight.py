@@ -2,7 +2,7 @@
 
 from cloudrc.cli.run import fly
 from cloudrc.config.load import load_experiment
-from cloudrc.sweep.flight import ERROR, fly_point, units
+from cloudrc.sweep.flight import fly_point, units
 
 SHORT = "mission.steps.count=1", "mission.steps.period_s=1.0", "criteria.settle_m=null"
 """Overrides of `steps` for one second of flight."""
@@ -24,13 +24,3 @@ def test_a_metric_that_fails_is_told(tmp_path):
     flown = fly_point(load_experiment("steps", [*SHORT, f"report.metrics=[{tmp_path}/mine.py]"]))
     assert (flown["verdict"], "mine" in flown["numbers"]) == ("success", False)
     assert flown["text"] == "metric mine failed: ZeroDivisionError: division by zero"
-
-
-def test_an_exception_becomes_the_verdict_error(monkeypatch):
-    def fail(experiment):
-        raise RuntimeError("no\nluck")
-
-    monkeypatch.setattr("cloudrc.assembly.assemble", fail)
-    flown = fly_point(load_experiment("steps", SHORT))
-    assert (flown["verdict"], flown["failures"]) == (ERROR, [ERROR])
-    assert flown["text"] == "RuntimeError: no luck"
