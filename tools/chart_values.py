@@ -173,10 +173,12 @@ def make_schema(text: str) -> Schema:
 
 
 def _adapt(part: Any) -> Any:
-    """Convert tuples of fixed length to draft 7: all items of a vector have one schema."""
+    """Convert tuples of fixed length to draft 7, and leave out titles and defaults."""
     if isinstance(part, list):
         return [_adapt(item) for item in part]
     if not isinstance(part, dict):
         return part
-    kept = {key: _adapt(value) for key, value in part.items()}
-    return kept if "prefixItems" not in kept else kept | {"items": kept.pop("prefixItems")[0]}
+    kept = {key: _adapt(each) for key, each in part.items() if key not in ("title", "default")}
+    if "prefixItems" in kept:  # a vector: all items have one schema
+        kept["items"] = kept.pop("prefixItems")[0]
+    return kept

@@ -15,11 +15,12 @@ STEP = 5
 """Time between two points of a curve [s]; Prometheus scrapes as often."""
 RATE_INTERVAL = "20s"
 """Value of Grafana's variable `$__rate_interval`: four scrapes, as in Grafana."""
-UNITS = {"s": "s", "lengthm": "m", "velocityms": "m/s", "forceN": "N", "bytes": "B", "cps": "/s"}
+UNITS = {
+    **{"s": "s", "lengthm": "m", "velocityms": "m/s", "forceN": "N", "bytes": "B", "cps": "/s"},
+    "percentunit": "share",
+}
 """Name of a unit in Grafana -> its symbol."""
 COLUMNS = 3
-DAY = 86_400
-"""Matplotlib's unit of time [s]."""
 
 Dashboard = Mapping[str, Any]
 Ask = Callable[[str], Sequence[Mapping[str, Any]]]
@@ -66,7 +67,7 @@ def fetch(dashboard: Dashboard, ask: Ask, duration: int) -> Curves:
 
 
 def draw(shown: Sequence[tuple[Dashboard, Curves]], path: Path) -> None:
-    """Draw all panels of dashboards into a picture."""
+    """Draw all panels into a picture, over the time before the end of the data [min]."""
     from matplotlib.figure import Figure
 
     rows = [-(-len(dashboard["panels"]) // COLUMNS) for dashboard, _ in shown]
@@ -83,25 +84,17 @@ def draw(shown: Sequence[tuple[Dashboard, Curves]], path: Path) -> None:
 
 
 def _draw_panel(axis: Any, panel: Mapping[str, Any], curves: list[Curve]) -> None:
-    from matplotlib.dates import DateFormatter, MinuteLocator
-    from matplotlib.ticker import EngFormatter, PercentFormatter
-
     defaults = panel["fieldConfig"]["defaults"]
+    end = max((time for _, points in curves for time, _ in points), default=0.0)
     for legend, points in curves:
-        days, values = [time / DAY for time, _ in points], [value for _, value in points]
-        axis.plot(days, values, label=legend, linewidth=1, drawstyle="steps-post")
-    axis.set_title(panel["title"], fontsize=8, loc="left")
+        minutes, values = [(time - end) / 60 for time, _ in points], [value for _, value in points]
+        axis.plot(minutes, values, label=legend, linewidth=1, drawstyle="steps-post")
+    unit = UNITS.get(defaults.get("unit"), "")
+    axis.set_title(panel["title"] + (f" ({unit})" if unit else ""), fontsize=8, loc="left")
     axis.tick_params(labelsize=7)
     axis.grid(alpha=0.3)
     if mappings := defaults.get("mappings"):
         states = mappings[0]["options"]
         axis.set_yticks([*map(int, states)], [state["text"] for state in states.values()])
         axis.set_ylim(-0.5, len(states) - 0.5)
-    elif (unit := defaults["unit"]) == "percentunit":
-        axis.yaxis.set_major_formatter(PercentFormatter(1.0))
-    elif unit in UNITS:
-        axis.yaxis.set_major_formatter(EngFormatter(UNITS[unit]))
-    axis.xaxis_date()
-    axis.xaxis.set_major_locator(MinuteLocator())
-    axis.xaxis.set_major_formatter(DateFormatter("%H:%M"))
     axis.legend(fontsize=7, frameon=False, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.15))
