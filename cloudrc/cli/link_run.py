@@ -39,8 +39,8 @@ EPILOG = ""
 TOOL_TIMEOUT = 5.0  # time limit of one call of tc or ip [s]
 _BATCH = ("tc", "-s", "-j", "-force", "-batch", "-")
 _END = "qdisc show dev lo"
-"""Command that is sent to tc after each change. Its answer, a list, marks the end of the change's
-answer; tc itself does not mark it."""
+"""Command that is sent to tc after each other command. Its answer, a list, marks the end of the
+other command's answer; tc itself does not mark it."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -196,7 +196,7 @@ class Programs:
     """Runs tc and ip.
 
     The steps of a time line have to take effect within milliseconds; starting a process takes
-    longer. Therefore one `tc -batch -` process stays open for all changes.
+    longer. Therefore one `tc -batch -` process stays open for all changes and lists of qdiscs.
     """
 
     def __init__(self, tables: str = "") -> None:
@@ -206,11 +206,14 @@ class Programs:
 
     def __call__(self, words: Sequence[str]) -> Answer:
         """Run a command of tc or ip, and return its answer."""
-        if tuple(words[:3]) == ("tc", "qdisc", "change"):
-            try:
-                return self._change(" ".join(words[1:]))
-            except OSError:  # tc was killed or is too old for -batch: start it for this command
-                self.close()
+        try:
+            match list(words):
+                case ["tc", "qdisc", "change", *_]:
+                    return self._ask(" ".join(words[1:]), lists=False)
+                case ["tc", "-s", "-j", "qdisc", "show", *_]:
+                    return self._ask(" ".join(words[3:]), lists=True)
+        except OSError:  # tc was killed or is too old for -batch: start it for this command alone
+            self.close()
         return run_tool(words, self._environment)
 
     def close(self) -> None:
@@ -220,8 +223,11 @@ class Programs:
             self._tc.communicate()
             self._tc = None
 
-    def _change(self, line: str) -> Answer:
-        """Send a command to the open tc process; raise an OSError if tc has ended."""
+    def _ask(self, line: str, *, lists: bool) -> Answer:
+        """Send a command to the open tc process; `lists` tells whether the command lists qdiscs.
+
+        Raise an OSError if tc has ended.
+        """
         from cloudrc.link.netem import Answer
 
         if self._tc is None:
@@ -233,11 +239,13 @@ class Programs:
         assert self._tc.stdout is not None
         self._tc.stdin.write(f"{line}\n{_END}\n")
         self._tc.stdin.flush()
-        said = list[str]()
-        while not (answer := self._tc.stdout.readline()).startswith("["):
-            if not answer:
+        said, listings, failed = list[str](), list[str](), False
+        while len(listings) < 1 + (lists and not failed):
+            if not (answer := self._tc.stdout.readline()):
                 raise OSError("tc has ended")
-            said.append(answer.strip())
-        failed = any(one.startswith("Command failed") for one in said)
-        errors = [one for one in said if not one.startswith("Command failed")]
-        return Answer(2 if failed else 0, "", "\n".join(errors))
+            failed = failed or answer.startswith("Command failed")
+            (listings if answer.startswith("[") else said).append(answer.strip())
+        if failed:
+            errors = [one for one in said if not one.startswith("Command failed")]
+            return Answer(2, "", "\n".join(errors))
+        return Answer(0, listings[0] if lists else "", "")

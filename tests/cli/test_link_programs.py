@@ -41,16 +41,19 @@ def programs(tmp_path, monkeypatch):
     return Programs()
 
 
-def test_changes_go_through_one_process(programs, tmp_path):
+def test_changes_and_lists_go_through_one_process(programs, tmp_path):
     for _ in range(2):
         assert programs((*CHANGE, "delay", "1us")) == (0, "", "")
+        assert programs(SHOW) == (0, '[{"kind":"netem"}]', "")
         code, _, error = programs((*CHANGE, "lacks"))
         assert code
         assert error == "Cannot find device eth0"
+        assert programs((*SHOW, "lacks")).code
     lines = (tmp_path / "log").read_text().splitlines()
     assert lines[:2] == ["qdisc change dev eth0 netem delay 1us", "qdisc show dev lo"]
+    assert lines[2] == "qdisc show dev eth0", "by the same process"
     assert programs((*CHANGE, "dies")).code == 0  # repeated in its own process
-    assert programs(SHOW).output.strip() == '[{"kind":"netem"}]'
+    assert programs(SHOW).output == '[{"kind":"netem"}]'
     programs.close()
     assert programs(("tc", "qdisc", "add", "lacks")).code == 2, "not a change"
     assert programs(("no-such-program",)).code == 127
