@@ -114,4 +114,5 @@ def check(folder: Path, limit: float = TIME_LIMIT) -> list[dict[str, Any]]:
         finally:
             for process in processes.values():
                 process.kill()
+                process.wait()
     return found

@@ -138,6 +138,8 @@ def test_keys_drive_and_sliders_change_the_delay(flight, page, figure):
     page.get_by_role("textbox").first.fill("9999")
     page.keyboard.press("Enter")
     wait_for(lambda: page.get_by_role("textbox").first.input_value() == "500")
+    page.get_by_role("textbox").first.fill("10")  # with 500 ms no drive ends: the guard holds
+    page.keyboard.press("Enter")
     page.get_by_role("tab", name="Fly").click()
     button(page, "Start").click()  # it ends the drive first
     wait_for(lambda: (api.get("/v1/state")["mission"] or mission)["name"] == "hover")
