@@ -374,10 +374,9 @@ def _run_relay(options: argparse.Namespace) -> int:
 
     experiment = read_experiment(str(options.config))
     links = dict(zip(("uplink", "downlink"), assembly.build_links(experiment), strict=True))
-    profiles = {}
-    for way, direction in (("uplink", experiment.uplink), ("downlink", experiment.downlink)):
-        values = direction.model_dump(mode="json", exclude_defaults=True)
-        profiles[way] = Loaded(assembly.link_profile(direction), values)
+    ways = {"uplink": experiment.uplink, "downlink": experiment.downlink}
+    values = {way: d.model_dump(mode="json", exclude_defaults=True) for way, d in ways.items()}
+    profiles = {way: Loaded(assembly.link_profile(d), values) for way, d in ways.items()}
     settle()
     if options.fifo:
         refused = ask_for_fifo()
