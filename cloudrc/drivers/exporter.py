@@ -6,10 +6,13 @@ import socket
 import socketserver
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler
+from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
@@ -24,19 +27,29 @@ from cloudrc.records import Counted, Record
 
 TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
 """Content type of Prometheus' text format."""
-PLAIN, JSON = "text/plain; charset=utf-8", "application/json"
 CLIENT_WAIT_MAX = 5.0
-"""Longest wait for data from or to a client [s]; idle clients then free their threads."""
+"""Longest wait for data from or to a client [s]."""
+CONNECTIONS_MAX = 16
+"""Largest number of open connections. A further connection closes the oldest one, so that idle
+clients cannot use up the files or threads of the process."""
+KEPT = 0.25
+"""Time for which a page of metrics is reused [s]: making a page may delay the control loop."""
 CONFIG_DIGITS = 12
 """Number of hexadecimal digits of the configuration's hash in the metrics."""
 STILL_MAX = 5.0
 """Time without a record after which the control loop counts as stopped [s]. A running loop makes at
 least one record per second."""
-CPU_COUNTS = Path("/sys/fs/cgroup/cpu.stat")
-"""File with the CPU counts of this container (cgroup version 2)."""
-Answer = tuple[int, str, str]
-"""An HTTP answer: status, content and content type."""
-NO_PEER: Answer = (503, "no peer yet\n", PLAIN)
+CGROUP = Path("/sys/fs/cgroup")
+CPU_COUNTS = ("cpu.stat", "cpu/cpu.stat", "cpu,cpuacct/cpu.stat")
+"""Files below `CGROUP` that may contain a container's CPU counts: one for cgroup v2, two for v1."""
+
+
+class Answer(NamedTuple):
+    """An HTTP answer: status, content and content type."""
+
+    status: int
+    content: str
+    kind: str = "text/plain; charset=utf-8"
 
 
 class _Server(socketserver.ThreadingTCPServer):
@@ -52,7 +65,7 @@ class _Server(socketserver.ThreadingTCPServer):
     request_queue_size = 1_024
 
     def __init__(self, address: tuple[str, int], pages: Mapping[str, Callable[[], Answer]]) -> None:
-        self.pages = pages
+        self.pages, self._newest = pages, deque[socket.socket]()
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         super().__init__(address, _Handler)
         threading.Thread(target=self.serve_forever, args=(0.25,), daemon=True).start()
@@ -62,6 +75,14 @@ class _Server(socketserver.ThreadingTCPServer):
         if self.address_family == socket.AF_INET6:
             self.socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         super().server_bind()
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer on a new thread; above `CONNECTIONS_MAX`, close the oldest connection."""
+        self._newest.append(request)
+        if len(self._newest) > CONNECTIONS_MAX:
+            with suppress(OSError):  # the client has its answer
+                self._newest.popleft().shutdown(socket.SHUT_RDWR)
+        super().process_request(request, client_address)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore the errors of clients that disconnect early."""
@@ -76,11 +97,10 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """Answer with the page of the requested path, or with 404."""
         page = self.server.pages.get(self.path.partition("?")[0])
-        missing = 404, f"there are {', '.join(self.server.pages)}\n", PLAIN
-        status, text, kind = page() if page else missing
-        content = text.encode()
-        self.send_response(status)
-        self.send_header("Content-Type", kind)
+        answer = page() if page else Answer(404, f"there are {', '.join(self.server.pages)}\n")
+        content = answer.content.encode()
+        self.send_response(answer.status)
+        self.send_header("Content-Type", answer.kind)
         self.send_header("Content-Length", str(len(content)))
         self.end_headers()
         self.wfile.write(content)
@@ -89,22 +109,27 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing, because a request arrives every few seconds."""
 
 
-def read_throttling(path: Path = CPU_COUNTS) -> Readings:
-    """Read how much the CPU limit has throttled this container; {} without a limit.
+def read_throttling(root: Path = CGROUP) -> Readings:
+    """Read how much the CPU limit has throttled this container; {} outside a container.
 
-    Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us).
+    Source: Linux, Documentation/admin-guide/cgroup-v2.rst (throttled_usec, in us) and
+    Documentation/scheduler/sched-bwc.rst (throttled_time of version 1, in ns).
     """
-    try:
-        counts = dict(line.split() for line in path.read_text().splitlines())
-    except OSError:
-        return {}
-    if "nr_periods" not in counts:
-        return {}
-    return {
-        "cloudrc_cpu_periods_total": unlabelled(int(counts["nr_periods"])),
-        "cloudrc_cpu_throttled_periods_total": unlabelled(int(counts["nr_throttled"])),
-        "cloudrc_cpu_throttled_seconds_total": unlabelled(int(counts["throttled_usec"]) * 1e-6),
-    }
+    for name in CPU_COUNTS:
+        try:
+            words = (line.split() for line in (root / name).read_text().splitlines())
+        except OSError:
+            continue
+        counts = {key: int(number) for key, number in words}
+        if "nr_periods" in counts:
+            stopped = counts.get("throttled_usec", 0) * 1e-6
+            stopped += counts.get("throttled_time", 0) * 1e-9
+            return {
+                "cloudrc_cpu_periods_total": unlabelled(counts["nr_periods"]),
+                "cloudrc_cpu_throttled_periods_total": unlabelled(counts["nr_throttled"]),
+                "cloudrc_cpu_throttled_seconds_total": unlabelled(stopped),
+            }
+    return {}
 
 
 class Exporter:
@@ -122,6 +147,8 @@ class Exporter:
         self._said_ready, self._config = False, config[:CONFIG_DIGITS]
         self._seen_at: float | None = None  # time of the newest records; None before the first
         self._server: _Server | None = None
+        self._page_lock = threading.Lock()
+        self._made_at, self._made_page = -inf, Answer(503, "")
         self._registry = CollectorRegistry()
         self._registry.register(self)
         ProcessCollector(registry=self._registry)
@@ -168,16 +195,12 @@ class Exporter:
 
         Raise a MissingPrerequisiteError if the address cannot be bound.
         """
-        pages: dict[str, Callable[[], Answer]] = {
-            "/metrics": lambda: (200, self.text(), TEXT_FORMAT),
-            "/healthz": self._liveness,
-            "/readyz": lambda: (200, "ready\n", PLAIN) if self.is_ready else NO_PEER,
-        }
+        pages = {"/metrics": self._page, "/healthz": self._liveness, "/readyz": self._readiness}
         end, link = self._live.end, self._live.link
         if end is not None:
-            pages["/link.json"] = lambda: (200, end.check.text(), JSON)
+            pages["/link.json"] = lambda: Answer(200, end.check.text(), "application/json")
         if link is not None:
-            pages["/link.json"] = lambda: (200, link.tell(), JSON)
+            pages["/link.json"] = lambda: Answer(200, link.tell(), "application/json")
         try:
             self._server = _Server(address, pages)
         except OSError as error:
@@ -209,12 +232,24 @@ class Exporter:
         """Format the metrics for Prometheus."""
         return generate_latest(self._registry).decode()
 
+    def _page(self) -> Answer:
+        """Return the page of metrics, at most 0.25 s old; one thread at a time makes a new page."""
+        with self._page_lock:
+            now = time.monotonic()
+            if now - self._made_at >= KEPT:
+                self._made_at = now
+                self._made_page = Answer(200, self.text(), TEXT_FORMAT)
+            return self._made_page
+
+    def _readiness(self) -> Answer:
+        return Answer(200, "ready\n") if self.is_ready else Answer(503, "no peer yet\n")
+
     def _liveness(self) -> Answer:
         """Answer whether the loop of this process runs, even if the link or the peer is down."""
         still = 0.0 if self._seen_at is None else time.monotonic() - self._seen_at
         if still <= STILL_MAX:
-            return 200, "alive\n", PLAIN
-        return 503, f"the loop has stood still for {still:.0f} s\n", PLAIN
+            return Answer(200, "alive\n")
+        return Answer(503, f"the loop has stood still for {still:.0f} s\n")
 
 
 def _family(metric: Metric, reading: dict[Labels, float] | Histogram) -> Family:

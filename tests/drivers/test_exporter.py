@@ -1,8 +1,11 @@
-"""The exporter: valid text in bounds, probes on one port, clients that hang, CPU throttling."""
+"""The exporter: valid text in bounds, probes on one port, hostile clients, CPU throttling."""
 
+import select
 import socket
+import threading
 import urllib.error
 import urllib.request
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -106,18 +109,23 @@ def test_the_sync_age_is_absent_until_it_is_known():
     assert "cloudrc_recorder_sync_age_seconds 0.25" in world.text()
 
 
+LIMITED = "nr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n"
+OLD = "nr_periods 4\nnr_throttled 2\nthrottled_time 500000000\n"
+
+
 @pytest.mark.parametrize(
-    ("text", "counts"),
+    ("file", "text", "counts"),
     [
-        ("nr_periods 120\nnr_throttled 17\nthrottled_usec 1250000\n", [120, 17, 1.25]),
-        ("usage_usec 4402130\n", []),  # without a limit
-        (None, []),
+        ("cpu.stat", LIMITED, [120, 17, 1.25]),
+        ("cpu,cpuacct/cpu.stat", OLD, [4, 2, 0.5]),
+        ("cpu.stat", "usage_usec 4402130\n", []),  # without a limit
+        ("none", "", []),
     ],
 )
-def test_throttling_is_read_from_the_kernel(text, counts, tmp_path):
-    if text:
-        (tmp_path / "cpu.stat").write_text(text)
-    read = read_throttling(tmp_path / "cpu.stat")
+def test_throttling_is_read_from_the_kernel(file, text, counts, tmp_path):
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).write_text(text)
+    read = read_throttling(tmp_path)
     values = [value for reading in read.values() for value in dict(reading).values()]
     assert values == pytest.approx(counts)
 
@@ -139,7 +147,8 @@ def get(port, path, host=HOST):
             return error.code, error.read().decode()
 
 
-def test_metrics_and_probes_are_on_one_port(served):
+def test_metrics_and_probes_are_on_one_port(served, monkeypatch):
+    monkeypatch.setattr(exporters, "KEPT", 0.0)
     exporter, port = served
     assert get(port, "/healthz") == (200, "alive\n")
     assert get(port, "/readyz") == (503, "no peer yet\n")
@@ -150,6 +159,26 @@ def test_metrics_and_probes_are_on_one_port(served):
     with urllib.request.urlopen(f"http://{HOST}:{port}/metrics", timeout=10) as answer:
         assert answer.headers["Content-Type"] == "text/plain; version=0.0.4; charset=utf-8"
     assert get(port, "/") == (404, "there are /metrics, /healthz, /readyz, /link.json\n")
+
+
+def test_scrapers_that_come_at_once_have_one_page_made(served, monkeypatch):
+    exporter, port = served
+    monkeypatch.setattr(exporters, "KEPT", 60.0)
+    write, calls, all_wait = exporter.text, [], threading.Event()
+
+    def slowly():
+        calls.append(1)
+        assert all_wait.wait(10.0)
+        return write()
+
+    monkeypatch.setattr(exporter, "text", slowly)
+    with ThreadPoolExecutor(8) as scrapers:
+        answers = [scrapers.submit(get, port, "/metrics") for _ in range(8)]
+        while threading.active_count() < 16:  # eight clients and eight server threads
+            assert get(port, "/healthz")[0] == 200  # probes do not wait for scrapes
+        all_wait.set()
+        pages = {each.result() for each in answers}
+    assert (len(pages), len(calls)) == (1, 1)
 
 
 def test_a_loop_that_stands_still_is_not_alive(served, monkeypatch):
@@ -175,8 +204,12 @@ def test_probes_of_both_address_families_are_answered():
 
 
 def test_a_burst_of_clients_that_hang_blocks_no_probe(served):
+    """The oldest are closed."""
     waiting = [socket.create_connection((HOST, served[1]), timeout=0.9) for _ in range(200)]
     waiting[-1].sendall(b"GET /metr")
     assert get(served[1], "/healthz")[0] == 200
+    closed = select.select(waiting, [], [], 0)[0]
+    assert closed == waiting[: len(closed)]
+    assert len(closed) == len(waiting) + 1 - exporters.CONNECTIONS_MAX
     for client in waiting:
         client.close()
