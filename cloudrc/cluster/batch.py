@@ -1,7 +1,7 @@
-"""Fly the flights of a sweep as an Indexed Job; their rows come back in the logs of the pods.
+"""Fly the flights of a sweep as an Indexed Job; each pod writes the rows of its flights to its log.
 
-If a pod is lost, Kubernetes starts its index again, and the same flights give the same rows.
-Therefore the sweep needs only the Job and a ConfigMap, and no volume.
+If a pod is lost, Kubernetes starts another pod, and the same flights give the same rows. Therefore
+the sweep needs only the Job and a ConfigMap, and no volume.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FILE = "flights.json.gz"
 SIZE_MAX = 700_000
 """Largest size of the file of flights [bytes]; a ConfigMap has at most 1 MiB of base64."""
 RETRIES = 3
-"""Number of times that the pod of an index is started again after a failure of its own."""
+"""Largest number of restarts after a pod has failed; pods of a drained node do not count."""
 KEEP_FINISHED = 86_400
 """Time for which Kubernetes keeps a finished Job and its logs [s], if nobody fetches the rows."""
 LOOK_PERIOD = 2.0
@@ -42,16 +42,16 @@ def start(
     cpu: str,
     queue: str | None,
 ) -> None:
-    """Create the Job `name` of a file of flights, with `shards` pods, unless it flies already.
+    """Create the Job `name` with `shards` pods for `flights`; a Job that has not failed stays.
 
-    `flights` is from `cloudrc.sweep.parcel`, `image` has the simulator, `cpu` is the request of a
-    pod, and `queue` is a queue of Kueue. The Job belongs to no Helm release.
+    `flights` is a file made by `cloudrc.sweep.parcel`, `image` an image with the simulator, `cpu`
+    the CPU request of a pod, and `queue` a queue of Kueue. The Job belongs to no Helm release.
 
     Raises:
         ClusterError: If the cluster refuses the Job, or if the sweep is too large.
     """
     if len(flights) > SIZE_MAX:
-        text = f"the flights need {len(flights)} bytes, and a ConfigMap has {SIZE_MAX}"
+        text = f"the flights need {len(flights)} bytes, and a ConfigMap takes {SIZE_MAX}"
         raise ClusterError(f"{text}; split the file of the sweep")
     for job in release.find("jobs", COMPONENT):
         if job.metadata.name == name:
@@ -169,4 +169,4 @@ def _failure(pod: Any) -> str:
 
 def _remedy(release: Release, name: str) -> str:
     flags = " ".join(release.flags)
-    return f"see: kubectl {flags} describe job {name}; the same command flies what is missing"
+    return f"see: kubectl {flags} describe job {name}; then repeat the command"

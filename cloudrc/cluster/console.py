@@ -1,4 +1,4 @@
-"""Forward the page of a release's console to this machine, and read what its process prints."""
+"""Forward the page of a release's console to this machine, and read the console's log."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CONTAINER, PORT = "console", 8090
 
 
 def follow_page(release: Release, port: int, tell: Callable[[str], None]) -> Iterator[str]:
-    """Forward the page to `port` of 127.0.0.1 (0: any), and yield what its container prints.
+    """Forward the page to `port` of 127.0.0.1 (0: any), and yield the lines of the console's log.
 
     `tell` is called with the page's address on this machine.
 

@@ -30,8 +30,8 @@ LOOK_PERIOD = 1.0
 HELM_LIMIT = 120.0
 """Time limit for one helm command [s]; helm does not wait for pods."""
 FAILURE_TIME = 5.0
-"""A pod's failure is reported if it lasts for this time [s]: objects that the pod needs may still
-be missing before."""
+"""Time for which a pod's failure must last before it is reported [s]: at first, Kubernetes may not
+yet have made all objects that the pod needs."""
 FLUSH = 1.0
 """Time after which a recorder has certainly written its buffer of half a second [s]."""
 FETCHES = 4
@@ -166,8 +166,8 @@ def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> d
 def refuse_local_files(experiment: ResolvedExperiment) -> None:
     """Raise a BadInputError if an experiment names local files, or if its mission has steps.
 
-    The API accepts missions with waypoints only. Own metrics are evaluated on this machine, and a
-    link profile is part of the experiment.
+    The API accepts only missions with waypoints. Files of the user's metrics and link profile are
+    allowed: this machine evaluates the metrics, and the experiment contains the profile.
     """
     flown = experiment.model_dump(mode="json", exclude={"report": True, "link": {"profile"}})
     pods.refuse_local_files(flown, "or fly with --mode local")

@@ -87,7 +87,7 @@ def run_job(
         mission: Mission in the API's format: name, start, time_limit_s, waypoints.
         name: Name of the Job; default: an unused name.
         limit: Time limit of the mission [s].
-        queue: Whether to wait while another mission flies; if False, the API then refuses it.
+        queue: Whether to wait while another mission flies; if False, the API refuses the mission.
 
     Raises:
         ClusterError: If the cluster refuses the Job, or if the release does not exist.
@@ -177,8 +177,8 @@ def find_flight(release: Release, ask: Ask) -> tuple[str, str] | None:
     """Find a Job that has not ended, or else the mission that the API shows as under way.
 
     Returns:
-        The flight in words, and the command that ends the flight. None if nothing flies; also if
-            the API does not answer, so that the user may still upgrade and repair the release.
+        The flight in words, and the command that ends the flight; None if nothing flies. Also
+            None if the API does not answer: the user can then upgrade to repair the release.
     """
     for job in release.find("jobs", COMPONENT):
         if (status := _status(job, None)).state not in ENDED:

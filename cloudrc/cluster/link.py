@@ -1,9 +1,9 @@
 """Change the link of a release in flight, for `cloudrc link set` in a cluster.
 
-The new profile goes first to the link containers of both pods, which use it within a second. Then
-it goes into the ConfigMap, which restarted containers read. If a container refuses the profile, the
-ConfigMap stays unchanged. After a failure, the message lists where the change is in force. Traces
-are further files beside the profile.
+First, `send` writes the new profile into the link containers of both pods, which apply it within a
+second. Then `keep` writes it into the ConfigMap, which restarted containers read. If a container
+refuses the profile, the ConfigMap stays unchanged. After a failure, the message lists where the
+change is in force. Each trace of the profile is a further file.
 
 This module uses kubectl, which starts in 0.1 s; the Python client takes 0.5 s. For the same reason
 it runs `sh` in the containers, not Python.
@@ -157,7 +157,7 @@ def send(
 
 
 def keep(release: Release, link: LinkParts, sent: Sent) -> None:
-    """Write a change into the ConfigMap; raise an error if the write or a container has failed."""
+    """Write a sent change into the ConfigMap; raise an error if this or a container failed."""
     said = list(map(str, sent.failed))
     words = ["patch", "configmap", link.name, "--type=merge", "--patch-file=/dev/stdin"]
     try:

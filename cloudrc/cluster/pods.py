@@ -34,7 +34,7 @@ FATAL = {
     ),
     **dict.fromkeys(("CrashLoopBackOff", "Error"), "container '{name}' ends repeatedly{end}"),
 }
-"""Reason in Kubernetes' words why a container will never run -> text of the error message."""
+"""Kubernetes' reason why a container will never run -> text of the error message."""
 RESTARTS_MAX = 2
 """Largest number of restarts after which a container is still expected to start."""
 TOKENS, OPERATOR = "tokens", "operator"

@@ -1,12 +1,12 @@
 """Compute the random impairments of each packet with a counter-based random number generator.
 
 Seed, direction, session (epoch) and kind of datagram select a stream of random numbers. The counter
-of the packet is its position in the stream. So its impairment does not depend on earlier calls.
-Loss, jitter and each other purpose have a separate column of numbers, so that adding loss to a
+of a packet is its position in the stream. So the impairment of a packet does not depend on earlier
+calls. Each purpose, such as loss or jitter, has its own column of numbers, so that adding loss to a
 profile does not change the jitter.
 
-Bursts and correlated jitter depend on the packet before. To limit this recursion, they restart from
-their stationary distribution every 64 blocks of 256 packets.
+Loss bursts and correlated jitter depend on the previous packet. To limit the recursion, both
+restart from their stationary distribution every 64 blocks of 256 packets.
 
 The impairment of a packet is a tuple with one entry for each copy that arrives: no entry for a lost
 packet, two entries for a duplicated packet. An entry is the constant OVERTAKES, or the extra delay
@@ -84,10 +84,10 @@ def uniforms(key: StreamKey, purpose: Purpose, block: int) -> Floats:
 
 @lru_cache(maxsize=_CACHED)
 def normals(key: StreamKey, purpose: Purpose, block: int, correlation: float) -> tuple[float, ...]:
-    """Draw normal variates of a block; `correlation`, in [0, 1], is that of successive variates.
+    """Draw standard normal variates for the packets of a block, shape (256,).
 
-    The variates follow the autoregression z_n = c · z_(n-1) + sqrt(1 - c²) · e_n. So every variate
-    is exactly standard normal. Their shape is (256,).
+    Successive variates have the correlation c = `correlation`, in [0, 1]. The autoregression
+    z_n = c · z_(n-1) + sqrt(1 - c²) · e_n keeps each variate exactly standard normal.
 
     Deviation: tc-netem mixes (1 - c) · new + c · old, which narrows the distribution.
     """
@@ -134,8 +134,8 @@ def impairments(
 ) -> list[Fate]:
     """Draw the impairments of the 256 packets of a block.
 
-    `jitter` [s] and `loss` are the present values, because a profile can change them over time. A
-    lost packet is neither duplicated nor reordered. The copy of a duplicated packet has its own
+    `jitter` [s] and `loss` are arguments, because a profile can change them over time. A lost
+    packet is neither duplicated nor reordered. The copy of a duplicated packet has its own
     random delay with the same distribution.
 
     Deviation: tc-netem delivers one copy of a packet that is both duplicated and lost.
@@ -184,7 +184,7 @@ def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfil
     correlation = 0.0 if purpose is Purpose.COPY_DELAY else profile.correlation
     if profile.distribution == "normal":
         return list(normals(key, purpose, block, correlation))
-    # The variates z (normal) or u (uniform) as their share of the distribution below or above.
+    # z: correlated normal variates; u: independent uniform variates. One of the two is empty.
     z = normals(key, purpose, block, correlation) if correlation else ()
     u = [] if correlation else uniforms(key, purpose, block).tolist()
     if profile.distribution == "uniform":

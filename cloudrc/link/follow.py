@@ -1,9 +1,9 @@
-"""Follow changes of a link in flight: of its profile and of the peer's address.
+"""Follow changes of a running link: a new profile, or a new address of the other pod (the peer).
 
-`cloudrc link set` changes the release's ConfigMap, so that the change is permanent. A kubelet may
-need a minute to copy it to a pod. Therefore the command also writes the same files, as one JSON
-document, into the pod. ConfigMap and document contain the same number of the change: the first to
-arrive takes effect, and the other is ignored.
+`cloudrc link set` changes the release's ConfigMap, so that the change is permanent. Kubernetes may
+need a minute to copy the ConfigMap to a pod. Therefore the command also writes the same files, as
+one JSON document, into the pod. ConfigMap and document contain the number of the change; the link
+applies the one that arrives first and ignores the other.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PEER_PAUSE = (0.5, 1.0)
 """Shortest and longest pause before the peer's name is resolved again [s]. The pause is random, so
 that the links of many releases do not query their name server at the same time.
 Source: docs/reference/faults.md, "F19"."""
-HANDED_FILE = "asked.json"  # JSON document of `cloudrc link set`, in the folder of the route
+HANDED_FILE = "asked.json"  # JSON document of `cloudrc link set`, beside the route file
 SIZE_MAX = 1_200_000  # size limit of the JSON document [bytes]: room for the content of a ConfigMap
 PROFILE = "profile.yaml"
 _NAME = re.compile(r"[a-zA-Z0-9_][-._a-zA-Z0-9]{0,252}")
@@ -51,9 +51,9 @@ Load = Callable[[Path], Loaded]
 class ProfileFile:
     """Reads a profile's file again whenever the file changes.
 
-    Kubernetes mounts a ConfigMap as links into the folder `..data`. `..data` is itself a link,
-    which Kubernetes replaces in one step, so that the same path leads to another file. The check
-    for a change takes one system call, because it runs 20 times per second.
+    Kubernetes mounts a ConfigMap as symbolic links into `..data`, which is itself a symbolic link.
+    For a new version, Kubernetes replaces `..data`, so that the same path leads to another file.
+    A check for a change takes only one system call, because it runs 20 times per second.
     """
 
     def __init__(self, path: Path, load: Load, log: Callable[[str], None]) -> None:
@@ -148,7 +148,7 @@ class _HandedFile(ProfileFile):
 
 
 class Profiles:
-    """Follows the profile's file and the JSON document; applies each change once."""
+    """Watches the profile's file and the JSON document, and returns each change once."""
 
     def __init__(
         self, profile: Path, document: Path, load: Load, log: Callable[[str], None]
@@ -172,10 +172,10 @@ class Profiles:
         return None
 
     def _is_known(self, loaded: Loaded) -> bool:
-        """Return whether the same change has arrived before; otherwise remember the change.
+        """Return whether the same change has arrived before; remember a new change.
 
-        `helm upgrade` changes the profile but keeps the number of the previous change. So two
-        changes are the same only if both their numbers and their contents are equal.
+        Two changes are the same only if their numbers and their profiles are equal, because
+        `helm upgrade` changes the profile but keeps the number of the previous change.
         """
         number = loaded.change.number
         if not number:

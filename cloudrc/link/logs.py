@@ -3,7 +3,7 @@
     ping -D -O HOST, ping --apple-time HOST, fping -D HOST
     irtt client -i 10ms -l 204 -d 1m -o irtt.json HOST
 
-Every reader fills a `Log`, and `Log.packets` checks it in the same way. `Packets.notes` counts the
+Every reader fills a `Log` with rows, and `Log.packets` checks the rows. `Packets.notes` counts the
 rows that are left out, merged or sorted. A log with more than 1 % unusable rows is rejected.
 docs/link.md describes the formats.
 
@@ -38,8 +38,8 @@ UNUSABLE_MAX = 0.01  # largest share of rows that may be left out, in [0, 1]
 GAP, GAP_MIN = 5, 1.0
 """A gap between packets is reported if it is longer than GAP_MIN [s] and longer than GAP times the
 median time between packets."""
-STEPS_MAX = 3  # more jumps back in time than this are no clock steps: the rows are unordered
-PACKETS_MAX = 10_000_000  # packets in a log of ping; more are a wrong sequence number
+STEPS_MAX = 3  # largest number of jumps back in time that count as clock steps, not as disorder
+PACKETS_MAX = 10_000_000  # limit for packets in a log of ping; more mean a wrong sequence number
 HALVE = (
     "a trace is one way; if both directions are alike, use half of each round trip with "
     "--halve-rtt; otherwise measure one way with irtt between synchronised clocks"
@@ -77,9 +77,9 @@ class Log:
 
     name: str
     entries: list[Entry] = field(default_factory=list)  # the packets in the order of the log
-    counts: Counter[str] = field(default_factory=Counter)  # what happened to rows -> their number
-    unusable: list[str] = field(default_factory=list)  # why a row cannot be used, for each
-    halved: bool = False
+    counts: Counter[str] = field(default_factory=Counter)  # what was done -> number of rows
+    unusable: list[str] = field(default_factory=list)  # one reason for each unusable row
+    halved: bool = False  # whether the delays are halves of round trips
 
     def packets(self) -> Packets:
         """Check the packets, sort them by time of sending, and note what was changed.
@@ -123,7 +123,7 @@ class Log:
         return BadInputError(f"{self.name}: {text}")
 
     def refuse_early(self, least: float) -> None:
-        """Raise an error if the shortest delay, `least` [s], is negative, because clocks differ."""
+        """Raise an error if the shortest delay, `least` [s], is negative."""
         if least < 0.0:
             raise self.error(
                 f"a packet arrived {-least * 1e3:.4g} ms before it was sent: the two clocks differ;"
@@ -140,8 +140,8 @@ class Log:
 def trace_of(packets: Packets) -> Trace:
     """Make a trace that repeats the delays and losses of a log at the log's packet rate.
 
-    Each row applies from half a period before its packet was sent until half a period after. So a
-    packet that is replayed a little early or late gets the right row. Time 0 is the first packet.
+    Each row applies from half a period before its packet was sent until half a period after. So in
+    a flight a packet that is a little early or late gets the right row. Time 0 is the first packet.
     """
     sent = packets.sent
     halfway = [(before + after) / 2 - sent[0] for before, after in pairwise(sent)]
@@ -347,7 +347,7 @@ def _check_unit(packets: Packets, unit: str, name: str) -> None:
     elif middle > LONGEST:
         found = f"has a median of {middle * factor:.6g} {unit}, which looks like {FINER[unit]}"
     if found:
-        raise BadInputError(f"{name} {found}; name the column after its unit, or say --trust-units")
+        raise BadInputError(f"{name} {found}; name the column after its unit, or use --trust-units")
 
 
 def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, str]:

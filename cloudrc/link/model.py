@@ -39,7 +39,8 @@ class LinkDirection:
     ) -> None:
         """Create the model; `uplink` is True for world to cloud.
 
-        `origin_ns` is when the link came up and the time line starts [ns], on the clock of `send`.
+        `origin_ns` is the time at which the link came up and its time line starts [ns]; it is on
+        the clock of `now_ns` in `send`.
         """
         self._seed, self._uplink = seed, uplink
         self._origin_ns: int | None = origin_ns
@@ -69,8 +70,8 @@ class LinkDirection:
     def send(self, epoch: int, kind: int, counter: int, size: int, now_ns: int) -> Fate:
         """Send one packet of `size` bytes of UDP payload at `now_ns` [ns]; compute when it arrives.
 
-        As in tc-netem, packets are lost before they reach the bottleneck, and reordered packets
-        skip the bottleneck.
+        Epoch, kind and counter identify the packet. As in tc-netem, random losses occur before the
+        bottleneck, and reordered packets skip the bottleneck.
 
         Returns:
             Times of arrival [ns], at or after `now_ns`: none for a lost packet, two for a
@@ -183,10 +184,10 @@ class Numbers:
 
     mean: float  # mean delay [s]
     deviation: float  # standard deviation of the delay [s]
-    least: float  # [s]
-    median: float  # [s]
-    p99: float  # [s]
-    most: float  # [s]
+    least: float  # shortest delay [s]
+    median: float  # median of the delay [s]
+    p99: float  # 99th percentile of the delay [s]
+    most: float  # longest delay [s]
     correlation: float  # correlation of the delays of successive packets [1]
     loss: float  # share of packets that did not arrive, in [0, 1]
     runs: tuple[int, ...]  # length of each run of successive losses
@@ -204,10 +205,11 @@ def sample(
     first: int = 0,
     pause: Callable[[], None] = lambda: None,
 ) -> Stream:
-    """Send packets of `size` bytes at rising times [ns] through a link that came up at time 0.
+    """Send packets of `size` bytes through the model of a link; return their delays.
 
-    Damaged packets count as lost, because the receiver rejects them. `first` is the counter of the
-    first packet. `pause` is called every few hundred microseconds.
+    `sent_ns` are the times of sending since the link came up, rising [ns]. `first` is the counter
+    of the first packet. Damaged packets count as lost, because the receiver rejects them. `pause`
+    is called every few hundred microseconds, so that other threads can run.
     """
     delays, copies = np.full(len(sent_ns), np.nan), np.zeros(len(sent_ns), dtype=np.int64)
     whole = bytes(size)

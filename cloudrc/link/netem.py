@@ -9,7 +9,7 @@ change`, which keeps queued packets. An option that is missing in this command k
 so every call contains all options.
 
 netem draws jitter from a table of 16-bit integers, in which 8192 stands for one times the jitter.
-The tables that come with tc differ from the distributions of the link's model.
+The tables of tc differ from the distributions of the link's model, so `write_table` makes others.
 
 Source: tc-prio(8), tc-netem(8), tc-u32(8); iproute2 netem/README.distribution; Linux,
 net/sched/sch_netem.c (tabledist).
@@ -39,7 +39,7 @@ from cloudrc.link.relay import Address
 NOT_FOUND = 127  # exit code that stands for a program that does not exist
 ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"  # root qdisc, band of the tunnel, its netem
 PERIOD_NS = 1_000_000_000  # time between two checks of the qdiscs [ns]
-STEP_NS = 5_000_000  # shortest time between two changes by a time line; only the last counts [ns]
+STEP_NS = 5_000_000  # shortest time between two changes by a time line; faster are skipped [ns]
 LIMIT = 10_000  # largest number of packets in a qdisc without a bottleneck, as in the relay
 DELAY_MAX_MS = 274_000  # longest delay that tc accepts [ms]: 2^32 ticks of 64 ns
 ENTRIES = 4096  # number of entries in a table of a delay distribution
@@ -51,7 +51,7 @@ _END_OF_TABLE = 32_767 / _ONE  # largest 16-bit entry of a table, as a multiple 
 _KEPT = 10_000  # number of recent changes from which the percentiles of the lateness are computed
 _IN_ORDER = "100gbit"  # limits nothing; netem keeps packets in order if it has a rate
 _ETHERNET_BYTES = 14  # Ethernet header, which netem counts and the model does not [bytes]
-_PACKET_BITS = 8 * 116  # size of a command with its headers [bit]; telemetry is larger
+_PACKET_BITS = 8 * 116  # size of the smallest frequent datagram, a command with headers [bit]
 _PACKETS = 1_000  # assumed packet rate without a bottleneck [1/s]; tunnel and probes send fewer
 # The kernel's default for three bands: no type of service selects the fourth band.
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
@@ -283,7 +283,8 @@ def _is_ours(root: dict[str, Any]) -> bool:
 class Steps:
     """Counts the changes that a time line makes to a qdisc, and how late each change is.
 
-    `applied` changes were made; `passed_over` were skipped, because the next was already due.
+    `applied` counts changes that were made. `passed_over` counts changes that were skipped because
+    the next change was already due.
     """
 
     def __init__(self) -> None:
@@ -291,7 +292,7 @@ class Steps:
         self._lateness_ns: deque[int] = deque(maxlen=_KEPT)
 
     def note(self, lateness_ns: int, passed_over: int) -> None:
-        """Count one change, `lateness_ns` [ns] after it was due, and the skipped changes before."""
+        """Count a change made `lateness_ns` [ns] late, and `passed_over` skipped changes."""
         self.applied += 1
         self.passed_over += passed_over
         self._lateness_ns.append(lateness_ns)
@@ -369,8 +370,8 @@ class Netem:
         """Use this profile from now on; with `restart`, its time line starts now.
 
         Without `restart`, the new time line has the start of the old time line. Datagrams in flight
-        are not lost. If netem cannot realise the profile, the old profile stays
-        in force and the method raises a CloudrcError.
+        are not lost. If netem cannot realise the profile, the method raises a CloudrcError and the
+        old profile stays in force.
         """
         check(profile)
         held = self._look().get("held", 0)

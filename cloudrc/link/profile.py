@@ -41,7 +41,7 @@ def mean_loss(loss: Loss) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A change of the conditions at one time; a value of None means that it does not change."""
+    """A change of the conditions at one time; a value that is None stays unchanged."""
 
     at: float  # time since the link came up [s]
     delay: float | None = None  # mean one-way delay [s]
@@ -63,15 +63,13 @@ class Trace:
     """Measured conditions over time: each row applies until the time of the next row.
 
     The delays replace the profile's `delay`; the profile's jitter is added to them. If the trace
-    has losses, they replace the profile's `loss`. The last row applies forever. In a trace that
-    loops, it lasts as long as the other rows on average; then the trace begins again.
+    has losses, they replace the profile's `loss`. The first row also applies before its time.
 
-    The first row also applies before its time.
+    The last row applies forever. In a trace that loops, the last row lasts as long as the other
+    rows on average; then the trace begins again.
     """
 
-    times: tuple[
-        float, ...
-    ]  # times since the link came up, strictly rising [s], shape (n,), n >= 1
+    times: tuple[float, ...]  # since the link came up, strictly rising [s], shape (n,), n >= 1
     delays: tuple[float, ...]  # one-way delay of each row [s], shape (n,)
     losses: tuple[float, ...] | None = None  # loss of each row in [0, 1], shape (n,)
     loop: bool = False  # whether the trace begins again after its end
@@ -107,9 +105,7 @@ class DirectionProfile:
     changes: tuple[Change, ...] = ()  # strictly rising in `at`
     trace: Trace | None = None
     blackouts: tuple[Blackout, ...] = ()  # in any order; they may overlap
-    table: tuple[
-        float, ...
-    ] = ()  # values of the distribution "table", as multiples of `jitter` [1]
+    table: tuple[float, ...] = ()  # values of the distribution "table", in units of `jitter` [1]
 
 
 class Conditions(NamedTuple):
@@ -126,7 +122,7 @@ class Timeline:
     """The conditions of one direction over time, from its changes, trace and blackouts.
 
     Attributes:
-        pieces: The pieces of the time line; if the time line loops, the pieces of one pass.
+        pieces: The conditions in each piece of the time line, or of one pass if it loops.
         pass_ns: Start of each piece, as time since the link came up, rising [ns].
         period_ns: Duration of one pass of a looping time line [ns]; None if there is no loop.
     """
@@ -175,7 +171,7 @@ def settled(profile: DirectionProfile) -> DirectionProfile:
 
 
 def _conditions(profile: DirectionProfile, instant: float) -> Conditions:
-    """Return the conditions that hold from `instant` [s] until the next change."""
+    """Return the conditions from `instant` [s] until the next change."""
     delay, jitter, loss, rate = profile.delay, profile.jitter, profile.loss, profile.rate
     for change in profile.changes:
         if change.at > instant:

@@ -6,9 +6,9 @@ datagrams that the pod sends:
     world <-> [world side]  Relay  [cloud side] <-> cloud
     tunnel end > [listen]  RelayShaper  [any port] > the other pod's tunnel end
 
-A datagram is due at its time of arrival at the kernel plus the delay from the model. It never
-leaves before it is due. A sleeping thread wakes 15 to 50 us late; so the relay sleeps until shortly
-before the next datagram is due, and then reads the clock in a loop.
+A datagram is due at its time of arrival at the kernel plus the delay from the model. The relay
+never sends a datagram before it is due. A sleeping thread wakes 15 to 50 us late; so the relay
+sleeps until shortly before the next datagram is due, and then reads the clock in a loop.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ SPIN_NS = 60_000  # the relay reads the clock in a loop for this time before a d
 STOP_PERIOD = 0.1  # longest time between two calls of the argument `stop` of `Relay.run` [s]
 ANCILLARY_SIZE = 64  # buffer for the kernel's time stamp and count of dropped datagrams [bytes]
 AGE_MAX_NS = 50_000_000  # largest time from arrival to reading that the relay compensates [ns]
-QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}  # percentiles of the lateness
+QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}  # name -> share of less late datagrams
 
 _BITS = 7  # number of significant bits of a lateness that select its bucket: buckets are 1.6 % wide
 _EARLY = -1  # bucket of the datagrams that left before they were due
@@ -129,7 +129,7 @@ class Lane:
     """One direction of the relay: reads datagrams, and sends them when they are due.
 
     The datagrams arrive at the bound UDP socket `source`, which the caller closes. `origin_ns` is
-    the start of the model's time [ns], monotonic; None until the first datagram sets it.
+    the start of the model's time on the monotonic clock [ns], or None before the first datagram.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class Lane:
         self._counts, self._stalled = dict.fromkeys(outcomes, 0), 0
 
     def due_ns(self) -> int | None:
-        """Return when the next datagram is due [ns], monotonic clock; None without a datagram."""
+        """Return when the next datagram is due [ns], monotonic clock; None if none is waiting."""
         return self._in_flight[0][0] if self._in_flight else None
 
     def take_in(self) -> None:
@@ -349,7 +349,7 @@ class RelayShaper(Lanes):
     def __init__(
         self, listen: Address, direction: LinkDirection, peek: Peek, end: Address | None = None
     ) -> None:
-        """Open the two sockets; raise an OSError if `listen` is in use or `end` cannot reach it.
+        """Open the two sockets; raise an OSError if `listen` is in use or cannot reach `end`.
 
         This pod's end of the tunnel sends from `end` (None: any address) to `listen` (port 0: the
         kernel chooses). The origin of the model `direction` is a time on the monotonic clock.
@@ -397,7 +397,7 @@ class RelayShaper(Lanes):
 
 
 def settle() -> None:
-    """Make garbage collections rare and cheap, and let other threads block the interpreter less."""
+    """Let the relay's thread wake on time: rare garbage collections, short turns of others."""
     sys.setswitchinterval(_SWITCH_INTERVAL)
     gc.collect()
     gc.freeze()

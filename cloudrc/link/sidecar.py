@@ -1,6 +1,7 @@
 """Run a pod's `link` container: choose relay or netem, and follow changes of profile and peer.
 
-The route file contains the address to which this pod's end of the tunnel has to send.
+The peer is the end of the tunnel in the other pod. The route file contains the address to which
+this pod's end of the tunnel has to send.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def find_netems(run: Run, host: str) -> dict[str, Any]:
 
 
 class Machine(NamedTuple):
-    """Functions that a sidecar calls on its machine, and the permissions that it has there."""
+    """Functions and permissions of the machine on which a sidecar runs."""
 
     relay: Make  # makes a `RelayShaper`
     netem: Make  # makes a `Netem`, without changing the network yet

@@ -1,7 +1,7 @@
 """Publish the state of one direction of the link in a file: its shaper, profile and last change.
 
-The state file is in the folder of the route file. World or cloud on the same machine records its
-changes; `cloudrc link set` reads there whether a change has taken effect.
+The state file is in the folder of the route file. World or cloud on the same machine reads it and
+records each change; `cloudrc link set` reads in it whether a change has taken effect.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a
 START_MAX = 600.0  # latest time of the first row; until then a flight uses this row alone [s]
 UNIX_TIME = 1e8  # from here on, times are Unix times (1e8 is in March 1973) [s]
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
-_ROWS_TO_JUDGE = 10  # fewer rows are typed by hand: there a delay of 0 marks no lost packet
+_ROWS_TO_JUDGE = 10  # with fewer rows, delays of 0 are accepted, as a user may have typed them
 
 
 def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:

@@ -16,7 +16,7 @@ NUMBERS = (
     *("prediction_error_rms", "tracking_error_p95", "iae_mean", "settling_time_mean"),
     *("overshoot_mean", "delay_estimate_error_rms", "min_clearance"),
 )
-"""Metrics that are compared by default; the first one that the flights have is the answer."""
+"""Metrics that are compared by default."""
 METHOD = (
     "B - A: Hodges-Lehmann estimate, 95 % interval and p of the exact Wilcoxon signed-rank test; "
     "success: Wilson intervals, p of the exact McNemar test"

@@ -1,4 +1,4 @@
-"""Make the figure of a sweep: medians and success rates with 95 % intervals per point."""
+"""Draw the figure of a sweep: for each point, medians and success rate with 95 % intervals."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ def draw_sweep(
         units: Metric -> unit.
         names: Metrics to show; by default the first three of `compare.NUMBERS`.
         x: Axis of the sweep along x; by default the first one with numbers, else the first.
-        by: Axis with one line per value; by default the first one with names, else the next one.
+        by: Axis with one line per value; by default the first other one with names, else with
+            numbers.
         look: Size of the figure.
 
     Returns:
@@ -80,7 +81,7 @@ def draw_sweep(
 def _choose(
     rows: Sequence[Row], x: str | None, by: str | None
 ) -> tuple[dict[str, list[Any]], str, str | None, list[str]]:
-    """Return axes with their values; the axis along x, that of the lines, and the other axes."""
+    """Return the values of each axis, the axes for x and for the lines, and the other axes."""
     values = values_of(rows)
     for axis in (x, by, *([] if values else ["of any name"])):
         if axis is not None and axis not in values:
@@ -90,7 +91,7 @@ def _choose(
     x = x or next(iter(numeric), free[0])
     if x == by:
         raise BadInputError(f"--x and --by are both {x}; name two axes, or leave one out")
-    # Numbers of two predictors make no common median, those of two delays rather do.
+    # Axes with names come first: a median of two predictors says less than one of two delays.
     others = sorted((axis for axis in free if axis != x), key=lambda axis: axis in numeric)
     by = by or next(iter(others), None)
     return values, x, by, [axis for axis in free if axis not in (x, by)]

@@ -1,4 +1,4 @@
-"""Fly one experiment in virtual time without any file, and keep its verdict and its numbers."""
+"""Fly one experiment in virtual time without writing files; return its verdict and metrics."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from cloudrc.report.write import assess
 ERROR = "error"
 """Verdict of a flight that raised an exception, and code of its only failure."""
 Row: TypeAlias = dict[str, Any]
-"""A flight: `verdict`; `failures` (codes, the earliest first); `text`, which says the first failure
-or why a metric has no number; `numbers` (metric -> value); and `records_sha256`.
-A row of a sweep also has `key`, `point` and `seed`."""
+"""Result of a flight: `verdict`; `failures` (codes, the earliest first); `text` (the first failure,
+or why a metric has no value); `numbers` (metric -> value); and `records_sha256`. A row of a sweep
+also has `key`, `point` and `seed`."""
 
 
 def fly_point(experiment: ResolvedExperiment) -> Row:
@@ -45,15 +45,15 @@ def measure(experiment: ResolvedExperiment) -> Row:
 
 
 def counts(row: Row) -> bool:
-    """Return whether the numbers of a flight are those of its experiment.
+    """Return whether the metrics of a flight are valid results of its experiment.
 
-    They are not if the flight did not end, or if a plug-in failed and another one replaced it.
+    They are invalid if the flight did not end, or if another plug-in replaced one that failed.
     """
     return row["verdict"] in ("success", "failure") and "plugin_failed" not in row["failures"]
 
 
 def units(own: Iterable[str]) -> dict[str, str]:
-    """Return the unit of each metric, those of the user (`own`, names or paths) included."""
+    """Return metric -> unit, with the metrics of the user (`own`: names or paths)."""
     names = (*metrics.SHIPPED, *plugins.names("metrics"), *own)
     return {metric.name: metric.unit for metric in map(metrics.find, names)}
 

@@ -18,15 +18,15 @@ class Found(NamedTuple):
 
     pairs: list[Pair]
     units: dict[str, str]  # metric -> unit
-    what: str  # what differs, and where
+    what: str  # in words: the compared axis, the folder, and limits of the comparison
 
 
 def read_flights(folder: Path) -> tuple[list[Row], dict[str, str], str]:
     """Read the rows of a sweep in the order of its grid.
 
-    Also return the unit of each metric, and a text that says how many flights are missing, or "".
-    A value of a point that is neither a number nor a text becomes text. Raise a BadInputError if
-    there are no rows.
+    Also return metric -> unit, and how many flights are missing, in words ("" if none). Values of
+    axes that are neither numbers nor text become JSON text. Raise a BadInputError if there are no
+    rows.
     """
     summary = store.read_summary(folder)
     axes = summary["axes"]
@@ -51,9 +51,9 @@ def values_of(rows: Sequence[Row]) -> dict[str, list[Any]]:
 
 
 def of_sweep(folder: Path, a: str, b: str) -> Found:
-    """Pair the rows with the values `a` and `b` of one axis that agree in all other axes and seed.
+    """Pair each row with the value `a` of an axis with the row that differs only in the value `b`.
 
-    `a` and `b` are values, or AXIS=VALUE.
+    `a` and `b` are texts: VALUE or AXIS=VALUE.
 
     Raises:
         BadInputError: If not exactly one axis has both values, or if they are the same.

@@ -1,6 +1,6 @@
 """Pack flights of a sweep into a file for pods, which have none of the user's files.
 
-The file contains the resolved points, and point and seed of each flight.
+The file contains each resolved point once, and the point and seed of each flight.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
 COLUMNS = ("key", "seed", "verdict", "failures")
 """Columns of the table besides the axes and the numbers."""
 _Entry: TypeAlias = tuple[str, Any, Source]
-"""A key, its value, and where both are from."""
+"""A setting's key and value, and their place in the file."""
 
 
 class SweepFile(Section):
@@ -57,7 +57,7 @@ class Flight(NamedTuple):
     key: str  # 16 hexadecimal digits; equal keys mean equal flights
     point: dict[str, Any]  # axis -> value or name
     seed: int
-    resolved: ResolvedExperiment  # of the point: with another seed
+    resolved: ResolvedExperiment  # experiment of the point; its seed is not used
 
     @property
     def experiment(self) -> ResolvedExperiment:
@@ -73,7 +73,7 @@ class Plan:
     axes: dict[str, list[Any]]  # axis -> its values or names
     seeds: tuple[int, ...]
     points: list[ResolvedExperiment]
-    flights: dict[str, Flight]  # by key: point by point, each with all seeds
+    flights: dict[str, Flight]  # key -> flight; all seeds of a point follow each other
 
 
 def read_plan(path: Path) -> Plan:
@@ -149,7 +149,7 @@ def _seeds(given: Any) -> tuple[int, ...]:
 def _entries(
     document: Document, file: SweepFile, folder: Path, found: list[Problem]
 ) -> tuple[list[_Entry], dict[str, list[tuple[Any, list[_Entry]]]]]:
-    """Return the settings of all points, and those of each choice of each axis.
+    """Return the common settings, and axis -> label and settings of each of its choices.
 
     Problems of the axes are added to `found`.
     """

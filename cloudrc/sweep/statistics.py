@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 LEVEL = 0.05
-"""An effect is decided if the probability of a larger one by chance is below this value [1]."""
+"""Significance level of the tests: an effect is decided if its p-value is below this value [1]."""
 POWER = 0.80
 """Probability with which `pairs_needed` pairs decide [1]."""
 PAIRS_MIN = 6
-"""With fewer pairs no test at 5 % can decide: 2 / 2^5 is above 0.05."""
+"""Smallest number of pairs that can decide: with 5 pairs, p is at least 2 / 2^5, above 0.05."""
 EXACT_MAX = 200
 """Largest number of pairs with an exact signed-rank test; above it, the normal approximation."""
 Z = NormalDist().inv_cdf(1 - LEVEL / 2)
@@ -60,10 +60,11 @@ def wilson_interval(successes: int, count: int) -> tuple[float, float]:
 
 
 def sign_test(less: int, more: int) -> float:
-    """Return the exact two-sided p of `less` against `more` events of equal chance.
+    """Return the exact two-sided p-value that two kinds of events are equally likely.
 
-    With the numbers of pairs in which B is below and above A, this is the sign test. With the
-    numbers of pairs in which only A and only B succeeded, it is the exact test of McNemar.
+    `less` and `more` are the numbers of events of each kind. If B is below A in `less` pairs and
+    above A in `more` pairs, this is the sign test. If only A succeeded in `less` pairs and only B
+    in `more` pairs, this is the exact McNemar test.
 
     Source: Q. McNemar, "Note on the sampling error of the difference between correlated
     proportions or percentages", 1947.
@@ -74,10 +75,10 @@ def sign_test(less: int, more: int) -> float:
 
 
 def signed_rank_test(differences: Sequence[float]) -> float:
-    """Return the two-sided p of Wilcoxon's signed-rank test of paired differences, any unit.
+    """Return the two-sided p-value of Wilcoxon's signed-rank test of paired differences, any unit.
 
-    Zeros are left out. Equal sizes get the mean of their ranks, and p is exact for these ranks.
-    With more than 200 pairs p is the normal approximation with a correction for continuity.
+    Zeros are left out. Differences of equal size get the mean of their ranks, and p is exact for
+    these ranks. With more than 200 pairs, p is the normal approximation with continuity correction.
 
     Source: F. Wilcoxon, "Individual comparisons by ranking methods", 1945.
     """
@@ -114,24 +115,24 @@ def _sums(doubled: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True, slots=True)
 class Paired:
-    """What paired differences B - A of one number show; "u" is the unit of the number."""
+    """Evaluation of paired differences B - A of one metric; "u" is the unit of the metric."""
 
     count: int
     lower: int  # pairs in which B is below A
     higher: int  # pairs in which B is above A
-    difference: float  # median of the means of any two differences [u]
+    difference: float  # Hodges-Lehmann estimate: median of the means of two differences [u]
     interval: tuple[float, float] | None  # 95 % interval of the difference; None below 6 pairs
     p_wilcoxon: float  # signed-rank test [1]
     p_sign: float  # sign test [1]
     decided: bool  # whether p_wilcoxon is below 5 % and the interval excludes 0
-    pairs_needed: int | None  # that decide with power 80 %; None if no effect is seen
+    pairs_needed: int | None  # pairs that decide with a power of 80 %; None without an effect
 
 
 def paired(differences: Sequence[float]) -> Paired:
     """Evaluate at least one paired difference B - A, any unit.
 
-    The interval contains each shift that the signed-rank test of the differences minus the shift
-    does not refute. It assumes differences that are symmetric around their centre.
+    The interval contains each shift that the signed-rank test does not reject after the shift is
+    subtracted from the differences. It assumes differences that are symmetric around their centre.
 
     Source: J. L. Hodges, E. L. Lehmann, "Estimates of location based on rank tests", 1963;
     M. Hollander, D. A. Wolfe, E. Chicken, Nonparametric Statistical Methods, 3rd ed., 2013,
@@ -150,7 +151,7 @@ def paired(differences: Sequence[float]) -> Paired:
 
 
 def _cut(n: int) -> int:
-    """Return the largest sum of ranks that refutes a shift with `n` pairs; -1 if none does."""
+    """Return the largest sum of ranks with which `n` pairs reject a shift; -1 if none does."""
     if n > EXACT_MAX:
         mean, spread = n * (n + 1) / 4, math.sqrt(n * (n + 1) * (2 * n + 1) / 24)
         return math.floor(mean - 0.5 - Z * spread)
@@ -164,7 +165,7 @@ def _pairs_needed(values: NDArray[Any], means: NDArray[Any], least: int) -> int 
     Source: G. E. Noether, "Sample size determination for some common nonparametric tests", 1987.
     """
     n = len(values)
-    # Share of means of two different pairs that are above 0; a mean of 0 counts half.
+    # The share of means of two different pairs that are above 0; a mean of 0 counts half.
     above = np.sign(means).sum() - np.sign(values).sum()
     effect = abs(above) / max(n * (n - 1), 1)  # = |share - 1/2|
     if effect == 0:

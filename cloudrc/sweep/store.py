@@ -1,7 +1,6 @@
-"""Keep a sweep in a folder: one line of JSON per flight, and tables of all flights.
+"""Keep a sweep in a folder: one line of JSON (a row) per flight, and tables of all flights.
 
-docs/sweeps.md describes the files. A row has no times of the machine: equal flights give equal
-rows.
+docs/sweeps.md describes the files. A row has no wall-clock times, so equal flights give equal rows.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ def read_rows(folder: Path) -> dict[str, Row]:
 
 
 def parse_row(line: bytes | str) -> Row | None:
-    """Return the row in a line of JSON; None if there is none."""
+    """Parse a line of JSON as a row; return None if it is not a row."""
     with suppress(ValueError):
         row = json.loads(line)
         if isinstance(row, dict) and FIELDS <= row.keys():
@@ -64,7 +63,7 @@ def parse_row(line: bytes | str) -> Row | None:
 
 @contextmanager
 def append_rows(folder: Path, shard: int | None) -> Iterator[Callable[[Row], None]]:
-    """Yield a function that appends a row to the file of a shard, or to that of the whole sweep."""
+    """Yield a function that appends a row to the file of a shard; None means the whole sweep."""
     path = folder / ("rows.jsonl" if shard is None else f"rows-{shard}.jsonl")
     with path.open("ab+") as file:
         file.seek(0)
@@ -78,10 +77,10 @@ def append_rows(folder: Path, shard: int | None) -> Iterator[Callable[[Row], Non
 
 
 def begin(folder: Path, plan: Plan) -> dict[str, Row]:
-    """Write the description of a sweep into its folder, and return the rows that it has.
+    """Write the description of a sweep into its folder; return the rows that the folder has.
 
     Raises:
-        BadInputError: If the folder has rows that are not of this sweep.
+        BadInputError: If the folder has rows of another sweep.
     """
     rows, points = read_rows(folder), {key: each.point for key, each in plan.flights.items()}
     if any(points.get(key) != row["point"] for key, row in rows.items()):
@@ -96,7 +95,7 @@ def begin(folder: Path, plan: Plan) -> dict[str, Row]:
 
 
 def finish(folder: Path, plan: Plan) -> dict[str, Row]:
-    """Count the rows; once all flights are done, write their tables. Return the rows."""
+    """Update the description; if all flights are done, write the tables. Return the rows."""
     rows = read_rows(folder)
     unit_of = _write_summary(folder, plan, rows)
     if len(rows) == len(plan.flights):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 WINDOW = 1024
-"""A channel remembers for this many counters, up to the newest, which datagrams have arrived. A
-datagram with a lower counter counts as repeated."""
+"""Number of counters, up to the newest, for which a channel remembers whether the datagram has
+arrived. A datagram with an older counter counts as repeated."""
 _MASK = (1 << WINDOW) - 1
 
 # Outcomes of a datagram, which name the counts.
@@ -12,7 +12,7 @@ USED, LATE, REPEATED = "used", "late", "repeated"
 
 
 class Channel:
-    """Classify the datagrams of one kind and direction in one session."""
+    """Classifies the datagrams of one kind and direction in one session."""
 
     def __init__(self, newest_wins: bool) -> None:
         """Set whether a datagram that arrives after a newer datagram is late, and thus not used.
@@ -40,7 +40,7 @@ class Channel:
     def take(self, counter: int, newest_wins: bool = False) -> str:
         """Classify the datagram with this counter as USED, LATE or REPEATED.
 
-        With `newest_wins` this datagram is not used if it is late, whatever the channel's rule is.
+        With `newest_wins`, a late datagram counts as LATE even if the channel would use it.
         """
         ahead = counter - self._newest
         if ahead > 0:

@@ -29,7 +29,7 @@ from cloudrc.tunnel.session import NO_EPOCH, Session
 EPOCH_MAX = 2**32 - 1  # largest session number that the header can hold; the next number is 1
 CHALLENGE_NS = 100_000_000  # shortest time between two challenges [ns]
 COOKIE_NS = 2_000_000_000  # length of a time slot; a cookie is valid in its slot and the next [ns]
-GRACE_NS = 1_000_000_000  # a new session waits so long for its first encrypted datagram [ns]
+GRACE_NS = 1_000_000_000  # time limit for the first encrypted datagram of a new session [ns]
 REPEATS_MAX = 3  # repeats of ACCEPT to a cloud that sends no encrypted datagrams
 CLOUDS_MAX = 64  # cloud processes whose newest hello world remembers
 NO_COOKIE = bytes(codec.COOKIE_SIZE)  # cookie in a hello for which cloud has no cookie from world
@@ -127,11 +127,11 @@ class ServerHandshake:
         return self._accept()
 
     def _keeps_epoch(self, now_ns: int) -> bool:
-        """Decide after a hello whether its cloud, which has the session, keeps the epoch.
+        """Return whether a hello of the cloud that has the session keeps the present epoch.
 
-        The next epoch begins if the epoch has ended, or if the key of the hello is newer than the
-        epoch's. It also begins after more than REPEATS_MAX hellos with no encrypted datagram among
-        them, if the session has become free for another cloud, or if the keys are different.
+        A new epoch is needed if the present epoch has ended, or if the key of the hello is newer.
+        After REPEATS_MAX hellos without an encrypted datagram between them, a new epoch is also
+        needed if the session has become free for another cloud, or if the hello has another key.
         """
         session, key = self._session, self._session.greeting_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current
@@ -195,16 +195,16 @@ class ClientHandshake:
         return self._hello()
 
     def is_refused(self, nonce: bytes) -> bool:
-        """Return whether a BUSY with this nonce answers a hello of this process."""
+        """Return whether a BUSY with this nonce is the answer to a hello of this process."""
         return nonce == self._nonce
 
     def receive_accept(self, epoch: int, accept: Accept, *, asks: bool) -> bytes | None:
         """Process an ACCEPT; return cloud's and world's nonce if a new epoch begins, else None.
 
-        `asks` tells whether cloud asks for a session. While it does not, cloud ignores another
-        world process, because the ACCEPT may be a late datagram of a process that has ended. If
-        cloud accepts a late ACCEPT while it asks, it takes the running process for an ended one.
-        When the running process answers again, cloud takes a new nonce, which no late ACCEPT has.
+        `asks` tells whether cloud asks for a session. If it does not, cloud ignores an ACCEPT from
+        another world process, because that process may have ended and the ACCEPT may be late.
+        While cloud asks, it can accept such a late ACCEPT and take the running process for an ended
+        one. When the running process answers again, cloud makes a new nonce: late ACCEPTs lack it.
         """
         known = accept.world_nonce == self._world
         if accept.nonce != self._nonce or (self._world and not known and not asks):
@@ -234,7 +234,7 @@ SILENCE_TEXT = (
 
 
 class HandshakeLog:
-    """Log why there is no session, each reason once until the next session begins."""
+    """Logs why there is no session; logs each reason once until the next session begins."""
 
     def __init__(self) -> None:
         self._logged: set[str] = set()

@@ -29,7 +29,7 @@ from cloudrc.tunnel.codec import (
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 
 NO_EPOCH = 0  # epoch of an end without a session, and of every HELLO, CHALLENGE and BUSY datagram
-TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}  # belong to no session
+TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}  # kinds without a session
 _PUBLIC_KEY = b"nothing is secret in one process"
 _NO_TAG = bytes(TAG_SIZE)
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
@@ -51,7 +51,7 @@ class Session:
     """Keys and counters of one end in the present session.
 
     `epoch` is the number of the session, or `NO_EPOCH`. `epoch_key` is the pre-shared key of the
-    session; `is_outdated` tells whether the key file has a newer one. `greeting_key` is the
+    session; `is_outdated` tells whether the key file has a newer key. `greeting_key` is the
     pre-shared key that verified the last handshake datagram.
     """
 
@@ -73,7 +73,7 @@ class Session:
         """Begin a session with the number `epoch`: derive its keys and restart its counters.
 
         `nonces` is cloud's nonce followed by world's nonce; `key` is the pre-shared key of the
-        handshake. If one is left out, that of the previous session is used.
+        handshake. The default of both is the value of the previous session.
         """
         self.epoch = epoch
         self._counters |= dict.fromkeys(self._counters.keys() - TIMELESS, 0)
@@ -91,9 +91,9 @@ class Session:
         return header + self._sealing.encrypt(header[4:], body, header)
 
     def pass_on(self, kind: int, message: Telemetry | Command) -> Passed:
-        """Return `message` in place of the next datagram of this kind, as `seal` would number it.
+        """Return `message` instead of the next datagram of this kind, with the same counter.
 
-        Only `open` in the same process can take it.
+        Only an end in the same process can `open` the result.
         """
         counters = self._counters
         counter = counters[kind]

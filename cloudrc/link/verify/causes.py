@@ -16,7 +16,7 @@ from cloudrc.link.verify.judge import Row
 LATE, UNREAD, STOPPED = 1.5e-3, 0.003, 0.01
 """Limits of a shaper with enough CPU time: 99 % quantile of its release error [s]; share of
 datagrams not read in time; share of CPU periods in which the shaper was throttled."""
-RAISED = ("mean", "round_trip", "deviation", "loss")  # these rise without CPU time
+RAISED = ("mean", "round_trip", "deviation", "loss")  # rise if the shaper lacks CPU time
 PASSED = 0.9  # if the shaper counts less than this share of the arrived datagrams, some bypass it
 
 

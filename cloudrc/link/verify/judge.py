@@ -1,4 +1,4 @@
-"""Predict what a link with the requested profile would measure, and judge a real measurement.
+"""Predict the measurement of a link with the requested profile, and judge a real measurement.
 
 The random numbers of a relay depend only on seed and counter, so the delay of each datagram through
 a relay can be predicted. The random numbers of netem cannot be predicted. Therefore 200 simulated
@@ -75,9 +75,9 @@ class Row(NamedTuple):
 
 
 class Expected(NamedTuple):
-    """Values that a link with the requested profile would measure."""
+    """Expected measurement of a link that has the requested profile."""
 
-    bands: dict[str, tuple[float, float, float]]  # mean; limits of the band
+    bands: dict[str, tuple[float, float, float]]  # quantity -> mean, low and high limit of its band
     pooled: Floats  # delays minus the requested delays, with median 0, sorted [s]
     known: bool  # whether the random numbers are known, so that a band has no width
 
@@ -126,7 +126,7 @@ class Plan:
 
     @cached_property
     def links(self) -> list[Stream]:
-        """Simulated streams of up to `RUN_LENGTH` datagrams over 200 links with netem."""
+        """Streams over 200 simulated netem links, shortened if the profile is constant in time."""
         few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
         sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
         seeds = range(-RUNS, 0)  # the seed of an experiment is not negative
@@ -135,11 +135,11 @@ class Plan:
 
     @cached_property
     def chance(self) -> Expected:
-        """Bands of the values that the simulated `links` measure."""
+        """Bands of the values measured on the simulated `links`."""
         return self._expect(self.links)
 
     def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:
-        """Return the values that a correct link would measure with the datagrams of a stream.
+        """Return the expected measurement of a correct link with the datagrams of a stream.
 
         If the stream matches the predicted random numbers of a relay, the values are exact.
         Otherwise they are the bands of simulated links with different seeds.
@@ -252,7 +252,9 @@ def netem_makes(profile: DirectionProfile) -> DirectionProfile:
     """Return the profile with which the link's model behaves as netem does with `profile`.
 
     netem hardly correlates delays. If netem selects a packet both for loss and for duplication, one
-    packet arrives. netem can also lose the copy. Source: Linux, net/sched/sch_netem.c.
+    copy arrives. netem can also lose the copy of a duplicated packet.
+
+    Source: Linux, net/sched/sch_netem.c.
     """
     loss, lost, single = profile.loss, mean_loss(profile.loss), 1.0 - profile.duplicate
     twice = profile.duplicate * (1.0 - lost) ** 2 / max(1e-9, 1.0 - single * lost)

@@ -37,8 +37,9 @@ from cloudrc.link.verify.judge import (
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 
 PERIOD = 0.01  # default period of telemetry and of commands [s]
-CHECK_NS, SETTLE_NS = 5_000_000_000, 2_000_000_000  # period; pause after a change [ns]
-KEPT, FINAL = 6000, 128  # most datagrams judged; later datagrams before one counts as lost
+CHECK_NS, SETTLE_NS = 5_000_000_000, 2_000_000_000  # verdict period; pause after a change [ns]
+KEPT = 6000  # largest number of datagrams that one verdict uses
+FINAL = 128  # a missing datagram counts as lost if the newest counter is higher by this number
 ENDS = 2e-3  # largest delay that world and cloud add to a round trip if they wake on time [s]
 FOLLOW_PERIOD = 0.1  # period at which the thread reads new records and the link's state file [s]
 UNJUDGED = {"distribution"}  # not judged in flight: late wakes of world and cloud change it
@@ -91,7 +92,7 @@ class LinkMonitor:
             ]
 
     def after(self, records: Sequence[Record], now_ns: int) -> list[Record]:
-        """Process the newest records of this end at `now_ns` [ns]; return records of the link."""
+        """Process this end's newest records at `now_ns` [ns]; return verdicts and faults."""
         if self._inbox is None:
             return self._see(records, now_ns)
         self._inbox.put((records, now_ns))
@@ -177,7 +178,7 @@ class LinkMonitor:
         return found
 
     def _rows(self) -> list[Row]:
-        """Judge all quantities, including the round trip and properties that are only reported."""
+        """Judge all quantities; add rows for properties that are only reported."""
         stream, first, timed = _in_order(self._arrivals, self._period)
         judged = timed and (self._uplink or not self._computes)
         rows, skipped = list[Row](), UNJUDGED if judged else UNJUDGED | DELAYS
@@ -217,8 +218,8 @@ class LinkMonitor:
 def _in_order(arrivals: Sequence[Arrival], period: float) -> tuple[Stream, int, bool]:
     """Sort arrivals by counter, and mark missing counters between them as lost.
 
-    Also return the first counter, and whether world and cloud share a clock. Without a shared
-    clock, the delays have an unknown constant offset.
+    Return the stream, the first counter, and whether world and cloud share a clock. Without a
+    shared clock, the delays have an unknown constant offset.
     """
     last = max((one.counter for one in arrivals), default=0) - FINAL
     arrivals = [one for one in arrivals if last - KEPT < one.counter <= last]
