@@ -1,7 +1,5 @@
 """The page of a release is forwarded, and the changes of the link that it asks for are told."""
 
-import os
-
 import pytest
 
 from cloudrc.cluster.client import ClusterError
@@ -9,7 +7,6 @@ from cloudrc.cluster.console import follow_page
 from tests.cluster.conftest import pod
 
 KUBECTL = """\
-#!/bin/sh
 case "$*" in
 *port-forward*) echo "Forwarding from 127.0.0.1:4321 -> 8090"; exec sleep 60;;
 *logs*--container=console*) echo "console: http://127.0.0.1:8090"; echo "link set uplink.loss=0.1";;
@@ -23,13 +20,11 @@ def test_a_release_without_a_console_says_how_to_get_one(api, release):
         next(follow_page(release, 0, print))
 
 
-def test_the_page_is_forwarded_and_its_process_is_heard(api, release, tmp_path, monkeypatch):
+def test_the_page_is_forwarded_and_its_process_is_heard(api, release, pretend):
     made = pod("cloud-1", "cloud")
     made["spec"]["containers"].append({"name": "console"})
     api.put("pods", made)
-    (tmp_path / "kubectl").write_text(KUBECTL)
-    (tmp_path / "kubectl").chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    pretend("kubectl", KUBECTL)
     told = []
     lines = list(follow_page(release, 0, told.append))
     assert told == ["http://127.0.0.1:4321"]

@@ -11,7 +11,6 @@ from cloudrc.cluster import flight, pods
 from cloudrc.cluster.client import ClusterError, connect
 from cloudrc.cluster.jobs import run_job
 from cloudrc.config.load import load_experiment
-from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.record.writer import McapWriter
 from tests.cluster.conftest import terminated
 from tests.flights.conftest import records
@@ -30,7 +29,7 @@ def later(given, by_ns):
     return [record._replace(stamp_ns=record.stamp_ns + by_ns) for record in given]
 
 
-def merged(folder, *flights, torn):
+def record(folder, *flights, torn):
     """Record flights as two pods do; torn: the files have no end, as when copied in flight."""
     for number, name in enumerate(("world", "cloud")):
         path = folder / f"{name}.mcap"
@@ -42,26 +41,6 @@ def merged(folder, *flights, torn):
         if torn:
             with path.open("r+b") as file:
                 file.truncate(size)
-    return merge(folder / "world.mcap", folder / "cloud.mcap")
-
-
-@pytest.mark.parametrize("torn", [True, False])
-def test_the_last_mission_of_a_recording_is_kept_if_it_is_complete(tmp_path, torn):
-    world, cloud = flown()
-    gap = world[-1].stamp_ns + 5 * SECOND
-    second, after = (later(world, gap), later(cloud, gap)), (later(world[-300:], gap + SECOND), [])
-    mission = merged(tmp_path, flown(), second, after, torn=torn)
-    assert bool(mission.note) == torn
-    assert cut_to_last_mission(mission)
-    assert int(mission.recording()["/mission"]["stamp_ns"][0]) > gap
-    # The mission's start may be in the recording of a pod that is gone.
-    mission = merged(tmp_path, (second[0], second[1][len(cloud) // 3 :]), after, torn=torn)
-    assert cut_to_last_mission(mission)
-    assert mission.messages[0][1] <= second[0][0].stamp_ns + SECOND
-    half = (world[: len(world) // 2], cloud[: len(cloud) // 2])
-    mission = merged(tmp_path, half, torn=True)
-    assert not cut_to_last_mission(mission)
-    assert not mission.recording().complete
 
 
 BEFORE = {"metrics": {"allowFrom": ["x"]}, "mission": {"enabled": True, "queue": True}}
@@ -75,7 +54,7 @@ def ready(running, teleop, pretend, tmp_path, monkeypatch):
     monkeypatch.setattr("cloudrc.report.write._write_page", lambda *arguments: None)
     monkeypatch.chdir(tmp_path)
     world, _ = flown()
-    merged(tmp_path, flown(), (later(world[-300:], SECOND), []), torn=True)
+    record(tmp_path, flown(), (later(world[-300:], SECOND), []), torn=True)
     pretend(
         "helm",
         f"echo $@ >> {tmp_path}/helm; case $1 in list) echo '[1]' ;;"
@@ -184,7 +163,7 @@ def test_an_interrupted_flight_cancels_its_mission_and_is_reported(
     ready, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr(flight, "follow", Mock(side_effect=KeyboardInterrupt))
-    merged(tmp_path, [each[: len(each) // 2] for each in flown()], torn=False)
+    record(tmp_path, [each[: len(each) // 2] for each in flown()], torn=False)
     assert main([*LINE, "--out", "out"]) == 130
     captured = capsys.readouterr()
     assert "cancelling the mission" in captured.err
