@@ -46,7 +46,7 @@ def test_the_job_flies_each_index_with_its_flights(started, api, release):
     assert api.get("jobs", "sweep-2")["metadata"]["labels"]["kueue.x-k8s.io/queue-name"] == "lab"
 
 
-def test_a_job_that_flies_is_found_again_and_a_failed_one_is_replaced(started, api, release):
+def test_a_running_job_is_kept_and_a_failed_job_is_replaced(started, api, release):
     first = api.get("jobs", "sweep-1")["metadata"]["uid"]
     batch.start(release, "sweep-1", b"flights", 4, **WORDS)
     assert api.get("jobs", "sweep-1")["metadata"]["uid"] == first

@@ -22,7 +22,7 @@ def test_flags_override_the_kubeconfig(api):
         connect("x")
 
 
-def test_a_missing_or_broken_kubeconfig_is_reported_with_a_remedy(tmp_path, monkeypatch):
+def test_a_missing_or_broken_kubeconfig_is_named_with_a_remedy(tmp_path, monkeypatch):
     path = tmp_path / "config"
     monkeypatch.setattr(CONFIG_PLACE, str(path))
     for _ in range(2):

@@ -20,7 +20,7 @@ def test_a_release_without_a_console_says_how_to_get_one(api, release):
         next(follow_page(release, 0, print))
 
 
-def test_the_page_is_forwarded_and_its_process_is_heard(api, release, pretend):
+def test_the_page_is_forwarded_and_its_log_is_read(api, release, pretend):
     made = pod("cloud-1", "cloud")
     made["spec"]["containers"].append({"name": "console"})
     api.put("pods", made)

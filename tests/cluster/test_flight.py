@@ -106,7 +106,7 @@ def test_a_flight_on_a_cluster_writes_a_whole_run(ready, tmp_path, capsys):
     assert "--namespace=demo --create-namespace" in line
 
 
-def test_the_job_flies_the_mission_with_its_carrot_over_an_own_link(ready, tmp_path):
+def test_a_job_flies_a_carrot_mission_over_the_users_profile(ready, tmp_path):
     (tmp_path / "own.yaml").write_text("uplink: {delay_ms: 5}")
     ends(ready)
     own = ["--set", "mission.carrot.speed_mps=1.5", "--set", "link.profile=./own.yaml"]
@@ -159,7 +159,7 @@ def test_a_broken_port_forward_loses_metrics_but_no_report(ready, tmp_path, caps
     assert (tmp_path / "out" / "cloud-teleop.log").is_file()
 
 
-def test_an_interrupted_flight_cancels_its_mission_and_is_reported(
+def test_an_interrupted_flight_cancels_and_reports_its_mission(
     ready, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr(flight, "follow", Mock(side_effect=KeyboardInterrupt))
@@ -197,7 +197,7 @@ FITTED = "cloud.predictor={name: command_history, model: ./mine.yaml}"
         (["steps"], "mission.steps"),
     ],
 )
-def test_what_pods_cannot_have_is_refused_before_the_install(
+def test_files_that_pods_lack_are_refused_before_the_install(
     tmp_path, capsys, monkeypatch, settings, words
 ):
     monkeypatch.chdir(tmp_path)

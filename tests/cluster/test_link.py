@@ -127,7 +127,7 @@ def error(capsys):
     return line
 
 
-def test_an_unreachable_or_silent_container_gets_the_change_later(cluster, capsys):
+def test_an_unreachable_or_silent_container_is_changed_later(cluster, capsys):
     cluster.broken.add("cloud-1")
     assert main(LINE) == 5
     said = error(capsys)
@@ -145,7 +145,7 @@ def test_an_unreachable_or_silent_container_gets_the_change_later(cluster, capsy
     assert "a link container has another version: not a LinkState: " in error(capsys)
 
 
-def test_a_change_that_cannot_be_kept_says_where_it_is(cluster, capsys):
+def test_a_failed_write_names_where_the_change_is_in_force(cluster, capsys):
     cluster.refused.add("patch")
     assert main(LINE) == 5
     said = error(capsys)
@@ -158,7 +158,7 @@ def test_a_change_that_cannot_be_kept_says_where_it_is(cluster, capsys):
     assert (said.count("this is forbidden"), "has the change" in said) == (3, False)
 
 
-def test_a_change_that_one_direction_refuses_does_not_last(cluster, capsys):
+def test_a_refused_change_is_not_written_to_the_configmap(cluster, capsys):
     cluster.cannot["cloud-1"] = "corrupt"
     assert main(["link", "set", "downlink.corrupt=0.5", "uplink.delay_ms=9", "-n", "demo"]) == 2
     assert error(capsys) == (
@@ -196,7 +196,7 @@ def tell(folder, **state):
 
 
 @pytest.mark.parametrize("state", [{"change": "b2"}, {"change": "a1", "refused": "b2"}])
-def test_the_script_hands_over_a_change_and_prints_the_state(tmp_path, state):
+def test_the_script_writes_a_change_and_prints_the_state(tmp_path, state):
     tell(tmp_path, change="a1", refused="b22")
     running = start(tmp_path)
     decided = list[str]()
@@ -226,7 +226,7 @@ def test_a_silent_sidecar_leaves_the_old_state(tmp_path):
     ("folder", "given", "words"),
     [(".", DOCUMENT[:-1], "the change arrived incomplete"), ("none", "", "no link runs here")],
 )
-def test_what_the_script_cannot_hand_over_is_refused(tmp_path, folder, given, words):
+def test_the_script_refuses_an_incomplete_change(tmp_path, folder, given, words):
     tell(tmp_path, change="a1")
     running = start(tmp_path / folder)
     _, err = running.communicate(given)

@@ -122,7 +122,7 @@ def test_an_upgrade_after_a_change_by_hand_takes_effect(pod):
     assert pod.poll() == (0.05, "")
 
 
-def test_a_trace_is_read_beside_the_handed_profile(pod):
+def test_a_change_can_contain_a_trace(pod):
     pod.first()
     files = {"profile.yaml": "uplink: {trace: t.csv}\n", "t.csv": "time_s,delay_ms\n0,40\n1,60\n"}
     document = Handed(note("a1"), files)
@@ -155,7 +155,7 @@ def test_an_invalid_document_is_refused_in_one_line(pod, monkeypatch, text):
     assert os.listdir(pod.run) == [HANDED_FILE]
 
 
-def test_the_newest_address_is_the_peer_and_stays_without_an_answer():
+def test_the_peer_is_the_newest_address_even_without_an_answer():
     """While an old and a new pod overlap, their name has two addresses."""
     log, answers = [], [[], ["b"], ["a", "b"], [], ["b", "a"], ["a", "b", "c"], ["a"]]
 

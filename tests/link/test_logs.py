@@ -55,19 +55,19 @@ def test_units_and_separators_are_those_of_the_header(text, delays):
         ("time_s,delay_ms", "1,0", "1 with delay_ms 0 taken as lost"),
     ],
 )
-def test_the_marks_of_lost_packets_are_known(header, row, note):
+def test_marks_of_lost_packets_are_recognised(header, row, note):
     end = ",0" if "loss" in header else ""
     packets = read(f"{header}\n0,45{end}\n{row}\n2,46{end}")
     assert packets.delays == pytest.approx((0.045, None, 0.046))
     assert packets.notes == ((note,) if note else ())
 
 
-def test_zeros_are_delays_if_rounded_or_said_to_have_arrived():
+def test_zero_is_a_delay_if_rounded_or_marked_as_arrived():
     assert read("time_s,delay_ms\n0,0\n1,1\n2,2").lost == 0
     assert read("time_s,delay_ms,loss\n0,0,0\n1,90,0").lost == 0
 
 
-def test_round_trips_are_halved_if_asked_only():
+def test_round_trips_are_halved_only_on_request():
     assert read("time_s,rtt_ms\n0,90\n1,80", halve=True).delays == pytest.approx((0.045, 0.040))
     assert read("time_s,delay_ms\n0,90\n1,80", halve=True).delays == pytest.approx((0.090, 0.080))
     with pytest.raises(BadInputError, match=r"column rtt_ms: has round trips; .*--halve-rtt"):
@@ -98,7 +98,7 @@ def test_round_trips_are_halved_if_asked_only():
         ("time_s,delay_ms\n98,4\n99,4\n100,4\n0,4\n1,4", "after row 3 the times go back by 100 s"),
     ],
 )
-def test_what_cannot_be_used_is_refused(text, says):
+def test_an_unusable_csv_log_is_refused(text, says):
     with pytest.raises(BadInputError) as caught:
         read(text, halve="rtt" in says)
     assert str(caught.value).startswith("x.csv")
@@ -135,7 +135,7 @@ def test_up_to_1_percent_may_be_unusable_and_all_is_counted():
         ("traceroute to 192.0.2.1, 30 hops max", "traceroute or mtr"),
     ],
 )
-def test_other_tools_are_called_by_their_names(line, says):
+def test_output_of_another_tool_is_refused_by_its_name(line, says):
     with pytest.raises(BadInputError, match=f"x: the output of {says}, which lacks the number, "):
         refuse_others(["", line], "x")
 
@@ -168,7 +168,7 @@ TRIPS = [trip(0), trip(1, "true_up"), trip(2, "true_down"), trip(3, True), trip(
         (None, (0.0, 0.010, 0.020, 0.030, 0.040), (0.025, None, None, None, 0.0275)),
     ],
 )
-def test_irtt_knows_both_ways(direction, sent, delays):
+def test_irtt_gives_the_delays_of_each_direction(direction, sent, delays):
     """Packets lost on the uplink were never on the downlink, and vice versa."""
     packets = irtt(TRIPS, direction, packets_sent=5, packets_received=3, duplicates=1)
     assert packets.sent == pytest.approx(sent)
@@ -248,7 +248,7 @@ END = (
 
 
 @pytest.mark.parametrize(("end", "lost"), [((), 2), (END, 3)])
-def test_ping_gives_halves_sent_when_the_request_left(end, lost):
+def test_ping_gives_half_round_trips_at_the_time_of_sending(end, lost):
     """A packet after the last line is known from the summary only."""
     packets = ping(*PING, *end)
     assert packets.sent == pytest.approx((100.0, 100.2, 100.4, 100.6, 100.8, 101.0)[: 3 + lost])
@@ -257,7 +257,7 @@ def test_ping_gives_halves_sent_when_the_request_left(end, lost):
     assert packets.notes == ("1 duplicates left out",)
 
 
-def test_losses_before_the_first_reply_are_counted_if_told():
+def test_losses_before_the_first_reply_count_if_reported():
     told = [f"no answer yet for icmp_seq={number}" for number in (1, 2)]
     for lines in ([*told, reply(3, 10.02)], [reply(3, 10.02), summary(3, 1)]):
         packets = ping(HEAD, *lines)

@@ -88,7 +88,7 @@ def test_uniforms_stay_inside_the_open_interval(block, purpose):
     assert 0.0 < values.min() < 0.1 < 0.9 < values.max() < 1.0
 
 
-def test_chains_are_those_of_the_docstrings():
+def test_correlated_draws_follow_their_equations():
     fresh, correlated = (normals(KEY, Purpose.DELAY, 0, c) for c in (0.0, 0.6))
     assert correlated[0] == fresh[0]
     assert correlated[1] == pytest.approx(0.6 * fresh[0] + 0.8 * fresh[1])
@@ -166,7 +166,7 @@ def test_200000_packets_have_the_specified_bursts(figure):
         figure(f"Gilbert-Elliott: {name} off by", off, "<=", 10.0, "%", lost.size)
 
 
-def test_the_bad_state_delays_what_it_does_not_lose():
+def test_the_bad_state_loses_or_delays_packets():
     loss = GilbertElliott(0.1, 0.1, loss_bad=0.5, loss_good=0.0, delay_bad=0.040)
     fate = flow(DirectionProfile(0.030, loss=loss), COUNT)
     assert set(fate) == {(), (30 * MS,), (70 * MS,)}
@@ -176,7 +176,7 @@ def test_the_bad_state_delays_what_it_does_not_lose():
         assert set(flow(DirectionProfile(duplicate=1.0, loss=certain), 1000)) == {()}
 
 
-def test_what_overtakes_has_no_delay_and_no_queue():
+def test_a_reordered_packet_skips_delay_and_queue():
     fate = flow(DirectionProfile(0.045, 0.005, reorder=0.1), COUNT)
     assert fate.count((0,)) / COUNT == pytest.approx(0.1, abs=0.01)
     assert min(copies[0] for copies in fate if copies != (0,)) >= 40 * MS
@@ -185,7 +185,7 @@ def test_what_overtakes_has_no_delay_and_no_queue():
     assert set(flow(slow, 100)) == {(0,)}
 
 
-def test_damage_flips_one_bit_anywhere_and_shifts_no_other_draw():
+def test_damage_flips_one_bit_and_changes_no_other_draw():
     profile, data = replace(LIVELY, corrupt=0.2), bytes(SIZE)
     one, other = link(profile, 7), link(profile, 7)
     damaged = [one.corrupted(1, 3, n, data) for n in range(COUNT)]
@@ -222,7 +222,7 @@ def test_nothing_is_early_and_every_packet_is_counted_once(profile, seed):
 @pytest.mark.parametrize(
     "profile", [LIVELY, DirectionProfile(0.01, 0.01, changes=(Change(10.0, 0.02, loss=0.2),))]
 )
-def test_order_other_kinds_and_epochs_shift_nothing(profile):
+def test_draws_depend_on_seed_kind_epoch_and_counter_alone(profile):
     counters = [*range(3000), *range(100_000, 101_000), 10**12, 2**63, 2**64 - 1]
     among, alone = link(profile), ask(link(profile), counters)
     for n in random.Random(1).sample(counters, len(counters)):

@@ -152,7 +152,7 @@ def text(profile, at=0.0):
         (TIMED, 2.1, "delay 100000.000us loss random 100% duplicate 0%"),  # no copy arrives
     ],
 )
-def test_a_profile_is_put_into_tcs_words(profile, at, words):
+def test_a_profile_becomes_arguments_of_tc(profile, at, words):
     assert words in text(profile, at)
 
 
@@ -166,7 +166,7 @@ def test_a_profile_is_put_into_tcs_words(profile, at, words):
         (DirectionProfile(blackouts=(Blackout(1.0, 0.004),)), "blackouts shorter than 5 ms"),
     ],
 )
-def test_what_netem_cannot_do_is_refused_by_name(profile, key):
+def test_a_profile_beyond_netem_is_refused_by_key(profile, key):
     with pytest.raises(BadInputError, match=r"netem cannot do .*; set link\.mode=relay") as refused:
         check(profile)
     assert key in str(refused.value)
@@ -179,7 +179,7 @@ def test_only_lossy_of_the_shipped_profiles_needs_the_relay():
     assert all(map(text, profiles.values()))
 
 
-def test_what_netem_does_differently_is_said():
+def test_deviations_of_netem_are_reported():
     profile = DirectionProfile(0.1, 0.01, correlation=0.3)
     assert notes(profile) == ["netem realises next to nothing of correlation 0.3"]
     assert notes(replace(profile, correlation=0.0)) == []
@@ -225,7 +225,7 @@ def test_root_with_the_capability_may_shape():
     assert not may_shape(status.format("10001", "0000000000001000"))
 
 
-def test_only_the_tunnels_flow_is_sent_to_netem_and_all_is_removed():
+def test_only_tunnel_datagrams_go_to_netem_and_close_removes_all():
     kernel, shaper = shaped(PLAIN, until=0.1)
     assert {"forwarded": 90, "lost": 10, "restored": 0}.items() <= shaper.counts().items()
     for _ in range(2):
@@ -240,7 +240,7 @@ def test_only_the_tunnels_flow_is_sent_to_netem_and_all_is_removed():
     ]
 
 
-def test_the_set_up_of_a_killed_process_is_taken_over():
+def test_qdiscs_of_a_killed_process_are_taken_over():
     kernel, _ = shaped(PLAIN)
     kernel.said.clear()
     netem(kernel, DirectionProfile(0.07)).follow_peer(PEER)
@@ -248,7 +248,7 @@ def test_the_set_up_of_a_killed_process_is_taken_over():
     assert len(kernel.filters) == 1
 
 
-def test_what_is_under_way_has_room_until_it_has_left():
+def test_a_smaller_limit_waits_until_queued_packets_have_left():
     kernel, shaper = shaped(DirectionProfile(1.0, rate=1e6, queue_packets=10))
     small = DirectionProfile(0.02, rate=1e6, queue_packets=10)
     for held, seconds, room in ((100, 1.5, limit(small) + 100), (3, 2.0, limit(small))):
@@ -261,7 +261,7 @@ def test_what_is_under_way_has_room_until_it_has_left():
 
 
 @pytest.mark.parametrize("delay", [300.0, 0.1])
-def test_what_is_refused_leaves_the_old_profile_in_force(delay):
+def test_a_refused_profile_leaves_the_old_one_in_force(delay):
     """`check` refuses the first, and tc the second."""
     kernel, shaper = shaped(PLAIN)
     before, kernel.refuses = kernel.netem, "100000.000us"
@@ -294,7 +294,7 @@ def test_a_kernel_that_lacks_a_module_is_left_as_it_was(lacks):
         (lambda kernel: kernel.netem.append("ecn"), 'was changed to {"words": ["limit", "1000'),
     ],
 )
-def test_what_another_program_did_is_an_error_and_not_repaired(harm, said):
+def test_a_foreign_change_of_the_qdisc_is_an_error(harm, said):
     log = []
     profile = DirectionProfile(0.04, changes=(Change(5.0, loss=0.1),))
     kernel, shaper = shaped(profile, 1.5, log.append)

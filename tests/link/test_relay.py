@@ -194,7 +194,7 @@ def stamp(wall_ns):
     return 1, 35, seconds.to_bytes(8, "little") + rest.to_bytes(8, "little")
 
 
-def test_a_stamp_becomes_an_age_and_drops_are_counted_beyond_32_bits():
+def test_stamps_give_ages_and_a_drop_count_beyond_32_bits():
     stamps, now_ns = Stamps(), 1_700_000_000 * SECOND
     for age_ns, counted_ns in ((7_000, 7_000), (0, 0), (-3_000, 0), (80 * MS, AGE_MAX_NS)):
         assert stamps.age_ns([stamp(now_ns - age_ns)], now_ns) == counted_ns

@@ -53,7 +53,7 @@ def test_a_trace_is_read_into_si(tmp_path, data, times, delays, losses):
         (f'{HEAD}\n0,"' + "9" * 200_000, "field larger than field limit"),
     ],
 )
-def test_what_is_not_a_trace_is_refused(text, says):
+def test_an_invalid_trace_is_refused(text, says):
     with pytest.raises(BadInputError, match=f"^trace x\\.csv[^\\n]*{says}") as caught:
         parse_trace(text.splitlines(), "x.csv")
     assert len(str(caught.value)) < 300
@@ -67,7 +67,7 @@ def test_a_file_that_cannot_be_read_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-3])
-def test_what_is_written_is_read_again(scale):
+def test_a_written_trace_reads_back_the_same(scale):
     delays = tuple(delay * scale for delay in (0.040, 0.045, 0.060))
     trace = Trace((0.0, 0.005, 0.015), delays, (0.0, 1.0, 0.5))
     again = parse_trace(write_trace(trace).splitlines(), "x")

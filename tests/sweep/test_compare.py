@@ -34,7 +34,7 @@ def test_success_is_compared_by_pairs():
     assert found["p_mcnemar"] == pytest.approx(2 * (1 + 8) / 2**8)
 
 
-def test_pairs_without_a_number_or_an_end_are_left_out_and_counted():
+def test_incomplete_pairs_are_left_out_and_counted():
     whole, torn = flown(iae_mean=1.0, rtt_mean=1.0), flown(rtt_mean=2.0)
     found = compare(pairs((whole, whole), (whole, torn), (whole, flown("error"))), UNITS)
     assert (found["pairs"], found["left_out"]) == (2, 1)

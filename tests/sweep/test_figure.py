@@ -55,7 +55,7 @@ def test_names_along_x_keep_the_order_of_the_grid(tmp_path, drawn):
     assert [*drawn[0][0].lines] == ["[1, 2]", "[3, 4]"]
 
 
-def test_lines_are_names_rather_than_numbers(drawn):
+def test_lines_prefer_axes_with_names(drawn):
     draw_sweep([row({"delay": d, "loss": p, "predictor": name}, 1)
                 for d in (1, 2) for p in (0, 1) for name in "ab"], UNITS)  # fmt: skip
     assert (drawn[1], drawn[3]) == ("delay", "predictor")
@@ -108,7 +108,7 @@ def test_a_sweep_without_axes_or_rows_has_no_figure(tmp_path):
         read_flights(sweep(tmp_path / "s", rows=0))
 
 
-def test_missing_flights_are_told(tmp_path, capsys):
+def test_missing_flights_are_reported(tmp_path, capsys):
     """A sweep that still flies may answer otherwise in the end."""
     folder = sweep(tmp_path / "s", rows=22)
     assert "s, of which 2 flights are not done, over" in of_sweep(folder, "none", "kalman").what

@@ -19,7 +19,7 @@ def test_a_point_gives_the_numbers_of_the_report(tmp_path):
     assert numbers == report["numbers"]
 
 
-def test_a_metric_that_fails_is_told(tmp_path):
+def test_a_failed_metric_is_reported(tmp_path):
     (tmp_path / "mine.py").write_text("UNIT = '1'\n\n\ndef measure(flight):\n    return 1 / 0\n")
     flown = fly_point(load_experiment("steps", [*SHORT, f"report.metrics=[{tmp_path}/mine.py]"]))
     assert (flown["verdict"], "mine" in flown["numbers"]) == ("success", False)

@@ -40,7 +40,7 @@ def test_the_window_agrees_with_a_set(counters, newest_wins):
     compare(counters, newest_wins)
 
 
-def test_more_that_is_repeated_than_sent_is_a_flood():
+def test_more_repeated_than_new_datagrams_are_a_flood():
     channel = Channel(newest_wins=True)
     flooded = []
     for counter in (0, 1, 0, 1, 0, 2, 2):  # a link that doubles everything, and more

@@ -57,7 +57,7 @@ COME_BACK = {
 @pytest.mark.parametrize("name", COME_BACK)
 @given(st.data())
 @settings(max_examples=50, deadline=None)
-def test_every_body_comes_back_as_it_was(name, data):
+def test_every_body_survives_a_round_trip(name, data):
     encode, decode = (getattr(codec, f"{way}code_{name}") for way in ("en", "de"))
     message = data.draw(COME_BACK[name])
     assert decode(encode(message)) == message
@@ -119,7 +119,7 @@ TELEMETRY = bytes(codec.BODY_SIZES[Kind.TELEMETRY])
         (codec.decode_telemetry, TELEMETRY, -1, max(Cause)),
     ],
 )
-def test_a_value_that_does_not_exist_is_refused(decode, body, offset, largest):
+def test_an_undefined_value_is_refused(decode, body, offset, largest):
     changed = bytearray(body)
     for value, said in ((largest, "fine"), (largest + 1, "malformed"), (255, "malformed")):
         changed[offset] = value

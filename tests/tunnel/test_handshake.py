@@ -138,7 +138,7 @@ def test_epochs_rise_through_restarts_of_world(step, last, known, epoch):
     assert step.answer(OTHER, epoch=known)[1] == epoch + 1
 
 
-def test_a_session_rests_on_the_key_of_its_hello(step):
+def test_a_session_uses_the_key_of_its_hello(step):
     step.world.ring.keys = KeySet(NEW, KEY)
     for key in (KEY, NEW):
         for cookie in (NO_COOKIE, None):

@@ -30,7 +30,7 @@ def test_texts_logs_and_tracebacks_hold_no_key(caplog):
     assert not hasattr(key, "__dict__")
 
 
-def test_keys_are_equal_by_what_they_hold():
+def test_keys_are_equal_if_their_secrets_are():
     assert {Key(SECRET), Key(SECRET)} == {Key(SECRET)}
     assert A not in (B, "a" * 32)
     assert A.name != B.name

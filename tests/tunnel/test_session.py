@@ -81,7 +81,7 @@ def test_each_kind_has_its_own_counter_in_each_epoch():
     assert cloud.next_counter(Kind.COMMAND) == 0
 
 
-def test_while_two_keys_are_accepted_greetings_may_have_either():
+def test_during_a_rotation_greetings_may_have_either_key():
     world, cloud = pair()
     world.ring.keys = KeySet(NEW, OLD)
     for key in (OLD, NEW):
@@ -149,7 +149,7 @@ def test_a_counter_that_no_recording_can_hold_is_refused():
     assert refuses(world, cloud.seal(Kind.COMMAND, BODY), "malformed")
 
 
-def test_a_passed_message_has_the_number_that_its_datagram_would_have():
+def test_a_passed_message_has_the_counter_of_its_datagram():
     world, cloud = pair(secret=None)
     cloud.seal(Kind.COMMAND, BODY)
     message = Command(1, 2, 3, ZERO, 0.0)

@@ -140,7 +140,7 @@ def test_too_few_or_dead_probes_decide_nothing():
     assert ("mean", "open") in doubts(rows_of(PAPER, replace(PAPER, loss=1.0)))
 
 
-def test_only_what_is_off_twice_is_off():
+def test_a_quantity_is_off_only_after_two_measurements():
     good, slow, lossy = (
         rows_of(PAPER, replace(PAPER, **values))
         for values in ({}, {"delay": 0.09}, {"delay": 0.09, "loss": 0.5})

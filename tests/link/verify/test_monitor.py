@@ -102,7 +102,7 @@ def test_a_new_session_starts_undecided():
     assert (row.quantity, row.verdict) == ("loss", "open")
 
 
-def test_ends_that_wake_late_are_not_the_links_fault():
+def test_late_wakes_of_the_ends_are_no_fault_of_the_link():
     slow = arrivals(replace(PAPER, delay=PAPER.delay + 0.0045))
     assert checked(hearing(PAPER, PAPER), slow)[1], "of punctual ends it is"
     heard = []
@@ -157,7 +157,7 @@ def state(profile):
     return json.dumps(found | {"shaper": "relay", "since_ns": 0, "profile": profile})
 
 
-def test_the_state_file_is_followed_past_nonsense(tmp_path):
+def test_the_monitor_follows_the_state_file_and_ignores_nonsense(tmp_path):
     path, slow = tmp_path / "link.json", DirectionProfile(0.070)
 
     def load(values):

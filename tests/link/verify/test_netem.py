@@ -89,7 +89,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_what_is_wrong_in_the_kernel_is_named(fault, figure):
+def test_a_fault_in_the_kernel_is_named(fault, figure):
     more, commands = FAULTS[fault]
     with running() as ways:
         for way in ways.values():
