@@ -57,7 +57,7 @@ LOOK_PERIOD = 0.5
 DELETE_LIMIT = 40.0
 """Time limit for a deleted Job to end [s]; Kubernetes gives the Job's pod 30 s."""
 Ask: TypeAlias = Callable[[str, str], Any]
-"""Function of an API's URL and token that gets the state of robot and missions from the API."""
+"""Function that gets the state of robot and missions from the API with a given URL and token."""
 ENDED = ("complete", "failed")
 """States of a Job that has ended, in `JobStatus.state`."""
 

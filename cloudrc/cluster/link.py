@@ -157,7 +157,7 @@ def send(
 
 
 def keep(release: Release, link: LinkParts, sent: Sent) -> None:
-    """Write a sent change into the ConfigMap; raise an error if this or a container failed."""
+    """Write a sent change into the ConfigMap; raise an error if this or a container fails."""
     said = list(map(str, sent.failed))
     words = ["patch", "configmap", link.name, "--type=merge", "--patch-file=/dev/stdin"]
     try:

@@ -37,13 +37,13 @@ Send: TypeAlias = Callable[[bytes], object]
 """Function that sends a datagram; raises an OSError if the kernel refuses."""
 
 IN_FLIGHT_MAX = 10_000  # datagrams in flight in one direction; more are dropped and counted
-DATAGRAM_MAX = 2_048  # largest length of a datagram [bytes], to limit the memory that a lane uses
-BATCH = 32  # largest number of datagrams that a lane reads or sends before the next lane's turn
+DATAGRAM_MAX = 2_048  # largest length of a datagram, to limit the memory in use [bytes]
+BATCH = 32  # datagrams that one direction reads or sends before the other direction's turn
 SPIN_NS = 60_000  # the relay reads the clock in a loop for this time before a datagram is due [ns]
 STOP_PERIOD = 0.1  # longest time between two calls of the argument `stop` of `Relay.run` [s]
 ANCILLARY_SIZE = 64  # buffer for the kernel's time stamp and count of dropped datagrams [bytes]
 AGE_MAX_NS = 50_000_000  # largest time from arrival to reading that the relay compensates [ns]
-QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}  # name -> share of less late datagrams
+QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}  # name -> quantile of the lateness, in [0, 1]
 
 _BITS = 7  # number of significant bits of a lateness that select its bucket: buckets are 1.6 % wide
 _EARLY = -1  # bucket of the datagrams that left before they were due
@@ -163,7 +163,7 @@ class Lane:
                 return
             self._counts["received"] += 1
             age_ns = self._stamps.age_ns(beside, time_ns())
-            # The wall clock first: a pause between the two makes a datagram late, never early.
+            # Read the wall clock first: a pause between both readings then never makes it early.
             received_ns = monotonic_ns() - age_ns
             self._stalled += age_ns >= AGE_MAX_NS
             try:
@@ -397,7 +397,7 @@ class RelayShaper(Lanes):
 
 
 def settle() -> None:
-    """Let the relay's thread wake on time: rare garbage collections, short turns of others."""
+    """Let this thread wake on time: rare garbage collections, short turns of other threads."""
     sys.setswitchinterval(_SWITCH_INTERVAL)
     gc.collect()
     gc.freeze()

@@ -32,13 +32,13 @@ from cloudrc.records import Counted
 
 Mode: TypeAlias = Literal["auto", "netem", "relay"]
 """Setting `link.mode`: the only allowed shaper, or "auto": netem if it works, else the relay."""
-COUNT_PERIOD_NS = 1_000_000_000  # between two updates of the metrics and the lateness file [ns]
+COUNT_PERIOD_NS = 1_000_000_000  # time between two updates of metrics and lateness file [ns]
 STEP = 0.05  # longest time until `run` reacts to a new peer or profile [s]
 
 Shaper: TypeAlias = RelayShaper | Netem
 """Shapes the datagrams that this pod's end of the tunnel sends."""
 Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
-"""Function that makes a shaper from a profile and the start of its time line [ns], monotonic."""
+"""Function that makes a shaper from a profile and the monotonic start of its time line [ns]."""
 
 
 def find_netems(run: Run, host: str) -> dict[str, Any]:

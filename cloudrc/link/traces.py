@@ -220,7 +220,7 @@ def _bare_numbers(lines: list[str], name: str) -> BadInputError:
 def looks_lost(values: Collection[float]) -> bool:
     """Return whether delays of 0 mark lost packets: all other delays are far from 0.
 
-    The delays have any unit. If they have few decimals, 0 may be a short delay that was rounded.
+    `values` are delays in any unit. With few decimals, 0 may be a short delay that was rounded.
     """
     decimals = max((len(f"{value:.12g}".partition(".")[2]) for value in values), default=0)
     shortest = min((value for value in values if value > 0.0), default=0.0)

@@ -124,7 +124,7 @@ def _everything(point: ResolvedExperiment) -> dict[str, Any]:
 
 @cache
 def _code(kind: str, name: str) -> str:
-    """Return the SHA-256 of the file of a plug-in with a name; "" for a path or without a file."""
+    """Return the SHA-256 of the source file of a plug-in selected by its name, otherwise ""."""
     with suppress(TypeError, OSError):
         if not plugins.is_path(name):
             file = inspect.getfile(plugins.find(kind, name))
@@ -138,7 +138,7 @@ def _key(everything: Mapping[str, Any], seed: int) -> str:
 
 
 def _seeds(given: Any) -> tuple[int, ...]:
-    """Return the seeds of the file's value; none if the value is invalid."""
+    """Convert the value of the key `seeds`; return () if the value is invalid."""
     if type(given) is int:
         return tuple(range(1, given + 1)) if given <= SEEDS_MAX else ()
     values = given if isinstance(given, list) else []

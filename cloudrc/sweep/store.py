@@ -88,7 +88,7 @@ def begin(folder: Path, plan: Plan) -> dict[str, Row]:
         raise BadInputError(f"--out {folder}: has {text}; name a new folder")
     write_atomically(folder / FILE, write_yaml(plan.file).encode())
     _write_summary(folder, plan, rows)
-    if len(rows) < len(plan.flights):  # the tables of a smaller grid would look like the whole
+    if len(rows) < len(plan.flights):  # tables of a smaller grid would look complete
         for name in (TABLE, PARQUET):
             (folder / name).unlink(missing_ok=True)
     return rows

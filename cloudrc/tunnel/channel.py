@@ -15,9 +15,9 @@ class Channel:
     """Classifies the datagrams of one kind and direction in one session."""
 
     def __init__(self, newest_wins: bool) -> None:
-        """Set whether a datagram that arrives after a newer datagram is late, and thus not used.
+        """Set the rule for a datagram that arrives after a newer datagram.
 
-        If `newest_wins` is False, every datagram that arrives for the first time is used, as in the
+        If `newest_wins` is True, the datagram is late and not used. Otherwise it is used, as in the
         published code. A repeated datagram is never used.
         """
         self._newest_wins = newest_wins
@@ -33,7 +33,7 @@ class Channel:
     def is_flooded(self) -> bool:
         """Whether more repeated datagrams have arrived than the sender has sent new datagrams.
 
-        Only an attacker repeats so many; the receiver then stops recording repeated datagrams.
+        Only an attacker repeats so many datagrams. Then the receiver no longer records repeats.
         """
         return self._repeats > self._newest + 1
 

@@ -35,7 +35,7 @@ NUMBER_MAX = 2**32 - 1  # highest number of an operator request
 
 
 class Kind(IntEnum):
-    """Kind of a datagram's content. Each kind is counted separately in each direction.
+    """Kind of a datagram's content. Each kind has its own counter in each direction.
 
     Kinds up to LAST_GREETING belong to the handshake and are authenticated with the pre-shared key.
     The other kinds belong to a session and are encrypted with the session's keys.

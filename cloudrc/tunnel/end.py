@@ -22,7 +22,7 @@ class Identity:
     clock_id: bytes  # 16 bytes that identify the monotonic clock of this machine
     nonce: bytes  # 16 random bytes that identify this process
     ring: KeyRing | None = None  # the pre-shared keys; None if both ends are in one process
-    passes: bool = False  # whether both ends pass frequent messages on as they are, not as bytes
+    passes: bool = False  # whether telemetry and commands go to the other end as objects
 
 
 class TunnelEnd:

@@ -31,10 +31,10 @@ CHALLENGE_NS = 100_000_000  # shortest time between two challenges [ns]
 COOKIE_NS = 2_000_000_000  # length of a time slot; a cookie is valid in its slot and the next [ns]
 GRACE_NS = 1_000_000_000  # time limit for the first encrypted datagram of a new session [ns]
 REPEATS_MAX = 3  # repeats of ACCEPT to a cloud that sends no encrypted datagrams
-CLOUDS_MAX = 64  # cloud processes whose newest hello world remembers
+CLOUDS_MAX = 64  # number of cloud processes of which world remembers the newest hello
 NO_COOKIE = bytes(codec.COOKIE_SIZE)  # cookie in a hello for which cloud has no cookie from world
 REPLIES_MAX = 3  # largest number of challenges that cloud answers per periodic hello
-COOKIES_MAX = 4096  # cookies that cloud remembers: at one every 2 s, of more than two hours
+COOKIES_MAX = 4096  # number of cookies that cloud remembers: those of two hours, one every 2 s
 WORLDS_MAX = 64  # cloud ignores late answers from at most this many earlier world processes
 
 
@@ -55,7 +55,7 @@ class ServerHandshake:
     """World's side of the handshake: decide which cloud gets a session, and number sessions."""
 
     def __init__(self, session: Session, nonce: bytes, clock: bytes, age_max_ns: int) -> None:
-        """Begin without a session; this class begins the sessions of `session`.
+        """Begin without a session; the handshake begins each session in `session`.
 
         `nonce` and `clock` have 16 bytes each, which identify this process and the monotonic clock
         of this machine. After a silence of `age_max_ns` [ns] another cloud can get a session.

@@ -42,7 +42,7 @@ TOLERANCES = {
 }
 """Quantity -> tolerance in the unit of the quantity, and tolerance as a share of the requested
 value. The larger tolerance applies. For the deviation on a relay, half the share is used."""
-SHARE_TOLERANCE = (0.02, 0.25)  # of shares: absolute [1], and relative to the request
+SHARE_TOLERANCE = (0.02, 0.25)  # tolerance of a share: absolute, and relative to the request [1]
 UNITS = {"mean": "s", "round_trip": "s", "deviation": "s", "rate": "bit/s"}
 """Quantity -> unit; quantities that are not listed are shares with the unit "1"."""
 FEWEST, CHANCE_MAX = 300, 1.6
@@ -266,7 +266,7 @@ def netem_makes(profile: DirectionProfile) -> DirectionProfile:
 
 
 def told(name: str, asked: float, measured: float = nan) -> Row:
-    """Report the `asked` and `measured` values [any unit] of a quantity without judging them."""
+    """Make the row of a quantity that is not judged, from its values [any unit]."""
     return Row(name, UNITS.get(name, "1"), asked, measured, nan, nan, "told")
 
 

@@ -37,7 +37,8 @@ from cloudrc.link.verify.judge import (
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 
 PERIOD = 0.01  # default period of telemetry and of commands [s]
-CHECK_NS, SETTLE_NS = 5_000_000_000, 2_000_000_000  # verdict period; pause after a change [ns]
+CHECK_NS = 5_000_000_000  # time between two verdicts [ns]
+SETTLE_NS = 2_000_000_000  # time after a change in which nothing is judged [ns]
 KEPT = 6000  # largest number of datagrams that one verdict uses
 FINAL = 128  # a missing datagram counts as lost if the newest counter is higher by this number
 ENDS = 2e-3  # largest delay that world and cloud add to a round trip if they wake on time [s]
@@ -191,7 +192,7 @@ class LinkMonitor:
             rows.append(self._round_trip())
         rows = [self._excuse(row) for row in rows]
         timelines = [Timeline(one) for one in self._asked or ()]
-        if any(one.only() is None for one in timelines):  # 1: it loops, so it is never judged
+        if any(one.only() is None for one in timelines):  # measured 1: it loops
             rows.append(told("time_line", 1, float(any(isinf(one.last_ns) for one in timelines))))
         return rows
 

@@ -99,7 +99,7 @@ class ProbeEnd:
 
     def receive(self, far: socket.socket) -> None:
         """Read a datagram from the other end's socket `far`; record it if this end has sent it."""
-        with suppress(OSError, ValueError):  # an earlier probe had no receiver; no probe
+        with suppress(OSError, ValueError):  # no receiver of an earlier probe; not a probe
             data, ancillary, _, _ = far.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
             at_ns, number = self._stamps.wall_ns(ancillary) or time.time_ns(), peek(data)[2]
             if number < len(self.probes) and data == self.probes[number]:
