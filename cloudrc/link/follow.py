@@ -215,7 +215,7 @@ class PeerName:
             addresses = sorted(self._resolve(self._name))
         except OSError as error:
             self.failures += 1
-            keeps = f"keeps {before[0]}" if before else "waits for it"
+            keeps = f"the link keeps {before[0]}" if before else "the link waits"
             said, was = f"cannot be resolved ({error.strerror or error}); {keeps}", ""
         else:
             kept = [address for address in self._known if address in addresses]

@@ -111,7 +111,7 @@ def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
             "a namespace for privileged pods, or "
         )
     return MissingPrerequisiteError(
-        f"{cause}; {remedy}set link.mode=relay, which needs nothing of the kernel"
+        f"{cause}; {remedy}set link.mode=relay, which needs no kernel module"
     )
 
 
@@ -201,13 +201,13 @@ def notes(profile: DirectionProfile) -> list[str]:
     starts = Timeline(profile).pass_ns
     passed_over = sum(after - before < STEP_NS for before, after in pairwise(starts))
     differences = {
-        f"netem realises next to nothing of correlation {profile.correlation:g}": (
+        f"netem hardly applies correlation {profile.correlation:g}": (
             profile.jitter and profile.correlation
         ),
         "netem corrupts frames, not datagrams: the receiving kernel drops most of them by their "
         f"checksums, so that corrupt {profile.corrupt:g} is seen as loss": profile.corrupt,
         f"netem changes at most every {STEP_NS * 1e-6:g} ms: {passed_over} of {len(starts)} steps "
-        "of the time line come sooner, and some are passed over": passed_over,
+        "of the time line come sooner, and some are skipped": passed_over,
     }
     return [text for text, holds in differences.items() if holds]
 
@@ -431,8 +431,8 @@ class Netem:
         if self._applied and (not found or found != self._listed):
             what = f"was changed to {json.dumps(found)}" if found else "was removed"
             said = (
-                f"the qdisc of {self._device} {what} by another program, so the link is not as "
-                "asked; find out which, and restart this pod to set it up again"
+                f"the qdisc of {self._device} {what} by another program, so the link no longer has "
+                "the requested profile; stop that program, and restart this pod"
             )
         if said and said != self._damage:
             self._damages += 1

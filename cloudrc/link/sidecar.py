@@ -206,7 +206,7 @@ class Sidecar:
             shaper.follow_profile(profile.direction, restart=change.restart)
         except CloudrcError as error:
             if self._mode == "auto":
-                self._machine.log(f"changes the shaper: {_cause(error)}")
+                self._machine.log(f"the shaper changes to the relay: {_cause(error)}")
                 return False
             self._machine.log(f"the new profile is refused, the old one stays: {error}")
             if self._in_force is not None:

@@ -68,7 +68,7 @@ def of_sweep(folder: Path, a: str, b: str) -> Found:
     if len(found) != 1 or found[0][1] == found[0][2]:
         known = "; ".join(f"{axis}: {', '.join(map(str, values))}" for axis, values in axes.items())
         raise BadInputError(
-            f"{folder}: A and B must be two values of one axis, VALUE or AXIS=VALUE; it has {known}"
+            f"{folder}: A and B must be two values of one axis, VALUE or AXIS=VALUE; axes: {known}"
         )
     axis, first, second = found[0]
     flown: dict[str, dict[Any, Row]] = {}

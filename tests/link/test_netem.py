@@ -181,7 +181,7 @@ def test_only_lossy_of_the_shipped_profiles_needs_the_relay():
 
 def test_deviations_of_netem_are_reported():
     profile = DirectionProfile(0.1, 0.01, correlation=0.3)
-    assert notes(profile) == ["netem realises next to nothing of correlation 0.3"]
+    assert notes(profile) == ["netem hardly applies correlation 0.3"]
     assert notes(replace(profile, correlation=0.0)) == []
     assert "seen as loss" in notes(DirectionProfile(corrupt=0.01))[0]
 

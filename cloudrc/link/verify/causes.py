@@ -115,16 +115,16 @@ _BY_NUMBERS = (
     ("doubled_delay", "mean", 1.8, 2.2, ": it is shaped twice, or requested twice"),
     ("halved_delay", "mean", 0.45, 0.55, ": a round trip was taken for one way"),
     ("rate_ignored", "rate", 1.0, inf, ": the rate is ignored"),
-    ("slow", "rate", 0.0, 1.0, ": something is slower"),
+    ("slow", "rate", 0.0, 1.0, ": the bottleneck is slower"),
     ("wrong_delay", "mean", 0.0, inf, ""),
     ("wrong_delay", "round_trip", 0.0, inf, ""),
-    ("wrong_jitter", "deviation", 0.0, inf, ": another jitter"),
+    ("wrong_jitter", "deviation", 0.0, inf, ": the jitter differs"),
     ("no_loss", "loss", 0.0, 0.05, ": loss is not applied"),
     ("less_loss", "loss", 0.0, 1.0, ""),
     ("more_loss", "loss", 1.0, inf, ""),
     ("wrong_duplicates", "duplicated", 0.0, inf, ""),
     ("wrong_order", "reordered", 0.0, inf, ""),
-    ("wrong_distribution", "distribution", 0.0, inf, ": delays are distributed otherwise"),
+    ("wrong_distribution", "distribution", 0.0, inf, ": the delays have another distribution"),
 )
 """Rules in the order of their certainty: code of the cause, quantity, smallest and largest ratio of
 measured to requested value, and text."""

@@ -266,7 +266,7 @@ def netem_makes(profile: DirectionProfile) -> DirectionProfile:
 
 
 def told(name: str, asked: float, measured: float = nan) -> Row:
-    """Make the row of a quantity that is not judged, from its values [any unit]."""
+    """Make the row of an unjudged quantity from its values `asked` and `measured` [any unit]."""
     return Row(name, UNITS.get(name, "1"), asked, measured, nan, nan, "told")
 
 

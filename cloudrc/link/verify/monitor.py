@@ -174,7 +174,7 @@ class LinkMonitor:
         if self._complained and not before:
             way = "uplink" if self._uplink else "downlink"
             wrong = ", ".join(describe(row) for row in rows if row.verdict == "off")
-            text = f"the {way} is not what was asked for: {wrong}; see 'cloudrc link verify'"
+            text = f"the {way} differs from its profile: {wrong}; see 'cloudrc link verify'"
             found.append(Fault(now_ns, "link", text))
         return found
 

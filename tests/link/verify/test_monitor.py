@@ -59,7 +59,7 @@ def test_a_wrong_link_is_a_fault_after_a_second_look(quantity):
     assert verdicts[0] == "open", "not said before it was looked at again"
     assert verdicts[-1] == "off"
     assert [fault.code for fault in faults] == ["link"], "told once"
-    assert faults[0].text.startswith("the downlink is not what was asked for: ")
+    assert faults[0].text.startswith("the downlink differs from its profile: ")
 
 
 def test_without_a_common_clock_one_way_delays_are_not_judged():
