@@ -50,12 +50,12 @@ class Versions(set):
 
 
 def nothing(*words):
-    """Answer `lookup` as without a cluster (`helm template`)."""
+    """Answer `lookup` without a cluster, as `helm template` does."""
     return {}
 
 
 def a_namespace(level="", objects=()):
-    """Make a cluster with a namespace, which may enforce a level of Pod Security, and objects."""
+    """Make a cluster with objects and a namespace that enforces a level of Pod Security."""
     labels = {"pod-security.kubernetes.io/enforce": level} if level else {}
 
     def lookup(version, kind, namespace, name):
@@ -77,7 +77,7 @@ def laid_over(base, values):
 
 SOURCES = Files().Glob("templates/**/*")
 cluster = []
-"""The function that answers `lookup`, last in the list; templates are compiled only once."""
+"""The last function answers `lookup`; a list, because templates are compiled only once."""
 
 
 @cache
@@ -128,7 +128,7 @@ def of_kind(objects, kind):
 
 
 def pod_specs(objects):
-    """Return all pod specs: those of Deployments and Jobs by component, a Pod's by container."""
+    """Return all pod specs: by component for Deployments and Jobs, by container for Pods."""
     specs = {}
     for thing in objects:
         spec = thing.get("spec", {})

@@ -85,7 +85,7 @@ def test_only_another_mission_makes_another_job():
 
 
 def test_the_chart_makes_the_job_of_the_example():
-    """The example's is also that of `cloudrc mission run`."""
+    """`cloudrc mission run` also uses the Job of the example."""
     found = (*jobs(ENABLED, release="cloudrc"), EXAMPLES["mission-job"][1])
     ours, theirs = (job["spec"]["template"]["spec"] for job in copy.deepcopy(found))
     for pod in (ours, theirs):

@@ -44,7 +44,7 @@ def test_scrape_annotations_are_optional(wanted):
 
 
 def series():
-    """Return the names of all series: those of a histogram are its buckets, sum and count."""
+    """Return the names of all series; a histogram has the series bucket, sum and count."""
     parts = {Kind.HISTOGRAM: ("_bucket", "_sum", "_count")}
     return {name + part for name, one in METRICS.items() for part in parts.get(one.kind, ("",))}
 

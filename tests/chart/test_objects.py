@@ -94,7 +94,7 @@ def test_the_command_line_accepts_every_containers_arguments():
 
 
 def test_each_pod_has_one_image():
-    """A node pulls one image per pod, because the link uses that of its pod."""
+    """A node pulls one image per pod, because the link uses the same image."""
 
     def images(values):
         found = {}

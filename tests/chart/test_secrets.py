@@ -26,7 +26,7 @@ MOUNTS = {
     "test": {"test": MISSION},
     "test-link": {"test-link": set()},
 }
-"""Pod -> container -> its mounts: an attacker in a container gets no more than these."""
+"""Pod -> container -> its mounts; an attacker in the container can reach only these."""
 KEY = {"secretName": "demo-cloudrc-tunnel", "defaultMode": 0o440}
 TOKENS = {"secretName": "demo-cloudrc-tokens", "defaultMode": 0o440}
 OPERATOR = {**TOKENS, "items": [{"key": "operator", "path": "operator"}]}
@@ -108,7 +108,7 @@ def test_a_container_mounts_only_what_it_needs(mode):
         return {name: volume for name, volume in kinds.items() if volume}
 
     def folder(part, flag):
-        """Return the volume that a container has for an argument, which must be a mount itself."""
+        """Return the volume that is mounted at the path in an argument, or at its parent folder."""
         (path,) = (a.partition("=")[2] for a in part["args"] if a.startswith(f"--{flag}="))
         where = {m["mountPath"]: m["name"] for m in part["volumeMounts"]}
         return where.get(path) or where[path.rpartition("/")[0]]

@@ -1,4 +1,4 @@
-"""Values, schema and tables come from the models; an unknown value is refused by name."""
+"""The schema is closed, the defaults are valid, and a wrong value is named."""
 
 import pytest
 

@@ -97,7 +97,7 @@ class FakeApi:
         self.put("pods", pod(f"{job}-x", "mission", labels={UID_LABEL: uid}, **given))
 
     def at_look(self, number, action, plural="jobs"):
-        """Call `action` at the n-th request for a Job, or another object."""
+        """Call `action` at the n-th request for objects of a kind, by default Jobs."""
         looks = itertools.count(1)
 
         def look(path):
@@ -107,7 +107,7 @@ class FakeApi:
         self.hooks.append(look)
 
     def away(self, plural, code, times):
-        """Refuse a number of read requests; return those left, as a list."""
+        """Refuse `times` read requests; return the list of the refusals still to come."""
         left = [(code, {"message": "etcdserver: leader changed", "code": code})] * times
         self.hooks.append(lambda path: left.pop() if left and f"/{plural}" in path else None)
         return left

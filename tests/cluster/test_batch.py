@@ -1,4 +1,4 @@
-"""The Job of a sweep on the fake API server: made once, its lines read, its failures named."""
+"""The Job of a sweep is created once, its log is read, and its failures are named."""
 
 import base64
 

@@ -1,4 +1,4 @@
-"""The selection of a release, its requests, and calls of kubectl and helm; errors in one line."""
+"""A release is selected; requests and programs fail with an error of one line."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The page of a release is forwarded, and the changes of the link that it asks for are told."""
+"""The page of a release's console is forwarded, and the console's log is read."""
 
 import pytest
 

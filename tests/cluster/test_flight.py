@@ -30,7 +30,7 @@ def later(given, by_ns):
 
 
 def record(folder, *flights, torn):
-    """Record flights as two pods do; torn: the files have no end, as when copied in flight."""
+    """Record flights as two pods do; `torn` files lack their end, as if copied in flight."""
     for number, name in enumerate(("world", "cloud")):
         path = folder / f"{name}.mcap"
         with McapWriter(path, clock=name, clock_id="same") as writer:

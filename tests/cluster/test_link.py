@@ -1,4 +1,4 @@
-"""`cloudrc link set` in a cluster: the change in pods and ConfigMap, its answer and its rights."""
+"""`cloudrc link set` in a cluster: pods, ConfigMap, messages and permissions."""
 
 import json
 import os
@@ -242,7 +242,7 @@ KUBECTL_NEEDS = {
     "patch": {("configmaps", "get"), ("configmaps", "patch")},
     "exec": {("pods", "get"), ("pods/exec", "create")},
 }
-"""Verb of kubectl -> rights that it needs, as an API server has recorded them."""
+"""Verb of kubectl -> permissions that it needs, according to an API server's audit log."""
 
 
 def test_the_role_allows_just_what_its_commands_need(cluster):

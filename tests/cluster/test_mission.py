@@ -1,4 +1,4 @@
-"""`cloudrc mission` in a cluster: where it goes, what it checks, its output and exit codes."""
+"""`cloudrc mission` in a cluster: its target, checks, output and exit codes."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""A ConfigMap's file, a change that is handed over, and a name whose address changes."""
+"""Changes of a profile, by ConfigMap and by JSON document, and of the peer's address."""
 
 import json
 import os
@@ -26,7 +26,7 @@ def note(number):
 
 
 class Pod:
-    """The two folders of a link container: the ConfigMap's, and the one beside the route."""
+    """The two folders of a link container: that of the ConfigMap and that of the route file."""
 
     def __init__(self, folder):
         self.map, self.run, self.log = folder / "map", folder / "run", []
@@ -111,7 +111,7 @@ def test_a_late_config_map_does_not_bring_an_older_change_back(pod):
 
 
 def test_an_upgrade_after_a_change_by_hand_takes_effect(pod):
-    """Helm puts the profile back and leaves the note of who changed it, or breaks the note."""
+    """Helm restores the profile and leaves the file of the last change, which may be invalid."""
     pod.first()
     pod.put(120.0, "a1")
     assert pod.poll() == (0.12, "a1")

@@ -1,4 +1,4 @@
-"""Logs of ping, irtt and CSV: units, losses, directions; everything left out is counted."""
+"""Logs of ping, irtt and CSV: units, losses, directions; unused rows are counted."""
 
 import json
 
@@ -107,7 +107,7 @@ def test_an_unusable_csv_log_is_refused(text, says):
 
 
 def test_up_to_1_percent_may_be_unusable_and_all_is_counted():
-    """Of 200 rows one is torn, one comes late, one is at the time of another; then a pause."""
+    """Of 200 rows, one is cut off, one is out of order, one repeats a time; a pause follows."""
     rows = [f"{n / 10:g},{40 + n % 5}" for n in range(200)]
     rows[20:22], rows[50], rows[60] = [rows[21], rows[20]], "5", rows[59]
     packets = read("\n".join(["time_s,delay_ms", *rows, "919.9,40"]))
@@ -169,7 +169,7 @@ TRIPS = [trip(0), trip(1, "true_up"), trip(2, "true_down"), trip(3, True), trip(
     ],
 )
 def test_irtt_gives_the_delays_of_each_direction(direction, sent, delays):
-    """Packets lost on the uplink were never on the downlink, and vice versa."""
+    """A packet that is lost in one direction does not count in the other direction."""
     packets = irtt(TRIPS, direction, packets_sent=5, packets_received=3, duplicates=1)
     assert packets.sent == pytest.approx(sent)
     assert packets.delays == pytest.approx(delays)
@@ -249,7 +249,7 @@ END = (
 
 @pytest.mark.parametrize(("end", "lost"), [((), 2), (END, 3)])
 def test_ping_gives_half_round_trips_at_the_time_of_sending(end, lost):
-    """A packet after the last line is known from the summary only."""
+    """Only the summary counts a packet after the last line."""
     packets = ping(*PING, *end)
     assert packets.sent == pytest.approx((100.0, 100.2, 100.4, 100.6, 100.8, 101.0)[: 3 + lost])
     assert packets.delays[:5] == pytest.approx((0.020, 0.015, None, 0.050, None))

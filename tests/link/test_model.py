@@ -1,4 +1,4 @@
-"""One direction of the link: draws by counter, queue, order, time line, and their statistics."""
+"""The model of a direction: random draws, queue, order, time line and statistics."""
 
 import random
 from dataclasses import replace
@@ -259,7 +259,7 @@ def test_the_time_line_counts_from_the_origin():
 
 @pytest.mark.parametrize("loop", [False, True])
 def test_a_trace_holds_each_row_until_the_next(loop):
-    """If it loops, its last row lasts as long as a mean row: the period is 4 s."""
+    """If the trace loops, its last row lasts as long as the mean row: the period is 4 s."""
     trace = Trace((1.0, 2.0, 3.0), (0.010, 0.020, 0.030), (0.0, 1.0, 0.0), loop)
     direction = link(DirectionProfile(9.0, loss=1.0, trace=trace))
     late = ((3 * 3600 + t, delay) for t, delay in ((0, 10), (2, None), (3, 30)) if loop)

@@ -1,4 +1,4 @@
-"""netem: a profile in tc's words, set up, found again, stepped and removed, by a fake kernel."""
+"""netem with a fake kernel: arguments of tc, set-up, restart, time line and removal."""
 
 import json
 from dataclasses import replace
@@ -33,7 +33,7 @@ PEER = ("10.244.0.7", 7400)
 class Kernel:
     """An interface with its qdiscs and filters.
 
-    Its history notes from when on [ms] which delay [us] and loss were in force.
+    `history` has a row per change of netem: time [ms], new delay with its unit, new loss.
     """
 
     def __init__(self, lacks="nothing"):
@@ -105,7 +105,7 @@ def netem(kernel, profile, log=print):
 
 
 def shaped(profile, until=0.0, log=print):
-    """Return a kernel, and what shapes in it by a profile until a time [s]."""
+    """Return a kernel and its `Netem`, after `until` [s] with a profile."""
     kernel = Kernel()
     shaper = netem(kernel, profile, log)
     assert shaper.follow_peer(PEER) == PEER
@@ -262,7 +262,7 @@ def test_a_smaller_limit_waits_until_queued_packets_have_left():
 
 @pytest.mark.parametrize("delay", [300.0, 0.1])
 def test_a_refused_profile_leaves_the_old_one_in_force(delay):
-    """`check` refuses the first, and tc the second."""
+    """`check` refuses a delay of 300 s, and tc a delay of 0.1 s."""
     kernel, shaper = shaped(PLAIN)
     before, kernel.refuses = kernel.netem, "100000.000us"
     with pytest.raises((BadInputError, MissingPrerequisiteError), match="delay"):

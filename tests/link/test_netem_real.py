@@ -1,4 +1,4 @@
-"""netem in the kernel: asked, applied and measured between two network namespaces."""
+"""netem of the kernel, measured between two network namespaces."""
 
 import os
 import socket
@@ -31,16 +31,16 @@ MINUTES = [
     if name != "lossy"  # netem refuses that one
     and (way == "uplink" or load_profile(name).downlink != load_profile(name).uplink)
 ]
-"""Every direction that ships, once: most profiles have the same both ways."""
+"""Directions of the shipped profiles; one direction if both are equal."""
 pytestmark = pytest.mark.netem
 
 
 NEAR, FAR = (f"cloudrc-{way}-{os.getpid()}" for way in HOSTS)
 FAR_PEER = FAR_HOST, _ = HOSTS["downlink"], 7400
 WITHIN = 0.002
-"""Tolerance of medians [s]; means would show the stalls of a slow virtual machine."""
+"""Tolerance of medians [s]; means are worse, because a slow virtual machine stalls."""
 LATE = 0.1
-"""Lateness of a step where the machine now and then stands still [s]."""
+"""Accepted lateness of a change, because a virtual machine stalls [s]."""
 SIZE = 172
 _SO_TIMESTAMPNS = 35  # include/uapi/asm-generic/socket.h
 
@@ -62,7 +62,7 @@ def qdiscs():
 
 
 class Flow:
-    """Numbered datagrams from near to a port of far, with the arrival of each copy."""
+    """Numbered datagrams from the near namespace to a port of the far one, and their arrivals."""
 
     def __init__(self, port=7400):
         self.port, self.sent_ns, self.arrived = port, [], []
@@ -132,7 +132,7 @@ def least(error, enough):
 
 @pytest.fixture(scope="module")
 def make(tmp_path_factory):
-    """Connect two namespaces; the value makes a netem in the near one."""
+    """Connect two namespaces; return a function that makes a netem in the near one."""
     folder = tmp_path_factory.mktemp("tc")
     run = NearPrograms(str(folder))
 
@@ -238,7 +238,7 @@ def test_a_shipped_profile_for_a_minute(shaped, name, way, figure):
 
 
 def drawn_for(flow, profile, seed):
-    """What the model does to packets that are sent when those of a flow were."""
+    """Return the model's statistics for packets with the times of sending of a flow."""
     sent_ns = [at_ns - flow.sent_ns[0] for at_ns in flow.sent_ns]
     return numbers(sample(LinkDirection(profile, seed, True), Kind.TELEMETRY, sent_ns, SIZE))
 

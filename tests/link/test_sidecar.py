@@ -1,4 +1,4 @@
-"""The sidecar's decisions, with shapers that only take notes; and what it tells `link verify`."""
+"""The sidecar's decisions and its state, with shapers that only record their calls."""
 
 import json
 import re
@@ -154,7 +154,7 @@ def test_where_netem_fails_auto_takes_the_relay_and_netem_ends(
 
 
 def test_the_peer_is_waited_for_and_its_new_address_followed(tmp_path):
-    """The time line counts from when the link came up, whatever shaper follows."""
+    """The time line keeps its start when another shaper takes over."""
     bench = Bench(tmp_path, "auto")
     bench.route.write_text("10.0.0.1:7400\n")  # an earlier process was killed
     bench.sidecar.peer = None

@@ -1,4 +1,4 @@
-"""Traces are read and written; what is none is refused with file, line, value and remedy."""
+"""Traces are read and written; an invalid trace is refused with file, line and remedy."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""A comparison counts what both flights of a pair have; pairs come from finished flights."""
+"""A comparison uses the metrics that both flights of a pair have."""
 
 import pytest
 

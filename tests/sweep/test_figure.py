@@ -14,7 +14,7 @@ AXES = {"delay_ms": [20, 5, 10], "predictor": ["none", "kalman"], "gain": [[1, 2
 
 
 def sweep(folder, rows=None):
-    """Write the rows of a sweep in an order that is not that of its grid; 10 and 20 ms fail."""
+    """Write the rows of a sweep in another order than its grid; flights above 5 ms fail."""
     points = [(d, p, g, seed) for seed in (2, 1) for g in AXES["gain"] for d in (5, 10, 20)
               for p in ("kalman", "none")]  # fmt: skip
     lines = [
@@ -32,7 +32,7 @@ def sweep(folder, rows=None):
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """Keep what would be drawn."""
+    """Replace drawing; return the arguments of `draw`."""
     kept = []
     monkeypatch.setattr("cloudrc.sweep.figure.draw", lambda *what, look: kept.extend(what) or {})
     return kept
@@ -109,7 +109,7 @@ def test_a_sweep_without_axes_or_rows_has_no_figure(tmp_path):
 
 
 def test_missing_flights_are_reported(tmp_path, capsys):
-    """A sweep that still flies may answer otherwise in the end."""
+    """An unfinished sweep may give another result in the end."""
     folder = sweep(tmp_path / "s", rows=22)
     assert "s, of which 2 flights are not done, over" in of_sweep(folder, "none", "kalman").what
     assert main(["sweep", "figure", str(folder)]) == 0

@@ -1,4 +1,4 @@
-"""A grid becomes points with keys; problems are refused at their place, before any flight."""
+"""A grid becomes points with keys; a problem is refused with its file and line."""
 
 import inspect
 import re
@@ -47,7 +47,7 @@ def test_equal_flights_have_equal_keys_however_they_are_written(write_sweep):
 
 
 def test_a_key_depends_on_the_code_of_a_named_plugin(write_sweep, monkeypatch, tmp_path):
-    """Somebody may edit a predictor in a clone, and go on with a sweep."""
+    """A user may edit a predictor in a clone, and then continue a sweep."""
     path, found = write_sweep({"cloud.predictor": ["last_sample", "constant_velocity"]}), []
     (tmp_path / "edited.py").write_text("# edited")
     real = inspect.getfile

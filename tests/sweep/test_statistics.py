@@ -1,4 +1,4 @@
-"""Intervals and tests have the values of published tables, and cover what they promise."""
+"""Intervals and tests have the values of published tables."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ CRITICAL = {6: 0, 7: 2, 8: 3, 9: 5, 10: 8, 12: 13, 15: 25, 20: 52, 25: 89}
 @given(st.permutations(range(1, 21)))
 @settings(max_examples=20, deadline=None)
 def test_the_interval_of_the_median_has_the_bounds_of_textbooks(values):
-    """With 20 values 0.9586; the range of 5 values encloses it with 0.9375 only, that of 6 does."""
+    """Its probability is 0.9586 with 20 values; the range of 5 values has only 0.9375."""
     assert median_interval(values) == (6, 15)
     assert median_interval(values[:5]) is None
     assert median_interval(values[:6]) == (min(values[:6]), max(values[:6]))
@@ -52,7 +52,7 @@ def test_the_signed_rank_test_has_the_p_of_a_known_example():
 
 @pytest.mark.parametrize(("n", "cut"), CRITICAL.items())
 def test_the_signed_rank_test_has_the_critical_values_of_tables(n, cut):
-    """Give the ranks that make up the sum a minus; one more makes p larger than 5 %."""
+    """A sum of negative ranks above the tabulated value has a p-value above 5 %."""
 
     def p_of(total):
         signs = dict.fromkeys(range(1, n + 1), 1)
@@ -103,7 +103,7 @@ def test_interval_and_p_agree_without_ties(values):
 
 
 def test_the_number_of_pairs_needed_has_power_80_percent():
-    """Half a standard deviation: the formula gives 39 from the true distribution."""
+    """For a shift of half a standard deviation, the formula gives 39 pairs."""
     rng = np.random.default_rng(3)
     needed = paired(rng.normal(0.5, 1.0, 2000).tolist()).pairs_needed
     assert needed == pytest.approx(39, abs=4)

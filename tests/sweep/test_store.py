@@ -1,4 +1,4 @@
-"""Rows survive a crash; a folder holds one sweep; tables do not depend on the order of flights."""
+"""Rows survive a crash, a folder has one sweep, and tables follow the grid's order."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""Share a world that answers hellos between the tests of the handshake."""
+"""A world that answers hellos, for the tests of the handshake."""
 
 from cloudrc.tunnel.codec import Direction, Hello, Kind, decode_challenge
 from cloudrc.tunnel.handshake import CHALLENGE_NS, COOKIE_NS, NO_COOKIE, ServerHandshake
@@ -40,7 +40,7 @@ class Doorstep:
         return kind, epoch, body
 
     def cookie(self):
-        """Return the cookie of a challenge, as soon as world may send one."""
+        """Return the cookie of a challenge; first wait until world may send a challenge."""
         self.now_ns = max(self.now_ns, self.door._challenged_ns + CHALLENGE_NS)
         kind, _, body = self.answer(cookie=NO_COOKIE)
         assert kind == Kind.CHALLENGE

@@ -1,12 +1,12 @@
-"""Hostile datagrams for both ends, and the oracle: none is accepted, none raises, none is kept.
+"""Send hostile datagrams to both ends, and check that none is accepted, raises or is kept.
 
-Run by itself it is a coverage-guided fuzzer (libFuzzer's flags):
+As a program, this module is a coverage-guided fuzzer with libFuzzer's flags:
 
     python tests/tunnel/hostile.py -atheris_runs=10000000 [CORPUS]
 
-Four ways to be hostile, in turns: bytes as they come; a sealed frame of the session with some bytes
-changed; one cut short or made longer; one sealed properly, with a key that is not ours. Now and
-then time passes, and both ends hear each other, or nothing but what was captured.
+There are four kinds of hostile datagrams: random bytes; a datagram of the session with some bytes
+changed; a datagram cut short or made longer; and a datagram sealed with another key. From time to
+time the clock advances, and both ends get each other's datagrams or only captured ones.
 """
 
 import atexit
@@ -25,12 +25,12 @@ from tests.flights.conftest import MS, Bare, BareCloud, bare_cloud, ring
 STEPS_NS = tuple(round(ms * MS) for ms in (1, 30, 400, 1_500, 6_000, 150_000))
 """Steps of time [ns]; cloud asks for a session after 0.5 s of silence."""
 TOLD_MAX = 256
-"""Largest number of faults of a cloud without a session: each version and the wrong key once."""
+"""Largest number of faults of a cloud without a session: one per version, one for the key."""
 DOWNLINK = (Kind.COMMAND, Kind.OPERATOR, Kind.ALIVE)
 
 
 class Target:
-    """A world and a cloud in a session, with every frame that was valid between them."""
+    """A world and a cloud in a session, with all datagrams that were valid between them."""
 
     def __init__(self, pace=5_000):
         """Begin a session; time passes after every `pace` datagrams."""
@@ -154,7 +154,7 @@ class Target:
 
 
 def memory():
-    """Return this process's memory now [MiB]; the peak would hide a leak below it. Linux."""
+    """Return this process's present memory on Linux [MiB]; the peak could hide a leak."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() / 2**20
 

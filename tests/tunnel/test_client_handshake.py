@@ -1,4 +1,4 @@
-"""Cloud's side of the handshake, the log of why there is no session, and what an end sends."""
+"""Cloud's side of the handshake, the log of its failures, and an end's datagrams."""
 
 import pytest
 
@@ -23,7 +23,7 @@ STRANGER = KeyRing(KeySet(Key(b"x" * 32)))
 
 
 class Asking:
-    """A cloud's handshake with short ways to try it."""
+    """A cloud's handshake with short methods for the tests."""
 
     def __init__(self):
         self.handshake = ClientHandshake(NONCE, CLOCK)
@@ -100,7 +100,7 @@ def test_a_dead_world_does_not_come_back(cloud):
 
 
 def test_a_living_world_that_counts_as_dead_gets_a_new_nonce(cloud):
-    """Cloud has accepted a late datagram of a dead world while it heard nobody."""
+    """Without a session, cloud has accepted a late datagram of a world that has ended."""
     cloud.accepts(3, NEXT_WORLD)
     cloud.accepts(9)
     assert cloud.accepts(3, NEXT_WORLD) is None  # alive, and answers

@@ -97,7 +97,7 @@ def test_every_wrong_length_direction_and_version_is_refused(kind):
 
 
 def test_an_unknown_kind_is_refused_at_every_length():
-    """Such as a probe of `link verify`, which has a header of the tunnel."""
+    """For example, a probe of `link verify` has the header of a tunnel's datagram."""
     for kind in (0, 9, PROBE):
         for size in sorted({codec.HEADER_SIZE, *codec.SIZES.values(), codec.DATAGRAM_MAX}):
             data = codec.encode_header(kind, 1, 1, 2).ljust(size, b"\0")

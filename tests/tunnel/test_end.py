@@ -1,4 +1,4 @@
-"""Both ends send telemetry and commands as bytes, or pass them as they are."""
+"""Both ends send telemetry and commands as bytes, or pass them as objects."""
 
 import pytest
 

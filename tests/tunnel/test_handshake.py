@@ -1,4 +1,4 @@
-"""World's side of the handshake: cookies, epochs, keys, and which cloud has authority."""
+"""World's side of the handshake: cookies, epochs, keys, and which cloud gets the session."""
 
 import pytest
 
@@ -108,7 +108,7 @@ def test_operator_and_alive_are_let_in_once(step):
 
 
 def test_an_incumbent_that_asks_gets_its_epoch_again(step):
-    """Until it has asked in vain: world cannot hear it, so a new epoch loses nothing."""
+    """After too many hellos alone, it gets a new epoch, because world hears nothing else."""
     step.receive_hello()
     step.door.hear(step.now_ns)
     step.now_ns += 250 * MS  # the last instant at which it counts as heard

@@ -1,4 +1,4 @@
-"""Keys: what a file may hold, and that a key is never shown."""
+"""Key files are parsed and written, and no text shows a key."""
 
 import logging
 import traceback

@@ -1,4 +1,4 @@
-"""Sessions: which datagrams are opened, and that nothing changes before a tag is verified."""
+"""A session opens valid datagrams; nothing changes before a tag is verified."""
 
 import pytest
 
@@ -15,7 +15,7 @@ OLD, NEW = Key(b"p" * 32), Key(b"n" * 32)
 
 
 def refuses(session, data, outcome="tag"):
-    """Tell whether a session refuses a datagram for this reason, and is then as before."""
+    """Return whether a session refuses a datagram for this reason, with its state unchanged."""
     before = state(session)
     try:
         session.open(data)
@@ -25,7 +25,7 @@ def refuses(session, data, outcome="tag"):
 
 
 def state(session):
-    """Return all state that a datagram could change; ciphers by their addresses."""
+    """Return all state that a datagram could change; a cipher is shown by its address."""
     return {name: repr(value) for name, value in vars(session).items()}
 
 
@@ -70,7 +70,7 @@ def test_keys_depend_on_key_epoch_and_both_nonces():
 
 
 def test_each_kind_has_its_own_counter_in_each_epoch():
-    """So no nonce is used twice in an epoch."""
+    """Therefore no nonce is used twice in an epoch."""
     _, cloud = pair()
     kinds = (Kind.COMMAND, Kind.OPERATOR, Kind.ALIVE)
     sealed = [cloud.seal(kind, bytes(codec.BODY_SIZES[kind])) for kind in kinds for _ in range(9)]
@@ -108,7 +108,7 @@ def test_a_dropped_key_opens_nothing():
 
 
 def datagrams(count):
-    """Make datagrams of every kind in both directions, each with the end that opens it."""
+    """Make datagrams of all kinds in both directions, each with the end that opens it."""
     world, cloud = pair()
     made = []
     for number in range(count):

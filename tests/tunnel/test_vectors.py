@@ -1,4 +1,4 @@
-"""Known answers: the datagrams as they stay, and as docs/wire.md alone describes them."""
+"""Datagrams have fixed bytes, and agree with docs/wire.md."""
 
 import hashlib
 import hmac
@@ -34,7 +34,7 @@ GOLDEN = {
         "402bd85b"
     ),
 }
-"""Datagrams as they go over the wire. If one changes, so does the format: raise `codec.VERSION`."""
+"""Bytes of datagrams. If they change, the format has changed: raise `codec.VERSION`."""
 
 
 def greeting(direction, epoch, kind, counter, body):

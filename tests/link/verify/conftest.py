@@ -1,4 +1,4 @@
-"""Links in virtual time: probes and flights over the model, or what netem makes of it."""
+"""Probes and flights over links in virtual time, shaped as by the relay or by netem."""
 
 from dataclasses import replace
 
@@ -28,9 +28,10 @@ OVERHEAD = 8e-5
 
 
 def rows_of(profile, real, *, stall=0.0, seconds=None, netem=False):
-    """Probe a link; a relay without CPU delays 30 % of the probes by up to `stall` [s].
+    """Request `profile`, probe a link that has the profile `real`, and judge it.
 
-    A relay draws by the experiment's seed, the kernel (`netem`) by none that is known.
+    30 % of the probes are up to `stall` [s] late, as with a relay without CPU time. With `netem`,
+    the random numbers do not follow the experiment's seed.
     """
     flow = Flow(SEED, True, PROBE, SIZES[Kind.TELEMETRY])
     plan = plan_probes(profile, flow, seconds, drawn=netem)
@@ -44,13 +45,13 @@ def rows_of(profile, real, *, stall=0.0, seconds=None, netem=False):
 
 
 def verify(profile, up, down, known):
-    """Request a profile both ways and find another one in each."""
+    """Request a profile in both directions, and probe links with the profiles `up` and `down`."""
     ways = {"uplink": up, "downlink": down}
     return {way: Findings(rows_of(profile, one), known) for way, one in ways.items()}
 
 
 def arrivals(profile, seconds=60.0, *, seed=SEED, overhead=5e-4, uplink=False):
-    """Return what cloud (`uplink`) or world notes of a flight of some seconds.
+    """Return the arrivals that cloud (`uplink`) or world records in a flight of `seconds` [s].
 
     The ends add `overhead` [s]; NaN: they share no clock. The experiment's seed is 1.
     """

@@ -1,4 +1,4 @@
-"""Which links are believed, which are not and why: whole links in virtual time."""
+"""Verdicts and named causes for whole links in virtual time."""
 
 from dataclasses import replace
 
@@ -92,7 +92,7 @@ def test_netem_is_believed_unless_it_delays_twice_as_long():
 
 @pytest.mark.parametrize("loss", [0.2, GilbertElliott(0.1, 0.4, 0.8, 0.05)])
 def test_netem_loses_either_a_packet_or_its_copy(loss):
-    """Beside a duplicate a loss leaves one packet; a copy can be lost, too.
+    """A packet selected for loss and duplication arrives once; a copy can be lost, too.
 
     Source: Linux, net/sched/sch_netem.c: netem_enqueue; get_crandom for the correlation.
     """

@@ -1,4 +1,4 @@
-"""What shapers and kernels report of themselves, read back: state, metrics, qdiscs."""
+"""Evidence is read from the state, metrics and qdiscs of a link container."""
 
 import pytest
 

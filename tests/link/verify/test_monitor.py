@@ -1,4 +1,4 @@
-"""The monitor in flight: by the tunnel's own datagrams, drawn here without any flight."""
+"""The monitor of a link in flight, with simulated arrivals of the tunnel's datagrams."""
 
 import json
 import time

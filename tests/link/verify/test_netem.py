@@ -1,4 +1,4 @@
-"""netem verified as between two pods: an honest link, and faults that only a kernel can have."""
+"""`link verify` with netem: an honest link, and faults that only a kernel can have."""
 
 import signal
 import subprocess
@@ -31,7 +31,7 @@ def verify(ways, plans):
 
 
 def change(way, command):
-    """Change the kernel behind the back of the link's process."""
+    """Change the qdiscs without the link's process."""
     words = ["ip", "netns", "exec", way.namespace, "tc", *command.split()]
     subprocess.run(words, check=True, capture_output=True)
 
@@ -44,7 +44,7 @@ def planned(*settings):
 
 @contextmanager
 def running():
-    """Run a link of the profile that is asked for, without what else is planned."""
+    """Run a link with the delay and jitter of `ASKED`, but no other requested property."""
     applied = Profile.model_validate({way: {"delay_ms": 400.0, "jitter_ms": 80.0} for way in HOSTS})
     try:
         with run_link(find_experiment("ideal", []), "netem", applied) as ways:

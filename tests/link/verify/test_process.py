@@ -1,4 +1,4 @@
-"""`cloudrc link verify` over real sockets and processes: what it believes, and what it names."""
+"""`cloudrc link verify` over real sockets and processes: verdicts, causes, exit codes."""
 
 import json
 import os
