@@ -10,7 +10,6 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
-import yaml
 
 from cloudrc.cluster import client, flight, jobs
 from cloudrc.cluster.client import connect
@@ -169,20 +168,16 @@ class FakeTeleop:
 
 def kubeconfig(url):
     """Build a kubeconfig with two contexts: `here`, the current one, and `elsewhere`."""
-    here = {"cluster": "fake", "user": "me", "namespace": "demo"}
-    elsewhere = {"cluster": "fake", "user": "me"}
-    config = {
-        "apiVersion": "v1",
-        "kind": "Config",
-        "clusters": [{"name": "fake", "cluster": {"server": url}}],
-        "users": [{"name": "me", "user": {"token": "none"}}],
-        "contexts": [
-            {"name": "here", "context": here},
-            {"name": "elsewhere", "context": elsewhere},
-        ],
-        "current-context": "here",
-    }
-    return yaml.safe_dump(config)
+    return f"""\
+apiVersion: v1
+kind: Config
+current-context: here
+clusters: [{{name: fake, cluster: {{server: "{url}"}}}}]
+users: [{{name: me, user: {{token: none}}}}]
+contexts:
+- {{name: here, context: {{cluster: fake, user: me, namespace: demo}}}}
+- {{name: elsewhere, context: {{cluster: fake, user: me}}}}
+"""
 
 
 def labels(component):

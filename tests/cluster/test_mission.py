@@ -106,13 +106,6 @@ def flies_here(tmp_path):
 
 
 @pytest.mark.usefixtures("flies_here")
-def test_the_local_run_is_the_default(running, capsys):
-    assert main(["mission", "list"]) == 5
-    assert "silent.sock" in capsys.readouterr().err
-    assert running.seen == []
-
-
-@pytest.mark.usefixtures("flies_here")
 @pytest.mark.parametrize(
     "words",
     [["cloudrc", "mission", "list", "-n", "demo"], ["/bin/kubectl-cloudrc", "mission", "list"]],
