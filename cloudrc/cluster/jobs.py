@@ -272,7 +272,7 @@ def _look(release: Release, name: str) -> tuple[JobStatus, list[str]]:
         why = next((event.message for event in found if event.reason == "FailedCreate"), "")
     if why:
         raise ClusterError(
-            f"Job '{name}' cannot start: {why}; then delete the Job: "
+            f"Job '{name}' cannot start: {why}; fix this, then delete the Job: "
             f"kubectl {' '.join(release.flags)} delete job {name}"
         )
     return status, []

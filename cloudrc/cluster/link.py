@@ -135,7 +135,9 @@ def send(
         except CloudrcError as error:
             return error
         except ValueError as error:
-            return ClusterError(f"a link container has another version: {error}")
+            return ClusterError(
+                f"a link container has another version: {error}; upgrade the release: helm upgrade"
+            )
         if number in (state.change, state.refused):
             return state
         return TimedOutError(

@@ -101,7 +101,8 @@ def read_plan(path: Path) -> Plan:
         for seed in seeds:
             key = _key(everything, seed)
             if key in flights:
-                raise BadInputError(f"{name}: {point} is the same as {flights[key].point}")
+                same = f"{point} is the same as {flights[key].point}; remove one of them"
+                raise BadInputError(f"{name}: {same}")
             flights[key] = Flight(key, point, seed, points[-1])
     labels = {axis: [label for label, _ in choices] for axis, choices in axes.items()}
     return Plan(document.tree | {"folder": str(folder)}, labels, seeds, points, flights)
