@@ -136,7 +136,7 @@ def send(
             return error
         except ValueError as error:
             return ClusterError(
-                f"a link container has another version: {error}; upgrade the release: helm upgrade"
+                f"a link container has another version: {error}; upgrade the release"
             )
         if number in (state.change, state.refused):
             return state

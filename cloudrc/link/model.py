@@ -39,8 +39,7 @@ class LinkDirection:
     ) -> None:
         """Create the model; `uplink` is True for world to cloud.
 
-        `origin_ns` is the time at which the link came up and its time line starts [ns]; it is on
-        the clock of `now_ns` in `send`.
+        `origin_ns` is when the link came up and its time line starts [ns], on the clock of `send`.
         """
         self._seed, self._uplink = seed, uplink
         self._origin_ns: int | None = origin_ns
@@ -151,7 +150,6 @@ class LinkDirection:
         return True
 
     def _find_table(self, epoch: int, kind: int, block: int, conditions: Conditions) -> list[Fate]:
-        """Return the impairments of a block; keep them for the other packets of the block."""
         jitter, loss = conditions.jitter, conditions.loss
         key = (epoch, kind, block, jitter, loss)
         if key in self._fates:

@@ -171,7 +171,6 @@ def settled(profile: DirectionProfile) -> DirectionProfile:
 
 
 def _conditions(profile: DirectionProfile, instant: float) -> Conditions:
-    """Return the conditions from `instant` [s] until the next change."""
     delay, jitter, loss, rate = profile.delay, profile.jitter, profile.loss, profile.rate
     for change in profile.changes:
         if change.at > instant:

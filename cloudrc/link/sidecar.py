@@ -259,7 +259,6 @@ class Sidecar:
                 publish(self._released_file, json.dumps(released))
 
     def _publish(self, state: LinkState, profile: DirectionProfile) -> None:
-        """Store the state in force, and write it to the state file."""
         self._in_force = state, profile
         with suppress(OSError):
             publish(self._state_file, to_text(state))

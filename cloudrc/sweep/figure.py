@@ -41,8 +41,7 @@ def draw_sweep(
         units: Metric -> unit.
         names: Metrics to show; by default the first three of `compare.NUMBERS`.
         x: Axis of the sweep along x; by default the first one with numbers, else the first.
-        by: Axis with one line per value; by default the first other one with names, else with
-            numbers.
+        by: Axis with one line per value; by default another one with names, else with numbers.
         look: Size of the figure.
 
     Returns:

@@ -252,9 +252,7 @@ def netem_makes(profile: DirectionProfile) -> DirectionProfile:
     """Return the profile with which the link's model behaves as netem does with `profile`.
 
     netem hardly correlates delays. If netem selects a packet both for loss and for duplication, one
-    copy arrives. netem can also lose the copy of a duplicated packet.
-
-    Source: Linux, net/sched/sch_netem.c.
+    copy arrives. netem can also lose the second copy. Source: Linux, net/sched/sch_netem.c.
     """
     loss, lost, single = profile.loss, mean_loss(profile.loss), 1.0 - profile.duplicate
     twice = profile.duplicate * (1.0 - lost) ** 2 / max(1e-9, 1.0 - single * lost)
