@@ -135,9 +135,7 @@ def send(
         except CloudrcError as error:
             return error
         except ValueError as error:
-            return ClusterError(
-                f"a link container has another version: {error}; upgrade the release"
-            )
+            return ClusterError(f"a link container has another version: {error}; upgrade it")
         if number in (state.change, state.refused):
             return state
         return TimedOutError(
