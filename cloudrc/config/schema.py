@@ -227,7 +227,8 @@ class Waypoint(Section):
     """Time limit for the flight to this point [s], not counting time in HOLD; after it the
     mission fails. null: 3 times the expected time"""
     speed_mps: Speed | None = None
-    """Speed of the carrot on the way to this point [m/s]; only with carrot. null: carrot.speed_mps"""
+    """Speed of the carrot on the way to this point [m/s]; only with carrot. null:
+    carrot.speed_mps"""
 
 
 class Carrot(Section):
@@ -269,8 +270,9 @@ class Mission(Section):
     steps: Steps | None = None
     """Random setpoints in place of waypoints"""
     setpoints: str | None = None
-    """CSV file with the columns time_s,x_m,y_m,z_m, in place of waypoints: the position of the setpoint
-    over time, with straight lines between the rows. A drive by hand writes such a file, drive.csv"""
+    """CSV file with the columns time_s,x_m,y_m,z_m, in place of waypoints: the position of the
+    setpoint over time, with straight lines between the rows. A drive by hand writes such a file,
+    drive.csv"""
     carrot: Carrot | None = None
     """Moves the setpoint at limited speed from waypoint to waypoint; null: the setpoint jumps"""
 
@@ -465,8 +467,8 @@ class Cloud(Section):
     horizon_max_s: CloudTime | None = None
     """Longest horizon of the prediction [s]. null: the link profile's value, else 1"""
     freeze_after_s: CloudTime | None = None
-    """If no telemetry confirms a new command for the horizon plus this time [s], cloud commands zero
-    velocity. null: the link profile's value, else 0.4"""
+    """If no telemetry confirms a new command for the horizon plus this time [s], cloud commands
+    zero velocity. null: the link profile's value, else 0.4"""
     command_rate_hz: Annotated[int, Field(ge=COMMAND_RATE_MIN_HZ, le=COMMAND_RATE_MAX_HZ)] = 100
     """Rate of the commands [Hz]. At less than 20 Hz the guard would never leave HOLD, which takes
     10 commands within 500 ms"""

@@ -133,12 +133,13 @@ cloud
 cloudrc_uplink_delay_seconds: One-way delay from world to cloud, late datagrams included; absent
     unless both ends prove that they share a clock.
 cloudrc_rtt_seconds: Round trip of applied commands, without their time in world.
-cloudrc_loop_delay_seconds: Round trip of applied commands, with their time in world: the paper's tau.
+cloudrc_loop_delay_seconds: Round trip of applied commands, with their time in world: the paper's
+    tau.
 cloudrc_delay_estimate_seconds: Clamped delay estimate: how far ahead cloud predicts the odometry.
 cloudrc_delay_estimate_error_seconds: Delay estimate minus the true time from the odometry to the
     application of the command, for the newest command that the robot confirmed.
-cloudrc_prediction_error_meters[axis]: Predicted minus measured position for the same instant, newest
-    value.
+cloudrc_prediction_error_meters[axis]: Predicted minus measured position for the same instant,
+    newest value.
 cloudrc_prediction_error_square_meters_total: Sum of the squared lengths of all prediction errors.
 cloudrc_predictions_judged_total: Predictions compared with a measurement.
 cloudrc_tracking_error_meters[axis]: Setpoint minus measured position, in the newest period.
