@@ -156,7 +156,7 @@ class Direction(Section):
     relative path starts at the folder of the file that contains this key"""
     loop: bool = False
     """Whether trace, changes and blackouts begin again after the end of the trace; netem refuses
-    it"""
+    true"""
     blackouts: tuple[Blackout, ...] = ()
     """Intervals in which every packet is lost; they may overlap"""
 
@@ -227,7 +227,8 @@ class Waypoint(Section):
     """Time limit for the flight to this point [s], not counting time in HOLD; after it the
     mission fails. null: 3 times the expected time"""
     speed_mps: Speed | None = None
-    """Speed of the carrot on the way to this point [m/s]; only with carrot. null: the carrot's"""
+    """Speed of the carrot on the way to this point [m/s]; only with carrot. null:
+    carrot.speed_mps"""
 
 
 class Carrot(Section):
@@ -269,10 +270,11 @@ class Mission(Section):
     steps: Steps | None = None
     """Random setpoints in place of waypoints"""
     setpoints: str | None = None
-    """CSV file time_s,x_m,y_m,z_m in place of waypoints: where the setpoint is over time, with
-    straight lines between the rows. A run that was driven by hand writes such a file, drive.csv"""
+    """CSV file with the columns time_s,x_m,y_m,z_m, in place of waypoints: the position of the
+    setpoint over time, with straight lines between the rows. A drive by hand writes such a file,
+    drive.csv"""
     carrot: Carrot | None = None
-    """Lets the setpoint move along the ways; null: the setpoint jumps to the next waypoint"""
+    """Moves the setpoint at limited speed from waypoint to waypoint; null: the setpoint jumps"""
 
     @property
     def count(self) -> int:
@@ -384,8 +386,8 @@ class World(Section):
     sensors: Sensors = Sensors()
     """Errors of the odometry for cloud; guard and onboard controller see the true state"""
     plant: Plant = Plant()
-    """How the true robot differs from its model; guard, onboard controller and cloud do not know.
-    A heavy or weak robot brakes worse, so that the guard may stop it too late"""
+    """How the true robot differs from its model; guard, onboard controller and cloud use the
+    model. A heavy or weak robot brakes worse, so the guard may stop it too late"""
     wind: Wind = Wind()
     """Horizontal wind. It acts by the drag of the rotors, the only drag of the robot, and not on a
     robot with stopped rotors"""
@@ -397,9 +399,9 @@ class Guard(Section):
     """Limits of the onboard guard; only world reads them."""
 
     command_age_max_ms: CommandAge | None = None
-    """Largest age of the odometry from which a command was computed [ms]. If this age of the
-    newest command is larger, the robot holds its position. null: the link
-    profile's value, else 250"""
+    """Largest age of a command [ms], counted from the odometry from which cloud computed it. If the
+    newest command is older, the robot holds its position. null: the link profile's value, else
+    250"""
     plan_max_s: PlanMax | None = None
     """Longest time for which the robot flies a command's plan after its arrival [s]; 0: no plan
     outlasts command_age_max_ms. null: 0.8 if cloud.plan_s is above 0, else 0"""
@@ -407,13 +409,13 @@ class Guard(Section):
     """Cap on the commanded speed [m/s]; a faster command is shortened. null: the largest speed
     from which the robot stops within 8.7 m, 6 m/s if command_age_max_ms is 250 and plan_max_s 0"""
     acceleration_max_mps2: Acceleration = 12.0
-    """Cap on the acceleration that the guard lets the onboard controller follow [m/s^2]"""
+    """Largest acceleration of the velocity that the onboard controller follows [m/s^2]"""
     yaw_rate_max_radps: Speed = 1.0
     """Cap on the commanded yaw rate [rad/s]; a faster command is shortened"""
     hold_max_s: HoldTime = 60.0
     """Time in HOLD during a mission after which the robot lands [s]. On the ground, a mission ends
     after this time without a fresh command, but at the earliest after 10 s. With a value below 1 s
-    minus guard.command_age_max_ms, the robot lands after every silence in flight"""
+    minus guard.command_age_max_ms, the robot lands after every HOLD in flight"""
 
 
 class Tunnel(Section):
@@ -460,13 +462,13 @@ class Cloud(Section):
     """Tracks the setpoint: a name, or a mapping with parameters"""
     plan_s: PlanTime = 0.0
     """Length of the plan of future velocities in each command [s], in steps of 10 ms. The robot
-    follows it while newer commands are late or lost. Needs a predictor with a model; the estimator
-    earliest fits. 0: no plan"""
+    follows it while newer commands are late or lost. Needs a predictor with a model; use it with
+    the estimator earliest. 0: no plan"""
     horizon_max_s: CloudTime | None = None
     """Longest horizon of the prediction [s]. null: the link profile's value, else 1"""
     freeze_after_s: CloudTime | None = None
-    """Time without the echo of a new command, beyond the horizon, after which cloud commands zero
-    velocity [s]. null: the link profile's value, else 0.4"""
+    """If no telemetry confirms a new command for the horizon plus this time [s], cloud commands
+    zero velocity. null: the link profile's value, else 0.4"""
     command_rate_hz: Annotated[int, Field(ge=COMMAND_RATE_MIN_HZ, le=COMMAND_RATE_MAX_HZ)] = 100
     """Rate of the commands [Hz]. At less than 20 Hz the guard would never leave HOLD, which takes
     10 commands within 500 ms"""
@@ -475,8 +477,8 @@ class Cloud(Section):
     the true time. While cloud computes, it begins no other command. Reports count this time in
     the delay of the downlink"""
     compute_deviation_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
-    """Standard deviation of this time [ms], which then has a gamma distribution; needs compute_ms
-    above 0"""
+    """Standard deviation of the time compute_ms [ms], which then has a gamma distribution; needs
+    compute_ms above 0"""
     compute_measured: bool = False
     """Whether a command in virtual time leaves only after the processor time that this machine
     needed for it, in addition to compute_ms. Such a flight is not repeatable"""
@@ -503,7 +505,7 @@ class Criteria(Section):
     fails"""
     settle_m: Positive | None = 0.15
     """Largest distance from the setpoint in the last 0.5 s of each random step [m]. An oscillation
-    that does not decay fails every mission. null: neither is judged"""
+    that does not decay fails every mission. null: neither distance nor oscillation is judged"""
     time_limit_s: TimeLimit = 60.0
     """Time limit of the mission [s], counted from its start; after this time the mission fails"""
 

@@ -79,7 +79,7 @@ _TABLE = f"""
 world cloud teleop link
 cloudrc_build_info[version, role, config]: Always 1; the labels name the process, its version and
     its configuration. Both ends of a run have the same configuration.
-cloudrc_ready: 1 while this process receives messages from its peer, else 0.
+cloudrc_ready: 1 while this process is ready, as /readyz on the same port says, else 0.
 cloudrc_cpu_periods_total: Scheduler periods (CFS) in which this container wanted CPU time.
 cloudrc_cpu_throttled_periods_total: Scheduler periods cut short by the CPU limit.
 cloudrc_cpu_throttled_seconds_total: Time for which the CPU limit stopped this container.
@@ -89,7 +89,8 @@ cloudrc_session_epoch: Epoch number of the current session.
 cloudrc_sessions_opened_total: Sessions opened since this process started.
 cloudrc_datagrams_total[direction, outcome]: Datagrams by outcome; updated once a second.
 cloudrc_datagrams_expected_total[direction]: Datagrams that have arrived or count as lost.
-cloudrc_datagrams_lost_total[direction]: Datagrams missing when 128 newer ones had been sent.
+cloudrc_datagrams_lost_total[direction]: Datagrams that had not arrived when the peer had sent 128
+    newer ones.
 cloudrc_datagrams_reordered_total[direction]: Datagrams that arrived after a newer one.
 cloudrc_link_gap_seconds: Time between two arrivals: of telemetry at cloud, of commands at world.
 cloudrc_link_believed[direction]: 1 if the incoming direction of the link matches its profile, 0 if
@@ -102,7 +103,7 @@ cloudrc_loop_busy_seconds_total: Time for which the loop computed.
 cloudrc_recorder_dropped_records_total = recorder_dropped: Records that did not reach the recording.
 cloudrc_recorder_sync_age_seconds: Time since the last complete sync of the recording to disk began:
     what a power cut would lose; absent without a recording.
-cloudrc_clock_steps_total: Times that somebody set the wall clock, on which no flight depends.
+cloudrc_clock_steps_total: Steps of the machine's wall clock; no flight depends on this clock.
 
 world
 cloudrc_clouds_admitted_total: Cloud processes that got a session, restarted ones included.
@@ -132,11 +133,13 @@ cloud
 cloudrc_uplink_delay_seconds: One-way delay from world to cloud, late datagrams included; absent
     unless both ends prove that they share a clock.
 cloudrc_rtt_seconds: Round trip of applied commands, without their time in world.
-cloudrc_loop_delay_seconds: Round trip of applied commands, with their time in world: paper's tau.
+cloudrc_loop_delay_seconds: Round trip of applied commands, with their time in world: the paper's
+    tau.
 cloudrc_delay_estimate_seconds: Clamped delay estimate: how far ahead cloud predicts the odometry.
 cloudrc_delay_estimate_error_seconds: Delay estimate minus the true time from the odometry to the
     application of the command, for the newest command that the robot confirmed.
-cloudrc_prediction_error_meters[axis]: Newest predicted minus measured position of one instant.
+cloudrc_prediction_error_meters[axis]: Predicted minus measured position for the same instant,
+    newest value.
 cloudrc_prediction_error_square_meters_total: Sum of the squared lengths of all prediction errors.
 cloudrc_predictions_judged_total: Predictions compared with a measurement.
 cloudrc_tracking_error_meters[axis]: Setpoint minus measured position, in the newest period.

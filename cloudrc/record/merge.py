@@ -178,13 +178,15 @@ def cut_to_last_mission(mission: Contents) -> bool:
 
 
 def _last_mission(contents: Contents) -> tuple[int | None, int | None, int]:
-    """Find the stamps [ns] of the last mission's start and end, and of the end of the one before.
+    """Find the times [ns] of the last mission's start and end, and of the end of the one before.
 
-    None: the stamp is missing; -1: the recording has no earlier mission.
+    None: the event is missing; -1: the recording has no earlier mission.
     """
-    table = _table(contents, "/mission")
+    # The times of the messages, which are later than the stamps in them.
+    times_ns = [message[1] for message in contents.messages if message[0] == "/mission"]
+    events = _table(contents, "/mission")["event"].tolist()
     began, ended, earlier = None, None, -1
-    for stamp_ns, event in zip(table["stamp_ns"].tolist(), table["event"].tolist(), strict=True):
+    for stamp_ns, event in zip(times_ns, events, strict=True):
         if event == "started":
             began, ended, earlier = stamp_ns, None, earlier if ended is None else ended
         elif event not in UNDER_WAY and ended is None:

@@ -17,8 +17,8 @@ ERROR = "error"
 """Verdict of a flight that raised an exception, and code of its only failure."""
 Row: TypeAlias = dict[str, Any]
 """Result of a flight: `verdict`; `failures` (codes, the earliest first); `text` (the first failure,
-or why a metric has no value); `numbers` (metric -> value); and `records_sha256`. A row of a sweep
-also has `key`, `point` and `seed`."""
+or why a metric has no value); `numbers` (metric -> value); `records_sha256`; and, if a plug-in
+failed, `traceback`. A row of a sweep also has `key`, `point` and `seed`."""
 
 
 def fly_point(experiment: ResolvedExperiment) -> Row:
@@ -41,6 +41,7 @@ def measure(experiment: ResolvedExperiment) -> Row:
         "text": failures[0].text if failures else next(notes, ""),
         "numbers": {name: number.value for name, number in found.numbers.items()},
         "records_sha256": found.run.records_sha256,
+        **({"traceback": found.traceback} if found.traceback else {}),
     }
 
 
