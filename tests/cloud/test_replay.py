@@ -249,7 +249,7 @@ def test_values_of_a_file_replace_the_parameters(tmp_path):
     [
         (command_history.build, {"model": "none.yaml"}, "model: none.yaml: cannot be read.*ident"),
         (kalman.build, {"parameters": {"model": "m.yaml"}}, "parameters: .* as model_file, beside"),
-        (kalman.build, {"model_file": "none.yaml"}, "model_file: is for model: first_order"),
+        (kalman.build, {"model_file": "none.yaml"}, "model_file: needs `model: first_order`"),
         (kalman.build, {"parameters": {"gain": 1}}, "^gain: "),
     ],
 )

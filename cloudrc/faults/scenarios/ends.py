@@ -19,8 +19,8 @@ from cloudrc.tunnel.handshake import BUSY_TEXT
 @scenario(
     13,
     "cloud-killed",
-    injects="SIGKILL of the cloud process, a new one 0.8 s later",
-    expects="HOLD by 252 ms; the new process commands in <= 2 s; the same waypoint goes on",
+    injects="SIGKILL of the cloud process; a new process starts 0.8 s later",
+    expects="HOLD within 252 ms; new commands in <= 2 s; the mission continues at its waypoint",
 )
 def _cloud_killed(outcome: Outcome, seed: int) -> None:
     at, down = measures.instant(seed), 0.8
@@ -40,7 +40,7 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
     15,
     "cloud-paused",
     injects="SIGSTOP of the cloud process for 5 s",
-    expects="HOLD; of what it computed before nothing is applied",
+    expects="HOLD; world applies no command that is too old",
 )
 def _cloud_paused(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
@@ -59,8 +59,8 @@ def _cloud_paused(outcome: Outcome, seed: int) -> None:
     17,
     "world-restarted",
     injects="the world pod restarts within 2 s",
-    expects="back on the ground, never airborne without power; a new epoch, commands of the old "
-    "one are refused; nothing resumes alone",
+    expects="the robot is at its spawn on the ground, and stays there; a new epoch; world rejects "
+    "commands of the old epoch",
 )
 def _world_restarted(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
@@ -87,8 +87,8 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
     25,
     "two-clouds",
     injects="a second cloud with the same key; later the first one leaves",
-    expects="the first keeps authority while fresh; after HOLD the second gets a higher epoch; "
-    "commands never interleave",
+    expects="the first cloud keeps the session until it leaves; then HOLD, and the second cloud "
+    "gets a higher epoch; commands of both never mix",
 )
 def _two_clouds(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed, 4.0, 12.0)
@@ -121,7 +121,7 @@ def _two_clouds(outcome: Outcome, seed: int) -> None:
     "swizzle-clog",
     injects="uplink, downlink, cloud, world and teleop freeze one by one and return in random "
     "order",
-    expects="always a safe state; the mission goes on",
+    expects="always a safe state; the mission continues",
 )
 def _swizzle(outcome: Outcome, seed: int) -> None:
     """Stop each direction of the link before its sender stops, so that datagrams are lost.

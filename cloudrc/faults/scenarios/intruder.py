@@ -52,7 +52,7 @@ def _check_no_effect(
 @scenario(
     8,
     "corruption",
-    injects="1 % of the datagrams lose a bit; for 1 s, 1 % of all bits turn over",
+    injects="one bit flips in 1 % of the datagrams; for 1 s, 1 % of all bits flip",
     expects="corrupted datagrams are dropped",
 )
 def _corruption(outcome: Outcome, seed: int) -> None:
@@ -77,7 +77,7 @@ def _corruption(outcome: Outcome, seed: int) -> None:
 @scenario(
     20,
     "garbage-flood",
-    injects="10,000 datagrams of garbage per second at the world's port",
+    injects="10,000 random datagrams per second arrive at world's port",
     expects="no effect: the same path, bit by bit",
 )
 def _flood(outcome: Outcome, seed: int) -> None:
@@ -96,7 +96,7 @@ def _flood(outcome: Outcome, seed: int) -> None:
 @scenario(
     21,
     "old-session",
-    injects="a captured flight is played to both ends after their restart",
+    injects="world and cloud get the captured datagrams of an earlier flight",
     expects="no effect: the same path, bit by bit",
 )
 def _old_session(outcome: Outcome, seed: int) -> None:
@@ -119,7 +119,7 @@ def _old_session(outcome: Outcome, seed: int) -> None:
 @scenario(
     22,
     "forged-command",
-    injects="copies with bits turned over, and with a counter far ahead",
+    injects="copies of datagrams with flipped bits, and with a much higher counter",
     expects="no effect: the same path, bit by bit",
 )
 def _forgery(outcome: Outcome, seed: int) -> None:
@@ -137,7 +137,8 @@ def _forgery(outcome: Outcome, seed: int) -> None:
     "malformed",
     injects="empty, truncated, oversized datagrams and those of another version; a cloud of "
     "another version for 2 s",
-    expects="dropped before any cryptography: the same path, bit by bit; no session with the other",
+    expects="dropped before any cryptography: the same path, bit by bit; no session between two "
+    "versions",
 )
 def _malformed(outcome: Outcome, seed: int) -> None:
     rng, newer = generator(seed, 20), bytes([codec.VERSION + 1])

@@ -33,8 +33,8 @@ EXCESSIVE: dict[str, dict[str, Any]] = {
 @scenario(
     23,
     "invalid-values",
-    injects="NaN, infinite, huge and over-limit values with a valid seal",
-    expects="refused or clamped; 5 refused in 1 s: LAND, latched",
+    injects="NaN, infinite, huge and excessive values in authentic commands",
+    expects="rejected or limited; 5 rejected commands in 1 s cause LAND until acknowledged",
 )
 def _invalid_values(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
@@ -76,8 +76,8 @@ def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
 @scenario(
     27,
     "impossible-mission",
-    injects="waypoints of NaN, in a wall, behind one, beyond the fence, 10,001 of them",
-    expects="refused as a whole, before anything is flown",
+    injects="waypoints of NaN, in a wall, behind a wall, beyond the fence; 10,001 waypoints",
+    expects="the whole mission is refused before the flight",
 )
 def _impossible(outcome: Outcome, seed: int) -> None:
     scene, first = load_scene("pipes"), (0.5, 0.0, 0.8)
@@ -118,8 +118,8 @@ def _wall_of(pipe: Pipe) -> Vector:
 @scenario(
     28,
     "waypoint-not-reached",
-    injects="what the cloud commands comes to nothing",
-    expects="HOLD; the leg ends by its limit of time",
+    injects="cloud commands the robot to stay where it is",
+    expects="the leg ends at its time limit, and HOLD begins",
 )
 def _unreachable(outcome: Outcome, seed: int) -> None:
     """Command the robot to stay where it is, so that it cannot reach the next waypoint."""
