@@ -155,18 +155,6 @@ def test_the_peak_force_is_that_of_every_step_and_the_impulse_stops_the_tip(at_t
     assert simulator.take_tip_force() == (0.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("spawn", "reference", "found"),
-    [
-        ((-1.0, 0.0, 0.7), (0.5, 0.0, 0.0), ("pipe_1", True)),
-        ((5.66, -6.42, 0.7), (0.0, 0.5, 0.0), ("pipe_3", False)),
-    ],
-)
-def test_a_contact_names_the_touched_pipe(scene_at, spawn, reference, found):
-    touch = fly(Simulator("pelican", scene_at(*spawn)), LowLevel(), reference, 2.0)[0]
-    assert (touch.body, touch.tip) == found
-
-
 def test_the_floor_is_a_new_contact_only_after_a_flight():
     simulator, low_level = Simulator("pelican", "empty"), LowLevel()
     for _ in range(200):
