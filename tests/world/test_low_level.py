@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.world.low_level import NOSE_COSINE_MIN, YAW_SINE_MAX, LowLevel, allocate, attitude
 from cloudrc.world.readings import Readings
+from tests.world.conftest import normalised
 
 WEIGHT = 10.3005  # 1.05 kg * 9.81 m/s^2
 KF = 9.9865e-6
@@ -62,16 +63,14 @@ unit = st.floats(-1.0, 1.0)
     quaternion=st.tuples(*[unit] * 4).filter(lambda q: np.linalg.norm(q) > 0.1),
 )
 def test_attitude_is_the_matrix_formula(force, quaternion):
-    w, *q = np.array(quaternion) / np.linalg.norm(quaternion)
-    cross = np.array([[0, -q[2], q[1]], [q[2], 0, -q[0]], [-q[1], q[0], 0]])
-    rotation = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    orientation, rotation = normalised(quaternion)
     z_d = np.array(force) / np.linalg.norm(force)
     y_d = np.cross(z_d, (1.0, 0.0, 0.0))
     y_d /= np.linalg.norm(y_d)
     error = np.column_stack([np.cross(y_d, z_d), y_d, z_d]).T @ rotation
     assume(error[1, 1] > NOSE_COSINE_MIN and abs(rotation[1, 0]) < YAW_SINE_MAX)
     error = 0.5 * (error - error.T)
-    thrust, *torque = attitude(force, turned((w, *q)))
+    thrust, *torque = attitude(force, turned(orientation))
     assert thrust == pytest.approx(np.dot(force, rotation[:, 2]), abs=1e-9)
     assert torque == pytest.approx([-error[2, 1], -error[0, 2], -0.035 * error[1, 0]], abs=1e-9)
 

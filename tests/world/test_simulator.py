@@ -12,6 +12,7 @@ from cloudrc.world.low_level import LowLevel
 from cloudrc.world.readings import Readings
 from cloudrc.world.rotors import STOPPED, Rotors
 from cloudrc.world.simulator import Simulator, replay
+from tests.world.conftest import normalised
 
 AT_REST = Readings.of((*ZERO, *UPRIGHT), (*ZERO, *ZERO))
 
@@ -21,13 +22,6 @@ def fly(simulator, low_level, reference, duration):
     for _ in range(round(duration / simulator.dt)):
         simulator.step(low_level.update(simulator.readings, reference))
     return simulator.take_contacts()
-
-
-def steady(speeds, readings):
-    """Return the thrusts and drag of rotors that turn as commanded."""
-    rotors = Rotors(0.002)
-    rotors.speeds = speeds
-    return rotors.step(speeds, readings)
 
 
 def test_rotors_are_faster_up_than_down():
@@ -49,16 +43,16 @@ unit = st.floats(-1.0, 1.0)
     rate=st.tuples(*[st.floats(-5.0, 5.0)] * 3),
 )
 def test_thrust_and_drag_are_those_of_the_rotors(speeds, quaternion, velocity, rate):
-    w, *q = np.array(quaternion) / np.linalg.norm(quaternion)
-    cross = np.array([[0, -q[2], q[1]], [q[2], 0, -q[0]], [-q[1], q[0], 0]])
-    rotation = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    orientation, rotation = normalised(quaternion)
     force, torque = np.zeros(3), np.zeros(3)
     hubs = [(0.21, 0, 0.05), (0, 0.21, 0.05), (-0.21, 0, 0.05), (0, -0.21, 0.05)]
     for speed, hub in zip(speeds, hubs, strict=True):
         across = (rotation.T @ velocity + np.cross(rate, hub)) * (1, 1, 0)
         force += -speed * 8.06428e-5 * across
         torque += np.cross(hub, -speed * 8.06428e-5 * across)
-    found = steady(speeds, Readings.of((*ZERO, w, *q), (*velocity, *rate)))
+    rotors = Rotors(0.002)
+    rotors.speeds = speeds
+    found = rotors.step(speeds, Readings.of((*ZERO, *orientation), (*velocity, *rate)))
     assert found[:4] == pytest.approx([9.9865e-6 * speed**2 for speed in speeds])
     assert found[4:] == pytest.approx([*(rotation @ force), *torque], abs=1e-9)
 
@@ -88,16 +82,12 @@ def test_a_velocity_is_followed(scene_at):
 
 
 def test_reset_gives_the_same_flight_again(scene_at):
-    simulator, low_level = Simulator("pelican", scene_at(8.0, -6.42, 0.9)), LowLevel()
-    ends = []
+    simulator, ends = Simulator("pelican", scene_at(8.0, -6.42, 0.9)), set()
     for _ in range(2):
         simulator.reset()
-        low_level.reset()
-        for _ in range(1000):
-            simulator.step(low_level.update(simulator.readings, (0.2, 0.0, 0.0)))
-        assert len(simulator.touches) == 1, "those of the last flight are forgotten"
-        ends.append(simulator.state()[0].tobytes())
-    assert ends[0] == ends[1]
+        assert len(fly(simulator, LowLevel(), (0.2, 0.0, 0.0), 2.0)) == 1
+        ends.add(simulator.state()[0].tobytes())
+    assert len(ends) == 1
 
 
 @pytest.mark.parametrize("before", [0.2, 1.5])

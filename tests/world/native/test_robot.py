@@ -28,7 +28,6 @@ from tests.world.guard.conftest import MS, SECOND, UP, hostile
 
 pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
 LIMITS = Limits(fence.LOW, fence.HIGH)
-PERIOD_NS = 10 * MS
 
 
 def robot_of(kind, scene="empty", limits=LIMITS, model="pelican"):
@@ -65,8 +64,8 @@ class Pilot:
     def fly(self, seconds, policy, parts=(4, 6)):
         """Fly; run every period in two parts [ms], as arrivals of commands divide it."""
         for _ in range(round(seconds * 100)):
-            if (velocity := policy(self)) is not None:
-                command = Command(0, self.now_ns, 0, velocity, 0.0)
+            if (sent := policy(self)) is not None:
+                command = sent if type(sent) is Command else Command(0, self.now_ns, 0, sent, 0.0)
                 self.guard.accept_command(command, self.now_ns)
             for part in parts:
                 self.robot.run(self.now_ns, self.now_ns + part * MS)
@@ -125,24 +124,21 @@ def test_commands_fly_the_same_in_c(make, seconds, spawn, limits, least, scene_a
 @pytest.mark.parametrize("seed", range(3))
 def test_plans_fly_the_same_in_c(seed):
     """Commands every 10 ms or much later; a plan's velocities are due at odd times."""
-    limits = Limits(fence.LOW, fence.HIGH, speed_max=4.0, plan_max_ns=800 * MS)
-    robots = both(limits=limits)
-    count, flights = Count(robots[1]), []
-    for robot in robots:
-        rng, seen = np.random.default_rng(seed), []
-        robot.put_on_ground(0, "test")
-        robot.guard.start_mission(0)
-        for now_ns in range(0, 6 * SECOND, PERIOD_NS):
+    robots = both(limits=Limits(fence.LOW, fence.HIGH, speed_max=4.0, plan_max_ns=800 * MS))
+    count, pilots = Count(robots[1]), [Pilot(robot) for robot in robots]
+    for pilot in pilots:
+        rng = np.random.default_rng(seed)
+
+        def policy(pilot, rng=rng):
+            now_ns = pilot.now_ns
             velocity = UP if now_ns < SECOND else tuple(rng.uniform(-0.8, 0.8, 3).tolist())
             plan = tuple(map(tuple, rng.uniform(-0.8, 0.8, (int(rng.integers(0, 40)), 3)).tolist()))
-            ahead_ns = int(rng.integers(0, 60 * MS))
-            if now_ns < 3 * SECOND or rng.random() < 0.05:
-                command = Command(0, now_ns, 0, velocity, 0.0, plan, now_ns + ahead_ns)
-                robot.guard.accept_command(command, now_ns)
-            robot.run(now_ns, now_ns + PERIOD_NS)
-            seen += [robot.simulator.readings, robot.guard.reference, robot.guard.state]
-        flights.append(seen)
-    assert flights[0] == flights[1]
+            planned_ns = now_ns + int(rng.integers(0, 60 * MS))
+            sends = now_ns < 3 * SECOND or rng.random() < 0.05
+            return Command(0, now_ns, 0, velocity, 0.0, plan, planned_ns) if sends else None
+
+        pilot.fly(6.0, policy)
+    assert pilots[0].seen == pilots[1].seen
     assert count.steps > 1000
 
 
