@@ -161,7 +161,7 @@ def test_a_failing_plug_in_is_counted_and_reported_once(kind, bad):
     assert fault.text.endswith(f"fix cloud.{kind} or choose another")
 
 
-def test_a_failure_names_the_line_or_the_value_that_is_not_finite():
+def test_a_fault_names_the_line_or_the_bad_value():
     a_loop = loop(None, NOT_FINITE(), raises(ZeroDivisionError("no"))(), heard_ms=1090)
     command(a_loop, 1094)
     value, line = a_loop.take_faults()

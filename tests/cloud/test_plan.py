@@ -73,7 +73,7 @@ def test_a_command_has_the_plan_and_its_time():
     assert sent.velocity_at(221 * MS) == sent.plan[2]
 
 
-def test_a_frozen_loop_or_a_predictor_without_a_model_plans_nothing():
+def test_without_a_model_or_while_frozen_there_is_no_plan():
     a_loop = loop(predictor=Modelled(), heard_ms=1100, echo_ms=1000, plan=0.05)
     assert command(a_loop, 1600)[0][3:] == (ZERO, 0.0, (), -1)
     sent, _ = command(loop(heard_ms=1090, echo_ms=1000, plan=0.05), 1094)

@@ -300,7 +300,7 @@ def test_a_velocity_command_is_reached_without_a_steady_error(velocity, limit):
     assert state.velocity == pytest.approx(velocity, abs=0.1 if any(velocity) else 0.02)
 
 
-def test_a_sinking_reference_leads_the_robot_by_half_a_metre_per_second():
+def test_a_sinking_reference_leads_by_half_a_metre_per_second():
     sinking = at_rest()
     states = [sinking.step((0.0, 0.0, -3.0), 0.01) for _ in range(20)]
     falls = [(b.velocity[2] - a.velocity[2]) / 0.01 for a, b in pairwise(states)]

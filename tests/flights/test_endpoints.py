@@ -18,7 +18,7 @@ def talk():
 @pytest.mark.parametrize(
     "wakes", [(), (21_300_000,), (20_500_000, 21_300_000), (20 * MS, 20 * MS + 1)]
 )
-def test_a_command_is_applied_at_the_next_tick_whenever_the_driver_wakes(talk, wakes):
+def test_a_command_is_applied_at_the_next_step_after_any_wake(talk, wakes):
     for wake in wakes:
         talk.world.handle_deadline(wake)
     talk.now_ns = 21_300_000
@@ -31,7 +31,7 @@ def test_a_command_is_applied_at_the_next_tick_whenever_the_driver_wakes(talk, w
     assert told == (30 * MS, 21_300_000, 8 * MS)
 
 
-def test_a_command_at_the_time_of_a_sample_waits_for_the_next_step(talk):
+def test_a_command_at_a_sample_waits_for_the_next_step(talk):
     """The same result in real time, where its time is a little later."""
     talk.now_ns = 20 * MS
     talk.world.handle_deadline(talk.now_ns)

@@ -77,7 +77,7 @@ def test_a_link_that_loses_most_loses_no_alarm(seed):
     assert states(ends, 4)[-1] is ESTOP
 
 
-def test_an_acknowledgement_ends_the_alarm_and_a_later_stop_holds(ends):
+def test_an_acknowledgement_ends_one_alarm_not_the_next_stop(ends):
     teleop = ends.cloud.teleop
     teleop.outputs.append(ALARM)
     assert states(ends, 1) == [ESTOP]

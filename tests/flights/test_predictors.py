@@ -53,7 +53,7 @@ def test_a_replay_is_stable_at_round_trips_of_seconds(case):
     assert flight.verdict.failures == ()
 
 
-def test_before_the_first_echo_the_start_of_the_mission_tells_the_delay():
+def test_before_the_first_echo_the_start_shows_the_delay():
     """On the ground, cloud knows no delay but the round trip of the operator's request."""
     control = fly("steps", "mission.steps.count=1", *link(100)).flight.control
     first = control["horizon"][:10]

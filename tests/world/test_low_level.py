@@ -23,7 +23,7 @@ def turned(orientation, rate=ZERO):
 AT_REST = turned(UPRIGHT)
 
 
-def test_proportional_and_integral_force_carry_the_mass_and_oppose_the_error():
+def test_the_force_carries_the_mass_and_opposes_the_error():
     # 10.3005 / 4 = 2.575125 N; / 9.9865e-6 = 257860.6; root 507.80.
     assert LowLevel().update(AT_REST, ZERO) == pytest.approx((507.80,) * 4, abs=0.005)
     # e = v - v_ref = (.1, -.1, .1): P = 4, 4, 10 times; the integral after 2 ms is .0002.
@@ -47,7 +47,7 @@ def test_the_integral_force_in_x_and_y_is_limited():
     assert low_level.force(ZERO, ZERO) == pytest.approx((0.3, -0.3, WEIGHT + 2.5 * 0.40))
 
 
-def test_a_forward_force_pitches_the_nose_down_and_rates_are_damped():
+def test_a_forward_force_pitches_down_and_rates_are_damped():
     # Wanted tilt atan(3/4) about +y, so e_R = -sin = -.6; thrust is the force's part along z.
     assert attitude((3.0, 0.0, 4.0), AT_REST) == pytest.approx((4.0, 0, 0.6, 0))
     spinning = turned(UPRIGHT, (1.0, 2.0, 3.0))

@@ -132,7 +132,7 @@ def test_the_tip_touches_the_board_and_again_after_0_1_s_without(at_the_board):
     assert (again.body, again.tip) == ("board", True)
 
 
-def test_the_peak_force_is_that_of_every_step_and_the_impulse_stops_the_tip(at_the_board):
+def test_peak_force_and_impulse_of_the_tip_include_every_step(at_the_board):
     simulator, low_level = at_the_board
     peaks, every = [], []
     for _ in range(100):

@@ -69,12 +69,12 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
     flight.fly(at + 12.0)
     measures.safe(outcome, flight)
     after = [c for c in flight.changes if c.stamp_ns * 1e-9 > at]
-    outcome.same("changes of the guard after it", len(after), 0)
+    outcome.same("changes of the guard after the restart", len(after), 0)
     path = [r for r in flight.trajectory() if r.stamp_ns * 1e-9 > at]
     moved = max((hypot(*r.odometry.velocity) for r in path), default=nan)
     outcome.most("speed on the ground", moved, 0.01, "m/s")
     raised = measures.drift(flight, at, flight.now)
-    outcome.most("way from where it stood up", raised, 0.01, "m")
+    outcome.most("distance from its place after the restart", raised, 0.01, "m")
     outcome.true("mission failed", flight.mission.state == "failed")
     coded = "world_restarted" in str(flight.mission.verdict)
     outcome.true("with the code world_restarted", coded)
@@ -97,23 +97,23 @@ def _two_clouds(outcome: Outcome, seed: int) -> None:
     assert isinstance(group, EndpointGroup)
     flight.fly(at + 5.0)
     opened = max(measures.epochs(flight), default=-1)
-    outcome.same("epochs while both are there", opened, 2)
+    outcome.same("epochs while both clouds run", opened, 2)
     flight.fly(at + 6.0)
-    outcome.same("HOLDs while both are there", len(measures.held(flight)), 0)
+    outcome.same("HOLDs while both clouds run", len(measures.held(flight)), 0)
     group.members = group.members[1:]  # the first leaves
     flight.fly(at + 14.0)
     measures.safe(outcome, flight)
     refused = "world datagrams_total downlink busy", "world sessions_refused_total"
     moves(outcome, flight, *refused, since=at)
     told = measures.told(group.others, "busy")
-    outcome.true("the second says why it waits, once", [r.text for r in told] == [BUSY_TEXT])
+    outcome.true("the second reports once why it waits", [r.text for r in told] == [BUSY_TEXT])
     said = min((r.stamp_ns * 1e-9 for r in told), default=nan)
-    outcome.most("it says so after", said - at, 1.0, "s")
+    outcome.most("the second cloud reports it after", said - at, 1.0, "s")
     by_first = [r for r in measures.seen_by(flight, "cloud", at + 6.0) if isinstance(r, Fault)]
-    outcome.same("faults that the first tells of", len(by_first), 0)
-    measures.held_in_time(outcome, flight, "HOLD once the first is gone")
+    outcome.same("faults that the first cloud reports", len(by_first), 0)
+    measures.held_in_time(outcome, flight, "HOLD after the first cloud has left")
     later = [epoch for epoch in measures.epochs(flight) if epoch > 2]
-    outcome.true("then the second gets a higher epoch", bool(later))
+    outcome.true("the second cloud then gets a higher epoch", bool(later))
 
 
 @scenario(

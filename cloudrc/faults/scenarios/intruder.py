@@ -46,7 +46,7 @@ def _check_no_effect(
     moves(outcome, flight, *metrics, since=since)
     outcome.least("hostile datagrams", sum(sent), 1000)
     same = measures.epochs(clean) == measures.epochs(flight)
-    outcome.true("they opened no session", same)
+    outcome.true("hostile datagrams opened no session", same)
 
 
 @scenario(
@@ -113,7 +113,7 @@ def _old_session(outcome: Outcome, seed: int) -> None:
     makes = [lambda data, tape=tape: islice(tape, 6) for tape in tapes]
     _check_no_effect(outcome, seed, makes, "tag", since=SETTLED)
     left = sum(len(list(tape)) for tape in tapes)
-    outcome.same("captured datagrams that were not played to an end", left, 0)
+    outcome.same("captured datagrams that were not sent", left, 0)
 
 
 @scenario(
@@ -156,4 +156,4 @@ def _malformed(outcome: Outcome, seed: int) -> None:
     fly_safely(outcome, flight)
     told = [fault.text for fault in measures.told(flight.of_world, "version")]
     text = f"peer speaks v{codec.VERSION + 1}, we speak v{codec.VERSION}"
-    outcome.true(f"it is told once: {text}", len(told) == 1 and told[0].startswith(text))
+    outcome.true(f"reported once: {text}", len(told) == 1 and told[0].startswith(text))

@@ -84,10 +84,12 @@ def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
     measures.safe(outcome, flight)
     held = measures.first_into(flight, GuardState.HOLD)
     landed = measures.first_into(flight, GuardState.LAND)
-    outcome.most(f"{where}: LAND 60 s after HOLD, off by", abs(landed - held - 60.0), 0.01, "s")
+    outcome.most(
+        f"{where}: deviation of LAND from 60 s after HOLD", abs(landed - held - 60.0), 0.01, "s"
+    )
     fallen = [-r.odometry.velocity[2] for r in flight.trajectory() if r.stamp_ns >= landed * 1e9]
     fastest = max(fallen, default=nan)
-    outcome.most(f"{where}: descent at 0.5 m/s, off by", abs(fastest - 0.5), 0.05, "m/s")
+    outcome.most(f"{where}: deviation of the descent from 0.5 m/s", abs(fastest - 0.5), 0.05, "m/s")
     rotor = max(flight.robot.simulator.rotor_speeds)
     outcome.most(f"{where}: fastest rotor", rotor, 1.0, "rad/s")
     outcome.true(f"{where}: touched down", flight.changes[-1].cause == Cause.DOWN.words)
@@ -110,7 +112,7 @@ def _loss(outcome: Outcome, seed: int) -> None:
     flight = fly_safely(outcome, Flight(seed=seed, link=conditions(loss=0.3)))
     outcome.same("HOLDs", len(measures.held(flight)), 0)
     error, usual = (measures.number(each, "tracking_rms_measured") for each in (flight, clean))
-    outcome.most("tracking error over that without loss", error / usual, 1.5)
+    outcome.most("tracking error, relative to that without loss", error / usual, 1.5)
     lost = "world datagrams_lost_total downlink", "cloud datagrams_lost_total uplink"
     moves(outcome, flight, *lost, since=0.0)
     outcome.least("loss in the report", measures.number(flight, "loss_uplink"), 0.25)

@@ -78,7 +78,7 @@ def _delay_step(outcome: Outcome, seed: int) -> None:
         for r in flight.of_cloud
         if isinstance(r, Control) and at + 0.5 <= r.stamp_ns * 1e-9 < at + 2.0
     ]
-    outcome.most("delay estimate off after 0.5 s, share", max(off, default=nan), 0.2)
+    outcome.most("relative error of the delay estimate after 0.5 s", max(off, default=nan), 0.2)
     outcome.same("HOLDs", len(measures.held(flight)), 0)
     moves(outcome, flight, "cloud delay_estimate_seconds", "cloud rtt_seconds", since=at)
 
@@ -94,9 +94,9 @@ def _asymmetry(outcome: Outcome, seed: int) -> None:
     flight = fly_safely(outcome, Flight(*settings, seed=seed, cloud_clock=Clock(HOUR_NS)))
     outcome.same("HOLDs", len(measures.held(flight)), 0)
     rtt = measures.reading(flight, "cloud", "rtt_seconds")
-    outcome.most("metric rtt_seconds, its mean is off 0.2 s by", abs(rtt - 0.2), 0.01, "s")
+    outcome.most("deviation of the mean of rtt_seconds from 0.2 s", abs(rtt - 0.2), 0.01, "s")
     arrivals = [r for r in (*flight.of_world, *flight.of_cloud) if isinstance(r, Arrival)]
-    outcome.true("no one-way delay is claimed", all(isnan(r.delay) for r in arrivals))
+    outcome.true("no one-way delay is reported", all(isnan(r.delay) for r in arrivals))
 
 
 @scenario(

@@ -118,7 +118,7 @@ def test_a_plan_with_one_absurd_number_is_rejected_as_a_whole(absurd):
     assert guard.state is GuardState.LAND
 
 
-def test_played_velocities_are_capped_and_forgotten_with_the_session():
+def test_a_plan_is_capped_and_forgotten_with_the_session():
     guard = following(planned([0.1, 9.0, 9.0, *[0.2] * 60]))
     run(guard, 0, 50 * MS)
     assert guard.counts["limited_speed"] == 2

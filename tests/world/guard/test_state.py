@@ -508,7 +508,7 @@ def test_c_may_run_the_steps_of_a_fresh_command_in_the_air():
         assert (next_ns, asked) == (next_ms * MS, velocity)
 
 
-def test_c_runs_no_step_before_take_off_or_on_the_ramp_after_a_hold():
+def test_c_runs_no_step_before_take_off_or_after_a_hold():
     assert taking_off(0.01).plain_track(10 * MS) is None
     guard = taking_off(1.0)
     run(guard, 10 * MS, 2 * SECOND, (0.0, 0.0, 1.1))
