@@ -4,12 +4,11 @@ import pytest
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.controllers.pid import build as pid
-from cloudrc.cloud.estimators.earliest import build as earliest
 from cloudrc.cloud.plan import make_plan
 from cloudrc.cloud.predictors import Model
 from cloudrc.cloud.predictors.last_sample import LastSample
 from cloudrc.messages import UPRIGHT, ZERO, Motion, Odometry, Setpoint
-from tests.cloud.conftest import HERE, MS, Integrating, command, loop, telemetry
+from tests.cloud.conftest import HERE, MS, Integrating, command, loop
 
 
 class Obedient(Model):
@@ -110,15 +109,3 @@ def test_without_its_plan_a_command_leaves_and_a_fault_says_why(predictor, contr
     assert a_loop.counts == {f"{kind}_failed": 1}
     for part in (text, "cloud sends this command without a plan", f"fix cloud.{kind}"):
         assert part in a_loop.faults[0].text
-
-
-def test_the_earliest_command_sets_the_horizon():
-    a_loop = loop(estimator=lambda: earliest(2), heard_ms=1090, echo_ms=1000)
-    horizons = []
-    for k, applied_ms in enumerate((60, 30, 95, 95)):
-        stamp_ms = 110 + 10 * k
-        now_ms = 1000 + stamp_ms
-        seen = telemetry(stamp_ms, echo_ms=1000 + stamp_ms - applied_ms, hold_ms=0)
-        a_loop.observe(seen, now_ms * MS)
-        horizons.append(command(a_loop, now_ms)[1].horizon)
-    assert horizons == pytest.approx([0.06, 0.03, 0.03, 0.095])

@@ -1,18 +1,13 @@
-"""The contract of both endpoints without a link: ticks, bytes of any kind, stalls."""
+"""World without a link: when commands act, and what happens after a stall."""
 
 from itertools import pairwise
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from cloudrc.records import CommandApplied, Fault, GroundTruth, TelemetrySent
-from tests.flights.conftest import HOVER, MS, join, talking
+from tests.flights.conftest import MS, talking
 
-
-@pytest.fixture
-def talk():
-    return talking()
+talk = pytest.fixture(talking)
 
 
 @pytest.mark.parametrize(
@@ -38,16 +33,6 @@ def test_a_command_at_a_sample_waits_for_the_next_step(talk):
     talk.send(talk.command(basis_ns=20 * MS))
     talk.wait(10)
     assert [applied.stamp_ns for applied in talk.take(CommandApplied)] == [22 * MS]
-
-
-ENDS = join(HOVER)[:2]
-
-
-@given(st.binary(max_size=300))
-@settings(max_examples=60, deadline=None)
-def test_no_bytes_make_an_end_raise(data):
-    for end in ENDS:
-        end.receive_datagram(data, 0)
 
 
 def test_after_a_stall_waiting_commands_are_stale(talk):

@@ -8,6 +8,7 @@ from cloudrc.faults.flight import SECRET, Flight
 from cloudrc.faults.measures import epochs
 from cloudrc.messages import GuardState
 from cloudrc.tunnel.keys import Key, KeySet
+from tests.flights.conftest import both_ways
 
 NEW = KeySet(Key(b"n" * 32), SECRET.current)
 ONLY = KeySet(NEW.current)
@@ -18,7 +19,7 @@ HOLD_MAX = 2 * DELAY + 1.1
 HOVER = (
     "mission.waypoints=[{position_m: [0.5, 0, 0.8], dwell_s: 400, time_limit_s: 500}]",
     *("criteria.time_limit_s=500", "criteria.contact=false", "link.profile=ideal"),
-    *(f"link.{way}.delay_ms={DELAY * 1e3}" for way in ("uplink", "downlink")),
+    *both_ways(delay_ms=DELAY * 1e3),
 )
 ENDS = ("world", "cloud")
 
