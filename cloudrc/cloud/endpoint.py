@@ -51,7 +51,7 @@ HELLO_PERIOD_NS = 100_000_000
 """Shortest time between two periodic hellos [ns]."""
 KEY_PERIOD_NS = 5_000_000_000
 """Time between two hellos with a new pre-shared key while the session uses the old key [ns]. Until
-world has the new key, it counts these hellos as forged; 12 hellos a minute raise no alert."""
+world has the new key, world counts the hellos as forged; 12 hellos a minute raise no alert."""
 GIVE_UP_NS = 5_000_000_000
 """Longest time for which cloud tries to tell the robot that the mission has ended [ns]."""
 SILENCE_NS = 500_000_000

@@ -2,7 +2,7 @@
 
 If a plug-in raises an exception, or returns values that are not finite numbers, the loop uses a
 safe value: the last good horizon, the last sample, or zero velocity. The loop counts every failure,
-reports the first failure of each plug-in, and goes on.
+reports the first failure of each plug-in, and continues.
 
 Telemetry echoes the stamp of the newest command that world has applied, and contains the hold time:
 from this application to the telemetry. If no new echo arrives for some time, the robot does not fly
@@ -48,8 +48,8 @@ FRESH_ECHO_PERIODS = 5
 """Longest hold time of an echo that gives a delay sample [command periods]. While no commands reach
 world, the hold time grows although the delay of the link does not change."""
 ECHOES, ECHOES_NS = 32, 320_000_000
-"""Cloud remembers at least ECHOES echoes, and those of the commands of ECHOES_NS [ns], so that
-`add_applied` is called once per command."""
+"""Smallest number of stored echoes, and the time for which echoes are stored [ns]. With the stored
+echoes, the loop calls `add_applied` only once per command."""
 STAND_STILL = ControlOutput(ZERO, 0.0)
 INSTEAD = {
     "estimator": "cloud uses the last good horizon",

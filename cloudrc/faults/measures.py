@@ -1,4 +1,4 @@
-"""Measure what happened in a flight, from its records and from the metrics of its processes."""
+"""Measure a flight by its records and by the metrics of its processes."""
 
 from __future__ import annotations
 

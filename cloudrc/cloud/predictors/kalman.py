@@ -29,8 +29,8 @@ class Kalman(Predictor):
     def __init__(self, replay: Replay, position: float, velocity: float, model: float) -> None:
         """Set the predictor that replays the commands, and three standard deviations.
 
-        They are those of measured position [m] and velocity [m/s], and of the acceleration of the
-        `model` [m/s^2].
+        `position` [m] and `velocity` [m/s] belong to the measurement; `model` belongs to the
+        acceleration of the model [m/s^2].
         """
         self._replay, self._error = replay, model * model
         self._noise = np.diag([position * position, velocity * velocity])

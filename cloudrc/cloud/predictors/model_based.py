@@ -2,8 +2,8 @@
 
 The model is a white box: guard's limits, velocity PID, attitude loop, rotors, drag. Its hidden
 states (reference, integral, thrust, torque) follow the commands that the echoes show. Each odometry
-sample replaces the other states. Effects outside of the model, such as wind, a payload or the arm's
-weight, are estimated as a constant acceleration and a constant torque.
+sample replaces pose and twist. The model estimates effects that it lacks, such as wind, a payload
+or the arm's weight, as a constant acceleration and a constant torque.
 
 Source: docs/reference/control.md, "Predictors", (e2); docs/reference/plant.md, "Robot", "Low-level
 controller".

@@ -26,9 +26,9 @@ def _check_no_effect(
 ) -> None:
     """Fly with and without hostile datagrams; both flights must be equal.
 
-    Hostile datagrams are sent from `since` [s] on. The first function in `makes` makes those for
-    world, the second function, if there is one, those for cloud. World's counters
-    `refusals` must rise.
+    Hostile datagrams are sent from `since` [s] on. The first function in `makes` makes datagrams
+    for world, an optional second function makes datagrams for cloud. World's counters `refusals`
+    must rise.
     """
     clean, flight, sent = Flight(seed=seed).fly_mission(), Flight(seed=seed), list[int]()
 

@@ -44,7 +44,7 @@ class Library(NamedTuple):
 
     @property
     def text(self) -> str:
-        """One line for a person, such as "C (compiled by cc)"."""
+        """Summary in one line, such as "C (compiled by cc)"."""
         return f"{'Python' if self.run is None else 'C'} ({self.origin})"
 
 
