@@ -36,7 +36,6 @@ def test_the_same_seed_gives_the_same_records_in_any_process():
     assert printed.strip() == digest(short()) == digest(short()) != digest(short("seed=2"))
 
 
-
 PLAN = ("cloud.predictor=model_based", "cloud.estimator=earliest", "cloud.plan_s=0.4")
 
 
