@@ -8,9 +8,9 @@ import numpy as np
 
 
 class ComputeTime:
-    """Say how long a command is computed: a constant, a random or a measured time.
+    """Simulated time to compute a command: constant, random or measured.
 
-    A random time has a gamma distribution, because it is never negative and sometimes long.
+    A random time has a gamma distribution, which is never negative and sometimes long.
     """
 
     def __init__(
@@ -33,7 +33,7 @@ class ComputeTime:
             self._began_ns = self._cpu_clock()
 
     def end(self) -> int:
-        """Return how long the computation since `begin` takes [ns]."""
+        """Return the time that the computation since `begin` takes in the simulation [ns]."""
         time_ns = self._mean_ns
         if self._deviation_ns:
             shape = (self._mean_ns / self._deviation_ns) ** 2

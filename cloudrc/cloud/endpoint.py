@@ -41,8 +41,8 @@ from cloudrc.tunnel.keys import Key
 from cloudrc.tunnel.session import NO_EPOCH
 
 LATE_NS, LATE_WINDOW_NS = 500_000_000, 10_000_000_000
-"""Cloud reports a fault if it misses periods of more than LATE_NS within LATE_WINDOW_NS, 5 % [ns].
-The fault is reported once per session."""
+"""Cloud reports a fault, once per session, if the periods that it misses within LATE_WINDOW_NS add
+up to more than LATE_NS, 5 % [ns]."""
 LATE_TEXT = (
     "cloud misses more than 5 % of its periods: a plug-in is slow, cloud.compute_ms is long, "
     "or the machine is busy"
@@ -51,7 +51,7 @@ HELLO_PERIOD_NS = 100_000_000
 """Shortest time between two periodic hellos [ns]."""
 KEY_PERIOD_NS = 5_000_000_000
 """Time between two hellos with a new pre-shared key while the session uses the old key [ns]. Until
-world has the new key, it counts these hellos as forged; 12 hellos a minute raise no alert."""
+world has the new key, world counts the hellos as forged; 12 hellos a minute raise no alert."""
 GIVE_UP_NS = 5_000_000_000
 """Longest time for which cloud tries to tell the robot that the mission has ended [ns]."""
 SILENCE_NS = 500_000_000
@@ -104,7 +104,7 @@ class CloudEndpoint(TunnelEnd):
         self._delays = (nan, nan, nan)  # horizon, round trip and loop delay of the last command [s]
         self._alarm = EmergencyStopRepeater()
         self._period_ns = loop.period_ns
-        self._late_ns, self._late_window_ns = 0, start_ns  # time missed since the second time
+        self._late_ns, self._late_window_ns = 0, start_ns  # missed time, begin of its window [ns]
         self._compute = compute
         self._unsent: tuple[int, Datagram] | None = None  # departure [ns] and command
         self._asked = 0  # highest number of an operator request in this session
@@ -129,7 +129,7 @@ class CloudEndpoint(TunnelEnd):
 
     @property
     def mission_over(self) -> bool:
-        """Whether the mission has ended and the robot confirms this, or GIVE_UP_NS have passed."""
+        """Whether the mission has ended, and the robot confirms it or GIVE_UP_NS have passed."""
         done = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
         return done and self.teleop.outcome is not None
 

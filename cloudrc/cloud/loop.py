@@ -2,12 +2,13 @@
 
 If a plug-in raises an exception, or returns values that are not finite numbers, the loop uses a
 safe value: the last good horizon, the last sample, or zero velocity. The loop counts every failure,
-reports the first failure of each plug-in, and goes on.
+reports the first failure of each plug-in, and continues.
 
-Telemetry echoes the stamp of the newest command that world has applied. If no new echo arrives for
-some time, the robot does not fly the commands, and the loop freezes: it commands zero velocity and
-does not call the controller. So no integral winds up, and no predictor assumes a motion that the
-robot did not fly. The loop works normally again after the echo of a new command.
+Telemetry echoes the stamp of the newest command that world has applied, and contains the hold time:
+from this application to the telemetry. If no new echo arrives for some time, the robot does not fly
+the commands, and the loop freezes: it commands zero velocity and does not call the controller. So
+no integral winds up, and no predictor assumes a motion that the robot did not fly. The loop works
+normally again after the echo of a new command.
 
 The loop measures ages on cloud's clock, and subtracts stamps of world's clock only from each other.
 It needs no clock synchronisation.
@@ -44,11 +45,11 @@ PERIOD_NS = 10_000_000
 """Time between two commands, unless an experiment sets another rate [ns].
 Source: docs/reference/plant.md, "Commands"."""
 FRESH_ECHO_PERIODS = 5
-"""An echo gives a delay sample only up to a hold time of this many command periods. While no
-commands arrive at world, the hold time grows although the delay of the link does not change."""
+"""Longest hold time of an echo that gives a delay sample [command periods]. While no commands reach
+world, the hold time grows although the delay of the link does not change."""
 ECHOES, ECHOES_NS = 32, 320_000_000
-"""Cloud remembers at least ECHOES echoes, and those of the commands of ECHOES_NS [ns], so that
-`add_applied` is called once per command."""
+"""Smallest number of stored echoes, and the time for which echoes are stored [ns]. With the stored
+echoes, the loop calls `add_applied` only once per command."""
 STAND_STILL = ControlOutput(ZERO, 0.0)
 INSTEAD = {
     "estimator": "cloud uses the last good horizon",
@@ -68,7 +69,7 @@ _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class DelayMeter:
-    """Gives a delay estimator the delays of commands, and gets the horizon from the estimator.
+    """Passes the delays of commands to a delay estimator, and gets the horizon from it.
 
     Attributes:
         rtt: Newest round-trip time, without the hold time on world [s]; NaN before the first.
@@ -100,11 +101,11 @@ class DelayMeter:
         self.rtt = self.loop_delay = nan
 
     def observe(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Process telemetry that arrived at `now_ns` [ns] and is newer than all before.
+        """Process telemetry that arrived at `now_ns` [ns] and is newer than all earlier telemetry.
 
-        Every telemetry datagram with a short hold time gives one sample of eq. (1), even if its
-        echo was received before. New echoes alone have the shortest hold times, and would make the
-        mean too small.
+        Every telemetry datagram with a short hold time gives one sample of the paper's eq. (1),
+        even if an earlier datagram had the same echo. A mean over the first datagrams of each echo
+        would be too small, because these have the shortest hold times.
         Source: docs/reference/control.md, "The delay sample".
         """
         self._stamp_ns = telemetry.stamp_ns
@@ -339,7 +340,7 @@ class ControlLoop:
             return ()
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
-        """Whether no new echo has come for the `horizon` [s] and `freeze_after`."""
+        """Whether the last new echo is older than the `horizon` [s] plus `freeze_after`."""
         if self._echoed_ns < self._delays.newest_echo_ns:
             self._echoed_ns = self._delays.newest_echo_ns
         elif self._echoed_ns == NEVER_NS:

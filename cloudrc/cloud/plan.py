@@ -19,7 +19,7 @@ Source: docs/reference/faults.md, "F23"."""
 
 
 class ControllerError(Exception):
-    """The controller failed while a plan was made; the cause is its exception."""
+    """The controller failed during `make_plan`; `__cause__` is the controller's exception."""
 
 
 def make_plan(
@@ -33,12 +33,12 @@ def make_plan(
     """Compute the velocities [m/s] that follow a command, one per STEP; at most `count`.
 
     Args:
-        model: Model of the robot, at the time for which the command was computed; it is advanced.
-        controller: Controller after the command; it is copied, not changed.
+        model: Model of the robot at the time for which the command was computed; it is changed.
+        controller: Controller after it has computed the command; it is copied, not changed.
         setpoint: Setpoint, with its motion.
         velocity: Velocity of the command [m/s].
         now_ns: Time of the command [ns], cloud's clock.
-        count: Number of velocities.
+        count: Largest number of velocities.
 
     Returns:
         The plan; it ends before a velocity that the guard would refuse.

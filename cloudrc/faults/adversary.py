@@ -41,15 +41,15 @@ Lie: TypeAlias = Callable[[Command, Control], Command]
 """Function that changes an honest command; it also gets cloud's record of the control period."""
 Policy: TypeAlias = Callable[[Generator], Lie]
 Words: TypeAlias = Callable[[int, RobotStatus], OperatorRequest | None]
-"""Function that makes a false operator request, or None, at a time on cloud's clock [ns]. The
-status is the newest that cloud knows. The number of the request is not used."""
+"""Function that makes a false operator request, or None, from cloud's time [ns] and cloud's newest
+status of the robot. `HostileOperator` sets the number of the request."""
 
 
 class DishonestLoop(ControlLoop):
     """Computes honest commands, and changes them before they are sent."""
 
     def __init__(self, lies: Sequence[Lie], *plugins: Any, **limits: Any) -> None:
-        """Apply all `lies` in turn to each command; the others are as for `ControlLoop`."""
+        """Apply all `lies` in turn to each command; the other arguments are for `ControlLoop`."""
         super().__init__(*plugins, **limits)
         self._lies = lies
 
@@ -312,10 +312,10 @@ def _stop_and_go(rng: Generator) -> Lie:
 
 
 def _hostile_plans(rng: Generator) -> Lie:
-    """Send plans of random lengths, for now or much later, with jumps and now and then NaN.
+    """Send plans of random lengths, for now or much later, with jumps and sometimes NaN.
 
-    Some clouds alternate plans with plain commands. Others pause, by stale commands, so that the
-    robot flies a plan to its end.
+    Some of these clouds alternate plans with plain commands. Others send stale commands for some
+    time, so that the robot flies a plan to its end.
     """
     ahead, share = float(rng.choice([0.05, 0.5, 9.9])), float(rng.choice([0.0, 0.5]))
     absurd, old_ns = float(rng.choice([0.0, 0.003])), int(rng.choice([0, 150_000_000, 300_000_000]))

@@ -62,18 +62,18 @@ class Flight:
         seed: int = 1,
         cloud_clock: Clock | None = None,  # None if world and cloud share a clock
         link: Shape = replace,  # changes both directions of the link; by default nothing
-        uplink: Shape | None = None,  # changes the direction from world to cloud instead
-        downlink: Shape | None = None,  # changes the direction from cloud to world instead
-        honest: bool = True,  # whether a contact is a breach
+        uplink: Shape | None = None,  # replaces `link` from world to cloud
+        downlink: Shape | None = None,  # replaces `link` from cloud to world
+        honest: bool = True,  # whether cloud is honest; then a contact is a breach
         keep: bool = True,  # whether all records are kept and hashed
         start: bool = True,  # whether the experiment's mission is ordered at once
         life: int = 1,  # makes the nonces differ from those of another flight
         lies: Sequence[Lie] = (),  # change cloud's commands, one after the other
         words: Words | None = None,  # makes requests in place of the operator
-        second: float | None = None,
+        second: float | None = None,  # when a second cloud connects [s]
         separate: bool = False,  # whether teleop has its own process
     ) -> None:
-        """Prepare a flight. If `second` is not None, a second cloud connects at this time [s]."""
+        """Prepare a flight; a second cloud connects at `second` [s], if that is not None."""
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         self._honest, self._keep = honest, keep
         self._life, self._second, self._lies, self._words = life, second, lies, words

@@ -1,8 +1,8 @@
 """Safety invariants, checked after every 2 ms step, independently of the guard.
 
 fence      The base stays inside the fence while the rotors turn. After a collision or an
-           emergency stop the robot may leave the fence by at most `FALL_MAX`. Rotors that were
-           stopped start again only if the robot lies still inside the fence.
+           emergency stop the robot may leave the fence by at most `FALL_MAX`. Stopped rotors
+           start again only if the robot is at rest inside the fence.
 cap, stop  The reference velocity stays within its limits, and the robot can always stop before the
            fence. During LAND the robot may fly down to the floor. After a HOLD the reference
            velocity grows slowly at first.
@@ -57,7 +57,7 @@ FLOWN, LATCHED = (TRACK, HOLD, LAND), (LAND, ESTOP)
 REPORTED = 5  # number of breaches of each kind that are kept
 SLACK = 1e-9  # tolerance for rounding [m/s]
 STILL = 0.12
-"""Largest speed of a robot that lies still [m/s]: the guard's limit, 0.1, and one step of fall."""
+"""Largest speed of a robot at rest [m/s]: the guard's limit, 0.1, plus one step of free fall."""
 STANDS = 0.2  # speed per axis up to which a robot stands when its rotors stop [m/s]
 FALL = 1.0
 """Downward speed that proves a fall with stopped rotors [m/s]; a drop of 2 cm ends at only 0.7."""
@@ -267,7 +267,7 @@ class RobotInvariants:
     def _check_fence(
         self, state: GuardState, position: Vector, velocity: Vector, now_ns: int
     ) -> None:
-        """Check the base's position; a robot that fell may take off only if it lies still."""
+        """Check the base's position; a robot that fell may take off only if it is at rest."""
         self._falls = self._falls or (self._was in FLOWN and state is ESTOP)
         if self._falls and state in FLOWN:
             self._falls, speed = False, hypot(*velocity)

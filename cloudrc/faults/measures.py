@@ -1,4 +1,4 @@
-"""Measure what happened in a flight, from its records and from the metrics of its processes."""
+"""Measure a flight by its records and by the metrics of its processes."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 
 AGE_MAX = 0.252 + 1e-9
-"""When a HOLD begins, the odometry behind the newest command is at most this old [s]: the limit
-guard.command_age_max_ms plus one tick."""
+"""Largest age of the newest command's odometry when a HOLD begins [s]: the limit
+guard.command_age_max_ms plus one step."""
 SOON = 5.0  # time within which a fault has to show in its metric [s]
 STANDS = 0.05  # speed up to which the robot stands [m/s]
 SAMPLE = 0.01  # time between two records of the ground truth [s]
@@ -101,7 +101,7 @@ def held(flight: Flight) -> list[GuardChange]:
 
 
 def held_in_time(outcome: Outcome, flight: Flight, text: str = "HOLD after") -> None:
-    """Check that every HOLD began before the last command was too old."""
+    """Check that every HOLD began within one step after the last command became too old."""
     outcome.most(text, basis_age_at_hold(flight), AGE_MAX, "s")
 
 

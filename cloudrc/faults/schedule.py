@@ -30,24 +30,24 @@ KINDS = {
     "jitter": Kind("jitter rises to value [s]", 10.0, 0.01, 0.15),
     "loss": Kind("a share of value is lost", 10.0, 0.05, 0.9),
     "bursts": Kind("loss in bursts of value packets", 15.0, 3.0, 60.0),
-    "corruption": Kind("a share of value has a bit turned over", 10.0, 0.01, 1.0),
-    "garbage": Kind("value datagrams of garbage before every honest one", 5.0, 1.0, 20.0),
-    "replay": Kind("value captured datagrams before every honest one", 5.0, 1.0, 20.0),
-    "cloud_killed": Kind("the cloud process is away", 5.0),
-    "pod_killed": Kind("the cloud pod, teleop with it, is away", 8.0),
-    "teleop_killed": Kind("teleop is away", 6.0),
-    "teleop_shut_down": Kind("teleop is asked to end, away after a share of value", 6.0, 0.0, 1.0),
-    "pod_shut_down": Kind("the cloud pod is asked to end, away after a share of value", 8.0, 0, 1),
-    "cloud_paused": Kind("the cloud process stands still", 5.0),
-    "cloud_throttled": Kind("the cloud process runs for a share of value", 8.0, 0.05, 0.9),
-    "world_paused": Kind("the world process stands still", 1.0),
-    "world_killed": Kind("the world restarts", 3.0),
-    "world_throttled": Kind("the world process runs for a share of value", 8.0, 0.1, 0.95),
-    "teleop_paused": Kind("the teleop process stands still", 5.0),
+    "corruption": Kind("a share of value has 1 to 8 flipped bits", 10.0, 0.01, 1.0),
+    "garbage": Kind("value random datagrams arrive before every honest one", 5.0, 1.0, 20.0),
+    "replay": Kind("value captured datagrams arrive before every honest one", 5.0, 1.0, 20.0),
+    "cloud_killed": Kind("the cloud process is down", 5.0),
+    "pod_killed": Kind("the cloud pod with teleop is down", 8.0),
+    "teleop_killed": Kind("teleop is down", 6.0),
+    "teleop_shut_down": Kind("teleop pauses, and is down after a share of value", 6.0, 0.0, 1.0),
+    "pod_shut_down": Kind("teleop pauses, the pod is down after a share of value", 8.0, 0.0, 1.0),
+    "cloud_paused": Kind("the cloud process is stopped", 5.0),
+    "cloud_throttled": Kind("the cloud process gets a share of value of the CPU", 8.0, 0.05, 0.9),
+    "world_paused": Kind("the world process is stopped", 1.0),
+    "world_killed": Kind("the world process is down, then restarts", 3.0),
+    "world_throttled": Kind("the world process gets a share of value of the CPU", 8.0, 0.1, 0.95),
+    "teleop_paused": Kind("the teleop process is stopped", 5.0),
     "second_cloud": Kind("another cloud with the same key joins", 15.0),
-    "key_rotated": Kind("world reads a new key, cloud after the duration", 10.0),
+    "key_rotated": Kind("world reads a new key, cloud reads it after the duration", 10.0),
     "key_wrong": Kind("cloud has a wrong key", 10.0),
-    "values_invalid": Kind("value commands a second hold NaN or infinity", 10.0, 1.0, 12.0),
+    "values_invalid": Kind("value commands a second have NaN or infinity", 10.0, 1.0, 12.0),
     "values_huge": Kind("value commands a second are 1e308 m/s", 10.0, 1.0, 4.0),
     "second_order": Kind("another mission is ordered"),
     "stopped": Kind("the operator stops the rotors, and acknowledges later"),
@@ -141,8 +141,8 @@ def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> Direction
     waves = [e for e in mine if e.kind in ("delay", "jitter", "loss", "bursts")]
     if waves and (profile.changes or profile.trace is not None):
         raise BadInputError(
-            f"the link's profile {schedule.profile} has a time line, on which {waves[0].kind} "
-            "cannot be laid; choose a profile that does not change"
+            f"the link's profile {schedule.profile} changes over time, so that the fault "
+            f"{waves[0].kind} cannot be added; choose a profile without changes"
         )
     edges = sorted({instant for event in waves for instant in (event.at, event.end)})
     changes = tuple(_change(profile, [e for e in waves if e.at <= t < e.end], t) for t in edges)

@@ -45,7 +45,7 @@ INVARIANTS = {
     "waypoint": "waypoints reached out of order, or twice",
     "stuck": "stuck states",
     "alarm": "false alarms",
-    "error": "errors in an end",
+    "error": "errors in world or cloud",
 }
 """Name of an invariant -> name of its breaches in a table."""
 BACK = 10.0  # time without faults in which the robot must have flown [s]

@@ -7,8 +7,8 @@ World's clock follows the machine's monotonic clock, but may fall behind. After 
 process, world simulates at most 50 ms of the lost time, and its clock never jumps ahead. The
 remaining lag stays for good; it is called the slip. The guard runs in every simulated step.
 
-World numbers the sessions: a session's number is its epoch. A new epoch begins when a cloud gets a
-session, and when a mission starts from the spawn.
+World numbers the sessions; the number is the session's epoch. A new epoch begins when a cloud gets
+a session, and when a mission starts from the spawn, the robot's initial place in the scene.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ from cloudrc.world.robot import Robot
 from cloudrc.world.sensors import Sensors
 
 START_AGE_MAX_NS = 1_000_000_000
-"""Largest accepted age of a start request [ns], unless the age limit for commands is larger. The
-age of a request is that of the newest odometry that cloud had when it sent the request."""
+"""Largest accepted age of a start request [ns]; a larger age limit for commands applies instead.
+The age counts from the stamp of the newest odometry that cloud had when it sent the request."""
 
 
 class Orders:
@@ -65,7 +65,7 @@ class Orders:
     def __init__(
         self, guard: Guard, counts: defaultdict[str, int], command_age_max_ns: int
     ) -> None:
-        """Set the guard and the counters; a refused start is counted as "start_refused".
+        """Use `guard`; count each refused start in `counts` as "start_refused".
 
         `command_age_max_ns` is the largest accepted age of a command [ns].
         """
@@ -121,8 +121,8 @@ class Orders:
 
 
 ODOMETRY_PERIOD_NS = 10_000_000
-"""Time between two odometry samples, unless an experiment sets another rate, and longest time
-between two records of the true state [ns]. Source: docs/reference/plant.md, "Odometry"."""
+"""Default time between two odometry samples, and longest time between two records of the true
+state [ns]. Source: docs/reference/plant.md, "Odometry"."""
 CATCH_UP_NS = 50_000_000
 """Largest lag of world's clock that world makes up after a stall [ns]; further lag stays."""
 COUNT_PERIOD_NS = 1_000_000_000
@@ -212,9 +212,9 @@ class WorldEndpoint(TunnelEnd):
                 self._records += self._complaints.about(str(error), data, world_ns)
 
     def _follow(self, now_ns: int) -> int:
-        """Return the time on world's clock [ns]; remember `now_ns` if a stall has just ended.
+        """Return world's time at `now_ns` [ns]; extend the slip if world lags by too much.
 
-        Datagrams that are received at this time may have waited in the socket during the stall.
+        Store the end of a stall: datagrams that arrive then may have waited in the socket.
         """
         world_ns = now_ns - self._slip_ns
         behind_ns = world_ns - self._tick_ns
@@ -229,8 +229,8 @@ class WorldEndpoint(TunnelEnd):
     def _advance(self, until_ns: int, *, samples: bool = False) -> None:
         """Simulate all steps that begin before `until_ns` [ns], world's clock.
 
-        With `samples`, take the sample that is due at `until_ns`, too. The step that begins at the
-        time of a sample comes before a datagram that arrives later at the same time.
+        With `samples`, take the sample that is due at `until_ns`, too. If this sample was taken
+        earlier, also simulate the step that begins at `until_ns`, before the next datagram acts.
         """
         tick_ns = self._tick_ns
         if until_ns == tick_ns == self._sample_ns - self._sample_period_ns:
@@ -301,7 +301,7 @@ class WorldEndpoint(TunnelEnd):
         self._sample_ns += self._sample_period_ns
 
     def _record_counts(self, now_ns: int) -> None:
-        """Record the counters and, once per session, that simulated time is too slow."""
+        """Record the counters; report once per session that simulated time is too slow."""
         guard, before_ns = self.robot.guard, self._counted_slip_ns
         self._count_ns, self._counted_slip_ns = self._count_ns + COUNT_PERIOD_NS, self._slip_ns
         self._counts["held_seconds"] += guard.armed and guard.state is HOLD

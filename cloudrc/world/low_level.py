@@ -40,9 +40,8 @@ _HALF_TILT_GAIN, _HALF_YAW_GAIN = 0.5 * TILT_GAIN, 0.5 * YAW_GAIN
 _TWO_ARMS, _FOUR_RATIOS = 2.0 * ARM, 4.0 * TORQUE_RATIO
 
 NOSE_COSINE_MIN, YAW_SINE_MAX = 0.5, 0.3
-"""The controller uses the published formula of the attitude error if the cosine of the roll error
-is at least the first value and the sine of the yaw error is at most the second. For larger errors
-the published formula is wrong."""
+"""Range in which the published formula of the attitude error is right: smallest cosine of the roll
+error, largest sine of the yaw error [1]. For larger errors, `attitude` uses another formula."""
 
 
 class LowLevel:
@@ -51,7 +50,7 @@ class LowLevel:
     Attributes:
         gains: Force per velocity error, per integrated error and per change of the error in one
             step, each for x, y and z [N s/m, N/m, N s/m], shape (9,).
-        limits: Limits of the integrated error in x and y, and in z [m], and the step [s].
+        limits: Limit of the integrated error in x and y [m], its limit in z [m], time step [s].
         integral: Integrated velocity error [m], shape (3,).
         error: Velocity error of the last update [m/s], shape (3,); None after a reset.
     """
@@ -82,7 +81,7 @@ class LowLevel:
         self.reset()
 
     def reset(self) -> None:
-        """Set the integral to zero and forget the last error."""
+        """Set the integral to zero and delete the last error."""
         self.integral = ZERO
         self.error: Vector | None = None
 

@@ -1,4 +1,4 @@
-"""Model what guard, onboard controller and cloud do not know: the true robot, and the wind."""
+"""Model the true robot and the wind, which guard, onboard controller and cloud do not know."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def point_inertia(mass: float, place: Array) -> Array:
 
 
 def true_inertia(plant: Plant, model: Inertia) -> Inertia:
-    """Return the inertia of the true robot, given that of its model.
+    """Return the inertia of the true robot: that of the `model`, scaled, with the payload.
 
-    Robot and payload have the inertia of the robot and that of a point of mass m1 m2/(m1 + m2) at
-    the distance between both centres.
+    By the parallel-axis theorem, the payload adds the inertia of a point mass m1 m2/(m1 + m2) at
+    the distance between the robot's centre of mass and the payload.
     """
     mass, centre, inertia = model
     mass, apart = mass * plant.mass_factor, plant.payload_offset_m - centre
@@ -52,7 +52,7 @@ class Wind:
     def __init__(
         self, mean: tuple[float, float], gust: float, time: float, rng: np.random.Generator
     ) -> None:
-        """Set the mean [m/s], the deviation `gust` [m/s], and its time constant `time` [s]."""
+        """Set the `mean` [m/s], and the gusts' deviation `gust` [m/s] and time constant [s]."""
         self._mean, self._gust, self._time, self._rng = mean, gust, time, rng
         self._gusts = gust * rng.standard_normal(2)
 

@@ -20,7 +20,7 @@ TRACK = GuardState.TRACK  # looking up a member of an enum is slow
 
 
 class Observer(Protocol):
-    """Observes what a robot receives and does. Times are on world's clock [ns]."""
+    """Observes the steps and the inputs of a robot. Times are on world's clock [ns]."""
 
     def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
         """Observe a physics step that begins at `now_ns` with these readings and rotor speeds."""

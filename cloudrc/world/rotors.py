@@ -40,7 +40,8 @@ frame [N] and a torque in the body frame [N m], as MuJoCo's free joint requires.
 class Rotors:
     """Four rotors with lag, thrust and drag; `speeds` are front, left, back, right [rad/s].
 
-    `up` and `down` are the shares of the way to the commanded speed that one step makes.
+    In one step, a rotor speeds up by the share `up` of the missing speed, or slows down by the
+    share `down` of the excess speed [1].
     """
 
     def __init__(self, dt: float) -> None:
@@ -58,7 +59,7 @@ class Rotors:
         With body velocity (u, v, .), rates (p, q, r) and a hub at (x, y, h), vh is (u + q · h - r ·
         y, v + r · x - p · h). The hubs have x = (l, 0, -l, 0), y = (0, l, 0, -l).
         The sum of r x F over the hubs is the torque (-h · Fy, h · Fx, sum of x · Fy - y · Fx).
-                Source: docs/reference/plant.md, "Rotor speed", "Rotor drag".
+        Source: docs/reference/plant.md, "Rotor speed", "Rotor drag".
         """
         up, down, k = self.up, self.down, THRUST_COEFFICIENT
         front, left, back, right = self.speeds

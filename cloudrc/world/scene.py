@@ -83,7 +83,7 @@ def compile_model(robot: str, scene: str, plant: Plant | None = None) -> Any:
     bodies lose their names; therefore each geom of the scene gets the name BODY/NUMBER. Raise a
     BadInputError if a file is missing, does not compile or does not fit the onboard controller.
 
-    With `plant`, the result is the true robot; the files have to fit the controller without it.
+    With `plant`, the result is the true robot. The check of the files ignores `plant`.
     """
     paths = model_path("robots", robot), model_path("scenes", scene)
     model = _compile(*paths)

@@ -134,7 +134,7 @@ class Simulator:
 
         `rotor_speeds` are the actual speeds [rad/s], shape (4,). `tip_force_peak` [N],
         `tip_impulse` [N s], `contacts` and `steps` are the new values of the attributes. `before`
-        has the readings at the beginning of the last step if its contacts have to be checked.
+        has the readings at the beginning of the last step; None: its contacts need no check.
         """
         self._rotors.speeds, self._readings = rotor_speeds, None
         self.tip_force_peak, self.tip_impulse = tip_force_peak, tip_impulse

@@ -18,11 +18,9 @@ def telemetry(stamp_ms, echo_ms=None, hold_ms=0):
     return Telemetry(stamp_ms * MS, odometry, 0.0, echo_ns, hold_ms * MS, 0, 1, GuardState.TRACK)
 
 
-def loop(
-    estimator=running_mean, predictor=None, controller=None, heard_ms=None, echo_ms=None, **limits
-):
+def loop(estimator=None, predictor=None, controller=None, heard_ms=None, echo_ms=None, **limits):
     """Return a loop, which has heard telemetry of 100 ms at `heard_ms`."""
-    parts = estimator, predictor or last_sample(), controller or pid()
+    parts = estimator or running_mean, predictor or last_sample(), controller or pid()
     made = ControlLoop(*parts, **{"horizon_max": 1.0, "freeze_after": 0.4, **limits})
     if heard_ms is not None:
         made.observe(telemetry(100, echo_ms), heard_ms * MS)

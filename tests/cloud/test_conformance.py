@@ -62,11 +62,6 @@ def are_finite(*values):
     return all(isfinite(number) for value in values for number in value)
 
 
-def test_the_shipped_plugins_are_found():
-    names = {short(module) for module, _ in PLUGINS}
-    assert {"estimators.split", "predictors.constant_velocity", "controllers.pid"} <= names
-
-
 @every_plugin
 def test_a_plugin_is_built_and_documented_as_the_contract_says(module, kind):
     signature = inspect.signature(module.build, eval_str=True)

@@ -2,7 +2,14 @@
 
 import pytest
 
-from cloudrc.cloud.estimators import DelaySample, ewma, running_mean, running_mean_500, split
+from cloudrc.cloud.estimators import (
+    DelaySample,
+    earliest,
+    ewma,
+    running_mean,
+    running_mean_500,
+    split,
+)
 
 
 def horizons(estimator, *delays):
@@ -26,6 +33,15 @@ def horizons(estimator, *delays):
 )
 def test_first_horizons(estimator, delays, expected):
     assert horizons(estimator, *delays) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("offset", [0.0, -86_400.0])
+def test_earliest_adds_the_age_and_the_smallest_delay(offset):
+    estimator, found = earliest.build(count=2), []
+    for delay in (0.060, 0.030, 0.095, 0.095):
+        estimator.add_applied(delay - offset)
+        found.append(estimator.horizon(0.010 + offset))
+    assert found == pytest.approx([0.070, 0.040, 0.040, 0.105])
 
 
 @pytest.mark.parametrize("offset", [0.0, -86_400.0])

@@ -41,45 +41,21 @@ def test_each_telemetry_is_a_sample_while_its_echo_is_fresh(hold_ms, horizon_ms)
 
 
 def test_each_applied_command_counts_once_also_in_late_telemetry():
-    applied = []
+    differences, told = [], []
 
-    class Listening(Estimator):
+    class Listening(Estimator, LastSample):
         def add_applied(self, applied_minus_stamp):
-            applied.append(round(applied_minus_stamp * 1e3))
+            differences.append(round(applied_minus_stamp * 1e3))
 
-        def horizon(self, age):
-            return 0.0
-
-    a_loop = loop(estimator=Listening, heard_ms=1090, echo_ms=1000)  # world's clock is behind
-    a_loop.observe(telemetry(120, echo_ms=1020, hold_ms=2), 1110 * MS)
-    a_loop.observe_late(telemetry(110, echo_ms=1005, hold_ms=1), 1115 * MS)
-    a_loop.observe(telemetry(130, echo_ms=1020, hold_ms=12), 1120 * MS)
-    assert applied == [-900, -902, -896]
-
-
-def test_the_predictor_is_told_each_applied_command_once():
-    told = []
-
-    class Told(LastSample):
         def applied(self, command_stamp_ns, applied_ns):
             told.append((command_stamp_ns // MS, applied_ns // MS))
 
-    a_loop = loop(predictor=Told(), heard_ms=1090, echo_ms=1000)
+    a_loop = loop(Listening, Listening(), heard_ms=1090, echo_ms=1000)  # world's clock is behind
     a_loop.observe(telemetry(120, echo_ms=1020, hold_ms=2), 1110 * MS)
     a_loop.observe_late(telemetry(110, echo_ms=1005, hold_ms=1), 1115 * MS)
     a_loop.observe(telemetry(130, echo_ms=1020, hold_ms=12), 1120 * MS)
+    assert differences == [-900, -902, -896]
     assert told == [(1000, 100), (1020, 118), (1005, 109)]
-
-
-def test_a_predictor_that_fails_when_told_is_named():
-    class Deaf(LastSample):
-        def applied(self, command_stamp_ns, applied_ns):
-            raise RuntimeError
-
-    a_loop = loop(predictor=Deaf(), heard_ms=1090, echo_ms=1000)
-    assert a_loop.counts == {"predictor_failed": 1}
-    (fault,) = a_loop.take_faults()
-    assert (fault.code, fault.stamp_ns) == ("predictor_failed", 1090 * MS)
 
 
 @pytest.mark.parametrize(
@@ -115,12 +91,10 @@ def test_a_silent_echo_freezes_after_horizon_plus_400_ms():
     assert command(a_loop, 1520)[0].velocity == ONE
 
 
-def test_a_longer_freeze_after_bears_a_longer_silence():
+def test_a_loop_waits_for_an_echo_as_long_as_configured():
     a_loop = loop(controller=Integrating(), heard_ms=1100, echo_ms=1000, freeze_after=0.8)
     assert [command(a_loop, now_ms)[0].velocity for now_ms in (1900, 1901)] == [ONE, ZERO]
-
-
-def test_the_first_echo_has_as_much_time():
+    # Before the first echo, the wait begins with the first command, and again with a mission.
     a_loop = loop(controller=Integrating(), heard_ms=1100)
     flown = [command(a_loop, now_ms)[0].velocity for now_ms in (2000, 2400, 2401)]
     assert flown == [ONE, ONE, ZERO]
@@ -138,7 +112,7 @@ def raises(error):
         def update(self, *arguments):
             raise error
 
-        horizon = observe = predict = update
+        horizon = observe = predict = applied = update
 
     return Bad
 
@@ -174,7 +148,7 @@ NO_NUMBERS = returns("abc", ANY._replace(integral=(None,) * 3), velocity="abc")
 def test_a_failing_plug_in_is_counted_and_reported_once(kind, bad):
     a_loop = loop(**{kind: bad if kind == "estimator" else bad()})
     for k in range(3):
-        a_loop.observe(telemetry(100 + 10 * k), (1090 + 10 * k) * MS)
+        a_loop.observe(telemetry(100 + 10 * k, 1000 + 10 * k), (1090 + 10 * k) * MS)
         sent, control = command(a_loop, 1094 + 10 * k)
     assert control.position == HERE  # the last sample, not moved
     assert sent.velocity == (ZERO if kind == "controller" else pytest.approx((0.8, 0.0, 0.0)))
@@ -187,18 +161,13 @@ def test_a_failing_plug_in_is_counted_and_reported_once(kind, bad):
     assert fault.text.endswith(f"fix cloud.{kind} or choose another")
 
 
-def test_a_failure_names_file_and_line_and_keeps_its_traceback():
-    a_loop = loop(controller=raises(ZeroDivisionError("no"))(), heard_ms=1090)
+def test_a_fault_names_the_line_or_the_bad_value():
+    a_loop = loop(None, NOT_FINITE(), raises(ZeroDivisionError("no"))(), heard_ms=1090)
     command(a_loop, 1094)
-    (fault,) = a_loop.take_faults()
-    assert re.search(r"\(ZeroDivisionError: no, test_loop.py:\d+ in update\)", fault.text)
-    assert "raise error\nZeroDivisionError: no" in fault.traceback
-
-
-def test_a_value_that_is_not_finite_is_named_shortly():
-    a_loop = loop(predictor=NOT_FINITE(), heard_ms=1090)
-    command(a_loop, 1094)
-    assert "failed (InvalidResultError: its position is (inf, 0, 0));" in a_loop.faults[0].text
+    value, line = a_loop.take_faults()
+    assert "failed (InvalidResultError: its position is (inf, 0, 0));" in value.text
+    assert re.search(r"\(ZeroDivisionError: no, test_loop.py:\d+ in update\)", line.text)
+    assert "raise error\nZeroDivisionError: no" in line.traceback
 
 
 def test_arrays_and_generators_become_plain_numbers():

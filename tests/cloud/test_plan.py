@@ -4,12 +4,11 @@ import pytest
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.controllers.pid import build as pid
-from cloudrc.cloud.estimators.earliest import build as earliest
 from cloudrc.cloud.plan import make_plan
 from cloudrc.cloud.predictors import Model
 from cloudrc.cloud.predictors.last_sample import LastSample
 from cloudrc.messages import UPRIGHT, ZERO, Motion, Odometry, Setpoint
-from tests.cloud.conftest import HERE, MS, Integrating, command, loop, telemetry
+from tests.cloud.conftest import HERE, MS, Integrating, command, loop
 
 
 class Obedient(Model):
@@ -32,16 +31,12 @@ def along_x(plan):
     return [velocity[0] for velocity in plan]
 
 
-def test_a_plan_is_what_the_controller_would_command():
+def test_a_plan_has_the_commands_for_the_future_setpoints():
     controller = pid(gain_p=(10.0, 1.0, 1.0))
     plan = make_plan(Obedient(), controller, Setpoint((1.0, 0.0, 0.0)), (10.0, 0.0, 0.0), 0, 3)
     assert along_x(plan) == pytest.approx([9.0, 8.1, 7.29])
-
-
-def test_a_plan_knows_where_the_carrot_will_be():
     carrot = Setpoint((9.0, 0.0, 0.0), motion=Motion(ZERO, 0, 1.0, 100.0))
-    controller = pid(gain_p=(1e-9,) * 3)
-    plan = make_plan(Obedient(), controller, carrot, ZERO, -20 * MS, 4)
+    plan = make_plan(Obedient(), pid(gain_p=(1e-9,) * 3), carrot, ZERO, -20 * MS, 4)
     assert along_x(plan) == pytest.approx([0.0, 0.0, 1.0, 1.0], abs=1e-6)
 
 
@@ -77,51 +72,40 @@ def test_a_command_has_the_plan_and_its_time():
     assert sent.velocity_at(221 * MS) == sent.plan[2]
 
 
-def test_a_frozen_loop_or_a_predictor_without_a_model_plans_nothing():
+def test_without_a_model_or_while_frozen_there_is_no_plan():
     a_loop = loop(predictor=Modelled(), heard_ms=1100, echo_ms=1000, plan=0.05)
     assert command(a_loop, 1600)[0][3:] == (ZERO, 0.0, (), -1)
     sent, _ = command(loop(heard_ms=1090, echo_ms=1000, plan=0.05), 1094)
     assert (sent.plan, sent.planned_ns) == ((), -1)
 
 
-def test_a_failing_model_is_reported_and_the_command_goes_out():
-    class Broken(LastSample):
-        def model(self):
-            raise ZeroDivisionError
+class Broken(LastSample):
+    def model(self):
+        raise ZeroDivisionError
 
-    a_loop = loop(predictor=Broken(), heard_ms=1090, echo_ms=1000, plan=0.05)
+
+class Uncopied(Integrating):
+    def __deepcopy__(self, memo):
+        raise TypeError("cannot copy")
+
+
+class Impatient(Integrating):
+    def update(self, estimate, setpoint, dt):
+        return ControlOutput((1.0, 0.0, 0.0), 0.0) if estimate.stamp_ns else 1 / 0
+
+
+@pytest.mark.parametrize(
+    ("predictor", "controller", "kind", "text"),
+    [
+        (Broken(), Integrating(), "predictor", "in model"),
+        (Modelled(), Uncopied(), "controller", "cannot copy"),
+        (Modelled(), Impatient(), "controller", "in update"),
+    ],
+)
+def test_without_its_plan_a_command_leaves_and_a_fault_says_why(predictor, controller, kind, text):
+    a_loop = loop(None, predictor, controller, heard_ms=1090, echo_ms=1000, plan=0.05)
     sent, _ = command(a_loop, 1094)
-    assert (sent.plan, sent.velocity) == ((), pytest.approx((0.8, 0.0, 0.0)))
-    assert "cloud sends this command without a plan" in a_loop.faults[0].text
-
-
-def test_a_controller_that_fails_in_a_plan_is_the_one_to_fix():
-    class Uncopied(Integrating):
-        def __deepcopy__(self, memo):
-            raise TypeError("cannot copy")
-
-    class Impatient(Integrating):
-        def update(self, estimate, setpoint, dt):
-            return ControlOutput(ZERO, 0.0) if estimate.stamp_ns else 1 / 0
-
-    for controller, word in ((Uncopied(), "cannot copy"), (Impatient(), "in update")):
-        a_loop = loop(
-            predictor=Modelled(), controller=controller, heard_ms=1090, echo_ms=1000, plan=0.05
-        )
-        sent, _ = command(a_loop, 1094)
-        assert sent.plan == ()
-        assert a_loop.counts == {"controller_failed": 1}
-        assert word in a_loop.faults[0].text
-        assert "fix cloud.controller" in a_loop.faults[0].text
-
-
-def test_the_earliest_command_sets_the_horizon():
-    a_loop = loop(estimator=lambda: earliest(2), heard_ms=1090, echo_ms=1000)
-    horizons = []
-    for k, applied_ms in enumerate((60, 30, 95, 95)):
-        stamp_ms = 110 + 10 * k
-        now_ms = 1000 + stamp_ms
-        seen = telemetry(stamp_ms, echo_ms=1000 + stamp_ms - applied_ms, hold_ms=0)
-        a_loop.observe(seen, now_ms * MS)
-        horizons.append(command(a_loop, now_ms)[1].horizon)
-    assert horizons == pytest.approx([0.06, 0.03, 0.03, 0.095])
+    assert (sent.plan, sent.velocity) == ((), (1.0, 0.0, 0.0))
+    assert a_loop.counts == {f"{kind}_failed": 1}
+    for part in (text, "cloud sends this command without a plan", f"fix cloud.{kind}"):
+        assert part in a_loop.faults[0].text

@@ -31,15 +31,23 @@ def in_ms(parts):
 # When the robot follows which command
 
 
-def test_the_echoes_show_the_past():
+@pytest.mark.parametrize(
+    ("echoes", "start_ms", "end_ms", "parts"),
+    [
+        (((1, 60), (3, 75), (4, 95)), 60, 100, [(1, 15), (3, 20), (4, 5)]),
+        (((1, 60), (3, 75), (4, 95)), 70, 80, [(1, 5), (3, 5)]),
+        (((1, 60), (3, 75), (4, 95)), 50, 65, [(1, 5)]),
+        # With tunnel.order: arrival, the robot may follow an older command after a newer one.
+        (((0, 50), (2, 60), (1, 70)), 50, 80, [(0, 10), (2, 10), (1, 10)]),
+    ],
+)
+def test_the_echoes_show_the_past(echoes, start_ms, end_ms, parts):
     history = History()
     for k in range(10):
         history.add(command(10 * k, float(k)))
-    for k, at_ms in ((1, 60), (3, 75), (4, 95)):
+    for k, at_ms in echoes:
         history.note_applied(command(10 * k, 0).stamp_ns, at_ms * MS)
-    assert in_ms(history.past(60 * MS, 100 * MS)) == [(1, 15), (3, 20), (4, 5)]
-    assert in_ms(history.past(70 * MS, 80 * MS)) == [(1, 5), (3, 5)]
-    assert in_ms(history.past(50 * MS, 65 * MS)) == [(1, 5)]
+    assert in_ms(history.past(start_ms * MS, end_ms * MS)) == parts
 
 
 def test_commands_ahead_begin_at_their_stamps_and_the_last_stays():
@@ -50,15 +58,12 @@ def test_commands_ahead_begin_at_their_stamps_and_the_last_stays():
     assert in_ms(parts) == [(0, 5), (1, 10), (2, 10), (3, 25)]
 
 
-@pytest.mark.parametrize("every", [1, 2])
-def test_the_shift_gives_commands_their_mean_age(every):
-    """A command that loses its successors is older, on average, while it is in force."""
-    expected_ms = 50 + 5 * (every - 1)
-    assert shift_ms(every=every) == pytest.approx(expected_ms, abs=1)
-
-
-def shift_ms(every=1, period_ms=10, odometry_ms=10):
-    """Return the shift if commands take 50 ms, each `every`-th arrives, and echoes are exact."""
+@pytest.mark.parametrize(
+    ("every", "period_ms", "odometry_ms", "expected"),
+    [(1, 10, 10, 50), (2, 10, 10, 55), (1, 20, 10, 50), (1, 2, 10, 50), (1, 10, 50, 50)],
+)
+def test_the_shift_gives_commands_their_mean_age(every, period_ms, odometry_ms, expected):
+    """Commands take 50 ms, and each `every`-th arrives: without its successor it acts longer."""
     history = History()
     for k in range(400):
         history.add(command(period_ms * k, 0.0))
@@ -66,21 +71,8 @@ def shift_ms(every=1, period_ms=10, odometry_ms=10):
         history.seen_ns = (begins_ms - 1) // odometry_ms * odometry_ms * MS
         if k % every == 0 and begins_ms % odometry_ms < period_ms:
             history.note_applied(command(period_ms * k, 0).stamp_ns, begins_ms * MS)
-    return (history.shift_ns(sample(0), 0.1) + AHEAD) / MS
-
-
-@pytest.mark.parametrize("rates", [{"period_ms": 20}, {"period_ms": 2}, {"odometry_ms": 50}])
-def test_the_shift_does_not_depend_on_rates(rates):
-    assert shift_ms(**rates) == pytest.approx(50, abs=1.5)
-
-
-def test_an_older_command_counts_if_the_robot_follows_it_after_a_newer_one():
-    history = History()
-    for k in range(3):
-        history.add(command(10 * k, float(k)))
-    for k, at_ms in ((0, 50), (2, 60), (1, 70)):  # tunnel.order: arrival
-        history.note_applied(command(10 * k, 0).stamp_ns, at_ms * MS)
-    assert in_ms(history.past(50 * MS, 80 * MS)) == [(0, 10), (2, 10), (1, 10)]
+    shift_ms = (history.shift_ns(sample(0), 0.1) + AHEAD) / MS
+    assert shift_ms == pytest.approx(expected, abs=1.5)
 
 
 def test_echoes_of_late_telemetry_change_no_shift():
@@ -114,10 +106,7 @@ def after_silence(predictor, *, lost):
 
     Telemetry, commands or nothing is `lost`. The robot follows its commands 50 ms late.
     """
-    body = model_based.build()
-    body.predict(sample(0), 0.0)
-    truth, dark = body.model(), range(200, 200 if lost == "none" else 2200)
-    x = {}
+    truth, dark, x = at_rest(), range(200, 200 if lost == "none" else 2200), {}
     for k in range(2260):
         state = truth.odometry()
         x[k] = state.position[0]
@@ -131,6 +120,13 @@ def after_silence(predictor, *, lost):
         predictor.commanded(command(10 * k, wanted(k)))
         truth.step((wanted(k - 5) if k - 5 not in dark and k not in dark else 0.0, 0, 0), 0.01)
     return later - x[2250]
+
+
+def at_rest(**parameters):
+    """Return the white box at rest."""
+    predictor = model_based.build(**parameters)
+    predictor.predict(sample(0), 0.0)
+    return predictor.model()
 
 
 def wanted(k):
@@ -249,7 +245,7 @@ def test_values_of_a_file_replace_the_parameters(tmp_path):
     [
         (command_history.build, {"model": "none.yaml"}, "model: none.yaml: cannot be read.*ident"),
         (kalman.build, {"parameters": {"model": "m.yaml"}}, "parameters: .* as model_file, beside"),
-        (kalman.build, {"model_file": "none.yaml"}, "model_file: is for model: first_order"),
+        (kalman.build, {"model_file": "none.yaml"}, "model_file: needs `model: first_order`"),
         (kalman.build, {"parameters": {"gain": 1}}, "^gain: "),
     ],
 )
@@ -275,10 +271,7 @@ def fly(predictor, push=0.0, noise=0.0, seconds=6.0, speed=0.5):
 
     Return the errors of the predictions by 100 ms, as (position [m], velocity [m/s]) along x.
     """
-    rng = np.random.default_rng(1)
-    body = model_based.build()
-    body.predict(sample(0), 0.0)
-    truth, states, predicted = body.model(), [], []
+    rng, truth, states, predicted = np.random.default_rng(1), at_rest(), [], []
     for k in range(round(seconds * 100)):
         u = speed * ((k // 100) % 2)
         predictor.commanded(command(10 * k - 50, u))
@@ -299,29 +292,16 @@ def rms(errors):
     return float(np.sqrt((errors**2).mean()))
 
 
-def test_model_based_stands_still_without_commands():
-    predictor = model_based.build()
-    predictor.predict(sample(0), 0.0)
-    still = predictor.model()
-    for _ in range(300):
-        state = still.step(ZERO, 0.01)
-    assert state.position == pytest.approx(ZERO, abs=0.06)
-    assert state.velocity == pytest.approx(ZERO, abs=0.02)
-
-
-def test_a_velocity_command_is_reached_without_a_steady_error():
-    predictor = model_based.build(integral_limit_xy=0.3)
-    predictor.predict(sample(0), 0.0)
-    flying = predictor.model()
+@pytest.mark.parametrize(("velocity", "limit"), [(ZERO, 0.1), ((2.0, -1.0, 0.5), 0.3)])
+def test_a_velocity_command_is_reached_without_a_steady_error(velocity, limit):
+    flying = at_rest(integral_limit_xy=limit)
     for _ in range(400):
-        state = flying.step((2.0, -1.0, 0.5), 0.01)
-    assert state.velocity == pytest.approx((2.0, -1.0, 0.5), abs=0.1)
+        state = flying.step(velocity, 0.01)
+    assert state.velocity == pytest.approx(velocity, abs=0.1 if any(velocity) else 0.02)
 
 
-def test_a_sinking_reference_leads_the_robot_by_half_a_metre_per_second():
-    predictor = model_based.build()
-    predictor.predict(sample(0), 0.0)
-    sinking = predictor.model()
+def test_a_sinking_reference_leads_by_half_a_metre_per_second():
+    sinking = at_rest()
     states = [sinking.step((0.0, 0.0, -3.0), 0.01) for _ in range(20)]
     falls = [(b.velocity[2] - a.velocity[2]) / 0.01 for a, b in pairwise(states)]
     assert min(falls) > -9.0  # without the limit the rotors would stop

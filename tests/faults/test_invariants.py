@@ -196,6 +196,6 @@ ENDING = (IMPOSSIBLE, step(LAND), *RELEASE)
         (set(), (step(TRACK), put(touch_age=0.5), step(ESTOP))),
     ],
 )
-def test_an_honest_cloud_touches_only_the_board_and_only_by_the_tip(kinds, story):
+def test_an_honest_cloud_touches_the_board_by_the_tip_only(kinds, story):
     assert play(*story, honest=True) == kinds
     assert play(*story) == set(), "with a hostile one a contact is no breach"

@@ -249,6 +249,12 @@ def numbers(assessment):
     return {name: number.value for name, number in assessment.numbers.items()}
 
 
+def both_ways(**keys):
+    """Return settings for both directions of the link."""
+    ways = ("uplink", "downlink")
+    return [f"link.{way}.{key}={value}" for way in ways for key, value in keys.items()]
+
+
 def digest(experiment, **options):
     """Compute the SHA-256 of all records of a flight."""
     digest = RecordHash()

@@ -1,24 +1,19 @@
-"""The contract of both endpoints without a link: ticks, bytes of any kind, stalls."""
+"""World without a link: when commands act, and what happens after a stall."""
 
 from itertools import pairwise
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from cloudrc.records import CommandApplied, Fault, GroundTruth, TelemetrySent
-from tests.flights.conftest import HOVER, MS, join, talking
+from tests.flights.conftest import MS, talking
 
-
-@pytest.fixture
-def talk():
-    return talking()
+talk = pytest.fixture(talking)
 
 
 @pytest.mark.parametrize(
     "wakes", [(), (21_300_000,), (20_500_000, 21_300_000), (20 * MS, 20 * MS + 1)]
 )
-def test_a_command_is_applied_at_the_next_tick_whenever_the_driver_wakes(talk, wakes):
+def test_a_command_is_applied_at_the_next_step_after_any_wake(talk, wakes):
     for wake in wakes:
         talk.world.handle_deadline(wake)
     talk.now_ns = 21_300_000
@@ -31,23 +26,13 @@ def test_a_command_is_applied_at_the_next_tick_whenever_the_driver_wakes(talk, w
     assert told == (30 * MS, 21_300_000, 8 * MS)
 
 
-def test_a_command_at_the_time_of_a_sample_waits_for_the_next_step(talk):
+def test_a_command_at_a_sample_waits_for_the_next_step(talk):
     """The same result in real time, where its time is a little later."""
     talk.now_ns = 20 * MS
     talk.world.handle_deadline(talk.now_ns)
     talk.send(talk.command(basis_ns=20 * MS))
     talk.wait(10)
     assert [applied.stamp_ns for applied in talk.take(CommandApplied)] == [22 * MS]
-
-
-ENDS = join(HOVER)[:2]
-
-
-@given(st.binary(max_size=300))
-@settings(max_examples=60, deadline=None)
-def test_no_bytes_make_an_end_raise(data):
-    for end in ENDS:
-        end.receive_datagram(data, 0)
 
 
 def test_after_a_stall_waiting_commands_are_stale(talk):

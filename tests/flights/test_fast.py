@@ -5,7 +5,7 @@ from functools import cache
 import pytest
 
 from tests.conftest import nightly
-from tests.flights.conftest import fly, numbers
+from tests.flights.conftest import both_ways, fly, numbers
 
 LIMITS = {200: (500, 0.4), 400: (800, 0.5), 600: (1000, 0.6)}
 """Round trip [ms] -> guard.command_age_max_ms, cloud.freeze_after_s."""
@@ -18,10 +18,7 @@ SILENT = 20.0  # [s]
 def link(rtt):
     """Return settings for a round trip [ms] with jitter and 10 % loss each way."""
     age, freeze = LIMITS[rtt]
-    one_way = {"delay_ms": rtt // 2, "jitter_ms": 60 if rtt == 600 else 40, "loss": 0.1}
-    both = [
-        f"link.{way}link.{key}={value}" for way in WAYS["both"] for key, value in one_way.items()
-    ]
+    both = both_ways(delay_ms=rtt // 2, jitter_ms=60 if rtt == 600 else 40, loss=0.1)
     return [*both, f"guard.command_age_max_ms={age}", f"cloud.freeze_after_s={freeze}"]
 
 

@@ -80,7 +80,7 @@ def test_split_estimates_the_delay_better_than_the_running_mean():
 @pytest.mark.parametrize(
     ("position", "scene"), [([9.2, 0.0, 1.0], "empty"), ([0.0, 0.0, 1.0], "pipes")]
 )
-def test_a_point_offered_for_one_that_the_guard_refuses_is_reached(position, scene):
+def test_the_point_offered_for_an_illegal_one_is_reached(position, scene):
     def load(point):
         waypoint = f"mission.waypoints=[{{position_m: {point}}}]"
         settings = [waypoint, f"world.scene={scene}", "criteria.time_limit_s=25"]

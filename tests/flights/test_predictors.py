@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import nightly
-from tests.flights.conftest import fly, numbers
+from tests.flights.conftest import both_ways, fly, numbers
 
 FAST = (
     "cloud.controller={name: pid, gain_p: [2.5, 2.5, 3.0], gain_d: [0.5, 0.5, 0.0]}",
@@ -14,21 +14,14 @@ FAST = (
 )
 BOX = "{name: model_based, integral_limit_xy: 0.3}"
 FILTERED = "{name: kalman, parameters: {integral_limit_xy: 0.3}}"
-
-
-def link(delay_ms, jitter_ms=0):
-    return [
-        f"link.{way}.{key}={value}"
-        for way in ("uplink", "downlink")
-        for key, value in (("delay_ms", delay_ms), ("jitter_ms", jitter_ms))
-    ]
+LONG = both_ways(delay_ms=70, jitter_ms=40)
 
 
 @pytest.mark.parametrize(
     ("predictor", "millimetres"), [("command_history", 8.0), (BOX, 3.0), (FILTERED, 3.5)]
 )
 def test_a_replay_knows_where_the_robot_will_be(predictor, millimetres):
-    flight = fly("steps", *FAST, *link(70, 40), f"cloud.predictor={predictor}")
+    flight = fly("steps", *FAST, *LONG, f"cloud.predictor={predictor}")
     assert flight.verdict.failures == ()
     n = numbers(flight)
     assert n["estimate_error_rms"] < millimetres * 1e-3
@@ -37,7 +30,7 @@ def test_a_replay_knows_where_the_robot_will_be(predictor, millimetres):
 
 def test_kalman_bears_the_noise_of_the_odometry():
     noise = "world.sensors={position_noise_m: 0.005, velocity_noise_mps: 0.02}"
-    flight = fly("steps", *FAST, *link(70, 40), noise, f"cloud.predictor={FILTERED}")
+    flight = fly("steps", *FAST, *LONG, noise, f"cloud.predictor={FILTERED}")
     assert numbers(flight)["estimate_error_rms"] < 6e-3
 
 
@@ -45,17 +38,19 @@ def test_kalman_bears_the_noise_of_the_odometry():
 def test_a_replay_is_stable_at_round_trips_of_seconds(case):
     predictor, each_way_ms = case
     limits = (
+        *both_ways(delay_ms=each_way_ms, jitter_ms=0),
         f"guard.command_age_max_ms={2 * each_way_ms + 150}",
         f"cloud.horizon_max_s={2e-3 * each_way_ms + 0.2}",
         "cloud.controller.speed_max=2.3",
     )
-    flight = fly("steps", *FAST, *limits, *link(each_way_ms), f"cloud.predictor={predictor}")
+    flight = fly("steps", *FAST, *limits, f"cloud.predictor={predictor}")
     assert flight.verdict.failures == ()
 
 
-def test_before_the_first_echo_the_start_of_the_mission_tells_the_delay():
+def test_before_the_first_echo_the_start_shows_the_delay():
     """On the ground, cloud knows no delay but the round trip of the operator's request."""
-    control = fly("steps", "mission.steps.count=1", *link(100)).flight.control
+    link = both_ways(delay_ms=100, jitter_ms=0)
+    control = fly("steps", "mission.steps.count=1", *link).flight.control
     first = control["horizon"][:10]
     assert np.isnan(control["rtt"][:10]).all()
     assert first == pytest.approx(np.full(10, 0.2), abs=0.02)

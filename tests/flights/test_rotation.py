@@ -7,12 +7,11 @@ import pytest
 from cloudrc.faults.flight import SECRET, Flight
 from cloudrc.faults.measures import epochs
 from cloudrc.messages import GuardState
-from cloudrc.records import CommandApplied
 from cloudrc.tunnel.keys import Key, KeySet
+from tests.flights.conftest import both_ways
 
 NEW = KeySet(Key(b"n" * 32), SECRET.current)
 ONLY = KeySet(NEW.current)
-FILES = (ONLY, NEW, KeySet(SECRET.current, NEW.current))
 DELAY = 0.05
 """One-way delay of the link in both directions [s]."""
 HOLD_MAX = 2 * DELAY + 1.1
@@ -20,7 +19,7 @@ HOLD_MAX = 2 * DELAY + 1.1
 HOVER = (
     "mission.waypoints=[{position_m: [0.5, 0, 0.8], dwell_s: 400, time_limit_s: 500}]",
     *("criteria.time_limit_s=500", "criteria.contact=false", "link.profile=ideal"),
-    *(f"link.{way}.delay_ms={DELAY * 1e3}" for way in ("uplink", "downlink")),
+    *both_ways(delay_ms=DELAY * 1e3),
 )
 ENDS = ("world", "cloud")
 
@@ -62,30 +61,6 @@ def test_a_rotation_costs_one_short_hold_at_most(first, second, apart):
     (hold,) = held(flight)
     assert hold < HOLD_MAX
     assert flight.count("tag") <= 12 * apart / 60 + 2, "no alert"
-
-
-@pytest.mark.parametrize(("first", "second"), [ENDS, ENDS[::-1]])
-def test_an_end_that_starts_amid_a_rotation_uses_both_keys(first, second):
-    flight = Flight(*HOVER)
-    flight.replace_key(first, NEW)
-    assert key(flight.fly(5.0)) == SECRET.current
-    flight.replace_key(second, NEW)
-    assert key(flight.fly(5.7)) == NEW.current
-
-
-@pytest.mark.parametrize("of_world", FILES)
-@pytest.mark.parametrize("of_cloud", FILES)
-def test_ends_with_a_common_key_hear_each_other(of_world, of_cloud):
-    """Whatever the order of the keys in both files, as after a roll-back; the cloud restarts."""
-    flight = Flight(*HOVER).fly(2.0)
-    flight.replace_key("world", of_world)
-    flight.cloud.restart(flight.run.now_ns, 0.5)
-    flight.fly(4.0)
-    flight.replace_key("cloud", of_cloud)
-    flight.fly(8.0)
-    assert key(flight) in (of_world.current, of_cloud.current)
-    heard = [r for r in flight.of_world if isinstance(r, CommandApplied)]
-    assert heard[-1].stamp_ns > 7.7e9
 
 
 @pytest.mark.promise("old-keys-end")

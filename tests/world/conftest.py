@@ -1,5 +1,6 @@
 """Scenes with another spawn, so that a test can start in the air or beside the board."""
 
+import numpy as np
 import pytest
 
 from cloudrc.world.scene import FOLDER
@@ -19,3 +20,10 @@ def scene_at(tmp_path):
         return str(path)
 
     return write
+
+
+def normalised(quaternion):
+    """Return a unit quaternion (wxyz) and its rotation matrix."""
+    w, *q = quaternion / np.linalg.norm(quaternion)
+    cross = np.array([[0, -q[2], q[1]], [q[2], 0, -q[0]], [-q[1], q[0], 0]])
+    return (w, *q), np.eye(3) + 2 * w * cross + 2 * cross @ cross

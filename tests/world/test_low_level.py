@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.world.low_level import NOSE_COSINE_MIN, YAW_SINE_MAX, LowLevel, allocate, attitude
 from cloudrc.world.readings import Readings
+from tests.world.conftest import normalised
 
 WEIGHT = 10.3005  # 1.05 kg * 9.81 m/s^2
 KF = 9.9865e-6
@@ -22,7 +23,7 @@ def turned(orientation, rate=ZERO):
 AT_REST = turned(UPRIGHT)
 
 
-def test_proportional_and_integral_force_carry_the_mass_and_oppose_the_error():
+def test_the_force_carries_the_mass_and_opposes_the_error():
     # 10.3005 / 4 = 2.575125 N; / 9.9865e-6 = 257860.6; root 507.80.
     assert LowLevel().update(AT_REST, ZERO) == pytest.approx((507.80,) * 4, abs=0.005)
     # e = v - v_ref = (.1, -.1, .1): P = 4, 4, 10 times; the integral after 2 ms is .0002.
@@ -46,7 +47,7 @@ def test_the_integral_force_in_x_and_y_is_limited():
     assert low_level.force(ZERO, ZERO) == pytest.approx((0.3, -0.3, WEIGHT + 2.5 * 0.40))
 
 
-def test_a_forward_force_pitches_the_nose_down_and_rates_are_damped():
+def test_a_forward_force_pitches_down_and_rates_are_damped():
     # Wanted tilt atan(3/4) about +y, so e_R = -sin = -.6; thrust is the force's part along z.
     assert attitude((3.0, 0.0, 4.0), AT_REST) == pytest.approx((4.0, 0, 0.6, 0))
     spinning = turned(UPRIGHT, (1.0, 2.0, 3.0))
@@ -62,16 +63,14 @@ unit = st.floats(-1.0, 1.0)
     quaternion=st.tuples(*[unit] * 4).filter(lambda q: np.linalg.norm(q) > 0.1),
 )
 def test_attitude_is_the_matrix_formula(force, quaternion):
-    w, *q = np.array(quaternion) / np.linalg.norm(quaternion)
-    cross = np.array([[0, -q[2], q[1]], [q[2], 0, -q[0]], [-q[1], q[0], 0]])
-    rotation = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    orientation, rotation = normalised(quaternion)
     z_d = np.array(force) / np.linalg.norm(force)
     y_d = np.cross(z_d, (1.0, 0.0, 0.0))
     y_d /= np.linalg.norm(y_d)
     error = np.column_stack([np.cross(y_d, z_d), y_d, z_d]).T @ rotation
     assume(error[1, 1] > NOSE_COSINE_MIN and abs(rotation[1, 0]) < YAW_SINE_MAX)
     error = 0.5 * (error - error.T)
-    thrust, *torque = attitude(force, turned((w, *q)))
+    thrust, *torque = attitude(force, turned(orientation))
     assert thrust == pytest.approx(np.dot(force, rotation[:, 2]), abs=1e-9)
     assert torque == pytest.approx([-error[2, 1], -error[0, 2], -0.035 * error[1, 0]], abs=1e-9)
 

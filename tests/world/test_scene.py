@@ -60,16 +60,16 @@ def test_staves_are_tangent_to_the_pipe(pipes, name):
     [
         ((0.0, 0.0, 0.1), set()),
         # The rear rotor's rim reaches x = -.338; pipe 1's outside is at -1 + .7 = -.3.
-        ((0.0, 0.0, 0.75), {"pipe_1"}),
+        ((0.0, 0.0, 0.75), {("pipe_1", False)}),
         ((0.2, 0.0, 0.75), set()),
         ((8.134, -6.42, 0.7), set()),  # the tip meets the board with the base at 8.135
-        ((8.136, -6.42, 0.7), {"board"}),
+        ((8.136, -6.42, 0.7), {("board", True)}),
     ],
 )
 def test_what_the_robot_touches(scene_at, place, touched):
     simulator = Simulator("pelican", scene_at(*place))
     simulator.step(STOPPED)
-    assert {touch.body for touch in simulator.take_contacts()} == touched
+    assert {(touch.body, touch.tip) for touch in simulator.take_contacts()} == touched
 
 
 SHIPPED = {"robots": "pelican", "scenes": "empty"}

@@ -9,22 +9,6 @@ from cloudrc.world.sensors import Errors, Sensors
 TRUTH = Odometry(5, (1.0, 2.0, 3.0), (0.6, 0.0, 0.8, 0.0), (4.0, 5.0, 6.0), (7.0, 8.0, 9.0))
 
 
-def test_noise_has_the_configured_deviation_per_axis():
-    position, velocity = 0.005, 0.02
-    sensors = Sensors(position, velocity, np.random.default_rng(1))
-    samples = [sensors.measure(TRUTH) for _ in range(2000)]
-    again = Sensors(position, velocity, np.random.default_rng(1))
-    assert again.measure(TRUTH) == samples[0], "the seed decides"
-    for name, deviation in (("position", position), ("velocity", velocity)):
-        errors = np.array([getattr(s, name) for s in samples]) - getattr(TRUTH, name)
-        # 2000 samples: the deviation within 5 %, the mean within 3 standard errors.
-        assert errors.std(axis=0) == pytest.approx([deviation] * 3, rel=0.05)
-        assert np.all(abs(errors.mean(axis=0)) <= 3.0 * deviation / np.sqrt(2000))
-    noisy = samples[-1]
-    assert noisy._replace(position=TRUTH.position, velocity=TRUTH.velocity) == TRUTH
-    assert {type(x) for x in (*noisy.position, *noisy.velocity)} == {float}
-
-
 def test_attitude_and_rate_have_their_bias_about_the_body_axes():
     turn = (0.0, 0.0, np.pi / 2)
     biased = Sensors(
@@ -40,7 +24,9 @@ def test_attitude_and_rate_have_their_bias_about_the_body_axes():
     assert (biased.position, biased.velocity) == same
 
 
-def test_noise_of_attitude_and_rate_changes_no_other_noise():
+def test_noise_has_the_configured_deviation_per_axis():
+    """Noise of attitude and rate does not change that of position and velocity."""
+
     def sensors(**errors):
         first, second = np.random.default_rng(1), np.random.default_rng(2)
         return Sensors(0.005, 0.02, first, turn_rng=second, **errors)
@@ -48,7 +34,14 @@ def test_noise_of_attitude_and_rate_changes_no_other_noise():
     plain, noisy = sensors(), sensors(attitude=Errors(0.01), rate=Errors(0.05))
     pairs = [(plain.measure(TRUTH), noisy.measure(TRUTH)) for _ in range(2000)]
     assert all(a.position == b.position and a.velocity == b.velocity for a, b in pairs)
+    deviations = {"position": 0.005, "velocity": 0.02, "angular_velocity_body": 0.05}
+    for name, deviation in deviations.items():
+        errors = np.array([getattr(b, name) for _, b in pairs]) - getattr(TRUTH, name)
+        # 2000 samples: the deviation within 5 %, the mean within 3 standard errors.
+        assert errors.std(axis=0) == pytest.approx([deviation] * 3, rel=0.05)
+        assert np.all(abs(errors.mean(axis=0)) <= 3.0 * deviation / np.sqrt(2000))
     products = [2 * np.dot(TRUTH.orientation_wxyz, b.orientation_wxyz) ** 2 - 1 for _, b in pairs]
     assert np.sqrt(np.mean(np.arccos(products) ** 2)) == pytest.approx(0.01 * np.sqrt(3), rel=0.05)
-    rates = np.array([b.angular_velocity_body for _, b in pairs])
-    assert rates.std(axis=0) == pytest.approx([0.05] * 3, rel=0.05)
+    last = pairs[-1][0]
+    assert last._replace(position=TRUTH.position, velocity=TRUTH.velocity) == TRUTH
+    assert {type(x) for x in (*last.position, *last.velocity)} == {float}

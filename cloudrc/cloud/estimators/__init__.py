@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 
 class DelaySample(NamedTuple):
-    """The delays that one telemetry datagram shows, if its hold time is at most 50 ms.
+    """The delays that one telemetry datagram with a short hold time shows.
 
     Attributes:
         loop_delay: Arrival of the echo minus the command's stamp [s]. The loop delay includes the
@@ -33,8 +33,8 @@ class Estimator:
         """Add a command that world has applied; called once for each command that an echo shows.
 
         Args:
-            applied_minus_stamp: Instant of application on world's clock minus the command's stamp
-                on cloud's clock [s]: the downlink delay plus an unknown constant, the clock offset.
+            applied_minus_stamp: Time of application on world's clock minus the command's stamp on
+                cloud's clock [s]: the downlink delay plus the unknown clock offset world - cloud.
         """
 
     def horizon(self, age: float) -> float:

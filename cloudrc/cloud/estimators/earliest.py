@@ -1,7 +1,7 @@
 """Estimator: the exact age of the odometry, plus the shortest delay of recent commands.
 
-For plans (`cloud.plan_s`): a plan begins when its command can arrive at the earliest. World skips
-the first part of a plan that arrives later, so that this delay needs no estimate.
+Use it with plans (`cloud.plan_s`): a plan begins at the earliest possible arrival of its command.
+If the command arrives later, world skips the beginning of the plan.
 
 Source: docs/reference/control.md, "Plans".
 """
@@ -15,7 +15,7 @@ from cloudrc.config.schema import Count
 
 
 class Earliest(Estimator):
-    """Takes the minimum over the last applied commands."""
+    """Adds the age of the newest odometry and the smallest delay of the last commands."""
 
     def __init__(self, count: int) -> None:
         self._offsets: deque[float] = deque(maxlen=count)
@@ -25,7 +25,7 @@ class Earliest(Estimator):
         self._offsets.append(applied_minus_stamp)
 
     def horizon(self, age: float) -> float:
-        """Return the shortest time from odometry to command [s]; `age` [s] has the same offset."""
+        """Return `age` plus the smallest `applied_minus_stamp` [s]; the clock offsets cancel."""
         return max(0.0, age + min(self._offsets)) if self._offsets else 0.0
 
 

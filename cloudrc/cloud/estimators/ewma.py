@@ -11,7 +11,7 @@ from cloudrc.config.schema import Gain
 
 
 class Ewma(Estimator):
-    """Exponentially weighted moving average of the loop delay, which begins at the first sample."""
+    """Exponentially weighted moving average of the loop delay; it starts at the first sample."""
 
     def __init__(self, gain: float) -> None:
         """Set `gain`, the weight of a new sample, in [0, 1]."""

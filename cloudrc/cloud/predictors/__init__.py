@@ -19,7 +19,7 @@ from cloudrc.messages import Command, Odometry, Quaternion, Vector
 
 
 class Model:
-    """A state of the robot that commands move, for a plan of future commands."""
+    """A simulated robot that follows velocity commands; `make_plan` plans with it."""
 
     def step(self, velocity: Vector, dt: float) -> Odometry:
         """Advance the state by `dt` [s], > 0, under a velocity command [m/s]; return the state."""
@@ -52,7 +52,7 @@ class Predictor:
         raise NotImplementedError
 
     def model(self) -> Model | None:
-        """Return a new model in the state of the last prediction, or None without a model."""
+        """Return a new model in the state of the last prediction; by default there is none."""
         return None
 
 

@@ -1,7 +1,7 @@
-"""What predictors share that replay the sent commands through a model of the robot.
+"""Base class of the predictors that replay the sent commands through a model of the robot.
 
-World follows the newest command that has arrived. A command begins at its stamp on cloud's clock,
-plus a shift to world's clock. The echoes give the shift, so the clocks need no synchronisation.
+World follows the newest command that has arrived. On world's clock, a command begins at its stamp
+plus a shift: the downlink delay plus the clock offset. The echoes show the sum of both.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from cloudrc.messages import NEVER_NS, PLAN_STEP_NS, ZERO, Command, Odometry, Ve
 PERIOD_NS = 10_000_000
 """Usual time between two samples or commands [ns]. Source: docs/reference/plant.md, "Commands"."""
 COUNT = 2048
-"""Number of commands that are remembered at least: 20 s at 100 Hz, twice the longest horizon."""
+"""Smallest number of stored commands: 20 s at 100 Hz, twice the longest horizon."""
 GAIN = 0.05
-"""Weight of a command that lasts PERIOD_NS in the mean shift."""
+"""Weight in the mean shift of a command that the robot follows for PERIOD_NS [1]."""
 SILENCE_NS = 200_000_000
-"""The mean shift begins anew after a longer time without a new command [ns]."""
+"""Time without a new command after which the mean shift starts again [ns]."""
 FOLLOWED_NS = 1_000_000_000
-"""The robot follows no command for longer without a newer one, not even a plan [ns]."""
+"""Longest time for which the robot follows a command or its plan without a newer command [ns]."""
 NO_COMMAND = Command(0, 0, 0, ZERO, 0.0)
 
 
@@ -41,7 +41,7 @@ class History:
         self._shift_ns = 0.0
 
     def add(self, command: Command) -> bool:
-        """Remember a command that has just been sent; return False if it is not the newest."""
+        """Store a command that cloud has just sent; return False if it is not the newest."""
         if self.stamps and command.stamp_ns <= self.stamps[-1]:
             return False
         self.stamps.append(command.stamp_ns)
@@ -55,7 +55,7 @@ class History:
         return self.stamps[-1] - self.stamps[-2] if len(self.stamps) > 1 else PERIOD_NS
 
     def note_applied(self, stamp_ns: int, began_ns: int) -> None:
-        """Note when the robot began to follow the command with this stamp, world's clock [ns]."""
+        """Note that the command stamped `stamp_ns` began at `began_ns`, world's clock [ns]."""
         last_began_ns, last_stamp_ns = self._applied[-1] if self._applied else (NEVER_NS, 0)
         lasted_ns = began_ns - last_began_ns
         if lasted_ns <= 0:
@@ -65,7 +65,7 @@ class History:
         if not self._applied or lasted_ns > SILENCE_NS:
             self._shift_ns = began_ns - stamp_ns
         else:
-            # A command lasts longer if the next ones are lost. So half of this time counts, too.
+            # A command lasts longer if the next ones are lost. Half of the extra time counts.
             shift_ns = last_began_ns - last_stamp_ns + 0.5 * (lasted_ns - self._period_ns)
             share = min(1.0, GAIN * lasted_ns / PERIOD_NS)
             self._shift_ns += share * (shift_ns - self._shift_ns)
@@ -76,9 +76,9 @@ class History:
         return bool(self._applied) and now_ns - self._applied[-1][0] > FOLLOWED_NS
 
     def shift_ns(self, odometry: Odometry, horizon: float) -> int:
-        """Return the shift [ns]; before the first echo, the one that `horizon` [s] implies.
+        """Return the shift [ns]; before the first echo, compute it from `horizon` [s].
 
-        A plan begins at its own time, however late it arrives.
+        With a plan, the shift is known: the command states when its plan begins.
         """
         if self.commands and self.commands[-1].plan:
             return self.commands[-1].planned_ns - self.stamps[-1]
@@ -87,7 +87,7 @@ class History:
         return odometry.stamp_ns + round(horizon * 1e9) - self.stamps[-1] - self._period_ns
 
     def past(self, start_ns: int, end_ns: int) -> Iterator[tuple[Vector, float]]:
-        """Yield velocity [m/s] and duration [s] of the commands that the echoes have shown.
+        """Yield velocity [m/s] and duration [s] of each command that world followed, by the echoes.
 
         The interval from `start_ns` to `end_ns` is on world's clock [ns].
         """
@@ -103,7 +103,7 @@ class History:
         return reversed(parts)
 
     def ahead(self, start_ns: int, end_ns: int, shift_ns: int) -> Iterator[tuple[Vector, float]]:
-        """Yield velocity [m/s] and duration [s] of the commands that are expected to be followed.
+        """Yield velocity [m/s] and duration [s] of each command that world will probably follow.
 
         The interval from `start_ns` to `end_ns` is on world's clock [ns].
         """
@@ -115,7 +115,7 @@ class History:
             start_ns, index = until_ns, index + 1
 
     def followed(self, count: int, start_ns: int, end_ns: int) -> list[tuple[Vector, float]]:
-        """List velocity [m/s] and duration [s] of the last of `count` commands, with its plan."""
+        """List velocity [m/s] and duration [s] of command number `count`, or of its plan."""
         command = self.commands[count - 1] if count else NO_COMMAND
         if not command.plan:
             return [(command.velocity, (end_ns - start_ns) * 1e-9)]
@@ -174,23 +174,23 @@ class Replay(Predictor):
         self._last: Body | None = None
 
     def commanded(self, command: Command) -> None:
-        """Remember the command."""
+        """Store the command."""
         self.history.add(command)
 
     def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
-        """Remember from when on the robot follows the command."""
+        """Store the time from which the robot follows the command."""
         self.history.note_applied(command_stamp_ns, applied_ns)
 
     def observe(self, odometry: Odometry) -> None:
-        """Remember the newest sample."""
+        """Store the newest sample."""
         self.newest, self.history.seen_ns = odometry, odometry.stamp_ns
 
     def roll(self, odometry: Odometry, horizon: float) -> Body:
-        """Return a body that has moved from the newest sample for `horizon` [s]."""
+        """Return a body in the predicted state `horizon` [s] after the newest sample."""
         raise NotImplementedError
 
     def forecast(self, stamp_ns: int) -> Body | None:
-        """Return a body at the stamp of the next sample [ns]; None if there was none before."""
+        """Return a body in the predicted state at a later stamp [ns]; None without a sample."""
         if self.newest is None or stamp_ns <= self.newest.stamp_ns:
             return None
         return self.roll(self.newest, (stamp_ns - self.newest.stamp_ns) * 1e-9)

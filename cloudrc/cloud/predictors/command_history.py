@@ -21,11 +21,11 @@ from cloudrc.messages import ZERO, Command, Odometry, Vector
 Axes: TypeAlias = tuple[Vector, ...]
 """Time constant [s], dead time [s] and gain [1] of x, y and z."""
 STEPS_MAX = 200
-"""Largest number of steps from one command to the next."""
+"""Largest number of steps of the model from one command to the next."""
 
 
 class FirstOrder(Body):
-    """The guard's acceleration limit, a dead time as a lag, and a first-order lag per axis."""
+    """Model per axis: the guard's acceleration limit, then two lags; the first is the dead time."""
 
     def __init__(self, axes: Axes, acceleration_max: float) -> None:
         """Begin at rest, with `acceleration_max` [m/s^2], the guard's cap."""
@@ -61,8 +61,8 @@ class FirstOrder(Body):
 class CommandHistory(Replay):
     """Adds the effect of the commands in the horizon to the measured position and velocity.
 
-    The loop is linear behind the acceleration limit. So one replay of all commands, from rest, is
-    enough: the measured velocity differs from the replayed one by an error that decays.
+    The loop is linear behind the acceleration limit. Therefore one replay of all commands, from
+    rest, is enough: the difference between measured and replayed velocity decays exponentially.
     """
 
     def __init__(self, axes: Axes, acceleration_max: float) -> None:
@@ -76,7 +76,7 @@ class CommandHistory(Replay):
         self._bodies: list[FirstOrder] = []  # at the stamp of each command
 
     def commanded(self, command: Command) -> None:
-        """Replay until the stamp of this command."""
+        """Replay the earlier commands until the stamp of this command; store both."""
         body = self._at(command.stamp_ns)
         if self.history.add(command):
             if len(self._bodies) >= len(self.history.stamps):
@@ -97,7 +97,7 @@ class CommandHistory(Replay):
         return body
 
     def roll(self, odometry: Odometry, horizon: float) -> FirstOrder:
-        """Return a body that has moved from a sample for `horizon` [s]."""
+        """Return a body in the predicted state `horizon` [s] after a sample."""
         start_ns = odometry.stamp_ns - self.history.shift_ns(odometry, horizon)
         start, body = self._at(start_ns), self._at(start_ns + round(horizon * 1e9))
         axes = []

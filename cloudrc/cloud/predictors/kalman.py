@@ -27,9 +27,10 @@ class Kalman(Predictor):
     """Filters position and velocity, and gives the filtered samples to another predictor."""
 
     def __init__(self, replay: Replay, position: float, velocity: float, model: float) -> None:
-        """Set the predictor that replays the commands, and standard deviations.
+        """Set the predictor that replays the commands, and three standard deviations.
 
-        These are of position [m], velocity [m/s] and the model's acceleration [m/s^2].
+        `position` [m] and `velocity` [m/s] belong to the measurement; `model` belongs to the
+        acceleration of the model [m/s^2].
         """
         self._replay, self._error = replay, model * model
         self._noise = np.diag([position * position, velocity * velocity])
@@ -118,7 +119,7 @@ def build(
     """
     given = dict(parameters or {})
     if model_file is not None and model == "white_box":
-        raise ValueError("model_file: is for model: first_order; set that, or leave it out")
+        raise ValueError("model_file: needs `model: first_order`; set that, or omit model_file")
     if "model" in given:  # the experiment file makes a relative model_file absolute
         raise ValueError("parameters: give the file of a model as model_file, beside parameters")
     if model_file is not None:

@@ -1,9 +1,9 @@
 """Predictor: replay the sent commands through a model of the robot and its onboard controller.
 
 The model is a white box: guard's limits, velocity PID, attitude loop, rotors, drag. Its hidden
-states (reference, integral, thrust, torque) follow the commands that the echoes show. Measured
-states replace the model's at each odometry. What the model misses is estimated as a constant
-acceleration and a constant torque, for example from wind, a payload or the arm's weight.
+states (reference, integral, thrust, torque) follow the commands that the echoes show. Each odometry
+sample replaces pose and twist. The model estimates effects that it lacks, such as wind, a payload
+or the arm's weight, as a constant acceleration and a constant torque.
 
 Source: docs/reference/control.md, "Predictors", (e2); docs/reference/plant.md, "Robot", "Low-level
 controller".
@@ -30,7 +30,7 @@ RATE_GAIN = 0.22
 """Torque per angular velocity [N m s]; the torque per attitude error is 1 N m.
 Source: docs/reference/plant.md, "Low-level controller"."""
 LAG_UP, LAG_DOWN, LAG = 0.0125, 0.025, 0.01875
-"""Time constants of the thrust, and of a torque, which needs both: their mean [s].
+"""Time constants of a rising thrust, of a falling thrust, and of a torque: the mean of both [s].
 Source: docs/reference/plant.md, "Rotor speed"."""
 DRAG = 0.155
 """Deceleration per velocity across the thrust axis, with the rotors at hover speed [1/s].
@@ -44,10 +44,10 @@ refuses to descend. Source: docs/safety.md, "Limits"."""
 THRUST_MAX = 134.9
 """Largest thrust of the four rotors [N]. Source: docs/reference/plant.md, "Rotor speed"."""
 GAIN_ACCELERATION, GAIN_TORQUE = 0.3, 0.1
-"""Rates at which the estimates of what the model misses follow its errors [1/s]. The rate of the
-torque begins at 1 and falls with time, because the model's own errors disturb it."""
+"""Rates at which the estimated acceleration and torque follow the errors of a prediction [1/s]. The
+rate of the torque falls from 1 to GAIN_TORQUE, because other errors disturb the estimate."""
 GAP_NS = 500_000_000
-"""After a longer time without odometry the model begins anew [ns]."""
+"""Time without odometry after which the model starts again [ns]."""
 
 
 class WhiteBox(Body):
@@ -72,7 +72,7 @@ class WhiteBox(Body):
         self._take(basis)
 
     def correct(self, odometry: Odometry) -> None:
-        """Replace the measured states by those of `odometry`, and learn from the differences."""
+        """Replace the states by the measured ones, and learn from the differences."""
         (ax, ay, az), (vx, vy, vz) = odometry.velocity, self.velocity
         bx, by, bz = self._missed
         k = GAIN_ACCELERATION
@@ -177,7 +177,7 @@ def _limit(reference: Vector, last: Vector, height: float, climb: float) -> Vect
 
 
 class ModelBased(Replay):
-    """Rolls the white box from the newest odometry through the commands of the horizon."""
+    """Moves the white box from the newest odometry by the commands of the horizon."""
 
     def __init__(self, gains: tuple[float, ...], acceleration_max: float) -> None:
         """Set the gains of the onboard velocity loop, and `acceleration_max` [m/s^2]."""
@@ -190,7 +190,7 @@ class ModelBased(Replay):
         self._body: WhiteBox | None = None  # at the newest sample
 
     def forecast(self, stamp_ns: int) -> WhiteBox | None:
-        """Return a body at the stamp of the next sample [ns]; None without a recent sample."""
+        """Return a body in the predicted state at a later stamp [ns]; None without recent data."""
         body = copy(self._body)
         if body is None or not 0 < stamp_ns - body.basis.stamp_ns < GAP_NS:
             return None
@@ -207,7 +207,7 @@ class ModelBased(Replay):
         self._body.correct(odometry)
 
     def roll(self, odometry: Odometry, horizon: float) -> WhiteBox:
-        """Return a body that has moved from the newest sample for `horizon` [s]."""
+        """Return a body in the predicted state `horizon` [s] after the newest sample."""
         if self._body is None or self._body.basis.stamp_ns != odometry.stamp_ns:
             self.observe(odometry)
         assert self._body is not None

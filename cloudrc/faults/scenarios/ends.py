@@ -19,8 +19,8 @@ from cloudrc.tunnel.handshake import BUSY_TEXT
 @scenario(
     13,
     "cloud-killed",
-    injects="SIGKILL of the cloud process, a new one 0.8 s later",
-    expects="HOLD by 252 ms; the new process commands in <= 2 s; the same waypoint goes on",
+    injects="SIGKILL of the cloud process; a new process starts 0.8 s later",
+    expects="HOLD within 252 ms; new commands in <= 2 s; the mission continues at its waypoint",
 )
 def _cloud_killed(outcome: Outcome, seed: int) -> None:
     at, down = measures.instant(seed), 0.8
@@ -40,7 +40,7 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
     15,
     "cloud-paused",
     injects="SIGSTOP of the cloud process for 5 s",
-    expects="HOLD; of what it computed before nothing is applied",
+    expects="HOLD; world applies no command that is too old",
 )
 def _cloud_paused(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
@@ -59,8 +59,8 @@ def _cloud_paused(outcome: Outcome, seed: int) -> None:
     17,
     "world-restarted",
     injects="the world pod restarts within 2 s",
-    expects="back on the ground, never airborne without power; a new epoch, commands of the old "
-    "one are refused; nothing resumes alone",
+    expects="the robot is at its spawn on the ground, and stays there; a new epoch; world rejects "
+    "commands of the old epoch",
 )
 def _world_restarted(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
@@ -69,12 +69,12 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
     flight.fly(at + 12.0)
     measures.safe(outcome, flight)
     after = [c for c in flight.changes if c.stamp_ns * 1e-9 > at]
-    outcome.same("changes of the guard after it", len(after), 0)
+    outcome.same("changes of the guard after the restart", len(after), 0)
     path = [r for r in flight.trajectory() if r.stamp_ns * 1e-9 > at]
     moved = max((hypot(*r.odometry.velocity) for r in path), default=nan)
     outcome.most("speed on the ground", moved, 0.01, "m/s")
     raised = measures.drift(flight, at, flight.now)
-    outcome.most("way from where it stood up", raised, 0.01, "m")
+    outcome.most("distance from its place after the restart", raised, 0.01, "m")
     outcome.true("mission failed", flight.mission.state == "failed")
     coded = "world_restarted" in str(flight.mission.verdict)
     outcome.true("with the code world_restarted", coded)
@@ -87,8 +87,8 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
     25,
     "two-clouds",
     injects="a second cloud with the same key; later the first one leaves",
-    expects="the first keeps authority while fresh; after HOLD the second gets a higher epoch; "
-    "commands never interleave",
+    expects="the first cloud keeps the session until it leaves; then HOLD, and the second cloud "
+    "gets a higher epoch; commands of both never mix",
 )
 def _two_clouds(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed, 4.0, 12.0)
@@ -97,23 +97,23 @@ def _two_clouds(outcome: Outcome, seed: int) -> None:
     assert isinstance(group, EndpointGroup)
     flight.fly(at + 5.0)
     opened = max(measures.epochs(flight), default=-1)
-    outcome.same("epochs while both are there", opened, 2)
+    outcome.same("epochs while both clouds run", opened, 2)
     flight.fly(at + 6.0)
-    outcome.same("HOLDs while both are there", len(measures.held(flight)), 0)
+    outcome.same("HOLDs while both clouds run", len(measures.held(flight)), 0)
     group.members = group.members[1:]  # the first leaves
     flight.fly(at + 14.0)
     measures.safe(outcome, flight)
     refused = "world datagrams_total downlink busy", "world sessions_refused_total"
     moves(outcome, flight, *refused, since=at)
     told = measures.told(group.others, "busy")
-    outcome.true("the second says why it waits, once", [r.text for r in told] == [BUSY_TEXT])
+    outcome.true("the second reports once why it waits", [r.text for r in told] == [BUSY_TEXT])
     said = min((r.stamp_ns * 1e-9 for r in told), default=nan)
-    outcome.most("it says so after", said - at, 1.0, "s")
+    outcome.most("the second cloud reports it after", said - at, 1.0, "s")
     by_first = [r for r in measures.seen_by(flight, "cloud", at + 6.0) if isinstance(r, Fault)]
-    outcome.same("faults that the first tells of", len(by_first), 0)
-    measures.held_in_time(outcome, flight, "HOLD once the first is gone")
+    outcome.same("faults that the first cloud reports", len(by_first), 0)
+    measures.held_in_time(outcome, flight, "HOLD after the first cloud has left")
     later = [epoch for epoch in measures.epochs(flight) if epoch > 2]
-    outcome.true("then the second gets a higher epoch", bool(later))
+    outcome.true("the second cloud then gets a higher epoch", bool(later))
 
 
 @scenario(
@@ -121,7 +121,7 @@ def _two_clouds(outcome: Outcome, seed: int) -> None:
     "swizzle-clog",
     injects="uplink, downlink, cloud, world and teleop freeze one by one and return in random "
     "order",
-    expects="always a safe state; the mission goes on",
+    expects="always a safe state; the mission continues",
 )
 def _swizzle(outcome: Outcome, seed: int) -> None:
     """Stop each direction of the link before its sender stops, so that datagrams are lost.

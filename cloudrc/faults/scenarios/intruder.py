@@ -26,9 +26,9 @@ def _check_no_effect(
 ) -> None:
     """Fly with and without hostile datagrams; both flights must be equal.
 
-    Hostile datagrams are sent from `since` [s] on. The first function in `makes` makes those for
-    world, the second function, if there is one, those for cloud. World's counters
-    `refusals` must rise.
+    Hostile datagrams are sent from `since` [s] on. The first function in `makes` makes datagrams
+    for world, an optional second function makes datagrams for cloud. World's counters `refusals`
+    must rise.
     """
     clean, flight, sent = Flight(seed=seed).fly_mission(), Flight(seed=seed), list[int]()
 
@@ -46,13 +46,13 @@ def _check_no_effect(
     moves(outcome, flight, *metrics, since=since)
     outcome.least("hostile datagrams", sum(sent), 1000)
     same = measures.epochs(clean) == measures.epochs(flight)
-    outcome.true("they opened no session", same)
+    outcome.true("hostile datagrams opened no session", same)
 
 
 @scenario(
     8,
     "corruption",
-    injects="1 % of the datagrams lose a bit; for 1 s, 1 % of all bits turn over",
+    injects="one bit flips in 1 % of the datagrams; for 1 s, 1 % of all bits flip",
     expects="corrupted datagrams are dropped",
 )
 def _corruption(outcome: Outcome, seed: int) -> None:
@@ -77,7 +77,7 @@ def _corruption(outcome: Outcome, seed: int) -> None:
 @scenario(
     20,
     "garbage-flood",
-    injects="10,000 datagrams of garbage per second at the world's port",
+    injects="10,000 random datagrams per second arrive at world's port",
     expects="no effect: the same path, bit by bit",
 )
 def _flood(outcome: Outcome, seed: int) -> None:
@@ -96,7 +96,7 @@ def _flood(outcome: Outcome, seed: int) -> None:
 @scenario(
     21,
     "old-session",
-    injects="a captured flight is played to both ends after their restart",
+    injects="world and cloud get the captured datagrams of an earlier flight",
     expects="no effect: the same path, bit by bit",
 )
 def _old_session(outcome: Outcome, seed: int) -> None:
@@ -113,13 +113,13 @@ def _old_session(outcome: Outcome, seed: int) -> None:
     makes = [lambda data, tape=tape: islice(tape, 6) for tape in tapes]
     _check_no_effect(outcome, seed, makes, "tag", since=SETTLED)
     left = sum(len(list(tape)) for tape in tapes)
-    outcome.same("captured datagrams that were not played to an end", left, 0)
+    outcome.same("captured datagrams that were not sent", left, 0)
 
 
 @scenario(
     22,
     "forged-command",
-    injects="copies with bits turned over, and with a counter far ahead",
+    injects="copies of datagrams with flipped bits, and with a much higher counter",
     expects="no effect: the same path, bit by bit",
 )
 def _forgery(outcome: Outcome, seed: int) -> None:
@@ -137,7 +137,8 @@ def _forgery(outcome: Outcome, seed: int) -> None:
     "malformed",
     injects="empty, truncated, oversized datagrams and those of another version; a cloud of "
     "another version for 2 s",
-    expects="dropped before any cryptography: the same path, bit by bit; no session with the other",
+    expects="dropped before any cryptography: the same path, bit by bit; no session between two "
+    "versions",
 )
 def _malformed(outcome: Outcome, seed: int) -> None:
     rng, newer = generator(seed, 20), bytes([codec.VERSION + 1])
@@ -155,4 +156,4 @@ def _malformed(outcome: Outcome, seed: int) -> None:
     fly_safely(outcome, flight)
     told = [fault.text for fault in measures.told(flight.of_world, "version")]
     text = f"peer speaks v{codec.VERSION + 1}, we speak v{codec.VERSION}"
-    outcome.true(f"it is told once: {text}", len(told) == 1 and told[0].startswith(text))
+    outcome.true(f"reported once: {text}", len(told) == 1 and told[0].startswith(text))

@@ -41,7 +41,7 @@ def _short_silence(outcome: Outcome, seed: int) -> None:
     2,
     "blackout",
     injects="both directions silent for 0.5, 3 and 20 s",
-    expects="HOLD at 252 ms, below 0.05 m/s in 1 s, drift <= 0.10 m, resumes <= 1 s after return",
+    expects="HOLD after 252 ms, below 0.05 m/s in 1 s, drift <= 0.10 m, TRACK <= 1 s after the end",
 )
 def _silence(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
@@ -64,8 +64,8 @@ def _silence(outcome: Outcome, seed: int) -> None:
 @scenario(
     3,
     "long-blackout",
-    injects="both directions silent for 75 s, over the floor and amid the pipes",
-    expects="HOLD, LAND after 60 s at 0.5 m/s, rotors stop on what lies below, latched",
+    injects="both directions silent for 75 s, over the floor and among the pipes",
+    expects="HOLD; LAND after 60 s at 0.5 m/s; rotors stop after touch-down; stays in LAND",
 )
 def _long_silence(outcome: Outcome, seed: int) -> None:
     """Interrupt the link over the free floor, and at a random place among the pipes."""
@@ -84,10 +84,12 @@ def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
     measures.safe(outcome, flight)
     held = measures.first_into(flight, GuardState.HOLD)
     landed = measures.first_into(flight, GuardState.LAND)
-    outcome.most(f"{where}: LAND 60 s after HOLD, off by", abs(landed - held - 60.0), 0.01, "s")
+    outcome.most(
+        f"{where}: deviation of LAND from 60 s after HOLD", abs(landed - held - 60.0), 0.01, "s"
+    )
     fallen = [-r.odometry.velocity[2] for r in flight.trajectory() if r.stamp_ns >= landed * 1e9]
     fastest = max(fallen, default=nan)
-    outcome.most(f"{where}: descent at 0.5 m/s, off by", abs(fastest - 0.5), 0.05, "m/s")
+    outcome.most(f"{where}: deviation of the descent from 0.5 m/s", abs(fastest - 0.5), 0.05, "m/s")
     rotor = max(flight.robot.simulator.rotor_speeds)
     outcome.most(f"{where}: fastest rotor", rotor, 1.0, "rad/s")
     outcome.true(f"{where}: touched down", flight.changes[-1].cause == Cause.DOWN.words)
@@ -110,7 +112,7 @@ def _loss(outcome: Outcome, seed: int) -> None:
     flight = fly_safely(outcome, Flight(seed=seed, link=conditions(loss=0.3)))
     outcome.same("HOLDs", len(measures.held(flight)), 0)
     error, usual = (measures.number(each, "tracking_rms_measured") for each in (flight, clean))
-    outcome.most("tracking error over that without loss", error / usual, 1.5)
+    outcome.most("tracking error, relative to that without loss", error / usual, 1.5)
     lost = "world datagrams_lost_total downlink", "cloud datagrams_lost_total uplink"
     moves(outcome, flight, *lost, since=0.0)
     outcome.least("loss in the report", measures.number(flight, "loss_uplink"), 0.25)
@@ -120,7 +122,7 @@ def _loss(outcome: Outcome, seed: int) -> None:
     5,
     "burst-loss",
     injects="Gilbert-Elliott loss, mean bursts of 50, 200 and 500 ms",
-    expects="TRACK and HOLD without chatter: <= 2 changes in any second",
+    expects="at most 2 changes between TRACK and HOLD in any second",
 )
 def _bursts(outcome: Outcome, seed: int) -> None:
     for packets in (5, 20, 50):

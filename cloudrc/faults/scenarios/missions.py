@@ -33,8 +33,8 @@ EXCESSIVE: dict[str, dict[str, Any]] = {
 @scenario(
     23,
     "invalid-values",
-    injects="NaN, infinite, huge and over-limit values with a valid seal",
-    expects="refused or clamped; 5 refused in 1 s: LAND, latched",
+    injects="NaN, infinite, huge and excessive values in authentic commands",
+    expects="rejected or limited; 5 rejected commands in 1 s cause LAND until acknowledged",
 )
 def _invalid_values(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
@@ -47,15 +47,15 @@ def _invalid_values(outcome: Outcome, seed: int) -> None:
         again = [change for change in tracked if change.stamp_ns * 1e-9 > landed]
         outcome.same(f"{name}: flown again without the operator", len(again), 0)
         causes = [change.cause for change in measures.changes_into(flight, GuardState.LAND)]
-        outcome.true(f"{name}: the cause is told", "impossible commands" in " ".join(causes))
+        outcome.true(f"{name}: the cause is reported", "impossible commands" in " ".join(causes))
         moves(outcome, flight, "world datagrams_total downlink range", since=at)
     for limit, changes in EXCESSIVE.items():
         lie, harmless = _for_a_while(at, 1.0, changes), limit != "speed"  # it may hit a pipe
         flight = Flight(seed=seed, honest=harmless, lies=[lie]).fly(40.0)
         measures.safe(outcome, flight)
         refused = sum("impossible" in change.cause for change in flight.changes)
-        outcome.same(f"100 times {limit}: taken for impossible", refused, 0)
-        outcome.least(f"100 times {limit}: clamped", flight.count(f"limited_{limit}"), 20)
+        outcome.same(f"100 times {limit}: rejected as impossible", refused, 0)
+        outcome.least(f"100 times {limit}: limited", flight.count(f"limited_{limit}"), 20)
         moves(outcome, flight, f"world guard_limited_total {limit}", since=at)
     one = Flight(seed=seed, lies=[_for_a_while(at, 0.005, IMPOSSIBLE["NaN"])]).fly(40.0)
     measures.safe(outcome, one)
@@ -76,8 +76,8 @@ def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
 @scenario(
     27,
     "impossible-mission",
-    injects="waypoints of NaN, in a wall, behind one, beyond the fence, 10,001 of them",
-    expects="refused as a whole, before anything is flown",
+    injects="waypoints of NaN, in a wall, behind a wall, beyond the fence; 10,001 waypoints",
+    expects="the whole mission is refused before the flight",
 )
 def _impossible(outcome: Outcome, seed: int) -> None:
     scene, first = load_scene("pipes"), (0.5, 0.0, 0.8)
@@ -118,8 +118,8 @@ def _wall_of(pipe: Pipe) -> Vector:
 @scenario(
     28,
     "waypoint-not-reached",
-    injects="what the cloud commands comes to nothing",
-    expects="HOLD; the leg ends by its limit of time",
+    injects="cloud commands the robot to stay where it is",
+    expects="the leg ends at its time limit, and HOLD begins",
 )
 def _unreachable(outcome: Outcome, seed: int) -> None:
     """Command the robot to stay where it is, so that it cannot reach the next waypoint."""
@@ -143,7 +143,7 @@ def _unreachable(outcome: Outcome, seed: int) -> None:
     reached = flight.events("reached")
     leg, began = assembly.build_plan(flight.experiment).legs[len(reached)], reached[-1].stamp_ns
     off = abs(ended - began * 1e-9 - leg.time_limit)
-    outcome.most("the leg ends off its limit by", off, 0.05, "s")
+    outcome.most("deviation of the leg's end from its limit", off, 0.05, "s")
     moves(outcome, flight, "teleop missions_total leg_timed_out", since=ended - 0.01)
     flight.fly(flight.now + 10.0)
     outcome.true("the robot holds", flight.guard_now()[0] is GuardState.HOLD)

@@ -36,7 +36,7 @@ was thrown up is also at rest at its highest point, but for less time."""
 POSITION_GAIN = 0.8
 """Gain of the position hold [1/s]: velocity reference per distance from the hold point."""
 DAMPING_GAIN = 1.6
-"""Damping of the position hold: the hold subtracts this factor times the robot's velocity."""
+"""Damping of the position hold [1]: it subtracts this factor times the robot's velocity."""
 HOLD_SPEED_MAX = 0.5
 """Largest velocity reference of the position hold [m/s]."""
 INTEGRAL_GAIN, INTEGRAL_MAX, INTEGRAL_RANGE = 0.2, 0.05, 0.1
@@ -168,9 +168,9 @@ class Descent:
 class TakeOff:
     """Detect when the robot has left the ground (`over`), and decide whether it may take off.
 
-    After a stop of the rotors in the air, the robot is perhaps still falling, or outside the fence,
-    when the operator acknowledges. The robot may then take off only after it has come to rest on
-    the ground, at least TAKE_OFF_MARGIN inside the fence.
+    If the rotors stopped in the air, the robot may still fall, or be outside the fence, when the
+    operator acknowledges the stop. It may then take off only after it has come to rest on the
+    ground, at least TAKE_OFF_MARGIN inside the fence.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
@@ -201,7 +201,7 @@ class TakeOff:
             self._stopped, self._still_ticks, self._height = True, 0, nan
 
     def look(self, readings: Readings, flies: bool) -> None:
-        """Process a step: if the robot flies, update `over`; else, its height and time at rest."""
+        """Process one step: update `over` in flight, height and time at rest on the ground."""
         height = readings.position[2]
         if flies:
             self.over, self._stopped = not abs(height - self._height) < LIFT_OFF_HEIGHT, False

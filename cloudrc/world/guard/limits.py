@@ -39,8 +39,8 @@ RECHECK_DISTANCE, RECHECK_NS = 0.25, 10_000_000
 fence only once per RECHECK_NS [ns]. In this time the robot moves by less than RECHECK_DISTANCE,
 because it is never faster than 25 m/s."""
 RETURN_GAIN, RETURN_SPEED_MAX = 1.0, 0.5
-"""Velocity with which a robot returns that is too near to a face of the fence, or outside: velocity
-per distance [1/s], and largest speed [m/s]."""
+"""A robot that is too near to a face of the fence, or outside, flies back: velocity per distance
+[1/s], and largest speed [m/s]."""
 LOW_HEIGHT, LOW_SPEED = 0.25, 1.0
 """The horizontal speed is limited to LOW_SPEED [m/s] while the robot is less than LOW_HEIGHT [m]
 above the fence's floor."""
@@ -79,7 +79,7 @@ def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
 
 
 def is_far_from_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> bool:
-    """Tell whether `limit_to_fence` changes nothing for a robot within RECHECK_DISTANCE.
+    """Tell whether `limit_to_fence` changes nothing within RECHECK_DISTANCE of `position`.
 
     `velocity` [m/s], `position` [m], `low` and `high` [m] are the arguments of `limit_to_fence`.
     """
@@ -122,7 +122,7 @@ def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector
 
 
 def limit_length(a: Vector, length_max: float) -> Vector:
-    """Shorten a velocity to `length_max` [m/s]; return zero if `a` has NaN or infinity."""
+    """Shorten the velocity `a` to `length_max` [m/s]; return zero for NaN or infinity."""
     x, y, z = a
     largest = max(abs(x), abs(y), abs(z))
     if largest > length_max:
@@ -155,7 +155,7 @@ def step_towards(start: Vector, end: Vector, step: float) -> Vector:
 
 
 def limit_growth(before: Vector, after: Vector, step: float) -> Vector:
-    """Return `after`, changed so that no more than `step` [m/s] is gained in speed.
+    """Return the velocity `after`, slowed so that the speed grows by at most `step` [m/s].
 
     `before` and `after` are finite velocities before and after one step [m/s]. The limit applies to
     all axes together, because the fence may reverse one axis while another axis gains speed.
@@ -218,8 +218,8 @@ class Limits:
         acceleration_max: Largest rate of change of the velocity reference [m/s^2].
         yaw_rate_max: Largest yaw rate [rad/s].
         hold_max_ns: Longest HOLD in a mission before LAND begins [ns]; see `alone_max_ns`.
-        plan_max_ns: Longest time for which a command's plan is flown after its arrival [ns]; 0: the
-            age of the command's odometry alone counts.
+        plan_max_ns: Longest time for which the robot flies a command's plan after its arrival [ns];
+            with 0, a plan does not keep a command fresh for longer.
     """
 
     fence_low: Vector
@@ -257,8 +257,8 @@ class Limits:
     def ramp_ns(self) -> int:
         """Time after a HOLD in which the acceleration of the velocity reference is limited [ns].
 
-        The limit is BRAKE, and the time is long enough to reach the speed cap. A limit that ends at
-        the commanded velocity would end too early: the first commands after a silence may be zero.
+        The limit is BRAKE, and the time is long enough to reach the speed cap. The time does not
+        end at the commanded velocity, because the first commands after a silence may be zero.
         Source: docs/reference/plant.md, "Leaving HOLD".
         """
         return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)
@@ -271,7 +271,7 @@ class Limits:
         return self.hold_max_ns if flies else max(self.hold_max_ns, GROUND_WAIT_MIN_NS)
 
     def inner_corners(self) -> tuple[Vector, Vector]:
-        """Return the lower and upper corner of the fence made smaller by its margins [m]."""
+        """Return the lower and upper corner of the fence without its margins [m]."""
         (ax, ay, az), (bx, by, bz) = self.fence_low, self.fence_high
         low = (ax + FENCE_MARGIN, ay + FENCE_MARGIN, az + FLOOR_MARGIN)
         return low, (bx - FENCE_MARGIN, by - FENCE_MARGIN, bz - FENCE_MARGIN)

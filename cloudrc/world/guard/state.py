@@ -16,8 +16,8 @@ the cloud is hostile.
 
 The *basis* of a command is the odometry from which cloud computed the command. A command is fresh
 while its basis is at most `command_age_max` old. A command with a plan stays fresh until the plan
-ends, at most for `plan_max` after its arrival. In each step the guard limits the velocity that the
-plan has for this time, as if it had just arrived; it trusts nothing of the plan.
+ends, at most for `plan_max` after its arrival. The guard does not trust a plan: in each step it
+limits the plan's velocity for the present time like the velocity of a new command.
 
 - Every state can change to ESTOP: by the operator's request, or when the robot has turned over,
   because its rotors would then push it in any direction. An acknowledgement leads to GROUND.
@@ -63,7 +63,7 @@ RESUME_NS = 500_000_000
 """RESUME_COMMANDS fresh commands within RESUME_NS [ns] end a HOLD.
 Source: docs/reference/plant.md, "Leaving HOLD"."""
 SETTLE_NS = 1_000_000_000
-"""Shortest time from the beginning of a HOLD to that of the next HOLD, and likewise for TRACK [ns].
+"""Shortest time between the beginnings of two HOLDs, and between those of two TRACKs [ns].
 Source: docs/reference/plant.md, "Settling time"; docs/reference/faults.md, "F5"."""
 INVALID_COMMANDS = 5
 IMPOSSIBLE = f"{INVALID_COMMANDS} impossible commands within 1 s"
@@ -71,7 +71,7 @@ INVALID_NS = 1_000_000_000
 """INVALID_COMMANDS impossible commands within INVALID_NS [ns] lead to LAND.
 Source: docs/reference/faults.md, "F23"."""
 FOREVER_NS = 1 << 62
-"""Stamp after all others [ns]: the commanded velocity does not change."""
+"""Stamp later than all others [ns]: no further velocity of a plan is due."""
 NO_COMMAND = Command(NEVER_NS, NEVER_NS, 0, ZERO, 0.0)
 
 
@@ -85,9 +85,8 @@ class Guard:
         reference: Velocity reference of the last step [m/s], world frame, shape (3,).
         yaw_rate: Limited yaw rate [rad/s]; the published low-level controller ignores it.
         changes: Changes of the state since the last `take_changes`.
-        counts: How often a limit was applied. "limited_speed" and "limited_yaw_rate" are numbers of
-            changed commands, and of changed velocities in a plan that were flown; "limited_fence"
-            is the number of steps with a changed reference.
+        counts: How often the guard applied a limit: "limited_speed" counts commands and flown
+            velocities of plans, "limited_yaw_rate" commands, "limited_fence" steps.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -172,8 +171,8 @@ class Guard:
     def accept_command(self, command: Command, now_ns: int) -> str | None:
         """Accept a command at `now_ns` [ns] and return None, or return the reason to reject it.
 
-        The reason is "range" if a number of the command is too large or NaN, "stale" if the basis
-        (the odometry of the command) is too old, and "future" if it is later than `now_ns`.
+        The reason is "range" for a number that is too large or NaN and for an impossible plan,
+        "stale" for a basis that is too old, and "future" for a basis later than `now_ns`.
         """
         velocity, yaw_rate = command.velocity, command.yaw_rate
         x, y, z = velocity
@@ -214,15 +213,12 @@ class Guard:
         return 0 <= ahead_ns <= AGE_MAX_NS and rules.within(command.plan, COMMAND_MAX)
 
     def _plan_end_ns(self, command: Command, now_ns: int) -> int:
-        """Return until when a plan that arrives at `now_ns` [ns] is flown without other commands.
-
-        The rest of the plan cannot make a command fresh that is too old when it arrives.
-        """
+        """Return the end [ns] of a plan that arrives at `now_ns` [ns], if no command follows."""
         end_ns = command.planned_ns + (len(command.plan) + 1) * PLAN_STEP_NS
         return min(end_ns, now_ns + self._limits.plan_max_ns)
 
     def _play(self, command: Command, now_ns: int) -> None:
-        """Follow the velocity that a command has for `now_ns` [ns]; note when its next is due."""
+        """Use a command's velocity for `now_ns` [ns]; store when its plan changes the velocity."""
         velocity, self._played, self._next_ns = command.velocity, command, FOREVER_NS
         if command.plan:
             velocity = command.velocity_at(now_ns)
@@ -282,12 +278,11 @@ class Guard:
         return self.reference
 
     def plain_track(self, now_ns: int) -> tuple[int, Vector, Vector, int, int] | None:
-        """Return what `native/step.c` needs to run steps from `now_ns` [ns] on, or None.
+        """Return the input of `native/step.c` for steps from `now_ns` [ns] on, or None.
 
-        None: a step may do more than follow the command, so that `step` has to run it. Else: when
-        the plan's next velocity is due [ns]; the reference and the commanded velocity [m/s], which
-        are one object once the reference has arrived; the end of the time without checks, and the
-        end of the fresh command [ns].
+        The input: time of the plan's next velocity [ns]; velocity reference and commanded velocity
+        [m/s], the same object once they are equal; end of the time without checks of the fence, and
+        end of the time in which the command is fresh [ns]. With None, only `step` can run the step.
         """
         if not (self._take_off.over and self._ramp_until_ns <= now_ns <= self._track_until_ns):
             return None

@@ -73,9 +73,9 @@ class Flight(ctypes.Structure):
 def make_flight(
     simulator: Simulator, controller: LowLevel, limits: rules.Limits, step_ns: int
 ) -> Flight:
-    """Fill everything but the state; `step_ns` is the duration of a step [ns].
+    """Make a `Flight` with all fields except the present state; a step takes `step_ns` [ns].
 
-    Call it after a reset of the simulator. Raise an OSError, AttributeError, KeyError or
+    Call `make_flight` after a reset of the simulator. Raise an OSError, AttributeError, KeyError or
     ImportError if MuJoCo is not as expected.
     """
     model, data = simulator.model, simulator.data
@@ -108,8 +108,8 @@ def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
     """Return a box with rounded edges around each geom of the scene, and the robot's radius [m].
 
     A row has the centre (3,) and the axes (9,) of the box, its half sizes (3,), and the radius of
-    the edges, all [m]. The radius of the robot is that of a ball around its base's origin; it is
-    infinite if geoms, constraints, springs or dampers matter without a contact, too.
+    the edges, all [m]. The robot's radius is that of a ball around its base's origin; the radius is
+    infinite if forces act without a contact, for example of springs, constraints or a fluid.
     """
     option, rows, radius = model.opt, [], 0.0
     other = option.density, option.viscosity, model.nflex, model.npair, model.neq, model.ntendon

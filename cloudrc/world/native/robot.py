@@ -27,7 +27,7 @@ _unpack_before = Struct("13d").unpack_from
 def make_robot(simulator: Simulator, low_level: LowLevel, guard: Guard, limits: Limits) -> Robot:
     """Make a robot that uses C if this machine can; `limits` are those of the guard.
 
-    C knows neither wind nor a true robot that differs from its model.
+    `step.c` has neither wind nor a true robot that differs from its model.
     """
     if usable().run is None or not simulator.is_nominal:
         return Robot(simulator, low_level, guard)
@@ -43,8 +43,8 @@ def usable() -> Library:
 class NativeRobot(Robot):
     """A `Robot` whose usual steps `step.c` runs.
 
-    Usual steps follow a fresh command that the guard need not limit. Python runs the others, and
-    all steps while the robot has observers or the simulator has a tape.
+    In a usual step the robot follows a fresh command that the guard need not limit. Python runs all
+    other steps, and every step while the robot has observers or the simulator has a tape.
     """
 
     def __init__(

@@ -21,7 +21,7 @@ def flight(simulator):
 
 
 @pytest.mark.parametrize("velocity", [(1.5, 0.0, 0.0), (0.0, -1.0, 0.3)])
-def test_without_commands_it_stops_stays_and_lands_after_a_minute(flight, velocity):
+def test_without_commands_it_holds_and_lands_after_a_minute(flight, velocity):
     flight.fly(1.2, velocity)
     flight.fly(0.26)
     assert flight.guard.state is GuardState.HOLD

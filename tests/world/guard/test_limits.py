@@ -173,7 +173,7 @@ def test_limit_to_fence_by_hand_worked_numbers(velocity, position, limited):
     assert fenced(velocity, position) == pytest.approx(limited)
 
 
-def test_the_floor_is_approached_as_the_stop_rule_says_and_is_no_face_in_land():
+def test_the_stop_rule_holds_at_the_floor_but_not_in_land():
     v = -fenced((0.0, 0.0, -9.0), (0, 0, 1.35))[2]
     assert 0.2 * v + v * v / 6 == pytest.approx(1.0)
     down = (0.0, 0.0, -0.5)

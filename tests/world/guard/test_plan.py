@@ -3,25 +3,13 @@
 from math import hypot, inf, nan, nextafter
 
 import pytest
-import z3
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.messages import Cause, Command, GuardState
 from cloudrc.tunnel.codec import PLAN_MAX
-from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX, Limits
-from tests.world.guard.conftest import (
-    DT,
-    LIMITS,
-    MS,
-    TICK,
-    armed,
-    command,
-    everywhere,
-    run,
-    sensed,
-)
+from tests.world.guard.conftest import DT, LIMITS, MS, TICK, armed, command, run, sensed
 from tests.world.guard.test_any_input import check_flown
 from tests.world.guard.test_limits import ANY, PLACES, SPEEDS, VECTORS
 from tests.world.guard.test_state import told
@@ -107,24 +95,30 @@ def test_no_plan_is_flown_longer_than_the_cap_allows(ahead_ns, age_ns, count):
     assert guard.state is not TRACK
 
 
-@pytest.mark.parametrize("bad", [nan, inf, nextafter(COMMAND_MAX, inf), -1000.1])
-@pytest.mark.parametrize("place", [0, 39])
-def test_an_absurd_plan_is_rejected_as_a_whole(bad, place):
+def with_a_bad_value(bad, place, axis):
+    velocity = tuple(bad if k == axis else 0.1 for k in range(3))
+    plan = [(0.1, 0.0, 0.0)] * 40
+    plan[place] = velocity
+    return planned([0.1])._replace(plan=tuple(plan))
+
+
+@pytest.mark.parametrize(
+    "absurd",
+    [
+        *map(with_a_bad_value, (nan, inf, nextafter(COMMAND_MAX, inf), -1000.1), (0, 39, 39, 0),
+             (0, 1, 2, 2)),
+        *(planned([0.1] * 9, planned_ns=ahead_ns)
+          for ahead_ns in (-1, AGE_MAX_NS + 1, -(2**63), 2**63 - 1)),
+    ],
+)  # fmt: skip
+def test_a_plan_with_one_absurd_number_is_rejected_as_a_whole(absurd):
     guard = following(planned([0.1] * 60))
-    speeds = [0.1] * 41
-    speeds[place + 1] = bad
-    assert guard.accept_command(planned(speeds), 0) == "range"
-    for _ in range(4):
-        guard.accept_command(planned(speeds), 0)
+    for _ in range(5):
+        assert guard.accept_command(absurd, 0) == "range"
     assert guard.state is GuardState.LAND
 
 
-@pytest.mark.parametrize("ahead_ns", [-1, AGE_MAX_NS + 1, -(2**63), 2**63 - 1])
-def test_a_plan_for_an_impossible_time_is_rejected(ahead_ns):
-    assert armed(PLANS).accept_command(planned([0.1] * 9, planned_ns=ahead_ns), 0) == "range"
-
-
-def test_played_velocities_are_capped_and_forgotten_with_the_session():
+def test_a_plan_is_capped_and_forgotten_with_the_session():
     guard = following(planned([0.1, 9.0, 9.0, *[0.2] * 60]))
     run(guard, 0, 50 * MS)
     assert guard.counts["limited_speed"] == 2
@@ -179,15 +173,3 @@ def test_any_plan_is_flown_inside_the_caps(plan, second, planned_ms, place, velo
             guard.accept_command(sent, now_ns)
         check_flown(guard, guard.step(now_ns, sensed(place, velocity), DT), place)
         assert hypot(*guard.reference) <= PLANS.speed_max
-
-
-def test_no_velocity_out_of_range_is_within():
-    """Prove it for all floats."""
-
-    def check(run):
-        numbers = [run.fresh(name) for name in "xyz"]
-        inside = z3.And([z3.fpAbs(number.term) <= COMMAND_MAX for number in numbers])
-        answer = rules.within([tuple(numbers)], COMMAND_MAX)
-        run.prove(inside if answer else z3.Not(inside))
-
-    assert everywhere(check) == 4

@@ -37,7 +37,7 @@ def test_a_command_with_one_value_out_of_range_is_rejected():
     assert everywhere(check) == 5
 
 
-def test_clamp_keeps_a_value_inside_its_interval_and_moves_any_other_into_it():
+def test_clamp_moves_only_values_outside_into_the_interval():
     def check(run):
         value, low, high = (run.fresh(name) for name in ("value", "low", "high"))
         run.learn(z3.And(is_finite(low.term), is_finite(high.term), low.term <= high.term))

@@ -301,18 +301,11 @@ def test_land_sinks_slowly_and_stops_the_rotors_when_it_stands():
     assert guard.reference == ZERO
     assert told(guard) == (4398 * MS, LAND, DOWN)
     assert guard.cause is cause, "why it landed"
-    guard.acknowledge(5 * SECOND)
-    assert told(guard) == (5 * SECOND, GROUND, "acknowledged")
-
-
-def test_after_touch_down_it_may_slide_off_an_obstacle():
-    guard = landing()
-    run(guard, 2 * SECOND, 4 * SECOND, (1.0, 2.0, 0.6), SINKS)
-    run(guard, 4 * SECOND, 5 * SECOND, (1.0, 2.0, 0.5))
-    run(guard, 5 * SECOND, 6 * SECOND, (1.0, 2.0, 0.3), (0.0, 0.0, -1.0))
+    run(guard, 5 * SECOND, 6 * SECOND, LOW, (0.0, 0.0, -1.0))  # it slides off an obstacle
     guard.acknowledge(6 * SECOND)
+    assert told(guard) == (6 * SECOND, GROUND, Cause.STILL_FIRST.words)
     guard.start_mission(6 * SECOND)
-    feed(guard, 6 * SECOND, 1, position=(1.0, 2.0, 0.3))
+    feed(guard, 6 * SECOND, 1, position=LOW)
     assert guard.state is GROUND
 
 
@@ -498,32 +491,24 @@ def test_after_flying_the_rotors_do_not_stop_where_it_stood():
 
 
 def test_c_may_run_the_steps_of_a_fresh_command_in_the_air():
-    guard = taking_off(1.0)
-    wanted = (0.0, 0.0, 1.0)
-    next_ns, reference, asked, steady_ns, track_ns = guard.plain_track(10 * MS)
-    assert (reference, asked, track_ns) == (guard.reference, wanted, 250 * MS)
-    assert next_ns > SECOND  # there is no plan
-    assert steady_ns <= track_ns
+    guard, half, wanted = taking_off(1.0), (0.0, 0.0, 0.5), (0.0, 0.0, 1.0)
+    next_ns, *track, steady_ns, track_ns = guard.plain_track(10 * MS)
+    assert (*track, track_ns) == (guard.reference, wanted, 250 * MS)
+    assert steady_ns <= track_ns < next_ns, "there is no plan"
     assert guard.plain_track(252 * MS) is None
-    guard.continue_track((0.0, 0.0, 0.5), 20 * MS)
-    assert guard.plain_track(20 * MS)[1:] == ((0.0, 0.0, 0.5), wanted, 20 * MS, 250 * MS)
+    guard.continue_track(half, 20 * MS)
+    assert guard.plain_track(20 * MS)[1:] == (half, wanted, 20 * MS, 250 * MS)
     guard.continue_track(None, 30 * MS)
     _, reference, asked, *_ = guard.plain_track(30 * MS)
     assert reference is asked
+    planned = command(wanted, 30 * MS)._replace(plan=(half, ZERO), planned_ns=32 * MS)
+    assert guard.accept_command(planned, 30 * MS) is None
+    for now_ms, next_ms, velocity in ((40, 42, wanted), (42, 52, half)):
+        next_ns, _, asked, *_ = guard.plain_track(now_ms * MS)
+        assert (next_ns, asked) == (next_ms * MS, velocity)
 
 
-def test_c_gets_the_velocity_of_a_plan_that_is_due():
-    guard = taking_off(1.0)
-    plan = ((0.0, 0.0, 0.5), (0.0, 0.0, 0.25))
-    planned = command((0.0, 0.0, 1.0), 10 * MS)._replace(plan=plan, planned_ns=12 * MS)
-    assert guard.accept_command(planned, 10 * MS) is None
-    next_ns, _, wanted, *_ = guard.plain_track(20 * MS)
-    assert (next_ns, wanted) == (22 * MS, (0.0, 0.0, 1.0))
-    next_ns, _, wanted, *_ = guard.plain_track(22 * MS)
-    assert (next_ns, wanted) == (32 * MS, plan[0])
-
-
-def test_c_runs_no_step_before_take_off_or_on_the_ramp_after_a_hold():
+def test_c_runs_no_step_before_take_off_or_after_a_hold():
     assert taking_off(0.01).plain_track(10 * MS) is None
     guard = taking_off(1.0)
     run(guard, 10 * MS, 2 * SECOND, (0.0, 0.0, 1.1))

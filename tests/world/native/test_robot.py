@@ -1,7 +1,7 @@
 """Flights in C and in Python have the same bits, whatever the cloud sends."""
 
 import logging
-from functools import partial
+from functools import cache, partial
 from math import inf
 
 import numpy as np
@@ -16,6 +16,7 @@ from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.limits import Limits
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
+from cloudrc.world.native import flight
 from cloudrc.world.native import robot as native
 from cloudrc.world.native.library import SWITCH, Library, library
 from cloudrc.world.native.robot import NativeRobot, make_robot, usable
@@ -27,7 +28,6 @@ from tests.world.guard.conftest import MS, SECOND, UP, hostile
 
 pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
 LIMITS = Limits(fence.LOW, fence.HIGH)
-PERIOD_NS = 10 * MS
 
 
 def robot_of(kind, scene="empty", limits=LIMITS, model="pelican"):
@@ -35,8 +35,8 @@ def robot_of(kind, scene="empty", limits=LIMITS, model="pelican"):
     return NativeRobot(*parts, limits) if kind is NativeRobot else Robot(*parts)
 
 
-def both(scene="empty", limits=LIMITS):
-    return robot_of(Robot, scene, limits), robot_of(NativeRobot, scene, limits)
+def both(scene="empty", limits=LIMITS, model="pelican"):
+    return [robot_of(kind, scene, limits, model) for kind in (Robot, NativeRobot)]
 
 
 class Count:
@@ -64,8 +64,8 @@ class Pilot:
     def fly(self, seconds, policy, parts=(4, 6)):
         """Fly; run every period in two parts [ms], as arrivals of commands divide it."""
         for _ in range(round(seconds * 100)):
-            if (velocity := policy(self)) is not None:
-                command = Command(0, self.now_ns, 0, velocity, 0.0)
+            if (sent := policy(self)) is not None:
+                command = sent if type(sent) is Command else Command(0, self.now_ns, 0, sent, 0.0)
                 self.guard.accept_command(command, self.now_ns)
             for part in parts:
                 self.robot.run(self.now_ns, self.now_ns + part * MS)
@@ -109,10 +109,12 @@ HOLDS = Limits(fence.LOW, fence.HIGH, hold_max_ns=2000 * MS)
 )
 def test_commands_fly_the_same_in_c(make, seconds, spawn, limits, least, scene_at):
     python, c = both(scene_at(*spawn) if spawn else "empty", limits)
-    count = Count(c)
+    count, model = Count(c), c.simulator.model
+    before = model.ngeom, model.opt.disableflags
     pilots = [Pilot(robot).fly(seconds, make()) for robot in (python, c)]
     assert pilots[0].seen == pilots[1].seen
     assert count.steps >= least
+    assert (model.ngeom, model.opt.disableflags) == before
     if limits is HOLDS:
         assert {GuardState.TRACK, GuardState.HOLD, GuardState.LAND} <= pilots[1].states
     if spawn is TOUCHING:
@@ -122,24 +124,21 @@ def test_commands_fly_the_same_in_c(make, seconds, spawn, limits, least, scene_a
 @pytest.mark.parametrize("seed", range(3))
 def test_plans_fly_the_same_in_c(seed):
     """Commands every 10 ms or much later; a plan's velocities are due at odd times."""
-    limits = Limits(fence.LOW, fence.HIGH, speed_max=4.0, plan_max_ns=800 * MS)
-    robots = both(limits=limits)
-    count, flights = Count(robots[1]), []
-    for robot in robots:
-        rng, seen = np.random.default_rng(seed), []
-        robot.put_on_ground(0, "test")
-        robot.guard.start_mission(0)
-        for now_ns in range(0, 6 * SECOND, PERIOD_NS):
+    robots = both(limits=Limits(fence.LOW, fence.HIGH, speed_max=4.0, plan_max_ns=800 * MS))
+    count, pilots = Count(robots[1]), [Pilot(robot) for robot in robots]
+    for pilot in pilots:
+        rng = np.random.default_rng(seed)
+
+        def policy(pilot, rng=rng):
+            now_ns = pilot.now_ns
             velocity = UP if now_ns < SECOND else tuple(rng.uniform(-0.8, 0.8, 3).tolist())
             plan = tuple(map(tuple, rng.uniform(-0.8, 0.8, (int(rng.integers(0, 40)), 3)).tolist()))
-            ahead_ns = int(rng.integers(0, 60 * MS))
-            if now_ns < 3 * SECOND or rng.random() < 0.05:
-                command = Command(0, now_ns, 0, velocity, 0.0, plan, now_ns + ahead_ns)
-                robot.guard.accept_command(command, now_ns)
-            robot.run(now_ns, now_ns + PERIOD_NS)
-            seen += [robot.simulator.readings, robot.guard.reference, robot.guard.state]
-        flights.append(seen)
-    assert flights[0] == flights[1]
+            planned_ns = now_ns + int(rng.integers(0, 60 * MS))
+            sends = now_ns < 3 * SECOND or rng.random() < 0.05
+            return Command(0, now_ns, 0, velocity, 0.0, plan, planned_ns) if sends else None
+
+        pilot.fly(6.0, policy)
+    assert pilots[0].seen == pilots[1].seen
     assert count.steps > 1000
 
 
@@ -158,14 +157,6 @@ def test_a_micrometre_of_room_means_that_no_fence_limits(monkeypatch):
             found += 1
             assert rules.limit_to_fence(velocity, place, low, high) == tuple(velocity)
     assert found > 1000
-
-
-def test_c_leaves_the_model_as_it_was():
-    robot = robot_of(NativeRobot, "pipes")
-    model = robot.simulator.model
-    before = model.ngeom, model.opt.disableflags
-    Pilot(robot).fly(2.0, lambda pilot: (0.3, 0.0, 0.5))
-    assert (model.ngeom, model.opt.disableflags) == before
 
 
 def nearest(robot, position):
@@ -200,8 +191,7 @@ def test_a_tether_holds_the_robot_in_c_too(tmp_path):
     text = text.replace("<worldbody>", '<worldbody><site name="post" pos="0 0 0"/>')
     path = tmp_path / "tethered.xml"
     path.write_text(text.replace("<actuator>", f"{rope}</spatial></tendon><actuator>"))
-    robots = [robot_of(kind, model=str(path)) for kind in (Robot, NativeRobot)]
-    pilots = [Pilot(robot).fly(2.0, lambda pilot: UP) for robot in robots]
+    pilots = [Pilot(robot).fly(2.0, lambda pilot: UP) for robot in both(model=str(path))]
     assert pilots[0].seen == pilots[1].seen
     assert pilots[1].robot.simulator.readings.position[2] < 1.1
 
@@ -218,19 +208,17 @@ def test_geoms_that_air_acts_on_are_always_placed(setting):
     ("name", "settings"),
     [
         ("paper", ()),
-        ("paper-verbatim", ()),
-        ("paper", ("link.profile=satellite",)),
-        ("steps", ("link.profile=paper-p3", "cloud.predictor=last_sample")),
         ("steps", ("world.low_level.integral_limit_xy=0.3", "guard.speed_max_mps=0.5")),
-        ("hover", ("link.profile=ideal",)),
         ("hover", ("link.uplink.blackouts=[{start_s: 8, duration_s: 3}]",)),
     ],
 )
 def test_an_experiment_has_the_same_records_in_c(name, settings, monkeypatch):
-    experiment = load_experiment(name, settings)
+    experiment, identity = load_experiment(name, settings), Identity(bytes(16), bytes(16))
+    assert isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
     in_c = digest(experiment)
     monkeypatch.setenv(SWITCH, "0")
     assert digest(experiment) == in_c
+    assert not isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
 
 
 def test_observers_and_a_tape_see_every_step():
@@ -258,39 +246,19 @@ def test_a_robot_that_moves_from_c_to_python_flies_on_the_same():
     assert pilots[0].seen == pilots[1].seen
 
 
-def test_the_switch_and_the_machine_choose_the_robot(monkeypatch):
-    experiment = load_experiment("hover")
-    identity = Identity(bytes(16), bytes(16))
-    assert isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
-    monkeypatch.setenv(SWITCH, "0")
-    assert not isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
-
-
-@pytest.fixture
-def _untested():
-    native._self_test.cache_clear()
-    yield
-    native._self_test.cache_clear()
-
-
-@pytest.mark.usefixtures("_untested")
-@pytest.mark.parametrize("what", ["other bits", "another MuJoCo"])
-def test_a_failed_self_test_means_python_and_one_warning(what, monkeypatch, caplog):
-    if what == "other bits":
-        flights = iter([[1.0], [1.0 + 2**-52]])
-        monkeypatch.setattr(native, "_fly", lambda robot: next(flights))
-    else:
-        monkeypatch.setattr(native, "make_flight", lambda *parts: {}["mjtNew"])
+@pytest.mark.parametrize(
+    ("what", "value", "text"),
+    [
+        ("_VALUES", flight._VALUES | {"mass": 1.05 + 1e-12}, "C and Python differ"),
+        ("_mujoco_library", lambda: {}["mjtNew"], "MuJoCo is not as expected: KeyError('mjtNew')"),
+    ],
+)
+def test_a_failed_self_test_means_python_and_one_warning(what, value, text, monkeypatch, caplog):
+    monkeypatch.setattr(native, "_self_test", cache(native._self_test.__wrapped__))
+    monkeypatch.setattr(flight, what, value)
     with caplog.at_level(logging.WARNING):
-        assert usable().run is None
+        assert usable() == Library(None, text)
         robot = make_robot(Simulator("pelican", "empty"), LowLevel(), Guard(LIMITS), LIMITS)
     assert not isinstance(robot, NativeRobot)
     (warning,) = [record.message for record in caplog.records]
-    assert warning.startswith("all steps run in Python: ")
-    assert usable().text.startswith("Python (")
-
-
-@pytest.mark.usefixtures("_untested")
-def test_the_self_test_sees_a_wrong_number(monkeypatch):
-    monkeypatch.setitem(native.make_flight.__globals__["_VALUES"], "mass", 1.05 + 1e-12)
-    assert usable() == Library(None, "C and Python differ")
+    assert warning == f"all steps run in Python: {text}; report this"
