@@ -61,11 +61,11 @@ class Api:
             raise BadInputError(f"--api {url}: give http://HOST:PORT or unix:PATH") from None
 
     def say(self, text: str) -> None:
-        """Print what the robot will do; name the run or the release."""
+        """Print a text; before it, print the name of the run or release, if there is one."""
         print_line(f"{self.place}: {text}" if self.place else text)
 
     def get(self, path: str) -> Any:
-        """Send a GET request; results and errors are those of `post`."""
+        """Send a GET request; result and errors are those of `post`."""
         with self._answer("GET", path, None, REQUEST_TIMEOUT) as answer:
             return json.loads(answer.read())
 

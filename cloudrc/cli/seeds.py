@@ -1,4 +1,4 @@
-"""`cloudrc run --seeds N`: fly a sweep of one point; print medians and their intervals."""
+"""`cloudrc run --seeds N`: fly one experiment with N seeds; print medians and their intervals."""
 
 from __future__ import annotations
 
@@ -94,5 +94,5 @@ def fly_seeds(options: argparse.Namespace) -> int:
 
 
 def fly_one(flight: Flight) -> Row:
-    """Fly, and return the row; an exception ends the command."""
+    """Fly, and return the row of the flight; an exception ends the command."""
     return store.make_row(flight, measure(flight.experiment))

@@ -126,7 +126,7 @@ def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch):
         return [(family, kind, 17, "", ("::5", 0))] if family == socket.AF_INET6 else no_such_name()
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
-    with pytest.raises(OSError, match="IPv6 addresses alone, and a link is shaped over IPv4"):
+    with pytest.raises(OSError, match="only IPv6 addresses, but a link needs IPv4"):
         ipv4_addresses("cloud")
     assert resolve_address("--peer", ("cloud", 1), ("::1", 2)) == ("::5", 1)
     with pytest.raises(BadInputError, match="--peer cloud:1: cloud cannot be resolved"):
