@@ -1,7 +1,8 @@
-"""Call the API of teleop over HTTP, at http://HOST:PORT with a token, or at unix:PATH.
+"""Call the HTTP API of teleop, the process that commands missions.
 
-PATH is a socket file that only its owner can open. The token is read from a file, because a token
-on the command line would appear in the list of processes and in the history of the shell.
+The API is at http://HOST:PORT, which needs a token, or at unix:PATH, a socket file that only its
+owner can open. The token is read from a file, because a token on the command line would appear in
+the list of processes and in the history of the shell.
 """
 
 from __future__ import annotations

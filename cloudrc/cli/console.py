@@ -85,7 +85,6 @@ class Flight(NamedTuple):
 
 
 def _serve(port: int, flight: Flight) -> None:
-    """Serve the page of a flight until it has ended."""
     with ExitStack() as opened:
         from cloudrc.console.page import Page
 
@@ -120,7 +119,6 @@ def _serve(port: int, flight: Flight) -> None:
 
 
 def _local(options: argparse.Namespace) -> Flight:
-    """Return the flight of a run on this machine."""
     from cloudrc.cli.link_set import read_states, set_here
     from cloudrc.console.steering import Link
     from cloudrc.drivers.local import LINK_FOLDER, under_way

@@ -106,7 +106,7 @@ def read_states(folder: Path) -> list[LinkState]:
 def set_here(
     folder: Path, profile: str | None, settings: Sequence[str], number: str
 ) -> tuple[Edit, list[LinkState]]:
-    """Write a new profile into the relay's folder, and wait until the relay has applied it.
+    """Hand a new profile to the relay, and wait until it applies; return edit and new states.
 
     `profile` is the name or file of a profile that replaces the present one; None keeps it.
     `settings` are changed values, each "uplink.KEY=VALUE". `number` identifies the change.

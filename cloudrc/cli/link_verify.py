@@ -65,7 +65,7 @@ from cloudrc.tunnel.codec import SIZES, Kind
 RELEASE_TIMEOUT = 270.0  # default time limit for the verdict on a release [s]
 START_LIMIT = 90.0  # for the processes of both directions to start, on a slow disk [s]
 COUNTS_WAIT = 1.3  # after the last probe: processes update their counts once a second [s]
-POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0  # between two looks at a release; limit of a request [s]
+POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0  # between requests to a release; limit of a request [s]
 PORTS = METRICS["world"]["world"], METRICS["world"]["link"]
 LOOPBACK, DEVICE = "127.0.0.1", "tunnel"
 HOSTS = {"uplink": "10.79.7.1", "downlink": "10.79.7.2"}  # senders, with netem
@@ -345,7 +345,7 @@ def _pods(options: argparse.Namespace) -> Iterator[Pods]:
 
 
 def verify_release(title: str, pods: Pods, limit: float) -> Report:
-    """Wait at most `limit` [s] for the verdicts of world and cloud on the directions they receive.
+    """Report the verdicts of world and cloud on the directions they receive; wait `limit` [s].
 
     Raises:
         TimedOutError: If world or cloud does not answer in time.

@@ -96,9 +96,9 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def largest_stable(works: Callable[[int], bool], start: int, top: int) -> tuple[int, int]:
-    """Double a step from `start` until it fails, then bisect; a step is a number from 1 to `top`.
+    """Find the largest step from 1 to `top` that works: double it from `start`, then bisect.
 
-    Return the largest step that works and the next one, which fails; 0 stands for none.
+    Return this step, or 0 if no step works, and the next step, or 0 if `top` works.
     """
     low, high = 0, start
     while works(high):

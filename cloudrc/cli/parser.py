@@ -137,7 +137,7 @@ def input_file(text: str) -> Path:
 def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:
     """Build the parser of all commands, with the arguments of the `wanted` commands only.
 
-    So only the modules of the `wanted` commands are imported. With `for_completion`, the help also
+    The function imports only the modules of these commands. With `for_completion`, the help also
     contains argparse's list of commands, which the completion script needs.
     """
     common, about = Parser(add_help=False), "show the traceback of an error"

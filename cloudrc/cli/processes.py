@@ -197,7 +197,7 @@ def warn_if_exposed(listen: Address) -> None:
 
 @contextmanager
 def _listening(flag: str, listen: Address) -> Iterator[None]:
-    """Warn if `listen` is exposed; name `flag` in the error if the block cannot bind it."""
+    """Warn if `listen` is exposed; if the block cannot bind it, name `flag` in the error."""
     warn_if_exposed(listen)
     try:
         yield

@@ -226,7 +226,6 @@ def _local_flight(
 def _cluster_flight(
     experiment: ResolvedExperiment, options: argparse.Namespace, stream: TextIO
 ) -> Flight:
-    """Return a function that flies in the cluster that the flags in `options` name."""
     from cloudrc.cli.client import Api
     from cloudrc.cluster.client import program
     from cloudrc.cluster.flight import fly_in_cluster, refuse_local_files, refuse_second_flight
@@ -286,7 +285,7 @@ def _record_virtual(
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
     """Fly in virtual time, and yield the recording, the experiment and facts about the run.
 
-    In the block, the caller writes the report; it is then attached to the file of the recording.
+    The caller writes the report in the block; afterwards, the recording contains the report.
     """
     from cloudrc import assembly
     from cloudrc.record.columns import RecordStore, merged
@@ -326,7 +325,7 @@ def _record_virtual(
 
 
 def _prepare(experiment: ResolvedExperiment) -> bool:
-    """Check a robot or scene of the user before the flight; return whether it has an API."""
+    """Check the user's robot and scene before the flight; return whether the run has an API."""
     if absent := missing("api"):
         text = f"no operator's API in this run: {', '.join(absent)} not installed"
         print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)

@@ -27,7 +27,7 @@ METHOD = "95 % interval of the median, by order statistics"
 def summarise(rows: Sequence[Row], units: Mapping[str, str]) -> dict[str, Any]:
     """Count all runs and successful runs; compute median and interval of each measurement.
 
-    Runs whose plug-in failed have no numbers here. `units`: metric -> unit.
+    Numbers of runs whose plug-in failed do not count. `units`: metric -> unit.
     """
     numbers, measured = {}, [row["numbers"] for row in rows if counts(row)]
     for name in dict.fromkeys(name for each in measured for name in each):

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from cloudrc.teleop.store import Mission
 
 Say = Callable[[str], None]
-"""Function that prints a line beside the progress of a flight."""
+"""Function that prints a line above the status line of a flight."""
 DOWN_LIMIT = 120.0
 """Time limit for a session to end and to write its report [s]."""
 NEXT = """\

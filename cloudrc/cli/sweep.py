@@ -125,7 +125,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fly the flights of a sweep that have no row yet; return the exit code of the worst row."""
+    """Fly the flights of a sweep that have no row yet; return 1 unless all flights succeed."""
     from cloudrc.cli.progress import SweepView
     from cloudrc.cli.run import new_folder
     from cloudrc.sweep import store
@@ -205,7 +205,7 @@ def _rows(
 
 
 def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
-    """Fly, record the flight if the job asks for it, and return the row."""
+    """Fly and return the row; if the job asks for a recording, fly again with a recording."""
     from cloudrc.sweep.flight import fly_point
     from cloudrc.sweep.store import make_row
 
