@@ -101,7 +101,7 @@ read_count = whole_number(1, COUNT_MAX)
 
 
 def number(low: float, high: float, unit: str) -> Callable[[str], float]:
-    """Return a type for argparse: a function that parses a number from `low` to `high`.
+    """Return a type for argparse: a function that parses a number from `low` to `high` [`unit`].
 
     `unit` is the name of the unit; its first letter may follow the number, as in "300s".
     """

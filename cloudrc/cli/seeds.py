@@ -12,6 +12,7 @@ from typing import Any
 from cloudrc.cli.advice import warn
 from cloudrc.cli.output import escape, format_document, format_number, print_or_drop, table
 from cloudrc.cli.pool import map_in_order, take_each
+from cloudrc.cli.report import print_traceback
 from cloudrc.cli.run import load, new_folder
 from cloudrc.config.document import write_yaml
 from cloudrc.config.overrides import parse_settings
@@ -76,6 +77,8 @@ def fly_seeds(options: argparse.Namespace) -> int:
             line = f"{count:>7}  seed {row['seed']}  {row['verdict']}{failure}"
             if for_people or sys.stderr.isatty():
                 print_or_drop(escape(line), sys.stdout if for_people else sys.stderr)
+            if not any("traceback" in earlier for earlier in rows[:-1]):
+                print_traceback(options, row)
 
         stopped, code = take_each(map_in_order(fly_one, work, len(work)), take)
     store.finish(folder, plan)

@@ -44,12 +44,12 @@ Readings: TypeAlias = dict[str, "dict[Labels, float] | Histogram"]
 
 
 def unlabelled(value: float) -> dict[Labels, float]:
-    """Make the reading of a metric without labels [unit of the metric]; the one of NaN is empty."""
+    """Make an unlabelled metric's reading from `value` [its unit]; NaN becomes an empty reading."""
     return {} if isnan(value) else {(): value}
 
 
 def per_axis(vector: Vector) -> dict[Labels, float]:
-    """Make the reading of a metric with the label `axis` [unit of the metric], without NaN."""
+    """Make a reading with the label `axis` from `vector` [unit of the metric]; leave NaN out."""
     values = zip(AXES, vector, strict=True)
     return {(axis,): value for axis, value in values if not isnan(value)}
 

@@ -11,8 +11,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
-
 from cloudrc.files import write_atomically
 from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
 
@@ -73,6 +71,8 @@ T = TypeVar("T")
 
 def parse(kind: type[T], text: bytes | str) -> T:
     """Parse JSON as a dataclass; raise a ValueError with one line if the text is invalid."""
+    from pydantic import TypeAdapter, ValidationError  # slow to import
+
     try:
         return TypeAdapter(kind).validate_json(text)
     except ValidationError as error:

@@ -54,6 +54,11 @@ class Assessment:
     notes: tuple[str, ...]  # sentences for the reader of the report
 
     @property
+    def traceback(self) -> str | None:
+        """The traceback of a plug-in's first failure, if one failed."""
+        return next(filter(None, self.flight.recording["/fault"]["traceback"]), None)
+
+    @property
     def document(self) -> dict[str, Any]:
         """The content of report.json."""
         recording, numbers = self.flight.recording, self.numbers.items()
@@ -75,7 +80,7 @@ class Assessment:
                 else None,
                 "clock_offset": clock_offset_document(recording.metadata),
                 "complete": recording.complete,
-                "traceback": next(filter(None, recording["/fault"]["traceback"]), None),
+                "traceback": self.traceback,
                 "notes": list(self.notes),
             }
         )

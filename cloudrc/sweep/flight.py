@@ -17,7 +17,8 @@ ERROR = "error"
 """Verdict of a flight that raised an exception, and code of its only failure."""
 Row: TypeAlias = dict[str, Any]
 """A flight: `verdict`; `failures` (codes, the earliest first); `text`, which says the first failure
-or why a metric has no number; `numbers` (metric -> value); and `records_sha256`.
+or why a metric has no number; `numbers` (metric -> value); `records_sha256`; and `traceback`, if a
+plug-in failed.
 A row of a sweep also has `key`, `point` and `seed`."""
 
 
@@ -41,6 +42,7 @@ def measure(experiment: ResolvedExperiment) -> Row:
         "text": failures[0].text if failures else next(notes, ""),
         "numbers": {name: number.value for name, number in found.numbers.items()},
         "records_sha256": found.run.records_sha256,
+        **({"traceback": found.traceback} if found.traceback else {}),
     }
 
 
