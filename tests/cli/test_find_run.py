@@ -98,9 +98,10 @@ def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call):
         for words in ("status", "status m1", "list"):
             assert call(f"mission {words}").out.startswith("runs/latest: "), words
         assert "missions" in json.loads(call("mission list -o json").out)
-        for words, code in (("hold", 5), ("goto 0 0 99", 2)):
+        for words, code, why in (("hold", 5, ""), ("goto 0 0 99", 2, "beyond the fence")):
             error = call(f"mission {words}", code=code).err
             assert error.startswith("cloudrc: error: runs/latest: "), error
+            assert why in error
 
 
 def test_the_console_names_a_run_as_it_was_given(tmp_path, said):
