@@ -53,7 +53,7 @@ def test_yaml_has_the_content_of_json(line, call):
     assert document["schemaVersion"] == 1
 
 
-def test_events_are_plain_lines_in_a_file_and_wrapped_on_a_terminal():
+def test_events_are_plain_lines_or_wrapped_on_a_terminal():
     file, terminal = io.StringIO(), Terminal()
     odometry = Odometry(0, (-1.0, 2.5, -0.0004), UPRIGHT, ZERO, ZERO)
     seen = TelemetrySent(0, 1, 1, Telemetry(0, odometry, 0.0, -1, 0, 0, 0, GuardState.TRACK))

@@ -52,7 +52,7 @@ def test_a_signal_ends_a_sweep_at_once(folder):
     assert 1 <= sum(counts.values()) < 40
 
 
-def test_runs_may_lack_a_number_and_those_of_a_failed_plugin_do_not_count():
+def test_numbers_may_be_missing_and_failed_plugins_do_not_count():
     failed = row(4, "failure", ["plugin_failed"], x=9.0)
     rows = [row(1, x=1.0), row(2, "failure", y=2.0), row(3, x=3.0), failed]
     summary = summarise(rows, {"x": "m", "y": "1"})

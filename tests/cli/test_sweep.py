@@ -86,7 +86,7 @@ def test_a_row_flies_again_to_the_same_hash(write_sweep, call):
 
 
 @pytest.mark.usefixtures("no_page")
-def test_a_plugin_that_failed_is_flown_again_with_its_traceback(write_sweep, call):
+def test_a_failed_plugin_is_flown_again_with_its_traceback(write_sweep, call):
     Path("mine.py").write_text(
         "from cloudrc.cloud.predictors import Predictor\n\n\nclass Mine(Predictor):\n"
         "    def predict(self, odometry, horizon):\n        return 1 / 0\n\n\nbuild = Mine\n"
