@@ -1,7 +1,7 @@
-"""Warn before a flight of settings that do not fit together, and name the key and value that would.
+"""Warn about settings that do not fit together, and suggest a value that fits.
 
-The delays come from a simulation of the link alone, with the random numbers of the flight. The
-flight takes place in any case.
+The delays come from a simulation of the link alone, with the random numbers of the flight. A
+warning never prevents the flight.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
 
 DURATION_NS = 20_000_000_000
-"""Length of the simulation [ns]."""
+"""Simulated time of the link [ns]."""
 SAG_MAX = 0.05
 """Largest steady error of the position that needs no warning [m]."""
 WIND_FORCE = 0.24
-"""Force against which a hovering robot has to fly, per wind speed [N s/m]: two thirds are the drag
-of the rotors, one third comes from the tilt by which this drag turns the robot."""
+"""Horizontal force on a hovering robot per wind speed [N s/m]: two thirds are the drag of the
+rotors, one third comes from the tilt that this drag causes."""
 
 
 def warn(experiment: ResolvedExperiment) -> None:
-    """Print a line on stderr for each problem of the experiment."""
+    """Print the texts of `advise` as warnings on stderr."""
     for text in advise(experiment):
         print_line(f"cloudrc: warning: {text}", sys.stderr)
 
 
 def advise(experiment: ResolvedExperiment) -> Iterator[str]:
-    """Describe the settings of an experiment that do not fit together."""
+    """Yield a text for each problem: settings of the experiment that do not fit together."""
     yield from _hover(experiment)
     carrot, cap = experiment.mission.carrot, experiment.guard.speed_max_mps
     if carrot is not None and carrot.speed_mps > cap:
@@ -50,10 +50,10 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
 
 
 def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]:
-    """Exchange telemetry and commands over the link, without its blackouts.
+    """Simulate telemetry and commands over the experiment's link, without its blackouts.
 
-    Return ages just before each telemetry and each command: of the odometry behind the command in
-    force [s], and of the newest command that telemetry has echoed to cloud [s].
+    Return two lists of ages [s], sampled before each datagram is sent: the age of the odometry used
+    for world's present command, and of the newest command that telemetry has confirmed to cloud.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection
@@ -71,7 +71,7 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
         LinkDirection(profile, experiment.seed, uplink=uplink)
         for profile, uplink in zip(profiles, (True, False), strict=True)
     ]
-    # Per direction: the newest arrival, as its stamp and the stamp that it contains [ns].
+    # Per direction: the newest arrived datagram: its stamp, and the stamp that it confirms [ns].
     arrived: list[tuple[int, int] | None] = [None, None]
     pending: list[tuple[int, int, tuple[int, int]]] = []
     ages, echoes = list[float](), list[float]()
@@ -102,7 +102,7 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
 
 
 def _hover(experiment: ResolvedExperiment) -> Iterator[str]:
-    """Compare the force that a hover lacks with the largest integral of the velocity loop."""
+    """Check whether the integral of the velocity loop can balance wind and additional weight."""
     from cloudrc.config.schema import GRAVITY_MPS2, MASS_KG
     from cloudrc.world.low_level import GRAVITY, MASS
 
@@ -128,7 +128,7 @@ def _hover(experiment: ResolvedExperiment) -> Iterator[str]:
 def _long_link(
     experiment: ResolvedExperiment, ages: list[float], echoes: list[float]
 ) -> Iterator[str]:
-    """Compare ages of odometry and of echoes [s] with the limits of guard and cloud."""
+    """Compare the two lists of `simulate_ages` [s] with the limits of guard and cloud."""
     age_max, cloud = experiment.guard.command_age_max_ms * 1e-3, experiment.cloud
     mean, longest = sum(ages) / len(ages), max(ages)
     lasts = max(age_max, min(ages) + min(cloud.plan_s, experiment.guard.plan_max_s))
@@ -150,12 +150,12 @@ def _long_link(
 
 
 def _round_up(value: float, step: float) -> float:
-    """Return a multiple of `step` that is at least one step above a value, in any unit."""
+    """Round a value up to a multiple of `step`, and add one more step as a reserve."""
     return round((ceil(value / step) + 1) * step, 3)
 
 
 def _control(experiment: ResolvedExperiment, delay: float) -> Iterator[str]:
-    """Check the gains of the PID with a mean delay [s] from odometry to command."""
+    """Check the gains of the PID; `delay` is the mean time from odometry to command [s]."""
     controller = experiment.cloud.controller
     if controller.name != "pid":
         return

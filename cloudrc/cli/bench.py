@@ -1,9 +1,9 @@
 """`cloudrc bench`: measure how much processor time the closed loop needs on this machine.
 
 The command flies the experiment `paper`. For comparison, it also replays only the physics of this
-flight, in C (`mujoco.rollout`, one thread). Every repeat flies the same bits, so the loop's time is
-the sum over slices of the flight, each the shortest of all repeats: other programs that interrupt
-some slices do not change it. They hardly slow down the raw physics, which needs no slices.
+flight, in C (`mujoco.rollout`, one thread). All repeats do the same work. The closed loop is timed
+in slices: the result is the sum of the shortest time of each slice. Therefore a program that
+interrupts some slices does not change the result.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ LIMIT_NS = 120_000_000_000
 """Time limit of a measured flight, in its virtual time [ns]."""
 LOOP = "closed loop, records in memory"
 Part: TypeAlias = Callable[[Callable[[], None]], Callable[[], int]]
-"""Function that prepares a measurement, and returns a function that does the work and returns the
-number of physics steps. The work calls the given function `mark` after each of its slices."""
+"""Function that prepares a measurement and returns the work, another function. The work calls the
+argument `mark` after each slice, and returns the number of physics steps."""
 EPILOG = """\
 'raw mj_step' replays the thrusts and the drag of the same flight in C and must
 end in the same bits. Close other programs before you compare two machines; the
@@ -76,14 +76,14 @@ def execute(options: argparse.Namespace) -> int:
     for name, cost in costs.items():
         rows.append((name, f"{cost * 1e6:.2f}", f"{raw / cost:.3f}", f"{STEP / cost:.0f}"))
     print(table(rows, right=(1, 2, 3)))
-    print(f"\nraw replayed the same controls and ended in the same bits; usual steps: {steps}")
+    print(f"\n'raw mj_step' ended in the same bits as the flight; steps of the flight: {steps}")
     return 0
 
 
 def measure(parts: dict[str, Part], repeats: int) -> dict[str, float]:
-    """Measure `parts` in turn, `repeats` times; return the shortest time per step of each [s].
+    """Measure each part `repeats` times; return its shortest processor time per step [s].
 
-    All repeats of a part call `mark` equally often, each time after the same work.
+    In all repeats, a part calls `mark` after the same slices of its work.
     """
     marks: list[int] = []
 

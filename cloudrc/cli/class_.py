@@ -1,7 +1,7 @@
 """`cloudrc class`: hand out and score the exercise of docs/exercise.md.
 
-Each part runs in a process of its own, so that a failure costs the points of this part only. That
-is no sandbox: a student's file has all rights of the user.
+Each part of the exercise runs in its own process, so that a crash costs the points of this part
+only. The process is no sandbox: a student's file has all rights of the user.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Write the files, or score them; the exit code does not depend on the score."""
+    """Write the files, or score them; return 0 whatever the score."""
     if options.verb == "new":
         return _new(options.folder)
     if not options.folder.is_dir():
@@ -84,7 +84,7 @@ def _new(folder: Path) -> int:
 
 
 def check(folder: Path, limit: float = TIME_LIMIT) -> list[dict[str, Any]]:
-    """Run all parts at the same time, for `limit` [s] at most; return the rows of all."""
+    """Score a folder, all parts in parallel, within `limit` [s]; return one row per test."""
     from cloudrc.drivers.machine import interpreter
     from cloudrc.exercise import checks
 

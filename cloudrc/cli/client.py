@@ -1,7 +1,8 @@
-"""Call the API of teleop over HTTP, at http://HOST:PORT with a token, or at unix:PATH.
+"""Call the HTTP API of teleop, the process that commands missions.
 
-PATH is a socket file that only its owner can open. The token is read from a file, because a token
-on the command line would appear in the list of processes and in the history of the shell.
+The API is at http://HOST:PORT, which needs a token, or at unix:PATH, a socket file that only its
+owner can open. The token is read from a file, because a token on the command line would appear in
+the list of processes and in the history of the shell.
 """
 
 from __future__ import annotations
@@ -61,11 +62,11 @@ class Api:
             raise BadInputError(f"--api {url}: give http://HOST:PORT or unix:PATH") from None
 
     def say(self, text: str) -> None:
-        """Print what the robot will do; name the run or the release."""
+        """Print a text; before it, print the name of the run or release, if there is one."""
         print_line(f"{self.place}: {text}" if self.place else text)
 
     def get(self, path: str) -> Any:
-        """Send a GET request; results and errors are those of `post`."""
+        """Send a GET request; result and errors are those of `post`."""
         with self._answer("GET", path, None, REQUEST_TIMEOUT) as answer:
             return json.loads(answer.read())
 

@@ -20,7 +20,7 @@ READY_LIMIT = 300.0
 def release_arguments(parser: argparse.ArgumentParser) -> Callable[..., argparse.Action]:
     """Declare `--context` and `--namespace`, as in kubectl, and `--release`.
 
-    Return the function that adds an argument to their group.
+    Return a function that adds another flag to the same group of the help.
     """
     group = parser.add_argument_group("in a cluster (uses KUBECONFIG)")
     group.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")

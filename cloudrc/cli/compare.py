@@ -56,7 +56,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def flight_arguments(parser: argparse.ArgumentParser, seeds: int) -> None:
-    """Declare the arguments that say what to fly, by default `seeds` seeds."""
+    """Declare --of, --set and --seeds; `seeds` is the default number of seeds."""
     add = parser.add_argument
     about = "experiment to fly: a shipped name or a YAML file (default: steps)"
     add("--of", default="steps", dest="experiment", metavar="EXPERIMENT", help=about)
@@ -67,7 +67,7 @@ def flight_arguments(parser: argparse.ArgumentParser, seeds: int) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Compare and print; return 0 whatever the answer, or 130 if flights were interrupted."""
+    """Compare and print; return 0 whatever the answer, or the exit code of an early end."""
     from cloudrc.sweep import pairs
     from cloudrc.sweep.compare import compare
 
@@ -93,7 +93,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
-    """Fly A and B with each seed; return the pairs, and why and with which code it ended early."""
+    """Fly A and B with each seed; return the pairs, and reason and exit code of an early end."""
     from cloudrc.cli.advice import warn
     from cloudrc.cli.progress import SweepView
     from cloudrc.cli.run import load
@@ -135,7 +135,7 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
 
 
 def as_text(document: Mapping[str, Any]) -> str:
-    """Format the result of a comparison as a table and one sentence that answers."""
+    """Format the result of a comparison: a table and, in the last lines, the answer."""
     from cloudrc.sweep.compare import LEFT_OUT
 
     body = [_row(name, entry) for name, entry in document["numbers"].items()]
@@ -182,7 +182,7 @@ def _needed(entry: Mapping[str, Any]) -> str:
 
 
 def _answer(document: Mapping[str, Any]) -> str:
-    """Answer in a sentence about the first number, after one about success if that differs."""
+    """Say how the first number of the table differs; before it, say whether success differs."""
     success, text = document["success"], ""
     if success["decided"]:
         more, less = "ba" if success["b"] > success["a"] else "ab"

@@ -107,7 +107,7 @@ def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
 def _candidates(name: str, words: Sequence[str], *, files: bool = False) -> dict[str, Any]:
     """Return what shtab needs to complete `words`, in the syntax of each shell.
 
-    `name` becomes part of the name of the shell function. With `files`, complete paths, too.
+    `name` becomes part of the name of a shell function. With `files`, also complete paths.
     """
     function, joined = f"_cloudrc_{name}", " ".join(words)
     bash = zsh = fish = ""

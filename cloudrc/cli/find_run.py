@@ -43,14 +43,14 @@ def find_local_run(
 
     Args:
         options: Parsed arguments of the command.
-        look: Gets the run's folder and the URL of its API ("" without an API); its result is
-            returned. None means that the command cannot use this run.
+        look: Function of a run's folder and the URL of its API ("" without an API). It returns
+            what the command needs, or None if the command cannot use this run.
         nobody: Text of the error if `--run` names no run in flight.
         steers: Whether the command changes the flight.
-        flag: How the user names the run.
+        flag: Flag that names a run, for the texts of errors; "" for a positional argument.
 
     Returns:
-        None if no run is in flight, or if the flags name a cluster.
+        The result of `look`; None if no run is in flight, or if the flags name a cluster.
 
     Raises:
         BadInputError: If `--run` names no run in flight; if several runs are in flight; or if the

@@ -1,4 +1,4 @@
-"""`cloudrc identify RUN`: fit the model of the velocity loop that `command_history` uses."""
+"""`cloudrc identify RUN`: fit a model of the velocity loop for the predictor `command_history`."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from cloudrc.errors import BadInputError
 EPILOG = """\
 World and cloud read the same key file ('--key FILE'; in a cluster, a Secret)
 and read it again when it changes. 'new' on an existing file rotates the key:
-the file keeps the key until now as the second, and each end accepts both. The
+the file keeps the old key as the second one, and each end accepts both. The
 session changes to the new key, with one short HOLD in flight, once both ends
 have read the file. 'drop' removes the second key: each end refuses it within a
 second. Use 'drop', or the next 'new', only once both ends have reported the

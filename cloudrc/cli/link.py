@@ -1,4 +1,4 @@
-"""Run `cloudrc link ACTION`: the action `show`, and the arguments of `verify`.
+"""Run `cloudrc link ACTION`. Here are the action `show` and the arguments of `verify`.
 
 The modules `cli/link_<action>.py` contain the other actions. The module of `verify` imports large
 packages, which would slow down `cloudrc link --help`.
@@ -54,7 +54,7 @@ examples:
 
 The delays come from the same link model as in a flight, packet by packet: a
 flight with the same seed has exactly these delays. All delays are one way.
-Of a trace every row counts the same, however long it holds."""
+In the statistics of a trace, each row counts once, whatever its duration."""
 VERIFY_EPILOG = """\
 examples:
   cloudrc link verify                       the link of the paper's experiment
@@ -62,10 +62,11 @@ examples:
   cloudrc link verify paper --set link.uplink.loss=0.05 -o json
 
 The command starts the link's processes on this machine, one per direction, and
-sends numbered probes through each. A relay's draws are known, so each probe has
-a predicted delay; netem is compared with 200 simulated links. Tolerances:
-max(2 ms, 5 %) of the mean delay, 10 % of the jitter, max(2 percentage points,
-25 %) of the loss. What is off is measured again before it is reported.
+sends numbered probes through each. The random numbers of a relay are known, so
+the command can predict the delay of each probe; it compares netem with 200
+simulated links. Tolerances: max(2 ms, 5 %) of the mean delay, 10 % of the
+jitter, max(2 percentage points, 25 %) of the loss. It measures a second time
+before it reports that something is off.
 
 With --mode cluster the command judges the link of a release in flight by the
 tunnel's own datagrams, within a minute. It reports what it cannot judge.
@@ -81,8 +82,8 @@ RANGES: dict[str, tuple[float, float]] = {
     "packets": (1, PACKETS_MAX),
 }
 """Option of `show` -> its least and largest value."""
-ROWS = 1000  # least packets in a picture of a trace; several follow each row of a short trace
-SECONDS = 30.0  # shortest time shown by default; a longer time line is shown in full [s]
+ROWS = 1000  # least number of packets in the figure of a trace; a short trace gets several per row
+SECONDS = 30.0  # time that a figure shows by default [s]; a longer time line is shown in full
 KINDS = ("png", "svg", "pdf")
 
 
@@ -237,7 +238,7 @@ def _way(
 
 
 def _row_times(times: Sequence[float]) -> list[int]:
-    """Return times [ns] to send packets: at each row of a trace, and between rows if few exist."""
+    """Return times [ns] to send packets: one per row of a trace, several if the trace is short."""
     rows = [round(time * 1e9) for time in times]
     share = -(-ROWS // len(rows))
     if len(rows) == 1 or share == 1:

@@ -39,8 +39,8 @@ EPILOG = ""
 TOOL_TIMEOUT = 5.0  # time limit of one call of tc or ip [s]
 _BATCH = ("tc", "-s", "-j", "-force", "-batch", "-")
 _END = "qdisc show dev lo"
-"""Command that is sent to tc after each other command. Its answer, a list, marks the end of the
-other command's answer; tc itself does not mark it."""
+"""Command that follows each command to tc. Its answer, a list of qdiscs, marks the end of the
+previous answer, because tc itself marks no end."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -108,7 +108,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def log(line: str) -> None:
-    """Write one line to the log."""
+    """Write a line to stderr, the log of the process."""
     print_line(f"cloudrc link: {line}", sys.stderr)
 
 
@@ -171,7 +171,7 @@ def status_page(sidecar: Sidecar) -> str:
 
 @lru_cache(maxsize=1)
 def _find_netems(host: str, second: int) -> dict[str, Any]:
-    """Find the netem qdiscs of this pod, once in each `second` on the monotonic clock [s]."""
+    """Find the netem qdiscs of this pod; the cache keeps them for one `second`."""
     from cloudrc.link.sidecar import find_netems
 
     return find_netems(run_tool, host)

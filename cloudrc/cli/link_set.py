@@ -30,7 +30,7 @@ where:
   named by --run
   a release in a cluster: if --context, -n or --release is given, or if there is
   no run on this machine; always with 'kubectl cloudrc link set'
-  It asks for a flag if several runs fly, or if ./runs/latest has ended.
+  If several runs fly, or ./runs/latest has ended, name the flight by a flag.
 
 examples:
   cloudrc link set downlink.delay_ms=120 uplink.loss=0.02
@@ -106,7 +106,7 @@ def read_states(folder: Path) -> list[LinkState]:
 def set_here(
     folder: Path, profile: str | None, settings: Sequence[str], number: str
 ) -> tuple[Edit, list[LinkState]]:
-    """Write a new profile into the relay's folder, and wait until the relay has applied it.
+    """Hand a new profile to the relay, and wait until it applies; return edit and new states.
 
     `profile` is the name or file of a profile that replaces the present one; None keeps it.
     `settings` are changed values, each "uplink.KEY=VALUE". `number` identifies the change.
@@ -162,7 +162,7 @@ def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
 
 
 def note_of(edit: Edit, number: str) -> str:
-    """Return the record of a change, for the file beside the profile."""
+    """Describe a change in JSON, for the file beside the profile."""
     return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
 
 

@@ -65,10 +65,10 @@ from cloudrc.tunnel.codec import SIZES, Kind
 RELEASE_TIMEOUT = 270.0  # default time limit for the verdict on a release [s]
 START_LIMIT = 90.0  # for the processes of both directions to start, on a slow disk [s]
 COUNTS_WAIT = 1.3  # after the last probe: processes update their counts once a second [s]
-POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0  # of a release; of one HTTP request [s]
+POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0  # between requests to a release; limit of a request [s]
 PORTS = METRICS["world"]["world"], METRICS["world"]["link"]
 LOOPBACK, DEVICE = "127.0.0.1", "tunnel"
-HOSTS = {"uplink": "10.79.7.1", "downlink": "10.79.7.2"}  # addresses of the senders
+HOSTS = {"uplink": "10.79.7.1", "downlink": "10.79.7.2"}  # senders, with netem
 WAYS = {
     "uplink": ("world", "cloud", Kind.TELEMETRY),
     "downlink": ("cloud", "world", Kind.COMMAND),
@@ -133,10 +133,10 @@ def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
 class Way:
     """One direction of a link under test: socket of the probes, process and files of the shaper."""
 
-    own: socket.socket
+    own: socket.socket  # sends the probes of this direction, receives those of the other
     ports: tuple[int, int]  # port at which a relay receives, and metrics port
     namespace: str  # network namespace; "" for the namespace of this process
-    peer: tuple[str, int] = ("", 0)
+    peer: tuple[str, int] = ("", 0)  # address of the other direction's socket
     folder: Path = Path()
     process: subprocess.Popen[bytes] | None = None
 
@@ -345,7 +345,7 @@ def _pods(options: argparse.Namespace) -> Iterator[Pods]:
 
 
 def verify_release(title: str, pods: Pods, limit: float) -> Report:
-    """Wait at most `limit` [s] for the verdicts of world and cloud on the directions they receive.
+    """Report the verdicts of world and cloud on the directions they receive; wait `limit` [s].
 
     Raises:
         TimedOutError: If world or cloud does not answer in time.

@@ -1,4 +1,4 @@
-"""Run the program `cloudrc`: run the given command; print an error in one line."""
+"""Run the given command of `cloudrc`; print an error in one line."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command and return the exit code; by default parse the arguments of this process."""
+    """Run the command in `arguments` (default: those of this process); return the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return _dispatch(given)

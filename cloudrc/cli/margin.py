@@ -25,17 +25,17 @@ examples:
   cloudrc margin link.uplink.loss --resolution 0.05 -o json
 
 A value is stable if the flights of all seeds succeed. With a key of the link,
-cloud.horizon_max_s, cloud.freeze_after_s and guard.command_age_max_ms follow
-the delays, unless --set gives them."""
+the command also raises cloud.horizon_max_s, cloud.freeze_after_s and
+guard.command_age_max_ms as the delays need it, unless --set gives them."""
 SLACK = 0.1
-"""Distance of the limits of cloud and guard from the largest age in the simulated link [s]."""
+"""Reserve between the largest age of `simulate_ages` and the limits of cloud and guard [s]."""
 STEPS_MAX = 100
 """Default of --max, as a multiple of the first value."""
 
 
 Trial: TypeAlias = dict[str, Any]
-"""The flights with one value, for JSON: `value`, `stable`; of the first failure `code` (or
-"refused"), `text` and `seed`; `rtt_ms` for a delay of the link, and the guard's `speed_max_mps`."""
+"""Result of the flights with one value: `value`, `stable`, the guard's `speed_max_mps`; for a delay
+`rtt_ms`; after a failure `code` ("refused": invalid value), `text` and `seed`."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,7 +51,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Search and print; return 0, or 1 if no value is stable."""
+    """Search the largest stable value and print it; return 0, or 1 if no value is stable."""
     from cloudrc.cli.run import load
 
     interrupt_on_signals()
@@ -96,9 +96,9 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def largest_stable(works: Callable[[int], bool], start: int, top: int) -> tuple[int, int]:
-    """Double a step from `start` until it fails, then bisect; a step is a number from 1 to `top`.
+    """Find the largest step from 1 to `top` that works: double it from `start`, then bisect.
 
-    Return the largest step that works and the next one, which fails; 0 stands for none.
+    Return this step, or 0 if no step works, and the next step, or 0 if `top` works.
     """
     low, high = 0, start
     while works(high):
@@ -112,7 +112,7 @@ def largest_stable(works: Callable[[int], bool], start: int, top: int) -> tuple[
 
 
 def _present(experiment: ResolvedExperiment, key: str) -> float:
-    """Return the present value of a key; 0 if it is null or unknown, which the search refuses."""
+    """Return the present value of a key; 0 if the value is null or the key is unknown."""
     from cloudrc.config.document import child
 
     value: Any = experiment.model_dump(mode="json")
@@ -124,7 +124,7 @@ def _present(experiment: ResolvedExperiment, key: str) -> float:
 
 
 def _try(options: argparse.Namespace, value: float, *, first: bool) -> Trial:
-    """Fly the seeds with one value of the key until one fails."""
+    """Fly all seeds with one value of the key, until a flight fails."""
     from cloudrc.cli.run import load
     from cloudrc.sweep.flight import fly_point
 
@@ -155,7 +155,7 @@ def _try(options: argparse.Namespace, value: float, *, first: bool) -> Trial:
 
 
 def _limits(experiment: ResolvedExperiment) -> list[str]:
-    """Return settings of cloud and guard that bear the link, as far as the schema allows."""
+    """Return settings KEY=VALUE that raise limits of cloud and guard to the delays of the link."""
     from cloudrc.config.load import COMMAND_AGE_MAX_MS, FREEZE_AFTER_S, HORIZON_MAX_S
     from cloudrc.config.schema import COMMAND_AGE_MS
 

@@ -38,7 +38,7 @@ where:
   named by --run DIR or --api URL
   a release in a cluster: if --context, -n or --release is given, or if there is
   no run on this machine; always with 'kubectl cloudrc mission'
-  It asks for a flag if several runs fly, or if ./runs/latest has ended.
+  If several runs fly, or ./runs/latest has ended, name the flight by a flag.
 
 examples:
   cloudrc mission run pipes
@@ -66,7 +66,7 @@ RUN_TIMEOUT, API_TIMEOUT = 10.0, 180.0
 The second limit is longer, because the pod of the API may still have to load its image."""
 TURN_MAX = 30.0
 """Longest time that a request and the pause after the request take [s]. If more time has passed,
-this process was suspended; the time of the suspension does not count."""
+this process was suspended; the suspension does not count towards a time limit."""
 TERMINATION_LOG = Path("/dev/termination-log")
 """File in a pod for the pod's last message, which `kubectl describe` shows after the pod's end."""
 LIMIT_MAX = 86_400.0
@@ -405,11 +405,11 @@ def _print_robot(seen: Json | None, cloud_age: float | None) -> None:
     """Print the robot's newest known state, and the age of cloud's last message [s]."""
     heard = "never" if cloud_age is None else f"{cloud_age:.1f} s ago"
     if seen is None:
-        print(f"no telemetry from the robot yet; is the link up? cloud heard {heard}")
+        print(f"no telemetry from the robot yet; is the link up? last message from cloud: {heard}")
         return
     where = describe_point(seen["position_m"])
     if seen["guard_for_s"] is None:
-        print_line(f"robot not heard for {seen['age_s']:.1f} s; cloud heard {heard}")
+        print_line(f"no telemetry for {seen['age_s']:.1f} s; last message from cloud: {heard}")
         print_line(f"last seen at {where} m, guard {seen['guard']}: {seen['cause']}")
     else:
         rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"

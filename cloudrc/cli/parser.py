@@ -26,7 +26,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "identify": "fit the model of the velocity loop to a recorded flight",
         "recover": "write a clean copy of a damaged recording",
         "compare": "say whether a setting differs from another, and how sure that is",
-        "margin": "find the largest delay, or other value, that a flight bears",
+        "margin": "find the largest delay, or other value, with which flights succeed",
         "bench": "measure how fast the simulation runs here",
         "faults": "inject faults and check that the system handles them",
         "class": "hand out and score the exercise for students",
@@ -137,7 +137,7 @@ def input_file(text: str) -> Path:
 def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:
     """Build the parser of all commands, with the arguments of the `wanted` commands only.
 
-    So only the modules of the `wanted` commands are imported. With `for_completion`, the help also
+    The function imports only the modules of these commands. With `for_completion`, the help also
     contains argparse's list of commands, which the completion script needs.
     """
     common, about = Parser(add_help=False), "show the traceback of an error"

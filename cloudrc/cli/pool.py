@@ -75,10 +75,10 @@ def map_in_order(
 ) -> Generator[Result]:
     """Call a function on each piece of work, in parallel, and yield the results in order.
 
-    With `in_order` False, each result is yielded as soon as it is there. At most `jobs` worker
-    processes run, and at most one per core. Instead of a single worker, this process makes all
-    calls. The function has to be at module level: a worker imports the function. Ctrl-C or closing
-    the generator kills the workers and drops all calls that have not ended.
+    With `in_order` False, yield each result as soon as it is there. At most `jobs` worker processes
+    run, and at most one per core. If one worker is enough, this process makes the calls itself. The
+    function has to be at module level: a worker imports the function. Ctrl-C or closing the
+    generator kills the workers and drops all calls that have not ended.
     """
     workers = min(jobs, len(work), usable_cores())
     if workers <= 1:
@@ -109,7 +109,7 @@ def take_each(
 ) -> tuple[str, int]:
     """Call `take` with each result until the work ends or is interrupted.
 
-    Return "" and 0, or the reason why the work ended early and the exit code.
+    Return "" and 0 or, if the work ended early, the reason and the exit code.
     """
     try:
         with closing(results):

@@ -54,7 +54,7 @@ RELEASED_PERIOD = 2.0
 
 
 class Command(NamedTuple):
-    """A command that shares its module with others; the names are those of a command's module."""
+    """One of several commands in a module; attributes as in the module of a single command."""
 
     arguments: Callable[[argparse.ArgumentParser], None]
     execute: Callable[[argparse.Namespace], int]
@@ -157,8 +157,8 @@ def ipv4_addresses(name: str) -> list[str]:
         with suppress(OSError):
             _addresses(name, socket.AF_INET6)
             error.strerror = (
-                "it has IPv6 addresses alone, and a link is shaped over IPv4; in a cluster with "
-                "both families set ipFamilyPolicy=PreferDualStack"
+                "it has only IPv6 addresses, but a link needs IPv4; in a cluster with both "
+                "families set ipFamilyPolicy=PreferDualStack"
             )
         raise
 
@@ -172,7 +172,7 @@ def _addresses(name: str, family: int) -> list[str]:
 
 
 def resolve_address(flag: str, where: Address, listen: Address = ("0.0.0.0", 0)) -> Address:
-    """Resolve an address, before the control loop starts: the loop must not wait for DNS.
+    """Look up the host of an address before the control loop starts, which must not wait for DNS.
 
     The result is IPv4 or IPv6, like the address `listen` of this process; if `listen` is [::], both
     are possible. Raise a BadInputError, which names `flag`, if the host cannot be resolved.
@@ -197,7 +197,7 @@ def warn_if_exposed(listen: Address) -> None:
 
 @contextmanager
 def _listening(flag: str, listen: Address) -> Iterator[None]:
-    """Warn if `listen` is exposed; name `flag` in the error if the block cannot bind it."""
+    """Warn if `listen` is exposed; if the block cannot bind it, name `flag` in the error."""
     warn_if_exposed(listen)
     try:
         yield
@@ -338,8 +338,8 @@ def link_monitor(
 ) -> LinkMonitor:
     """Make the monitor that compares the received datagrams with the link profile.
 
-    `uplink` is True in cloud, False in world. The monitor follows the link's file `state` for
-    changes of the profile in flight. Unless the link is `trusted`, limit the traces of the file.
+    `uplink` is True in cloud, False in world. In flight, the monitor reads changes of the profile
+    from the link's file `state`. Unless the link is `trusted`, its traces have the limit TRACE_MAX.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile
@@ -456,9 +456,8 @@ class RelayControl:
     ) -> None:
         """Publish the initial state in `folder`, which is created if missing.
 
-        `links` and `first` have the link of each direction, "uplink" and "downlink", and its
-        profile at the start. `asked` is called at each change with the direction and its new mean
-        delay [s].
+        `links` and `first` map "uplink" and "downlink" to the direction's link and to its first
+        profile. Each change calls `asked` with the direction and its new mean delay [s].
         """
         from cloudrc.cli.link_run import make_profile_loader
 

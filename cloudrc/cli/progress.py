@@ -122,7 +122,7 @@ def _joined(cells: Iterable[str]) -> str:
 
 
 class SweepView:
-    """Shows how many flights are done: in a line on a terminal, else in a line every 30 s."""
+    """Shows how many flights are done: on a terminal in a status line, else in a line per 30 s."""
 
     def __init__(self, stream: TextIO, head: str, total: int) -> None:
         """Print `head`; set the number of flights to fly."""

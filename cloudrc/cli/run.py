@@ -46,11 +46,11 @@ Flight = Callable[[Path], dict[str, Any]]
 See = Callable[["list[Record]"], None]
 """Function that displays records during the flight."""
 Ready = Callable[[Path, Callable[[str], None], contextlib.ExitStack, str, dict[str, str]], None]
-"""Function that a session calls when it is ready, with its folder, a function that prints a line,
-a stack that closes at the end, and the arguments of `session` of `LocalRun`."""
+"""Function that a session calls when it is ready. Arguments: the run's folder, a function that
+prints a line, a stack that closes at the end, the API's URL, process -> HOST:PORT of metrics."""
 
 NO_C = "Python (wind, or a robot that differs from its model)"
-"""Where the usual steps run if C cannot run them."""
+"""Where the physics steps run if the C code does not cover the experiment."""
 EPILOG = """\
 modes:
   local    real time: four processes, UDP on 127.0.0.1
@@ -122,7 +122,7 @@ def load(name: str, overrides: Iterable[str], seed: int | None = None) -> Resolv
 def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None) -> int:
     """Fly as `options` say, print the summary, and return the exit code.
 
-    With `ready`, fly a session, which calls `ready` when everything is ready.
+    With `ready`, fly a session, which calls `ready` once it waits for missions.
     """
     from cloudrc.metrics.verdict import exit_code
 
@@ -226,7 +226,6 @@ def _local_flight(
 def _cluster_flight(
     experiment: ResolvedExperiment, options: argparse.Namespace, stream: TextIO
 ) -> Flight:
-    """Return a function that flies in the cluster that the flags in `options` name."""
     from cloudrc.cli.client import Api
     from cloudrc.cluster.client import program
     from cloudrc.cluster.flight import fly_in_cluster, refuse_local_files, refuse_second_flight
@@ -253,8 +252,8 @@ def fly(
     """Fly in mode "virtual" or "local"; write all files into `folder`, and return the report.
 
     During the flight `see` is called with new records; in local mode some are left out. An
-    interrupted flight also gets a report. Without `page`, write no report.html. In a session (see
-    `LocalRun`), the report is that of the last mission.
+    interrupted flight also gets a report. Without `page`, write no report.html. With `session` (see
+    `LocalRun`), fly a session; the report is that of its last mission.
     """
     from cloudrc.config.load import dump
     from cloudrc.report.write import write_report
@@ -273,7 +272,7 @@ def fly(
 
 
 def _physics_steps(experiment: ResolvedExperiment, usual: str) -> str:
-    """Return where the physics steps run; `usual` says where the usual steps run."""
+    """Return where the physics steps run: `usual`, unless the C code does not cover the world."""
     from cloudrc.config.schema import Plant
 
     is_usual = experiment.world.plant == Plant() and not experiment.world.wind.blows
@@ -286,7 +285,7 @@ def _record_virtual(
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
     """Fly in virtual time, and yield the recording, the experiment and facts about the run.
 
-    In the block, the caller writes the report; it is then attached to the file of the recording.
+    The caller writes the report in the block; afterwards, the recording contains the report.
     """
     from cloudrc import assembly
     from cloudrc.record.columns import RecordStore, merged
@@ -326,7 +325,7 @@ def _record_virtual(
 
 
 def _prepare(experiment: ResolvedExperiment) -> bool:
-    """Check a robot or scene of the user before the flight; return whether it has an API."""
+    """Check the user's robot and scene before the flight; return whether the run has an API."""
     if absent := missing("api"):
         text = f"no operator's API in this run: {', '.join(absent)} not installed"
         print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)
@@ -345,7 +344,7 @@ def _record_local(
     see: See,
     session: Callable[[str, dict[str, str]], None] | None = None,
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
-    """Fly in real time; otherwise as `_record_virtual`, with the merged recording of both ends."""
+    """Do as `_record_virtual`, but in real time; merge the recordings of world and cloud."""
     from cloudrc.assembly import flight_limit
     from cloudrc.cli.session import read_last_mission
     from cloudrc.drivers.local import LocalRun

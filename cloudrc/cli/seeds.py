@@ -1,4 +1,4 @@
-"""`cloudrc run --seeds N`: fly a sweep of one point; print medians and their intervals."""
+"""`cloudrc run --seeds N`: fly one experiment with N seeds; print medians and their intervals."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ METHOD = "95 % interval of the median, by order statistics"
 def summarise(rows: Sequence[Row], units: Mapping[str, str]) -> dict[str, Any]:
     """Count all runs and successful runs; compute median and interval of each measurement.
 
-    Runs whose plug-in failed have no numbers here. `units`: metric -> unit.
+    Numbers of runs whose plug-in failed do not count. `units`: metric -> unit.
     """
     numbers, measured = {}, [row["numbers"] for row in rows if counts(row)]
     for name in dict.fromkeys(name for each in measured for name in each):
@@ -97,5 +97,5 @@ def fly_seeds(options: argparse.Namespace) -> int:
 
 
 def fly_one(flight: Flight) -> Row:
-    """Fly, and return the row; an exception ends the command."""
+    """Fly, and return the row of the flight; an exception ends the command."""
     return store.make_row(flight, measure(flight.experiment))

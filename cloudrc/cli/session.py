@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from cloudrc.teleop.store import Mission
 
 Say = Callable[[str], None]
-"""Function that prints a line beside the progress of a flight."""
+"""Function that prints a line above the status line of a flight."""
 DOWN_LIMIT = 120.0
 """Time limit for a session to end and to write its report [s]."""
 NEXT = """\
@@ -85,7 +85,7 @@ def _up(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _console(folder: Path, say: Say) -> Iterator[None]:
-    """Run `cloudrc console` while the block runs; `say` gets its address, or why there is none."""
+    """Run `cloudrc console` while the block runs; print its address or its error by `say`."""
     from cloudrc.cluster.client import end_process
     from cloudrc.drivers.machine import interpreter
 
@@ -142,7 +142,7 @@ def read_last_mission(folder: Path) -> tuple[Contents, ResolvedExperiment, bool]
 
     if (last := _last_mission(folder)) is None:
         raise NothingFlownError(f"{folder}: no mission flew, so there is no report")
-    if last.order.plan.by_hand:  # until the report has the setpoints: rest where the drive began
+    if last.order.plan.by_hand:  # rest at the start, until the report has the setpoints
         rest = [(time, last.order.plan.legs[0].position) for time in (0.0, 1.0)]
         (folder / DRIVE_FILE).write_text(write_setpoints(rest), encoding="utf-8")
     config = folder / "config.yaml"
@@ -155,7 +155,7 @@ def read_last_mission(folder: Path) -> tuple[Contents, ResolvedExperiment, bool]
 
 
 def restore_mission(folder: Path) -> None:
-    """Write mission.mcap of a session that was killed before it did so."""
+    """Write the mission.mcap of a session that was killed before it wrote this file."""
     from cloudrc.drivers.local import JOURNAL_FILE, under_way
     from cloudrc.report.write import attachments
 

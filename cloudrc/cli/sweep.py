@@ -55,10 +55,10 @@ ARRAYS = {
     "SLURM_ARRAY_TASK_ID": ("SLURM_ARRAY_TASK_COUNT", "SLURM_ARRAY_TASK_MIN"),
     "JOB_COMPLETION_INDEX": ("JOB_COMPLETIONS", ""),
 }
-"""Variable with the index of a process -> variables with the number of processes and with the first
-index, which is 0 without a variable."""
+"""Environment variable with the index of a process -> variables with the number of processes and
+with the first index ("": it is 0)."""
 WARNINGS_MAX = 3
-"""Largest number of warnings about points."""
+"""Largest number of warnings that a sweep prints."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -125,7 +125,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fly the flights of a sweep that have no row yet; return the exit code of the worst row."""
+    """Fly the flights of a sweep that have no row yet; return 1 unless all flights succeed."""
     from cloudrc.cli.progress import SweepView
     from cloudrc.cli.run import new_folder
     from cloudrc.sweep import store
@@ -205,7 +205,7 @@ def _rows(
 
 
 def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
-    """Fly, record the flight if that is asked for, and return the row."""
+    """Fly and return the row; if the job asks for a recording, fly again with a recording."""
     from cloudrc.sweep.flight import fly_point
     from cloudrc.sweep.store import make_row
 
@@ -218,7 +218,7 @@ def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
 
 
 def _to_record(row: Row, record: str | None, folder: Path) -> bool:
-    """Return whether a flight shall have a recording in `folder` and has none."""
+    """Return whether `record` ("failed", "all", None) asks for a recording that is missing."""
     wanted = record == "all" or (record == "failed" and row["verdict"] != "success")
     has = (folder / row["key"] / "report.json").is_file()
     return wanted and row["verdict"] != "error" and not has
@@ -232,7 +232,7 @@ def _fly_into(folder: Path, flight: Flight, *, page: bool) -> dict[str, Any]:
 
 
 def fly_again(options: argparse.Namespace) -> int:
-    """Fly a row again with recording and report; exit with 6 if its records differ."""
+    """Fly a row again with recording and report; exit with 6 if the records differ."""
     from cloudrc.cli.report import print_traceback, summary
     from cloudrc.sweep import store
     from cloudrc.sweep.plan import read_plan

@@ -76,12 +76,12 @@ def rows_from_pods(
 
 
 def print_rows(options: argparse.Namespace) -> int:
-    """Fly a shard of a file of flights and print a row for each flight."""
+    """Fly one shard of the flights in a file, and print the row of each flight."""
     from cloudrc.sweep.flight import fly_point
     from cloudrc.sweep.parcel import unpack
     from cloudrc.sweep.store import make_row
 
-    interrupt_on_signals()  # as the first process of a container, it would ignore them
+    interrupt_on_signals()  # the first process of a container ignores signals by default
     shard, count = options.shard
     for flight in unpack(options.file)[shard - 1 :: count]:
         row = make_row(flight, fly_point(flight.experiment))

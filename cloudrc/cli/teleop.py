@@ -142,7 +142,7 @@ def ending(
     """Return a function that tells whether teleop's process may end.
 
     Once `asked()` is true, the function pauses the mission. The process may end when the robot
-    holds its position, or after `PAUSE_LIMIT_NS`; with `single`, also after its mission.
+    holds its position, or after `PAUSE_LIMIT_NS`; with `single`, also after the mission.
     """
     until_ns = 0
 

@@ -1,7 +1,15 @@
-"""The working folder of each command, and text that would control a terminal."""
+"""The working folder of each command, calls of commands, and text that would control a terminal."""
+
+import time
 
 import pytest
 
+from cloudrc.cli.main import main
+
+KEYS = "mission.steps.count=1", "mission.steps.period_s=1.0", "criteria.settle_m=null"
+SHORT = [f"--set={key}" for key in KEYS]
+"""Overrides of `steps` for one second of flight."""
+FLY = ["run", "steps", "--mode", "virtual", *SHORT]
 EVIL = "x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"
 SHOWN = r"x\x1b]0;owned\x07\x9b2J\rcloudrc: all is well\n\u202ecloudrc: error: run me"
 
@@ -13,8 +21,58 @@ def assert_harmless(text, count=None):
     assert [line for line in text.splitlines() if line.startswith("cloudrc: all")] == []
 
 
+def until(condition, limit=90.0):
+    """Wait until `condition()` is true, at most `limit` [s]; return its value."""
+    deadline = time.monotonic() + limit
+    while not (found := condition()):
+        assert time.monotonic() < deadline, "not in time"
+        time.sleep(0.05)
+    return found
+
+
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     """Work in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture
+def call(capsys):
+    """Return a function that runs a command, checks its exit code, and returns its output."""
+
+    def run(line, *more, code=0):
+        capsys.readouterr()
+        assert main([*line.split(), *map(str, more)]) == code
+        return capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def refused(call):
+    """Return a function that runs a command and returns its only output: one line of error."""
+
+    def run(line, *more, code=2):
+        out, error = call(line, *more, code=code)
+        assert (out, error.count("\n"), error[:16]) == ("", 1, "cloudrc: error: ")
+        return error
+
+    return run
+
+
+@pytest.fixture
+def no_page(monkeypatch):
+    """Leave out the figures of a report, which take longer than a flight."""
+
+    def write_page(folder, *assessment):
+        (folder / "report.html").write_text("drawn elsewhere")
+
+    monkeypatch.setattr("cloudrc.report.write._write_page", write_page)
+
+
+@pytest.fixture
+def replace_flights(monkeypatch):
+    """Return a function that replaces flights by `fly(experiment)`, in this process."""
+    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 1)
+    return lambda fly: monkeypatch.setattr("cloudrc.sweep.flight.fly_point", fly)

@@ -5,13 +5,10 @@ import subprocess
 
 import pytest
 
-from cloudrc.cli.main import main
-
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_the_script_knows_commands_and_options(shell, capsys):
-    assert main(["completion", shell]) == 0
-    script = capsys.readouterr().out
+def test_the_script_knows_commands_and_options(shell, call):
+    script = call(f"completion {shell}").out
     for word in ("doctor", "seeds", "paper-verbatim", "satellite", "link.profile=lte"):
         assert word in script
     if shutil.which(shell):
@@ -31,9 +28,8 @@ def test_the_script_knows_commands_and_options(shell, capsys):
         (["run", "--set", "cloud.predictor", "=", "last"], ["last_sample"]),
     ],
 )
-def test_bash_completes_names(words, found, capsys):
-    main(["completion", "bash"])
-    script = capsys.readouterr().out
+def test_bash_completes_names(words, found, call):
+    script = call("completion bash").out
     line = " ".join(["cloudrc", *words])
     probe = (
         f"\nCOMP_WORDS=({line}); COMP_CWORD={len(words)}; COMP_LINE='{line}'"

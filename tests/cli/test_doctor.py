@@ -8,7 +8,6 @@ import pytest
 
 from cloudrc.cli import doctor, extras
 from cloudrc.cli.doctor import Check
-from cloudrc.cli.main import main
 from cloudrc.errors import MissingPrerequisiteError
 
 GOOD = Check("python", "ok", "3.12.1", "", ("local", "virtual"))
@@ -24,14 +23,13 @@ NO_PHYSICS = Check("physics", "missing", "aborted", "install mujoco", ("local", 
         ("virtual", [NO_PHYSICS], 3),
     ],
 )
-def test_only_a_needed_check_gives_exit_code_3(mode, found, code, monkeypatch, capsys):
+def test_only_a_needed_check_gives_exit_code_3(mode, found, code, monkeypatch, call):
     monkeypatch.setattr(doctor, "all_checks", lambda *given: iter(found))
-    assert main(["doctor", "--mode", mode]) == code
-    text = capsys.readouterr().out
+    text = call(f"doctor --mode {mode}", code=code).out
     assert text.splitlines()[-1].startswith(f"Mode {mode} can")
     assert all(check.fix in text for check in found)
-    assert main(["doctor", "--mode", mode, "-o", "json"]) == code
-    assert json.loads(capsys.readouterr().out)["ready"] is (code == 0)
+    document = json.loads(call(f"doctor --mode {mode} -o json", code=code).out)
+    assert document["ready"] is (code == 0)
 
 
 def test_every_problem_says_how_to_fix_it(monkeypatch):

@@ -39,13 +39,12 @@ def test_a_name_in_an_error(words, printed):
     assert line.startswith("cloudrc: error: ")
 
 
-def test_the_note_of_a_recording(folder, capsys):
+def test_the_note_of_a_recording(folder, call):
     with McapWriter(folder / "a.mcap", clock="world") as writer:
         writer.write(world_records(5))
         writer.note({MISSING: EVIL})
-    assert main(["recover", "a.mcap"]) == 1
     note = SHOWN.replace(r"\r", " ").replace(r"\n", " ")
-    assert f"lossy: {note}\n" in capsys.readouterr().out
+    assert f"lossy: {note}\n" in call("recover a.mcap", code=1).out
 
 
 def test_what_is_printed_of_a_flight(printed):
@@ -69,13 +68,12 @@ def api():
         yield one
 
 
-def test_a_missions_name(api, printed, capsys):
+def test_a_missions_name(api, printed, call):
     for words in ("list", "status", "status m1", "hold", "cancel"):
         main(["mission", *words.split(), "--api", api.url])
         printed()
     for form, read in (("json", json.loads), ("yaml", yaml.safe_load)):
-        assert main(["mission", "list", "--api", api.url, "-o", form]) == 0
-        said = capsys.readouterr().out
+        said = call(f"mission list --api {api.url} -o {form}").out
         assert [c for c in said if (c != "\n" and ord(c) < 32) or 127 <= ord(c) < 160] == []
         assert read(said)["missions"][0]["name"] == EVIL
     with pytest.raises(BadInputError) as refused:
@@ -83,10 +81,9 @@ def test_a_missions_name(api, printed, capsys):
     assert_harmless(str(refused.value))
 
 
-def test_an_id_that_no_mission_can_have(api, capsys):
+def test_an_id_that_no_mission_can_have(api, refused):
     for given in ("\x1b[31m", "m1?x", "..", "a/b", "tür", "\udcff", "%"):
-        assert main(["mission", "cancel", given, "--api", api.url]) == 5
-        (line,) = capsys.readouterr().err.splitlines()
-        assert line.isprintable()
+        line = refused(f"mission cancel --api {api.url}", given, code=5)
+        assert line.rstrip().isprintable()
         shown = {"a/b": "Not Found", "\udcff": "no mission '\ufffd'"}
         assert shown.get(given, f"no mission '{escape(given)}'") in line

@@ -4,7 +4,6 @@ import json
 
 import pytest
 
-from cloudrc.cli.main import main
 from cloudrc.cli.pool import WorkerDiedError
 from cloudrc.faults.scenario import Outcome
 from cloudrc.faults.schedule import Schedule
@@ -21,15 +20,14 @@ KILLED = WorkerDiedError("a worker was killed")
         ("run --all", KeyboardInterrupt(), 130, "cloudrc: interrupted; 1 of "),
     ],
 )
-def test_what_was_flown_before_an_interrupt_is_kept(line, error, code, said, monkeypatch, capsys):
+def test_what_was_flown_before_an_interrupt_is_kept(line, error, code, said, monkeypatch, call):
     def flown(function, work, jobs):
         seed = work[0][1] if "search" in line else 0
         yield Finding(Schedule(seed), ()) if seed else Outcome()
         raise error
 
     monkeypatch.setattr("cloudrc.cli.faults.map_in_order", flown)
-    assert main(["faults", *line.split(), "-o", "json"]) == code
-    out, message = capsys.readouterr()
+    out, message = call(f"faults {line} -o json", code=code)
     document = json.loads(out)
     assert document.get("count") == 1 or len(document["faults"]) == 1
     assert said in message

@@ -9,11 +9,11 @@ import threading
 import pytest
 
 from cloudrc.cli.client import Api
-from cloudrc.cli.main import main
 from cloudrc.drivers import local
+from tests.cli.conftest import until
 from tests.teleop.conftest import running
 
-SET = ["link", "set", "uplink.loss=0.1"]
+SET = "link set uplink.loss=0.1"
 
 
 @pytest.fixture(autouse=True)
@@ -29,14 +29,9 @@ def elsewhere(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def said(capsys):
-    """Run a command and return what it prints on stderr."""
-
-    def run(code, words, *more):
-        assert main([*words.split(), *map(str, more)]) == code
-        return capsys.readouterr().err
-
-    return run
+def said(call):
+    """Return a function that runs a command and returns what it prints on stderr."""
+    return lambda code, line, *more: call(line, *more, code=code).err
 
 
 @contextlib.contextmanager
@@ -47,7 +42,7 @@ def flying(folder):
         yield api
 
 
-def test_the_only_run_is_used_and_of_several_one_is_named(tmp_path, elsewhere, said, capsys):
+def test_the_only_run_is_used_and_of_several_one_is_named(tmp_path, elsewhere, said):
     with flying(tmp_path / "a") as a:
         assert said(0, "mission estop") == f"cloudrc: using the run in {tmp_path / 'a'}\n"
         with flying(elsewhere / "runs" / "latest") as here:
@@ -58,7 +53,6 @@ def test_the_only_run_is_used_and_of_several_one_is_named(tmp_path, elsewhere, s
     with flying(elsewhere / "runs" / "one"):
         (elsewhere / "runs" / "latest").rmdir()
         (elsewhere / "runs" / "latest").symlink_to("one")
-        capsys.readouterr()
         assert said(0, "mission estop") == ""
 
 
@@ -66,7 +60,7 @@ def test_no_command_steers_another_flight_after_yours_has_ended(tmp_path, elsewh
     latest = elsewhere / "runs" / "latest"
     latest.mkdir(parents=True)
     (latest / "relay.log").touch()
-    for words in ("mission hold", "mission run pipes", " ".join(SET)):
+    for words in ("mission hold", "mission run pipes", SET):
         assert "runs/latest has ended; name another flight: --release" in said(2, words)
     assert "no cluster is configured" in said(3, "mission list"), "it may read in a cluster"
     assert "no cluster is configured" in said(3, "mission hold --release other")
@@ -79,11 +73,16 @@ def test_no_command_steers_another_flight_after_yours_has_ended(tmp_path, elsewh
         assert said(0, "mission estop") == using
 
 
-def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, capsys):
+def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call):
     with flying(elsewhere / "runs" / "latest") as served:
         api, far = Api(served.url), {"name": "far", "waypoints": [{"position_m": [0.5, -2.0, 1.0]}]}
         api.post("/v1/missions", far)
         served.until(lambda: api.get("/v1/state")["mission"]["state"] == "flying")
+
+        def cancel_second():
+            until(lambda: len(api.get("/v1/missions")["missions"]) == 2)
+            api.post("/v1/missions/m2/cancel")
+
         for words, does in (
             ("hold", "holding at ("),
             ("goto 0.5 -1 1.2", "flying to (0.5, -1, 1.2); mission m1 (far): held"),
@@ -93,18 +92,16 @@ def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, capsys):
             ("run pipes", "mission m2: starting, waypoints: 7; the robot is set back to its spawn"),
         ):
             if words.startswith("run"):
-                threading.Timer(0.5, lambda: api.post("/v1/missions/m2/cancel")).start()
-            assert main(["mission", *words.split()]) in (0, 130)
-            assert capsys.readouterr().out.startswith(f"runs/latest: {does}"), words
+                threading.Thread(target=cancel_second).start()
+            out = call(f"mission {words}", code=130 if words.startswith("run") else 0).out
+            assert out.startswith(f"runs/latest: {does}"), words
         for words in ("status", "status m1", "list"):
-            assert main(["mission", *words.split()]) == 0
-            assert capsys.readouterr().out.startswith("runs/latest: "), words
-        assert main(["mission", "list", "-o", "json"]) == 0
-        assert "missions" in json.loads(capsys.readouterr().out)
-        for words, code in (("hold", 5), ("goto 0 0 99", 2)):
-            assert main(["mission", *words.split()]) == code
-            refused = capsys.readouterr().err
-            assert refused.startswith("cloudrc: error: runs/latest: "), refused
+            assert call(f"mission {words}").out.startswith("runs/latest: "), words
+        assert "missions" in json.loads(call("mission list -o json").out)
+        for words, code, why in (("hold", 5, ""), ("goto 0 0 99", 2, "beyond the fence")):
+            error = call(f"mission {words}", code=code).err
+            assert error.startswith("cloudrc: error: runs/latest: "), error
+            assert why in error
 
 
 def test_the_console_names_a_run_as_it_was_given(tmp_path, said):
@@ -125,26 +122,25 @@ def test_no_request_goes_to_a_server_that_a_folder_names(elsewhere, said):
             stranger.accept()
 
 
-def test_a_local_run_gets_no_token(tmp_path, monkeypatch):
+def test_a_local_run_gets_no_token(tmp_path, monkeypatch, call):
     unread = str(tmp_path / "there is none")  # sending it would mean reading it
     monkeypatch.setenv("CLOUDRC_TOKEN_FILE", unread)
     with flying(tmp_path / "out") as api:
-        for more in ([], ["--run", str(tmp_path / "out")], ["--token-file", unread]):
-            assert main(["mission", "estop", *more]) == 0
+        for more in ([], ["--run", tmp_path / "out"], ["--token-file", unread]):
+            call("mission estop", *more)
         assert len(api.alarms) == 3
-        assert main(["mission", "estop", "--api", api.url]) == 2
+        call("mission estop --api", api.url, code=2)
 
 
 def test_link_set_finds_the_only_run_with_a_link(tmp_path, elsewhere, said, monkeypatch):
     here = elsewhere / "runs" / "latest"
     (here / "link").mkdir(parents=True)
     with local.announced(here), local.announced(tmp_path / "without a link"):
-        assert "runs/latest: no link is up there (yet)" in said(2, " ".join(SET))
-        monkeypatch.setattr(sys, "argv", ["/usr/local/bin/kubectl-cloudrc", *SET])
-        error = said(3, " ".join(SET))
+        assert "runs/latest: no link is up there (yet)" in said(2, SET)
+        monkeypatch.setattr(sys, "argv", ["/usr/local/bin/kubectl-cloudrc"])
+        error = said(3, SET)
         assert "KUBECONFIG" in error, "the plug-in of kubectl never uses a local run"
-    assert f"--run {here}: no run flies there" in said(2, " ".join(SET), "--run", here)
+    assert f"--run {here}: no run flies there" in said(2, SET, "--run", here)
     monkeypatch.setenv("PATH", str(elsewhere))  # without kubectl
-    assert "no run flies here (start one: cloudrc run; or name one: --run)" in said(
-        3, " ".join(SET)
-    )
+    nowhere = "no run flies here (start one: cloudrc run; or name one: --run)"
+    assert nowhere in said(3, SET)

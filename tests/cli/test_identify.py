@@ -7,8 +7,8 @@ from math import exp
 import numpy as np
 import pytest
 
-from cloudrc.cli.main import main
 from cloudrc.config.document import parse_yaml
+from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
 from cloudrc.metrics.velocity_loop import DT, identify, series
@@ -100,29 +100,21 @@ def test_a_recording_that_is_not_enough_is_refused(recording, text):
         series(Recording.from_records(recording), "m")
 
 
-def test_the_command_writes_a_model_that_a_predictor_takes(tmp_path, capsys):
-    from cloudrc.config.load import load_experiment
-
+def test_the_command_writes_a_model_that_a_predictor_takes(tmp_path, call):
     with McapWriter(tmp_path / "mission.mcap", clock="world") as writer:
         writer.write(records())
-    assert main(["identify", str(tmp_path), "--out", "model.yaml"]) == 0
-    shown = capsys.readouterr().out
+    shown = call("identify --out model.yaml", tmp_path).out
     assert "input /reference, output /ground_truth" in shown
     assert shown.splitlines()[-1] == "model.yaml"
     model = parse_yaml((tmp_path / "model.yaml").read_text(), "")[0]
     assert model["time_constant"] == pytest.approx([TRUE[0]] * 3, abs=0.01)
     assert model["dead_time"] == pytest.approx([TRUE[1]] * 3, abs=0.01)
     file = tmp_path / "own.yaml"
-    file.write_text("mission: steps\nworld: {scene: empty}\n" + PREDICTOR)
-    predictor = load_experiment(file).cloud.predictor
-    assert predictor.model_extra["model"] == str(tmp_path / "model.yaml")
-    filtered = "{name: kalman, model: first_order, model_file: model.yaml}"
-    predictor = load_experiment(file, [f"cloud.predictor={filtered}"]).cloud.predictor
-    assert predictor.model_extra["model_file"] == str(tmp_path / "model.yaml")
-    assert main(["identify", str(tmp_path)]) == 2
-    assert "model.yaml: already there; name another file with --out" in capsys.readouterr().err
-    assert main(["identify", str(tmp_path), "--out", "second.yaml", "-o", "json"]) == 0
-    assert json.loads(capsys.readouterr().out) == model
-
-
-PREDICTOR = "cloud: {predictor: {name: command_history, model: model.yaml}}\n"
+    file.write_text("mission: steps\nworld: {scene: empty}\n")
+    for key, name in (("model", "command_history"), ("model_file", "kalman, model: first_order")):
+        setting = f"cloud.predictor={{name: {name}, {key}: model.yaml}}"
+        predictor = load_experiment(file, [setting]).cloud.predictor
+        assert predictor.model_extra[key] == str(tmp_path / "model.yaml")
+    error = call("identify", tmp_path, code=2).err
+    assert "model.yaml: already there; name another file with --out" in error
+    assert json.loads(call("identify --out second.yaml -o json", tmp_path).out) == model

@@ -5,20 +5,14 @@ import stat
 
 import pytest
 
-from cloudrc.cli.main import main
 from cloudrc.drivers.keyfile import PERIOD_NS, KeyFile, read_keys
 from cloudrc.tunnel.keys import KeySet
 
 
 @pytest.fixture
-def key(tmp_path, capsys):
+def key(tmp_path, call):
     """Return a function that changes the key file, and returns what was printed."""
-
-    def run(verb, *more):
-        assert main(["key", verb, str(tmp_path / "key"), *more]) == 0
-        return capsys.readouterr()
-
-    return run
+    return lambda verb, more="": call(f"key {verb} {tmp_path / 'key'} {more}")
 
 
 def test_a_key_is_made_rotated_and_dropped(tmp_path, key):
@@ -30,7 +24,7 @@ def test_a_key_is_made_rotated_and_dropped(tmp_path, key):
     path.rename(tmp_path / "real")
     path.symlink_to(tmp_path / "real")  # it stays a link
     follower = KeyFile(path, 0)
-    said, error = key("new", "--overlap", "600")
+    said, error = key("new", "--overlap 600")
     new, old = read_keys(path)
     assert old == first
     assert said == f"key {new.name}, beside {first.name} until 'cloudrc key drop': {path}\n"
@@ -57,10 +51,9 @@ def test_a_second_new_replaces_the_second_key(tmp_path, key):
         ("drop", "zeros", bytes(32), "an all-zero key is refused"),
     ],
 )
-def test_a_file_that_is_no_key_is_refused_and_kept(verb, name, data, said, tmp_path, capsys):
+def test_a_file_that_is_no_key_is_refused_and_kept(verb, name, data, said, tmp_path, refused):
     (tmp_path / name).write_bytes(data)
-    assert main(["key", verb, str(tmp_path / name)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    line = refused(f"key {verb}", tmp_path / name)
     assert said in line
     assert "--key" not in line
     assert "\x1b" not in line

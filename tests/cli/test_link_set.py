@@ -2,13 +2,11 @@
 
 import json
 from copy import deepcopy
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from cloudrc.cli import link_set
-from cloudrc.cli.main import main
 from cloudrc.cli.processes import RelayControl
 from cloudrc.config.document import Document
 from cloudrc.config.load import edit_profile
@@ -22,48 +20,64 @@ CHANGES = [{"at_s": 9.0, "delay_ms": 50.0, "jitter_ms": 20.0}, {"at_s": 12.0, "l
 TIMED = {"uplink": {"delay_ms": 40.0}, "downlink": {"delay_ms": 25.0, "changes": CHANGES}}
 
 
-def edit(before, *settings, profile=None):
-    return edit_profile(Document(deepcopy(before)), profile, settings)
-
-
-def test_a_value_set_by_hand_stays_and_the_rest_goes_on():
-    made = edit(TIMED, "uplink.loss=0.02", "link.uplink.delay_ms=60")
-    assert made.values["uplink"] == {"delay_ms": 60.0, "loss": 0.02}
-    assert made.values["downlink"]["changes"] == CHANGES
-    assert (made.cause, made.notes) == ("uplink.loss=0.02, link.uplink.delay_ms=60", [])
-    assert not made.restart, "the time line goes on where it is"
-    made = edit(TIMED, "downlink.delay_ms=120")
-    assert made.values["downlink"]["changes"] == [{"at_s": 9.0, "jitter_ms": 20.0}, CHANGES[1]]
-    assert made.notes == ["the time line of the downlink no longer changes delay_ms"]
-
-
-def test_a_delay_set_by_hand_ends_a_trace(tmp_path):
+@pytest.fixture
+def traced(tmp_path):
     (tmp_path / "t.csv").write_text("time_s,delay_ms\n0,40\n")
-    traced = {"uplink": {"trace": str(tmp_path / "t.csv")}}
-    made = edit(traced, "uplink.delay_ms=20")
-    assert made.values == {"uplink": {"delay_ms": 20.0}}
-    assert made.notes == ["the uplink no longer follows its trace"]
-    made = edit(traced, "uplink.loss=0.1")
-    assert made.notes == ["if the trace of the uplink has a column loss, it still sets the loss"]
+    return {"uplink": {"trace": str(tmp_path / "t.csv")}}
+
+
+@pytest.mark.parametrize(
+    ("settings", "way", "values", "notes"),
+    [
+        ("uplink.loss=0.02 link.uplink.delay_ms=60", "uplink", {"delay_ms": 60.0, "loss": 0.02},
+         []),
+        ("uplink.loss=0.02", "downlink", TIMED["downlink"], []),
+        ("downlink.delay_ms=120", "downlink",
+         {"delay_ms": 120.0, "changes": [{"at_s": 9.0, "jitter_ms": 20.0}, CHANGES[1]]},
+         ["the time line of the downlink no longer changes delay_ms"]),
+    ],
+)  # fmt: skip
+def test_a_value_set_by_hand_stays_and_the_rest_goes_on(settings, way, values, notes):
+    made = edit_profile(Document(deepcopy(TIMED)), None, settings.split())
+    assert made.values[way] == values
+    assert (made.cause, made.notes) == (settings.replace(" ", ", "), notes)
+    assert not made.restart, "the time line goes on where it is"
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "note"),
+    [
+        ("uplink.delay_ms=20", {"delay_ms": 20.0}, "the uplink no longer follows its trace"),
+        ("uplink.loss=0.1", None,
+         "if the trace of the uplink has a column loss, it still sets the loss"),
+    ],
+)  # fmt: skip
+def test_a_delay_set_by_hand_ends_a_trace(setting, value, note, traced):
+    made = edit_profile(Document(deepcopy(traced)), None, [setting])
+    assert made.values["uplink"] == (value or {**traced["uplink"], "loss": 0.1})
+    assert made.notes == [note]
 
 
 def test_a_profile_takes_the_place_of_all_values():
-    made = edit(TIMED, "uplink.delay_ms=280", profile="satellite")
+    made = edit_profile(Document(deepcopy(TIMED)), "satellite", ["uplink.delay_ms=280"])
     assert made.values["uplink"]["delay_ms"] == 280.0
     assert made.values["downlink"]["queue_packets"] == 100
     assert (made.cause, made.restart) == ("profile satellite, uplink.delay_ms=280", True)
     assert "guard.command_age_max_ms=800" in made.notes[0]
 
 
-def test_invalid_settings_are_refused():
-    for settings, words in (
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
         ([], "nothing to set"),
         (["delay_ms=3"], "delay_ms: set a key of uplink or downlink"),
         (["uplink.delay=3"], "delay_ms"),
         (["uplink.loss=1.5"], "link set: uplink.loss: 1.5"),
-    ):
-        with pytest.raises(BadInputError, match=words):
-            edit(TIMED, *settings)
+    ],
+)
+def test_invalid_settings_are_refused(settings, words):
+    with pytest.raises(BadInputError, match=words):
+        edit_profile(Document(deepcopy(TIMED)), None, settings)
 
 
 class Flight:
@@ -96,26 +110,24 @@ def flight(tmp_path, monkeypatch):
         yield found
 
 
-def test_a_run_here_is_found_changed_and_read_back(flight, capsys):
-    assert main(["link", "set", "downlink.delay_ms=120", "uplink.loss=0.02"]) == 0
-    shown = capsys.readouterr().out.splitlines()
+def test_a_run_here_is_found_changed_and_read_back(flight, call):
+    shown = call("link set downlink.delay_ms=120 uplink.loss=0.02").out.splitlines()
     assert shown[1].split()[:4] == ["uplink", "relay", "45", "ms"]
     assert shown[2].split()[:4] == ["downlink", "relay", "120", "ms"]
     assert (flight.delay("uplink"), flight.delay("downlink")) == pytest.approx((0.045, 0.120))
     assert flight.delays[-2:] == [("uplink", 0.045), ("downlink", 0.12)]
-    assert main(["link", "set", "--profile", "handover"]) == 0
-    assert "2 blackouts" in capsys.readouterr().out, "what has no column of its own"
-    assert main(["link", "set", "--profile", "paper-p1", "-o", "json"]) == 0
-    downlink = json.loads(capsys.readouterr().out)["links"]["downlink"]
+    out = call("link set --profile handover").out
+    assert "2 blackouts" in out, "what has no column of its own"
+    downlink = json.loads(call("link set --profile paper-p1 -o json").out)["links"]["downlink"]
     assert downlink["profile"]["downlink"]["delay_ms"] == 20.0
     assert (downlink["cause"], downlink["changes"]) == ("profile paper-p1", 3)
 
 
-def test_a_relay_that_does_not_answer_is_an_error(flight, capsys, monkeypatch):
+@pytest.mark.usefixtures("flight")
+def test_a_relay_that_does_not_answer_is_an_error(monkeypatch, refused):
     monkeypatch.setattr(link_set, "LOCAL_TIMEOUT", 0.0)
     monkeypatch.setattr(link_set, "sleep", lambda _: None)
-    assert main(["link", "set", "downlink.delay_ms=120"]) == 4
-    assert capsys.readouterr().err == (
+    assert refused("link set downlink.delay_ms=120", code=4) == (
         "cloudrc: error: the uplink and downlink did not apply the change within 0 s; "
-        f"see {Path('runs/latest/relay.log')}\n"
+        "see runs/latest/relay.log\n"
     )

@@ -3,11 +3,8 @@
 import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 import time
 from copy import copy
-from pathlib import Path
 
 import pytest
 
@@ -65,9 +62,6 @@ def test_ctrl_c_ends_the_workers_at_once():
     assert time.monotonic() - started < 30.0
 
 
-# Signals.
-
-
 def test_only_the_first_hang_up_interrupts():
     interrupt_on_signals()
     with pytest.raises(KeyboardInterrupt):
@@ -78,25 +72,6 @@ def test_only_the_first_hang_up_interrupts():
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as under nohup
     interrupt_on_signals()
     os.kill(os.getpid(), signal.SIGHUP)
-
-
-@pytest.mark.process
-def test_workers_end_if_their_parent_is_killed(tmp_path):
-    command = [sys.executable, "-m", "cloudrc", "run", "steps", "--seeds", "9"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE) as first:
-        children = Path(f"/proc/{first.pid}/task/{first.pid}/children")
-        until = time.monotonic() + 60.0
-        while len(workers := children.read_text().split()) < 2:
-            assert first.poll() is None
-            assert time.monotonic() < until
-            time.sleep(0.1)
-        time.sleep(3.0)  # until they are flying
-        first.kill()
-        first.wait()
-        until = time.monotonic() + 20.0
-        while any(Path(f"/proc/{worker}").exists() for worker in workers):
-            assert time.monotonic() < until, "workers still wait for work"
-            time.sleep(0.1)
 
 
 @pytest.mark.parametrize("error", [DiskFullError("runs/a"), BadInputError("a: b")])

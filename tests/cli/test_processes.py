@@ -10,7 +10,6 @@ import pytest
 
 from cloudrc import assembly
 from cloudrc.cli import processes
-from cloudrc.cli.main import main
 from cloudrc.cli.processes import (
     ipv4_addresses,
     open_recorder,
@@ -31,16 +30,15 @@ from tests.record.conftest import MS, counted, world_records
 
 FREE = "127.0.0.1:9"
 ENDS = ("world", "cloud")
-END = ["--listen", FREE, "--peer", FREE]
-RELAY = ["--world-side", FREE, "--cloud-side", FREE, "--world", FREE, "--cloud", FREE]
-MCAP_MAGIC = b"\x89MCAP0\r\n"
+END = f"--listen {FREE} --peer {FREE}"
+RELAY = f"--world-side {FREE} --cloud-side {FREE} --world {FREE} --cloud {FREE}"
 
 
 @pytest.fixture
 def key(tmp_path):
     (tmp_path / "key").write_bytes(b"k" * 32)
     (tmp_path / "key").chmod(0o600)
-    return ["--key", str(tmp_path / "key")]
+    return f"--key {tmp_path / 'key'}"
 
 
 @pytest.fixture
@@ -54,16 +52,9 @@ def taken():
         yield f"127.0.0.1:{address[1]}"
 
 
-def run(command, key, *last):
-    """Run a process with usable flags; the last flags replace earlier ones."""
-    flags = RELAY if command == "relay" else [*END, *key]
-    return main([command, "--config", "hover", *flags, *last])
-
-
-@pytest.mark.parametrize("more", [[], ["--peer", FREE, "--route", "route"]])
-def test_an_end_has_a_peer_or_a_route(more, capsys):
-    assert main(["world", "--config", "hover", "--listen", FREE, "--key", "key", *more]) == 2
-    assert "--peer" in capsys.readouterr().err
+@pytest.mark.parametrize("more", ["", f"--peer {FREE} --route route"])
+def test_an_end_has_a_peer_or_a_route(more, refused):
+    assert "--peer" in refused(f"world --config hover --listen {FREE} --key key {more}")
 
 
 # The process would close the socket at its end, but here the test process goes on.
@@ -76,9 +67,11 @@ def test_an_end_has_a_peer_or_a_route(more, capsys):
         ("world", "--metrics", 3, "metrics cannot be served on {}: Address already in use; end"),
     ],
 )
-def test_an_address_in_use_is_reported_with_its_flag(command, flag, code, said, taken, key, capsys):
-    assert run(command, key, flag, taken) == code
-    (line,) = capsys.readouterr().err.splitlines()
+def test_an_address_in_use_is_reported_with_its_flag(
+    command, flag, code, said, taken, key, refused
+):
+    flags = RELAY if command == "relay" else f"{END} {key}"
+    line = refused(f"{command} --config hover {flags} {flag} {taken}", code=code)
     assert line.startswith(f"cloudrc: error: {said.format(taken)}")
 
 
@@ -99,9 +92,7 @@ def test_an_address_of_ipv6_is_in_brackets(monkeypatch):
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize("end", ENDS)
-def test_an_end_stopped_at_its_start_completes_its_recording(
-    end, key, tmp_path, monkeypatch, capsys
-):
+def test_an_end_stopped_at_its_start_completes_its_recording(end, key, tmp_path, monkeypatch, call):
     """The handlers are set first: as the first process of a container, an end needs them."""
     build = getattr(assembly, f"build_{end}")
 
@@ -110,15 +101,12 @@ def test_an_end_stopped_at_its_start_completes_its_recording(
         return build(*arguments)
 
     monkeypatch.setattr(assembly, f"build_{end}", stop_and_build)
-    record = tmp_path / "end.mcap"
     (tmp_path / "key").chmod(0o644)
-    route = [end, "--config", "hover", "--route", str(tmp_path / "route"), *key]
-    listen = f"127.0.0.1:{free_ports(1)[0]}"
-    assert main([*route, "--listen", listen, "--record", str(record)]) == 0
-    assert record.read_bytes().endswith(MCAP_MAGIC)
-    errors = capsys.readouterr().err
+    flags = f"--listen 127.0.0.1:{free_ports(1)[0]} --route route {key} --record end.mcap"
+    errors = call(f"{end} --config hover {flags}").err
+    assert (tmp_path / "end.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
     assert f"warning: {tmp_path / 'key'} can be read by others: chmod 600" in errors
-    assert f"sends nothing until {tmp_path / 'route'} exists" in errors
+    assert "sends nothing until route exists" in errors
 
 
 def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch):
@@ -126,7 +114,7 @@ def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch):
         return [(family, kind, 17, "", ("::5", 0))] if family == socket.AF_INET6 else no_such_name()
 
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
-    with pytest.raises(OSError, match="IPv6 addresses alone, and a link is shaped over IPv4"):
+    with pytest.raises(OSError, match="only IPv6 addresses, but a link needs IPv4"):
         ipv4_addresses("cloud")
     assert resolve_address("--peer", ("cloud", 1), ("::1", 2)) == ("::5", 1)
     with pytest.raises(BadInputError, match="--peer cloud:1: cloud cannot be resolved"):
@@ -145,14 +133,18 @@ def started(path, size_max=None):
     return open_recorder(argparse.Namespace(record=path, record_max=size_max), "world", b"id")
 
 
+def write_down(recorder, records):
+    recorder.put(records)
+    while recorder.drain():
+        pass
+    recorder.flush(sync=False)
+
+
 def test_both_recordings_together_stay_within_the_limit(tmp_path):
     for _ in range(3):
         recorder = started(tmp_path / "world.mcap", 200_000)
         for start in range(0, 30_000, 500):
-            recorder.put(world_records(50, start * MS))
-            while recorder.drain():
-                pass
-            recorder.flush(sync=False)
+            write_down(recorder, world_records(50, start * MS))
         recorder.close()
         assert "the file has reached its size limit" in recorder.error
     sizes = [each.stat().st_size for each in tmp_path.iterdir()]
@@ -163,10 +155,7 @@ def test_a_restart_keeps_the_recording_of_a_crash(tmp_path):
     path, before = tmp_path / "world.mcap", tmp_path / "world.before.mcap"
     path.touch()  # an empty one is not kept
     killed = started(path)
-    killed.put(world_records(100))
-    while killed.drain():
-        pass
-    killed.flush(sync=False)
+    write_down(killed, world_records(100))
     left = path.read_bytes()
     again = started(path)
     again.put(counted(3))

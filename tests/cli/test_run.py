@@ -3,6 +3,7 @@
 import json
 import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -10,21 +11,7 @@ from cloudrc.cli.main import main
 from cloudrc.cli.report import summary
 from cloudrc.cli.run import new_folder
 from cloudrc.errors import BadInputError
-
-KEYS = "mission.steps.count=1", "mission.steps.period_s=1.0", "criteria.settle_m=null"
-SHORT = [f"--set={key}" for key in KEYS]
-"""Overrides of `steps` for one second of flight."""
-FLY = ["run", "steps", "--mode", "virtual", *SHORT]
-
-
-@pytest.fixture
-def no_page(monkeypatch):
-    """Leave out the figures, which take longer than the flight."""
-
-    def write_page(folder, *assessment):
-        (folder / "report.html").write_text("drawn elsewhere")
-
-    monkeypatch.setattr("cloudrc.report.write._write_page", write_page)
+from tests.cli.conftest import FLY, SHORT
 
 
 @pytest.mark.parametrize(
@@ -38,18 +25,13 @@ def no_page(monkeypatch):
         ("--set nonsense", "key=value"),
     ],
 )
-def test_bad_input_gives_one_line_and_writes_nothing(line, words, folder, capsys):
-    assert main(["run", *line.split()]) == 2
-    out, err = capsys.readouterr()
-    assert err.startswith("cloudrc: error: ")
-    assert (err.count("\n"), out) == (1, "")
-    assert words in err
+def test_bad_input_gives_one_line_and_writes_nothing(line, words, folder, refused):
+    assert words in refused(f"run {line}")
     assert list(folder.iterdir()) == []
 
 
-def test_the_last_line_is_the_report_and_the_folder_is_complete(folder, capsys):
-    assert main([*FLY, "--seed", "7"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+def test_the_last_line_is_the_report_and_the_folder_is_complete(folder, call):
+    lines = call(*FLY, "--seed", "7").out.splitlines()
     assert lines[0].startswith("steps: mode virtual, seed 7, link paper-p3")
     page = folder / lines[-1]
     assert page == folder / "runs" / "steps-virtual-seed7-1" / "report.html"
@@ -70,17 +52,15 @@ def test_a_run_that_c_cannot_fly_says_so(key, folder):
 
 
 @pytest.mark.usefixtures("no_page")
-def test_a_run_and_its_report_can_be_repeated(folder, capsys):
-    assert main([*FLY, "--seed", "3", "--out", "a", "-o", "json"]) == 0
-    written = (folder / "a/report.json").read_text()
-    assert capsys.readouterr() == (written, ""), "only the report"
-    assert main(["run", "a/config.yaml", "--mode", "virtual", "--out", "b", "-o", "json"]) == 0
-    first, again = json.loads(written), json.loads(capsys.readouterr().out)
+def test_a_run_and_its_report_can_be_repeated(folder, call):
+    only_the_report = call(*FLY, "--seed", "3", "--out", "a", "-o", "json")
+    assert only_the_report == ((folder / "a/report.json").read_text(), "")
+    first = json.loads(only_the_report.out)
+    again = json.loads(call("run a/config.yaml --mode virtual --out b -o json").out)
     assert first["records_sha256"] == again["records_sha256"]
     for name in ("report.json", "report.html"):
         (folder / "a" / name).unlink()
-    assert main(["report", "a"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == "a/report.html"
+    assert call("report a").out.splitlines()[-1] == "a/report.html"
     assert (folder / "a/report.html").is_file()
     numbers = json.loads((folder / "a/report.json").read_text())["numbers"]
     assert numbers.keys() == first["numbers"].keys()
@@ -90,15 +70,19 @@ def test_a_run_and_its_report_can_be_repeated(folder, capsys):
 
 
 @pytest.mark.usefixtures("no_page")
-def test_an_interrupt_while_the_report_is_written_names_the_remedy(monkeypatch, capsys):
-    def interrupt(*arguments, **options):
-        raise KeyboardInterrupt
-
+@pytest.mark.parametrize(
+    ("fails", "error", "code", "said"),
+    [
+        ("write_report", KeyboardInterrupt, 130, "'cloudrc report here' writes its report"),
+        ("write_json", OSError(28, "No space left on device", "here/report.json"), 3,
+         "disk_full: here/report.json: free some space"),
+    ],
+)  # fmt: skip
+def test_a_report_that_cannot_be_written_can_be_later(fails, error, code, said, monkeypatch, call):
     with monkeypatch.context() as changed:
-        changed.setattr("cloudrc.report.write.write_report", interrupt)
-        assert main([*FLY, "--out", "here"]) == 130
-    assert "'cloudrc report here' writes its report" in capsys.readouterr().err
-    assert main(["report", "here"]) == 0
+        changed.setattr(f"cloudrc.report.write.{fails}", Mock(side_effect=error))
+        assert said in call(*FLY, "--out", "here", code=code).err
+    call("report here")
 
 
 @pytest.mark.usefixtures("no_page")
@@ -123,28 +107,14 @@ def build() -> Bad:
 
 
 @pytest.mark.usefixtures("no_page")
-@pytest.mark.parametrize("how", [["--mode", "virtual"], ["--seeds", "1"]])
-def test_a_failing_plug_in_fails_the_run_and_debug_shows_where(how, folder, capsys):
+@pytest.mark.parametrize("how", ["--mode virtual", "--seeds 1"])
+def test_a_failing_plug_in_fails_the_run_and_debug_shows_where(how, folder, call):
     (folder / "bad.py").write_text(FAILING)
-    line = ["run", "steps", *SHORT, *how, "--set", "cloud.predictor=./bad.py"]
-    assert main(line) == 1
-    shown = capsys.readouterr()
+    line = [f"run steps {how} --set cloud.predictor=./bad.py", *SHORT]
+    shown = call(*line, code=1)
     assert "KeyError: 'oops', bad.py:5 in predict" in shown.out
     assert 'raise KeyError("oops")' not in shown.err
-    assert main([*line, "--debug"]) == 1
-    assert 'raise KeyError("oops")' in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("no_page")
-def test_a_full_disk_is_named_and_is_no_failed_mission(monkeypatch, capsys):
-    def full(*arguments, **options):
-        raise OSError(28, "No space left on device", "here/report.json")
-
-    with monkeypatch.context() as changed:
-        changed.setattr("cloudrc.report.write.write_json", full)
-        assert main([*FLY, "--out", "here"]) == 3
-    assert "disk_full: here/report.json: free some space" in capsys.readouterr().err
-    assert main(["report", "here"]) == 0
+    assert 'raise KeyError("oops")' in call(*line, "--debug", code=1).err
 
 
 @pytest.mark.parametrize(

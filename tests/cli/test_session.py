@@ -17,7 +17,6 @@ import pytest
 from cloudrc import assembly
 from cloudrc.cli import session
 from cloudrc.cli.client import Api, ApiError
-from cloudrc.cli.main import main
 from cloudrc.config.load import dump, load_experiment, read_experiment
 from cloudrc.config.setpoints import write_setpoints
 from cloudrc.drivers import local
@@ -26,9 +25,10 @@ from cloudrc.messages import Start
 from cloudrc.record.columns import Recording
 from cloudrc.teleop.store import Order, open_store
 from cloudrc.teleop.wire import Leg, Plan
+from tests.cli.conftest import until
 from tests.drivers.conftest import FAST, processes_of
 
-RUN, USING = ["--run", "s"], "cloudrc: using the run in s\n"
+USING = "cloudrc: using the run in s\n"
 
 
 @pytest.mark.parametrize("name", ["paper", "fast"])
@@ -41,22 +41,17 @@ def test_a_flown_order_becomes_the_mission_of_the_report(name):
 
 
 @pytest.fixture
-def down(monkeypatch, capsys):
-    """Run `cloudrc down` without ending a session; return what it prints."""
+def down(monkeypatch, call):
+    """Return a function that runs `cloudrc down`, which ends no session; it returns the output."""
     monkeypatch.setattr(local, "end_session", lambda run, limit: None)
-
-    def run(code, *words):
-        assert main(["down", *words]) == code
-        return "".join(capsys.readouterr())
-
-    return run
+    return lambda code, flags="": "".join(call(f"down {flags}", code=code))
 
 
 def test_down_ends_sessions_only_and_asks_which(folder, down):
     assert "no session runs here; start one: cloudrc up;" in down(3)
     with local.announced(folder / "r"):
         assert "a flight of 'cloudrc run' ends by Ctrl-C there" in down(3)
-        assert "--run r: no session runs there" in down(2, "--run", "r")
+        assert "--run r: no session runs there" in down(2, "--run r")
     (folder / "runs/latest").mkdir(parents=True)
     (folder / "runs/latest/relay.log").touch()
     with local.announced(folder / "theirs", "", "session"):
@@ -65,7 +60,7 @@ def test_down_ends_sessions_only_and_asks_which(folder, down):
         assert "runs/latest has ended; name another flight: --run theirs;" in down(2)
         with local.announced(folder / "runs/latest"):  # by 'cloudrc run'
             assert "runs/latest does not take this command; name" in down(2)
-        assert "theirs: ended" in down(0, "--run", "theirs")
+        assert "theirs: ended" in down(0, "--run theirs")
 
 
 def drive_order():
@@ -114,14 +109,9 @@ def test_a_console_is_shown_and_a_missing_one_is_explained(folder, monkeypatch):
 PYTHON = [sys.executable, "-c"]
 
 
-def until(condition, limit=90.0):
-    deadline = time.monotonic() + limit
-    while not condition():
-        assert time.monotonic() < deadline, "not in time"
-        time.sleep(0.05)
-
-
-def call(*words, code=0):
+def command(line, code=0):
+    """Run a command in its own process; return its output and errors."""
+    words = line.split()
     done = subprocess.run([*FAST, *words], capture_output=True, text=True)
     assert done.returncode == code, done.stdout + done.stderr
     return done.stdout + done.stderr
@@ -154,24 +144,20 @@ def test_a_session_flies_missions_and_reports_the_last_one(folder, figure):
         for _, port in ports:
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as page:
                 assert b"cloudrc_build_info" in page.read()
-        assert "guard GROUND" in call("mission", "status", *RUN)
+        assert "guard GROUND" in command("mission status --run s")
         (folder / "m.yaml").write_text("waypoints: [{position_m: [0.2, 0, 0.6]}]")
-        assert "SUCCESS" in call("mission", "run", "m.yaml", *RUN)
-        assert "s: flying to (0.5, 0, 1.2); mission m2" in call(
-            "mission", "goto", "0.5", "0", "1.2"
-        )
-        until(lambda: "done" in call("mission", "list", *RUN).splitlines()[-1])
-        assert "s: in force after" in call("link", "set", "downlink.delay_ms=60")
+        assert "SUCCESS" in command("mission run m.yaml --run s")
+        assert "s: flying to (0.5, 0, 1.2); mission m2" in command("mission goto 0.5 0 1.2")
+        until(lambda: "done" in command("mission list --run s").splitlines()[-1])
+        assert "s: in force after" in command("link set downlink.delay_ms=60")
         until(lambda: "link: downlink 60 " in (folder / "said").read_text())
-        assert call("down") == f"s/report.html\n{USING}"
+        assert command("down") == f"s/report.html\n{USING}"
         assert process.wait(10) == 0
     said = (folder / "said").read_text()
     assert said.splitlines()[-1] == "s/report.html"
     document = json.loads((folder / "s/report.json").read_text())
-    assert (document["verdict"], document["numbers"]["waypoints_reached"]["value"]) == (
-        "success",
-        1,
-    )
+    assert document["verdict"] == "success"
+    assert document["numbers"]["waypoints_reached"]["value"] == 1
     flown = read_experiment(folder / "s/config.yaml")
     assert flown.description == "Mission m2 (goto), the last one of a session"
     assert flown.mission.waypoints[0].position_m == (0.5, 0.0, 1.2)
@@ -189,25 +175,25 @@ def test_a_session_that_ends_with_a_drive_has_its_report(folder, ended):
             with suppress(ApiError):  # at first there is no telemetry
                 api.post("/v1/drive", {"velocity_mps": velocity})
             time.sleep(0.1)
-        until(lambda: "next: the operator drives;" in call("mission", "status", *RUN))
+        until(lambda: "next: the operator drives;" in command("mission status --run s"))
         if ended:
-            call("mission", "resume", *RUN)
-            until(lambda: "SUCCESS" in call("mission", "list", *RUN))
-        assert call("down") == f"s/report.html\n{USING}"
+            command("mission resume --run s")
+            until(lambda: "SUCCESS" in command("mission list --run s"))
+        assert command("down") == f"s/report.html\n{USING}"
         assert process.wait(10) == 0
     document = json.loads((folder / "s/report.json").read_text())
     assert document["verdict"] == ("success" if ended else "interrupted")
     assert (folder / "s/mission.mcap").exists()
     assert len((folder / "s/drive.csv").read_text().splitlines()) > 50
-    call("report", "s", code=0 if ended else 130)
-    call("run", "s/config.yaml", "--mode", "virtual", "--out", "again")
+    command("report s", code=0 if ended else 130)
+    command("run s/config.yaml --mode virtual --out again")
 
 
 @pytest.mark.process
 @pytest.mark.parametrize(("victim", "code"), [("cloud", 6), ("", -signal.SIGKILL)])
 def test_a_session_that_dies_in_flight_can_be_reported(folder, victim, code):
     with up(folder) as process:
-        call("mission", "goto", "0.5", "0", "1.2")
+        command("mission goto 0.5 0 1.2")
         until(lambda: "mission started" in (folder / "said").read_text())
         time.sleep(1.0)
         pids = processes_of(process)
@@ -217,7 +203,7 @@ def test_a_session_that_dies_in_flight_can_be_reported(folder, victim, code):
         until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids.values()))
     if victim:
         assert "the cloud process died in flight (signal 9)" in (folder / "said").read_text()
-    call("report", "s", code=130 if victim else 1)  # interrupted, or without an end
+    command("report s", code=130 if victim else 1)  # interrupted, or without an end
     document = json.loads((folder / "s/report.json").read_text())
     assert document["numbers"]["commands_applied"]["value"] > 10
     (waypoint,) = read_experiment(folder / "s/config.yaml").mission.waypoints
@@ -227,8 +213,8 @@ def test_a_session_that_dies_in_flight_can_be_reported(folder, victim, code):
 @pytest.mark.process
 def test_a_session_without_a_mission_has_no_report(folder):
     with up(folder) as process:
-        assert "s: the session has not ended; end it: cloudrc down" in call("report", "s", code=2)
-        assert call("down") == f"s: ended; no mission flew\n{USING}"
+        assert "s: the session has not ended; end it: cloudrc down" in command("report s", code=2)
+        assert command("down") == f"s: ended; no mission flew\n{USING}"
         assert process.wait(10) == 0
     assert "s: no mission flew, so there is no report" in (folder / "said").read_text()
-    assert "no mission flew, so there is no report" in call("report", "s", code=2)
+    assert "no mission flew, so there is no report" in command("report s", code=2)

@@ -5,15 +5,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from cloudrc.assembly import assemble
-from cloudrc.cli.main import main
 from cloudrc.cli.sweep import _shard
 from cloudrc.sweep.store import read_rows
+from tests.cli.conftest import until
 from tests.sweep.conftest import write_sweep
 
 __all__ = ["write_sweep"]
@@ -29,30 +28,23 @@ def rows(folder):
     return list(read_rows(Path(folder)).values())
 
 
-def test_shards_give_the_table_of_the_whole(write_sweep, capsys):
-    file = str(write_sweep())
-    assert main(["sweep", "run", file, "--out", "whole"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+def test_shards_give_the_table_of_the_whole(write_sweep, call):
+    file = write_sweep()
+    lines = call("sweep run --out whole", file).out.splitlines()
     assert lines[0] == "steps: 4 points x 1 seeds: 4 flights"
     assert lines[-3:] == ["4 success", "", "whole/table.csv"]
-    assert main(["sweep", "run", file, "--out", "parts", "--shard", "2/2"]) == 0
+    call("sweep run --out parts --shard 2/2", file)
     assert not Path("parts/table.csv").exists()
-    assert main(["sweep", "run", file, "--out", "parts", "--shard", "1/2"]) == 0
-    assert sorted(path.name for path in Path("parts").glob("rows*")) == [
-        "rows-1.jsonl",
-        "rows-2.jsonl",
-    ]
+    call("sweep run --out parts --shard 1/2", file)
+    assert {path.name for path in Path("parts").glob("rows*")} == {"rows-1.jsonl", "rows-2.jsonl"}
     assert Path("parts/table.csv").read_bytes() == Path("whole/table.csv").read_bytes()
-    capsys.readouterr()
-    assert main(["sweep", "status", "parts"]) == 0
-    head, _, _, *cells = capsys.readouterr().out.splitlines()
+    head, _, _, *cells = call("sweep status parts").out.splitlines()
     assert head == "4 of 4 flights are done: 4 success"
     assert [line.split() for line in cells][1] == ["cloud.predictor", "constant_velocity", "2/2"]
-    assert main(["sweep", "status", "parts", "-o", "json"]) == 0
-    assert json.loads(capsys.readouterr().out)["rows"] == 4
+    assert json.loads(call("sweep status parts -o json").out)["rows"] == 4
 
 
-def test_a_sweep_goes_on_where_it_ended(write_sweep, monkeypatch, capsys):
+def test_a_sweep_goes_on_where_it_ended(write_sweep, monkeypatch, call):
     """An interrupted one says how to go on; flights with a row are not flown again."""
     flown = []
 
@@ -65,79 +57,73 @@ def test_a_sweep_goes_on_where_it_ended(write_sweep, monkeypatch, capsys):
     from cloudrc.cli.sweep import fly_job as real
 
     monkeypatch.setattr("cloudrc.cli.sweep.fly_job", fly)
-    file = str(write_sweep(ONE, seeds=3))
-    assert main(["sweep", "run", file]) == 130
-    said = capsys.readouterr()
+    said = call("sweep run", write_sweep(ONE, seeds=3), code=130)
     assert said.out.endswith("runs/sweep-grid-1/sweep.json\n")
-    again = said.err.partition("to continue: cloudrc ")[2].split()
+    again = said.err.partition("to continue: cloudrc ")[2]
     assert Path("runs/latest-sweep").resolve() == Path("runs/sweep-grid-1").resolve()
-    assert main(again) == 0
-    assert "1 points x 3 seeds: 3 flights, 1 done before" in capsys.readouterr().out
+    assert "1 points x 3 seeds: 3 flights, 1 done before" in call(again).out
     assert flown == [1, 2, 2, 3]
 
 
-def test_alike_warnings_of_many_points_are_counted(write_sweep, monkeypatch, capsys):
+def test_alike_warnings_of_many_points_are_counted(write_sweep, monkeypatch, call):
     monkeypatch.setattr("cloudrc.cli.sweep.advise", lambda point: [f"{point.uplink.delay_ms} ms"])
     grid = {"link.both.delay_ms": [0, 1, 2, 3, 4]}
-    assert main(["sweep", "run", str(write_sweep(grid)), "--out", "grid", "--shard", "6/6"]) == 0
-    told = capsys.readouterr().err.splitlines()
+    told = call("sweep run --out grid --shard 6/6", write_sweep(grid)).err.splitlines()
     assert told[0] == "cloudrc: warning: 0.0 ms"
     assert told[3:] == ["cloudrc: warning: 5 warnings; the others are alike"]
 
 
-def test_a_row_flies_again_to_the_same_hash(write_sweep, monkeypatch, capsys):
-    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *given: None)  # it is slow
-    main(["sweep", "run", str(write_sweep(ONE)), "--out", "grid"])
+@pytest.mark.usefixtures("no_page")
+def test_a_row_flies_again_to_the_same_hash(write_sweep, call):
+    call("sweep run --out grid", write_sweep(ONE))
     (row,) = rows("grid")
-    assert main(["sweep", "fly", "grid", row["key"][:4]]) == 0
-    assert "the records are those of the sweep" in capsys.readouterr().err
+    assert "the records are those of the sweep" in call("sweep fly grid", row["key"][:4]).err
     report = json.loads(Path(f"grid/{row['key']}/report.json").read_text())
     assert report["records_sha256"] == row["records_sha256"]
     Path("grid/rows.jsonl").write_text(json.dumps(row | {"records_sha256": "f"}) + "\n")
-    assert main(["sweep", "fly", "grid", row["key"]]) == 6
-    assert main(["sweep", "fly", "grid", "x"]) == 2
-    assert main(["sweep", "fly", ".", row["key"]]) == 2
+    for folder, key, code in (("grid", row["key"], 6), ("grid", "x", 2), (".", row["key"], 2)):
+        call("sweep fly", folder, key, code=code)
 
 
-def test_a_plugin_that_failed_is_flown_again_with_its_traceback(write_sweep, monkeypatch, capsys):
-    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *given: None)
+@pytest.mark.usefixtures("no_page")
+def test_a_failed_plugin_is_flown_again_with_its_traceback(write_sweep, call):
     Path("mine.py").write_text(
         "from cloudrc.cloud.predictors import Predictor\n\n\nclass Mine(Predictor):\n"
         "    def predict(self, odometry, horizon):\n        return 1 / 0\n\n\nbuild = Mine\n"
     )
     grid = {"cloud.predictor": [str(Path("mine.py").resolve())]}
-    assert main(["sweep", "run", str(write_sweep(grid)), "--out", "grid"]) == 1
+    call("sweep run --out grid", write_sweep(grid), code=1)
     (row,) = rows("grid")
     assert row["failures"] == ["plugin_failed"]
-    assert main(["--debug", "sweep", "fly", "grid", row["key"]]) == 0
-    assert "ZeroDivisionError: division by zero" in capsys.readouterr().err
+    error = call("--debug sweep fly grid", row["key"]).err
+    assert "ZeroDivisionError: division by zero" in error
 
 
-def test_failed_flights_are_recorded_if_asked_for(write_sweep):
-    grid = {"criteria.contact": [False, True]}
-    assert main(["sweep", "run", str(write_sweep(grid)), "--out", "grid", "--record=failed"]) == 1
+def test_failed_flights_are_recorded_if_asked_for(write_sweep, call):
+    file = write_sweep({"criteria.contact": [False, True]})
+    call("sweep run --out grid --record=failed", file, code=1)
     good, bad = rows("grid")
     assert (good["verdict"], bad["verdict"]) == ("success", "failure")
     assert bad["failures"] == ["board_not_touched"]
     assert Path(f"grid/{bad['key']}/mission.mcap").is_file()
     assert not Path(f"grid/{good['key']}").exists()
-    assert main(["sweep", "run", str(write_sweep(grid)), "--out", "grid", "--record=all"]) == 1
+    call("sweep run --out grid --record=all", file, code=1)
     assert Path(f"grid/{good['key']}/mission.mcap").is_file()
     assert rows("grid") == [good, bad]
 
 
-def test_an_error_becomes_a_row_and_the_others_fly(write_sweep, monkeypatch, capsys):
+def test_an_error_becomes_a_row_and_the_others_fly(write_sweep, monkeypatch, call):
     def fly(experiment):
         if experiment.seed == 2:
             raise RuntimeError("no\x1b luck")
         return assemble(experiment)
 
     monkeypatch.setattr("cloudrc.assembly.assemble", fly)
-    assert main(["sweep", "run", str(write_sweep(ONE, seeds=[2, 1])), "--out", "grid"]) == 1
+    out = call("sweep run --out grid", write_sweep(ONE, seeds=[2, 1]), code=1).out
     bad, good = rows("grid")
     assert (bad["verdict"], bad["failures"], bad["numbers"]) == ("error", ["error"], {})
     assert good["verdict"] == "success"
-    assert rf"{bad['key']}: error: RuntimeError: no\x1b luck" in capsys.readouterr().out
+    assert rf"{bad['key']}: error: RuntimeError: no\x1b luck" in out
 
 
 @pytest.mark.parametrize(
@@ -169,11 +155,11 @@ def test_a_killed_sweep_continues_to_equal_bytes(write_sweep):
     file = str(write_sweep(seeds=4))
     command = [sys.executable, "-m", "cloudrc", "sweep", "run", file, "--jobs", "2", "--out"]
     with subprocess.Popen([*command, "killed"], stdout=subprocess.DEVNULL) as process:
-        until = time.monotonic() + 60.0
-        while not rows("killed"):
-            assert time.monotonic() < until
-            time.sleep(0.01)
+        until(lambda: rows("killed"))
+        workers = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
         os.kill(process.pid, signal.SIGKILL)
+    assert len(workers) >= 2
+    until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), 20.0)
     assert 0 < len(rows("killed")) < 16
     with Path("killed/rows.jsonl").open("ab") as torn:
         torn.write(b'{"key": "73')
