@@ -1,7 +1,7 @@
 """Read and write YAML, and keep the file and line of each value for error messages.
 
-Scalars follow the core schema of YAML 1.2, while PyYAML alone follows YAML 1.1. Thus `1e-3` is a
-number, and `on`, `yes` and `12:30` are text. Duplicate keys are refused.
+Scalars follow the core schema of YAML 1.2, not YAML 1.1 as in PyYAML: `1e-3` is a number, and `on`,
+`yes` and `12:30` are text. A duplicate key is an error.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ KeyPath = tuple[str, ...]
 SIZE_MAX = 8 << 20
 """Largest size of a configuration file [bytes]."""
 VALUES_MAX = 300_000
-"""Largest number of values in a document. The limit refuses a short file in which nested
-aliases make far more."""
+"""Largest number of values in a document. A short file with nested aliases (`*name`) could
+otherwise fill the memory."""
 
 _SCALARS = {
     "null": (r"~|null|Null|NULL|", [*"~nN", ""]),
@@ -36,7 +36,7 @@ _SCALARS = {
         [*"-+.0123456789"],
     ),
 }
-"""Type of a scalar -> pattern of its text, and possible first characters of the text.
+"""Type of a scalar -> regular expression of its text, possible first characters of the text.
 Source: YAML 1.2.2, section 10.3.2."""
 _TAG = "tag:yaml.org,2002:"
 
@@ -100,7 +100,7 @@ def parse_value(text: str, name: str) -> Any:
         # If text follows the value, the list has a second entry. A comment hides the last bracket.
         value, *rest = parse_yaml(f"[{stripped}, ]", name)[0]
         if rest:
-            raise BadInputError(f"{name}: {stripped}: text behind the value; delete or quote it")
+            raise BadInputError(f"{name}: {stripped}: text after the value; delete or quote it")
         return value
     loader = _Loader("")
     node = yaml.ScalarNode(loader.resolve(yaml.ScalarNode, stripped, (True, False)), stripped)
@@ -149,10 +149,10 @@ class Source(NamedTuple):
 
     label: str  # "paper.yaml:12", "--set"
     folder: Path  # a relative path in the value starts here
-    is_setting: bool = False  # whether the value overrides that of a configuration file
+    is_setting: bool = False  # True for `--set` and the like, False for a file or a default
 
     def absolute(self, path: str) -> Path:
-        """Make `path`, a value in a configuration file, absolute; no file has to exist there."""
+        """Make a `path` from the configuration absolute; no file has to exist there."""
         return Path(os.path.realpath(self.folder / os.path.expanduser(path)))
 
 
@@ -169,7 +169,7 @@ class Document:
     def source(self, path: KeyPath) -> Source:
         """Find the source of the value at `path`.
 
-        If a setting has set the value or a part of it, the source is that of the setting.
+        If a setting gave the value or a part of the value, return the source of the setting.
         """
         for key, source in self.sources.items():
             if source.is_setting and key[: len(path)] == path:
@@ -185,7 +185,7 @@ class Document:
         return value
 
     def set_value(self, path: KeyPath, value: Any, source: Source) -> None:
-        """Set the value at `path`, whose parents exist; at a list's length as index, append it."""
+        """Set a value; its parents must exist. A list index equal to the length appends."""
         parent = self.get(*path[:-1])
         if isinstance(parent, list):
             parent[int(path[-1]) : int(path[-1]) + 1] = [value]
@@ -207,7 +207,7 @@ def child(node: Any, key: str) -> Any:
 def read_document(path: Path, name: str) -> Document:
     """Read a YAML file whose top level is a mapping; `name` is its name in error messages.
 
-    Raise a BadInputError if the file cannot be read or is not such a file.
+    Raise a BadInputError if the file cannot be read or has another content.
     """
     try:
         text = files.read(path, SIZE_MAX).decode("utf-8")

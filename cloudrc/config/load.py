@@ -1,4 +1,4 @@
-"""Load an experiment and resolve it: replace names and defaults by values.
+"""Load an experiment and resolve it: replace names by contents, and add all default values.
 
 A resolved experiment contains its mission, both directions of the link, all parameters of the
 plug-ins and all limits. If `dump` writes it to a file, `cloudrc run FILE` repeats the flight. One
@@ -61,20 +61,19 @@ PLAN_MAX_S = 0.8
 Source: docs/reference/plant.md, "Plan"."""
 DIRECTIONS = ("uplink", "downlink")
 _PROFILE_KEYS = {("link",), ("link", "profile")}
-"""Keys whose settings replace the link profile."""
+"""If a setting gives one of these keys, it replaces the whole link profile."""
 FILE_READERS: dict[str, Callable[[Path], object]] = {
     **{"trace": read_trace, "table": read_table, "setpoints": read_setpoints}
 }
-"""Key of an experiment whose value is the path of a file -> function that reads this file."""
+"""Key whose value is the path of a data file -> function that reads and checks the file."""
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
 def speed_cap(command_age_max_ms: float, plan_max_s: float = 0.0) -> float:
     """Compute the largest speed v [m/s] from which the robot stops within 8.7 m.
 
-    If commands stop arriving, the robot keeps its speed for T + 0.2 s, where T is the sum of
-    `command_age_max_ms` [ms] and `plan_max_s` [s], and then brakes at 3 m/s^2:
-    v · (T + 0.2 s) + v^2 / 6 = 8.7 m.
+    If commands stop arriving, the robot keeps its speed for T + 0.2 s and then brakes at 3 m/s^2:
+    v · (T + 0.2 s) + v^2 / 6 = 8.7 m. T is `command_age_max_ms` [ms] plus `plan_max_s` [s].
     Source: docs/reference/plant.md, "Speed cap".
     """
     delay = command_age_max_ms * 1e-3 + plan_max_s + 0.2
@@ -101,7 +100,7 @@ class ResolvedGuard(Guard):
             plan = f" and plans of {plan_max:g} s" if plan_max else ""
             raise ValueError(
                 f"must be at most {cap:g} m/s: above it the robot does not stop in time with "
-                f"commands {age_max:g} ms old{plan}; lower it, or guard.command_age_max_ms"
+                f"commands {age_max:g} ms old{plan}; lower it or guard.command_age_max_ms"
             )
         return speed_max
 
@@ -117,7 +116,7 @@ class ResolvedCloud(Cloud):
 
 
 class ResolvedExperiment(Experiment):
-    """An experiment in which all names and defaults are replaced by values."""
+    """An experiment with all values: the mission itself, all limits, all keys of the link."""
 
     mission: Mission
     guard: ResolvedGuard
@@ -137,10 +136,10 @@ class ResolvedExperiment(Experiment):
 def load_experiment(
     name: str | Path, settings: Iterable[str] | Settings = (), *, build: bool = True
 ) -> ResolvedExperiment:
-    """Load an experiment for a flight by name or path, and import the plug-ins that it names.
+    """Load an experiment by name or path, and import and check its plug-ins.
 
-    The `settings`, or their texts `key=value`, override values of the file. Without `build`, do not
-    import or check the plug-ins. Raise a BadInputError that lists the experiment's problems.
+    `settings` override values of the file; they may be texts `key=value`. Without `build`, the
+    plug-ins are not imported. Raise a BadInputError that lists the experiment's problems.
     """
     name = str(name)
     document = shipped.read("experiment", name, Path())
@@ -181,9 +180,9 @@ def load_experiment(
 
 
 def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
-    """Load an experiment without importing its plug-ins, for all processes but cloud.
+    """Load an experiment without importing its plug-ins, for processes other than cloud.
 
-    The plug-ins have only the parameters that the file gives.
+    The result has only those parameters of plug-ins that the file gives.
     """
     return load_experiment(name, settings, build=False)
 
@@ -194,7 +193,7 @@ def load_profile(name: str | Path) -> Profile:
 
 
 def check_profile(document: Document, name: str) -> Profile:
-    """Check a link profile that was built in memory; raises BadInputError."""
+    """Convert a document to a link profile; raises BadInputError about all its problems."""
     return validate(document, Profile, name, _resolve_paths(document))
 
 
@@ -209,7 +208,7 @@ def fingerprint(experiment: ResolvedExperiment) -> str:
 
 
 def local_files(value: Any, key: str = "") -> dict[str, str]:
-    """Return the files that a resolved experiment names: key -> path; `value` is that of `key`."""
+    """Find the files that a part of a resolved experiment names: key -> path, below `key`."""
     if isinstance(value, str):
         return {key: value} if value.startswith("/") and Path(value).is_file() else {}
     listed = dict(enumerate(value)) if isinstance(value, list) else value
@@ -219,7 +218,7 @@ def local_files(value: Any, key: str = "") -> dict[str, str]:
 
 
 def _is_inside_name(path: KeyPath) -> bool:
-    """Whether a key is part of the mission or the profile, for which a file may give a name."""
+    """Whether a key is below one whose value can come from another file: mission, direction."""
     is_direction = path[0] == "link" and len(path) > 2 and path[1] in DIRECTIONS
     return is_direction or (path[0] == "mission" and len(path) > 1)
 
@@ -227,9 +226,9 @@ def _is_inside_name(path: KeyPath) -> bool:
 def validate(
     document: Document, model: type[_Model], name: str, found: Sequence[Problem] = ()
 ) -> _Model:
-    """Check a document against its model; raise an error about all problems, including `found`."""
+    """Convert a document to `model`; raise one BadInputError about `found` and its own problems."""
     known = {problem.path for problem in found}
-    # Error messages describe a file, in which for example the mission may be a name.
+    # The user wrote a file: describe what is valid there, for example the name of a mission.
     file_model = Experiment if model is ResolvedExperiment else model
     try:
         # In JSON mode pydantic accepts lists for tuples and is still strict.
@@ -248,7 +247,7 @@ def _default(document: Document, path: KeyPath, value: Any) -> None:
 
 @contextmanager
 def _collect(found: list[Problem], path: KeyPath) -> Iterator[None]:
-    """If the block raises a BadInputError, add a problem with the value at `path` to `found`."""
+    """Turn a BadInputError of the `with` block into a problem at `path`, and add it to `found`."""
     try:
         yield
     except BadInputError as error:
@@ -267,7 +266,7 @@ def _inline_mission(document: Document) -> None:
 
 
 def _inline_profile(document: Document) -> None:
-    """Insert the link profile's values for all keys of a direction that the experiment omits."""
+    """Take the values of both directions that the experiment omits from its link profile."""
     _default(document, ("link", "profile"), Experiment().link.profile)
     name = document.get("link", "profile")
     if not isinstance(name, str) or _has_all_values(document):
@@ -292,7 +291,7 @@ def _inline_profile(document: Document) -> None:
 
 
 def _implied(profile: Profile) -> dict[KeyPath, float]:
-    """Return the defaults of keys outside of the section `link` with a profile, by path."""
+    """Return the defaults that a profile gives for keys of `guard` and `cloud`, by path."""
     return {
         ("guard", "command_age_max_ms"): profile.command_age_max_ms or COMMAND_AGE_MAX_MS,
         ("cloud", "horizon_max_s"): profile.horizon_max_s or HORIZON_MAX_S,
@@ -315,10 +314,10 @@ def _plan_max(document: Document) -> float:
 
 
 def _remove_derived(document: Document, *, new_profile: bool) -> None:
-    """Remove the values of a resolved file that follow from others, which settings may change.
+    """Remove computed values from a resolved file, so that settings can change them.
 
-    With a `new_profile`, also remove the values of the present profile. A value of the experiment
-    itself is different from the value that follows, and stays.
+    With `new_profile`, also remove the values of the file's link profile. A value that differs from
+    the computed one is the experiment's own, and stays.
     """
     derived: dict[KeyPath, float] = {("guard", "plan_max_s"): _plan_max(document)}
     limits: Any = (document.get("guard", key) for key in ("command_age_max_ms", "plan_max_s"))
@@ -337,7 +336,7 @@ def _remove_derived(document: Document, *, new_profile: bool) -> None:
 
 
 def _resolve_paths(document: Document) -> list[Problem]:
-    """Make the paths of an experiment or a profile absolute; return problems of the files."""
+    """Make all paths in an experiment or profile absolute, and check the files; return problems."""
     found: list[Problem] = []
     ways = [(*above, way) for above in ((), ("link",)) for way in DIRECTIONS]
     paths = [(*way, key) for way in ways for key in ("trace", "table")]
@@ -379,8 +378,8 @@ class Edit(NamedTuple):
 def edit_profile(before: Document, profile: str | None, settings: Sequence[str]) -> Edit:
     """Set values in the link profile `before`, or in the profile named `profile` if it is given.
 
-    The time line (changes, trace) no longer changes a key that the user sets, and still changes
-    other keys. Raise a BadInputError if the request is empty or invalid.
+    A key that the user sets is removed from the time line (changes, trace), so that it keeps the
+    user's value. Raise a BadInputError if the request is empty or invalid.
     """
     if profile is None and not settings:
         raise BadInputError(f"nothing to set; name a value, {_EXAMPLE}")
@@ -409,7 +408,7 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
 
 
 def _drop_from_time_line(document: Document, way: str, key: str) -> list[str]:
-    """Remove `key` from the time line of a direction; return notes about side effects."""
+    """Remove `key` from a direction's time line; return sentences for the user about it."""
     direction = document.get(way)
     if not isinstance(direction, dict) or key not in CHANGEABLE_KEYS:
         return []

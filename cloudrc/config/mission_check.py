@@ -33,7 +33,7 @@ _INNER = ", ".join(f"{name} {low:g} to {high:g}" for name, low, high in _SPANS) 
 
 
 def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
-    """List the problems of a mission in a scene; their paths start at the mission."""
+    """List the problems of a mission in a scene, each with its path inside the mission."""
     if mission.setpoints is not None:
         if mission.waypoints or mission.steps or mission.carrot:
             reason = "a mission has setpoints, or waypoints, steps and a carrot; delete one"
@@ -42,11 +42,11 @@ def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
     if mission.carrot is None:
         for index, waypoint in enumerate(mission.waypoints):
             if waypoint.speed_mps is not None:
-                reason = "is the speed of a carrot; give the mission a carrot, or leave it out"
+                reason = "is the speed of a carrot; give the mission a carrot, or delete it"
                 path = ("waypoints", str(index), "speed_mps")
                 return [Problem(path, f"{waypoint.speed_mps:g}", reason)]
     elif mission.steps is not None:
-        return [Problem(("carrot",), "", "random steps jump; leave it out, or give waypoints")]
+        return [Problem(("carrot",), "", "impossible with steps; delete it, or give waypoints")]
     if mission.steps is not None:
         if mission.waypoints:
             reason = "a mission has waypoints or steps, not both; delete one"
@@ -54,7 +54,7 @@ def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
         reason = _check_steps(mission.steps, scene)
         return [Problem(("steps",), "", reason)] if reason else []
     if not mission.waypoints:
-        return [Problem(("waypoints",), "", "none given; give at least one, or steps")]
+        return [Problem(("waypoints",), "", "none given; give at least one, or steps or setpoints")]
     return list(_check_waypoints(mission, scene))
 
 
@@ -73,7 +73,9 @@ def _check_waypoints(mission: Mission, scene: Scene) -> Iterator[Problem]:
     start = scene.spawn if mission.start == "spawn" else None
     for index in wrong[:_REPORTED]:
         if outside[index]:
-            reason = f"beyond the fence, or nearer than the guard flies: {_INNER}"
+            reason = (
+                f"beyond the fence, or too near to it; the guard lets the robot fly at {_INNER}"
+            )
         else:
             name = scene.pipes[hit[index]].name
             reason = f"the robot would be within {CLEARANCE_MIN:g} m of the wall of {name}"
@@ -89,7 +91,7 @@ def _check_waypoints(mission: Mission, scene: Scene) -> Iterator[Problem]:
 
 
 def _check_ways(positions: Array, scene: Scene) -> Iterator[Problem]:
-    """List the straight paths between `positions` [m], shape (n, 3), that lead into a wall."""
+    """List the straight paths between successive `positions` [m], shape (n, 3), into a wall."""
     through = find_crossed_pipe(scene, positions[:-1], positions[1:])
     for index in np.flatnonzero(through >= 0)[:_REPORTED]:
         name = scene.pipes[through[index]].name
@@ -110,7 +112,7 @@ def _check_steps(steps: Steps, scene: Scene) -> str:
         positions = np.array(steps.centre_m) + box * np.array(steps.range_m)
     if outside_fence(positions).any():
         return (
-            "steps reach beyond the fence, or nearer to it than the guard flies: "
+            "steps reach beyond the fence, or too near to it; the guard lets the robot fly at "
             f"{_INNER}; choose a smaller range_m"
         )
     hit = find_overlapped_pipe(scene, positions, np.zeros(len(positions))).max()

@@ -1,13 +1,13 @@
-"""Apply settings to a document, such as `--set key=value`, and fill in the parameters of plug-ins.
+"""Apply settings, such as `--set key=value`, to a document, and complete plug-in parameters.
 
 - A key of both directions of the link, `link.both.delay_ms`, sets the uplink and the downlink.
-- Keys with fewer parts are set first. Therefore the order of `mission=steps` and
-  `mission.steps.count=3` does not matter.
+- Keys with fewer parts are set first: `mission=steps` before `mission.steps.count=3`, in whatever
+  order the user gives them.
 - A parameter turns the name of a plug-in into a mapping: if the file has `controller: pid`, then
   `cloud.controller.speed_max=2` gives `{name: pid, speed_max: 2}`.
-- An index that is one above the last index appends to a list.
+- An index one above the last index of a list appends to it.
 
-The signature of the function `build` of a plug-in gives types and defaults of its parameters.
+Types and defaults of a plug-in's parameters come from the signature of its function `build`.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
     for key, value, source in given:
         path = tuple(part.strip() for part in key.split("."))
         if not all(path):
-            raise BadInputError(f"{source.label}: {key!r}: is no key; one is cloud.predictor")
+            raise BadInputError(f"{source.label}: {key!r}: is no key, such as cloud.predictor")
         for each in _directions(path):
             if each in found:
                 raise BadInputError(f"{source.label} {key}: is set twice; keep one of them")
@@ -74,7 +74,7 @@ def _directions(path: KeyPath) -> list[KeyPath]:
 def parse_settings(texts: Iterable[str], label: str = "--set") -> Settings:
     """Parse texts `key=value`, in which a relative path starts at the working folder.
 
-    Raise a BadInputError for a text of another form; `label` is the beginning of its message.
+    Raise a BadInputError for a text of another form; its message begins with `label`.
     """
     given, source = list[tuple[str, Any, Source]](), Source(label, Path.cwd())
     for text in texts:

@@ -1,6 +1,6 @@
 """Describe problems of a configuration, each in one line: file, key, value, and how to fix it.
 
-The texts use the schema: type, range and unit of a key, or the known key most similar to a typo.
+The schema provides the texts: type, range and unit of a key, or the key most similar to a typo.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _LISTED = 50
 
 
 def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPath, FieldInfo]]:
-    """Yield the keys that have no keys below them, with their fields; "0" stands for any index."""
+    """Yield path and field of each key that is no section; "0" stands for any list index."""
     for key, info in model.model_fields.items():
         inner = list(_models(info.annotation))
         many = ("0",) if _is_list(info.annotation) else ()
@@ -149,13 +149,13 @@ class Problem(NamedTuple):
 def from_pydantic(
     error: ValidationError, model: type[BaseModel], prefix: KeyPath = (), limit: int | None = None
 ) -> list[Problem]:
-    """Convert validation errors of `model`, at most `limit`; `prefix` leads to the model's part."""
+    """Convert the first `limit` validation errors of `model`; `prefix` is the path of the model."""
     details = error.errors(include_url=False)[:limit]
     return [_problem(detail, model, prefix) for detail in details]
 
 
 def raise_problems(document: Document, problems: Iterable[Problem], name: str) -> None:
-    """Raise a BadInputError that lists all problems, if there are any, with file and line.
+    """If there are problems, raise a BadInputError that lists them with file and line.
 
     If a value and a key below it both have problems, list only the problem of the key below.
     """
@@ -184,7 +184,7 @@ def in_words(value: Any) -> str:
 
 
 _WITHOUT_VALUE = ("extra_forbidden", "missing", "value_error", "too_long")
-"""Types of pydantic's errors after which the message does not repeat the value."""
+"""Types of pydantic's errors whose message does not show the value."""
 _REASONS: Mapping[str, str] = {
     "value_error": "{error}",
     "too_long": "must have at most {max_length} entries",

@@ -124,8 +124,8 @@ class Direction(Section):
     delay_ms: NotNegative = 0.0
     """Mean one-way delay [ms]; a round trip is the sum of both directions"""
     jitter_ms: NotNegative = 0.0
-    """Spread of the delay [ms]; half the width of a uniform distribution, the standard
-    deviation of another. A delay below 0 becomes 0, which raises the mean"""
+    """Spread of the delay [ms]; with distribution: uniform, half the width; else the standard
+    deviation. A delay below 0 becomes 0, which raises the mean"""
     distribution: Literal["uniform", "normal", "pareto", "table"] = "uniform"
     """Distribution of the jitter; pareto has a long tail; table: the delays in the file `table`"""
     table: str | None = None
@@ -234,7 +234,7 @@ class Waypoint(Section):
 class Carrot(Section):
     """A setpoint that moves straight from waypoint to waypoint and rests at each for its dwell_s.
 
-    It moves by time alone, so that delays do not prolong the mission.
+    It moves with time and does not wait for the robot, so delays do not prolong the mission.
     """
 
     speed_mps: Speed = 2.0
@@ -389,10 +389,10 @@ class World(Section):
     """How the true robot differs from its model; guard, onboard controller and cloud use the
     model. A heavy or weak robot brakes worse, so the guard may stop it too late"""
     wind: Wind = Wind()
-    """Horizontal wind. It acts by the drag of the rotors, the only drag of the robot, and not on a
-    robot with stopped rotors"""
+    """Horizontal wind. It acts only through the drag of the rotors, so not on a robot whose rotors
+    are stopped"""
     odometry_rate_hz: Literal[20, 25, 50, 100, 125, 250, 500] = 100
-    """Rate of the odometry for cloud [Hz]. The recorded true state has at least 100 Hz"""
+    """Rate of the odometry for cloud [Hz]. The true state is recorded at 100 Hz or more"""
 
 
 class Guard(Section):
@@ -473,15 +473,15 @@ class Cloud(Section):
     """Rate of the commands [Hz]. At less than 20 Hz the guard would never leave HOLD, which takes
     10 commands within 500 ms"""
     compute_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
-    """Mean time that cloud computes before each command leaves [ms], in real time in addition to
-    the true time. While cloud computes, it begins no other command. Reports count this time in
-    the delay of the downlink"""
+    """Mean of the emulated computing time of a command [ms]; in real time, the true computing time
+    is added. During both, cloud begins no other command. Reports count this time in the delay of
+    the downlink"""
     compute_deviation_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
     """Standard deviation of the time compute_ms [ms], which then has a gamma distribution; needs
     compute_ms above 0"""
     compute_measured: bool = False
-    """Whether a command in virtual time leaves only after the processor time that this machine
-    needed for it, in addition to compute_ms. Such a flight is not repeatable"""
+    """Whether virtual time delays each command also by the processor time that this machine needed
+    to compute it. Such a flight is not repeatable"""
     clock_offset_s: Annotated[float, Field(ge=0, le=1_000_000)] = 0.0
     """By how much cloud's clock is ahead of world's at the start [s]; virtual time only"""
     clock_drift_ppm: Annotated[int, Field(ge=-1000, le=1000)] = 0

@@ -16,9 +16,9 @@ from cloudrc.messages import Vector
 
 COLUMNS = ["time_s", "x_m", "y_m", "z_m"]
 DRIVE_FILE = "drive.csv"
-"""File in the folder of a run that was driven by hand."""
+"""Name of the setpoint file in the folder of a run that the operator drove by hand."""
 ROUNDING = 1e-6
-"""Largest error of a position in a file [m]."""
+"""How far rounding may put a position outside the box of the guard [m]."""
 TimedPosition: TypeAlias = tuple[float, Vector]
 """Time since the first row [s], and position of the setpoint [m], world frame."""
 

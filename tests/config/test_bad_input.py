@@ -106,7 +106,7 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ("seed", "--set seed: must be key=value"),
         ("a..b=1", "is no key"),
         ("seed=[", "--set seed"),
-        ("seed=[1], [2]", "--set seed: [1], [2]: text behind the value"),
+        ("seed=[1], [2]", "--set seed: [1], [2]: text after the value"),
         ("mission.waypoints.9.dwell_s=1", "entries 0 to 6; use one of these, or 7 to append"),
         ("mission.waypoints.2.yaw_deg=90", "holds yaw at 0"),
         (
@@ -114,7 +114,7 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
             "cloud.predictor: 'constant_velocity' has no model of the",
         ),
         ("mission.waypoints.2.speed_mps=1", "waypoints.2.speed_mps: 1: is the speed of a carrot;"),
-        ('mission={"steps": {}, "carrot": {}}', "mission.carrot: random steps jump"),
+        ('mission={"steps": {}, "carrot": {}}', "mission.carrot: impossible with steps"),
         ("world.robot=./no.xml", "no.xml; names of shipped robots: pelican"),
         ("world.robot=/x/q", "world.robot: no such .xml file: /x/q"),
         # A limit of the guard cannot be switched off.
@@ -158,12 +158,12 @@ def test_an_invalid_profile_is_refused_with_the_reason(mine, text, reason):
 @pytest.mark.parametrize(
     ("waypoints", "reason"),
     [
-        ("[]", "mission.waypoints: none given; give at least one, or steps"),
+        ("[]", "mission.waypoints: none given; give at least one, or steps or setpoints"),
         ("[{position_m: [.nan, 0, 1]}]", "waypoints.0.position_m.0: nan: must be finite"),
         ("[{position_m: [0, 0, 1, 2]}]", "at most 3 entries"),
         ("[{tolerance_m: 1}]", "position_m: is missing; must be a list of 3 numbers [m]"),
         ("[{position_m: [0, 0, 3]}]",
-         "[0, 0, 3]: beyond the fence, or nearer than the guard flies: "
+         "[0, 0, 3]: beyond the fence, or too near to it; the guard lets the robot fly at "
          "x -2.8 to 9, y -8.3 to 5.3, z 0.35 to 2.3 [m]; nearest legal point found: [0.3, 0, 2.3]"),
         ("[{position_m: [0.5, 0, .7]}, {position_m: [-.6, 0, .8]}]",
          "waypoints.1.position_m: [-0.6, 0, 0.8]: the robot would be within 0.04 m of the wall of "
