@@ -40,7 +40,7 @@ class Result:
     notes: tuple[str, ...]  # sentences for the reader
     config: str  # the resolved experiment as YAML; `cloudrc run` repeats the flight from its file
     records_sha256: str  # hash of all records; equal experiments on one machine have equal hashes
-    flight: Flight  # what metrics measure: truth, control periods, applied commands
+    flight: Flight  # input of metrics: true states, control periods, applied commands
 
     def __getitem__(self, topic: str) -> Table:
         """Return the table of a topic; raise a KeyError that names all topics."""
@@ -48,12 +48,12 @@ class Result:
 
     @property
     def recording(self) -> Recording:
-        """All tables; stamps of rows are on world's clock [ns]."""
+        """All tables; the stamps of their rows [ns] are on world's clock."""
         return self.flight.recording
 
     @property
     def applied(self) -> Columns:
-        """Commands that world applied, with what cloud recorded when it sent them."""
+        """One row per command that world applied, with the columns of cloud's record of it."""
         return self.flight.applied
 
     @property

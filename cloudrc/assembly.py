@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 MS_TO_NS = 1_000_000
 SECOND_NS = 1_000_000_000
 CLOUD_CLOCK = b"cloud".ljust(16)
-"""Identity of cloud's clock in virtual time, if it is not world's."""
+"""Identity of cloud's clock in virtual time, if it differs from world's clock."""
 MEASURED = "Not repeatable: cloud.compute_measured uses the processor time of this machine."
 CRUISE_SPEED = 1.0
 """Expected speed between two waypoints, if the guard allows this speed [m/s]."""
@@ -51,7 +51,7 @@ Source: docs/reference/faults.md, "F28"."""
 ONLY_MISSION = 1
 """Mission number in a cloud that flies only one mission."""
 GRACE = 30.0
-"""A flight is stopped if its mission goes on for this time after its time limit [s]."""
+"""Time after the end of the mission's time limit at which a flight is stopped [s]."""
 VIRTUAL_CLOCK = bytes(16)
 """Identity of the virtual clock, which world and cloud share."""
 SAME_KEYS = {
@@ -92,8 +92,8 @@ def build_world(
 ) -> WorldEndpoint:
     """Build world: the robot in its scene, and world's end of the tunnel. Needs MuJoCo.
 
-    `clock` is the monotonic clock [ns]. World's time starts only when the scene has been compiled,
-    which takes a while.
+    `clock` returns the monotonic time [ns]. World's time starts after the scene has been compiled,
+    because compiling takes a while.
     """
     from cloudrc.world.endpoint import WorldEndpoint
     from cloudrc.world.guard.limits import Limits
@@ -156,9 +156,9 @@ def build_cloud(
 ) -> CloudEndpoint:
     """Build cloud: plug-ins, teleoperation, and cloud's end of the tunnel.
 
-    `clock` is cloud's monotonic clock [ns]. Without `teleop`, the source of setpoints, a new
-    `Teleop` flies the mission at once. `cpu_clock` is the processor time of this thread [ns], for
-    `cloud.compute_measured`; None in real time, where the computation takes its time anyway.
+    `clock` returns cloud's monotonic time [ns]. `teleop` provides the setpoints; without it, a new
+    `Teleop` flies the mission at once. `cpu_clock` returns the processor time of this thread [ns],
+    for `cloud.compute_measured`; it is None in real time, which includes the computing time anyway.
     `make_loop` makes the control loop from the arguments of `ControlLoop`.
     """
     cloud = experiment.cloud
@@ -224,7 +224,7 @@ def mission_plan(
 def with_order(
     experiment: ResolvedExperiment, order: Order, description: str
 ) -> ResolvedExperiment:
-    """Return the experiment that flies an operator's order; the inverse of `mission_plan`.
+    """Return the experiment with the mission of an operator's order; inverse of `mission_plan`.
 
     A drive by hand becomes a mission with the setpoints of `DRIVE_FILE` beside the experiment.
     """
@@ -288,7 +288,7 @@ def _leg(
         speed = min(speed, speed_max)
         speed_max = min(speed_max, speed)
     if limit is None:
-        # Where the robot starts is unknown: assume the longest way.
+        # The start of the way is unknown: assume the longest way.
         way = FENCE_SPAN if start is None else dist(start.position_m, waypoint.position_m)
         expected = way / min(CRUISE_SPEED, speed_max) + SETTLE_TIME + waypoint.dwell_s
         limit = round(LEG_FACTOR * expected, 1)
@@ -329,5 +329,5 @@ def _scaled(value: float | None, factor: float) -> float | None:
 
 
 def _generator(seed: int, stream: str) -> np.random.Generator:
-    """Make the generator of the stream of random numbers with this name."""
+    """Make a random number generator; each name of a `stream` gives other numbers."""
     return np.random.Generator(np.random.PCG64([seed, int.from_bytes(stream.encode(), "little")]))

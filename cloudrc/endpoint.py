@@ -39,7 +39,7 @@ class Endpoint(Protocol):
         """Do the work that is due at `now_ns` [ns]; the driver may call this late."""
 
     def take_datagrams(self) -> list[Datagram]:
-        """Return the datagrams to send that are new since the last call, oldest first."""
+        """Return the datagrams to send, oldest first; the next call returns only newer ones."""
 
     def take_records(self) -> list[Record]:
-        """Return the records that are new since the last call, oldest first."""
+        """Return the records, oldest first; the next call returns only newer ones."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import errno
 
 DISK_FULL = {errno.ENOSPC: "disk full", errno.EDQUOT: "disk quota used up"}
-"""Number of an error of a full disk -> words for it."""
+"""Error number (errno) of a full disk -> text for the user."""
 TEXT_MAX = 2000
-"""Largest part of another program's text that is shown [characters]."""
+"""Largest length of a text from another program in a message; the rest is cut off [characters]."""
 
 
 class CloudrcError(Exception):
@@ -23,7 +23,7 @@ class BadInputError(CloudrcError):
 
 
 class NothingFlownError(BadInputError):
-    """No mission has flown in a session, so there is nothing to report."""
+    """No mission was flown in a session, so there is nothing to report."""
 
 
 class MissingPrerequisiteError(CloudrcError):
@@ -37,7 +37,7 @@ class DiskFullError(MissingPrerequisiteError):
 
     def __init__(self, where: str) -> None:
         """Name the file or folder on the full disk."""
-        super().__init__(where)  # a worker process sends the error by its arguments
+        super().__init__(where)  # pickle passes these arguments to the parent process
 
     def __str__(self) -> str:
         """Return the message."""
@@ -63,7 +63,7 @@ class InterruptedRunError(CloudrcError):
 
 
 def to_one_line(text: str) -> str:
-    """Convert text from outside to one printable line; lone surrogates are escaped."""
+    """Convert text from another program or file to one printable line of limited length."""
     line = " ".join(text[:TEXT_MAX].split())
     return line.encode("utf-8", "backslashreplace").decode("utf-8")
 

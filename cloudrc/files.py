@@ -22,7 +22,7 @@ class TooLongError(ValueError):
 
 
 def version(path: Path | str) -> tuple[int, int, int] | None:
-    """Return a value that changes if a file changes, with one system call; None if missing."""
+    """Return a value that changes whenever the file changes; None if the file is missing."""
     try:
         status = os.stat(path)
     except OSError:

@@ -1,6 +1,6 @@
 """The messages between world, cloud and teleoperation.
 
-Messages are named tuples in SI units; to make a frozen dataclass takes four times as long.
+Messages are named tuples in SI units; creating a frozen dataclass would take four times as long.
 
 - Stamps: integer nanoseconds on the monotonic clock of world or cloud, as stated. Only stamps of
   the same clock may be subtracted.
@@ -136,8 +136,8 @@ def plan_length(duration: float) -> int:
 class Command(NamedTuple):
     """Message from cloud to world, at 100 Hz; it may contain a plan of future velocities.
 
-    The plan belongs to the time for which cloud predicted the robot's state. World plays it on this
-    time line, however late the command arrives.
+    The plan begins at the time for which cloud predicted the robot's state, even if the command
+    arrives later.
     """
 
     stamp_ns: int  # time of the computation [ns], cloud's clock
@@ -146,12 +146,12 @@ class Command(NamedTuple):
     velocity: Vector  # commanded velocity [m/s]
     yaw_rate: float  # commanded yaw rate [rad/s]
     plan: tuple[Vector, ...] = ()  # velocities after `velocity` [m/s], one per PLAN_STEP_NS
-    planned_ns: int = NEVER_NS  # with a plan: time for which `velocity` is [ns], world's clock
+    planned_ns: int = NEVER_NS  # with a plan: time at which it begins [ns], world's clock
 
     def velocity_at(self, now_ns: int) -> Vector:
-        """Return the commanded velocity at `now_ns` [ns], world's clock; after the plan, its last.
+        """Return the commanded velocity [m/s] at `now_ns` [ns], world's clock.
 
-        Before `planned_ns`, it is the first.
+        Before the plan begins it is `velocity`, after the plan its last velocity.
         """
         step = (now_ns - self.planned_ns) // PLAN_STEP_NS
         if step <= 0 or not self.plan:
@@ -160,7 +160,7 @@ class Command(NamedTuple):
 
 
 MISSION_OVER = 0xFFFF
-"""Value of `reached` for a mission that has ended; no mission has so many waypoints."""
+"""Value of `reached` for a mission that has ended, above the largest number of waypoints."""
 
 
 class OperatorRequest(NamedTuple):
@@ -211,13 +211,13 @@ class Setpoint(NamedTuple):
 
 
 class Passed(NamedTuple):
-    """A message that stays in one process, in place of a datagram with `message` as its body."""
+    """A message for an endpoint in the same process, which replaces the bytes of a datagram."""
 
     kind: int  # a `tunnel.codec.Kind`
     epoch: int
     counter: int  # of the datagram
-    message: Any  # the receiver uses this object itself
+    message: Any  # the object itself, not a copy
 
 
 Datagram: TypeAlias = Any
-"""What an end sends: bytes, or a `Passed` message where an `Identity` asks for it."""
+"""What an endpoint sends: bytes, or a `Passed` message if its `Identity` has `passes`."""

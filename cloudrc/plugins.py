@@ -67,7 +67,7 @@ def load(kind: str, name: str, **parameters: Any) -> Any:
 
 
 def find(kind: str, name: str) -> Any:
-    """Import a plug-in by its kind and its name or path; return its module or entry point."""
+    """Import a plug-in by kind and name or path; return its module or its entry point's object."""
     try:
         if is_path(name):
             return _load_file(kind, Path(name))
@@ -85,7 +85,7 @@ def find(kind: str, name: str) -> Any:
 
 
 def is_path(name: str) -> bool:
-    """Return whether the name of a plug-in is the path of a file."""
+    """Check whether the name of a plug-in is the path of a file."""
     return name.endswith(".py") or "/" in name or "\\" in name
 
 

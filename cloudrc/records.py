@@ -46,10 +46,10 @@ class LinkChecked(NamedTuple):
     stamp_ns: int
     uplink: bool  # True for the uplink, False for the downlink
     quantity: str
-    asked: float  # expected value: delays [s], shares in [0, 1]
-    measured: float  # measured value, likewise
-    low: float  # lowest accepted value, likewise
-    high: float  # highest accepted value, likewise
+    asked: float  # value expected from the profile: a delay [s] or a share in [0, 1]
+    measured: float  # measured value, in the unit of `asked`
+    low: float  # lowest accepted value, in the unit of `asked`
+    high: float  # highest accepted value, in the unit of `asked`
     verdict: str
     datagrams: int  # number of datagrams behind the measurement
 
@@ -106,7 +106,7 @@ class CommandApplied(NamedTuple):
     counter: int
     basis_stamp_ns: int  # stamp of the odometry that the command is based on [ns], world's clock
     velocity: Vector  # commanded velocity before the guard limits it [m/s]
-    planned_ns: int = NEVER_NS  # instant of its plan's start [ns], world's clock
+    planned_ns: int = NEVER_NS  # start of the command's plan [ns], world's clock
 
 
 class GuardChange(NamedTuple):
@@ -153,7 +153,7 @@ class Control(NamedTuple):
     basis_stamp_ns: int  # stamp of the odometry used [ns], world's clock
     horizon: float  # prediction horizon [s]: the estimated delay, clamped
     rtt: float  # round trip without the time that world held the command [s]; NaN before the first
-    loop_delay: float  # round trip with this time, the paper's tau_n [s]; NaN before the first
+    loop_delay: float  # whole round trip, the paper's tau_n [s]; NaN before the first
     measured: Vector  # position in the odometry used [m]
     position: Vector  # predicted position for `basis_stamp_ns + horizon` [m]
     orientation_wxyz: Quaternion  # predicted orientation, unit quaternion
@@ -168,7 +168,7 @@ class Control(NamedTuple):
 
 
 BY_HAND = ("goto", "driving", "operator_lost")
-"""Events of a held mission whose setpoint the operator moves; the mission stays held."""
+"""Events of a held mission while the operator moves the setpoint; the mission stays held."""
 UNDER_WAY = ("started", "reached", "held", "resumed", "paused", *BY_HAND)
 """Events after which a mission continues; every other event ends it. After "paused", the process
 that flies the mission ends and the next process continues the mission."""

@@ -27,7 +27,7 @@ CLEARANCE_SHOWN = 0.40
 """Upper end of the colour scale in figures and scenes [m]; inside a pipe no clearance is larger."""
 
 _CHUNK = 100  # poses per batch: 100 x 225 points fit in the processor's cache
-_STRIDE = 32  # distance of the first poses that `least_clearance` looks at
+_STRIDE = 32  # `least_clearance` begins with every 32nd pose
 _ROUNDING = 1e-9  # more than the rounding errors of a bound [m]
 
 
@@ -126,7 +126,7 @@ def clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: ArrayLike) 
 def least_clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: ArrayLike) -> float:
     """Compute the smallest `clearance` of n poses along a path [m]; infinite without poses.
 
-    The result is that of all poses, to the bit, but most poses are skipped. Between two poses no
+    The result is exactly that of all poses, although most poses are skipped. Between two poses no
     point of the robot moves further than s = |dp| + 2 R |dq| (base position p, quaternion q, and
     R the distance of the farthest point from the base). So between poses with the clearances a and
     b the clearance is at least (a + b - s) / 2. An interval is halved only if this bound is below

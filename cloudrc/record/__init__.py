@@ -12,7 +12,7 @@ from datetime import UTC, datetime, timedelta
 from cloudrc.errors import MissingPrerequisiteError
 
 WALL_OFFSET = "wall_clock_offset_ns"
-"""Metadata key, only in real time: wall time minus the clock of the stamps when the file was opened
+"""Metadata key, only in real time: wall time minus the stamps' clock at the opening of the file
 [ns]."""
 
 
@@ -28,7 +28,7 @@ def missing(error: ImportError) -> MissingPrerequisiteError:
 def wall_time(metadata: Mapping[str, str], stamp_ns: int) -> datetime | None:
     """Convert a stamp [ns] to wall time in UTC; None if the recording does not know the wall time.
 
-    The time is exact to the lag of world's clock (`slip_ns`) and to steps of the wall clock.
+    It is wrong by the lag of world's clock (`slip_ns`) and by later steps of the wall clock.
     """
     with suppress(ValueError, OverflowError):
         micros = (int(metadata.get(WALL_OFFSET, "")) + stamp_ns) // 1000

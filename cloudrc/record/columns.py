@@ -43,8 +43,8 @@ def merged(
     """Merge the records of world and cloud, each oldest first and all on one clock, into rows.
 
     Yield the log time [ns] and the row, in order of log time. If two log times are equal, world's
-    row comes first. The log time of a row is its stamp, or the log time of the previous row of its
-    end if that is later.
+    row comes first. The log time of a row is its stamp, or the log time of the previous row of the
+    same end (world or cloud) if that is later.
     """
     return heapq.merge(_logged(world_records), _logged(cloud_records), key=itemgetter(0))
 
@@ -116,7 +116,7 @@ class Recording:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is missing."""
+        """Whether no message of the flight is missing."""
         return not self.note
 
     @classmethod
@@ -171,7 +171,7 @@ def _column(kind: Kind, values: Iterable[Any]) -> Column:
 
 
 class RecordStore(RecordHash):
-    """Keep the records of a flight as columns, and hash them."""
+    """Keeps the records of a flight as columns, hashes them, and makes recordings of them."""
 
     def add(self, from_world: Iterable[Record], from_cloud: Iterable[Record]) -> None:
         """Add the new records of world and of cloud, each oldest first."""

@@ -1,4 +1,4 @@
-"""Compute one SHA-256 over all records of a run, to compare runs.
+"""Hash all records of a run, to compare runs: equal records give an equal SHA-256.
 
 The records of each type are hashed in blocks of `BLOCK` records, in their order. A block is hashed
 column by column, in the order of the record's fields: integers as little-endian 64-bit numbers,
@@ -30,7 +30,7 @@ _CODES = {int: "<i8", float: "<f8", bool: "?", str: "s"}
 
 
 class RecordHash:
-    """Records as columns, and their SHA-256, no matter how many records each `update` gets."""
+    """Keeps records as columns, and hashes them; the sizes of the updates have no effect."""
 
     def __init__(self) -> None:
         self._waiting: defaultdict[type, list[Record]] = defaultdict(list)
@@ -66,7 +66,7 @@ class RecordHash:
 
 
 def to_columns(kind: type, records: Sequence[Record]) -> Columns:
-    """Convert n records of one type, which may be 0, to columns in the order of their fields."""
+    """Convert n >= 0 records of one type to columns, in the order of the type's fields."""
     found: Columns = {}
     _convert(_fields(kind), "", records, found)
     return found
@@ -91,7 +91,7 @@ def _convert(
 
 @cache
 def _fields(cls: type) -> _Fields:
-    """List name, type and, for a vector, size of each field of a record or of a part of it."""
+    """List each field of a record: name, type, size of a vector (0 for other types)."""
     found = list[tuple[str, Any, int]]()
     for name, kind in get_type_hints(cls).items():
         if hasattr(kind, "_fields"):
@@ -111,7 +111,7 @@ def _packed_string(text: str) -> bytes:
 def messages_sha256(messages: Iterable[tuple[str, int, bytes]]) -> str:
     """Hash topic, log time [ns] and CDR bytes of a file's messages, in the order of the file.
 
-    Real-time runs use this hash, because their records are not kept in memory.
+    For runs in real time, whose records are not kept in memory.
     """
     sha256 = hashlib.sha256()
     for message in messages:

@@ -8,7 +8,7 @@ sent. Each telemetry datagram shows that world's clock is ahead of cloud's by at
 arrived). Each command datagram shows that world's clock is ahead by at most (arrived - sent). The
 fastest packet of each direction gives the narrowest interval: as wide as the sum of both delays.
 
-World's clock is also behind the clock of world's machine if world's process was stalled.
+After a stall of world's process, world's clock is behind the clock of its machine.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from cloudrc.records import UNDER_WAY
 
 BEFORE_NS, AFTER_NS = 1_000_000_000, 2_000_000_000
 """A cut recording begins BEFORE_NS before the mission's start and ends AFTER_NS after its end [ns].
-It then includes the beginning of the session and the guard's first change."""
+It thus includes the start of the session and the guard's first change of state."""
 CUT_SHORT = "cut short"
 """Beginning of the reader's note about a file whose end is missing."""
 
@@ -76,7 +76,7 @@ def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
 
 
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
-    """Return the smallest difference of arrival and departure [ns], including the clock offset."""
+    """Return the smallest (arrival - departure) of a datagram [ns], each on its end's clock."""
 
     def packets(table: Table) -> dict[tuple[int, int], int]:
         numbers = zip(table["epoch"].tolist(), table["counter"].tolist(), strict=True)
@@ -96,8 +96,8 @@ def _first_ns(recording: Recording) -> int:
 def world_time_ns(telemetry: Table, machine_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """Convert times [ns], shape (n,), from the clock of world's machine to world's clock.
 
-    World's clock is behind the machine's clock after a stall. Telemetry states this lag; between
-    two telemetry stamps it is interpolated linearly. The order of the times is kept.
+    World's clock is behind the machine's clock after a stall. Telemetry contains this lag; between
+    two telemetry stamps, the lag is interpolated linearly. The times stay in their order.
     """
     lag_ns = telemetry["slip_ns"]
     if not lag_ns.any():
@@ -162,9 +162,8 @@ def _join(world: Contents, cloud: Contents) -> Contents:
 def cut_to_last_mission(mission: Contents) -> bool:
     """Reduce a pod's recording of several missions to the mission that was started last.
 
-    Return whether the recording contains the end of that mission. If so, the note no longer says
-    that the end of the file is missing. It is always missing, because the pod still writes to the
-    file when the file is copied.
+    Return whether the recording contains the end of that mission. If so, remove the words about a
+    missing end of the file from the note: the pod was still writing the file when it was copied.
     """
     began, ended, earlier = _last_mission(mission)
     until = mission.messages[-1][1] if mission.messages else 0
@@ -192,7 +191,7 @@ def _last_mission(contents: Contents) -> tuple[int | None, int | None, int]:
         elif event not in UNDER_WAY and ended is None:
             ended = stamp_ns
         elif event in UNDER_WAY and ended is not None:
-            # A later mission whose start is lost: keep all that is later than the earlier mission.
+            # The start of this mission is lost: keep all that is after the earlier mission's end.
             began, ended = ended + BEFORE_NS + 1, None
     return began, ended, earlier
 

@@ -1,8 +1,8 @@
 """Read or repair an MCAP file, up to its end or to its first damaged part.
 
-A killed process leaves a file without an end; such a file is read up to its last complete chunk.
-The package `mcap` parses the format. This module adds a limit to the unpacked size of a file, and
-describes what is missing.
+A killed process leaves a file without an end; this module reads it up to its last complete chunk.
+The package `mcap` parses the format. This module limits the unpacked size, and describes in words
+what is missing.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ except ImportError as error:
     raise missing(error) from error
 
 UNPACKED_MAX = 64
-"""Largest ratio between a recording's size in memory and in the file; files below 1 MiB count as 1
-MiB. Recordings of flights need a ratio of 10, recordings of an idle robot 30."""
+"""Largest ratio of a recording's size in memory to its size in the file; a file below 1 MiB counts
+as 1 MiB. Recordings of flights need a ratio of 10, recordings of an idle robot 30."""
 MESSAGE_COST = 128
 """Memory for a message's Python objects, in addition to its content [bytes]."""
 LISTED_MAX = 3
@@ -67,7 +67,7 @@ class NothingReadableError(BadInputError):
 
 
 class _StopError(Exception):
-    """Reading stops although the file may be intact; the text is the reason."""
+    """Stops reading a file that may be intact; the text is the reason."""
 
 
 _UNPACK: dict[str, Callable[[bytes, int], bytes]] = {
@@ -82,7 +82,7 @@ used, because they allocate whatever size the file claims."""
 
 
 class Records:
-    """Yields the records of one MCAP file; the records inside chunks are unpacked."""
+    """Iterates over the records of one MCAP file, also over those inside its chunks."""
 
     def __init__(self, path: Path) -> None:
         """Open a file; use `with` to close it. Raise a BadInputError if it cannot be opened."""
@@ -98,7 +98,7 @@ class Records:
         self.position = 0  # end of the last intact record in the file [bytes]
         self.schemas: dict[int, mcap.Schema] = {}
         self.channels: dict[int, mcap.Channel] = {}
-        self.data_ended = False  # whether all data were read; only the index follows
+        self.data_ended = False  # whether all messages were read; only the index follows
         self.ended = False  # whether the whole file was read
         self.fault = ""  # why reading stopped or what is wrong, in words; "" if nothing is wrong
         self.cut = False  # whether the file breaks off at the fault, as after a kill
@@ -166,7 +166,7 @@ class Records:
             raise _StopError(f"unpacks to more than {UNPACKED_MAX} times its size")
 
     def _check(self, record: mcap.McapRecord) -> mcap.McapRecord:
-        """Store definitions of schemas and channels; check that each number is defined once."""
+        """Store a schema or channel; raise a ValueError if its number has another definition."""
         if isinstance(record, mcap.Message):
             self._take_room(MESSAGE_COST)
             if record.channel_id not in self.channels:
@@ -204,18 +204,18 @@ class Records:
 class Contents:
     """The contents of a file.
 
-    `lacking` is the part of `note` about damaged, removed or added messages. Messages that are
-    missing only because the process was killed are not in it.
+    `lacking` is the part of `note` about damaged, removed or added messages. It does not mention
+    messages that are missing because the recording process was killed.
     """
 
     # Topic, log time [ns] and CDR bytes of each message, in the order of log times.
     messages: list[tuple[str, int, bytes]] = field(default_factory=list)
-    metadata: dict[str, str] = field(default_factory=dict)  # a later value of a key counts
+    metadata: dict[str, str] = field(default_factory=dict)  # of a repeated key, the last value
     attachments: dict[str, bytes] = field(default_factory=dict)  # name -> content of a file
     views: list[tuple[str, int, bytes]] = field(default_factory=list)  # messages of `VIEWS`
     note: str = ""  # what is missing, in words; "" if nothing is missing
     lacking: str = ""
-    remarks: tuple[str, ...] = ()  # what was ignored or sorted; each continues "The recording ..."
+    remarks: tuple[str, ...] = ()  # what was ignored or sorted; "The recording" precedes each
 
     def recording(self) -> Recording:
         """Convert the messages to tables."""
@@ -247,7 +247,7 @@ def read_contents(path: Path) -> Contents:
 
 
 def _read(path: Path) -> tuple[Contents, Records, int]:
-    """Read a file; return its contents, its records, and the number of missing messages."""
+    """Read a file; return its contents, its used-up records, the number of missing messages."""
     contents, sequences, total = Contents(), array("L"), 0
     ours: dict[int, bool] = {}  # whether cloudrc records the topic of a channel, in this layout
     with Records(path) as records:
@@ -289,7 +289,7 @@ def _is_ours(channel: mcap.Channel, schema: mcap.Schema | None) -> bool:
 
 
 def _note(contents: Contents, records: Records, ours: dict[int, bool]) -> None:
-    """Describe what is missing in the contents.
+    """Write into `contents` what is missing from it, in words.
 
     `ours` maps the number of each channel with messages to whether cloudrc records it.
     """
@@ -314,7 +314,7 @@ def _note(contents: Contents, records: Records, ours: dict[int, bool]) -> None:
         changed.append("the metadata of cloudrc, which names the clock, is not there")
     if records.data_ended:
         changed += _changed(contents)
-    if before := to_one_line(metadata.get(CHANGED, "")):  # noted by an earlier reader of the file
+    if before := to_one_line(metadata.get(CHANGED, "")):  # known when the file was written
         changed.append(before)
     if changed:
         metadata[CHANGED] = "; ".join(changed)
@@ -334,7 +334,7 @@ def _changed(contents: Contents) -> Iterator[str]:
     if wrong := [f"{found} of {n} on {topic}" for topic, found, n in pairs if found != n]:
         yield f"messages were removed or added: it holds {_list(wrong)}"
     if metadata.get(COUNTS) == "" and MISSING not in metadata:
-        yield "it was torn, and another program has put an end to it"
+        yield "it was torn, and another program added an end"
 
 
 def _list(topics: list[str]) -> str:
@@ -348,7 +348,7 @@ class Recovery:
 
     size: int  # size of the damaged file [bytes]
     kept: dict[str, int]  # number of objects in the new file, by kind
-    dropped: dict[str, int]  # number of objects that are known to be lost (only "messages")
+    dropped: dict[str, int]  # {"messages": number of lost messages}; {} if none or unknown
     bytes_lost: int  # number of bytes after the last intact record
     notes: list[str]  # what is missing or doubtful, in words
     index_is_new: bool  # whether the old file had no readable index
@@ -360,9 +360,9 @@ class Recovery:
 
     @property
     def share(self) -> float:
-        """Share of the messages that were kept, else of the bytes, in [0, 1]; 1 only if complete.
+        """Share of the messages that were kept, in [0, 1]; 1 only if the recording is complete.
 
-        The share of the bytes counts if the number of messages is unknown.
+        If the number of lost messages is unknown, return the share of the bytes.
         """
         if self.complete:
             return 1.0

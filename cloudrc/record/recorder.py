@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 TROUBLE = {**DISK_FULL, errno.EROFS: "disk is read-only"}
 CAPACITY = 20_000
-"""Number of records in the queue: world or cloud makes as many in about 30 s."""
+"""Largest number of records in the queue; world or cloud makes this number in about 30 s."""
 
 
 class Recorder:
@@ -66,7 +66,7 @@ class Recorder:
                 self._overflowed += 1
 
     def drain(self, max_records: int = 64) -> int:
-        """Write up to `max_records` records and return their number; more would delay the loop."""
+        """Write up to `max_records` records; return their number. Many records delay the loop."""
         if self._sink is None and not self._ended:
             try:
                 self._sink = self._open_sink(self._path)

@@ -1,7 +1,7 @@
 """Convert rows of topics to ROS 2 messages in CDR encoding, and back.
 
-ROS writes quaternions as `xyzw` and the velocity of an odometry in the body frame. Only this module
-converts them from and to cloudrc's `wxyz` and world frame. Every message begins with a
+ROS stores quaternions as `xyzw` and the velocity of an odometry in the body frame; cloudrc uses
+`wxyz` and the world frame. Only this module converts between them. Every message begins with a
 `std_msgs/Header`, which contains the row's stamp; the frames are `world` and `base_link`.
 
 The message types in `cloudrc_msgs` are generated from `cloudrc/record/topics.py`, with a comment
@@ -80,7 +80,7 @@ def type_hash(ros_type: str) -> str:
 
 
 def is_known(ros_type: str, text: str) -> bool:
-    """Check whether a definition from a file has the layout that `decode` expects of the type."""
+    """Check whether a type's definition from a file has the layout that `decode` expects."""
     if text == definition(ros_type):
         return True
     try:
@@ -196,7 +196,7 @@ _STANDARD: dict[str, _Codec] = {
         lambda message: (_xyz(message.point),),
     ),
 }
-"""Standard ROS type -> functions to encode and decode it; topics may use a part of its fields."""
+"""Standard ROS type -> functions to encode and decode it; a topic may use only its first fields."""
 _TO_ROS: dict[Kind, Callable[[Any], Any]] = {
     "int": int,
     "float": float,

@@ -22,13 +22,13 @@ Row: TypeAlias = tuple[str, int, Values]
 
 
 class Field(NamedTuple):
-    """A column of a topic."""
+    """A column of a topic, which holds one value per row."""
 
     name: str  # name of the column and of the ROS field
     kind: Kind  # kind of a value; vectors have shape (3,), quaternions (4,)
     unit: str  # unit of the values; "" without a unit
     text: str  # meaning of the values
-    path: str = ""  # dotted path of the value in the record; "" if it follows from the name
+    path: str = ""  # dotted path of the value in the record; "": see `Topic.paths`
 
 
 class Topic(NamedTuple):
@@ -41,7 +41,7 @@ class Topic(NamedTuple):
     text: str  # meaning of a row
     fields: tuple[Field, ...]  # the columns after `stamp_ns`
     stamp_path: str = "stamp_ns"  # dotted path of the row's stamp in the record
-    part: str = ""  # path of a nested record with the other fields, with a dot at its end
+    part: str = ""  # path, with a final dot, of a nested record with fields that `source` lacks
 
     def paths(self) -> list[str]:
         """Return the dotted path of each field's value in the record."""
@@ -252,7 +252,7 @@ _UPLINK, _DOWNLINK = _EXTRACT.pop(rec.Arrival)
 
 
 def rows(record: Record) -> list[Row]:
-    """Convert a record to one row for each topic that it belongs to, in the order of `TOPICS`."""
+    """Convert a record to rows: one for each of its topics, in the order of `TOPICS`."""
     if isinstance(record, rec.Arrival):
         name, stamp, values = _UPLINK if record.uplink else _DOWNLINK
         return [(name, stamp(record), values(record))]

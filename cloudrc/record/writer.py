@@ -2,8 +2,8 @@
 
 The file has the MCAP profile `ros2`, schemas in `ros2msg`, messages in `cdr`, and chunks compressed
 with zstd. A chunk goes to the operating system after at most half a second of recording, so a
-killed process loses at most half a second. Chunks, the data section and the index have checksums,
-so a reader detects every wrong byte. A complete file contains the number and hash of its messages.
+killed process loses at most half a second. Checksums of chunks, data section and index reveal every
+wrong byte. A complete file contains the number and the hash of its messages.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ CHUNK_NS = 500_000_000
 METADATA = "cloudrc"
 """Name of the file's metadata record."""
 CLOCK = "clock"
-"""Metadata key: whose clock the stamps use, "world" or "cloud"."""
+"""Metadata key: the clock of the stamps, "world" or "cloud"."""
 MISSING = "missing"
 """Metadata key: what is missing from the file, in words."""
 CHANGED = "changed"
@@ -57,7 +57,7 @@ value of `COUNTS` is "" until the file is complete."""
 
 
 class McapWriter:
-    """Writes the rows of world, of cloud, or of a whole mission to one MCAP file."""
+    """Writes the rows of world, of cloud, or of both to one MCAP file."""
 
     def __init__(
         self,
@@ -87,9 +87,9 @@ class McapWriter:
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
         self._noted: dict[str, str] = {}
-        self._latest_ns = 0
+        self._latest_ns = 0  # log time of the last message [ns]
         self._chunk_start_ns: int | None = None
-        self._number = 0  # log time of the last message [ns]
+        self._number = 0  # sequence number of the last message
         self._counts: Counter[str] = Counter()
         self._sha256 = hashlib.sha256()
         self._mcap._Writer__chunk_indices = _ChunkIndexes()  # type: ignore[attr-defined]
@@ -124,8 +124,8 @@ class McapWriter:
     def write_views(self, views: Iterable[tuple[str, int, bytes]]) -> None:
         """Write messages of `VIEWS`, each with its log time [ns], after all other messages.
 
-        They are in chunks of their own, in the order of their log times; readers use the index to
-        merge the chunks. They are neither counted nor hashed, because they repeat other messages.
+        Views have chunks of their own; readers merge the chunks by the index. Views are neither
+        counted nor hashed, because they repeat other messages.
         """
         self.flush()
         for topic, log_time_ns, data in sorted(views, key=itemgetter(1)):
@@ -139,7 +139,7 @@ class McapWriter:
             self.flush()
             self._chunk_start_ns = now_ns
         channel = self._channels.get(topic) or self._open_channel(topic)
-        # Numbered, so that a reader can restore the order of messages of the same instant.
+        # By the number, a reader restores the order of messages with equal log times.
         self._number = (self._number + 1) & 0xFFFFFFFF
         self._mcap.add_message(channel, now_ns, data, now_ns, self._number)
 
@@ -225,7 +225,7 @@ class McapWriter:
 
 
 class _ChunkIndexes:
-    """List of the chunks written so far, compressed in memory.
+    """Compressed list of the indexes of all chunks that were written.
 
     For an hour of recording, the list of `mcap` takes 12 MB; this list takes 0.33 MB, because it
     stores offsets relative to the end of their chunk. Most bytes then repeat and compress well.

@@ -158,7 +158,7 @@ def test_a_torn_recording_that_others_ended_is_told(path):
         writer = McapWriter(stream, clock="world")
         writer.write(RECORDS)
         writer._mcap.finish()
-    assert "another program has put an end to it" in Recording.read(path).lacking
+    assert "another program added an end" in Recording.read(path).lacking
 
 
 def write_foreign(path, topic, ros_type, text, data, channels=1, **options):
