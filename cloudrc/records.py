@@ -47,9 +47,9 @@ class LinkChecked(NamedTuple):
     uplink: bool  # True for the uplink, False for the downlink
     quantity: str
     asked: float  # value expected from the profile: a delay [s] or a share in [0, 1]
-    measured: float  # measured value, in the unit of `asked`
-    low: float  # lowest accepted value, in the unit of `asked`
-    high: float  # highest accepted value, in the unit of `asked`
+    measured: float  # measured value [s] or [1], as `asked`
+    low: float  # lowest accepted value [s] or [1]
+    high: float  # highest accepted value [s] or [1]
     verdict: str
     datagrams: int  # number of datagrams behind the measurement
 

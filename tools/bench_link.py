@@ -2,7 +2,7 @@
 
 Numbered datagrams go through a relay. The kernel stamps each datagram when it leaves and when it
 arrives (wall clock), so late wakes of Python have no effect. Close other programs first, because
-they delay the relay. The program in C runs in turns with the relay, and shows how late any program
+they delay the relay. Relay and C program run in turns; the C program shows how late any program
 wakes on this machine. Exit codes: 0 all limits were kept, 1 a limit was exceeded, 3 no C compiler.
 """
 
@@ -85,7 +85,7 @@ class Judged(NamedTuple):
 
 
 class Line(NamedTuple):
-    """One result."""
+    """One line of the result table."""
 
     what: str
     asked: str
@@ -112,7 +112,7 @@ def run_relay(folder: Path, link: Link, *, fifo: bool) -> Iterator[list[Way]]:
 
 
 def main() -> int:
-    """Measure, and print the results."""
+    """Measure, print the results and return the exit code."""
     parser = argparse.ArgumentParser(prog="make bench-link", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="a tenth of the time; for a look")
     parser.add_argument("-o", "--output", choices=("table", "json"), default="table")
@@ -173,7 +173,7 @@ def releases(folder: Path, rounds: int, duration: float) -> list[Line]:
 
 
 def profiles(folder: Path, seconds: float) -> list[Line]:
-    """Compare all shipped profiles with the model, all during the same `seconds` [s]."""
+    """Measure all shipped profiles at the same time, for `seconds` [s]; compare with the model."""
     judged = measure_profiles(folder, names("profile"), seconds)
     every = np.concatenate([one.errors for one in judged.values()])
     wrong = sum(one.wrongly_lost + one.wrongly_arrived for one in judged.values())

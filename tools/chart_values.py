@@ -1,8 +1,8 @@
 """Make the chart's schema and its table of values from the file `values.yaml`.
 
-A key with a comment is a value or a section; the comment is its description. The default gives the
-type of a value, unless `RULES` has another schema. Units and other keys are those of the models in
-`cloudrc/config/schema.py`.
+A key with a comment above it is a value or a section; the comment is its description. The type of a
+value is that of its default, unless `RULES` has a schema for it. Units and other keys are those of
+the models in `cloudrc/config/schema.py`.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ RULES = {
     "podSecurityContext": _either(OBJECT, NULL),
     "containerSecurityContext": _either(OBJECT, NULL),
 }
-"""Last part of a key -> schema of its value, where the default does not tell it."""
+"""Last part of a key -> schema of its value, if the type of the default is not enough."""
 TYPES: dict[type, Schema] = {
     bool: {"type": "boolean"},
     int: {"type": "integer", "minimum": 0},

@@ -1,6 +1,6 @@
 """Film the console during the paper's mission, as an animated WebP for README.md: one minute.
 
-It flies a session in real time and takes screenshots in a headless Chromium.
+The script flies a session in real time and takes screenshots in a headless Chromium.
 """
 
 from __future__ import annotations

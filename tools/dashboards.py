@@ -1,4 +1,4 @@
-"""Query Prometheus for the panels of the chart's dashboards, and draw them as Grafana would.
+"""Run the queries of the chart's dashboards in Prometheus, and draw the panels as Grafana would.
 
 The end-to-end tests use this module: they need no Grafana, and draw build/e2e/dashboards.webp.
 """
@@ -35,11 +35,11 @@ class Curve(NamedTuple):
 
 
 Curves = dict[tuple[str, str], list[Curve]]
-"""Title of a panel, and its query's text in the legend -> the curves that the query returns."""
+"""(Title of a panel, legend text of a query) -> curves that the query returned."""
 
 
 def expressions(dashboard: Dashboard, panel: Mapping[str, Any]) -> dict[str, str]:
-    """Return legend -> query of a panel, with the values of variables that Grafana shows first."""
+    """Return legend -> query of a panel; variables have the values that Grafana selects first."""
     values = {"__rate_interval": RATE_INTERVAL}
     for variable in dashboard["templating"]["list"]:
         values[variable["name"]] = variable.get("current", {}).get("value", "")
@@ -67,7 +67,7 @@ def fetch(dashboard: Dashboard, ask: Ask, duration: int) -> Curves:
 
 
 def draw(shown: Sequence[tuple[Dashboard, Curves]], path: Path) -> None:
-    """Draw all panels into a picture, over the time before the end of the data [min]."""
+    """Draw all panels into a picture; the x axis is the time relative to the newest value [min]."""
     from matplotlib.figure import Figure
 
     rows = [-(-len(dashboard["panels"]) // COLUMNS) for dashboard, _ in shown]

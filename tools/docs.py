@@ -69,7 +69,7 @@ OPEN = {
     "defaults (on one machine with those of plug-ins, as `config_sha256` in report.json; in a "
     "cluster without those of plug-ins); empty for a process without configuration",
 }
-"""Label of a metric whose values cannot be listed -> description of the values."""
+"""Label of a metric that has too many values for a list -> description of the values."""
 COPIED = ("profile", "mission")
 """Kinds of shipped files of which the chart has copies."""
 
@@ -102,7 +102,7 @@ def _insert(page: Path, text: str) -> dict[Path, str]:
     """Replace the text between the marks of a page by generated text."""
     parts = re.split("(<!-- made by `make docs`.*-->\n|<!-- end -->\n)", page.read_text())
     if len(parts) != 5:
-        raise ValueError(f"{page.name}: no place for generated text")
+        raise ValueError(f"{page.name}: needs one pair of marks around the generated text")
     parts[2] = text
     return {page: "".join(parts)}
 

@@ -37,7 +37,7 @@ def read(folder: Path, names: str) -> Iterator[dict[str, Any]]:
 
 
 def numbers(folder: Path) -> list[dict[str, Any]]:
-    """Find the worst measurement of each recorded number, and count the cases of the number."""
+    """Find the worst measurement of each recorded number, and count its measurements."""
     groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for path in sorted(folder.glob("numbers/*.jsonl")):
         for row in map(json.loads, path.read_text(encoding="utf-8").splitlines()):

@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 README, SWEEPS = ROOT / "README.md", ROOT / "docs" / "sweeps"
 MARK = "<!-- made by `make results` -->\n"
 LINKS = "paper-p3", "far"
-"""Links in `predictors.yaml`."""
+"""Link profiles in `predictors.yaml`."""
 ERROR = "prediction_error_rms"
 
 
@@ -38,7 +38,7 @@ def fly(name: str, folder: Path) -> list[dict[str, Any]]:
 
 
 def results(rows: list[dict[str, Any]]) -> dict[str, tuple[list[float], list[int]]]:
-    """Return for each predictor its errors over the first link [mm], and successes per link."""
+    """Return per predictor: its errors over the first link [mm], its successes over each link."""
     found = {}
     for name in dict.fromkeys(row["point"]["predictor"] for row in rows):
         mine = [row for row in rows if row["point"]["predictor"] == name]

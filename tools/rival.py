@@ -3,8 +3,8 @@
     pip install 'setuptools<81' git+https://github.com/learnsyslab/gym-pybullet-drones
     python -m tools.rival
 
-One drone hovers under their PID controller, without a window and without recording. cloudrc flies
-the experiment `paper`: with the link, the contact with the board, and all records in memory.
+In gym-pybullet-drones, one drone hovers under its PID controller, without window and recording.
+cloudrc flies the experiment `paper`: with the link, the contact with the board, and records kept.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cloudrc.cli.output import table
 from cloudrc.config.load import load_experiment
 
 SECONDS = 10
-"""Duration of their flight, in its virtual time [s]."""
+"""Duration of the flight of gym-pybullet-drones, in virtual time [s]."""
 STEPS = 5  # of physics in a period of the controller
 
 

@@ -29,8 +29,8 @@ PACKAGES = (
 class Run:
     """Facts about a run that are not in its recording.
 
-    `records_sha256` is a hash from `cloudrc.record.hash`: of all records of a run in virtual time,
-    or of all recorded messages of a run in real time. It is None if the recording is incomplete.
+    `records_sha256` is a hash from `cloudrc.record.hash`: in virtual time of all records, in real
+    time of all recorded messages. It is None if the recording is incomplete.
     """
 
     mode: str  # "virtual", "local" or "cluster"
@@ -38,7 +38,7 @@ class Run:
     records_sha256: str | None = None
     interrupted: bool = False  # whether the user stopped the run
     notes: tuple[str, ...] = ()  # sentences for the reader of the report
-    physics_steps: str = ""  # where the usual steps ran, such as "C (compiled by cc)"; "": unknown
+    physics_steps: str = ""  # code of the physics steps, such as "C (compiled by cc)"; "": unknown
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Assessment:
     flight: Flight
     numbers: dict[str, Number]  # metric -> value, for metrics with a known value
     verdict: Verdict
-    operator: Verdict | None  # verdict at the end of the mission, if it differs
+    operator: Verdict | None  # what telemetry told the operator at the end, if it differs
     notes: tuple[str, ...]  # sentences for the reader of the report
 
     @property
@@ -87,7 +87,7 @@ class Assessment:
 
 
 def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
-    """Describe how the stamps of cloud were shifted to world's clock; None if unshifted."""
+    """Describe how cloud's stamps were converted to world's clock; None if both clocks are one."""
     method = metadata.get("clock_offset_method", "same clock")
     if method == "same clock":
         return None
@@ -99,7 +99,7 @@ def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
 def environment_document(physics_steps: str = "") -> dict[str, Any]:
     """Describe the software and hardware of this machine, without names of users and hosts.
 
-    `physics_steps` is that of the `Run`.
+    `physics_steps` is as in `Run`.
     """
     packages = {}
     for name in PACKAGES:
@@ -143,5 +143,5 @@ def _verdict_document(verdict: Verdict) -> dict[str, Any]:
 
 
 def _known(entries: dict[str, Any]) -> dict[str, Any]:
-    """Remove unknown values, which are None: a document does not contain them."""
+    """Remove the entries whose value is None, that is, unknown."""
     return {name: value for name, value in entries.items() if value is not None}

@@ -1,7 +1,7 @@
-"""Read the folder of a recorded run, and refuse a recording that is not sufficient for a report.
+"""Read the folder of a run to write a new report; refuse a recording that is not sufficient.
 
-A new report of an old run is made from `mission.mcap`. If another program has filtered, cut or
-replaced this file, no report is written, and the old report stays unchanged.
+The source of the report is `mission.mcap`. If another program has filtered, cut or replaced this
+file, cloudrc writes no report, and the old report stays unchanged.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from cloudrc.report.views import views
 from cloudrc.report.write import DIFFERS, RECORDING_NOTE
 
 REPORT_BYTES_MAX = 16 << 20
-"""Largest size of a report.json that is read [bytes]; large enough for many notes."""
+"""Largest size of a report.json that cloudrc reads [bytes]; large enough for many notes."""
 JUDGEMENT = ("criteria", "description", "name", "report")
 """Keys of an experiment that affect the report, but not the flight."""
 
 
 class _EarlierReport(BaseModel):
-    """Values of an earlier report.json that a new report repeats."""
+    """Values of an earlier report.json that cannot be computed from the recording."""
 
     mode: Literal["virtual", "local", "cluster"]
     shaper: str
@@ -98,8 +98,8 @@ def _lacking(recording: Recording, config: Path, *, whole: bool) -> Iterator[str
         yield recording.lacking
     if recording.note and whole:
         yield (
-            f"{recording.note}, but report.json is of the whole recording: to report on what is"
-            " left, move report.json away"
+            f"{recording.note}, but report.json describes the whole recording: to report on what"
+            " is left, move report.json away"
         )
     if "config.yaml" in recording.attachments:
         there = _flown(recording.attachments["config.yaml"], "its config.yaml")
@@ -136,7 +136,7 @@ def _describe(recording: Recording, earlier: _EarlierReport | None, contents: Co
         real_time = len(recording["/lateness"]) > 0
         mode, shaper = ("local", "relay") if real_time else ("virtual", "virtual")
         earlier = _EarlierReport.model_validate({"mode": mode, "shaper": shaper})
-    # A new report writes its own notes of these kinds.
+    # The new report makes its own notes with these beginnings.
     anew = (METRIC_NOTE, RECORDING_NOTE, DIFFERS)
     notes = [note for note in earlier.notes if not note.startswith(anew)]
     digest: str | None = messages_sha256(contents.messages)

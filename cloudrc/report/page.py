@@ -37,7 +37,7 @@ REPEAT = {
     "same seed. The timing of the machine differs between runs, so the numbers will be close but "
     "not identical:",
 }
-"""Whether the run was in virtual time -> text about how to repeat the run."""
+"""Whether the run was in virtual time -> text above the command that repeats the run."""
 GROUPS = {
     "Mission": "duration waypoints_reached distance_flown speed_max contact_time tip_speed "
     "peak_contact_force contact_impulse steady_contact_force "
@@ -68,7 +68,7 @@ SENTENCES = (
     "position with an error of {prediction_error_rms:.3f} m (RMS).",
     "The guard on board took over {hold_count:.0f} times, for {hold_time:.1f} s in total.",
 )
-"""Sentences of the summary with names of metrics; one with an unknown metric is left out."""
+"""Sentences of the summary. A sentence with a metric that has no value is left out."""
 
 
 def summary(flight: Flight, numbers: Mapping[str, Number]) -> str:

@@ -21,11 +21,11 @@ from cloudrc.metrics import Flight
 from cloudrc.metrics.mission import reported
 
 RATE = 25.0
-"""Frames per second of the flight."""
+"""Number of frames per second of flight time."""
 FRAMES_MAX = 7_500
-"""Largest number of frames; a flight of more than 5 min gets fewer frames per second."""
+"""Largest number of frames; a flight longer than 5 min has fewer frames per second."""
 STALE = 0.5
-"""Age [s] from which a prediction is no longer shown."""
+"""Age from which the replay hides a prediction [s]."""
 
 
 def write_section(flight: Flight, experiment: ResolvedExperiment) -> str:
@@ -36,13 +36,13 @@ def write_section(flight: Flight, experiment: ResolvedExperiment) -> str:
     """
     if not len(flight.truth["stamp_ns"]):
         raise BadInputError("the robot never flew")
-    rich.get_console().quiet = True  # viser prints about itself
+    rich.get_console().quiet = True  # else viser prints its address
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     try:
         player = _record(server, flight, experiment)
     finally:
         server.stop()
-    # Hide that the browser draws without a graphics card: the message would cover the scene.
+    # Hide the warning about drawing without a graphics card: it would cover the scene.
     style = "<style>.mantine-Notifications-root { display: none }</style></head>"
     player = player.replace("</head>", style, 1)
     return Template(files(__package__).joinpath("replay.html").read_text("utf-8")).substitute(
@@ -51,7 +51,7 @@ def write_section(flight: Flight, experiment: ResolvedExperiment) -> str:
 
 
 def write_page(flight: Flight, experiment: ResolvedExperiment) -> str:
-    """Return the replay as a page; it raises the errors of `write_section`."""
+    """Return the replay as a page of its own; raise the same errors as `write_section`."""
     return (
         '<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8">\n'
         f"<title>{escape(experiment.name)}: replay</title>\n"

@@ -1,10 +1,11 @@
-"""Make the topics of a mission's recording that Foxglove and Lichtblick show without settings.
+"""Make topics for viewers: Foxglove and Lichtblick show them without settings.
 
-Everything that moves is a frame on `/tf`: `base_link` is the robot, `estimate` the robot as cloud
-predicted it, `setpoint` the position that the controller tracks. Everything that has a shape is a
-marker on `/scene`, which is written once: the robot is fixed to `base_link`, the pipes to `world`.
+Each moving thing is a frame on `/tf`: `base_link` is the true robot, `estimate` the robot as cloud
+predicted it, `setpoint` the position that the controller tracks. `/scene` has one message: a marker
+for each shape. A marker moves with its frame; the pipes have the frame `world`.
 
-The times of `estimate` and `setpoint` are those of `/estimated_odometry`: when the command left.
+The stamps of `estimate` and `setpoint` are those of `/estimated_odometry`: when cloud sent the
+command.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ _Colour: TypeAlias = tuple[float, float, float, float]
 _Shape: TypeAlias = tuple[Any, ...]  # arguments of `_marker`, from `name` on
 
 PERIOD_NS = 40_000_000
-"""Time between two messages of a topic [ns]. Viewers interpolate poses; with shorter periods the
-file would become more than 15 % larger."""
+"""Time between two messages of a topic [ns]. Viewers interpolate poses. With a shorter period, the
+views would enlarge the file by more than 15 %."""
 CUBE, SPHERE, CYLINDER, LINE_STRIP, TRIANGLE_LIST = 1, 2, 3, 4, 11
 """Types of a ROS marker."""
 ORIGIN, LEVEL = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
@@ -41,7 +42,7 @@ PATH, GOAL, GHOST = (0.0, 0.45, 0.70, 1.0), (0.84, 0.37, 0.0, 0.9), (0.34, 0.71,
 
 
 def add_views(mission: Contents, experiment: ResolvedExperiment) -> Recording:
-    """Replace a mission's messages for viewers; return its tables. Errors are those of `views`."""
+    """Replace the views in a mission; return its tables. Raise the same errors as `views`."""
     recording = mission.recording()
     mission.views = views(recording, experiment)
     return recording
@@ -76,13 +77,13 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[View]:
 
 
 def _thin(columns: Columns) -> Columns:
-    """Keep the first row of each period."""
+    """Keep the first row of each `PERIOD_NS`."""
     rows = np.flatnonzero(np.diff(columns["stamp_ns"] // PERIOD_NS, prepend=-1))
     return {name: column[rows] for name, column in columns.items()}
 
 
 def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:
-    """Yield a message per row. `frames`: frame -> columns of its position and orientation."""
+    """Yield a message per row. `frames`: frame -> names of the position and orientation column."""
     for row, stamp_ns in enumerate(columns["stamp_ns"].tolist()):
         parts = [
             part(
@@ -101,7 +102,7 @@ def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:
 
 
 def _errors(topic: str, flight: Flight, columns: Columns, name: str) -> Iterator[View]:
-    """Yield the distance of the position in the column `name` to the true position [m]."""
+    """Yield, per row, the distance [m] from the position in column `name` to the true position."""
     columns = _thin(columns)
     away = columns[name] - flight.true_position(columns["stamp_ns"])
     errors = np.linalg.norm(away, axis=1).astype(np.float32).tolist()
@@ -152,7 +153,7 @@ def _marker(
 
 
 def _robot(name: str, frame: str, colour: _Colour | None = None) -> Iterator[_Shape]:
-    """Build the robot of simple bodies, in the colours of its parts or in one `colour`."""
+    """Build the robot from simple shapes, in `colour`, or else in the colours of its parts."""
     width, rod = 2 * body.ROD_RADIUS, body.ROD_TOP - body.ROD_BOTTOM
     arm, thin, span = body.ARM_LENGTH, 2 * body.ARM_RADIUS, 2 * body.ROTOR_ARM
     disc = (2 * body.ROTOR_RADIUS, 2 * body.ROTOR_RADIUS, 2 * body.ROTOR_HALF_THICKNESS)
@@ -172,7 +173,7 @@ def _robot(name: str, frame: str, colour: _Colour | None = None) -> Iterator[_Sh
 
 
 def _pipe(pipe: Pipe) -> _Shape:
-    """Build the inner face of a pipe, open at both ends, of 32 strips."""
+    """Build the inner face of a pipe, open at both ends, from 32 flat strips."""
     axis = np.array(pipe.axis)
     across = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     across /= np.linalg.norm(across)

@@ -22,8 +22,8 @@ from cloudrc.report.document import Assessment, Run, environment_document, write
 if TYPE_CHECKING:
     from cloudrc.report.figures.style import Look
 
-DIFFERS = "By what telemetry had shown when the mission ended, the operator's verdict is "
-"""First words of a note: the verdict at the mission's end differs from the report's verdict."""
+DIFFERS = "From telemetry at the end of the mission, the operator's verdict was "
+"""First words of a note: the operator's verdict differs from the verdict of the report."""
 RECORDING_NOTE = "The recording "
 """First words of each note about a recording; a new report drops old notes with these words."""
 
@@ -33,8 +33,8 @@ def assess(
 ) -> Assessment:
     """Measure and judge a run without writing files or drawing figures.
 
-    `own` are names or paths of the user's metrics; the files at these paths are executed. Metric
-    files that only the experiment names are not executed: somebody else may have written them.
+    `own` are names or paths of the user's metrics; cloudrc executes these files, but no
+    metric files that only the experiment names: somebody else may have written them.
     """
     scene = load_scene(experiment.world.scene)
     flight = Flight(recording, experiment.criteria, experiment.mission, scene)
@@ -51,7 +51,7 @@ def assess(
         seen = operator_verdict(flight, evidence, numbers)
         if seen.outcome != verdict.outcome:
             operator = seen
-            notes.append(f"{DIFFERS}{seen.outcome}. This report's counts.")
+            notes.append(f"{DIFFERS}{seen.outcome}. The verdict of this report counts.")
     kept = tuple(dict.fromkeys([*notes, *metric_notes]))
     return Assessment(run, experiment, flight, numbers, verdict, operator, kept)
 
@@ -68,10 +68,9 @@ def write_report(
 ) -> dict[str, Any]:
     """Write report.json and environment.json and, if `page`, report.html with its figures.
 
-    `folder` is the folder of the run, in which files of an earlier report are replaced. `look` is
-    the size of the figures. For the other arguments see `assess`. Return the content of
-    report.json. Raise a MissingPrerequisiteError if the page needs matplotlib, which is not
-    installed; report.json is written before the error.
+    `folder` is the folder of the run; files of an earlier report in it are replaced. `look` is the
+    size of the figures. For the other arguments see `assess`. Return the content of report.json.
+    Raise a MissingPrerequisiteError, after writing report.json, if matplotlib is missing.
     """
     assessment = assess(recording, experiment, run, own)
     document, environment = assessment.document, environment_document(run.physics_steps)
@@ -120,8 +119,8 @@ def _write_page(
             "report.json is written, check the recording"
         ) from error
     figures = folder / "figures"
-    if figures.is_symlink():  # in a folder from somebody else it may point anywhere
-        raise BadInputError(f"{figures}: is a link; remove it, figures are kept with their run")
+    if figures.is_symlink():  # in a run from somebody else, the link may point anywhere
+        raise BadInputError(f"{figures}: is a symbolic link; remove it")
     figures.mkdir(exist_ok=True)
     for picture in pictures:
         for kind, content in picture.files.items():
@@ -131,7 +130,7 @@ def _write_page(
 
 
 def _replay(assessment: Assessment) -> str:
-    """Return the 3-D replay as HTML, or a line that says why there is none."""
+    """Return the 3-D replay as HTML, or a line with the reason why it is missing."""
     try:
         from cloudrc.report.replay import write_section
 
@@ -144,6 +143,6 @@ def _replay(assessment: Assessment) -> str:
 
 
 def attachments(folder: Path) -> dict[str, bytes]:
-    """Read the files to attach to a recording: name -> content of config.yaml and report.json."""
+    """Read the files to attach to a recording, config.yaml and report.json: name -> content."""
     paths = (folder / "config.yaml", folder / "report.json")
     return {path.name: path.read_bytes() for path in paths if path.exists()}

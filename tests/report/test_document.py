@@ -45,7 +45,7 @@ def test_failures_say_code_text_time_and_place():
     assert set(failure) == {"code", "text", "time", "place"}
     assert (failure["code"], len(failure["place"])) == ("time_limit_exceeded", 3)
     assert report["operator_verdict"] == {"verdict": "success", "failures": []}
-    assert "the operator's verdict is success. This report's counts." in report["notes"][-1]
+    assert "verdict was success. The verdict of this report counts." in report["notes"][-1]
 
 
 def test_the_environment_names_software_but_no_user_or_host():

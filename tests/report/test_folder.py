@@ -87,7 +87,7 @@ OTHER = b"seed: 2\nmission: pipes\n"
             "it holds 0 of 401 on /telemetry, .* and 12 more",
         ),
         (filtered(rename=lambda topic: f"/r1{topic}"), "does not record: /r1/cmd_vel, "),
-        (cut, "cut short: .* but report.json is of the whole recording"),
+        (cut, "cut short: .* but report.json describes the whole"),
         (recovered_and_filtered, "messages were removed or added: it holds 0 of [0-9]+ on /tele"),
         (recorded(more=40), "on /ground_truth that are not later than the row before"),
         (recorded(config=OTHER), "is the recording of an experiment with other values for: "),

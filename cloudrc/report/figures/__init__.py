@@ -73,7 +73,7 @@ def _over_time(figure: Figure) -> tuple[tuple[float, float, float, float], ...]:
 
 @contextmanager
 def own_settings(look: Look) -> Iterator[None]:
-    """Draw with the settings of cloudrc alone while the block runs."""
+    """Let matplotlib use only cloudrc's settings inside the `with` block."""
     with matplotlib.rc_context():
         # matplotlib reads a matplotlibrc in the working folder, which may be somebody else's run.
         matplotlib.rcdefaults()
@@ -82,9 +82,9 @@ def own_settings(look: Look) -> Iterator[None]:
 
 
 def save(figure: Figure, kind: str, date: datetime | None = None) -> bytes:
-    """Return the content of a "png", "svg" or "pdf" file; equal figures give equal bytes.
+    """Return a figure as a "png", "svg" or "pdf" file; equal figures give equal bytes.
 
-    `date` is the date in the file; without one the file has no date, not that of today.
+    `date` is stored in the file; with None, the file contains no date.
     """
     target = BytesIO()
     keys = {"svg": "Date", "pdf": "CreationDate", "png": "Creation Time"}

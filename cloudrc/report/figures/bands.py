@@ -1,4 +1,4 @@
-"""Draw the figure of a sweep: a panel per quantity, and a line with its band per setting."""
+"""Draw the figure of a sweep: one panel per quantity; in it, one line with a band per setting."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cloudrc.report.figures import own_settings, save, style
 from cloudrc.report.figures.style import Look, new_figure, panel
 
 UNITS = {"ms": "ms", "s": "s", "m": "m", "mps": "m/s", "kbit": "kbit/s", "deg": "deg"}
-"""End of a key -> unit."""
+"""Suffix of a configuration key -> unit."""
 LOOKS = (
     *((style.BLUE, "o", "-"), (style.VERMILION, "s", "--"), (style.GREEN, "^", "-.")),
     *((style.PURPLE, "D", ":"), (style.ORANGE, "v", "-"), (style.BLACK, "P", "--")),

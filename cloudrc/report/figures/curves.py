@@ -27,13 +27,13 @@ DELAY = (
     "these are the fast ones, so the loop delay lies below the mean of the profile."
 )
 TIME = "time since start (s)"
-"""Label of the time axis, by which a page finds the panels over time."""
+"""Label of the time axis; the report page finds panels over time by this label."""
 MARGIN = 1.25
 """Ratio of the upper end of the delay axis to the 99.5th percentile of the delays."""
 
 
 def draw_delay(subject: Subject) -> Figure:
-    """Draw the one-way delay of each datagram, and the loop delay with cloud's estimate of it."""
+    """Draw each datagram's one-way delay, the loop delay, and cloud's estimate of the latter."""
     figure, (one_way, loop) = subject.look.two_panels()
     flight, time = subject.flight, np.linspace(0.0, subject.duration, 600)
     limits = [bounds(subject, time, uplink=uplink) for uplink in (True, False)]
@@ -77,7 +77,7 @@ def _fill(axes: Axes, time: Array, low: Array, high: Array, label: str) -> None:
 
 
 def _finish_delay(axes: Axes, subject: Subject, label: str, shown: list[Array]) -> None:
-    """Scale the delay axis of a panel; outliers are cut off, and their number is written."""
+    """Scale the delay axis of a panel; cut off outliers, and write their number."""
     values = [v[np.isfinite(v)] for v in shown]
     top = max((float(np.percentile(v, 99.5)) for v in values if len(v)), default=1.0) * MARGIN
     top = max(top, 1.0)
@@ -108,11 +108,11 @@ ODOM = (
     "command was computed. The inset enlarges the part in the grey box: one step."
 )
 ZOOM, BEFORE = 1.2, 0.1
-"""Length of the part that the inset enlarges, and its part before the step [s]."""
+"""Duration that the inset shows enlarged, and how long before the step it begins [s]."""
 STEP_MIN = 0.2
-"""Smallest step that is enlarged [m]."""
+"""Smallest step of the setpoint that the inset enlarges [m]."""
 HEIGHTS = (0.85, 0.7, 0.55)
-"""Heights of the inset that are tried, as shares of a panel."""
+"""Heights of the inset, as shares of a panel; the first that fits is used."""
 LINES: dict[str, dict[str, Any]] = {
     "setpoint": {
         **{"label": "reference", "color": style.REFERENCE},
@@ -144,7 +144,7 @@ def draw_odom(subject: Subject) -> Figure:
 
 
 def _draw_inset(rows: Any, subject: Subject) -> None:
-    """Enlarge a large step in its panel, where the panel has the most room."""
+    """Draw an inset that enlarges a large step of the setpoint, in a free place of its panel."""
     control = subject.flight.control
     time, jumps = subject.flight.seconds(control["stamp_ns"]), np.diff(control["setpoint"], axis=0)
     largest = np.argsort(-np.abs(jumps), axis=None)[:9]
@@ -207,7 +207,7 @@ SPAN = 0.5
 
 
 def draw_error(subject: Subject) -> Figure:
-    """Draw the distance to the setpoint, as in the paper, and the error of position estimates."""
+    """Draw the distance to the setpoint, as in the paper, and the errors of estimated positions."""
     figure, (tracking, accuracy) = subject.look.two_panels()
     flight, control, applied = subject.flight, subject.flight.control, subject.flight.applied
 

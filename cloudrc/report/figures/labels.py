@@ -15,9 +15,9 @@ from matplotlib.transforms import Bbox
 FREE = "free"
 """Group id of the labels that `place_labels` moves."""
 DISTANCES = (4, 7, 11, 16, 22, 30, 40, 55, 75)
-"""Distances from a label to its point that are tried [points]."""
+"""Distances from a point to its label that are tried [points]."""
 ANGLES = np.radians((90, 270, 45, 315, 135, 225, 0, 180))
-"""Directions from the point to its label that are tried for each distance [rad]."""
+"""Directions from a point to its label that are tried, for each distance in turn [rad]."""
 PAD = 1.5
 """Space around a label [pixels]."""
 
@@ -29,7 +29,7 @@ def free_label(axes: Axes, text: str, place: Any, **look: Any) -> None:
 
 
 def place_labels(figure: Figure) -> None:
-    """Lay out a figure for good, then move its labels to places where nothing else is."""
+    """Fix the layout of a figure, then move its labels to free places."""
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     for axes in figure.axes:

@@ -38,7 +38,7 @@ LEGEND = (
 
 
 def delays_of(direction: Direction) -> Timeline | None:
-    """Return delay and jitter of a profile over time; None if the file of its trace is missing."""
+    """Return a profile's delay and jitter over time; None if its trace file cannot be read."""
 
     def seconds(milliseconds: float | None) -> float | None:
         return None if milliseconds is None else milliseconds * 1e-3

@@ -1,4 +1,4 @@
-"""Draw the overview: the scene with pipes cut open, the whole path, and the robot at some instants.
+"""Draw the overview: the scene with pipes cut open, the path, and the robot at some instants.
 
 All bodies consist of small convex polygons, which are drawn from back to front.
 """
@@ -35,7 +35,7 @@ ELEVATION = np.radians(38.0)
 MARGIN, SMALLEST = 0.6, 4.0
 """Space around path and obstacles, and smallest width of the part that is drawn [m]."""
 FLATTEST, TALLEST = 0.3, 0.6
-"""Limits of the ratio of height to width."""
+"""Limits of the drawing's ratio of height to width."""
 Colour = tuple[float, float, float]
 PIPE_COLOUR, WALL_COLOUR = (0.86, 0.88, 0.90), (0.45, 0.48, 0.52)
 BASE_COLOUR, ROD_COLOUR, ARM_COLOUR = (0.16, 0.33, 0.55), (0.30, 0.30, 0.32), (0.84, 0.37, 0.0)
@@ -131,7 +131,7 @@ class _View:
         return np.asarray(points @ self._sides)
 
     def draw_faces(self, axes: Axes, faces: list[Face]) -> None:
-        """Draw faces from back to front; brightest where light meets a face at a right angle."""
+        """Draw faces from back to front; a face is brightest if light meets it at a right angle."""
         faces = sorted(faces, key=lambda face: float((face.corners @ self.towards).mean()))
         light = (self.towards + self._sides[:, 1]) / np.sqrt(2)
         colours = []
@@ -151,7 +151,7 @@ class _View:
 
 
 def draw(subject: Subject) -> Figure:
-    """Draw the figure with its one panel."""
+    """Draw the figure, which has one panel."""
     truth, scene = subject.flight.truth, subject.flight.scene
     rows, path = _instants(subject), truth["position"]
     # The ends of the pipes' axes are enough to choose the view. The start is before the first pipe.
