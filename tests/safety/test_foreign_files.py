@@ -155,7 +155,7 @@ def test_a_report_follows_no_link(theirs, mine, tmp_path, monkeypatch):
     write(theirs / "cloud.mcap", cloud_records(20))
     names = ("report.json", "environment.json", "report.html", "mission.mcap", "figures/error.png")
     (theirs / "figures").symlink_to(tmp_path)
-    with pytest.raises(BadInputError, match="figures: is a link; remove it"):
+    with pytest.raises(BadInputError, match="figures: is a symbolic link; remove it"):
         write_report(theirs, *read_run(theirs))
     (theirs / "figures").unlink()
     (theirs / "figures").mkdir()
