@@ -1,4 +1,4 @@
-"""What all tests share: the signals of a terminal, and that nothing is skipped in silence."""
+"""Fixtures of all tests: a browser, checked numbers, signals and folders as in a new process."""
 
 from __future__ import annotations
 
@@ -18,19 +18,18 @@ CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
 # WebGL by the processor: a test machine has no graphics card.
 CHROMIUM_FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
-# A shell that starts the tests in the background lets them ignore Ctrl-C, and so would all the
-# processes that they start, though to end on Ctrl-C is what some of these are tested for.
+# A shell that starts the tests in the background lets them and their children ignore Ctrl-C, but
+# some tests check that a child ends on Ctrl-C.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def nightly(*values: object) -> list[object]:
-    """Mark values of a parametrized test as `full`: make nightly tries them, make test does not."""
+    """Mark values of a parametrized test as `full`: only `make nightly` tests them."""
     return [pytest.param(value, marks=pytest.mark.full) for value in values]
 
 
 def _has_ipv6() -> bool:
-    """Whether this machine has the address ::1; a container often has not."""
     try:
         with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as one:
             one.bind(("::1", 0))
@@ -43,28 +42,18 @@ needs_ipv6 = pytest.mark.skipif(not _has_ipv6(), reason="needs the IPv6 address 
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Where REQUIRE_ALL is set, as in CI, a test that was skipped has failed."""
+    """Fail if tests were skipped and REQUIRE_ALL is set, as in CI."""
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")
     if os.environ.get("REQUIRE_ALL") and reporter and reporter.stats.get("skipped"):
         reporter.write_line("REQUIRE_ALL: tests were skipped; see -rs", red=True)
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
-@pytest.fixture
-def handlers():
-    """Give back what a process of its own would keep: its signals, and what it has frozen."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-    gc.unfreeze()
-
-
 @pytest.fixture(autouse=True)
 def flights_of_others_are_not_seen(request, tmp_path_factory, monkeypatch):
-    """Whoever runs the tests may fly something else meanwhile."""
+    """Hide runs that the user of this machine flies at the same time."""
     if "e2e" in request.path.parts:
-        return  # kind's containers may need the first one
+        return  # kind's containers may need XDG_RUNTIME_DIR
     base = tmp_path_factory.getbasetemp()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(base))
     monkeypatch.setenv("XDG_STATE_HOME", str(base / "state"))
@@ -78,8 +67,8 @@ ROUNDING = 1e-9
 def figure(request):
     """Check a number: figure("HOLD after", 0.252, "<=", 0.252, "s", count=200).
 
-    `count` is the number of cases of which it is the worst; None was not measured, and fails. Where
-    CLOUDRC_EVIDENCE names a folder, a line of `numbers/*.jsonl` in it keeps the number as well.
+    `measured` is the worst of `count` cases; None (not measured) fails. If CLOUDRC_EVIDENCE names
+    a folder, the number is also written to `numbers/*.jsonl` in this folder.
     """
 
     def check(
@@ -108,9 +97,9 @@ def figure(request):
 
 @pytest.fixture(autouse=True)
 def signals_stay_as_they_were():
-    """A command that a test calls may take over signals, as a process of its own should.
+    """Restore signal handlers, which a command sets as if it had its own process.
 
-    Under `nohup` tests ignore SIGHUP, and so would all that they start; some are tested for it.
+    Under `nohup`, tests and their children would ignore SIGHUP, but some tests need SIGHUP.
     """
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     handlers = {number: signal.getsignal(number) for number in numbers}

@@ -136,7 +136,7 @@ def foreign(trees):
 
 
 def test_imported_and_declared_packages_are_the_same():
-    """Check that no package of a similar name is installed by mistake."""
+    """A package with a wrong, similar name in pyproject.toml fails this test."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = [lines for name, lines in project["optional-dependencies"].items() if name != "dev"]
     lines = sum(extras, project["dependencies"])
@@ -157,8 +157,8 @@ def test_no_file_and_no_function_is_too_long():
     assert long == set()
 
 
-def test_numpy_s_global_random_state_is_not_used():
-    """Allow `numpy.random.default_rng(seed)` and the like; everything else is global state."""
+def test_the_global_random_state_of_numpy_is_not_used():
+    """Only generators with a seed, such as `default_rng(seed)`, are allowed."""
     allowed = {"default_rng", "Generator", "Philox", "PCG64", "SeedSequence"}
     used = re.compile(r"\b(?:np|numpy)\.random\.(\w+)")
     found = {place_of(path): {*used.findall(path.read_text())} - allowed for path in FILES}

@@ -1,4 +1,4 @@
-"""Generated files are current; links, named files and cited sources lead somewhere."""
+"""Generated files are current; links, named files and cited sources exist."""
 
 import ast
 import re
@@ -27,7 +27,7 @@ PUBLIC = re.compile(
 
 
 def anchors(page):
-    """The anchors that GitHub gives to the headings of a page."""
+    """Return the anchors that GitHub makes from the headings of a page."""
     heads = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
 

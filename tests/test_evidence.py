@@ -1,4 +1,4 @@
-"""A number beyond its limit fails its test; the nightly page shows the worst of each number."""
+"""A number beyond its limit fails its test; the nightly page shows its worst measurement."""
 
 import json
 

@@ -26,10 +26,10 @@ LINES = [
     for line in body.splitlines()
 ]
 UNTESTED = {"", ". .venv/bin/activate", ".venv/bin/cloudrc up --console"}
-"""Lines that do nothing alone; the last one stays until Ctrl-C, and tests/console starts it."""
+"""Lines that are not run here; the last one runs until Ctrl-C, and tests/console tests it."""
 COMMANDS = [line for line in LINES if line not in UNTESTED]
 ANSWERS = {"compare": "B has a lower", "margin": "stable up to"}
-"""Command that flies many times -> beginning of its last line."""
+"""Subcommand with many flights -> beginning of the last line that it prints."""
 
 
 def is_slow(command):
@@ -41,7 +41,7 @@ def is_slow(command):
 QUICK = [command for command in COMMANDS if not is_slow(command)]
 SLOW = [command for command in COMMANDS if is_slow(command)]
 SWEEPS = [command for command in SLOW if "--seeds" in command]
-# The demo is a step of .ci/run by itself; of the sweeps, a push flies the first.
+# `make` runs in .ci/run as a step of its own; of the sweeps, only the first flies daily.
 NIGHTLY = [*(c for c in SLOW if c.startswith("make") or c.split()[1] in ANSWERS), *SWEEPS[1:]]
 STEPS = "run steps --mode virtual -o json --set mission.steps.count=3".split()
 FLIGHTS = [command for command in QUICK if command.startswith("cloudrc run")]
@@ -115,7 +115,7 @@ def test_the_readme_s_way_to_read_a_recording_works(folder):
 
 @pytest.mark.usefixtures("numbers_only")
 def test_the_readme_s_predictor_works(capsys):
-    """Check that a share of 1 is `constant_velocity`, and that a share of 0.5 predicts worse."""
+    """Compare a share of 0.5 with a share of 1, which is the predictor `constant_velocity`."""
     errors = []
     for share in ("0.5", "1.0"):
         plugin = f"--set cloud.predictor=./my_predictor.py --set cloud.predictor.share={share}"

@@ -90,7 +90,6 @@ def test_an_address_of_ipv6_is_in_brackets(monkeypatch):
 
 # Here, too, the socket stays open after the command.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.usefixtures("handlers")
 @pytest.mark.parametrize("end", ENDS)
 def test_an_end_stopped_at_its_start_completes_its_recording(end, key, tmp_path, monkeypatch, call):
     """The handlers are set first: as the first process of a container, an end needs them."""

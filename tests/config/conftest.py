@@ -1,4 +1,4 @@
-"""For each key of the schema: a valid value, and the settings that it needs."""
+"""Helpers for each key of the schema: a valid value, and other settings that the key needs."""
 
 import json
 from typing import Literal, get_args, get_origin
@@ -36,7 +36,7 @@ SPECIAL = {
 
 
 def refused(name, *settings):
-    """Return the message that refuses an experiment."""
+    """Return the error message of an invalid experiment."""
     with pytest.raises(BadInputError) as caught:
         load_experiment(str(name), settings)
     assert caught.value.exit_code == 2

@@ -1,4 +1,4 @@
-"""Bad input gives one message with place, reason and remedy, for all problems of a file at once."""
+"""One error lists all problems of a file, each with its place, its reason and what to do."""
 
 import re
 from pathlib import Path
@@ -15,9 +15,9 @@ def mine(tmp_path):
     return tmp_path / "mine.yaml"
 
 
-def refused_text(path, text, *settings):
+def refused_text(path, text):
     path.write_text(text, "utf-8")
-    return refused(path, *settings).replace(f"{path.parent}/", "")
+    return refused(path).replace(f"{path.parent}/", "")
 
 
 def test_all_problems_are_listed_with_their_lines(mine):
@@ -46,7 +46,7 @@ def test_all_problems_are_listed_with_their_lines(mine):
     ])  # fmt: skip
 
 
-def test_at_most_fifty_problems_and_ten_thousand_waypoints_are_listed(mine):
+def test_fifty_problems_at_most_are_listed(mine):
     points = ", ".join(["{position_m: [0, 0, 1], dwell_s: -1}"] * 2000)
     text = refused_text(mine, f"mission: {{waypoints: [{points}]}}\n")
     assert "mine.yaml has 2000 problems:" in text
@@ -77,8 +77,20 @@ def test_at_most_fifty_problems_and_ten_thousand_waypoints_are_listed(mine):
         ("delay_ms: 3", "did you mean link.uplink.delay_ms?"),
         ("zzz: 3", "known here: name, description, seed, mission"),
         ("guard: {speed_max_mps: 7}", "must be at most 6 m/s: above it the robot does not stop"),
+        ("mission: {waypoints: []}",
+         "mine.yaml:1: mission.waypoints: none given; give at least one, or steps or setpoints"),
+        ("mission: {waypoints: [{position_m: [.nan, 0, 1]}]}", "position_m.0: nan: must be finite"),
+        ("mission: {waypoints: [{position_m: [0, 0, 1, 2]}]}", "at most 3 entries"),
+        ("mission: {waypoints: [{tolerance_m: 1}]}",
+         "mission.waypoints.0.position_m: is missing; must be a list of 3 numbers [m]"),
+        ("mission: {waypoints: [{position_m: [0, 0, 3]}]}",
+         "[0, 0, 3]: beyond the fence, or too near to it; the guard lets the robot fly at "
+         "x -2.8 to 9, y -8.3 to 5.3, z 0.35 to 2.3 [m]; nearest legal point found: [0.3, 0, 2.3]"),
+        ("mission: {waypoints: [{position_m: [0.5, 0, .7]}, {position_m: [-.6, 0, .8]}]}",
+         "waypoints.1.position_m: [-0.6, 0, 0.8]: the robot would be within 0.04 m of the wall of "
+         "pipe_1; nearest legal point found: [0.08, 0, 0.8]"),
     ],
-)
+)  # fmt: skip
 def test_an_invalid_file_is_one_line(mine, text, reason):
     found = refused_text(mine, text)
     assert reason in found
@@ -104,17 +116,15 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
     ("text", "reason"),
     [
         ("seed", "--set seed: must be key=value"),
+        ("seed=1 name=x seed=2", "--set seed: is set twice; keep one"),
         ("a..b=1", "is no key"),
         ("seed=[", "--set seed"),
-        ("seed=[1], [2]", "--set seed: [1], [2]: text after the value"),
+        ("seed=[1],[2]", "--set seed: [1],[2]: text after the value"),
         ("mission.waypoints.9.dwell_s=1", "entries 0 to 6; use one of these, or 7 to append"),
         ("mission.waypoints.2.yaw_deg=90", "holds yaw at 0"),
-        (
-            "cloud.plan_s=0.4",
-            "cloud.predictor: 'constant_velocity' has no model of the",
-        ),
+        ("cloud.plan_s=0.4", "cloud.predictor: 'constant_velocity' has no model of the robot"),
         ("mission.waypoints.2.speed_mps=1", "waypoints.2.speed_mps: 1: is the speed of a carrot;"),
-        ('mission={"steps": {}, "carrot": {}}', "mission.carrot: impossible with steps"),
+        ("mission=steps mission.carrot.speed_mps=1", "mission.carrot: impossible with steps"),
         ("world.robot=./no.xml", "no.xml; names of shipped robots: pelican"),
         ("world.robot=/x/q", "world.robot: no such .xml file: /x/q"),
         # A limit of the guard cannot be switched off.
@@ -122,14 +132,16 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ("guard.speed_max_mps=1e-320", "--set: guard.speed_max_mps: "),
         ("guard.hold_max_s=1e-10", "--set: guard.hold_max_s: "),
         ("world.plant.mass_factor=1e9", "world.plant.mass_factor: "),
-        ("world.plant={payload_kg: 10, thrust_factor: 0.5}", "thrust-to-weight ratio is 0.62"),
-        ("world.plant.thrust_factor=[1, 1, 1]", "world.plant.thrust_factor"),
+        (
+            "world.plant.thrust_factor=0.2 world.plant.payload_kg=1",
+            "thrust-to-weight ratio is 1.34",
+        ),
+        ("world.plant.thrust_factor=[1,1,1]", "world.plant.thrust_factor"),
         ("cloud.compute_deviation_ms=1", "needs compute_ms"),
     ],
 )
 def test_an_invalid_setting_is_refused(text, reason):
-    assert reason in refused("paper", text)
-    assert "--set seed: is set twice; keep one" in refused("paper", "seed=1", "name=x", "seed=2")
+    assert reason in refused("paper", *text.split())
 
 
 @pytest.mark.parametrize(
@@ -156,27 +168,6 @@ def test_an_invalid_profile_is_refused_with_the_reason(mine, text, reason):
 
 
 @pytest.mark.parametrize(
-    ("waypoints", "reason"),
-    [
-        ("[]", "mission.waypoints: none given; give at least one, or steps or setpoints"),
-        ("[{position_m: [.nan, 0, 1]}]", "waypoints.0.position_m.0: nan: must be finite"),
-        ("[{position_m: [0, 0, 1, 2]}]", "at most 3 entries"),
-        ("[{tolerance_m: 1}]", "position_m: is missing; must be a list of 3 numbers [m]"),
-        ("[{position_m: [0, 0, 3]}]",
-         "[0, 0, 3]: beyond the fence, or too near to it; the guard lets the robot fly at "
-         "x -2.8 to 9, y -8.3 to 5.3, z 0.35 to 2.3 [m]; nearest legal point found: [0.3, 0, 2.3]"),
-        ("[{position_m: [0.5, 0, .7]}, {position_m: [-.6, 0, .8]}]",
-         "waypoints.1.position_m: [-0.6, 0, 0.8]: the robot would be within 0.04 m of the wall of "
-         "pipe_1; nearest legal point found: [0.08, 0, 0.8]"),
-    ],
-)  # fmt: skip
-def test_an_invalid_mission_is_refused_with_the_reason(mine, waypoints, reason):
-    found = refused_text(mine, f"mission: {{waypoints: {waypoints}}}")
-    assert reason in found
-    assert found.startswith("mine.yaml:1: mission.waypoints")
-
-
-@pytest.mark.parametrize(
     ("rows", "said"),
     [
         ("", "has 0 rows; give at least two"),
@@ -186,7 +177,7 @@ def test_an_invalid_mission_is_refused_with_the_reason(mine, waypoints, reason):
         (None, "the columns are time_s,delay_ms; give time_s,x_m,y_m,z_m"),
     ],
 )
-def test_setpoints_of_no_use_are_refused_in_one_line(tmp_path, rows, said):
+def test_an_invalid_file_of_setpoints_is_one_line(tmp_path, rows, said):
     header = "time_s,delay_ms" if rows is None else "time_s,x_m,y_m,z_m"
     (tmp_path / "drive.csv").write_text(f"{header}\n{rows or ''}")
     text = refused("hover", f"mission.setpoints={tmp_path / 'drive.csv'}")

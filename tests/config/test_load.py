@@ -68,7 +68,7 @@ def test_the_age_limit_of_file_or_profile_sets_the_speed_cap(experiment, setting
     assert guard.speed_max_mps == pytest.approx(cap, abs=1e-5)
 
 
-def test_a_profile_sets_the_limits_of_cloud_and_another_profile_takes_them_back(tmp_path):
+def test_a_profile_sets_and_another_resets_the_limits_of_cloud(tmp_path):
     (tmp_path / "far.yaml").write_text("horizon_max_s: 2.0\nfreeze_after_s: 0.8\n")
     far = load_experiment("paper", [f"link.profile={tmp_path}/far.yaml"])
     assert (far.cloud.horizon_max_s, far.cloud.freeze_after_s) == (2.0, 0.8)

@@ -1,4 +1,4 @@
-"""Plug-ins are found by name, entry point or path; an unknown one lists the known ones."""
+"""Plug-ins are found by name, entry point or path; an error lists the known names."""
 
 import sys
 from importlib.metadata import EntryPoint
@@ -83,9 +83,9 @@ def test_a_broken_plug_in_is_one_line(share, text, reason):
         assert plugins.describe("predictors", str(share)).startswith("(not usable")
 
 
-def test_a_missing_plug_in_file_is_refused(tmp_path):
+def test_a_plug_in_file_must_exist_and_end_in_py(tmp_path):
     assert "there is no such file" in refused("paper", f"cloud.predictor={tmp_path}/no.py")
-    (tmp_path / "notes.txt").write_text("no")
+    (tmp_path / "notes.txt").touch()
     assert "name it *.py" in refused("paper", f"cloud.predictor={tmp_path}/notes.txt")
 
 

@@ -34,7 +34,6 @@ from cloudrc.records import (
 )
 
 
-@pytest.mark.usefixtures("handlers")
 def test_it_ends_if_it_is_not_the_child_of_who_has_started_it(monkeypatch):
     for told, ends in ((os.getppid(), False), (os.getpid(), True), ("nobody", False)):
         monkeypatch.setenv(PARENT, str(told))

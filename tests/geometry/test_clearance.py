@@ -1,4 +1,4 @@
-"""Clearance equals hand-calculated, published and brute-force distances."""
+"""Clearance equals distances that were computed by hand, published, or computed pose by pose."""
 
 import math
 

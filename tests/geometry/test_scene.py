@@ -1,4 +1,4 @@
-"""The numbers in a scene file are those of the plant; bad ones are named."""
+"""Pipes, board and floor are read from a scene file; the error names an invalid number."""
 
 import pytest
 

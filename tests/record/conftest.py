@@ -1,4 +1,4 @@
-"""Fixtures: random records (hypothesis) and a short flight of both ends."""
+"""Helpers: random records, records of a short flight, and files written by other programs."""
 
 import math
 from enum import IntEnum
@@ -44,7 +44,7 @@ def _strategy(name, kind):
 
 
 def instances(cls):
-    """Generate records of the loop."""
+    """Generate random records of a class."""
     hints = get_type_hints(cls)
     return st.builds(cls, **{name: _strategy(name, kind) for name, kind in hints.items()})
 
@@ -54,7 +54,7 @@ def any_record():
 
 
 def world_records(count, start_ns=0):
-    """Make world's records at 100 Hz; each command took 30 ms."""
+    """Make world's records at 100 Hz; each command was on its way for 30 ms."""
     records = [
         rec.SessionOpened(start_ns, "world", 1, "cloud said hello"),
         rec.GuardChange(start_ns, GuardState.TRACK, "mission started"),
@@ -110,7 +110,7 @@ def write(path, records, clock="world", clock_id=""):
 
 
 def write_mission(path, world, cloud, attachments=None):
-    """Record both ends as one mission, as a run in virtual time does."""
+    """Write the records of world and cloud to one file, as a run in virtual time does."""
     with McapWriter(path, clock="world") as writer:
         for log_time_ns, row in merged(world, cloud):
             writer.write_row(row, log_time_ns)
@@ -151,7 +151,7 @@ def rewrite(
 
 
 def assert_equal(one, other):
-    """Check that all columns are equal; two rotations of a velocity change its last digits."""
+    """Check that all columns are equal; for rotated velocities, up to rounding errors."""
     for topic in TOPICS:
         assert one[topic].names == other[topic].names
         for name in one[topic].names:
@@ -174,7 +174,7 @@ def open_mcap(path):
 
 
 class Shelf:
-    """A sink that stores its records."""
+    """A writer that keeps the records in a list."""
 
     def __init__(self):
         self.records, self.closed = [], False

@@ -25,7 +25,7 @@ def test_a_topic_without_rows_is_an_empty_table_of_its_types():
             assert table[field.name].dtype == types.get(field.kind, np.float64), field
 
 
-def test_what_does_not_exist_is_answered_with_what_does():
+def test_the_error_for_an_unknown_name_lists_known_names():
     recording = Recording.from_records([])
     with pytest.raises(KeyError, match="no topic '/odometri'; there are: /odometry, /telemetry"):
         recording["/odometri"]

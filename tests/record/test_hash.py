@@ -23,8 +23,8 @@ def sha256(*parts):
     return hashlib.sha256(b"".join(parts)).digest()
 
 
-def test_the_bytes_are_those_that_the_module_promises(monkeypatch):
-    """Two records of one type in one block: column by column; the types in order of their names."""
+def test_the_hashed_bytes_are_those_in_the_docstring(monkeypatch):
+    """The hash covers blocks of two records, column by column, and types by name."""
     monkeypatch.setattr("cloudrc.record.hash.BLOCK", 2)
     applied = [rec.CommandApplied(n, 2, 3, -4, (0.5, 1.0, 2.0 + n)) for n in range(3)]
     pair = struct.pack("<8q6d2q", 0, 1, 2, 2, 3, 3, -4, -4, 0.5, 1, 2, 0.5, 1, 3, -1, -1)

@@ -1,4 +1,4 @@
-"""A file is read or recovered up to its end or first damage; foreign files are named."""
+"""A file is read or recovered up to its end or first damage; other kinds of files are named."""
 
 import io
 import itertools
@@ -59,7 +59,6 @@ SIZES = [
 
 @pytest.fixture
 def path(tmp_path):
-    """The path of a file that does not exist yet."""
     return tmp_path / "x.mcap"
 
 
@@ -144,7 +143,7 @@ def test_an_unusual_layout_is_read(whole, path, options):
     ],
     ids=["topic", "half", "renamed", "joined", "metadata", "doubled"],
 )
-def test_what_other_programs_changed_is_named(whole, path, options, said):
+def test_changes_by_another_program_are_noted(whole, path, options, said):
     recording = Recording.read(rewrite(whole, path, **options))
     assert recording.lacking == recording.note
     assert re.search(said, recording.lacking), recording.lacking
@@ -153,7 +152,7 @@ def test_what_other_programs_changed_is_named(whole, path, options, said):
         assert recording.lacking in Recording.read(new).lacking, "a copy hides nothing"
 
 
-def test_a_torn_recording_that_others_ended_is_told(path):
+def test_a_torn_file_that_another_program_ended_is_noted(path):
     with path.open("wb") as stream:
         writer = McapWriter(stream, clock="world")
         writer.write(RECORDS)
@@ -162,7 +161,7 @@ def test_a_torn_recording_that_others_ended_is_told(path):
 
 
 def write_foreign(path, topic, ros_type, text, data, channels=1, **options):
-    """Write messages as another program that names the clock as cloudrc does."""
+    """Write messages as another program, but with the metadata key `clock` of cloudrc."""
     with path.open("wb") as stream:
         writer = Writer(stream, **options)
         writer.start(profile="ros2")
@@ -190,7 +189,7 @@ ARRIVAL = definition(OURS)
         ("/camera", "", "", 1, ""),
     ],
 )
-def test_foreign_topics_are_told_apart(path, topic, name, text, channels, said):
+def test_foreign_topics_are_not_read_as_topics_of_cloudrc(path, topic, name, text, channels, said):
     write_foreign(path, topic, name, text, [b"\0\1\0\0\7"], channels)
     recording = Recording.read(path)
     assert said in recording.lacking
@@ -203,7 +202,7 @@ def test_foreign_topics_are_told_apart(path, topic, name, text, channels, said):
 @pytest.mark.parametrize(("size", "count"), [(0, 40_000), (1 << 20, 20)])
 @pytest.mark.parametrize("lies", [False, True])
 def test_a_bomb_ends_with_one_line(path, monkeypatch, compression, size, count, lies):
-    """A few kilobytes unpack to far more: in large messages, or in very many."""
+    """A small file unpacks to far more: to large messages, or to very many messages."""
     monkeypatch.setattr("cloudrc.record.reader.UNPACKED_MAX", limit := 4)
     options = {"chunk_size": 1 << 27, "compression": compression, "index_types": IndexType.NONE}
     data = (bytes(size) for _ in range(count))
@@ -226,7 +225,7 @@ def test_a_bomb_ends_with_one_line(path, monkeypatch, compression, size, count, 
 
 
 def examine(folder, data):
-    """Read and recover a file; both say what is wrong, or find all that was recorded."""
+    """Read and recover a file; check that a result without a note has all content."""
     source, new, found = folder / "f.mcap", folder / "new.mcap", list[Contents]()
     source.write_bytes(data)
     new.unlink(missing_ok=True)
@@ -251,7 +250,7 @@ FOURTHS = [range(part, len(WHOLE), 4) for part in range(4)]
     [SOME, *(pytest.param(part, marks=pytest.mark.full) for part in FOURTHS)],
     ids=["some", *"1234"],
 )
-def test_no_cut_or_flipped_byte_passes_unnoticed(tmp_path, places):
+def test_every_cut_and_every_flipped_byte_is_noticed(tmp_path, places):
     for at in places:
         examine(tmp_path, flipped(at, 1 << at % 8))
         examine(tmp_path, WHOLE[:at])
@@ -278,7 +277,7 @@ def test_a_recovery_says_what_is_kept_and_lost(path):
     assert (recovery.bytes_lost, recovery.share) == (len(WHOLE), pytest.approx(0.5))
 
 
-def test_a_number_without_its_one_definition_is_a_damage(path, tmp_path):
+def test_a_channel_with_two_or_no_definitions_is_damaged(path, tmp_path):
     source = write(tmp_path / "w.mcap", world_records(5))
     flat = rewrite(source, path, use_chunking=False).read_bytes()
     channels = [start for code, start, _ in spans(flat) if code == Opcode.CHANNEL]
@@ -287,7 +286,7 @@ def test_a_number_without_its_one_definition_is_a_damage(path, tmp_path):
         assert Recording.read(path).lacking.startswith("damaged: ")
 
 
-def test_nothing_is_offered_of_what_holds_nothing(path):
+def test_a_recording_without_messages_is_not_recovered(path):
     with pytest.raises(BadInputError, match="holds no readable message: none is in it; nothing"):
         recover(write(path, []), new := path.with_name("new.mcap"))
     assert not new.exists()

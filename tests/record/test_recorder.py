@@ -35,7 +35,7 @@ class Disk(io.BytesIO):
 
 
 def record_all(recorder, records, every):
-    """Record, with a flush after `every` records."""
+    """Write all records; flush after `every` records."""
     for start in range(0, len(records), every):
         recorder.put(records[start : start + every])
         while recorder.drain():
@@ -99,7 +99,7 @@ def failing(step, error):
 @pytest.mark.promise("a-bad-disk-spares-the-flight")
 @pytest.mark.parametrize("step", ["flush", "sync", "close"])
 @pytest.mark.parametrize(("code", "words"), [*TROUBLE.items(), (errno.EIO, "Input/output error")])
-def test_disk_errors_are_told_and_never_raised(step, code, words):
+def test_disk_errors_are_reported_and_never_raised(step, code, words):
     shelf = failing(step, OSError(code, "Input/output error"))
     recorder = Recorder(Path("w.mcap"), lambda path: shelf)
     recorder.put(counted(3))
@@ -112,7 +112,7 @@ def test_disk_errors_are_told_and_never_raised(step, code, words):
     assert recorder.dropped == (0 if step == "close" else 2)
 
 
-def test_a_record_that_cannot_be_written_costs_only_itself(tmp_path):
+def test_only_a_record_that_cannot_be_encoded_is_lost(tmp_path):
     path, bad = tmp_path / "w.mcap", Counted(1, "world", "sent", 2**70)
     recorder = Recorder(path, open_mcap)
     record_all(recorder, [*counted(1), bad, *counted(3)], 64)
@@ -121,7 +121,7 @@ def test_a_record_that_cannot_be_written_costs_only_itself(tmp_path):
     assert len(Recording.read(path)["/count"]) == 4
 
 
-def test_a_recording_that_has_grown_to_its_limit_ends_whole(tmp_path):
+def test_a_recording_at_its_size_limit_ends_complete(tmp_path):
     recorder = Recorder(path := tmp_path / "w.mcap", open_mcap, size_max=20_000)
     record_all(recorder, world_records(1000), 200)
     assert (said := "recording stopped: the file has reached its size limit") in recorder.error
@@ -177,7 +177,7 @@ INSTANTS = [pytest.param(0.6 + 0.031 * n, 0.0, marks=pytest.mark.full) for n in 
 @pytest.mark.process
 @pytest.mark.parametrize(("after", "sync"), [(0.9, 0.0), (2.1, 0.4), (2.1, 60.0), *INSTANTS])
 def test_sigkill_loses_at_most_half_a_second(tmp_path, after, sync, figure):
-    """Even if the disk is slow: `sync` is how long it takes [s]."""
+    """`after` is the time of the kill [s], `sync` the duration of one sync to a slow disk [s]."""
     path, clean = tmp_path / "world.mcap", tmp_path / "clean.mcap"
     command = [sys.executable, "-c", FLIGHT, str(path), str(sync)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

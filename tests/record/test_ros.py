@@ -1,4 +1,4 @@
-"""ROS messages hold the same values as the rows, in ROS's conventions."""
+"""ROS messages contain the values of the rows, in the conventions of ROS."""
 
 import math
 

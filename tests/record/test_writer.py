@@ -19,7 +19,7 @@ RECORDS = [*world_records(150), *cloud_records(150, 1500 * MS)]
 NEEDED = ["lz4", "mcap", "rosbags", "zstandard"]
 
 
-def test_other_programs_read_every_topic(tmp_path):
+def test_other_programs_can_read_every_topic(tmp_path):
     path, stamps = write(tmp_path / "both.mcap", RECORDS), defaultdict(list)
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -51,7 +51,7 @@ def test_log_times_never_fall_on_a_topic(tmp_path):
 
 
 def test_an_hour_of_recording_takes_no_memory(tmp_path):
-    """A chunk every half a second: mcap's own list of chunks takes 12 MB in an hour."""
+    """With a chunk every half a second, mcap's own list of chunks grows by 12 MB in an hour."""
     path, records = tmp_path / "long.mcap", world_records(1)
     grown, count = list[int](), 1000
     tracemalloc.start()
@@ -88,7 +88,7 @@ def test_a_missing_package_is_named_with_its_remedy():
     assert said.endswith("install it with: pip install 'cloudrc[record]'\n")
 
 
-def test_flying_needs_none_of_them():
+def test_a_flight_needs_no_package_for_recording():
     code = (
         f"import sys; sys.modules.update(dict.fromkeys({NEEDED}))\n"
         "from cloudrc.record import hash, recorder, topics\n"

@@ -1,4 +1,4 @@
-"""report.json and environment.json: their names, absent values, and what they never contain."""
+"""report.json and environment.json: their keys, absent values, and no names of users."""
 
 import getpass
 import json

@@ -1,4 +1,4 @@
-"""Figures are drawn of any flight, also with little data, and in the style of cloudrc alone."""
+"""Every flight can be drawn, also with little data; only cloudrc decides the style."""
 
 import itertools
 from dataclasses import replace
@@ -36,7 +36,7 @@ def test_a_flight_without_data_is_drawn(name, end_ns):
 
 
 def test_figures_ignore_the_users_matplotlib_settings(monkeypatch):
-    """matplotlib reads settings in the working folder, which may be somebody else's run."""
+    """matplotlib reads settings in the working folder, which may be a run from somebody else."""
     monkeypatch.setattr("cloudrc.report.figures.NAMES", ("error",))
     (picture,) = draw_all(subject_of(flown()))
     theirs = {"text.usetex": True, "axes.facecolor": "red", "lines.linestyle": ":"}
@@ -46,7 +46,7 @@ def test_figures_ignore_the_users_matplotlib_settings(monkeypatch):
 
 
 def samples(figure, axes):
-    """Return points on what is drawn in `axes`, at most a pixel apart [pixels], shape (n, 2)."""
+    """Return points on all lines in `axes`, at most a pixel apart [pixels], shape (n, 2)."""
     lines = [line for line in axes.lines if line.get_zorder() > 0]
     drawn = [line.get_transform().transform(line.get_xydata()) for line in lines]
     for collection in axes.collections:

@@ -1,4 +1,4 @@
-"""The replay: its content and size, and that it moves together with the figures in a browser."""
+"""The replay: its content, its size, and its movement together with the figures in a browser."""
 
 import json
 import re
@@ -36,7 +36,7 @@ def page(tmp_path_factory):
 
 
 def messages(section):
-    """Decode the recording in a replay: duration [s], and messages with their times [s]."""
+    """Decode viser's recording in a replay: duration [s], and (time [s], message) pairs."""
     player = json.loads(re.search(r'id="player">(.*?)</script>', section, re.DOTALL)[1])
     data = b64decode(re.search(r'__VISER_EMBED_DATA__="([^"]+)"', player)[1])
     raw = zstandard.ZstdDecompressor().decompress(data[8:])

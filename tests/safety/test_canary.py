@@ -29,7 +29,7 @@ def found_in(data):
 
 
 def content_of(path):
-    """Read a file's bytes, and the decompressed records of a recording."""
+    """Return the bytes of a file; of a recording, also its decompressed records."""
     data = path.read_bytes()
     if path.suffix == ".mcap":
         with path.open("rb") as stream, suppress(McapError):  # a truncated recording ends early

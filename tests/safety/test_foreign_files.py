@@ -1,4 +1,4 @@
-"""Files from somebody else: no waiting for pipes, size limits, no link is followed."""
+"""Files from somebody else: cloudrc waits for no pipe, limits sizes, and follows no link."""
 
 import json
 import os
@@ -46,7 +46,7 @@ def test_a_pipe_or_device_is_refused_at_once(tmp_path, read):
 
 
 @pytest.mark.parametrize("named", ["/dev/zero", "./loop", "~nobody/x.csv", "a\\0/b.py"])
-def test_one_named_by_a_configuration_is_refused(tmp_path, named):
+def test_an_unusable_file_in_a_configuration_is_refused(tmp_path, named):
     (tmp_path / "loop").symlink_to("loop")
     for where in ("mission: ", "link: {uplink: {trace: ", "link: {uplink: {table: "):
         (tmp_path / "config.yaml").write_text(f'{where}"{named}"' + "}" * where.count("{"))
@@ -54,7 +54,7 @@ def test_one_named_by_a_configuration_is_refused(tmp_path, named):
             read_experiment(tmp_path / "config.yaml")
 
 
-def test_aliases_in_aliases_do_not_multiply_values_without_end(tmp_path):
+def test_nested_aliases_of_yaml_are_limited(tmp_path):
     names = "abcdefghij"
     lines = [f"{y}: &{y} [{', '.join(f'*{x}' for _ in names)}]" for x, y in pairwise(names)]
     (tmp_path / "config.yaml").write_text("\n".join(["a: &a [1]", *lines]))

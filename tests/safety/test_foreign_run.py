@@ -32,13 +32,13 @@ report:
 
 @pytest.fixture
 def trace(tmp_path):
-    """The file that exists once any code of the run was executed."""
+    """The path of a file that the code of the run creates."""
     return tmp_path / "trace"
 
 
 @pytest.fixture
 def spy(trace):
-    """A program that leaves a trace when executed."""
+    """A plug-in that creates the file `trace` when it is imported."""
     return f"from pathlib import Path\nPath({str(trace)!r}).touch()\ndef build(): ...\n"
 
 
@@ -114,8 +114,8 @@ def test_a_new_process_imports_nothing_from_the_working_folder(run, trace, spy, 
     assert "-P" not in interpreter("-m", "cloudrc"), "this process uses that path, too"
 
 
-def test_a_worker_imports_nothing_from_there_either(run, trace, spy, monkeypatch):
-    """It imports the pool's modules before it gets its parent's path."""
+def test_a_worker_imports_nothing_from_the_working_folder(run, trace, spy, monkeypatch):
+    """A worker imports the modules of its pool before it gets the search path of its parent."""
     (run / "pickle.py").write_text(spy)
     monkeypatch.chdir(run)
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)

@@ -1,4 +1,4 @@
-"""Promises of guard and link, end to end: from received bytes to the robot's motion."""
+"""Hostile commands in whole flights do not change the limits of the guard."""
 
 import pytest
 
@@ -9,9 +9,9 @@ from cloudrc.messages import GuardState
 from cloudrc.world.guard.state import Guard
 
 HOSTILE = {"stop-and-go": 9, "false-basis": 8, "strange-numbers": 9, "refused-and-released": 3}
-"""Hostile policies with a seed each; together they cause all states."""
+"""Name of a hostile cloud's policy -> seed. Together, these flights reach all guard states."""
 BOUNDS = {"_limits", "_speed_max", "_floor", "_high", "speed"}
-"""Attributes of a guard and of its parts that are its limits or are derived from them."""
+"""Names of attributes of a guard and its parts that contain limits."""
 
 
 def bounds(guard):
@@ -22,7 +22,6 @@ def bounds(guard):
 
 @pytest.mark.promise("commands-within-caps")
 def test_nothing_in_the_tunnel_changes_the_limits():
-    """They come from world's experiment."""
     states = set()
     for policy, seed in HOSTILE.items():
         lie, words = POLICIES[policy](generator(seed, 666)), at_bad_moments(generator(seed, 667))
