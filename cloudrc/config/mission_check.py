@@ -61,7 +61,7 @@ def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
 def _check_waypoints(mission: Mission, scene: Scene) -> Iterator[Problem]:
     positions = np.array([waypoint.position_m for waypoint in mission.waypoints])
     yaws = np.radians([waypoint.yaw_deg for waypoint in mission.waypoints])
-    # The robot may reach a waypoint at half its tolerance; control errors need the other half.
+    # A waypoint may be outside by half its tolerance; the other half is for control errors.
     slack = np.array([0.5 * waypoint.tolerance_m for waypoint in mission.waypoints])
     in_fence = np.all((positions >= fence.LOW) & (positions <= fence.HIGH), axis=1)
     outside = outside_fence(positions, slack) | ~in_fence

@@ -148,7 +148,7 @@ class Direction(Section):
     """Rate of the bottleneck [kbit/s]; each packet counts with 28 bytes of headers;
     null: no bottleneck"""
     queue_packets: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
-    """Packets that the bottleneck holds; further packets are dropped"""
+    """Largest number of packets in the queue of the bottleneck; further packets are dropped"""
     changes: tuple[Change, ...] = ()
     """Changes of the conditions over time; at_s must rise from entry to entry"""
     trace: str | None = None
@@ -419,7 +419,7 @@ class Guard(Section):
 
 
 class Tunnel(Section):
-    """How both ends treat datagrams that arrive out of order."""
+    """How world and cloud treat datagrams that arrive out of order."""
 
     order: Literal["newest", "arrival"] = "newest"
     """newest: a datagram that arrives after a newer one is dropped; arrival: the datagram that

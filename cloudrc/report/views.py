@@ -42,7 +42,7 @@ PATH, GOAL, GHOST = (0.0, 0.45, 0.70, 1.0), (0.84, 0.37, 0.0, 0.9), (0.34, 0.71,
 
 
 def add_views(mission: Contents, experiment: ResolvedExperiment) -> Recording:
-    """Replace the views in a mission; return its tables. Raise the same errors as `views`."""
+    """Replace the views of a mission; return the mission's tables. Errors are those of `views`."""
     recording = mission.recording()
     mission.views = views(recording, experiment)
     return recording
