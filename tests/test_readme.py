@@ -43,7 +43,6 @@ SLOW = [command for command in COMMANDS if is_slow(command)]
 SWEEPS = [command for command in SLOW if "--seeds" in command]
 # `make` runs in .ci/run as a step of its own; of the sweeps, only the first flies daily.
 NIGHTLY = [*(c for c in SLOW if c.startswith("make") or c.split()[1] in ANSWERS), *SWEEPS[1:]]
-STEPS = "run steps --mode virtual -o json --set mission.steps.count=3".split()
 FLIGHTS = [command for command in QUICK if command.startswith("cloudrc run")]
 
 
@@ -114,23 +113,17 @@ def test_the_readme_s_way_to_read_a_recording_works(folder):
 
 
 @pytest.mark.usefixtures("numbers_only")
-def test_the_readme_s_predictor_works(capsys):
+def test_the_predictor_and_the_metric_of_the_pages_work(capsys):
     """Compare a share of 0.5 with a share of 1, which is the predictor `constant_velocity`."""
-    errors = []
-    for share in ("0.5", "1.0"):
-        plugin = f"--set cloud.predictor=./my_predictor.py --set cloud.predictor.share={share}"
-        assert main([*STEPS, *plugin.split()]) == 0
-        numbers = json.loads(capsys.readouterr().out)["numbers"]
-        assert numbers["fault_count"]["value"] == 0
-        errors.append(numbers["prediction_error_rms"]["value"])
-    assert errors[0] > 1.5 * errors[1]
-
-
-@pytest.mark.usefixtures("numbers_only")
-def test_the_metric_is_measured_by_a_run_and_by_a_report(capsys):
+    fly = "run steps --mode virtual -o json --set mission.steps.count=3"
+    fly += " --set cloud.predictor=./my_predictor.py --set report.metrics=./overshoot.py"
     report = "report runs/latest --metric ./overshoot.py -o json"
-    values = []
-    for words in ([*STEPS, "--set", "report.metrics=./overshoot.py"], report.split()):
-        assert main(words) == 0
-        values.append(json.loads(capsys.readouterr().out)["numbers"]["overshoot"]["value"])
-    assert values[0] == values[1]
+    found = []
+    for line in (*(f"{fly} --set cloud.predictor.share={share}" for share in (0.5, 1.0)), report):
+        assert main(line.split()) == 0
+        numbers = json.loads(capsys.readouterr().out)["numbers"]
+        found.append({name: number["value"] for name, number in numbers.items()})
+    half, whole, again = found
+    assert half["fault_count"] == whole["fault_count"] == 0
+    assert half["prediction_error_rms"] > 1.5 * whole["prediction_error_rms"]
+    assert whole["overshoot"] == again["overshoot"]

@@ -105,7 +105,7 @@ def test_a_file_of_another_kind_is_named(path, data, reason):
     for read in (read_contents, lambda path: recover(path, path.with_name("new.mcap"))):
         with pytest.raises(BadInputError, match=rf"^[^\n]*x\.mcap: {reason}[^\n]*$"):
             read(path)
-    assert not path.with_name("new.mcap").exists(), "an empty file is never offered"
+    assert not path.with_name("new.mcap").exists(), "no file without messages is written"
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_changes_by_another_program_are_noted(whole, path, options, said):
     assert re.search(said, recording.lacking), recording.lacking
     with suppress(BadInputError):  # no message is of cloudrc
         recover(path, new := path.with_name("new.mcap"))
-        assert recording.lacking in Recording.read(new).lacking, "a copy hides nothing"
+        assert recording.lacking in Recording.read(new).lacking, "the copy says it, too"
 
 
 def test_a_torn_file_that_another_program_ended_is_noted(path):

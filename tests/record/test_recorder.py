@@ -83,8 +83,8 @@ def test_on_a_full_disk_all_is_kept_or_counted(tmp_path, room):
         kept = len(recording["/count"])
         recovery = recover(path, tmp_path / "clean.mcap")
         assert recovery.bytes_lost == 0, "the file ends with a whole chunk"
-        told = "disk full" in recording.note
-        assert told or room - path.stat().st_size < 200, "told, if there is room"
+        noted = "disk full" in recording.note
+        assert noted or room - path.stat().st_size < 200, "noted, if there is room for a note"
     assert kept + recorder.dropped == len(records)
     assert kept < len(records)
 
@@ -136,7 +136,7 @@ def test_a_sync_by_another_thread_reports_its_error_later(tmp_path, error):
     recorder = Recorder(path, lambda path: shelf)
     recorder.put(counted(1))
     recorder.drain()
-    assert not recorder.sync(), "what is in no file is never safe"
+    assert not recorder.sync(), "without a file nothing is on the disk"
     path.touch()
     assert recorder.sync() is (error is None)
     assert not shelf.closed

@@ -103,16 +103,13 @@ def test_plotted_errors_agree_with_the_report(flown):
     assert rms == pytest.approx(known["prediction_error_rms"], rel=0.2), "a sample of them"
 
 
-def paths_of(config):
-    """Yield the message paths of a panel of the layout."""
-    yield from (path["value"] for path in config.get("paths", []))
-    yield from config.get("topics", {})
-
-
 def test_every_path_of_the_layout_is_in_a_recording(flown):
     layout, messages = json.loads(LAYOUT.read_text()), flown[2]
     for panel in layout["configById"].values():
-        for value in paths_of(panel):
+        for value in (
+            *(path["value"] for path in panel.get("paths", [])),
+            *panel.get("topics", {}),
+        ):
             topic, *names = value.split(".")
             assert messages[topic], value
             for _, message in messages[topic]:
