@@ -78,7 +78,7 @@ def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoi
 
 
 def virtual_notes(experiment: ResolvedExperiment) -> tuple[str, ...]:
-    """Return sentences for the reader of the report of a flight in virtual time."""
+    """Return the notes for the report of a flight in virtual time."""
     return (MEASURED,) if experiment.cloud.compute_measured else ()
 
 

@@ -7,7 +7,7 @@ import errno
 DISK_FULL = {errno.ENOSPC: "disk full", errno.EDQUOT: "disk quota used up"}
 """Error number (errno) of a full disk -> text for the user."""
 TEXT_MAX = 2000
-"""Largest length of a text from another program in a message; the rest is cut off [characters]."""
+"""Largest length of another program's text in a message [characters]; the rest is cut off."""
 
 
 class CloudrcError(Exception):

@@ -208,7 +208,7 @@ def fingerprint(experiment: ResolvedExperiment) -> str:
 
 
 def local_files(value: Any, key: str = "") -> dict[str, str]:
-    """Find the files that a part of a resolved experiment names: key -> path, below `key`."""
+    """Return dotted key -> path of each existing file in a resolved experiment, below `key`."""
     if isinstance(value, str):
         return {key: value} if value.startswith("/") and Path(value).is_file() else {}
     listed = dict(enumerate(value)) if isinstance(value, list) else value
@@ -266,7 +266,7 @@ def _inline_mission(document: Document) -> None:
 
 
 def _inline_profile(document: Document) -> None:
-    """Take the values of both directions that the experiment omits from its link profile."""
+    """Fill in the keys that the experiment omits in uplink and downlink from its profile."""
     _default(document, ("link", "profile"), Experiment().link.profile)
     name = document.get("link", "profile")
     if not isinstance(name, str) or _has_all_values(document):
@@ -314,7 +314,7 @@ def _plan_max(document: Document) -> float:
 
 
 def _remove_derived(document: Document, *, new_profile: bool) -> None:
-    """Remove computed values from a resolved file, so that settings can change them.
+    """Remove computed values from a resolved file; they are computed again after the settings.
 
     With `new_profile`, also remove the values of the file's link profile. A value that differs from
     the computed one is the experiment's own, and stays.

@@ -18,7 +18,7 @@ COLUMNS = ["time_s", "x_m", "y_m", "z_m"]
 DRIVE_FILE = "drive.csv"
 """Name of the setpoint file in the folder of a run that the operator drove by hand."""
 ROUNDING = 1e-6
-"""How far rounding may put a position outside the box of the guard [m]."""
+"""Largest distance outside the guard's box that counts as a rounding error [m]."""
 TimedPosition: TypeAlias = tuple[float, Vector]
 """Time since the first row [s], and position of the setpoint [m], world frame."""
 

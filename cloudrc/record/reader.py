@@ -166,7 +166,7 @@ class Records:
             raise _StopError(f"unpacks to more than {UNPACKED_MAX} times its size")
 
     def _check(self, record: mcap.McapRecord) -> mcap.McapRecord:
-        """Store a schema or channel; raise a ValueError if its number has another definition."""
+        """Store definitions; raise a ValueError for a number with no or with two definitions."""
         if isinstance(record, mcap.Message):
             self._take_room(MESSAGE_COST)
             if record.channel_id not in self.channels:
@@ -247,7 +247,7 @@ def read_contents(path: Path) -> Contents:
 
 
 def _read(path: Path) -> tuple[Contents, Records, int]:
-    """Read a file; return its contents, its used-up records, the number of missing messages."""
+    """Return the contents of a file, its `Records` after reading, the number of lost messages."""
     contents, sequences, total = Contents(), array("L"), 0
     ours: dict[int, bool] = {}  # whether cloudrc records the topic of a channel, in this layout
     with Records(path) as records:

@@ -51,8 +51,8 @@ CHANGED = "changed"
 STARTED = "started"
 """Metadata key, only in real time: wall time of a mission's first message, in UTC (ISO 8601)."""
 COUNTS, SHA256 = "counts", "messages_sha256"
-"""Metadata keys: number of messages by topic as JSON, and hash of the messages as from
-`messages_sha256`. With them a reader detects messages that were removed, added or changed. The
+"""Metadata keys: number of messages by topic as JSON, and hash of the messages, computed as by
+`messages_sha256`. From them a reader detects messages that were removed, added or changed. The
 value of `COUNTS` is "" until the file is complete."""
 
 

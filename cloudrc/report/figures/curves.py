@@ -33,7 +33,7 @@ MARGIN = 1.25
 
 
 def draw_delay(subject: Subject) -> Figure:
-    """Draw each datagram's one-way delay, the loop delay, and cloud's estimate of the latter."""
+    """Draw the one-way delay of each datagram, and the loop delay with cloud's estimate of it."""
     figure, (one_way, loop) = subject.look.two_panels()
     flight, time = subject.flight, np.linspace(0.0, subject.duration, 600)
     limits = [bounds(subject, time, uplink=uplink) for uplink in (True, False)]

@@ -28,9 +28,9 @@ from cloudrc.report.figures.style import Subject
 
 Interval: TypeAlias = tuple[float, float]
 SAME_CHANGE = 0.05
-"""Two records of one direction describe the same change if they are less than this apart [s]."""
+"""Two records of one direction describe the same change if their times differ by less [s]."""
 SAME_CAUSE = 1.0
-"""Records of uplink and downlink describe the same change if they are at most this apart [s]."""
+"""Records of uplink and downlink describe one change if their times differ by at most this [s]."""
 LEGEND = (
     " Behind the curves: red, the guard was in HOLD; hatched, a blackout of the link; dotted, a "
     "change of the link by its profile."
