@@ -55,9 +55,9 @@ STATUSES = {BadInputError: 422, ConflictError: 409, UnknownMissionError: 404, Un
 REASONS = {
     **{status: text for status, (_, text) in REFUSED.items()},
     404: "There is no such mission",
-    409: "The state does not allow it; `id` names the mission in the way",
+    409: "The state of mission or robot forbids it; `id` names the mission in the way",
     413: f"The body is longer than {BODY_MAX // 1024} KiB",
-    422: "A value cannot be used; `problems` has every one",
+    422: "A value cannot be used; `problems` lists all such values",
     503: "Not now: teleop starts or ends, another teleop has the journal, or the disk refuses it. "
     "Or teleop did not answer within 2 s; look at the state, because it may still act. Cloud "
     "receives an emergency stop all the same, unless another teleop has the journal",
@@ -88,7 +88,7 @@ class Bridge:
     def __init__(self) -> None:
         self.closed = STARTING  # why the bridge refuses calls, in words; "" while it accepts calls
         self.alarm: Callable[[], Any] = lambda: None  # sends an emergency stop to cloud at once
-        self.overtakings = 0  # number of stops and holds so far, which overtake all other calls
+        self.overtakings = 0  # number of stops and holds so far; they overtake all other calls
         self._urgent: deque[tuple[Call, Future[Any]]] = deque()  # stops and holds
         self._calls: deque[tuple[Call, Future[Any]]] = deque()
         self._service: MissionService | None = None
@@ -117,7 +117,7 @@ class Bridge:
         return future
 
     async def ask(self, call: Call, urgent: Urgent = "") -> Any:
-        """Queue a call and return its result; for a stop, also send the alarm at once.
+        """Queue a call and return its result; for a stop, also call `alarm` at once.
 
         Raise an UnavailableError if the bridge is closed, or if the loop does not answer within
         `ANSWER_LIMIT`. An urgent call then stays queued; any other call is withdrawn.
@@ -130,7 +130,7 @@ class Bridge:
         try:
             return await asyncio.wait_for(asyncio.shield(asked) if urgent else asked, ANSWER_LIMIT)
         except TimeoutError:
-            text = "teleop did not answer in time, but may do it yet: look before you try again"
+            text = "teleop did not answer in time, but may still act; look at the state first"
             raise UnavailableError(text) from None
 
     async def move(self, call: Call) -> Any:
@@ -139,7 +139,7 @@ class Bridge:
 
         def checked(service: MissionService, now_ns: int) -> Any:
             if self.overtakings != known:
-                raise ConflictError("a stop or a hold was asked for since; look, then ask again")
+                raise ConflictError("a later stop or hold cancels this; look at the state first")
             return call(service, now_ns)
 
         return await self.ask(checked)

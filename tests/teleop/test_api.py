@@ -240,7 +240,7 @@ def test_a_later_stop_or_hold_cancels_a_call_that_may_move_the_robot(urgent):
         bridge.submit(lambda service, now_ns: None, urgent)
         for call in bridge.take():
             call(0)
-        with pytest.raises(ConflictError, match="a stop or a hold was asked for since"):
+        with pytest.raises(ConflictError, match="a later stop or hold cancels this"):
             await moving
 
     asyncio.run(overtake())

@@ -229,7 +229,7 @@ def test_a_key_is_that_of_one_order_for_ever():
     for _ in range(2):
         assert flight.create(key="uid") == mission_id
         for order in (Order(QUICK, key="uid"), Order(FROM_SPAWN, key="uid", contact=True)):
-            with pytest.raises(ConflictError, match="'uid' is that of mission m1, with another"):
+            with pytest.raises(ConflictError, match="mission m1 has the key 'uid' already"):
                 flight.teleop.create(order, flight.now_ns)
         flight.restart_teleop()
     assert flight.create(key="another") == "m2"
