@@ -13,7 +13,7 @@ from cloudrc.messages import ZERO, Odometry, Setpoint, Vector
 
 
 class StudentController(Controller):
-    """From the predicted position to a velocity command."""
+    """Computes a velocity command from the predicted position."""
 
     def __init__(self, p: Vector, i: Vector, d: Vector, velocity_max: Vector) -> None:
         """Take `p` [1/s], `i` [1/s^2], `d` [1] and `velocity_max` [m/s], each for x, y and z."""

@@ -1,7 +1,7 @@
 """Compute parts of the live metrics: histograms, lost datagrams, errors of predictions.
 
-Records are handled in the thread of the control loop, in less than 1 us each: the handlers only
-store records and count. `read` does all other work, in the thread that serves the metrics.
+The thread of the control loop stores and counts records, in less than 1 us per record. The thread
+that serves the metrics does all other work.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ Readings: TypeAlias = dict[str, "dict[Labels, float] | Histogram"]
 
 
 def unlabelled(value: float) -> dict[Labels, float]:
-    """Make the reading of a metric without labels [unit of the metric]; the one of NaN is empty."""
+    """Make the reading of a metric without labels [unit of the metric]; {} for NaN."""
     return {} if isnan(value) else {(): value}
 
 

@@ -45,7 +45,7 @@ BODIES = ("pipe", "board", "floor", "other")
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
 """Outcomes of a datagram at the relay; `cloudrc.link.relay.Lanes.outcomes` explains them."""
 RELEASE_PERCENTILES = ("50", "99", "99.9")
-"""Percentiles of the relay's release error; its count of "99.9" is `release_error_p999_ns`."""
+"""Percentiles of the relay's release error; the count for "99.9" is `release_error_p999_ns`."""
 
 Labels = tuple[str, ...]
 

@@ -200,7 +200,7 @@ class Teleop:
         self._hold(now_ns)
 
     def drive(self, now_ns: int, velocity: Vector) -> None:
-        """Move the setpoint with `velocity` [m/s], world frame, for `HEARTBEAT_NS` from `now_ns` on.
+        """Move the setpoint with `velocity` [m/s], world frame, for at most `HEARTBEAT_NS`.
 
         The setpoint moves only while telemetry shows that the robot follows commands. Raise
         BadInputError unless the mission is held or begins held.
