@@ -3,10 +3,8 @@
 import argparse
 import asyncio
 import concurrent.futures
-import contextlib
 import json
 import stat
-import statistics
 import time
 
 import pytest
@@ -25,12 +23,22 @@ from cloudrc.teleop.api import ApiServer, Bridge
 from cloudrc.teleop.auth import LOCAL
 from cloudrc.teleop.store import ConflictError
 from tests.conftest import needs_ipv6
-from tests.teleop.conftest import DIRECT, OPERATOR, READER, A, B, C, connect, head, running
+from tests.teleop.conftest import (
+    A_MISSION,
+    DIRECT,
+    OPERATOR,
+    READER,
+    A,
+    B,
+    C,
+    connect,
+    head,
+    running,
+)
 
 LEG = {"dwell_s": 0.0, "tolerance_m": 0.3}
 NAME = "zum Brett, \N{RIGHTWARDS ARROW} 板"
 MISSION = {"name": NAME, "waypoints": [{"position_m": p, **LEG} for p in (A, B, C)]}
-A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
 emergency_stop = pytest.mark.promise("emergency-stop-gets-through")
 
 
@@ -60,7 +68,7 @@ def test_a_mission_from_post_to_verdict(api):
 
 def test_the_operator_steers_and_a_conflict_names_its_mission(api):
     assert api.post("/v1/resume")[0] == 409
-    mission_id, point = api.fly(MISSION), {"position_m": [0.5, 0.0, 1.0]}
+    mission_id, (point,) = api.fly(MISSION), A_MISSION["waypoints"]
     for path, body in (("missions", MISSION), ("goto", point)):
         status, refusal = api.post(f"/v1/{path}", body)
         assert (status, refusal["id"], mission_id in refusal["detail"]) == (409, mission_id, True)
@@ -266,25 +274,6 @@ def test_an_internal_error_is_one_line_and_500(api):
 
 
 # The server
-
-
-def test_a_kept_connection_answers_like_a_fresh_one(api):
-    """Without TCP_NODELAY it would wait for delayed acknowledgements: 40 ms for each answer."""
-
-    def median_of_answers(connection):
-        times = []
-        for _ in range(25):
-            began, answer = time.monotonic(), b""
-            with connection() as one:
-                one.sendall(head("GET", "/v1/state"))
-                while not answer.endswith(b"}"):
-                    answer += one.recv(65_536)
-            times.append(time.monotonic() - began)
-        return statistics.median(times)
-
-    with connect(api) as kept:
-        took = median_of_answers(lambda: contextlib.nullcontext(kept))
-        assert took < median_of_answers(lambda: connect(api)) + 0.02
 
 
 @needs_ipv6

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from cloudrc.messages import ZERO, GuardState, Motion, Setpoint, Start
 from cloudrc.teleop.carrot import arrival_ns, setpoint_at
 from cloudrc.teleop.wire import Leg, Plan
-from tests.teleop.conftest import PERIOD_NS, Flight
+from tests.teleop.conftest import PERIOD_NS, Flight, reference
 
 SECOND = 1_000_000_000
 TRACK, HOLD = GuardState.TRACK, GuardState.HOLD
@@ -59,10 +59,6 @@ def led(position=START, guard=TRACK):
     flight.guard = guard
     flight.step()
     return flight
-
-
-def reference(flight):
-    return setpoint_at(flight.setpoints[-1], flight.now_ns)
 
 
 def follow(flight, seconds):
