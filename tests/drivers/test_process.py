@@ -22,7 +22,7 @@ from cloudrc.drivers.process import (
 )
 from cloudrc.drivers.teleop import LAST_WORD_NS, LastWord
 from cloudrc.link.state import STATE_MAX, LinkState, publish, to_text
-from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
+from cloudrc.messages import GuardState
 from cloudrc.records import (
     Counted,
     Fault,
@@ -32,6 +32,7 @@ from cloudrc.records import (
     SessionOpened,
     TelemetrySent,
 )
+from tests.console.conftest import told as sample
 
 
 @pytest.mark.usefixtures("handlers")
@@ -57,12 +58,6 @@ def test_cloud_ends_once_nothing_flies_or_after_its_last_word():
         assert ends() is ended
 
 
-def sent(stamp_ns):
-    odometry = Odometry(stamp_ns, (1.0, 2.0, 3.0), UPRIGHT, ZERO, ZERO)
-    telemetry = Telemetry(stamp_ns, odometry, 0.5, 1, 2, 3, 4, GuardState.TRACK, 2, 0.1)
-    return TelemetrySent(stamp_ns, 1, 2, telemetry)
-
-
 EVENT = MissionEvent(5, "reached", 1, 'waypoint "2" of 7 \u2013 reached')
 
 
@@ -80,18 +75,18 @@ def test_events_are_all_told_and_samples_ten_times_a_second(pipe):
     alive = feed.alive_while(lambda: True)
     assert [alive(), alive()] == [True, True], "a sign of life, not more often than it says"
     for k in range(20):
-        feed.tell([sent(k * PERIOD_NS // 4), EVENT])
+        feed.tell([sample(k * PERIOD_NS * 0.25e-9), EVENT])
     ready, *lines = os.read(pipe[0], 1 << 20).decode().splitlines()
     told = [from_line(line) for line in lines]
     assert ready == "ready"
-    assert repr(told[:2]) == repr([sent(0), EVENT])  # with the types of all values
+    assert repr(told[:2]) == repr([sample(0.0), EVENT])  # with the types of all values
     assert [type(record) for record in told].count(TelemetrySent) == 5
     assert told.count(EVENT) == 20
 
 
 def test_where_nobody_watches_events_are_said_in_words(pipe):
     feed = Feed(pipe[1], watched=False)
-    feed.tell([sent(0), EVENT, EVENT._replace(text="caf\udce9")])
+    feed.tell([sample(0.0), EVENT, EVENT._replace(text="caf\udce9")])
     assert feed.alive_while(lambda: True)()
     assert os.read(pipe[0], 1 << 20) == f"{EVENT.text}\ncaf\\udce9\n".encode()
 
