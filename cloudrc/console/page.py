@@ -297,7 +297,7 @@ class Page:
         self._steering.fly({**order, "name": experiment.name})
 
     def _add_target(self, client: viser.ClientHandle) -> None:
-        """Add the gizmo and the numbers of the next waypoint, which follow each other."""
+        """Add the gizmo and the number fields of the target; each follows the other."""
         low, high, start = fence.INNER_LOW, fence.INNER_HIGH, self._place_target(time.monotonic())
         limits = tuple(zip(low, high, strict=True))
         gizmo = client.scene.add_transform_controls(

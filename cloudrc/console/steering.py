@@ -59,7 +59,7 @@ class Steering:
     """Sends the operator's requests.
 
     Attributes:
-        api: Makes no connection that stays open, so that several threads may use it.
+        api: Teleop's API; it keeps no connection open, so that several threads may use it.
         link: Functions for the emulated link.
         answer: Newest result in words, whether it is a refusal, and its time [s].
         state: Newest answer of the API's `GET /v1/state`; {} before the first.

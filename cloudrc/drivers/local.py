@@ -56,7 +56,7 @@ JOURNAL_FILE = "missions.journal"
 RELAY_LOG = "relay.log"
 """File in the folder of every run in real time."""
 RUN, SESSION = "run", "session"
-"""Kinds of flights: of `cloudrc run`, which end with their mission, and of `cloudrc up`."""
+"""Kinds of flights: a run (`cloudrc run`) ends with its mission, a session with `cloudrc down`."""
 UNANNOUNCED = "no folder for the flight file (XDG_STATE_HOME); use: cloudrc mission --api {}"
 
 
@@ -181,7 +181,7 @@ class LocalRun:
 
     Attributes:
         notes: Sentences for the report of the flight.
-        announcement: Keeps the flight file of a session, which the caller closes at its end.
+        announcement: Keeps the flight file of a session until the caller closes it.
     """
 
     def __init__(

@@ -109,7 +109,7 @@ class DatagramTally:
 
 
 GAP_MAX_NS = 50_000_000
-"""Largest time between two measurements between which positions are interpolated [ns]."""
+"""Longest time between two measurements over which positions are interpolated [ns]."""
 WAITING_MAX = 256
 """Largest number of stored predictions or commands; 100 are enough for delays of 1 s."""
 
@@ -178,7 +178,7 @@ class DelayJudge:
     def echoed(self, control: Control, arrival_ns: int) -> None:
         """Compute the error of the delay estimate of a command whose echo has arrived.
 
-        The echo arrived at `arrival_ns` [ns], cloud's clock; `control` is the next control period.
+        The echo arrived at `arrival_ns` [ns], cloud's clock; `control` is the period after it.
         """
         sent = self._sent.get(arrival_ns - round(control.loop_delay * 1e9))
         if sent is not None:

@@ -12,7 +12,7 @@ from cloudrc.messages import GuardState
 from cloudrc.metrics.flight import Array, Flight, Measure, add_metrics, mean
 
 BOARD = "board"
-"""Name of the board, which the arm must touch, in the scene."""
+"""Name in the scene of the board that the arm must touch."""
 IMPACT_NS = 100_000_000
 """Time from the first touch over which the impulse is summed [ns]: the impact and its bounces."""
 ODOMETRY_NS = 10_000_000

@@ -26,7 +26,7 @@ OUTPUTS = {"/ground_truth": "velocity", "/odometry": "velocity"}
 DT = 0.01
 """Time between two samples of the fit [s]."""
 START = 100
-"""Number of samples at the start that the fit leaves out: the input before them is unknown."""
+"""Number of first samples that the fit leaves out, because the earlier input is unknown."""
 TAKE_OFF = 2.0
 """Time after the beginning of TRACK that is left out [s]."""
 BLOCKS, T_QUANTILE = 10, 2.262

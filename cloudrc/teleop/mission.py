@@ -74,7 +74,7 @@ after the planned time, the carrot leaves as planned, else when telemetry shows 
 UNSEEN_MAX_NS = 2_000_000_000
 """Longest time without telemetry after which the dwell time at a waypoint continues [ns]."""
 JUMP_SPEED = 6.0
-"""Highest speed at which the setpoint moves on a part of a track [m/s]; else the setpoint jumps."""
+"""Highest speed of the setpoint on a track [m/s]; along a faster part the setpoint jumps."""
 GROUND, TRACK, HOLD, _, ESTOP = GuardState  # to look up a member takes time
 
 
@@ -397,7 +397,7 @@ class Teleop:
             self._select_leg(self.leg, now_ns)
 
     def _follow_track(self, now_ns: int) -> None:
-        """Move the setpoint to the next point of the track, once the time of a point has come."""
+        """Move the setpoint from each point of the track to the next, at the time of the point."""
         track = self._plan.track
         knot = bisect_right(track, self.elapsed(now_ns), key=lambda each: each[0]) - 1
         if not self._knot < knot < len(track) - 1:
@@ -421,7 +421,7 @@ class Teleop:
         return near and leaves_ns is not None and now_ns >= leaves_ns
 
     def _leaves_ns(self, leg: int) -> int | None:
-        """Return when a carrot's dwell time at a waypoint ends [ns]; None without this carrot."""
+        """Return when the dwell time of a carrot at a waypoint ends [ns]; None without a carrot."""
         setpoint = self._setpoint
         if setpoint is None or type(setpoint.motion) is not Motion or setpoint.waypoint != leg:
             return None

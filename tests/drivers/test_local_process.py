@@ -94,7 +94,7 @@ HANGS, DIES = signal.SIGSTOP, signal.SIGKILL
         pytest.param("world", HANGS, marks=pytest.mark.full),
     ],
 )
-def test_a_supervisor_that_stood_still_still_sees_who_hangs_or_dies(tmp_path, victim, how):
+def test_a_supervisor_that_was_paused_sees_who_hangs_or_dies(tmp_path, victim, how):
     run = start(tmp_path / "run", dwell=30.0)
     pids = wait_until_flying(run)
     os.kill(run.pid, signal.SIGSTOP)

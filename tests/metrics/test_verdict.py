@@ -196,7 +196,7 @@ def test_a_plug_in_may_fail_in_one_percent_of_the_periods(failures, found):
     assert all("my.py:12 in predict" in each.text for each in verdict.failures)
 
 
-def test_the_operator_counts_what_was_reported_the_report_what_was_true():
+def test_the_operator_counts_what_was_reported():
     missed = Mission(waypoints=(Waypoint(position_m=(0.0, 5.0, 1.0)),))
     flight = good().flight(ONE_PIPE, mission=missed)
     numbers = measured(flight)

@@ -212,7 +212,7 @@ def test_a_stop_is_made_however_late_teleop_answers(api, monkeypatch):
 
 @emergency_stop
 @pytest.mark.parametrize("locked", [False, True])
-def test_a_stop_during_the_start_is_the_first_call_unless_another_teleop_flies(locked):
+def test_a_stop_while_teleop_starts_is_its_first_call(locked):
     with running(ready=False) as api, concurrent.futures.ThreadPoolExecutor(1) as pool:
         answer = pool.submit(api.post, "/v1/estop")
         api.until(lambda: api.bridge.overtakings == 1)
@@ -239,7 +239,7 @@ def test_stop_and_hold_overtake_a_full_queue_of_calls():
 
 
 @pytest.mark.parametrize("urgent", ["stop", "hold"])
-def test_a_later_stop_or_hold_cancels_a_call_that_may_move_the_robot(urgent):
+def test_a_later_stop_or_hold_cancels_a_call_that_moves(urgent):
     async def overtake():
         bridge = Bridge()
         bridge.open(object())

@@ -104,7 +104,7 @@ def test_it_waits_at_a_robot_that_holds_and_starts_from_there():
     assert flight.teleop.leg == 1
 
 
-def test_it_starts_again_from_the_robot_after_a_silence_and_in_a_new_session():
+def test_it_starts_again_from_the_robot_after_a_silence():
     flight = led()
     follow(flight, 1.0)
     flight.uplink = False

@@ -130,7 +130,7 @@ def test_a_key_that_is_released_is_no_lost_operator(driven):
     assert "operator_lost" not in names(driven)
 
 
-def test_what_interrupts_a_drive_has_to_be_answered_by_letting_go(driven):
+def test_after_an_interrupted_drive_the_operator_must_let_go(driven):
     def ended(verb, *words):
         press(driven, seconds=0.1)
         getattr(driven.teleop, verb)(*words, driven.now_ns)
@@ -276,7 +276,7 @@ def test_keys_in_a_terminal_drive_the_robot():
 
 
 @pytest.mark.process
-def test_drive_shows_the_state_in_a_small_terminal_and_ends_with_it():
+def test_drive_runs_in_a_small_terminal_and_ends_with_it():
     with running(unix=True) as api:
         terminal = Terminal(api, lines=4, columns=20)
         terminal.close()

@@ -133,7 +133,7 @@ def test_a_robot_that_waits_during_its_mission_is_started_again(guard):
 # Requests and the emergency stop: repeated until the robot has acted on them
 
 
-def test_each_copy_of_a_setpoint_or_request_names_the_current_session():
+def test_each_copy_of_a_request_names_the_current_session():
     flight, said = Flight(), []
     flight.step()
     flight.operate("start", FROM_SPAWN, ID)

@@ -294,7 +294,7 @@ def shown(flight):
     return flight.teleop.state(flight.now_ns)["seen"]
 
 
-def test_the_state_is_shown_with_cause_and_since_when_in_this_world():
+def test_the_state_has_its_cause_and_its_duration():
     flight, _ = service_flying()
     flight.step(seconds=0.5)
     assert shown(flight)["guard_for_s"] > 0.5

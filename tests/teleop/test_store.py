@@ -252,7 +252,7 @@ def flown(kill, at):
 
 @pytest.mark.promise("waypoints-once-in-order")
 @pytest.mark.parametrize("kill", ["killed_before", "killed_after"])
-def test_killed_at_any_commit_waypoints_are_reached_once_in_order(kill):
+def test_waypoints_are_reached_once_whenever_teleop_is_killed(kill):
     killed, at = True, 0
     while killed:
         at += 1
