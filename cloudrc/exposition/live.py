@@ -117,7 +117,6 @@ class End:
         return self._opened_ns != NEVER_NS and self._woke_ns - self._arrival_ns < SILENCE_NS
 
     def _observe(self, name: str, seconds: float) -> None:
-        """Count a time [s] in a histogram."""
         self._histograms[f"cloudrc_{name}_seconds"].observe(seconds)
 
     def _on_arrival(self, record: Arrival) -> None:

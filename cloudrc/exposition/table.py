@@ -188,8 +188,7 @@ cloudrc_link_released_early_total = released_early: Datagrams that left the rela
 cloudrc_dns_errors_total = unresolved: Failed look-ups of the peer's name; the last known address
     stays in use.
 """
-"""All metrics. A block begins with the processes that expose its metrics; then one entry a metric:
-`name[labels] = count: meaning`."""
+"""All metrics, in blocks: the processes that expose them, then name[labels] = count: meaning."""
 _LABELS: Mapping[str, Labels] = {
     **dict.fromkeys(("version", "config"), ()),
     "role": ROLES,

@@ -135,8 +135,7 @@ class Teleop:
         self.stopping = False  # whether telemetry has not yet shown a requested ESTOP
         self._stop_ns, self._is_ended = 0, ended
         self._plan, self._mission_id, self._began_ns = NO_PLAN, 0, 0
-        # Whether an earlier teleop process began this mission, and whether that process held it.
-        self._continued = self._was_held = False
+        self._continued = self._was_held = False  # mission begun, and held, by an earlier teleop
         self._world = ""  # process of world in which the mission started; "": any
         self._expected: tuple[int, ...] = ()  # numbers that the robot may report; empty: any
         self._watch = LegWatch()
