@@ -52,8 +52,8 @@ class FlightScene:
     ) -> None:
         """Add the static shapes, and the robot at its spawn.
 
-        The first view shows the whole mission in a window whose width is at least `aspect` times
-        its height.
+        The first view shows the whole mission in a window whose width is at least `aspect` [1]
+        times its height.
 
         Raises:
             BadInputError: If robot or scene are missing or unsuitable.

@@ -155,7 +155,7 @@ class Steering:
         return x, y, z
 
     def set_link(self, key: str, value: float) -> None:
-        """Begin to set `key`, such as "uplink.delay_ms", to `value` in the unit of the key."""
+        """Begin to set `key`, such as "uplink.delay_ms", to `value` [unit of the key]."""
         self._changes[key] = value
         self._changed.set()
 

@@ -44,12 +44,12 @@ Readings: TypeAlias = dict[str, "dict[Labels, float] | Histogram"]
 
 
 def unlabelled(value: float) -> dict[Labels, float]:
-    """Make the reading of a metric without labels [unit of the metric]; {} for NaN."""
+    """Make the reading of a metric without labels from `value` [unit of the metric]; {} for NaN."""
     return {} if isnan(value) else {(): value}
 
 
 def per_axis(vector: Vector) -> dict[Labels, float]:
-    """Make the reading of a metric with the label `axis` [unit of the metric], without NaN."""
+    """Make the reading per axis of a `vector` [unit of the metric]; NaN is left out."""
     values = zip(AXES, vector, strict=True)
     return {(axis,): value for axis, value in values if not isnan(value)}
 
