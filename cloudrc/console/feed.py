@@ -1,7 +1,7 @@
-"""Keep what a console shows of a flight: the newest pose, the charts of the last 25 s, the trail.
+"""Store what a console shows of a flight: the newest pose, the charts of the last 25 s, the trail.
 
-The input is the records that cloud sends through the tap. No record has the delay of the downlink:
-this delay is the newest round trip minus the uplink's delay, if world and cloud share a clock.
+The input is the records that cloud sends through the tap. If world and cloud share a clock, the
+delay of the downlink is the newest round trip minus the delay of the uplink.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from cloudrc.records import Arrival, Control, Record, SessionOpened, TelemetrySe
 WINDOW = 25.0
 """Time that the charts show [s]."""
 STALE = 0.5
-"""Age from which a record is too old to be shown [s]."""
+"""Age above which a record is too old to be shown [s]."""
 TRAIL_STEP = 0.02
 """Shortest distance between two points of the trail [m]."""
 TRAIL_MAX = 4000
 """Largest number of points of the trail; older points are dropped."""
 JUMP = 0.5
-"""Distance between two poses from which a new trail begins, because the robot was reset [m]."""
+"""Distance between two poses above which a new trail begins, because the robot was reset [m]."""
 
 
 class Sample(NamedTuple):

@@ -1,4 +1,4 @@
-"""The page of the console: 3-D scene, charts and state for all browsers, controls for the first.
+"""Serve the console's page: scene, charts and state for all browsers, controls for the first one.
 
 viser draws and serves the page. The keyboard API of viser does not report the release of a key.
 Therefore a script on the page presses the buttons of the drive while keys are held.
@@ -26,7 +26,7 @@ from cloudrc.geometry.scene import SPAWN, load_scene
 from cloudrc.messages import ZERO, GuardState, Quaternion, Vector
 
 SLOW_PERIOD = 0.3
-"""Time between two updates of all but the moving bodies [s]."""
+"""Time between two updates of the page, except for the moving bodies [s]."""
 ANSWER_SHOWN = 8.0
 """Time for which an answer is shown [s]."""
 PANEL_WIDTH = 330
@@ -34,7 +34,7 @@ PANEL_WIDTH = 330
 NARROW = 900
 """Width of the window below which the charts start collapsed [px]."""
 ASPECT = (1280 - 2 * PANEL_WIDTH) / 800
-"""Width of the scene between the panels over its height, in a window of 1280 x 800 px."""
+"""Width divided by height of the scene between the panels, in a window of 1280 x 800 px."""
 BLUE, RED, GREEN = "#0072b2", "#d55e00", "#009e73"
 CHARTS: dict[str, tuple[float, float, dict[str, tuple[int, str]]]] = {
     "Delay [ms]": (1e3, 150, {"up": (1, BLUE), "down": (2, RED), "estimate": (3, GREEN)}),
@@ -52,9 +52,9 @@ KEYS: dict[str, tuple[str, Vector]] = {
     "ArrowDown": ("↓ -x", (-1.0, 0.0, 0.0)),
     "ArrowRight": ("→ -y", (0.0, -1.0, 0.0)),
 }
-"""Key, by the name of browsers -> label of its button, and direction of the drive."""
+"""Key, as browsers name it -> label of its button, and direction of the drive."""
 RELEASED = 0.3
-"""Time without a sign of a held key after which it counts as released [s]."""
+"""Time after the last call from a held button at which its key counts as released [s]."""
 STOP, HOLD = "STOP", "Hold"
 SCRIPT = """
 const drive = %s;
@@ -115,7 +115,7 @@ class Page:
         self._touched = -inf  # when somebody last moved a slider [s]
         self._sliders: dict[str, Any] = {}
         self._target: tuple[Any, Any] | None = None  # gizmo and its numbers, until somebody moves
-        self._drawn = 0  # points of the trail
+        self._drawn = 0  # number of drawn points of the trail
 
     def fill(self, experiment: ResolvedExperiment, feed: FlightFeed, steering: Steering) -> None:
         """Build the scene and the panels, and give the controls to the first browser."""
@@ -220,7 +220,7 @@ class Page:
         return "  \n".join(lines).replace("cloudrc mission ", "")  # buttons have the verbs' names
 
     def _follow_link(self, now: float) -> None:
-        """Move the sliders after a change from elsewhere, unless somebody moves them here."""
+        """Show the link's present state on the sliders, unless somebody is moving a slider."""
         if now - self._touched < 2.0:
             return
         for key, slider in self._sliders.items():
@@ -242,7 +242,7 @@ class Page:
             client.gui.add_markdown("**Read only**: another browser steers.", order=0)
 
     def _succeed(self, client: viser.ClientHandle) -> None:
-        """Give the controls of a browser that has left to the next one."""
+        """Give the controls to another browser if the browser that had them has left."""
         with self._lock:
             if self._pilot != client.client_id:
                 return
@@ -297,7 +297,7 @@ class Page:
         self._steering.fly({**order, "name": experiment.name})
 
     def _add_target(self, client: viser.ClientHandle) -> None:
-        """Add the gizmo and the numbers of the next waypoint, which follow each other."""
+        """Add the gizmo and the number fields of the target; each follows the other."""
         low, high, start = fence.INNER_LOW, fence.INNER_HIGH, self._place_target(time.monotonic())
         limits = tuple(zip(low, high, strict=True))
         gizmo = client.scene.add_transform_controls(
@@ -333,7 +333,7 @@ class Page:
             self._target = free
 
     def _place_target(self, now: float) -> Vector:
-        """Return where the target is before somebody moves it [m]: setpoint, or above the robot."""
+        """Return the position of an unmoved target [m]: the setpoint, or 0.6 m above the robot."""
         feed = self._feed
         if feed.control is not None and feed.controls(now):
             at: Any = feed.control.setpoint
@@ -373,7 +373,7 @@ class Page:
 
 
 def _clamp(slider: Any) -> float:
-    """Return the value of a slider, which its number field does not limit to the slider's range."""
+    """Limit a slider's value to its range, which the number field does not; return the value."""
     value = float(np.clip(slider.value, slider.min, slider.max))
     if value != slider.value:
         slider.value = value
@@ -381,7 +381,7 @@ def _clamp(slider: Any) -> float:
 
 
 def _with_gaps(curve: Array) -> list[float | None]:
-    """Replace NaN by None, a gap in the chart; no axis is drawn for a chart without a number."""
+    """Replace NaN by None, a gap in the chart; if no number is left, add one: it keeps the axis."""
     values = [None if value != value else value for value in curve.tolist()]
     return [-1.0, *values[1:]] if not any(value is not None for value in values) else values
 

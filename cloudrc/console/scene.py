@@ -27,7 +27,7 @@ FLOOR: dict[str, Any] = {
     **{"cell_color": (228, 230, 233), "section_color": (206, 210, 214)},
     **{"plane_color": (246, 247, 248), "plane_opacity": 1.0, "fade_distance": 40.0},
 }
-"""Look of a plane, which is a grid."""
+"""Look of the floor, which is shown as a grid."""
 GHOST_OPACITY, PIPE_OPACITY = 0.35, 0.5
 VIEW, LOOK, NEAREST = np.radians(75.0), np.array([0.7, -0.2, -0.7]), 3.5
 """Viewer: vertical angle of view [rad], direction, least distance from the middle [m]."""
@@ -38,7 +38,7 @@ LEGEND = (
     "display: inline-block; width: 5em; height: 0.7em; background: linear-gradient(to right, "
     f'{", ".join(f"#{each}" for each in VIRIDIS.split())})"></span> {CLEARANCE_SHOWN:g} m</div>'
 )
-"""Line of HTML that tells the colours of the flown path."""
+"""Line of HTML that explains the colours of the flown path."""
 
 
 class FlightScene:
@@ -52,8 +52,8 @@ class FlightScene:
     ) -> None:
         """Add the static shapes, and the robot at its spawn.
 
-        The first view shows the whole mission in a window of this shape or a wider one; `aspect` is
-        its width over its height [1].
+        The first view shows the whole mission in a window whose width is at least `aspect` [1]
+        times its height.
 
         Raises:
             BadInputError: If robot or scene are missing or unsuitable.
@@ -144,7 +144,7 @@ class FlightScene:
             self._scene.add_line_segments("/plan", lines, PLAN, thickness=0.03)
 
     def _add_surroundings(self, model: Any, geometry: Scene) -> None:
-        """Add all static shapes: planes as grids, pipes as smooth tubes, the rest as they are."""
+        """Add all static shapes: planes as grids, pipes as smooth tubes, others unchanged."""
         pipes = {pipe.name for pipe in geometry.pipes}
         bodies = defaultdict(list)
         for geom in map(int, np.flatnonzero(model.body_weldid[model.geom_bodyid] == 0)):
@@ -181,7 +181,7 @@ class FlightScene:
         self, parent: str, model: Any, geoms: list[int], ghost: Colour | None = None
     ) -> None:
         """Add geoms of one body, one mesh for each colour; all in the colour `ghost` if given."""
-        # It imports mujoco, which cloudrc.world.scene has imported without OpenGL.
+        # mjviser imports mujoco, which cloudrc.world.scene has imported without OpenGL.
         from mjviser.conversions import merge_geoms
 
         groups = defaultdict(list)
@@ -229,8 +229,8 @@ def _surface(
 def _camera(geometry: Scene, waypoints: Sequence[Vector], aspect: float) -> tuple[Array, Array]:
     """Return the place of the viewer, and the point at which the viewer looks [m], shape (3,).
 
-    The viewer looks along +x, so that the arrow keys fly away from the viewer, to the left and so
-    on, from the nearest place from which spawn, pipes and waypoints are in sight.
+    The viewer looks along +x, so that the key ↑ flies away from the viewer, and ← to the left. The
+    place is the nearest one from which spawn, pipes and waypoints are in sight.
     """
     pipes = [(pipe.centre, 0.5 * pipe.length * np.array(pipe.axis)) for pipe in geometry.pipes]
     ends = [centre + sign * half for centre, half in pipes for sign in (-1, 1)]

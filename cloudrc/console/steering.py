@@ -21,14 +21,14 @@ DRIVE_PERIOD = 0.1
 STOP_PERIOD = 0.2
 """Time between two attempts to send an emergency stop that nobody has answered [s]."""
 WATCH_PERIOD = 0.3
-"""Time between two looks at the state of missions and link [s]."""
+"""Time between two queries for the state of missions and link [s]."""
 SLIDERS: dict[str, tuple[str, float, float, float]] = {
     "delay_ms": ("delay [ms]", 500.0, 1.0, 1.0),
     "jitter_ms": ("jitter [ms]", 100.0, 1.0, 1.0),
     "loss": ("loss [%]", 50.0, 0.5, 100.0),
 }
-"""Key of a link direction -> label, largest value and step of its slider, and factor from the
-profile's unit to that of the slider."""
+"""Setting of a link direction -> label, largest value and step of its slider, and factor from the
+setting's unit to that of the slider."""
 
 
 class Api(Protocol):
@@ -43,7 +43,7 @@ class Api(Protocol):
 
 @dataclass(frozen=True)
 class Link:
-    """The way to the emulated link, on this machine or in a cluster.
+    """Functions for the emulated link, on this machine or in a cluster.
 
     Attributes:
         read: Returns the present profile, as in its file; {} if unknown.
@@ -59,8 +59,8 @@ class Steering:
     """Sends the operator's requests.
 
     Attributes:
-        api: Makes no connection that stays open, so that several threads may use it.
-        link: The way to the emulated link.
+        api: Teleop's API; it keeps no connection open, so that several threads may use it.
+        link: Functions for the emulated link.
         answer: Newest result in words, whether it is a refusal, and its time [s].
         state: Newest answer of the API's `GET /v1/state`; {} before the first.
         route: Waypoints of the mission under way [m], shape (n, 3); empty if none.
@@ -89,7 +89,7 @@ class Steering:
             threading.Thread(target=loop, daemon=True).start()
 
     def end_drive(self) -> None:
-        """Release all keys, and wait until teleop has been told."""
+        """Release all keys, and wait until teleop has the velocity zero."""
         self._drives = False
         self.release_keys()
         self._drive.join()
@@ -99,7 +99,7 @@ class Steering:
         self._stops.set()
 
     def ask(self, words: str, path: str, body: Mapping[str, Any] | None = None) -> bool:
-        """Post a request, and tell the result in `answer`; return whether it was accepted."""
+        """Post a request, and store the result in `answer`; return whether teleop accepted it."""
         try:
             self.api.post(path, body)
         except CloudrcError as error:
@@ -136,7 +136,7 @@ class Steering:
         self.ask(f"flying to ({x:g}, {y:g}, {z:g})", "/v1/goto", {"position_m": (x, y, z)})
 
     def hold_key(self, key: str, velocity: Vector, lasts: float) -> None:
-        """Add `velocity` [m/s] to the drive while `key` is held: for `lasts` [s] from now on."""
+        """Add `velocity` [m/s] to the drive for `lasts` [s] from now on, because `key` is held."""
         before, now = self.velocity(time.monotonic()), time.monotonic()
         self._held = {**self._held, key: (velocity, now + lasts)}
         if self.velocity(now) != before:
@@ -155,12 +155,12 @@ class Steering:
         return x, y, z
 
     def set_link(self, key: str, value: float) -> None:
-        """Set `value` in the unit of `key`, "uplink.delay_ms" [ms], "uplink.loss" [1]; at once."""
+        """Begin to set `key`, such as "uplink.delay_ms", to `value` [unit of the key]."""
         self._changes[key] = value
         self._changed.set()
 
     def watch(self) -> None:
-        """Look at the state of missions and link once."""
+        """Query the state of missions and link once, and store it."""
         try:
             self.state = self.api.get("/v1/state")
             mission = (self.state["mission"] or {"id": ""})["id"]
@@ -198,7 +198,7 @@ class Steering:
             self._moved.clear()
 
     def _link_loop(self) -> None:
-        """Apply the newest values; while a change is under way, later ones are collected."""
+        """Apply the newest settings; collect later settings while a change is under way."""
         while self._changed.wait():
             self._changed.clear()
             settings = []

@@ -33,7 +33,7 @@ CONNECTIONS_MAX = 16
 """Largest number of open connections. A further connection closes the oldest one, so that idle
 clients cannot use up the files or threads of the process."""
 KEPT = 0.25
-"""Time for which a page of metrics is reused [s]: making a page may delay the control loop."""
+"""Time for which a page of metrics is reused [s], because making one may delay the control loop."""
 CONFIG_DIGITS = 12
 """Number of hexadecimal digits of the configuration's hash in the metrics."""
 STILL_MAX = 5.0
@@ -55,8 +55,8 @@ class Answer(NamedTuple):
 class _Server(socketserver.ThreadingTCPServer):
     """Answers each request on its own thread.
 
-    `http.server.HTTPServer` may wait for a name server and is therefore not used. The queue of new
-    connections is long, so that health checks by Kubernetes succeed during a burst of connections.
+    Unlike `http.server.HTTPServer`, it never waits for a name server. The queue of new connections
+    is long, so that health checks by Kubernetes succeed during a burst of connections.
     """
 
     allow_reuse_address = True
@@ -159,7 +159,7 @@ class Exporter:
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Set whether teleop or a link is ready. For world and cloud, the records show this."""
+        """Set whether teleop or a link is ready; for world and cloud, the records show it."""
         self._seen_at = time.monotonic()
         self._said_ready = ready
 
@@ -187,7 +187,7 @@ class Exporter:
 
     @property
     def is_ready(self) -> bool:
-        """Whether `ready` was set or, in world and cloud, whether the peer's datagrams arrive."""
+        """Whether `ready(True)` was called or, in world and cloud, the peer's datagrams arrive."""
         return self._said_ready or (self._live.end is not None and self._live.end.has_peer)
 
     def serve(self, address: tuple[str, int]) -> int:

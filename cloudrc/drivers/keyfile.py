@@ -27,7 +27,7 @@ class KeyFile:
     def follow(self, now_ns: int) -> list[Fault]:
         """Reload the file if it has changed and a check is due at `now_ns` [ns, monotonic clock].
 
-        Return a record of the new key, or of the error because of which the old keys stay valid.
+        Return a record of the new key, or of the error that keeps the old keys in use.
         """
         if now_ns < self._due_ns:
             return []

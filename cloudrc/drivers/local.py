@@ -43,12 +43,12 @@ SILENCE_LIMIT = 5.0
 """Time after the last printed line at which a process counts as hung [s]. Every process prints a
 line at least once a second."""
 PAUSE = 1.0
-"""Longest turn of the supervisor's loop [s]. If a turn was longer, the supervisor was paused, and
-the time of this turn does not count for time limits."""
+"""Longest turn of the supervisor's loop [s]. A longer turn means that the supervisor was paused; it
+does not count for time limits."""
 SOCKET_NAME = "/cloudrc-12345678/teleop.sock"
 """Longest path of a socket, relative to the folder for temporary files."""
 API_FILE, AUDIT_FILE = "api.json", "audit.jsonl"
-"""Files in a run's folder: the API's address, and a log of its commands and their callers."""
+"""Files in a run's folder: the API's address, and the log of the API's commands."""
 LINK_FOLDER = "link"
 """Folder in a run's folder, for the relay's state and the profile from `cloudrc link set`."""
 JOURNAL_FILE = "missions.journal"
@@ -56,7 +56,7 @@ JOURNAL_FILE = "missions.journal"
 RELAY_LOG = "relay.log"
 """File in the folder of every run in real time."""
 RUN, SESSION = "run", "session"
-"""Kinds of flights: of `cloudrc run`, which end with their mission, and of `cloudrc up`."""
+"""Kinds of flights: a run (`cloudrc run`) ends with its mission, a session with `cloudrc down`."""
 UNANNOUNCED = "no folder for the flight file (XDG_STATE_HOME); use: cloudrc mission --api {}"
 
 
@@ -181,7 +181,7 @@ class LocalRun:
 
     Attributes:
         notes: Sentences for the report of the flight.
-        announcement: Keeps the flight file of a session, which the caller closes at its end.
+        announcement: Keeps the flight file of a session until the caller closes it.
     """
 
     def __init__(
@@ -194,12 +194,12 @@ class LocalRun:
     ) -> None:
         """Prepare a run in `folder`, which contains config.yaml; start no process yet.
 
-        The run adds world.mcap, cloud.mcap and four logs. `see` is called with the records that the
+        The run adds world.mcap, cloud.mcap and four logs. It calls `see` with the records that the
         processes print; `api` tells whether teleop serves the operator's API.
 
         With `session`, teleop waits for missions and stores them in a journal. Every process serves
-        metrics, and recordings contain the flights only. `session` is called when everything is
-        ready, with the address of the API, and the addresses HOST:PORT of the metrics by process.
+        metrics, and recordings contain the flights only. When all processes are ready, the run
+        calls `session` with the API's address, and the metrics' addresses HOST:PORT by process.
         """
         self._folder, self._see, self._api, self._session = folder, see, api, session
         self._metrics: dict[str, str] = {}

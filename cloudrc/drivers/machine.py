@@ -1,4 +1,4 @@
-"""Access to this machine: its clock, its cores, time limits, and its Python interpreter."""
+"""Identify the machine's clock, count its cores, run its Python, and measure time limits."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 PARENT = "CLOUDRC_PARENT"
 """Environment variable with the process id of the supervisor."""
 READY = "ready"
-"""Line that a process prints when it can receive datagrams, and then every `ALIVE_PERIOD`."""
+"""Line that a process prints once it can receive datagrams, and then every `ALIVE_PERIOD`."""
 ALIVE_PERIOD = 1.0
 """Time between two lines `READY` while the loop of a process runs [s]."""
 EVENTS = (GuardChange, MissionEvent, Fault, LinkChanged)
@@ -62,11 +62,11 @@ state [ns]."""
 RELEASED_PERIOD_NS = 2_000_000_000
 """Time between two records of the lateness with which the relay sends datagrams [ns]."""
 BEGINNINGS = frozenset({SessionOpened, GuardChange, MissionEvent})
-"""Types of records at which a mission may begin. The state of the link is recorded again after such
-a record, so that a recording whose earlier part is cut off contains the state, too."""
+"""Types of records at which a mission may begin. After each of them, the state of the link is
+recorded again, for recordings whose earlier part is cut off."""
 CLOCK_STEP = 0.1
 """Smallest step of the wall clock that is recorded [s]."""
-SINCE_BOOT = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # the former: Linux
+SINCE_BOOT = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # Linux has CLOCK_BOOTTIME
 NONSENSE = (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError)
 """Errors that an unreadable or malformed file can raise."""
 
@@ -219,7 +219,7 @@ class LinkNotes:
     def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
         """Return records about the link that are due at `now_ns` [ns, machine's monotonic clock].
 
-        `records` are new records of world or cloud; the `BEGINNINGS` make the state due at once.
+        `records` are new records of world or cloud; one of `BEGINNINGS` makes a record due at once.
         `slip_ns` is the lag of the records' clock behind the machine's clock [ns].
         """
         noted: list[Record] = []

@@ -33,10 +33,10 @@ BACKLOG_MAX = 2 * RECEIVE_BUFFER // 512
 """Largest number of datagrams in a wake after a stall: more than fit into the receive buffer. Linux
 doubles the requested size, and each datagram takes at least 768 bytes."""
 STALL_NS = 50_000_000
-"""If a wake is later than this [ns], the loop was stalled, and takes all waiting datagrams."""
+"""Lateness above which the loop was stalled [ns]; it then takes all waiting datagrams."""
 STALL_AGAIN_NS = 1_000_000_000
-"""Replaces `STALL_NS` in the wake after a stall [ns]: that wake is late, because the loop has just
-taken many datagrams."""
+"""Replaces `STALL_NS` in the wake after a stall [ns], which is late because the loop has just taken
+many datagrams."""
 SINK_PERIOD_NS = 20_000_000
 """Longest time between two calls of `sink` while there are records [ns]."""
 WAIT_MAX_NS = 100_000_000

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from cloudrc.record.recorder import Recorder
 
 AFTERWARDS_NS = 90_000_000_000
-"""Time for which all records are still kept after the robot has stopped following cloud [ns]: long
-enough for the landing after a loss of the link."""
+"""Time for which all records are still kept after the robot has stopped following cloud [ns]; a
+landing after a loss of the link takes less."""
 PERIODIC = (Arrival, CommandApplied, Control, GroundTruth, Lateness, TelemetrySent)
 """Types of records that world and cloud make all the time, even between flights."""
 BATCH = 16

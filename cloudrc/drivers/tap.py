@@ -1,8 +1,7 @@
-"""Send what a console shows from cloud to a Unix socket, and receive it there.
+"""Send the records that a console shows from cloud to a Unix socket, and receive them there.
 
-A datagram has one record per line, in the form of `to_line`: the newest of each type, a new
-session first. Cloud never waits: a datagram is lost when nobody listens, or when the listener does
-not keep up.
+A datagram has the newest record of each type, one per line in the form of `to_line`, a new session
+first. Cloud never waits: a datagram is lost if no listener runs, or if the listener is too slow.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ TAP_FILE = "tap.sock"
 PERIOD = 0.03
 """Average time between two datagrams [s]."""
 ALONE_PERIOD = 0.5
-"""Time between two attempts while nobody listens [s]."""
+"""Time between two attempts to send while no listener runs [s]."""
 DATAGRAM_MAX = 1 << 16
-"""Largest size of a datagram that is received [bytes]."""
+"""Size limit of a datagram [bytes]."""
 
 
 class Tap:
@@ -41,13 +40,14 @@ class Tap:
         self._path, self._telemetry = os.fspath(path), telemetry
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        self._session: list[Record] = []  # the newest, if it is new
-        self._arrival: Record | None = None  # the newest used
-        self._period: list[Record] = []  # the newest control period, after its newest arrival
+        # Newest records that have not been sent: session, used arrival, and control period.
+        self._session: list[Record] = []
+        self._arrival: Record | None = None
+        self._period: list[Record] = []  # begins with the newest arrival before the period
         self._due = 0.0
 
     def tell(self, records: Iterable[Record]) -> None:
-        """Take new records, oldest first; send a datagram if it is due."""
+        """Store the newest of new `records` (oldest first); send a datagram if one is due."""
         for record in records:
             if isinstance(record, Arrival):
                 self._arrival = record if record.used else self._arrival

@@ -32,15 +32,15 @@ TELL_NS = PERIOD_NS - 5_000_000
 ALIVE_NS = 200_000_000
 """Period of empty datagrams [ns]. Without telemetry, cloud sends them to show that it runs."""
 STALL_NS = 100_000_000
-"""If a loop is later than this [ns], it was stalled: its socket may be full of old datagrams."""
+"""Lateness above which a loop was stalled [ns]: its socket may be full of old datagrams."""
 BLIND_WAKES = 5
-"""Largest number of periods for which teleop waits for a new state of the robot after a stall."""
+"""Largest number of periods after a stall for which teleop waits for a new state of the robot."""
 SILENCE_NS = 1_000_000_000
 """Time without a datagram from teleop after which cloud reports a fault [ns]."""
 EVENTS_KEPT = 256
 """Largest number of mission events that teleop stores while cloud does not accept them."""
 LAST_WORD_NS = 800_000_000
-"""Time for which cloud, when asked to end, still forwards teleop's request to hold [ns]; a process
+"""Time for which cloud, when it has to end, still forwards teleop's request to hold [ns]. A process
 has 1.5 s to end."""
 Encode = Callable[[Any], bytes]
 Decode = Callable[[bytes], Any]
@@ -104,7 +104,7 @@ class RemoteTeleop:
 
     def __init__(self, peer: UnixPeer, encode: Encode, decode: Decode, start_ns: int) -> None:
         self._peer, self._encode, self._decode = peer, encode, decode
-        # Time of teleop's last datagram; before the first one, of the first telemetry for teleop.
+        # Time of teleop's last datagram; before one, time of the first telemetry sent to teleop.
         self._heard_ns: int | None = None
         self._silent = self._stalled = False
         self._tell_ns = self._looked_ns = self._alive_ns = start_ns
@@ -138,7 +138,7 @@ class RemoteTeleop:
         heard_ns = now_ns if self._heard_ns is None else self._heard_ns
         if not self._silent and now_ns - heard_ns > SILENCE_NS:
             self._silent = True
-            text = "no word from teleop for 1 s: the last setpoint is kept; see teleop's log"
+            text = "no message from teleop for 1 s: the last setpoint is kept; see teleop's log"
             self.outputs.append(Fault(now_ns, "teleop_silent", text))
 
     def take_outputs(self) -> list[Any]:

@@ -22,7 +22,7 @@ from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind, peek
 Sink = Callable[[list[Record], list[Record]], None]
 """Function that is called with the new records of world and the new records of cloud."""
 CPU_CLOCK = time.thread_time_ns
-"""Clock of the processor time of this thread [ns], which makes a flight not repeatable."""
+"""Clock of this thread's processor time [ns]; a flight that depends on it is not repeatable."""
 COMMAND = int(Kind.COMMAND)  # looking up a member of an enum is slow
 PERIOD_NS = 100_000_000
 """Virtual time between two calls of `sink` and of `until` [ns]."""

@@ -37,7 +37,7 @@ STATE = Odometry(10**9, (1.0, -2.0, 0.7), (0.6, 0.0, 0.0, 0.8), (0.5, 0.3, -0.2)
 
 
 def _horizons(build: Callable[[], Any], *delays: float, hold: float = 0.0) -> Any:
-    """Return the horizons before and after each loop delay [s] with a hold time [s] in it."""
+    """Return the horizons [s] before and after each loop delay [s], which contains `hold` [s]."""
     estimator = build()
     seen = [estimator.horizon(7.0)]
     for delay in delays:
@@ -76,7 +76,7 @@ class Formula(NamedTuple):
     measure: Callable[[Callable[..., Any]], Any]
 
     def score(self, files: Mapping[str, str]) -> tuple[float, str]:
-        """Return 1 and a text, or raise a BadInputError; `files` has one part -> its path."""
+        """Return 1 and a text, or raise a BadInputError; `files` maps the part to its file."""
         ((part, path),) = files.items()
         builds = (partial(plugins.load, f"{part}s", name) for name in (path, PARTS[part][2]))
         seen, wanted = (np.asarray(self.measure(build), dtype=float) for build in builds)
@@ -90,7 +90,7 @@ class Formula(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """A flight; a metric with the value `full` gives all points, with `none` no points."""
+    """A flight; the value `full` of its metric gives all points, the value `none` gives none."""
 
     test: str
     points: int
@@ -101,7 +101,7 @@ class Flight(NamedTuple):
     none: float  # any unit
 
     def score(self, files: Mapping[str, str]) -> tuple[float, str]:
-        """Return a share of the points in [0, 1], and a text; `files` has part -> its path."""
+        """Return a share of the points in [0, 1], and a text; `files` maps parts to their files."""
         chosen = {f"cloud.{part}": path for part, path in files.items()}
         result = fly(self.experiment, {**chosen, "link.profile": self.link})
         value = result.numbers.get(self.metric, self.none)
@@ -168,7 +168,7 @@ def run(part: str, folder: Path) -> list[dict[str, Any]]:
 
 
 def _explain(error: BaseException, part: str, files: Mapping[str, str]) -> str:
-    """Describe an error; begin with the line of a student's file that failed, or else a method."""
+    """Describe an error; begin with the failed line of a student's file, or with its method."""
     while isinstance(error, CloudrcError) and error.__cause__ is not None:
         error = error.__cause__
     places = [(each.filename, each.lineno) for each in traceback.extract_tb(error.__traceback__)]

@@ -13,7 +13,7 @@ from cloudrc.messages import ZERO, Odometry, Setpoint, Vector
 
 
 class StudentController(Controller):
-    """From the predicted position to a velocity command."""
+    """Computes a velocity command from the predicted position."""
 
     def __init__(self, p: Vector, i: Vector, d: Vector, velocity_max: Vector) -> None:
         """Take `p` [1/s], `i` [1/s^2], `d` [1] and `velocity_max` [m/s], each for x, y and z."""
@@ -35,6 +35,6 @@ def build(
 ) -> StudentController:
     """Make a controller of `gain_p` [1/s], `gain_i` [1/s^2], `gain_d` [1], `velocity_max` [m/s].
 
-    The defaults are the published gains, and a limit that they hardly reach.
+    The defaults are the published gains, and a limit that the commands hardly reach.
     """
     return StudentController(gain_p, gain_i, gain_d, velocity_max)

@@ -11,7 +11,7 @@ from cloudrc.messages import Odometry
 
 
 class StudentPredictor(Predictor):
-    """Prediction with constant velocity and constant angular velocity."""
+    """Predicts with constant velocity and constant angular velocity."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
         """Return the odometry after `horizon` [s], tau; its `stamp_ns` [ns] is later by tau.

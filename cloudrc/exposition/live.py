@@ -46,11 +46,11 @@ from cloudrc.records import (
 )
 
 ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total")
-"""Metrics that only one kind of shaper has; they are left out while there is no count for them."""
+"""Metrics that only relay or only netem has; without a count they are left out."""
 
 
 class LinkVerdict:
-    """Newest verdict of world or cloud on the direction of the link that this process receives."""
+    """Newest verdict of world or cloud on its incoming direction of the link."""
 
     def __init__(self, direction: str) -> None:
         """Set the direction, "uplink" or "downlink"; the first verdict is "open"."""
@@ -71,7 +71,7 @@ class LinkVerdict:
     def text(self) -> str:
         """Return the content of /link.json: the verdict on the link, and a row per quantity."""
         rows = [record._asdict() for record in self._newest]
-        for row in rows:  # these are equal in all rows
+        for row in rows:  # fields that are equal in all rows
             del row["stamp_ns"], row["uplink"]
         known = [{key: value for key, value in row.items() if value == value} for row in rows]
         document = {"direction": self._direction, "verdict": self.verdict, "rows": known}
@@ -117,7 +117,6 @@ class End:
         return self._opened_ns != NEVER_NS and self._woke_ns - self._arrival_ns < SILENCE_NS
 
     def _observe(self, name: str, seconds: float) -> None:
-        """Count a time [s] in a histogram."""
         self._histograms[f"cloudrc_{name}_seconds"].observe(seconds)
 
     def _on_arrival(self, record: Arrival) -> None:

@@ -1,7 +1,7 @@
 """Compute parts of the live metrics: histograms, lost datagrams, errors of predictions.
 
-Records are handled in the thread of the control loop, in less than 1 us each: the handlers only
-store records and count. `read` does all other work, in the thread that serves the metrics.
+The thread of the control loop stores and counts records, in less than 1 us per record. The thread
+that serves the metrics does all other work.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ Readings: TypeAlias = dict[str, "dict[Labels, float] | Histogram"]
 
 
 def unlabelled(value: float) -> dict[Labels, float]:
-    """Make an unlabelled metric's reading from `value` [its unit]; NaN becomes an empty reading."""
+    """Make the reading of a metric without labels from `value` [unit of the metric]; {} for NaN."""
     return {} if isnan(value) else {(): value}
 
 
 def per_axis(vector: Vector) -> dict[Labels, float]:
-    """Make a reading with the label `axis` from `vector` [unit of the metric]; leave NaN out."""
+    """Make the reading per axis of a `vector` [unit of the metric]; NaN is left out."""
     values = zip(AXES, vector, strict=True)
     return {(axis,): value for axis, value in values if not isnan(value)}
 
@@ -109,7 +109,7 @@ class DatagramTally:
 
 
 GAP_MAX_NS = 50_000_000
-"""Largest time between two measurements between which positions are interpolated [ns]."""
+"""Longest time between two measurements over which positions are interpolated [ns]."""
 WAITING_MAX = 256
 """Largest number of stored predictions or commands; 100 are enough for delays of 1 s."""
 
@@ -178,7 +178,7 @@ class DelayJudge:
     def echoed(self, control: Control, arrival_ns: int) -> None:
         """Compute the error of the delay estimate of a command whose echo has arrived.
 
-        The echo arrived at `arrival_ns` [ns], cloud's clock; `control` is the next control period.
+        The echo arrived at `arrival_ns` [ns], cloud's clock; `control` is the period after it.
         """
         sent = self._sent.get(arrival_ns - round(control.loop_delay * 1e9))
         if sent is not None:

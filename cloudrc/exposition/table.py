@@ -45,7 +45,7 @@ BODIES = ("pipe", "board", "floor", "other")
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
 """Outcomes of a datagram at the relay; `cloudrc.link.relay.Lanes.outcomes` explains them."""
 RELEASE_PERCENTILES = ("50", "99", "99.9")
-"""Percentiles of the relay's release error; its count of "99.9" is `release_error_p999_ns`."""
+"""Percentiles of the relay's release error; the count for "99.9" is `release_error_p999_ns`."""
 
 Labels = tuple[str, ...]
 
@@ -191,7 +191,7 @@ cloudrc_link_released_early_total = released_early: Datagrams that left the rela
 cloudrc_dns_errors_total = unresolved: Failed look-ups of the peer's name; the last known address
     stays in use.
 """
-"""All metrics: below the names of the processes that expose them, name[labels] = count: meaning."""
+"""All metrics, in blocks: the processes that expose them, then name[labels] = count: meaning."""
 _LABELS: Mapping[str, Labels] = {
     **dict.fromkeys(("version", "config"), ()),
     "role": ROLES,

@@ -73,7 +73,7 @@ def check(own: Iterable[str]) -> None:
 
 
 def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
-    """Write a note for each metric file that the experiment lists but `own` does not contain."""
+    """Return a note for each metric file in `named` (by the experiment) that is not in `own`."""
     names = set(map(name_of, own))
     return [
         f"{METRIC_NOTE}{name_of(choice)} is not measured: name its file with --metric"

@@ -20,14 +20,14 @@ def round_trips(flight: Flight) -> Columns:
 
 
 def _age_of_information(flight: Flight) -> float | None:
-    """Average the age of the odometry that cloud used [s]; None if the clocks may differ."""
+    """Average the age of the odometry that cloud used [s]; None if cloud's clock may differ."""
     if not np.isfinite(flight.during("/uplink_delay")["delay"]).any():
         return None
     return mean((flight.control["stamp_ns"] - flight.control["basis_stamp_ns"]) * 1e-9)
 
 
 def _prediction_error(flight: Flight) -> float | None:
-    """Compare prediction and truth when the command is applied: includes delay estimation errors.
+    """Compare prediction and truth when a command is applied; the delay estimate matters, too.
 
     Source: docs/reference/control.md, "Predictors".
     """
@@ -36,21 +36,21 @@ def _prediction_error(flight: Flight) -> float | None:
 
 
 def _estimate_error(flight: Flight) -> float | None:
-    """Compare prediction and truth at the predicted time: errors of the predictor alone."""
+    """Compare prediction and truth at the predicted time; only the predictor matters."""
     control = flight.control
     target_ns = control["basis_stamp_ns"] + np.rint(control["horizon"] * 1e9).astype(np.int64)
     return rms(control["position"] - flight.true_position(target_ns))
 
 
 def _delay_error(flight: Flight) -> float | None:
-    """Compare the horizon with the true delay; before the first echo there is no estimate."""
+    """Compare the horizon with the true delay, from the first echo on."""
     applied = flight.applied
     errors = applied["horizon"] - (applied["stamp_ns"] - applied["basis_stamp_ns"]) * 1e-9
     return rms(errors[np.isfinite(applied["rtt"])])
 
 
 def wakes(flight: Flight, end: str) -> Columns:
-    """Select the rows of /lateness from `end` ("world" or "cloud"); none in virtual time."""
+    """Select the wakes that `end` ("world" or "cloud") recorded; virtual time has none."""
     columns = flight.during("/lateness")
     rows = columns["end"] == end
     return {name: column[rows] for name, column in columns.items()}
@@ -101,8 +101,8 @@ add_metrics(
      lambda flight: percentile(wakes(flight, "world")["lateness"], 99.0)),
     ("cloud_lateness_p99", "s", "Lateness of cloud's wakes: 99th percentile; real time only.",
      lambda flight: percentile(wakes(flight, "cloud")["lateness"], 99.0)),
-    ("world_slip", "s", "Time that world's clock lost on the machine's clock because the "
-     "simulation was late.", _slip),
+    ("world_slip", "s", "Time by which world's clock fell behind the machine's clock because "
+     "the simulation was late.", _slip),
     ("real_time_factor", "1", "Simulated time divided by time on the machine's clock; real time "
      "only.", _real_time_factor),
     ("missed_periods", "1", "Number of periods without a command because cloud was late; "

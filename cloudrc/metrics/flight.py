@@ -73,7 +73,7 @@ class Flight:
         return (stamp_ns - (self.start_ns or 0)) * 1e-9
 
     def during(self, topic: str) -> Columns:
-        """Select the rows of a topic during the flight, including its first and last instant."""
+        """Select the rows of a topic from the first to the last instant of the flight."""
         return self._within(_columns(self.recording[topic]))
 
     def true_position(self, stamp_ns: Array) -> Array:
@@ -141,10 +141,10 @@ class Flight:
 
     @cached_property
     def applied(self) -> Columns:
-        """Commands that world applied in the flight, with what cloud recorded when it sent them.
+        """Commands that world applied in the flight, with the values of their control periods.
 
-        `stamp_ns` is the time of application [ns], `position` the predicted position [m]. A plan is
-        played on its own time line, so `stamp_ns` is then the time for which it was computed.
+        `stamp_ns` is the time of application or, for a command with a plan, the start of the plan
+        [ns]; `position` is the predicted position [m].
         """
         columns = self.join_control(self.during("/command_applied"))
         planned, stamp = columns["planned_ns"], columns["stamp_ns"]

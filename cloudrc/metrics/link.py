@@ -1,6 +1,6 @@
 """Metrics of each direction of the link: delays, losses, late datagrams, and the relay's counters.
 
-The delay includes late datagrams. Without them, only the fast datagrams would count.
+The mean delay includes datagrams that were too late to be used.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ WAYS = {"uplink": "from world to cloud", "downlink": "from cloud to world"}
 SENT = {"uplink": "/telemetry", "downlink": "/delay_estimate"}
 """Direction -> topic with one row for each datagram that is sent in this direction."""
 SETTLING_NS = 2_000_000_000
-"""Time after sending at which a datagram that has not arrived counts as lost [ns]."""
+"""Time after sending from which on a missing datagram counts as lost [ns]."""
 PERCENTILES = {"p50": "median", "p99": "99th percentile", "p999": "99.9th percentile"}
 COUNTS = {
     "relay_overflow": "that the relay dropped because its queue was full.",

@@ -12,7 +12,7 @@ from cloudrc.messages import GuardState
 from cloudrc.metrics.flight import Array, Flight, Measure, add_metrics, mean
 
 BOARD = "board"
-"""Name of the board, which the arm must touch, in the scene."""
+"""Name in the scene of the board that the arm must touch."""
 IMPACT_NS = 100_000_000
 """Time from the first touch over which the impulse is summed [ns]: the impact and its bounces."""
 ODOMETRY_NS = 10_000_000
@@ -70,7 +70,7 @@ def _waypoints_reached(flight: Flight) -> float | None:
 def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
     """Return whether the robot truly stayed at a waypoint for its dwell time before an instant.
 
-    With a carrot, the dwell time is that of the carrot, and the robot has to come near only.
+    With a carrot, the setpoint waits for the dwell time; the robot only has to come near.
     """
     truth, dwell = flight.truth, 0.0 if flight.mission.carrot else waypoint.dwell_s
     rows = truth["stamp_ns"] <= until_ns
@@ -84,7 +84,7 @@ def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
 
 
 def _of_touch(measure: Callable[[Flight, dict[str, Array]], float | None]) -> Measure:
-    """Make a metric of the first touch of the board, unknown without a touch."""
+    """Make a metric from a function of the first touch of the board; None without a touch."""
 
     def measured(flight: Flight) -> float | None:
         touch = first_touch(flight)
@@ -153,7 +153,7 @@ def _steady_error(flight: Flight, axis: int) -> float | None:
 
 
 def _fault_count(flight: Flight) -> float | None:
-    """Count the faults. Repetitions are in the fault's counter; the fault is recorded only once."""
+    """Count the faults; a fault that repeats is recorded once, and a counter has its number."""
     totals, count = dict.fromkeys(flight.recording["/fault"]["code"], 1), flight.recording["/count"]
     for name, total in zip(count["name"], count["total"], strict=True):
         if name in FAILURES:  # the largest total: a cloud that restarts counts from 0

@@ -15,13 +15,13 @@ import numpy as np
 from cloudrc.metrics.flight import Array, Flight, add_metrics, mean, percentile
 
 SHORTEST_NS = 500_000_000
-"""Shortest step, and the part at the end of a step in which the robot must have settled [ns]."""
+"""Shortest duration of a step, and its last part, in which the robot must have settled [ns]."""
 LENGTH_MIN = 0.05
-"""Shortest distance of a step [m]; the values of a shorter one would be noise."""
+"""Shortest length of a step [m]; the values of a shorter step would be noise."""
 BAND = 0.05
-"""Settled means: an error of at most this share of the step [1]."""
+"""Largest error of a settled robot, as a share of the step's length [1]."""
 RISE = 0.1, 0.9
-"""Shares of the step between which the rise time is measured [1]."""
+"""Shares of the step's length between which the rise time is measured [1]."""
 GROWTH_MIN = 0.15
 """Smallest amplitude of an unstable oscillation [m]; less may be noise."""
 
@@ -115,7 +115,7 @@ def _grows(error: Array) -> bool:
     """Return whether an error along one axis [m] oscillates without decay, shape (n,).
 
     A half-wave lies between two changes of sign; the part before the first change is the step
-    itself. The oscillation is unstable if a half-wave is as large as the one of the same sign
+    itself. The error does not decay if a half-wave is as large as the half-wave of the same sign
     before it, and larger than `GROWTH_MIN`.
     """
     crossings = np.flatnonzero(np.signbit(error[1:]) != np.signbit(error[:-1])) + 1

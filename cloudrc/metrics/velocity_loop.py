@@ -26,13 +26,13 @@ OUTPUTS = {"/ground_truth": "velocity", "/odometry": "velocity"}
 DT = 0.01
 """Time between two samples of the fit [s]."""
 START = 100
-"""Number of samples at the start that the fit leaves out: the input before them is unknown."""
+"""Number of first samples that the fit leaves out, because the earlier input is unknown."""
 TAKE_OFF = 2.0
 """Time after the beginning of TRACK that is left out [s]."""
 BLOCKS, T_QUANTILE = 10, 2.262
 """Number of blocks, and the 97.5 % quantile of Student's t with 9 degrees of freedom."""
 DURATION_MIN, DEVIATION_MIN, SHARE_MIN = 20.0, 0.1, 0.8
-"""Least duration [s], standard deviation of the input [m/s], and explained share of variance."""
+"""Least duration [s], deviation of the input [m/s], and explained share [1] for a valid fit."""
 
 
 class Fit(NamedTuple):
@@ -44,7 +44,7 @@ class Fit(NamedTuple):
 
 
 def series(recording: Recording, name: str) -> tuple[Array, Array, tuple[str, str]]:
-    """Return input and output velocities [m/s], shape (n, 3), each DT, and their topics.
+    """Return input and output velocities [m/s], shape (n, 3), at steps of DT, and their topics.
 
     The samples are from the longest time in TRACK, without the take-off; from the whole recording
     if it does not contain the guard's states. `name` is the recording's name in error messages.

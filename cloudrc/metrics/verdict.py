@@ -37,7 +37,7 @@ EXIT_CODES = {"success": 0, "failure": 1, "invalid": 6, "interrupted": 130}
 PLUGIN_FAILURES_MAX = 0.01
 """Largest share of periods in which a plug-in may fail in a valid flight, in [0, 1]."""
 BROKEN_OFF = ("interrupted", "cancelled", "disk_full")
-"""Codes of an `Ending` after which unmet goals are no failure."""
+"""Codes of an `Ending` that interrupts a mission; the goals then need not be met."""
 ADVICE = "close other programs or give the run more cores"
 
 Outcome = Literal["success", "failure", "invalid", "interrupted"]
@@ -244,7 +244,7 @@ def _restarts(flight: Flight) -> Iterator[Failure]:
 
 
 def _plugins(flight: Flight) -> Iterator[Failure]:
-    """Yield the plug-ins that failed so often that the numbers are those of other plug-ins."""
+    """Yield a failure for each plug-in that failed in too many control periods."""
     periods, faults = len(flight.recording["/delay_estimate"]), flight.recording["/fault"]
     for kind in ("estimator", "predictor", "controller"):
         share = (flight.last_total(f"{kind}_failed") or 0.0) / max(periods, 1)
@@ -259,7 +259,7 @@ def _plugins(flight: Flight) -> Iterator[Failure]:
 
 
 def _responses(flight: Flight, settle: float) -> Iterator[Failure]:
-    """Yield that steps did not settle within `settle` [m], and that the loop is unstable."""
+    """Yield failures for steps that did not settle within `settle` [m], and for instability."""
     found, unit = steps(flight), "step" if flight.mission.steps else "waypoint"
     far = [step for step in found if step.last_error > settle]
     if far and flight.mission.steps:
@@ -311,9 +311,9 @@ def _why_grounded(flight: Flight) -> str:
 def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, Number]) -> Verdict:
     """Judge a recorded mission with only what the operator knows when the mission ends.
 
-    The operator judges waypoints by the measured position. Contacts that telemetry reports only
-    after the end do not count. The operator does not know the report's time limit, and judges
-    timing only by the real-time factor. All other facts are those of the report's `evidence`.
+    The operator judges waypoints by the measured position, and timing by the real-time factor. The
+    operator knows neither the report's time limit, nor contacts that telemetry reports only after
+    the end. All other facts are those of the report's `evidence`.
     """
     basis = flight.control["basis_stamp_ns"]
     seen_ns = int(basis[-1]) if len(basis) else 0

@@ -41,7 +41,7 @@ from cloudrc.teleop.store import (
 from cloudrc.teleop.wire import Leg
 
 LOOK_PERIOD = 0.1
-"""Time between two checks for new events, for the stream of events [s]."""
+"""Time between two checks of an event stream for new events [s]."""
 ALIVE_PERIOD = 10.0
 """Time without an event after which the event stream sends a comment to the client [s]."""
 ANSWER_LIMIT = 2.0
@@ -55,9 +55,9 @@ STATUSES = {BadInputError: 422, ConflictError: 409, UnknownMissionError: 404, Un
 REASONS = {
     **{status: text for status, (_, text) in REFUSED.items()},
     404: "There is no such mission",
-    409: "The state does not allow it; `id` names the mission in the way",
+    409: "The state of mission or robot forbids it; `id` names the mission in the way",
     413: f"The body is longer than {BODY_MAX // 1024} KiB",
-    422: "A value cannot be used; `problems` has every one",
+    422: "A value cannot be used; `problems` lists all such values",
     503: "Not now: teleop starts or ends, another teleop has the journal, or the disk refuses it. "
     "Or teleop did not answer within 2 s; look at the state, because it may still act. Cloud "
     "receives an emergency stop all the same, unless another teleop has the journal",
@@ -76,19 +76,19 @@ operator's token may also command. `POST /v1/estop` stops the rotors at once. Te
 """
 STARTING = "teleop is starting"
 Call: TypeAlias = Callable[[MissionService, int], Any]
-"""Function of the service and the time [ns] that makes a call and returns the answer."""
+"""Call of the mission service: takes the service and the time [ns], and returns the answer."""
 Urgent: TypeAlias = Literal["stop", "hold", ""]
 Address: TypeAlias = tuple[str, int] | Path
 """Host and port, or the path of a Unix socket."""
 
 
 class Bridge:
-    """Queue the API's calls of the mission service for teleop's loop."""
+    """Pass calls of the mission service from the API's thread to teleop's loop, by queues."""
 
     def __init__(self) -> None:
         self.closed = STARTING  # why the bridge refuses calls, in words; "" while it accepts calls
         self.alarm: Callable[[], Any] = lambda: None  # sends an emergency stop to cloud at once
-        self.overtakings = 0  # number of stops and holds so far, which overtake all other calls
+        self.overtakings = 0  # number of stops and holds so far; they overtake all other calls
         self._urgent: deque[tuple[Call, Future[Any]]] = deque()  # stops and holds
         self._calls: deque[tuple[Call, Future[Any]]] = deque()
         self._service: MissionService | None = None
@@ -117,7 +117,7 @@ class Bridge:
         return future
 
     async def ask(self, call: Call, urgent: Urgent = "") -> Any:
-        """Queue a call and return its result; for a stop, also send the alarm at once.
+        """Queue a call and return its result; for a stop, also call `alarm` at once.
 
         Raise an UnavailableError if the bridge is closed, or if the loop does not answer within
         `ANSWER_LIMIT`. An urgent call then stays queued; any other call is withdrawn.
@@ -130,7 +130,7 @@ class Bridge:
         try:
             return await asyncio.wait_for(asyncio.shield(asked) if urgent else asked, ANSWER_LIMIT)
         except TimeoutError:
-            text = "teleop did not answer in time, but may do it yet: look before you try again"
+            text = "teleop did not answer in time, but may still act; look at the state first"
             raise UnavailableError(text) from None
 
     async def move(self, call: Call) -> Any:
@@ -139,7 +139,7 @@ class Bridge:
 
         def checked(service: MissionService, now_ns: int) -> Any:
             if self.overtakings != known:
-                raise ConflictError("a stop or a hold was asked for since; look, then ask again")
+                raise ConflictError("a later stop or hold cancels this; look at the state first")
             return call(service, now_ns)
 
         return await self.ask(checked)
@@ -173,8 +173,8 @@ def create_app(
 ) -> FastAPI:
     """Make the ASGI application of the API; run it behind a `Gate`, which checks the tokens.
 
-    `read_order` and `read_goto` read and check the body of a request that orders a mission, or a
-    flight to a point. `complain` receives one line about each internal error.
+    `read_order` reads and checks the body of an order to fly a mission, `read_goto` the body of an
+    order to fly to a point. `complain` receives one line about each internal error.
     """
     app = FastAPI(
         title="cloudrc teleop",
@@ -302,9 +302,9 @@ async def go_to(body: Body, bridge: Bridged, request: Request) -> Any:
 async def drive(body: Body, bridge: Bridged) -> Any:
     """Drive the setpoint by hand, during a held mission or as a new mission.
 
-    The setpoint takes up the velocity with at most 2 m/s^2, and stays inside the fence. Repeat this
-    request, 10 times a second for example: 0.5 s after the last one the setpoint brakes and rests,
-    and the robot holds there. After a hold, a stop or the end of a mission, let go first: send the
+    The setpoint accelerates to the velocity with at most 2 m/s^2 and stays inside the fence. Repeat
+    this request, for example 10 times a second: 0.5 s after the last request the setpoint brakes to
+    rest, and the robot holds there. After a hold, a stop or the end of a mission, let go: send the
     velocity zero, or nothing for 0.5 s. 409 while a mission flies.
     """
     velocity = models.read_drive(body)

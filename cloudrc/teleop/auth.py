@@ -37,10 +37,10 @@ READS = ("GET", "HEAD")
 URGENT = ("/v1/estop", "/v1/hold")
 """Paths of commands that are accepted even if too many requests are open."""
 STEERING = "/v1/drive"
-"""The audit log has only refused requests of this path, which a driver repeats at 10 Hz. The events
-of the mission show that it is driven."""
+"""Path of requests to drive, which an operator repeats at 10 Hz. Therefore the audit log contains
+only the refused ones."""
 ORDERS = ("/v1/missions", "/v1/goto")
-"""Paths of orders (to fly a mission, to fly to a point); refused orders are counted by reason."""
+"""Paths of orders to fly a mission or to a point; refused orders are counted by reason."""
 COUNTED = {409: "order_conflict", 413: "order_invalid", 422: "order_invalid"}
 """HTTP status of a refused order -> name of the counter."""
 REFUSED = {
@@ -164,13 +164,13 @@ class Gate:
     """Check token and role of every request before the application gets the request."""
 
     def __init__(self, app: ASGIApp, tokens: Tokens | None, audit: Audit | None = None) -> None:
-        """Put a gate in front of `app`; without `tokens`, everybody who can connect may command."""
+        """Set the application, `app`; without `tokens`, everybody who can connect may command."""
         self._app, self.tokens, self.audit = app, tokens, audit
         self._in_flight: Counter[str] = Counter()
         self.counts: Counter[str] = Counter()  # requests by outcome; "served": answered by `app`
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse a request, or remove a slash at its path's end and pass it to the application."""
+        """Refuse a request, or pass it to the application without the slash at its path's end."""
         path = scope["path"] = scope["path"].rstrip("/") or "/"
         # An event stream calls `caller` again, because the stream can outlast its token.
         caller, scope["caller"] = await self.caller(scope), lambda: self.caller(scope)

@@ -1,11 +1,11 @@
 """Compute where a moving setpoint, the carrot, is at any time.
 
-The carrot moves straight to its end, with a trapezoid profile of the speed: it accelerates from
-rest, moves at constant speed, and comes to rest at the end. The motion depends on time alone, so
-that cloud and teleop agree on it, and cloud knows the future of the reference.
+The carrot moves in a straight line to a waypoint with a trapezoidal speed profile: it accelerates
+from rest, moves at constant speed, and brakes to rest at the waypoint. The motion depends on time
+alone: teleop and cloud compute the same motion, and cloud can compute future setpoints.
 
 A setpoint that is driven by hand moves with the velocity of the operator's last request. If no
-request follows, the setpoint brakes and rests, even if teleop has ended meanwhile.
+other request follows, the setpoint brakes to rest, even if teleop has ended.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from cloudrc.geometry.fence import INNER_HIGH, INNER_LOW
 from cloudrc.messages import ZERO, Drive, Motion, Setpoint, Vector
 
 HEARTBEAT_NS = 500_000_000
-"""Time after a request to drive at which the setpoint begins to brake [ns]."""
+"""Time from the last request to drive until the setpoint begins to brake [ns]."""
 SPEED_MAX, ACCELERATION = 1.5, 2.0
 """Largest speed [m/s] and acceleration [m/s^2] of a setpoint that is driven by hand. The guard
 limits the acceleration of the robot to 3 m/s^2."""
-_new = tuple.__new__  # makes a named tuple twice as fast as its class does
+_new = tuple.__new__  # makes a named tuple in half the time of a call of its class
 
 
 def arrival_ns(setpoint: Setpoint) -> int:
-    """Return when a carrot comes to rest [ns]; 0 if the setpoint never moves."""
+    """Return the time at which a carrot comes to rest [ns], cloud's clock; 0 if it never moves."""
     if setpoint.motion is None:
         return 0
     _, _, total = _profile(setpoint)
@@ -61,7 +61,7 @@ def setpoint_at(setpoint: Setpoint, now_ns: int) -> Setpoint:
 
 
 def _profile(setpoint: Setpoint) -> tuple[float, float, float]:
-    """Return the distance [m], the time of the acceleration [s] and the time in all [s]."""
+    """Return a carrot's distance [m], the time of its acceleration [s], and its total time [s]."""
     motion = setpoint.motion
     assert isinstance(motion, Motion), "the setpoint rests, or is driven"
     distance, acceleration = dist(motion.start, setpoint.position), motion.acceleration
@@ -70,9 +70,9 @@ def _profile(setpoint: Setpoint) -> tuple[float, float, float]:
 
 
 def steer(setpoint: Setpoint, velocity: Vector, now_ns: int) -> Setpoint:
-    """Drive a setpoint with a velocity [m/s], world frame, from where it is at `now_ns` [ns].
+    """Return the setpoint driven with a `velocity` [m/s], world frame, from `now_ns` [ns] on.
 
-    It slows down before the box in which the guard lets the robot fly, and does not leave the box.
+    It stays in the box in which the guard lets the robot fly, and slows down before a wall.
     """
     start, yaw, _, _, before, _ = setpoint_at(setpoint, now_ns)
     x, y, z = (
@@ -85,7 +85,7 @@ def steer(setpoint: Setpoint, velocity: Vector, now_ns: int) -> Setpoint:
 
 
 def _speed_within(distance: float) -> float:
-    """Return the speed [m/s] from which an abandoned setpoint comes to rest in `distance` [m]."""
+    """Return the speed [m/s] from which a setpoint without requests stops in `distance` [m]."""
     wait = HEARTBEAT_NS * 1e-9
     return ACCELERATION * (sqrt(wait * wait + 2.0 * max(distance, 0.0) / ACCELERATION) - wait)
 
@@ -106,7 +106,7 @@ def _driven(setpoint: Setpoint, drive: Drive, now_ns: int) -> Setpoint:
 def _change(
     position: Vector, before: Vector, after: Vector, acceleration: float, time: float
 ) -> tuple[Vector, Vector]:
-    """Return position and velocity after `time` [s], in which a velocity changes to `after`."""
+    """Return position [m] and velocity [m/s] `time` [s] after a velocity began to change."""
     ramp = dist(before, after) / acceleration
     share = min(time / ramp, 1.0) if ramp else 1.0
     rising, steady = min(time, ramp), max(time - ramp, 0.0)

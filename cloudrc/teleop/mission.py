@@ -11,9 +11,10 @@ world, a guard in LAND or an emergency stop leads to FAILED. At the end of a mis
 robot to hold. The request may be late or lost; therefore teleop also makes the robot's position the
 setpoint.
 
-In a mission with a carrot the setpoint moves by time alone, so that the network does not change the
-duration. The carrot leaves a waypoint only if telemetry shows the robot near it. While the guard
-does not follow cloud's commands, a carrot or a setpoint that is driven by hand rests at the robot.
+A carrot is a setpoint that moves to the next waypoint. Its motion depends on time alone, so that
+the link's delay does not change the duration of a mission. The carrot leaves a waypoint only if
+telemetry shows the robot near the waypoint. While the guard ignores cloud's commands, a carrot, or
+a setpoint that is driven by hand, stays at the robot.
 """
 
 from __future__ import annotations
@@ -65,15 +66,15 @@ NO_WAYPOINT = -1
 UNDER_WAY = FLYING, STARTING, HELD
 """States of a mission that has begun and has not ended."""
 GAP_MAX_NS = 500_000_000
-"""If telemetry was missing for longer, only this time counts as time of flight [ns], and the carrot
-starts again from the robot."""
+"""Longest gap in telemetry that counts in full as time of flight [ns]. Of a longer gap only this
+time counts, and the carrot starts again from the robot."""
 PROMPT_NS = 100_000_000
-"""The carrot leaves a waypoint at the planned time if telemetry shows at most this time later that
-the robot is there [ns]; else it leaves at that later time."""
+"""Tolerance for late telemetry [ns]. If telemetry shows the robot at the waypoint at most this long
+after the planned time, the carrot leaves as planned, else when telemetry shows the robot there."""
 UNSEEN_MAX_NS = 2_000_000_000
-"""Time without telemetry after which the dwell time at a waypoint starts again [ns]."""
+"""Longest time without telemetry after which the dwell time at a waypoint continues [ns]."""
 JUMP_SPEED = 6.0
-"""On a part of a track that is faster than this, the setpoint jumps [m/s]."""
+"""Highest speed of the setpoint on a track [m/s]; along a faster part the setpoint jumps."""
 GROUND, TRACK, HOLD, _, ESTOP = GuardState  # to look up a member takes time
 
 
@@ -134,9 +135,9 @@ class Teleop:
         self.stopping = False  # whether telemetry has not yet shown a requested ESTOP
         self._stop_ns, self._is_ended = 0, ended
         self._plan, self._mission_id, self._began_ns = NO_PLAN, 0, 0
-        self._continued = self._was_held = False  # by an earlier teleop
+        self._continued = self._was_held = False  # mission begun, and held, by an earlier teleop
         self._world = ""  # process of world in which the mission started; "": any
-        self._expected: tuple[int, ...] = ()  # missions that the robot may report; empty: any
+        self._expected: tuple[int, ...] = ()  # numbers that the robot may report; empty: any
         self._watch = LegWatch()
         self._setpoint: Setpoint | None = None
         self._is_pending = False  # whether the mission's first setpoint has not been sent yet
@@ -144,8 +145,8 @@ class Teleop:
         self._seen_ns = NEVER_NS
         # Whether the robot has followed commands in this mission, and whether the carrot waits.
         self._followed = self._waits = False
-        self._released_ns = NEVER_NS  # when the operator is lost; NEVER_NS if nobody drives
-        self._knot = -1  # of the track, from which the setpoint has started
+        self._released_ns = NEVER_NS  # end of the wait for a request to drive; or NEVER_NS
+        self._knot = -1  # index of the point of the track that the setpoint has left last
 
     @property
     def settled(self) -> bool:
@@ -198,7 +199,7 @@ class Teleop:
         self._hold(now_ns)
 
     def drive(self, now_ns: int, velocity: Vector) -> None:
-        """Move the setpoint with a velocity [m/s], world frame, while the operator repeats this.
+        """Move the setpoint with `velocity` [m/s], world frame, for at most `HEARTBEAT_NS`.
 
         The setpoint moves only while telemetry shows that the robot follows commands. Raise
         BadInputError unless the mission is held or begins held.
@@ -331,8 +332,8 @@ class Teleop:
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
         """Keep the robot at its position, because its mission is not one of this teleop.
 
-        If the robot stands on the ground, or if its mission has ended, teleop also asks it to end
-        that mission.
+        If the robot stands on the ground, or if its mission has ended, teleop also requests the end
+        of that mission.
         """
         mission_id = seen.mission_id
         over = self._is_ended(mission_id) or (seen.guard is GROUND and mission_id != 0)
@@ -382,9 +383,9 @@ class Teleop:
             self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
 
     def _lead(self, seen: RobotStatus, now_ns: int) -> None:
-        """Let the carrot wait at the robot, or start it again from there, if that is necessary.
+        """Keep the carrot at the robot while the guard ignores commands; then start it again there.
 
-        The carrot does not wait for the take-off: a round trip would be lost.
+        The carrot does not wait for the take-off, because this would take a round trip.
         """
         self._followed = self._followed or seen.guard is TRACK
         if seen.guard is not TRACK and (self._followed or seen.guard is not GROUND):
@@ -395,7 +396,7 @@ class Teleop:
             self._select_leg(self.leg, now_ns)
 
     def _follow_track(self, now_ns: int) -> None:
-        """Start the setpoint from each point of the track when its time has come."""
+        """Move the setpoint from each point of the track to the next, at the time of the point."""
         track = self._plan.track
         knot = bisect_right(track, self.elapsed(now_ns), key=lambda each: each[0]) - 1
         if not self._knot < knot < len(track) - 1:
@@ -419,7 +420,7 @@ class Teleop:
         return near and leaves_ns is not None and now_ns >= leaves_ns
 
     def _leaves_ns(self, leg: int) -> int | None:
-        """Return when the carrot has rested at a waypoint [ns]; None if it is not on this way."""
+        """Return when the dwell time of a carrot at a waypoint ends [ns]; None without a carrot."""
         setpoint = self._setpoint
         if setpoint is None or type(setpoint.motion) is not Motion or setpoint.waypoint != leg:
             return None
@@ -477,7 +478,7 @@ class Teleop:
             self._select_leg(leg, now_ns)
 
     def _repeat_setpoint(self, now_ns: int) -> None:
-        """Send the setpoint again in a new session, or the robot's position while it may move."""
+        """Send the setpoint again; while the robot `_may_move`, send its position instead."""
         if self.state == STARTING and self._may_move:
             self._is_pending = True
             self._select_here()
@@ -515,7 +516,7 @@ class Teleop:
 
     @property
     def where(self) -> str:
-        """The way to the current waypoint in words, for events."""
+        """The place in the mission for texts of events: "on the way to waypoint 1 of 7"."""
         return f"on the way to {self._leg_name}"
 
     @property

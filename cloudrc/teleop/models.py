@@ -1,7 +1,7 @@
-"""Define the requests and answers of the API, and check the orders in requests.
+"""Define the requests and answers of the API, and check the missions and points in requests.
 
-The OpenAPI document comes from these models. An order has the form of a section of a configuration
-file, so that the same code checks both and describes the problems.
+The OpenAPI document is made from these models. A request has the form of a section of a
+configuration file, so that the same code checks both and describes the problems.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ class Seen(_Answer):
     next_step: str = _field("What the robot does next, or what the operator has to do")
     pipe_contacts: int = _field("Number of contacts with pipes so far")
     touch_speed_mps: float | None = _field("Speed of the arm's tip when it touched the board [m/s]")
-    horizon_s: float | None = _field("Time by which cloud predicts ahead [s]")
+    horizon_s: float | None = _field("Prediction horizon of cloud's last command [s]")
     rtt_s: float | None = _field("Last round trip, without the waiting time on board [s]")
     loop_delay_s: float | None = _field("Last round trip, with the waiting time on board [s]")
 
@@ -270,7 +270,7 @@ def read_drive(body: bytes) -> Vector:
 
 
 def leads_to_board(mission: Mission, scene: Scene) -> bool:
-    """Return whether the arm's tip reaches the board's face, or beyond, at any waypoint."""
+    """Return whether the arm's tip is at or behind the board's face at any waypoint."""
     board = scene.board
     if board is None:
         return False

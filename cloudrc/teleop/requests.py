@@ -14,11 +14,11 @@ UNNUMBERED = 0
 NOT_ENDED = (-1, 0)
 """Epoch and request number that mean: the robot has not ended a mission."""
 IDLE_NS = 3_000_000_000
-"""Time for which a robot may hold or stand during a mission [ns]. Then teleop sends the start
-again, because somebody else has probably stopped the robot."""
+"""Longest time for which a robot may hold or stand in a mission [ns]. After it, teleop sends the
+start again, because somebody else has probably stopped the robot."""
 PREDECESSORS = 1_000
-"""Smallest rise of the request number by a new teleop process: telemetry may not show the last
-requests of the earlier process yet."""
+"""A new teleop process raises the request number by at least this value, because telemetry may not
+show the last requests of the earlier process yet."""
 CLOCK_MAX = 65_536
 """A new teleop process adds the time in units of 100 ms, modulo this value, to its first request
 number, so that two new processes have different numbers."""
@@ -40,8 +40,8 @@ class RequestSender:
         self._progress = OperatorRequest(UNNUMBERED, Request.PROGRESS)
         self._number = UNNUMBERED
         self._asked_epoch = 0
-        self._ended = NOT_ENDED  # epoch and number of an END; NOT_ENDED after a START
-        self._is_started = False  # whether the last request carried out is a START
+        self._ended = NOT_ENDED  # epoch and number of the last END; NOT_ENDED after a START
+        self._is_started = False  # whether the last request that was carried out is a START
         self._flies_ns = 0  # when the robot last flew its mission
         self._due_ns = 0
 
@@ -70,12 +70,12 @@ class RequestSender:
             self._next = asked
 
     def forget(self) -> None:
-        """Drop all requests: somebody else controls the robot, or the robot is stopped."""
+        """Drop all requests, because somebody else controls the robot or an emergency stops it."""
         self._is_started = False
         self._pending = self._next = None
 
     def report(self, mission_id: int, reached: int) -> None:
-        """Set the mission and its number of reached waypoints, which every request contains."""
+        """Set the mission and the number of reached waypoints that every request contains."""
         self._progress = self._progress._replace(mission_id=mission_id, reached=reached)
         if self._pending is None:
             self._due_ns = 0

@@ -1,7 +1,7 @@
 """Queue and fly missions, carry out the operator's commands, and report the robot's state.
 
-A new teleop process continues the mission under way at the same waypoint, unless world has
-restarted, too. It sends the emergency stop again if an earlier stop has not reached the robot.
+A new teleop process continues the mission of the earlier process at the same waypoint, unless world
+has restarted. If an emergency stop has not reached the robot, the new process sends it again.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from cloudrc.teleop.wire import HELD, QUEUED, Leg, Output, Plan, RobotStatus
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 LATCHED, AIRBORNE = (LAND, ESTOP), (TRACK, HOLD, LAND)
-"""States of the guard that only an acknowledgement ends, and states in which rotors may turn."""
+"""States of the guard that only an acknowledgement ends; states in which the rotors may turn."""
 SILENCE = 1.0
-"""Age from which on telemetry, or the last message from cloud, is too old [s]."""
+"""Age above which telemetry, or the last message from cloud, is too old [s]."""
 SETPOINT_PERIOD_NS = 100_000_000
-"""Time between two copies of the setpoint [ns]; a restarted cloud needs the copies."""
+"""Time between two copies of the setpoint [ns]; a cloud that restarts needs the copies."""
 DRIVE_LIMIT = 3600.0
 """Time limit of a mission that begins with a request to drive [s]."""
 QUEUE_MAX = 16
 """Largest number of missions that wait while another mission flies."""
 DRIVEN = "driven"
-"""State that `next_step` describes while the operator drives the robot during a held mission."""
-TAKES_OFF = "a velocity other than zero takes off, once there is telemetry"
+"""State for `next_step` while the operator drives the robot by hand during a held mission."""
+TAKES_OFF = "a velocity other than zero makes the robot take off, once telemetry has arrived"
 NEVER_BEGAN, ASKED = "mission cancelled before it began", "the robot is asked to start"
 RESTARTED = "teleop has restarted; the robot is asked to go on"
 REST = "after a stop or a landing only when it has stood still, at least 0.5 m inside the fence"
@@ -72,7 +72,7 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
     if age > SILENCE:
         return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
     if mission == DRIVEN and guard is TRACK:
-        return "the operator drives; cloudrc mission resume ends the drive, cancel the mission"
+        return "the operator drives; to end the drive: cloudrc mission resume, or cancel"
     if mission == HELD and guard is TRACK:
         return "the operator holds the mission; to continue: cloudrc mission resume, or cancel"
     return (ALONE if mission is None else IN_MISSION)[guard]
@@ -102,10 +102,10 @@ class MissionService:
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
         self._current: Mission | None = None
-        self._ends = False  # whether this process ends; the next process starts the queue
+        self._ends = False  # whether this process ends; the next process flies the queue
         self._trouble = ""  # trouble of the store that was last reported
         self._driven_ns = -HEARTBEAT_NS  # time of the last request to drive
-        self._interrupted = False  # whether the operator has to let go before driving on
+        self._interrupted = False  # whether a drive has to pause (let go) before it continues
 
     @property
     def seen(self) -> RobotStatus | None:
@@ -130,7 +130,7 @@ class MissionService:
         known = self.book.with_key(order.key)
         if known is not None:
             if (known.order.plan, known.order.contact) != (order.plan, order.contact):
-                text = f"the key '{order.key}' is that of mission {known.id}, with another plan"
+                text = f"mission {known.id} has the key '{order.key}' already, with another plan"
                 raise ConflictError(f"{text}; take a new key", known.id)
             return known, False
         waiting = self.book.open()
@@ -227,13 +227,13 @@ class MissionService:
         self._collect(now_ns)
 
     def pause(self, now_ns: int) -> None:
-        """Pause the mission under way, because this process ends; the next process continues it."""
+        """Pause the mission under way because this process ends; the next process continues it."""
         self._ends = True
         if self._start_next(now_ns) is not None:
             self._operate(self._teleop.pause, now_ns)
 
     def hear(self, now_ns: int) -> None:
-        """Store the time `now_ns` at which a message from cloud has arrived."""
+        """Record that a message from cloud has arrived at `now_ns`."""
         self._heard_ns = now_ns
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
@@ -314,7 +314,7 @@ class MissionService:
 
     @property
     def _inherits_stop(self) -> Mission | None:
-        """Mission that an earlier process stopped; None if none, or once telemetry has arrived."""
+        """Mission that an earlier process has stopped; always None after the first telemetry."""
         unknown = self.seen is None and not self._teleop.stopping
         return self.book.stopped() if unknown else None
 

@@ -52,8 +52,8 @@ class Mission:
     elapsed: float = 0.0  # duration of the mission at its last event [s]
     reached: list[dict[str, Any]] = field(default_factory=list)  # waypoints with their times [s]
     events: deque[Event] = field(default_factory=lambda: deque(maxlen=SHOWN))  # the newest
-    happened: Counter[str] = field(default_factory=Counter)  # all events, by kind
-    witness: Observations = field(default_factory=Observations)  # what the robot has touched
+    happened: Counter[str] = field(default_factory=Counter)  # number of events, by kind
+    witness: Observations = field(default_factory=Observations)  # contacts in telemetry, and slip
     verdict: dict[str, Any] | None = None  # as the API shows it; None until the mission has ended
 
     @property
@@ -120,7 +120,7 @@ class StoreLockedError(CloudrcError):
 
 
 class ConflictError(CloudrcError):
-    """Report that the present state forbids a request; `mission` is the conflicting id or ""."""
+    """Report that the present state forbids a request; `mission` is the id in the way, or ""."""
 
     exit_code = 5
 
@@ -203,7 +203,7 @@ class MissionStore:
         self.notice = notice  # what happened to a damaged earlier file; "" without such a file
         self.missions: dict[str, Mission] = {}  # by id, oldest first
         self.trouble = ""  # why the disk refuses to write; "" if everything is on the disk
-        self.dropped = 0  # number of events that were removed before a reader requested them
+        self.dropped = 0  # number of events that readers missed, because they asked too late
         self._unsaved: set[str] = set()  # missions with events that are not on the disk
         self._events = self._keep_ns = 0  # number of the last event; time of the next attempt [ns]
         try:
@@ -258,7 +258,7 @@ class MissionStore:
         return mission
 
     def note(self, mission: Mission, event: str, text: str, **changed: Any) -> None:
-        """Store an event, as in `Mission.apply`; if the disk refuses, keep the event in memory."""
+        """Apply an event (see `Mission.apply`) and store it; if the disk refuses, try later."""
         if event == "reached" and changed["waypoint"] < len(mission.reached):
             return  # an earlier teleop has stored it
         self._events += 1
@@ -268,7 +268,7 @@ class MissionStore:
             self._commit()
 
     def catch_up(self, now_ns: int) -> None:
-        """Try again at `now_ns` [ns] to write events that the disk has refused, if that is due."""
+        """Write the events that the disk has refused, if an attempt is due at `now_ns` [ns]."""
         if self.trouble and now_ns >= self._keep_ns:
             self._keep_ns = now_ns + KEEP_PERIOD_NS
             with suppress(UnavailableError):

@@ -29,9 +29,9 @@ from cloudrc.records import FAILURES, MissionEvent
 class Leg:
     """A waypoint, and the conditions under which it counts as reached.
 
-    With an infinite `tolerance` (for random steps) the waypoint is reached after the time `dwell`.
-    With a `speed` the waypoint is reached when the setpoint has rested there for the time `dwell`
-    and the robot is within the tolerance.
+    With an infinite `tolerance` (for random steps), the waypoint is reached after the time `dwell`.
+    With a `speed`, it is reached when the setpoint has rested there for the time `dwell` and the
+    robot is within `tolerance`.
     """
 
     position: Vector  # [m], world frame, shape (3,)
@@ -75,11 +75,11 @@ class RobotStatus(NamedTuple):
     mission: int  # number of the last operator request that world has acted on; 0 if none
     world: str = ""  # identifies world's process; a restart of world changes it
     pipe_contacts: int = 0  # number of contacts with pipes in the mission
-    touch_speed: float = nan  # of the arm's tip at its first touch of the board in it [m/s]
+    touch_speed: float = nan  # of the arm's tip at the mission's first touch of the board [m/s]
     slip_ns: int = 0  # lag of world's clock behind its machine's clock [ns]
     horizon: float = nan  # prediction horizon of cloud's last command [s]
-    rtt: float = nan  # last round trip without the hold time on board [s]
-    loop_delay: float = nan  # last round trip with the hold time on board [s]
+    rtt: float = nan  # last round trip, without the hold time on board [s]
+    loop_delay: float = nan  # last round trip, with the hold time on board [s]
     mission_id: int = 0  # number of the mission of the last start request; 0 if none
     reached: int = 0  # waypoints that world has stored as reached, or `MISSION_OVER`
     cause: Cause = Cause.SPAWN  # why the guard is in its state

@@ -25,13 +25,12 @@ def wait_for(condition):
 
 def control(at, basis=0.0, **fields):
     """Make the record of a control period at `at` on odometry of `basis` [s]."""
-    still = dict.fromkeys(
-        ("measured", "position", "velocity", "setpoint", "command"), (0.0, 0.0, 1.0)
-    ) | dict.fromkeys(("proportional", "integral", "derivative"), ZERO)
-    numbers = {"horizon": 0.0, "rtt": nan, "loop_delay": nan, "yaw_rate": 0.0, "waypoint": 0}
-    stamps = {"stamp_ns": round(at * 1e9), "basis_stamp_ns": round(basis * 1e9)}
-    whole = {**still, **numbers, **stamps, "epoch": 1, "counter": 1, "orientation_wxyz": UPRIGHT}
-    return Control(**{**whole, **fields})
+    still = dict.fromkeys(Control._fields, ZERO)
+    still |= dict.fromkeys(("measured", "position", "setpoint"), (0.0, 0.0, 1.0))
+    still |= {"stamp_ns": round(at * 1e9), "basis_stamp_ns": round(basis * 1e9)}
+    still |= {"epoch": 1, "counter": 1, "horizon": 0.0, "rtt": nan, "loop_delay": nan}
+    still |= {"orientation_wxyz": UPRIGHT, "waypoint": 0, "yaw_rate": 0.0}
+    return Control(**{**still, **fields})
 
 
 def told(at, position=(0.0, 0.0, 1.0), velocity=ZERO, **fields):

@@ -52,7 +52,7 @@ def test_no_prediction_is_judged_across_two_sessions(feed):
     assert isnan(feed.samples[-1].prediction_error)
 
 
-def test_error_and_estimate_are_unknown_on_the_ground_and_without_control(feed):
+def test_error_and_estimate_are_unknown_without_control(feed):
     feed.take([control(0.1), told(0.1)], 1.0)
     assert feed.controls(1.0)
     assert not feed.controls(1.0 + STALE)
@@ -63,7 +63,7 @@ def test_error_and_estimate_are_unknown_on_the_ground_and_without_control(feed):
         assert isnan(sample.estimate)
 
 
-def test_copies_of_telemetry_are_silence_in_which_the_command_ages(feed):
+def test_copies_of_telemetry_are_silence(feed):
     assert feed.silence(5.0) == inf
     feed.take([told(0.1)], 1.0)
     feed.take([told(0.1)], 3.0)

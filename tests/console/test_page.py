@@ -30,21 +30,38 @@ def start(folder, *words):
     return subprocess.Popen(command, cwd=folder, **kinds)
 
 
-@pytest.fixture
-def flight(tmp_path):
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
     """A session with the hover's scene: the API, the console's address, and the run's folder."""
-    session = start(tmp_path, "up", "hover", "--set", "link.profile=wifi")
-    wait_for(lambda: under_way() or session.poll() is not None)
-    ((run, url),) = under_way().items()
-    api = Api(url)
-    wait_for(lambda: (tmp_path / "runs").exists() and answers(api))
-    console = start(tmp_path, "console", run)
-    address = console.stdout.readline().split()[-1]
-    yield api, address, run
+    folder = tmp_path_factory.mktemp("session")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.getbasetemp()))
+        session = start(folder, "up", "hover", "--set", "link.profile=wifi")
+        wait_for(lambda: under_way() or session.poll() is not None)
+        ((run, url),) = under_way().items()
+        api = Api(url)
+        wait_for(lambda: answers(api))
+        console = start(folder, "console", run)
+    yield api, console.stdout.readline().split()[-1], run
     session.terminate()
     assert console.wait(LIMIT) == 0, "it ends with the run"
     session.communicate(timeout=LIMIT)
     console.stdout.close()
+
+
+@pytest.fixture
+def flight(session):
+    """The session, whose robot is at the spawn and has no mission."""
+    api = session[0]
+    if api.get("/v1/state")["seen"]["guard"] == "ESTOP":
+        api.post("/v1/acknowledge")
+    elif mission := api.get("/v1/state")["mission"]:
+        api.post(f"/v1/missions/{mission['id']}/cancel")
+    wait_for(lambda: not api.get("/v1/state")["mission"] and answers(api)["guard"] != "ESTOP")
+    mission = api.post("/v1/missions", {"waypoints": [{"position_m": (0.0, 0.0, 0.6)}]})
+    wait_for(lambda: api.get("/v1/state")["mission"]["state"] == "flying")
+    api.post(f"/v1/missions/{mission['id']}/cancel")
+    return session
 
 
 @pytest.fixture
@@ -111,8 +128,8 @@ def test_drag_and_send_moves_the_setpoint(flight, page):
     page.wait_for_timeout(1000)
     asked = target()
     button(page, "Send").click()
-    wait_for(lambda: api.get("/v1/missions")["missions"])
-    (mission,) = api.get("/v1/missions")["missions"]
+    wait_for(lambda: api.get("/v1/state")["mission"])
+    mission = api.get("/v1/state")["mission"]
     assert api.get(f"/v1/missions/{mission['id']}")["route_m"] == [asked]
     api.post(f"/v1/missions/{mission['id']}/cancel")
     api.post("/v1/goto", {"position_m": (0.3, 0.2, 0.9)})

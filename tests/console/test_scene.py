@@ -33,7 +33,7 @@ def test_the_scene_has_the_bodies_of_the_experiment(server, name):
     assert ("/board/0" in nodes) == (name == "paper")
 
 
-def test_waypoints_and_trail_of_another_mission_replace_the_first(server):
+def test_another_mission_replaces_waypoints_and_trail(server):
     scene, points = FlightScene(server, load_experiment("hover")), np.eye(3)
     scene.set_waypoints(points, 1)
     scene.set_trail(points, np.array([0.1, np.inf, 0.3]))

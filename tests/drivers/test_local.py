@@ -82,7 +82,7 @@ def test_sockets_lie_in_a_folder_with_a_short_path(monkeypatch):
         assert socket_folder() == chosen
 
 
-def test_a_deadline_does_not_count_the_time_in_which_we_stood_still():
+def test_a_deadline_does_not_count_the_time_of_a_pause():
     now = 0.0
     deadline = Deadline(3.0, turn_max=1.0, clock=lambda: now)
     for step, passed in ((0.9, False), (7.0, False), (0.9, False), (1.0, False), (0.9, True)):

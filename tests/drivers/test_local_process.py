@@ -90,13 +90,11 @@ HANGS, DIES = signal.SIGSTOP, signal.SIGKILL
     [
         ("relay", HANGS),
         ("cloud", DIES),
-        *(
-            pytest.param(*other, marks=pytest.mark.full)
-            for other in (("teleop", HANGS), ("world", HANGS), ("cloud", HANGS), ("world", DIES))
-        ),
+        pytest.param("teleop", HANGS, marks=pytest.mark.full),
+        pytest.param("world", HANGS, marks=pytest.mark.full),
     ],
 )
-def test_a_supervisor_that_stood_still_still_sees_who_hangs_or_dies(tmp_path, victim, how):
+def test_a_supervisor_that_was_paused_sees_who_hangs_or_dies(tmp_path, victim, how):
     run = start(tmp_path / "run", dwell=30.0)
     pids = wait_until_flying(run)
     os.kill(run.pid, signal.SIGSTOP)
@@ -131,26 +129,10 @@ def call(folder, *words):
     return subprocess.run([*COMMAND, *words, "--run", str(folder)], capture_output=True, text=True)
 
 
-def operate(folder):
-    """Hold, move and resume the mission of a run, found by its folder and from anywhere."""
-    assert call(folder, "mission", "run", "hover").returncode == 5  # a mission already flies
-    assert "held" in call(folder, "mission", "hold").stdout
-    assert call(folder, "mission", "goto", "0.3", "0", "0.8").returncode == 0
-    time.sleep(3.0)
-    status = json.loads(call(folder, "mission", "status", "-o", "json").stdout)
-    assert status["mission"]["state"] == "held"
-    assert status["seen"]["position_m"] == pytest.approx([0.3, 0.0, 0.8], abs=0.1)
-    assert "flying" in call(folder, "mission", "resume").stdout
-    anywhere = [*COMMAND, "mission", "status", "-o", "json"]
-    found = subprocess.run(anywhere, capture_output=True, text=True, cwd="/")
-    assert found.stderr == f"cloudrc: using the run in {folder}\n"
-    assert json.loads(found.stdout)["mission"]["state"] == "flying"
-
-
 CAUSE = "downlink.delay_ms=120, downlink.jitter_ms=0"
 
 
-def test_an_operator_steers_a_run_and_sets_its_link(tmp_path, figure):
+def test_an_operator_sets_the_link_of_a_run_and_cancels_it(tmp_path, figure):
     folder, took = tmp_path / "run", []
     run = start(folder, dwell=30.0, command=COMMAND)
     wait_until_flying(run)
@@ -160,15 +142,12 @@ def test_an_operator_steers_a_run_and_sets_its_link(tmp_path, figure):
         made = call(folder, "link", "set", *words, "-o", "json")
         took.append(json.loads(made.stdout)["seconds"])
         time.sleep(2.0)
-    operate(folder)
     assert "INTERRUPTED" in call(folder, "mission", "cancel").stdout
     output, _ = run.communicate(timeout=60)
     assert run.returncode == 130
     assert report(folder)["failures"][0]["code"] == "cancelled"
     audit = [json.loads(line) for line in (folder / "audit.jsonl").read_text().splitlines()]
-    said = [(line["action"].rpartition("/")[2], line["status"], line["client"]) for line in audit]
-    done = [("missions", 409), ("hold", 200), ("goto", 200), ("resume", 200), ("cancel", 200)]
-    assert said == [(action, status, "local") for action, status in done]
+    assert [line["action"].rpartition("/")[2] for line in audit] == ["cancel"]
     assert local.under_way() == {}
     assert f"link: downlink 120 ms ({CAUSE})" in output
     assert not (folder / "link").exists()

@@ -35,16 +35,6 @@ def test_a_full_socket_drops_and_never_blocks(peers):
     assert other.receive()[0] == b"0"
 
 
-def test_a_neighbour_that_is_away_or_new_is_no_error(peers, tmp_path):
-    one, other = peers
-    other.close()
-    assert not one.send(b"lost")
-    again = UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock")
-    assert one.send(b"found")
-    assert again.receive() == [b"found"]
-    again.close()
-
-
 def test_a_path_that_is_too_long_is_named(tmp_path):
     with pytest.raises(BadInputError, match="longer than 107 bytes"):
         UnixPeer(tmp_path / ("x" * 120), tmp_path / "b")

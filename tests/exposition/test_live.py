@@ -9,7 +9,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.exposition import table
 from cloudrc.exposition.live import ONE_SHAPER, LinkVerdict, LiveMetrics
 from cloudrc.exposition.parts import Histogram
-from cloudrc.messages import UPRIGHT, ZERO, Cause, GuardState, Odometry, Telemetry
+from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.records import (
     Arrival,
     CommandApplied,
@@ -20,10 +20,11 @@ from cloudrc.records import (
     LinkChecked,
     MissionEvent,
     SessionOpened,
-    TelemetrySent,
 )
-from tests.exposition.conftest import MS, period
+from tests.console.conftest import control, told
 from tests.flights.conftest import records
+
+MS = 1_000_000
 
 
 def value(live, name, *label_values):
@@ -57,17 +58,12 @@ def test_without_a_shared_clock_one_way_delays_are_absent():
     assert histogram(live, "cloudrc_rtt_seconds").cumulative()[-1] > 100  # needs no shared clock
 
 
-def telemetry(at_ms, guard, cause=Cause.COMMAND):
-    still = Odometry(0, ZERO, UPRIGHT, ZERO, ZERO)
-    return TelemetrySent(at_ms * MS, 1, 1, Telemetry(0, still, 0.0, 0, 0, 0, 0, guard, cause=cause))
-
-
 def test_command_age_is_that_of_its_odometry_in_track():
     """It needs no shared clock; on the ground and in HOLD no command is in use."""
     live = LiveMetrics("world")
     live.see([CommandApplied(90 * MS, 1, 1, 10 * MS, ZERO)])
     for guard in (GuardState.GROUND, GuardState.TRACK, GuardState.HOLD):
-        live.see([telemetry(100, guard)])
+        live.see([told(0.1, guard=guard)])
     age = histogram(live, "cloudrc_command_age_seconds")
     assert (age.cumulative()[-1], age.total) == (1, pytest.approx(0.09))
 
@@ -84,7 +80,7 @@ def test_control_periods_give_delays_errors_and_terms():
     live, seen = LiveMetrics("cloud"), {"setpoint": (1.0, 2.0, 3.0), "measured": (0.0, 2.5, 3.0)}
     for k, rtt in enumerate((math.nan, 0.04, 0.04, 0.04, 0.05)):
         at = {"rtt": rtt, "loop_delay": rtt + 0.005, "derivative": (0.0, 0.0, -0.7)}
-        live.see([period(10 * k, 0, **seen, **at)])
+        live.see([control(0.01 * k, **seen, **at)])
     assert histogram(live, "cloudrc_rtt_seconds").cumulative()[-1] == 2, "once per echo"
     assert histogram(live, "cloudrc_loop_delay_seconds").total == pytest.approx(0.1)
     assert value(live, "cloudrc_tracking_error_meters", "x") == 1.0
@@ -139,7 +135,7 @@ def test_changes_of_the_guard_are_counted_by_cause():
         (GuardState.TRACK, Cause.COMMANDS),
         (GuardState.HOLD, Cause.SILENCE),
     ):
-        live.see([telemetry(0, guard, cause)])
+        live.see([told(0.0, guard=guard, cause=cause)])
     causes = live.read()["cloudrc_guard_causes_total"]
     counted = {cause: number for (cause,), number in causes.items() if number}
     assert counted == {"fresh command": 1, "no fresh commands": 2, "fresh commands again": 1}

@@ -14,7 +14,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.exposition.live import LiveMetrics
 from cloudrc.exposition.parts import WINDOW, DatagramTally, PredictionJudge
 from cloudrc.records import CommandApplied, Control
-from tests.exposition.conftest import period
+from tests.console.conftest import control
 from tests.flights.conftest import records
 
 
@@ -54,18 +54,17 @@ def test_counts_match_the_true_loss_and_reordering(seed, loss, jitter):
 
 def flying_along_x(predicted_lead, *, every_ms=10):
     """Yield a flight at 1 m/s along x, predicted 25 ms ahead with an error `predicted_lead` [m]."""
-    for at in range(0, 400, every_ms):
-        x = at * 1e-3
+    for x in (at * 1e-3 for at in range(0, 400, every_ms)):
         predicted = (x + 0.025 + predicted_lead, 0.0, 0.0)
-        yield period(7000 + at, at, measured=(x, 0.0, 0.0), position=predicted, horizon=0.025)
+        yield control(7.0 + x, x, measured=(x, 0.0, 0.0), position=predicted, horizon=0.025)
 
 
 @pytest.mark.parametrize(("lead", "every_ms", "judged"), [(0.01, 10, 37), (0, 10, 37), (1, 60, 0)])
 def test_a_prediction_is_compared_at_its_own_instant(lead, every_ms, judged):
     """The last three wait for a measurement 25 ms later; none is compared across a gap."""
     judge = PredictionJudge()
-    for control in flying_along_x(lead, every_ms=every_ms):
-        judge.take(control)
+    for period in flying_along_x(lead, every_ms=every_ms):
+        judge.take(period)
     assert judge.judged == judged
     assert judge.square == pytest.approx(judged * lead**2, abs=1e-12)
     assert judge.error == pytest.approx((lead, 0, 0) if judged else (math.nan,) * 3, nan_ok=True)

@@ -18,7 +18,6 @@ from cloudrc.records import (
     Arrival,
     CommandApplied,
     Contact,
-    Control,
     GroundTruth,
     GuardChange,
     MissionEvent,
@@ -26,6 +25,7 @@ from cloudrc.records import (
     SessionOpened,
     TelemetrySent,
 )
+from tests.console.conftest import control
 
 SECOND = 1_000_000_000
 START, DONE, END = 10 * SECOND, 20 * SECOND, 25 * SECOND
@@ -113,16 +113,11 @@ def _step(log, counter, stamp, path):
         CommandApplied(applied, 2, counter, basis, ZERO),
     ]
     log.cloud.append(Arrival(arrival, True, 2, counter, UPLINK, True))
-    log.cloud.append(
-        Control(
-            stamp_ns=stamp, epoch=2, counter=counter, basis_stamp_ns=basis, horizon=HORIZON,
-            rtt=UPLINK + DOWNLINK, loop_delay=UPLINK + DOWNLINK + 0.005, measured=measured,
-            position=(x + 0.003, y + 0.004, z), orientation_wxyz=UPRIGHT,
-            velocity=(1.0, 0.0, 0.0), waypoint=0, command=ZERO, yaw_rate=0.0,
-            setpoint=(measured[0] + 0.3, measured[1] + 0.4, measured[2]),
-            proportional=ZERO, integral=ZERO, derivative=ZERO,
-        )
-    )  # fmt: skip
+    fields = {"epoch": 2, "counter": counter, "horizon": HORIZON, "measured": measured}
+    fields |= {"rtt": UPLINK + DOWNLINK, "loop_delay": UPLINK + DOWNLINK + 0.005}
+    fields |= {"position": (x + 0.003, y + 0.004, z), "velocity": (1.0, 0.0, 0.0)}
+    fields["setpoint"] = (measured[0] + 0.3, measured[1] + 0.4, measured[2])
+    log.cloud.append(control(stamp / SECOND, basis / SECOND, **fields))
 
 
 @cache

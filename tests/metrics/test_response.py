@@ -66,7 +66,7 @@ def test_a_small_or_decaying_oscillation_is_stable():
     assert SHIPPED["unstable_steps"].measure(flight(second_order(0.1))) == 0.0
 
 
-def test_each_change_of_the_setpoint_begins_a_step_and_a_moving_reference_none():
+def test_a_changed_setpoint_begins_a_step_a_moving_one_does_not():
     two = steps(flight(second_order(0.5), lambda t: (1.0 if t < 4 else 2.0, 0.0, 1.0)))
     assert [(step.start, round(step.length, 2)) for step in two] == [(0.0, 1.0), (4.0, 1.0)]
     assert two[1].settling_time is None, "it never went there"

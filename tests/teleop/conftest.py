@@ -23,6 +23,7 @@ from cloudrc.records import Fault, MissionEvent
 from cloudrc.teleop import store
 from cloudrc.teleop.api import STARTING, ApiServer, Bridge, create_app
 from cloudrc.teleop.auth import Audit, Gate, Tokens
+from cloudrc.teleop.carrot import setpoint_at
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.models import read_goto, read_order
 from cloudrc.teleop.service import MissionService
@@ -183,7 +184,7 @@ class Disk(sqlite3.Connection):
         if self.flight.full:
             raise sqlite3.OperationalError("database or disk is full")
         super().commit()
-        self.flight.images.append(self.serialize())
+        self.flight.image = self.serialize()
         if self.flight.killed_after == self.flight.commits:
             raise KilledError
 
@@ -194,22 +195,20 @@ class ServiceFlight(Flight):
     def __init__(self, scene=None):
         super().__init__()
         self.scene, self.full, self.mark = scene, False, 0
-        self.images, self.commits = [], 0  # the disk after each commit, and attempts to commit
+        self.image, self.commits = None, 0  # the disk after the last commit; attempts to commit
         self.restart_teleop()
 
-    def restart_teleop(self, image=None):
-        """Start a new service with the missions on the disk, or in an `image` of the disk."""
+    def restart_teleop(self):
+        """Start a new service with the missions on the disk."""
         self.killed_before = self.killed_after = None  # number of a commit
-        self.teleop = MissionService(0.25, self.stored(image), self.scene)
+        self.teleop = MissionService(0.25, self.stored(), self.scene)
 
-    def stored(self, image=None):
-        """Return the store that a new process reads from the disk, or from an image."""
+    def stored(self):
+        """Return the store that a new process reads from the disk."""
         disk = store.connect(None, Disk)
         disk.flight = self
-        if image is None and self.images:
-            image = self.images[-1]
-        if image is not None:
-            disk.deserialize(image)
+        if self.image is not None:
+            disk.deserialize(self.image)
         return MissionStore(disk, b"")
 
     @property
@@ -243,6 +242,11 @@ def service_flying(**order):
     assert flight.view(mission_id)["state"] == "flying"
     assert flight.view(mission_id)["waypoint"] == 1
     return flight, mission_id
+
+
+def reference(flight):
+    """Return the setpoint as it is now."""
+    return setpoint_at(flight.setpoints[-1], flight.now_ns)
 
 
 PLACES = {"A": A, "B": B, "C": C, "away": AWAY}
@@ -300,6 +304,9 @@ DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 """Opener without a proxy: `urlopen` keeps the proxy that the environment named at first."""
 LIMIT = 5.0
 OPERATOR, READER = "operator-token-of-the-tests", "reader-token-of-the-tests"
+
+
+A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
 
 
 class Running:

@@ -10,9 +10,8 @@ import pytest
 from cloudrc.errors import BadInputError
 from cloudrc.teleop import auth
 from cloudrc.teleop.auth import LOCAL, Audit, Tokens
-from tests.teleop.conftest import OPERATOR, READER, connect, running
+from tests.teleop.conftest import A_MISSION, OPERATOR, READER, connect, running
 
-A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
 ANOTHER = "another-token-altogether"
 WRONG = [None, "", OPERATOR[:-1], OPERATOR + "x", "é"]
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from cloudrc.messages import ZERO, GuardState, Motion, Setpoint, Start
 from cloudrc.teleop.carrot import arrival_ns, setpoint_at
 from cloudrc.teleop.wire import Leg, Plan
-from tests.teleop.conftest import PERIOD_NS, Flight
+from tests.teleop.conftest import PERIOD_NS, Flight, reference
 
 SECOND = 1_000_000_000
 TRACK, HOLD = GuardState.TRACK, GuardState.HOLD
@@ -61,10 +61,6 @@ def led(position=START, guard=TRACK):
     return flight
 
 
-def reference(flight):
-    return setpoint_at(flight.setpoints[-1], flight.now_ns)
-
-
 def follow(flight, seconds):
     for _ in range(round(seconds * 100)):
         flight.step(reference(flight).position)
@@ -108,7 +104,7 @@ def test_it_waits_at_a_robot_that_holds_and_starts_from_there():
     assert flight.teleop.leg == 1
 
 
-def test_it_starts_again_from_the_robot_after_a_silence_and_in_a_new_session():
+def test_it_starts_again_from_the_robot_after_a_silence():
     flight = led()
     follow(flight, 1.0)
     flight.uplink = False

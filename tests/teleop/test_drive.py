@@ -25,6 +25,7 @@ from tests.teleop.conftest import (
     PERIOD_NS,
     A,
     ServiceFlight,
+    reference,
     running,
     service_flying,
 )
@@ -72,10 +73,6 @@ def press(flight, velocity=EAST, seconds=1.0):
     for _ in range(round(10 * seconds)):
         flight.teleop.drive(velocity, flight.now_ns)
         flight.step(seconds=0.1)
-
-
-def reference(flight):
-    return setpoint_at(flight.setpoints[-1], flight.now_ns)
 
 
 def step_after(flight):
@@ -133,7 +130,7 @@ def test_a_key_that_is_released_is_no_lost_operator(driven):
     assert "operator_lost" not in names(driven)
 
 
-def test_what_interrupts_a_drive_has_to_be_answered_by_letting_go(driven):
+def test_after_an_interrupted_drive_the_operator_must_let_go(driven):
     def ended(verb, *words):
         press(driven, seconds=0.1)
         getattr(driven.teleop, verb)(*words, driven.now_ns)
@@ -164,10 +161,10 @@ def test_what_interrupts_a_drive_has_to_be_answered_by_letting_go(driven):
 
 def test_only_a_held_mission_is_driven():
     flight = ServiceFlight()
-    with pytest.raises(ConflictError, match="once there is telemetry"):
+    with pytest.raises(ConflictError, match="once telemetry has arrived"):
         press(flight)
     flight.step()
-    with pytest.raises(ConflictError, match="other than zero takes off"):
+    with pytest.raises(ConflictError, match="other than zero makes the robot take off"):
         press(flight, ZERO)
     flight, mission_id = service_flying()
     with pytest.raises(ConflictError, match=f"{mission_id} is flying; hold or cancel it first"):
@@ -279,7 +276,7 @@ def test_keys_in_a_terminal_drive_the_robot():
 
 
 @pytest.mark.process
-def test_drive_shows_the_state_in_a_small_terminal_and_ends_with_it():
+def test_drive_runs_in_a_small_terminal_and_ends_with_it():
     with running(unix=True) as api:
         terminal = Terminal(api, lines=4, columns=20)
         terminal.close()

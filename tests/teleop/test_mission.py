@@ -5,7 +5,7 @@ import pytest
 from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Start
 from cloudrc.teleop.requests import REPEAT_NS
 from cloudrc.teleop.wire import ALARM, Leg, Plan
-from tests.teleop.conftest import AWAY, FROM_SPAWN, ID, PLAN, THREE, A, B, C, Flight, asked, flying
+from tests.teleop.conftest import AWAY, FROM_SPAWN, ID, PLAN, THREE, A, B, Flight, asked, flying
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 
@@ -27,26 +27,6 @@ def test_the_old_world_does_not_confirm_a_start_from_spawn():
     flight.downlink = True
     flight.step(seconds=0.15)
     assert (flight.state, flight.epoch) == ("FLYING", 2)
-
-
-def test_a_mission_flies_its_legs_in_order_and_ends_in_a_hold():
-    flight = flying()
-    assert (flight.requests[0].request, flight.requests[0].start) == (Request.START, Start.SPAWN)
-    assert (
-        flight.events[0].text
-        == "mission started from the spawn, waypoints: 3, judged by the measured position"
-    )
-    flight.step(position=A, seconds=0.6)
-    assert flight.events[-1].text == "waypoint 1 of 3 reached at 0.52 s"
-    assert flight.setpoints[-1] == Setpoint(B, 0.0, 1)
-    flight.step(position=B, seconds=0.02)
-    assert flight.setpoints[-1] == Setpoint(C, 0.0, 2)
-    there = (3.05, 0.0, 1.0)
-    flight.step(position=there, seconds=0.7)
-    assert flight.setpoints[-1] == Setpoint(there, 0.0, -1)
-    assert [event.event for event in flight.events] == ["started", *["reached"] * 3, "done"]
-    assert [event.waypoint for event in flight.events] == [0, 0, 1, 2, 2]
-    assert (flight.state, flight.guard) == ("DONE", HOLD)
 
 
 def test_dwell_starts_again_outside_of_the_tolerance():
@@ -133,7 +113,7 @@ def test_a_robot_that_waits_during_its_mission_is_started_again(guard):
 # Requests and the emergency stop: repeated until the robot has acted on them
 
 
-def test_each_copy_of_a_setpoint_or_request_names_the_current_session():
+def test_each_copy_of_a_request_names_the_current_session():
     flight, said = Flight(), []
     flight.step()
     flight.operate("start", FROM_SPAWN, ID)

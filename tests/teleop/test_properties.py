@@ -1,7 +1,7 @@
 """The mission machine under any order of verbs, flights, silences and restarts."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
@@ -160,40 +160,3 @@ class MissionMachine(RuleBasedStateMachine):
 
 MissionMachine.TestCase.settings = settings(max_examples=60, stateful_step_count=40, deadline=None)
 TestMissionMachine = MissionMachine.TestCase
-
-
-def disturb(flight, disturbance):
-    if disturbance in ("hold", "goto") and flight.state == "FLYING":
-        flight.operate("hold")
-        if disturbance == "goto":
-            flight.operate("go_to", Leg((9.0, 9.0, 9.0)))
-        flight.step((9.0, 9.0, 9.0), 0.2)
-        flight.operate("resume")
-    elif disturbance == "silence":
-        flight.uplink = flight.downlink = False
-        flight.step(seconds=0.3)
-        flight.uplink = flight.downlink = True
-    elif disturbance == "detour":
-        flight.step((5.0, 5.0, 5.0), 0.3)
-
-
-@given(
-    places=st.lists(positions, min_size=1, max_size=8),
-    start=st.sampled_from(Start),
-    disturbances=st.lists(st.sampled_from(["hold", "goto", "silence", "detour", "none"])),
-)
-@settings(max_examples=30, deadline=None)
-def test_a_disturbed_mission_reaches_waypoints_once_in_order(places, start, disturbances):
-    flight = Flight()
-    flight.operate("start", Plan(tuple(Leg(place, dwell=0.1) for place in places), start))
-    flight.step()
-    for disturbance in disturbances:
-        disturb(flight, disturbance)
-        flight.step(flight.setpoints[-1].position, 0.08)
-    for _ in range(2 * len(places) + 2):
-        flight.step(flight.setpoints[-1].position, 0.15)
-    assert flight.state == "DONE"
-    reached = [event.waypoint for event in flight.events if event.event == "reached"]
-    assert reached == list(range(len(places)))
-    waypoints = [setpoint.waypoint for setpoint in flight.setpoints if setpoint.waypoint >= 0]
-    assert waypoints == sorted(waypoints)

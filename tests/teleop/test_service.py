@@ -229,7 +229,7 @@ def test_a_key_is_that_of_one_order_for_ever():
     for _ in range(2):
         assert flight.create(key="uid") == mission_id
         for order in (Order(QUICK, key="uid"), Order(FROM_SPAWN, key="uid", contact=True)):
-            with pytest.raises(ConflictError, match="'uid' is that of mission m1, with another"):
+            with pytest.raises(ConflictError, match="mission m1 has the key 'uid' already"):
                 flight.teleop.create(order, flight.now_ns)
         flight.restart_teleop()
     assert flight.create(key="another") == "m2"
@@ -294,7 +294,7 @@ def shown(flight):
     return flight.teleop.state(flight.now_ns)["seen"]
 
 
-def test_the_state_is_shown_with_cause_and_since_when_in_this_world():
+def test_the_state_has_its_cause_and_its_duration():
     flight, _ = service_flying()
     flight.step(seconds=0.5)
     assert shown(flight)["guard_for_s"] > 0.5
