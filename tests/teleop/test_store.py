@@ -16,6 +16,7 @@ from cloudrc.teleop import models
 from cloudrc.teleop.store import (
     KEPT,
     SHOWN,
+    ConflictError,
     MissionStore,
     Order,
     StoreLockedError,
@@ -264,3 +265,7 @@ def test_waypoints_are_reached_once_whenever_teleop_is_killed(kill):
         assert flight.stored().missions == flight.teleop.book.missions
         assert list(flight.teleop.book.missions) == ["m1"]
     assert at > 6
+
+
+def test_a_conflict_names_the_mission_in_the_way():
+    assert ConflictError("a mission flies", "m1").mission == "m1"

@@ -34,3 +34,12 @@ def test_a_message_arrives_the_same_with_and_without_bytes(kind, message, decode
         bodies.append(body if passes else decode(body))
         assert end._counts == {"sent": 1}
     assert bodies == [message, message]
+
+
+def test_a_rare_message_is_sent_as_bytes_between_ends_that_pass():
+    end = TunnelEnd(Identity(bytes(16), bytes(16), passes=True), Direction.DOWNLINK, True)
+    end._session.begin(1, bytes(32))
+    end._send(Kind.OPERATOR, b"body")
+    (data,) = end.take_datagrams()
+    assert isinstance(data, bytes)
+    assert end._counts == {"sent": 1}
