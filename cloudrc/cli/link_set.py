@@ -162,7 +162,7 @@ def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
 
 
 def note_of(edit: Edit, number: str) -> str:
-    """Describe a change in JSON, for the file beside the profile."""
+    """Return the content of change.json: the change's number, its cause and whether to restart."""
     return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
 
 

@@ -343,7 +343,7 @@ class Page:
         return x, y, z
 
     def _add_keys(self, gui: viser.GuiApi) -> None:
-        """Add the buttons of the drive; a button that is held calls back ten times a second."""
+        """Add the buttons that steer by hand; a held button calls back ten times a second."""
         steering = self._steering
         speed = gui.add_slider("Drive [m/s]", 0.1, 1.0, 0.1, 0.4)
         for code, (label, direction) in KEYS.items():

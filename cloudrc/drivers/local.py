@@ -181,7 +181,8 @@ class LocalRun:
 
     Attributes:
         notes: Sentences for the report of the flight.
-        announcement: Keeps the flight file of a session until the caller closes it.
+        announcement: Holds the file that tells other commands of this session; the caller
+            closes it.
     """
 
     def __init__(

@@ -50,7 +50,7 @@ ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total"
 
 
 class LinkVerdict:
-    """Newest verdict of world or cloud on its incoming direction of the link."""
+    """Newest judgement of world or cloud: does the link towards it match its profile?"""
 
     def __init__(self, direction: str) -> None:
         """Set the direction, "uplink" or "downlink"; the first verdict is "open"."""

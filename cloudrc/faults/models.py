@@ -306,8 +306,8 @@ class TeleopModel:
     def stop_rotors(self, now_ns: int) -> None:
         """Make an emergency stop at `now_ns` on cloud's clock [ns].
 
-        In its own process, teleop sends an alarm to cloud at once, and stores the stop at its next
-        wake.
+        If teleop is a process of its own, it sends an alarm to cloud at once. It stores the stop in
+        the next turn of its loop.
         """
         if self.service is not None and self._phase_ns is not None:
             self._stops.append(partial(self._call, MissionService.stop_rotors))

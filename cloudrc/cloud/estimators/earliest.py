@@ -25,7 +25,10 @@ class Earliest(Estimator):
         self._offsets.append(applied_minus_stamp)
 
     def horizon(self, age: float) -> float:
-        """Return `age` plus the smallest `applied_minus_stamp` [s]; the clock offsets cancel."""
+        """Return `age` plus the smallest `applied_minus_stamp` [s].
+
+        Both contain the offset between the clocks, with opposite signs, so their sum does not.
+        """
         return max(0.0, age + min(self._offsets)) if self._offsets else 0.0
 
 

@@ -35,7 +35,10 @@ class Split(Estimator):
             )
 
     def horizon(self, age: float) -> float:
-        """Return `age` plus the average of `applied_minus_stamp` [s]; the clock offsets cancel."""
+        """Return `age` plus the average of `applied_minus_stamp` [s].
+
+        Both contain the offset between the clocks, with opposite signs, so their sum does not.
+        """
         if self._applied_minus_stamp is None:
             return 0.0
         return max(0.0, age + self._applied_minus_stamp)

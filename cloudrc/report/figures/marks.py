@@ -82,7 +82,7 @@ class Span:
 
 
 def spans(subject: Subject, *, uplink: bool) -> list[Span]:
-    """List the spans of one direction of the link, in the order of time."""
+    """List the times between two changes of one link direction, each with its profile."""
     configured = subject.uplink if uplink else subject.downlink
     found = [Span(-inf, subject.link_start, configured, "")]
     for span in sorted(_changes(subject, uplink), key=lambda span: span.begin):
