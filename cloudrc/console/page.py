@@ -198,7 +198,8 @@ class Page:
         guard, silence, age = feed.telemetry.guard, feed.silence(now), feed.command_age(now)
         mission = state.get("mission")
         doing = "none"
-        if self._steering.velocity(now) != ZERO:
+        is_free = not mission or mission["by_hand"] or mission["state"] == "held"
+        if is_free and self._steering.velocity(now) != ZERO:
             doing = "driving"
         elif is_drive(mission):
             doing = "drive, waits for keys"
@@ -214,7 +215,7 @@ class Page:
             lines[0] = f"**No telemetry for {silence:.1f} s**, last: {lines[0]}"
         text, is_refusal, at = self._steering.answer
         if now - at < ANSWER_SHOWN:
-            lines.append(f"**Refused** {text}" if is_refusal else text)
+            lines.append(f"**Refused:** {text}" if is_refusal else text)
         elif seen := state.get("seen"):
             lines.append(seen["next_step"])
         return "  \n".join(lines).replace("cloudrc mission ", "")  # buttons have the verbs' names
@@ -329,8 +330,8 @@ class Page:
 
         @send.on_click
         def _(_: object) -> None:
-            self._steering.go_to(numbers.value)
-            self._target = free
+            if self._steering.go_to(numbers.value):
+                self._target = free
 
     def _place_target(self, now: float) -> Vector:
         """Return the position of an unmoved target [m]: the setpoint, or 0.6 m above the robot."""

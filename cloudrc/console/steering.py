@@ -103,7 +103,7 @@ class Steering:
         try:
             self.api.post(path, body)
         except CloudrcError as error:
-            self.say(f"{words}: {error}", is_refusal=True)
+            self.say(str(error), is_refusal=True)
             return False
         self.say(words)
         return True
@@ -125,15 +125,15 @@ class Steering:
             if not self.ask("ending the drive", "/v1/resume"):
                 return
             order = {**order, "queue": True}  # in case the drive has not ended yet
-        self.ask("starting", "/v1/missions", order)
+        self.ask("starting; the robot is set back to its spawn", "/v1/missions", order)
 
-    def go_to(self, position: Vector) -> None:
-        """Fly to a position [m]; a mission that flies is held first."""
+    def go_to(self, position: Vector) -> bool:
+        """Hold a mission that flies, and fly to a position [m]; return whether teleop agrees."""
         x, y, z = (round(float(value), 3) for value in position)
         mission = self.state.get("mission") or {"state": ""}
         if mission["state"] in ("starting", "flying") and not self.ask("hold", "/v1/hold"):
-            return
-        self.ask(f"flying to ({x:g}, {y:g}, {z:g})", "/v1/goto", {"position_m": (x, y, z)})
+            return False
+        return self.ask(f"flying to ({x:g}, {y:g}, {z:g})", "/v1/goto", {"position_m": (x, y, z)})
 
     def hold_key(self, key: str, velocity: Vector, lasts: float) -> None:
         """Add `velocity` [m/s] to the drive for `lasts` [s] from now on, because `key` is held."""

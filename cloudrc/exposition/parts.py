@@ -178,7 +178,8 @@ class DelayJudge:
     def echoed(self, control: Control, arrival_ns: int) -> None:
         """Compute the error of the delay estimate of a command whose echo has arrived.
 
-        The echo arrived at `arrival_ns` [ns], cloud's clock; `control` is the period after it.
+        The echo arrived at `arrival_ns` [ns], cloud's clock. `control` is the record of the first
+        control period after this arrival.
         """
         sent = self._sent.get(arrival_ns - round(control.loop_delay * 1e9))
         if sent is not None:

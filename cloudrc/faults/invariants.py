@@ -267,7 +267,7 @@ class RobotInvariants:
     def _check_fence(
         self, state: GuardState, position: Vector, velocity: Vector, now_ns: int
     ) -> None:
-        """Check the base's position; a robot that fell may take off only if it is at rest."""
+        """Check that the robot stays inside the fence and, after a fall, takes off only at rest."""
         self._falls = self._falls or (self._was in FLOWN and state is ESTOP)
         if self._falls and state in FLOWN:
             self._falls, speed = False, hypot(*velocity)

@@ -69,7 +69,7 @@ def test_a_start_ends_a_drive_that_waits_for_keys(api, steering):
 
 def test_a_refusal_is_told_in_the_words_of_the_api(api, steering):
     api.refused["/v1/goto"] = "outside of the fence"
-    steering.go_to((50.0, 0.0, 1.2))
+    assert not steering.go_to((50.0, 0.0, 1.2))
     text, is_refusal, _ = steering.answer
     assert is_refusal
     assert "outside of the fence" in text

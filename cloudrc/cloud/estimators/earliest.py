@@ -36,6 +36,6 @@ def build(count: Count = 200) -> Earliest:
     """Make the estimator.
 
     Args:
-        count: Number of commands in the minimum [1], at least 1.
+        count: Number of newest commands of which the smallest delay counts [1]; at least 1.
     """
     return Earliest(count)
