@@ -466,6 +466,7 @@ class RelayControl:
         file, self._released_at = folder / PROFILE_FILE, 0.0
         self._files = {way: ProfileFile(file, make_profile_loader(way), _log) for way in links}
         self._pending: deque[tuple[str, Loaded]] = deque()
+        self._applied: deque[tuple[str, Loaded, int]] = deque()
         self._changes = dict.fromkeys(links, -1)
         for way, loaded in first.items():
             self._publish(way, loaded, time.monotonic_ns())
@@ -477,31 +478,36 @@ class RelayControl:
         while self._pending:
             way, loaded = self._pending.popleft()
             self._links[way].replace_profile(loaded.direction, restart=loaded.change.restart)
-            with suppress(OSError):  # such as a full disk: `link set` says that it has no answer
-                self._publish(way, loaded, time.monotonic_ns())
+            self._applied.append((way, loaded, time.monotonic_ns()))
 
     def follow(self) -> None:
         """Call `look` periodically, in a thread that never ends."""
         while True:
             self.look()
-            time.sleep(PROFILE_PERIOD)
+            time.sleep(PROFILE_PERIOD / 2 if self._pending else PROFILE_PERIOD)
 
     def look(self) -> None:
-        """Read requested changes from the folder; publish the lateness of the datagrams."""
+        """Read requested changes from the folder; publish applied changes and the lateness."""
         for way, file in self._files.items():
             if (loaded := file.poll()) is not None:
                 self._pending.append((way, loaded))
-        if time.monotonic() - self._released_at >= RELEASED_PERIOD:
-            self._released_at = time.monotonic()
-            for way in self._links:
-                with suppress(OSError):  # such as a full disk: the next time tries again
+        with suppress(OSError):  # such as a full disk: the next time tries again
+            while self._applied:  # written here, because the relay's loop must not wait for a disk
+                self._publish(*self._applied[0])
+                self._applied.popleft()
+            if time.monotonic() - self._released_at >= RELEASED_PERIOD:
+                self._released_at = time.monotonic()
+                for way in self._links:
                     if released := self._relay.released(way):
                         publish(self._folder / f"{way}{RELEASED_SUFFIX}", json.dumps(released))
 
     def _publish(self, way: str, loaded: Loaded, since_ns: int) -> None:
         changes, requested = self._changes[way] + 1, summary(loaded.direction)
         state = LinkState(
-            *("relay", "local mode", "relay", way),
+            shaper="relay",
+            reason="local mode",
+            mode="relay",
+            direction=way,
             profile=loaded.values,
             since=datetime.now(UTC).isoformat(timespec="seconds"),
             since_ns=since_ns,
