@@ -125,7 +125,9 @@ class Steering:
             if not self.ask("ending the drive", "/v1/resume"):
                 return
             order = {**order, "queue": True}  # in case the drive has not ended yet
-        self.ask("starting; the robot is set back to its spawn", "/v1/missions", order)
+        back = order.get("start", "spawn") == "spawn"
+        words = "starting; the robot is set back to its spawn" if back else "starting"
+        self.ask(words, "/v1/missions", order)
 
     def go_to(self, position: Vector) -> bool:
         """Hold a mission that flies, and fly to a position [m]; return whether teleop agrees."""

@@ -65,6 +65,9 @@ def test_a_start_ends_a_drive_that_waits_for_keys(api, steering):
     steering.state = {"mission": None}
     steering.fly({"waypoints": []})
     assert api.posted == [("/v1/missions", {"waypoints": []})]
+    assert "set back to its spawn" in steering.answer[0]
+    steering.fly({"waypoints": [], "start": "here"})
+    assert steering.answer[0] == "starting"
 
 
 def test_a_refusal_is_told_in_the_words_of_the_api(api, steering):
