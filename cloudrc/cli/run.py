@@ -154,9 +154,10 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
             with contextlib.suppress(OSError):
                 folder.rmdir()
         if folder.exists():
-            remedy = f"; 'cloudrc report {folder}' writes its report"
-            remedy *= isinstance(error, KeyboardInterrupt)
-            print_line(f"the recording is in {folder}{remedy}", sys.stderr)
+            text = f"the recording is in {folder}"
+            if isinstance(error, KeyboardInterrupt):
+                text += f"; 'cloudrc report {folder}' writes its report"
+            print_line(text, sys.stderr)
         raise
     finally:
         if in_cluster and options.out is None and folder.exists():

@@ -17,7 +17,7 @@ from cloudrc.errors import CloudrcError
 from cloudrc.messages import ZERO, Vector
 
 DRIVE_PERIOD = 0.1
-"""Longest time between two requests of a drive [s]; each is a heartbeat of the operator."""
+"""Time between two requests of a drive [s], unless one takes longer; each is a heartbeat."""
 STOP_PERIOD = 0.2
 """Time between two attempts to send an emergency stop that nobody has answered [s]."""
 WATCH_PERIOD = 0.3
@@ -139,7 +139,8 @@ class Steering:
 
     def hold_key(self, key: str, velocity: Vector, lasts: float) -> None:
         """Add `velocity` [m/s] to the drive for `lasts` [s] from now on, because `key` is held."""
-        before, now = self.velocity(time.monotonic()), time.monotonic()
+        now = time.monotonic()
+        before = self.velocity(now)
         self._held = {**self._held, key: (velocity, now + lasts)}
         if self.velocity(now) != before:
             self._moved.set()
@@ -169,9 +170,13 @@ class Steering:
             if mission and mission != self._mission:
                 self.route = self.api.get(f"/v1/missions/{mission}")["route_m"]
             self._mission = mission
+        except CloudrcError as error:
+            self.state = {}
+            self.say(str(error), is_refusal=True)
+        profile: Mapping[str, Any] = {}
+        try:
             profile = self.link.read()
         except CloudrcError as error:
-            self.state, profile = {}, {}
             self.say(str(error), is_refusal=True)
         self.conditions = {
             f"{way}.{name}": float(value)
@@ -191,12 +196,13 @@ class Steering:
         """Send the velocity while a key is held, and once more when the last key is released."""
         last = ZERO
         while self._drives or last != ZERO:
+            due = time.monotonic() + DRIVE_PERIOD
             velocity = self.velocity(time.monotonic())
             if velocity != ZERO or last != ZERO:
                 words = "driving" if velocity != ZERO else "drive ends: holding"
                 self.ask(words, "/v1/drive", {"velocity_mps": velocity})
             last = velocity
-            self._moved.wait(DRIVE_PERIOD)
+            self._moved.wait(max(0.0, due - time.monotonic()))
             self._moved.clear()
 
     def _link_loop(self) -> None:

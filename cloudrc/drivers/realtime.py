@@ -160,7 +160,10 @@ def free_ports(count: int) -> list[int]:
                 found.append(port)
         if len(found) == count:
             return found
-    raise MissingPrerequisiteError(f"127.0.0.1 has fewer than {count} free ports in {PORTS}")
+    raise MissingPrerequisiteError(
+        f"127.0.0.1 has fewer than {count} free ports from {PORTS[0]} to {PORTS[-1]}; "
+        "end a program that uses them"
+    )
 
 
 def serve(

@@ -168,8 +168,9 @@ def distribution_name(profile: DirectionProfile) -> str:
 def write_table(folder: Path, profile: DirectionProfile) -> None:
     """Write the table of a profile's distribution; TC_LIB_DIR tells tc the folder."""
     name = distribution_name(profile)
-    text = "\n".join([f"# {name}", *map(str, table(profile)), ""])
-    (folder / f"{name}.dist").write_text(text)
+    path = folder / f"{name}.dist"
+    if not path.exists():  # the name determines the content
+        path.write_text("\n".join([f"# {name}", *map(str, table(profile)), ""]))
 
 
 def check(profile: DirectionProfile) -> None:

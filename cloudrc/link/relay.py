@@ -163,7 +163,7 @@ class Lane:
                 return
             self._counts["received"] += 1
             age_ns = self._stamps.age_ns(beside, time_ns())
-            # Read the wall clock first: a pause between both readings then never makes it early.
+            # Read the wall clock first: then a pause between the readings makes no datagram early.
             received_ns = monotonic_ns() - age_ns
             self._stalled += age_ns >= AGE_MAX_NS
             try:

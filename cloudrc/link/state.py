@@ -8,11 +8,15 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from cloudrc.files import write_atomically
 from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
 
 STATE_FILE = "link.json"  # name of the state file, in the folder of the route file
 PROFILE_FILE = "profile.json"  # profile of a local run's relay, in the folder of the state files
@@ -69,12 +73,20 @@ def to_text(state: LinkState) -> str:
 T = TypeVar("T")
 
 
+@cache
+def _adapter(kind: type) -> TypeAdapter[Any]:  # takes 1 ms, and the control loop parses, too
+    from pydantic import TypeAdapter  # slow to import
+
+    return TypeAdapter(kind)
+
+
 def parse(kind: type[T], text: bytes | str) -> T:
     """Parse JSON as a dataclass; raise a ValueError with one line if the text is invalid."""
-    from pydantic import TypeAdapter, ValidationError  # slow to import
+    from pydantic import ValidationError
 
     try:
-        return TypeAdapter(kind).validate_json(text)
+        found: T = _adapter(kind).validate_json(text)  # type: ignore[arg-type]
+        return found
     except ValidationError as error:
         raise ValueError(f"not a {kind.__name__}: {error.errors()[0]['msg']}") from None
 

@@ -347,7 +347,7 @@ class MissionService:
             raise ConflictError(
                 f"the straight way from where the robot is, {_place(seen.position)}, to "
                 f"{_place(leg.position)} leads through the wall of {scene.pipes[through].name}; "
-                "go round it first, by 'cloudrc mission goto'",
+                "go round it first, by another target",
                 self._current.id if self._current else "",
             )
 
