@@ -144,4 +144,8 @@ def _one(kind: str) -> str:
 
 def _reason(error: Exception) -> str:
     text = " ".join(str(error).split())
-    return text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}"
+    return (
+        text
+        if isinstance(error, ValueError | CloudrcError) and text
+        else f"{type(error).__name__}: {text}"
+    )

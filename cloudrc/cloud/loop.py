@@ -25,7 +25,7 @@ from typing import Any, NoReturn
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
-from cloudrc.cloud.plan import ControllerError, make_plan
+from cloudrc.cloud.plan import PLUGIN_ERRORS, ControllerError, make_plan
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.errors import describe_error
 from cloudrc.messages import (
@@ -196,7 +196,7 @@ class ControlLoop:
         self._now_ns = now_ns
         try:
             estimator = self._build_estimator()
-        except Exception as error:
+        except PLUGIN_ERRORS as error:
             self._note("estimator", error)
             estimator = Estimator()  # it has no estimate, so the horizon stays 0
         self._call("predictor", self._predictor.reset)
@@ -264,7 +264,7 @@ class ControlLoop:
         assert basis is not None, "check `ready` first"
         try:
             self._horizon = delays.horizon(now_ns)
-        except Exception as error:
+        except PLUGIN_ERRORS as error:
             self._note("estimator", error)
         horizon = self._horizon
         estimate = self._predict(basis, horizon)
@@ -309,7 +309,7 @@ class ControlLoop:
             if not isfinite(sum(position + velocity + orientation)):
                 _refuse(position=position, velocity=velocity, orientation=orientation)
             return _new(Odometry, (stamp_ns, position, orientation, velocity, rate))
-        except Exception as error:
+        except PLUGIN_ERRORS as error:
             self._note("predictor", error)
             return basis
 
@@ -322,7 +322,7 @@ class ControlLoop:
                 _refuse(velocity=velocity, yaw_rate=(yaw_rate,))
             terms = (_triple(proportional), _triple(integral), _triple(derivative))
             return _new(ControlOutput, (velocity, yaw_rate, *terms))
-        except Exception as error:
+        except PLUGIN_ERRORS as error:
             self._note("controller", error)
             return STAND_STILL
 
@@ -334,9 +334,11 @@ class ControlLoop:
                 return ()
             count = self._planned
             return make_plan(model, self._controller, setpoint, velocity, now_ns, count)
-        except Exception as error:
-            kind = "controller" if isinstance(error, ControllerError) else "predictor"
-            self._note(kind, error.__cause__ or error, "cloud sends this command without a plan")
+        except PLUGIN_ERRORS as error:
+            in_controller = isinstance(error, ControllerError)
+            kind = "controller" if in_controller else "predictor"
+            cause = (in_controller and error.__cause__) or error
+            self._note(kind, cause, "cloud sends this command without a plan")
             return ()
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
@@ -351,7 +353,7 @@ class ControlLoop:
         """Call a method of a plug-in that returns nothing; note its exception."""
         try:
             call(*arguments)
-        except Exception as error:
+        except PLUGIN_ERRORS as error:
             self._note(kind, error, "cloud goes on using it")
 
     def _note(self, kind: str, error: BaseException, instead: str = "") -> None:

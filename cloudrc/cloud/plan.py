@@ -16,6 +16,8 @@ STEP = PLAN_STEP_NS * 1e-9
 SPEED_MAX = 1000.0
 """Largest component of a planned velocity [m/s]; the guard refuses a plan with a larger one.
 Source: docs/reference/faults.md, "F23"."""
+PLUGIN_ERRORS = (Exception, SystemExit, GeneratorExit)
+"""What counts as the failure of a plug-in. A user's Ctrl-C does not."""
 
 
 class ControllerError(Exception):
@@ -49,14 +51,14 @@ def make_plan(
     plan = list[Vector]()
     try:
         controller = deepcopy(controller)
-    except Exception as error:
+    except PLUGIN_ERRORS as error:
         raise ControllerError from error
     for k in range(1, count + 1):
         state, later = model.step(velocity, STEP), setpoint_at(setpoint, now_ns + k * PLAN_STEP_NS)
         try:
             x, y, z = controller.update(state, later, STEP).velocity
             velocity = (float(x), float(y), float(z))
-        except Exception as error:
+        except PLUGIN_ERRORS as error:
             raise ControllerError from error
         largest = max(map(abs, velocity))
         if not (isfinite(sum(velocity)) and largest <= SPEED_MAX):

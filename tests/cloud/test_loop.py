@@ -133,7 +133,7 @@ def returns(horizon=0.0, output=None, **changes):
     return Odd
 
 
-ERRORS = (RuntimeError("out of\nluck"), StopIteration)
+ERRORS = (RuntimeError("out of\nluck"), StopIteration, SystemExit("enough"), GeneratorExit)
 LONG = ValueError("no caf\udce9 " + "x" * 100_000)
 ANY = ControlOutput((0.1, 0.2, 0.3), 0.4, ZERO, ZERO, ZERO)
 OUT_OF_SHAPE = returns((0.1,), ANY._replace(velocity=(0.1, 0.2)), position=(1.0, 2.0))

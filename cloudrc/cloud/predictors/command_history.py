@@ -148,6 +148,8 @@ def _read_model(path: Path, names: Iterable[str]) -> dict[str, Vector]:
         value = tree.get(name)
         if not (isinstance(value, list) and len(value) == 3 and all(map(_fits, value))):
             raise ValueError(f"model: {path}: {name} is {value}, not three numbers >= 0; {hint}")
+    if min(tree["time_constant"]) == 0.0:
+        raise ValueError(f"model: {path}: time_constant is 0, but must be above 0; {hint}")
     return {name: tuple(map(float, tree[name])) for name in names}  # type: ignore[misc]
 
 

@@ -120,10 +120,12 @@ def build(
     given = dict(parameters or {})
     if model_file is not None and model == "white_box":
         raise ValueError("model_file: needs `model: first_order`; set that, or omit model_file")
+    if "name" in given:
+        raise ValueError("parameters: no 'name'; choose the model with model")
     if "model" in given:  # the experiment file makes a relative model_file absolute
         raise ValueError("parameters: give the file of a model as model_file, beside parameters")
     if model_file is not None:
         given["model"] = str(model_file)
     name = "model_based" if model == "white_box" else "command_history"
-    replay = build_plugin("predictors", PlugIn(name=name, **given))
+    replay = build_plugin("predictors", PlugIn.model_validate({**given, "name": name}))
     return Kalman(replay, position_noise, velocity_noise, acceleration_error)
