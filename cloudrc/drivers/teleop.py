@@ -189,8 +189,8 @@ def serve_teleop(
     """Run the loop of teleop's process at 50 Hz in real time until `stop()` returns true.
 
     `machine` is a `MissionService`, or has its methods hear, see, handle_deadline and take_outputs.
-    `calls` and `stops` return the queued API calls and emergency stops. `tell` is called with the
-    events and faults of each period, and must not block.
+    `stops` returns the queued emergency stops and holds, `calls` all other calls of the API. `tell`
+    is called with the events and faults of each period, and must not block.
     """
     unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
     deadline_ns, blind = time.monotonic_ns(), 0
@@ -234,7 +234,7 @@ def turn(
         return blind
     if arrived:
         machine.hear(now_ns)
-    # An emergency stop is queued before a state can show its effect, so stops come first.
+    # A stop or a hold is queued before a state can show its effect, so these come first.
     for stop in stops():
         stop(now_ns)
     if (seen := _newest(states, decode)) is not None:

@@ -134,11 +134,6 @@ class Flight:
         totals = count["total"][count["name"] == name]
         return float(totals[-1]) if len(totals) else None
 
-    @property
-    def pipes_flown(self) -> int:
-        """Number of different pipes that the robot's base has entered."""
-        return int((np.unique(pipe_index(self.scene, self.truth["position"])) >= 0).sum())
-
     @cached_property
     def applied(self) -> Columns:
         """Commands that world applied in the flight, with the values of their control periods.

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from math import inf, isfinite, nan
+from math import inf, isfinite
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -300,9 +300,11 @@ def _why_grounded(flight: Flight) -> str:
     if arrivals["used"][last].any():
         return "fresh commands arrived, but no request to start"
     commands = flight.join_control({name: arrivals[name][last] for name in arrivals.names})
-    age_ns = min(commands["stamp_ns"] - commands["basis_stamp_ns"], default=nan)
+    ages_ns = commands["stamp_ns"] - commands["basis_stamp_ns"]
+    if not len(ages_ns):
+        return "no fresh command arrived"
     return (
-        f"the odometry behind each command was {age_ns * 1e-9:.3f} s old or older when the"
+        f"the odometry behind each command was {min(ages_ns) * 1e-9:.3f} s old or older when the"
         " command arrived, above the limit guard.command_age_max_ms; shorten the delay or raise"
         " the limit"
     )
@@ -335,8 +337,7 @@ class Observations:
 
     pipe_contacts: int = 0  # number of contacts with pipes
     touch_speed: float | None = None  # of the arm's tip at its first touch of the board [m/s]
-    slip_began_ns: int = 0  # world's slip when the mission began [ns]
-    slip_ns: int = 0  # world's slip in the last telemetry [ns]
+    slip_ns: int = 0  # time by which world's clock fell behind while teleop ran [ns]
 
     def news(self, before: Observations, elapsed: float) -> Iterator[tuple[str, str]]:
         """Yield event and text of each contact since `before`, at mission time `elapsed` [s]."""
@@ -348,13 +349,12 @@ class Observations:
 
     def evidence(self, ending: Ending, elapsed: float, **known: Any) -> Evidence:
         """Return the evidence of a mission that ended at mission time `elapsed` [s]."""
-        slipped = (self.slip_ns - self.slip_began_ns) * 1e-9
         return Evidence(
             ending=ending,
             end=Moment(elapsed),
             touch=None if self.touch_speed is None else (self.touch_speed, UNKNOWN),
             violations=(_pipe_touched("a pipe", self.pipe_contacts),) if self.pipe_contacts else (),
-            slow=_too_slow(1.0 - slipped / elapsed) if elapsed > 0 else "",
+            slow=_too_slow(1.0 - self.slip_ns * 1e-9 / elapsed) if elapsed > 0 else "",
             **known,
         )
 

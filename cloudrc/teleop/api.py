@@ -98,7 +98,7 @@ class Bridge:
         self._service, self.closed = service, ""
 
     def close(self, why: str) -> None:
-        """Refuse all calls from now on; answer the waiting emergency stops with an error."""
+        """Refuse all calls from now on; answer the waiting stops and holds with an error."""
         self.closed = why
         while self._urgent:
             self._urgent.popleft()[1].set_exception(UnavailableError(why))

@@ -478,7 +478,7 @@ class Teleop:
             self._select_leg(leg, now_ns)
 
     def _repeat_setpoint(self, now_ns: int) -> None:
-        """Send the setpoint again; while the robot `_may_move`, send its position instead."""
+        """Send the setpoint again in a new session; before the start, the robot's position."""
         if self.state == STARTING and self._may_move:
             self._is_pending = True
             self._select_here()

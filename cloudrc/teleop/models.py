@@ -171,8 +171,10 @@ class Seen(_Answer):
     cause: str = _field("Why the guard is in this state; after a landing, why the robot landed")
     guard_for_s: float | None = _field("Time in this guard state [s]; null if `age_s` is above 1 s")
     next_step: str = _field("What the robot does next, or what the operator has to do")
-    pipe_contacts: int = _field("Number of contacts with pipes so far")
-    touch_speed_mps: float | None = _field("Speed of the arm's tip when it touched the board [m/s]")
+    pipe_contacts: int = _field("Number of contacts with pipes in the mission")
+    touch_speed_mps: float | None = _field(
+        "Speed of the arm's tip at its first touch of the board [m/s]"
+    )
     horizon_s: float | None = _field("Prediction horizon of cloud's last command [s]")
     rtt_s: float | None = _field("Last round trip, without the waiting time on board [s]")
     loop_delay_s: float | None = _field("Last round trip, with the waiting time on board [s]")

@@ -157,6 +157,9 @@ class MissionService:
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
         verdict = Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
         self._note(mission, "cancelled", NEVER_BEGAN, now_ns, verdict=verdict)
+        if self.book.trouble:
+            text = f"{mission.id} is cancelled, but waits again if teleop restarts"
+            raise UnavailableError(f"{text}: {self.book.trouble}")
         return mission
 
     def hold(self, now_ns: int) -> Mission:
@@ -251,7 +254,7 @@ class MissionService:
                 known,
                 pipe_contacts=seen.pipe_contacts,
                 touch_speed=finite_or_none(seen.touch_speed),
-                slip_ns=seen.slip_ns,
+                slip_ns=known.slip_ns + (seen.slip_ns - before.slip_ns if before else 0),
             )
             for event, text in mission.witness.news(known, self._teleop.elapsed(now_ns)):
                 self._note(mission, event, text, now_ns)
@@ -400,8 +403,7 @@ class MissionService:
         assert mission is not None, "an event belongs to a mission"
         changed: dict[str, Any] = {"waypoint": event.waypoint} if event.waypoint >= 0 else {}
         if event.event == "started" and seen is not None:
-            slip_ns = seen.slip_ns
-            changed |= {"world": seen.world, "witness": Observations(0, None, slip_ns, slip_ns)}
+            changed |= {"world": seen.world, "witness": Observations()}
         if event == self._teleop.outcome:
             evidence = mission.witness.evidence(
                 Ending(event.event, event.text),

@@ -15,7 +15,7 @@ from cloudrc.messages import Cause, GuardState, Setpoint, Start
 from cloudrc.teleop import wire
 from cloudrc.teleop.api import Bridge
 from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX, next_step
-from cloudrc.teleop.store import ConflictError, Order
+from cloudrc.teleop.store import ConflictError, Order, UnavailableError
 from cloudrc.teleop.wire import ENDED, STATES, Leg, Plan
 from tests.teleop.conftest import (
     FROM_SPAWN,
@@ -179,13 +179,14 @@ def test_what_follows_from_a_script(name, script, expected):
         ("create 0.05 A", "resume", "resume: the mission is flying; it must be held"),
         ("mute stop", "create", "an emergency stop is on its way to the robot; find the cause"),
         ("stop 0.1", "create", "the guard is in ESTOP (emergency stop) and lets nothing fly; find"),
+        ("create queue full", "cancelm2", "m2 is cancelled, but waits again if teleop restarts"),
     ],
 )
 def test_a_refusal_says_why(script, action, said):
     flight = ServiceFlight()
     flight.step()
     play(flight, script)
-    with pytest.raises(ConflictError, match=re.escape(said)):
+    with pytest.raises((ConflictError, UnavailableError), match=re.escape(said)):
         play(flight, action)
 
 
@@ -261,10 +262,12 @@ def test_the_setpoint_is_repeated_at_10_hz():
 )
 @pytest.mark.parametrize("restarted", [False, True])
 def test_what_the_robot_touched_decides(seen, codes, exit_code, restarted):
-    """Also while teleop was away."""
+    """Also what it touched while teleop was away, but not the time that world lost then."""
     flight, mission_id = service_flying(contact=True)
     if restarted:
         flight.restart_teleop()
+        if "slip_ns" in seen:
+            codes, exit_code = [], 0
     vars(flight).update(seen)
     flight.step(seconds=0.05)
     assert ("board_touched" in flight.names(mission_id)) == ("touch_speed" in seen)
