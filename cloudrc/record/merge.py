@@ -14,6 +14,7 @@ After a stall of world's process, world's clock is behind the clock of its machi
 from __future__ import annotations
 
 import heapq
+from collections.abc import Iterator
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -78,13 +79,12 @@ def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
     """Return the smallest (arrival - departure) of a datagram [ns], each on its end's clock."""
 
-    def packets(table: Table) -> dict[tuple[int, int], int]:
+    def packets(table: Table) -> Iterator[tuple[tuple[int, int], int]]:
         numbers = zip(table["epoch"].tolist(), table["counter"].tolist(), strict=True)
-        # In reverse: of a datagram that arrived twice, the first arrival counts.
-        return dict(reversed([*zip(numbers, table["stamp_ns"].tolist(), strict=True)]))
+        return zip(numbers, table["stamp_ns"].tolist(), strict=True)
 
-    sent_ns, arrived_ns = packets(sent), packets(arrived)
-    differences = (at_ns - sent_ns[one] for one, at_ns in arrived_ns.items() if one in sent_ns)
+    sent_ns = dict(packets(sent))
+    differences = (at_ns - sent_ns[one] for one, at_ns in packets(arrived) if one in sent_ns)
     return min(differences, default=None)
 
 
@@ -181,19 +181,28 @@ def _last_mission(contents: Contents) -> tuple[int | None, int | None, int]:
 
     None: the event is missing; -1: the recording has no earlier mission.
     """
-    # The times of the messages, which are later than the stamps in them.
-    times_ns = [message[1] for message in contents.messages if message[0] == "/mission"]
-    events = _table(contents, "/mission")["event"].tolist()
     began, ended, earlier = None, None, -1
-    for stamp_ns, event in zip(times_ns, events, strict=True):
+    for time_ns, event in _mission_events(contents):
         if event == "started":
-            began, ended, earlier = stamp_ns, None, earlier if ended is None else ended
+            began, ended, earlier = time_ns, None, earlier if ended is None else ended
         elif event not in UNDER_WAY and ended is None:
-            ended = stamp_ns
+            ended = time_ns
         elif event in UNDER_WAY and ended is not None:
             # The start of this mission is lost: keep all that is after the earlier mission's end.
-            began, ended = ended + BEFORE_NS + 1, None
+            began, earlier = ended + 1, ended
+            ended = None
     return began, ended, earlier
+
+
+def _mission_events(contents: Contents) -> Iterator[tuple[int, str]]:
+    """Yield the log time [ns] of each readable mission message, and its event.
+
+    The log time is later than the stamp in the message.
+    """
+    for message in contents.messages:
+        if message[0] == "/mission":
+            for event in _table(Contents([message]), "/mission")["event"].tolist():
+                yield message[1], event
 
 
 def _table(contents: Contents, topic: str) -> Table:

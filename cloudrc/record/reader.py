@@ -126,7 +126,7 @@ class Records:
             yield from self._read()
         except CRCValidationError as error:
             self.fault = "damaged: a checksum is wrong"
-            self.data_ended = isinstance(error.record, mcap.DataEnd)
+            self.data_ended |= isinstance(error.record, mcap.DataEnd)
         except (EndOfFile, RecordLengthLimitExceeded):  # a record longer than the rest of the file
             self.fault, self.cut = "cut short", True
         except _StopError as error:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from functools import cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -49,34 +50,30 @@ def _own_definition(ros_type: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-_NAMES = {topic.ros_type for topic in TOPICS.values()} | {*VIEWS.values()}
+_NAMES = {topic.ros_type for topic in TOPICS.values()}
 _OWN = {name: _own_definition(name) for name in _NAMES if name.startswith(_OURS)}
 for _name, _text in _OWN.items():
     STORE.register(get_types_from_msg(_text, _name))
 
 
-def _whole_definition(ros_type: str) -> str:
+@cache
+def definition(ros_type: str) -> str:
+    """Return a message type's definition as `ros2msg`, including the types that it uses."""
     text, _ = STORE.generate_msgdef(ros_type, ros_version=2)
     own, mark, needed = text.partition("=" * 80)
     return _OWN.get(ros_type, own) + mark + needed
 
 
-# All types are generated on import: rosbags takes milliseconds for each, and in flight the writing
-# thread would block the loop for that time.
-_DEFINITIONS = {name: _whole_definition(name) for name in _NAMES}
-_HASHES = {name: STORE.hash_rihs01(name) for name in _NAMES}
-for _name in _NAMES:
-    STORE.get_msgdef(_name)
-
-
-def definition(ros_type: str) -> str:
-    """Return a message type's definition as `ros2msg`, including the types that it uses."""
-    return _DEFINITIONS[ros_type]
-
-
+@cache
 def type_hash(ros_type: str) -> str:
     """Return the RIHS01 hash by which ROS 2 identifies a message type."""
-    return _HASHES[ros_type]
+    return STORE.hash_rihs01(ros_type)
+
+
+# The types of all topics are generated on import: rosbags takes milliseconds for each, and in
+# flight the writing thread would block the loop for that time.
+for _name in _NAMES:
+    definition(_name), type_hash(_name), STORE.get_msgdef(_name)
 
 
 def is_known(ros_type: str, text: str) -> bool:

@@ -2,8 +2,8 @@
 
 The file has the MCAP profile `ros2`, schemas in `ros2msg`, messages in `cdr`, and chunks compressed
 with zstd. A chunk goes to the operating system after at most half a second of recording, so a
-killed process loses at most half a second. Checksums of chunks, data section and index reveal every
-wrong byte. A complete file contains the number and the hash of its messages.
+killed process loses at most half a second. Checksums of the chunks and of the data section reveal
+every wrong byte outside the index. A complete file has the number and the hash of its messages.
 """
 
 from __future__ import annotations
