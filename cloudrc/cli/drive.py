@@ -70,7 +70,7 @@ def _handle_keys(screen: curses.window, steering: Steering, api: Api) -> None:
         if key == ord("h"):
             steering.ask("holding", "/v1/hold")
         elif key == ord("X"):
-            steering.ask("stopping the rotors", "/v1/estop")
+            steering.stop()
         screen.erase()
         height, width = screen.getmaxyx()
         lines = [part for line in _lines(steering, api) for part in wrap(line, width - 1) or [""]]

@@ -69,18 +69,20 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Shape one direction of the link until SIGTERM."""
     stop = StopSignal()  # first: until then, process 1 of a container ignores SIGTERM
+    from cloudrc.config.load import read_experiment
     from cloudrc.link.follow import HANDED_FILE, PEER_PAUSE, PROFILE_PERIOD, PeerName, Profiles
     from cloudrc.link.sidecar import Sidecar
 
     warn_if_exposed(options.listen)
-    exporter = open_exporter(options, "link")
+    experiment = read_experiment(str(options.config))
+    exporter = open_exporter(options, "link", experiment)
     document = options.route.with_name(HANDED_FILE)
     profiles = Profiles(options.profile, document, make_profile_loader(options.direction), log)
     profile, peer = profiles.first(), PeerName(options.peer, ipv4_addresses, log)
     with TemporaryDirectory(prefix="tc-", dir=options.route.parent) as tables:
         programs = Programs(tables)
         sidecar = Sidecar(
-            _machine(options, programs, Path(tables)),
+            _machine(options, experiment.seed, programs, Path(tables)),
             profile,
             mode=options.mode,
             direction=options.direction,
@@ -126,8 +128,7 @@ def make_profile_loader(direction: str) -> Load:
     return load
 
 
-def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> Machine:
-    from cloudrc.config.load import read_experiment
+def _machine(options: argparse.Namespace, seed: int, programs: Programs, tables: Path) -> Machine:
     from cloudrc.link.model import LinkDirection
     from cloudrc.link.netem import Netem, may_shape
     from cloudrc.link.profile import DirectionProfile
@@ -135,7 +136,7 @@ def _machine(options: argparse.Namespace, programs: Programs, tables: Path) -> M
     from cloudrc.link.sidecar import Machine
     from cloudrc.tunnel.codec import peek
 
-    seed, clock, wait = read_experiment(str(options.config)).seed, time.monotonic_ns, time.sleep
+    clock, wait = time.monotonic_ns, time.sleep
 
     def relay(profile: DirectionProfile, origin_ns: int) -> RelayShaper:
         settle()

@@ -208,16 +208,18 @@ def _listening(flag: str, listen: Address) -> Iterator[None]:
         ) from error
 
 
-def open_exporter(options: argparse.Namespace, role: str) -> Exporter | None:
+def open_exporter(
+    options: argparse.Namespace, role: str, experiment: ResolvedExperiment
+) -> Exporter | None:
     """Serve the metrics of this process at the address of `--metrics`; without it, return None."""
     if options.metrics is None:
         return None
-    from cloudrc.config.load import fingerprint, read_experiment
+    from cloudrc.config.load import fingerprint
     from cloudrc.drivers.exporter import Exporter
 
     warn_if_exposed(options.metrics)
-    config = fingerprint(read_experiment(str(options.config)))
-    exporter = Exporter(role, config, missions=getattr(options, "teleop", None) is None)
+    missions = getattr(options, "teleop", None) is None
+    exporter = Exporter(role, fingerprint(experiment), missions=missions)
     exporter.serve(options.metrics)
     return exporter
 
@@ -271,9 +273,10 @@ def open_end(
 
     feed = Feed.on_stdout(watched=options.feed)  # before plug-ins are loaded: they may print
     path, clock, key = str(options.config), clock_id(), options.key
-    exporter = open_exporter(options, name)
+    given = read_experiment(path)
+    exporter = open_exporter(options, name, given)
     # Only cloud loads the plug-ins, which fill in their default parameters.
-    experiment = load_experiment(path) if name == "cloud" else read_experiment(path)
+    experiment = load_experiment(path) if name == "cloud" else given
     keys = KeyFile(key, time.monotonic_ns())
     if readable_by_others(key):
         print_line(f"cloudrc: warning: {key} can be read by others: chmod 600 {key}", sys.stderr)
@@ -367,12 +370,13 @@ def link_monitor(
 
 
 def _run_relay(options: argparse.Namespace) -> int:
-    stop, exporter = StopSignal(), open_exporter(options, "link")
+    stop = StopSignal()
     from cloudrc import assembly
     from cloudrc.config.load import read_experiment
     from cloudrc.link.relay import ask_for_fifo, settle
 
     experiment = read_experiment(str(options.config))
+    exporter = open_exporter(options, "link", experiment)
     links = dict(zip(("uplink", "downlink"), assembly.build_links(experiment), strict=True))
     ways = {"uplink": experiment.uplink, "downlink": experiment.downlink}
     values = {way: d.model_dump(mode="json", exclude_defaults=True) for way, d in ways.items()}

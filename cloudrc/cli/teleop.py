@@ -85,8 +85,8 @@ def execute(options: argparse.Namespace) -> int:
 
     if options.api:
         require("the API of teleop", ("api",))
-    stop, exporter = StopSignal(), open_exporter(options, "teleop")
-    experiment = read_experiment(str(options.config))
+    stop, experiment = StopSignal(), read_experiment(str(options.config))
+    exporter = open_exporter(options, "teleop", experiment)
     with ExitStack() as opened:
         scene = load_scene(experiment.world.scene)
         server = serve_api(options, experiment, scene) if options.api else None

@@ -201,7 +201,7 @@ def explain_errors(doing: str, where: str) -> Iterator[None]:
             f"cannot {doing} {where}: the API server does not answer ({_root(error)}); "
             "is the cluster up? ask it: kubectl cluster-info"
         ) from error
-    except ConfigException as error:  # such as a login program that fails
+    except ConfigException as error:  # such as a missing certificate file
         raise ClusterError(f"cannot {doing} {where}: {str(error).partition(chr(10))[0]}") from error
 
 
@@ -211,7 +211,7 @@ def _refusal(error: Any, status: int, doing: str) -> str:
     except (ValueError, KeyError, TypeError):
         message = error.reason or f"the API server answered {status}"
     message = " ".join(str(message).split())
-    if status == 401:
+    if status == 401 or "system:anonymous" in message:
         return "the API server does not know you; log in to the cluster again"
     if status == 403 and "exceeded quota" not in message:
         return f"{message}; ask for the permission, and check it: kubectl auth can-i {doing}"

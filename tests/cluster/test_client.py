@@ -35,6 +35,7 @@ def test_a_missing_or_broken_kubeconfig_is_named_with_a_remedy(tmp_path, monkeyp
     ("code", "said", "expected"),
     [
         (401, "Unauthorized", "log in"),
+        (403, 'User "system:anonymous" cannot list', "log in to the cluster again"),
         (403, "exceeded quota: compute", "exceeded quota: compute$"),
         (500, "etcd\nis gone", "etcd is gone"),
     ],
