@@ -169,7 +169,7 @@ pictures: $(VENV)/dev ## film the console for the README, draw a flight, and tak
 results: $(VENV)/dev ## fly the README's results and write them into it: two minutes
 	$(bin)/python -m tools.results
 
-docs: $(VENV)/dev ## write the generated pages of docs/, and the chart's values, schema and table
+docs: $(VENV)/dev ## write the generated tables of docs/, and the chart's schema, table and copied files
 	$(bin)/python -m tools.docs
 
 images: ## build the container images; needs Docker

@@ -67,7 +67,7 @@ OPEN = {
     "version": "the version",
     "config": "the first 12 digits of the SHA-256 of the process's configuration with all "
     "defaults (on one machine with those of plug-ins, as `config_sha256` in report.json; in a "
-    "cluster without those of plug-ins); empty for a process without configuration",
+    "cluster without those of plug-ins)",
 }
 """Label of a metric that has too many values for a list -> description of the values."""
 COPIED = ("profile", "mission")

@@ -55,7 +55,7 @@ def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
     for key, value, source in given:
         path = tuple(part.strip() for part in key.split("."))
         if not all(path):
-            raise BadInputError(f"{source.label}: {key!r}: is no key, such as cloud.predictor")
+            raise BadInputError(f"{source.label}: {key!r}: is no key; one is cloud.predictor")
         for each in _directions(path):
             if each in found:
                 raise BadInputError(f"{source.label} {key}: is set twice; keep one of them")
@@ -80,7 +80,7 @@ def parse_settings(texts: Iterable[str], label: str = "--set") -> Settings:
     for text in texts:
         key, equals, value = text.partition("=")
         if not equals:
-            example = "cloud.predictor=last_sample"
+            example = "link.both.delay_ms=40"
             raise BadInputError(f"{label} {text}: must be key=value; for example {example}")
         given.append((key, parse_value(value, f"{label} {key}"), source))
     return collect_settings(given)

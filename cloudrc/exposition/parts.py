@@ -1,7 +1,7 @@
 """Compute parts of the live metrics: histograms, lost datagrams, errors of predictions.
 
-The thread of the control loop stores and counts records, in less than 1 us per record. The thread
-that serves the metrics does all other work.
+The thread of the control loop stores and counts records, in 1 to 2 us per record. The thread that
+serves the metrics does all other work.
 """
 
 from __future__ import annotations

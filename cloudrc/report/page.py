@@ -59,7 +59,8 @@ SHARES = ("loss_", "late_", "overshoot_")
 
 
 SENTENCES = (
-    "The drone reached {waypoints_reached:.0f} of {waypoints} waypoints in {duration:.1f} s.",
+    "The drone reached {waypoints_reached:.0f} of {waypoints} waypoints.",
+    "The mission took {duration:.1f} s.",
     "It flew {distance_flown:.1f} m.",
     "In the pipes, its smallest distance from a wall was {min_clearance:.3f} m.",
     "Its arm touched the board after {contact_time:.1f} s at {tip_speed:.2f} m/s.",

@@ -41,7 +41,7 @@ def test_the_page_says_what_the_flight_did(folder):
     text = re.sub(r"\s", " ", re.sub(r"<[^>]+>", "", page))
     for said in (
         "The mission succeeded.",
-        "The drone reached 7 of 7 waypoints in 31.0 s",
+        "The drone reached 7 of 7 waypoints. The mission took 31.0 s.",
         "In the pipes, its smallest distance from a wall was 0.153 m.",
         "Its arm touched the board after 27.8 s at 0.12 m/s",
         "cloudrc run config.yaml --mode virtual",
@@ -93,6 +93,6 @@ def test_the_summary_leaves_out_what_is_unknown():
     numbers = {name: Number(value, "", "") for name, value in values.items()}
     text = summary(flown().flight(ONE_PIPE, contact=True, waypoints=2), numbers)
     assert text == (
-        "The drone reached 1 of 2 waypoints in 10.0 s. "
+        "The drone reached 1 of 2 waypoints. The mission took 10.0 s. "
         "The guard on board took over 1 times, for 2.5 s in total."
     )

@@ -149,3 +149,5 @@ def _swizzle(outcome: Outcome, seed: int) -> None:
     moves(outcome, flight, *metrics, since=uplink[0], over=max(ends))
     for end, records in (("cloud", flight.of_cloud), ("world", flight.of_world)):
         outcome.least(f"times that {end} reports: late", len(measures.told(records, "late")), 1)
+    restarted = measures.events_of_missions(flight, "restarted")
+    outcome.least("events restarted in teleop's log", len(restarted), 1)

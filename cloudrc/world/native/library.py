@@ -69,7 +69,7 @@ def compile_to(file: Path, command: list[str]) -> None:
         made = Path(folder, file.name)
         words = [*command, *FLAGS, "-o", str(made), str(SOURCE)]
         subprocess.run(words, check=True, capture_output=True, text=True, timeout=COMPILE_MAX)
-        made.chmod(0o755)
+        made.chmod(0o755)  # other users read it in an image
         os.replace(made, file)
 
 
