@@ -16,7 +16,7 @@ from cloudrc.cli.client import UNIX, Api, token_argument, token_file, token_read
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
 from cloudrc.cli.extras import require
 from cloudrc.cli.find_run import find_local_run
-from cloudrc.cli.output import print_line
+from cloudrc.cli.output import open_page, print_line
 from cloudrc.cli.parser import whole_number
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 EPILOG = """\
 examples:
   cloudrc console
-  cloudrc console runs/hover-local-seed1 --port 8080
+  cloudrc console runs/hover-local-seed1 --port 8080 --no-open
   cloudrc console --cluster -n demo      a release with console.enabled=true
 
 The page is served on this machine only. The first browser steers; others read.
@@ -52,6 +52,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--port", type=whole_number(0, 65_535), default=0, metavar="N", help=port)
     about = "show the page of a release, and carry out its changes of the link until Ctrl-C"
     add("--cluster", action="store_true", help=about)
+    add("--no-open", action="store_true", help="print the page's address, open no browser")
     release_arguments(parser)
     pod = parser.add_argument_group("in the container of the chart")
     for flag, metavar, text in (
@@ -69,7 +70,8 @@ def execute(options: argparse.Namespace) -> int:
     if options.cluster or options.context or options.namespace or options.release:
         return _show_release(options)
     require("the console", ("console", "world"))
-    _serve(options.port, _in_pod(options) if options.tap else _local(options))
+    flight = _in_pod(options) if options.tap else _local(options)
+    _serve(options.port, flight, with_browser=not (options.no_open or options.tap))
     print_line("the flight has ended", sys.stderr)
     return 0
 
@@ -84,7 +86,7 @@ class Flight(NamedTuple):
     has_ended: Callable[[], bool]
 
 
-def _serve(port: int, flight: Flight) -> None:
+def _serve(port: int, flight: Flight, *, with_browser: bool) -> None:
     with ExitStack() as opened:
         from cloudrc.console.page import Page
 
@@ -95,6 +97,8 @@ def _serve(port: int, flight: Flight) -> None:
         tap = TapListener(flight.tap)
         opened.callback(tap.close)
         print_line(f"console: {page.url}")
+        if with_browser:
+            open_page(page.url)
         from cloudrc.config.load import read_experiment
         from cloudrc.console.feed import FlightFeed
         from cloudrc.console.steering import Steering
@@ -177,7 +181,12 @@ def _show_release(options: argparse.Namespace) -> int:
     from cloudrc.cluster.console import follow_page
     from cloudrc.cluster.link import keep, read_link, send
 
-    for line in follow_page(release, options.port, lambda url: print_line(f"console: {url}")):
+    def ready(url: str) -> None:
+        print_line(f"console: {url}")
+        if not options.no_open:
+            open_page(url)
+
+    for line in follow_page(release, options.port, ready):
         if not line.startswith(LINK_SET):
             continue
         try:

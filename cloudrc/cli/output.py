@@ -54,6 +54,18 @@ def discard_output(stream: TextIO) -> None:
         os.close(null)
 
 
+def open_page(url: str) -> bool:
+    """Open a page in the user's browser; return False if there is none that has a window.
+
+    Without a window, `webbrowser` could start a text browser in the terminal of the command.
+    """
+    import webbrowser
+
+    wanted = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
+    has_window = sys.platform != "linux" or any(os.environ.get(name) for name in wanted)
+    return has_window and webbrowser.open(url)
+
+
 def paint(text: str, colour: str) -> str:
     """Return the text with colour codes if stdout is a terminal, else unchanged."""
     if os.environ.get("NO_COLOR") or not is_live(sys.stdout):

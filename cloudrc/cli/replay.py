@@ -6,12 +6,11 @@ import argparse
 import os
 import sys
 import tempfile
-import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import print_line
+from cloudrc.cli.output import open_page, print_line
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -53,7 +52,7 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"{run}: no replay: {error}") from error
     except OSError as error:
         raise BadInputError(f"{out}: {error.strerror}; name another file with --out") from error
-    if not options.no_open and not webbrowser.open(out.absolute().as_uri()):
+    if not options.no_open and not open_page(out.absolute().as_uri()):
         print_line("cloudrc: found no browser here; open the page yourself", sys.stderr)
     print_line(str(out))
     return 0

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from math import inf
 from typing import Any
 
@@ -164,9 +165,10 @@ class Page:
             route = [point.position_m for point in self._experiment.mission.waypoints]
         scene.set_waypoints(np.array(route), len(mission["reached"]) if mission else 0)
         self._status.content = self._describe(now)
-        self._follow_link(now)
-        if target := self._target:
-            target[0].position = target[1].value = self._place_target(now)
+        with suppress(RuntimeError):  # viser has just removed the controls of a browser that left
+            self._follow_link(now)
+            if target := self._target:
+                target[0].position = target[1].value = self._place_target(now)
 
     def close(self) -> None:
         """Stop serving the page."""
@@ -309,7 +311,7 @@ class Page:
             depth_test=False,
             position=start,
         )
-        numbers: Any = client.gui.add_vector3("Target [m]", start, min=low, max=high, step=0.01)
+        numbers: Any = client.gui.add_vector3("Target [m]", start, step=0.01)
         send = client.gui.add_button("Send", hint="Fly to the target; a mission is held first")
 
         free = self._target = gizmo, numbers
@@ -360,17 +362,20 @@ class Page:
                 steering.release_keys(code)
 
     def _add_link(self, gui: viser.GuiApi) -> None:
+        sliders = {}
         for way in ("uplink", "downlink"):
             for name, (label, largest, step, factor) in SLIDERS.items():
                 key = f"{way}.{name}"
                 label = f"{way.removesuffix('link').title()} {label}"
-                slider = self._sliders[key] = gui.add_slider(label, 0.0, largest, step, 0.0)
+                slider = sliders[key] = gui.add_slider(label, 0.0, largest, step, 0.0)
 
                 @slider.on_update
                 async def _(event: Any, key: str = key, factor: float = factor) -> None:
                     if event.client is not None:
                         self._touched = time.monotonic()
                         self._steering.set_link(key, _clamp(event.target) / factor)
+
+        self._sliders = sliders  # complete: the main thread goes through them
 
 
 def _clamp(slider: Any) -> float:

@@ -11,6 +11,11 @@ def test_the_replay_of_a_run_is_written_and_opened(folder, monkeypatch, call):
     main([*FLY, "--out", "a"])
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
+        monkeypatch.delenv(name, raising=False)
+    assert call("replay a").out == "a/replay.html\n"
+    assert opened == [], "a text browser would take over the terminal"
+    monkeypatch.setenv("DISPLAY", ":0")
     out, err = call("replay a")
     assert out == "a/replay.html\n"
     assert "no browser" in err

@@ -41,12 +41,15 @@ def session(tmp_path_factory):
         ((run, url),) = under_way().items()
         api = Api(url)
         wait_for(lambda: answers(api))
+        patch.setenv("BROWSER", "echo opens %s")
         console = start(folder, "console", run)
-    yield api, console.stdout.readline().split()[-1], run
+    address, opened = (console.stdout.readline().split()[-1] for _ in range(2))
+    assert opened == address
+    yield api, address, run
     session.terminate()
-    assert console.wait(LIMIT) == 0, "it ends with the run"
+    said, _ = console.communicate(timeout=LIMIT)
+    assert console.returncode == 0, said  # it ends with the run
     session.communicate(timeout=LIMIT)
-    console.stdout.close()
 
 
 @pytest.fixture
@@ -134,6 +137,10 @@ def test_drag_and_send_moves_the_setpoint(flight, page):
     api.post(f"/v1/missions/{mission['id']}/cancel")
     api.post("/v1/goto", {"position_m": (0.3, 0.2, 0.9)})
     wait_for(lambda: target() == [0.3, 0.2, 0.9])  # after Send it follows the setpoint again
+    numbers.nth(2).fill("99")
+    page.keyboard.press("Enter")
+    button(page, "Send").click()
+    page.get_by_text("Refused:").wait_for()
     other = start(run, "console", run)
     assert "has a console already" in other.communicate(timeout=LIMIT)[0]
     assert other.returncode == 2
@@ -221,6 +228,17 @@ def test_the_state_tells_a_drive_and_names_buttons(filled):
     steering.hold_key("up", (0.0, 0.0, 0.4), 60.0)
     page.update(2.0)
     assert "Mission: driving" in page._status.content
+
+
+def test_controls_of_a_browser_that_left_do_not_end_the_console(filled):
+    page, feed, steering = filled("hover")
+    slider = page._server.gui.add_slider("Up", 0.0, 500.0, 1.0, 0.0)
+    page._sliders, steering.conditions = {"uplink.delay_ms": slider}, {"uplink.delay_ms": 60.0}
+    page.update(1.0)
+    assert slider.value == 60.0
+    slider.remove()
+    steering.conditions = {"uplink.delay_ms": 70.0}
+    page.update(2.0)
 
 
 def test_a_curve_has_gaps_and_an_unknown_one_keeps_its_axis():
