@@ -36,7 +36,7 @@ COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python
 DRAWING := glfw pyopengl mujoco-studio
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process e2e e2e-full test-netem smoke-netem test-netem-full faults coverage mutants nightly lint types audit bench bench-link pictures results docs images kind-load lock clean
+.PHONY: help demo test process e2e e2e-full test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types audit bench bench-link pictures results docs images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -47,8 +47,9 @@ demo: $(VENV)/all ## fly the paper's mission in real time and write its report
 test: $(VENV)/dev ## run the default tests on all cores; of one part: make test T=tunnel
 	$(bin)/pytest -n auto $(PART)
 
+# Of the files that have such tests alone: to collect all tests takes a quarter of a minute.
 process: $(VENV)/dev ## run the tests that start processes and take real time
-	$(bin)/pytest -m 'process and not full'
+	$(bin)/pytest -m 'process and not full' $(shell grep -rl --include='test_*.py' 'mark\.process' tests)
 
 # With KUBECONFIG set, the tests use that cluster and make and remove only their own objects.
 e2e: $(VENV)/dev ## fly on a new kind cluster, or on that of KUBECONFIG (KEEP=1 keeps it)
@@ -67,9 +68,15 @@ smoke-netem: $(VENV)/dev ## of these the few that every push runs: shape, measur
 test-netem-full: $(VENV)/dev ## as test-netem, and every shipped profile for a minute
 	$(bin)/pytest -m netem -rP tests/link
 
-faults: $(VENV)/dev ## inject every fault, then search for MINUTES (5) each: random faults, hostile clouds
+faults: faults-named faults-random faults-hostile ## inject every fault, then search for MINUTES (5) each: random faults, hostile clouds
+
+faults-named: $(VENV)/dev
 	$(bin)/cloudrc faults run --all --jobs $(JOBS)
+
+faults-random: $(VENV)/dev
 	$(SEARCH) --minutes $(MINUTES)
+
+faults-hostile: $(VENV)/dev
 	$(SEARCH) --minutes $(MINUTES) --adversarial
 
 coverage: $(VENV)/dev ## fail unless every branch of guard, tunnel and store is tested
