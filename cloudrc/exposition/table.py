@@ -117,8 +117,8 @@ cloudrc_command_age_seconds: Age of the current command in TRACK, sampled every 
 cloudrc_guard_state: State of the guard: {numbered(GUARD_STATES)}.
 cloudrc_guard_transitions_total[state]: Changes of the guard's state, by new state.
 cloudrc_guard_causes_total[cause]: Changes of the guard's state, by cause.
-cloudrc_guard_limited_total[limit] = limited_*: Commands that a limit changed; for the fence,
-    physics steps.
+cloudrc_guard_limited_total[limit] = limited_*: Commands that a limit changed; for
+    the fence, physics steps in which it changed the velocity.
 cloudrc_guard_held_seconds_total = held_seconds: Time in HOLD during missions; updated once a
     second.
 cloudrc_guard_starts_refused_total = start_refused: Mission starts refused in LAND or ESTOP.
@@ -126,8 +126,8 @@ cloudrc_contacts_total[body]: Contacts of the robot with bodies of the scene, by
 cloudrc_real_time_factor: Simulated time divided by machine time over the last 10 s; below 0.95 a
     run is invalid.
 cloudrc_world_slip_seconds_total: Time by which world's clock has fallen behind the machine's clock.
-cloudrc_world_stalls_total = stalls: Late wakes of world after which the waiting datagrams were
-    stale.
+cloudrc_world_stalls_total = stalls: Times that world woke so late that the waiting datagrams
+    were stale.
 
 cloud
 cloudrc_uplink_delay_seconds: One-way delay from world to cloud, late datagrams included; absent
@@ -150,7 +150,7 @@ cloudrc_command_yaw_rate_radians_per_second: Commanded yaw rate.
 cloudrc_horizon_clamped_total = horizon_clamped: Delay estimates clamped to the range 0 to
     cloud.horizon_max_s.
 cloudrc_commands_frozen_total = frozen: Commands of zero velocity, because the robot confirmed no
-    newer one.
+    newer command.
 cloudrc_plugin_failures_total[plugin] = *_failed: Plug-in calls that raised, or returned a wrong
     value.
 cloudrc_words_dropped_total = words_dropped: Teleop messages dropped because they were for another
