@@ -95,8 +95,8 @@ cloudrc_datagrams_reordered_total[direction]: Datagrams that arrived after a new
 cloudrc_link_gap_seconds: Time between two arrivals: of telemetry at cloud, of commands at world.
 cloudrc_link_believed[direction]: 1 if the incoming direction of the link matches its profile, 0 if
     it does not (/link.json on the same port says why); absent while datagrams are too few.
-cloudrc_age_of_information_seconds: Age of the newest odometry in cloud, of the newest command in
-    world, sampled every period; absent unless both ends prove that they share a clock.
+cloudrc_age_of_information_seconds: In cloud the age of the newest odometry, in world that of the
+    newest command, sampled every period; absent unless both ends prove that they share a clock.
 cloudrc_loop_period_seconds: Time between two periods of the loop.
 cloudrc_loop_lateness_seconds: Time from the deadline of a period to the wake of the loop.
 cloudrc_loop_busy_seconds_total: Time for which the loop computed.
@@ -153,8 +153,8 @@ cloudrc_commands_frozen_total = frozen: Commands of zero velocity, because the r
     newer command.
 cloudrc_plugin_failures_total[plugin] = *_failed: Plug-in calls that raised, or returned a wrong
     value.
-cloudrc_words_dropped_total = words_dropped: Teleop messages dropped because they were for another
-    session or no request number was left.
+cloudrc_words_dropped_total = words_dropped: Messages of teleop that cloud dropped, because
+    they were for another session or no request number was left.
 cloudrc_loop_missed_periods_total = missed_periods: Periods without a command because the loop was
     late.
 
