@@ -66,8 +66,8 @@ SAMPLING = {name: about for about, names in _STAMPS.items() for name in names.sp
 OPEN = {
     "version": "the version",
     "config": "the first 12 digits of the SHA-256 of the process's configuration with all "
-    "defaults (on one machine with those of plug-ins, as `config_sha256` in report.json; in a "
-    "cluster without those of plug-ins)",
+    "defaults. On one machine this includes the defaults of plug-ins, as `config_sha256` in "
+    "report.json; in a cluster it does not",
 }
 """Label of a metric that has too many values for a list -> description of the values."""
 COPIED = ("profile", "mission")

@@ -124,8 +124,8 @@ class Direction(Section):
     delay_ms: NotNegative = 0.0
     """Mean one-way delay [ms]; a round trip is the sum of both directions"""
     jitter_ms: NotNegative = 0.0
-    """Spread of the delay [ms]; with distribution: uniform, half the width; else the standard
-    deviation. A delay below 0 becomes 0, which raises the mean"""
+    """Spread of the delay [ms]. For the distribution uniform it is half the width, for the others
+    the standard deviation. A delay below 0 becomes 0, which raises the mean"""
     distribution: Literal["uniform", "normal", "pareto", "table"] = "uniform"
     """Distribution of the jitter; pareto has a long tail; table: the delays in the file `table`"""
     table: str | None = None
@@ -227,8 +227,8 @@ class Waypoint(Section):
     """Time limit for the flight to this point [s], not counting time in HOLD; after it the
     mission fails. null: 3 times the expected time"""
     speed_mps: Speed | None = None
-    """Speed of the carrot on the way to this point [m/s]; only with carrot. null:
-    carrot.speed_mps"""
+    """Largest speed of the moving setpoint on the way to this point [m/s]; only with the key
+    carrot. null: carrot.speed_mps"""
 
 
 class Carrot(Section):
@@ -389,8 +389,8 @@ class World(Section):
     """How the true robot differs from its model; guard, onboard controller and cloud use the
     model. A heavy or weak robot brakes worse, so the guard may stop it too late"""
     wind: Wind = Wind()
-    """Horizontal wind. It acts only through the drag of the rotors, so not on a robot whose rotors
-    are stopped"""
+    """Horizontal wind. Wind acts only as drag of turning rotors, so it does not move a robot with
+    stopped rotors"""
     odometry_rate_hz: Literal[20, 25, 50, 100, 125, 250, 500] = 100
     """Rate of the odometry for cloud [Hz]. The true state is recorded at 100 Hz or more"""
 
@@ -403,19 +403,22 @@ class Guard(Section):
     newest command is older, the robot holds its position. null: the link profile's value, else
     250"""
     plan_max_s: PlanMax | None = None
-    """Longest time for which the robot flies a command's plan after its arrival [s]; 0: no plan
-    outlasts command_age_max_ms. null: 0.8 if cloud.plan_s is above 0, else 0"""
+    """Longest time for which the robot follows the plan of a command (cloud.plan_s) after the
+    arrival of the command [s]. 0: only while the command is younger than command_age_max_ms.
+    null: 0.8 if cloud.plan_s is above 0, else 0"""
     speed_max_mps: Speed | None = None
     """Cap on the commanded speed [m/s]; a faster command is shortened. null: the largest speed
-    from which the robot stops within 8.7 m, 6 m/s if command_age_max_ms is 250 and plan_max_s 0"""
+    from which the robot stops within 8.7 m. This is 6 m/s if command_age_max_ms is 250 and
+    plan_max_s is 0"""
     acceleration_max_mps2: Acceleration = 12.0
     """Largest acceleration of the velocity that the onboard controller follows [m/s^2]"""
     yaw_rate_max_radps: Speed = 1.0
     """Cap on the commanded yaw rate [rad/s]; a faster command is shortened"""
     hold_max_s: HoldTime = 60.0
-    """Time in HOLD during a mission after which the robot lands [s]. On the ground, a mission ends
-    after this time without a fresh command, but at the earliest after 10 s. With a value below 1 s
-    minus guard.command_age_max_ms, the robot lands after every HOLD in flight"""
+    """Longest time in HOLD during a mission [s]; then the robot lands. In HOLD the guard keeps the
+    robot in place, because commands are missing. On the ground, the mission ends if no fresh
+    command arrives for this time, but not before 10 s. With a value below 1 s minus
+    command_age_max_ms, every HOLD in flight ends in a landing"""
 
 
 class Tunnel(Section):
@@ -461,21 +464,21 @@ class Cloud(Section):
     controller: PlugInChoice = "pid"
     """Tracks the setpoint: a name, or a mapping with parameters"""
     plan_s: PlanTime = 0.0
-    """Length of the plan of future velocities in each command [s], in steps of 10 ms. The robot
-    follows it while newer commands are late or lost. Needs a predictor with a model; use it with
-    the estimator earliest. 0: no plan"""
+    """Length of the plan in each command [s], with velocities in steps of 10 ms. The robot
+    follows the plan while newer commands are late or lost. A plan needs a predictor with a model;
+    use it with the estimator earliest. 0: no plan"""
     horizon_max_s: CloudTime | None = None
     """Longest horizon of the prediction [s]. null: the link profile's value, else 1"""
     freeze_after_s: CloudTime | None = None
-    """If no telemetry confirms a new command for the horizon plus this time [s], cloud commands
-    zero velocity. null: the link profile's value, else 0.4"""
+    """Cloud commands zero velocity if telemetry has confirmed no new command for this time plus the
+    prediction horizon [s]. null: the link profile's value, else 0.4"""
     command_rate_hz: Annotated[int, Field(ge=COMMAND_RATE_MIN_HZ, le=COMMAND_RATE_MAX_HZ)] = 100
     """Rate of the commands [Hz]. At less than 20 Hz the guard would never leave HOLD, which takes
     10 commands within 500 ms"""
     compute_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
-    """Mean of the emulated computing time of a command [ms]; in real time, the true computing time
-    is added. During both, cloud begins no other command. Reports count this time in the delay of
-    the downlink"""
+    """Mean of the emulated computing time of a command [ms]. In real time, the true computing time
+    is added. Cloud begins the next command only after this time. Reports count this time as part
+    of the downlink delay"""
     compute_deviation_ms: Annotated[float, Field(ge=0, le=1000)] = 0.0
     """Standard deviation of the time compute_ms [ms], which then has a gamma distribution; needs
     compute_ms above 0"""
@@ -505,7 +508,8 @@ class Criteria(Section):
     fails"""
     settle_m: Positive | None = 0.15
     """Largest distance from the setpoint in the last 0.5 s of each random step [m]. An oscillation
-    that does not decay fails every mission. null: neither distance nor oscillation is judged"""
+    that does not decay fails a mission, too, with or without random steps. null: neither distance
+    nor oscillation is judged"""
     time_limit_s: TimeLimit = 60.0
     """Time limit of the mission [s], counted from its start; after this time the mission fails"""
 

@@ -95,8 +95,8 @@ cloudrc_datagrams_reordered_total[direction]: Datagrams that arrived after a new
 cloudrc_link_gap_seconds: Time between two arrivals: of telemetry at cloud, of commands at world.
 cloudrc_link_believed[direction]: 1 if the incoming direction of the link matches its profile, 0 if
     it does not (/link.json on the same port says why); absent while datagrams are too few.
-cloudrc_age_of_information_seconds: Age of the newest odometry in cloud, of the newest command in
-    world, sampled every period; absent unless both ends prove that they share a clock.
+cloudrc_age_of_information_seconds: In cloud the age of the newest odometry, in world that of the
+    newest command, sampled every period; absent unless both ends prove that they share a clock.
 cloudrc_loop_period_seconds: Time between two periods of the loop.
 cloudrc_loop_lateness_seconds: Time from the deadline of a period to the wake of the loop.
 cloudrc_loop_busy_seconds_total: Time for which the loop computed.
@@ -117,8 +117,8 @@ cloudrc_command_age_seconds: Age of the current command in TRACK, sampled every 
 cloudrc_guard_state: State of the guard: {numbered(GUARD_STATES)}.
 cloudrc_guard_transitions_total[state]: Changes of the guard's state, by new state.
 cloudrc_guard_causes_total[cause]: Changes of the guard's state, by cause.
-cloudrc_guard_limited_total[limit] = limited_*: Commands that a limit changed; for the fence,
-    physics steps.
+cloudrc_guard_limited_total[limit] = limited_*: Commands that a limit changed; for
+    the fence, physics steps in which it changed the velocity.
 cloudrc_guard_held_seconds_total = held_seconds: Time in HOLD during missions; updated once a
     second.
 cloudrc_guard_starts_refused_total = start_refused: Mission starts refused in LAND or ESTOP.
@@ -126,8 +126,8 @@ cloudrc_contacts_total[body]: Contacts of the robot with bodies of the scene, by
 cloudrc_real_time_factor: Simulated time divided by machine time over the last 10 s; below 0.95 a
     run is invalid.
 cloudrc_world_slip_seconds_total: Time by which world's clock has fallen behind the machine's clock.
-cloudrc_world_stalls_total = stalls: Late wakes of world after which the waiting datagrams were
-    stale.
+cloudrc_world_stalls_total = stalls: Times that world woke so late that the waiting datagrams
+    were stale.
 
 cloud
 cloudrc_uplink_delay_seconds: One-way delay from world to cloud, late datagrams included; absent
@@ -150,11 +150,11 @@ cloudrc_command_yaw_rate_radians_per_second: Commanded yaw rate.
 cloudrc_horizon_clamped_total = horizon_clamped: Delay estimates clamped to the range 0 to
     cloud.horizon_max_s.
 cloudrc_commands_frozen_total = frozen: Commands of zero velocity, because the robot confirmed no
-    newer one.
+    newer command.
 cloudrc_plugin_failures_total[plugin] = *_failed: Plug-in calls that raised, or returned a wrong
     value.
-cloudrc_words_dropped_total = words_dropped: Teleop messages dropped because they were for another
-    session or no request number was left.
+cloudrc_words_dropped_total = words_dropped: Messages of teleop that cloud dropped, because
+    they were for another session or no request number was left.
 cloudrc_loop_missed_periods_total = missed_periods: Periods without a command because the loop was
     late.
 

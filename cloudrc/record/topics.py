@@ -133,7 +133,8 @@ _TABLE = (
         "The robot began to follow a command, world's clock", (
         *(_EPOCH, _COUNTER, _BASIS),
         Field("velocity", "vector", "m/s", "before the guard's caps, world frame"),
-        Field("planned_ns", "int", "ns", "time for which a plan was computed; -1 without a plan"))),
+        Field("planned_ns", "int", "ns",
+            "time at which the plan begins, world's clock; -1 without a plan"))),
     Topic("/guard", "cloudrc_msgs/msg/GuardChange", rec.GuardChange, "world",
         "The guard changed its state, world's clock", (
         Field("state", "int", "", _GUARD), Field("cause", "string", "", "why, in words"))),
@@ -194,7 +195,8 @@ _TABLE = (
         Field("shaper", "string", "", "relay or netem"),
         Field("cause", "string", "", "why it changed; empty before the first change"),
         Field("age", "float", "s", "time since these conditions took effect"),
-        Field("time_line", "float", "s", "time since the time line began; NaN: not restarted"),
+        Field("time_line", "float", "s",
+            "time since the time line (changes, blackouts, trace) began; NaN: not restarted"),
         Field("delay", "float", "s", "profile's delay at the start of the time line, one way"),
         Field("jitter", "float", "s", "profile's jitter at the start of the time line"),
         Field("loss", "float", "1", "profile's mean loss at the start of the time line"),

@@ -106,7 +106,7 @@ def build(
 
     Args:
         model: `white_box`, as in `model_based`, or `first_order`, as in `command_history`.
-        parameters: Parameters of that predictor; None: its defaults.
+        parameters: Parameters of the predictor that `model` names; None: its defaults.
         model_file: File from `cloudrc identify`, for `first_order`.
         position_noise: Standard deviation of the measured position per axis [m].
         velocity_noise: Standard deviation of the measured velocity per axis [m/s].

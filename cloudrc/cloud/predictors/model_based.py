@@ -232,10 +232,10 @@ def build(
 
     Args:
         gain_p: Proportional gain of the onboard velocity loop [N s/m], shape (3,).
-        gain_i: Its integral gain [N/m], shape (3,).
-        gain_d: Its derivative gain [N s^2/m], shape (3,).
-        integral_limit_xy: Limit of its integrated velocity error in x and y [m].
-        integral_limit_z: The same limit in z [m].
+        gain_i: Integral gain of the onboard velocity loop [N/m], shape (3,).
+        gain_d: Derivative gain of the onboard velocity loop [N s^2/m], shape (3,).
+        integral_limit_xy: Limit of the loop's integrated velocity error in x and y [m].
+        integral_limit_z: Limit of the loop's integrated velocity error in z [m].
         acceleration_max: The guard's cap on the acceleration [m/s^2].
     """
     limits = integral_limit_xy, integral_limit_xy, integral_limit_z
