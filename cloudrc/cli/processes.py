@@ -330,7 +330,7 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     return Recorder(
         path,
         lambda file: McapWriter(
-            file, clock=clock, clock_id=clock_id.hex(), wall_offset_ns=offset_ns
+            file, clock=clock, clock_id=clock_id.hex(), wall_offset_ns=offset_ns, index=False
         ),
         size_max=size_max,
     )
