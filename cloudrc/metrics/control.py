@@ -76,6 +76,7 @@ def _missed_periods(flight: Flight) -> float | None:
 
 
 add_metrics(
+    "Link and loop",
     ("rtt_mean", "s", "Mean round trip from command to echo, without the hold time in world.",
      lambda flight: mean(round_trips(flight)["rtt"])),
     ("rtt_p95", "s", "Round trip from command to echo, without the hold time in world: 95th "
@@ -86,6 +87,9 @@ add_metrics(
      "command.", _age_of_information),
     ("commands_applied", "1", "Number of commands that reached the low-level controller.",
      lambda flight: flight.count(len(flight.during("/command_applied")["epoch"]))),
+)  # fmt: skip
+add_metrics(
+    "Estimation and tracking",
     ("prediction_error_rms", "m", "RMS distance from the predicted to the true position when each "
      "command was applied.", _prediction_error),
     ("estimate_error_rms", "m", "RMS distance from the predicted to the true position at the "
@@ -97,6 +101,9 @@ add_metrics(
      lambda flight: rms(flight.control["setpoint"] - flight.control["measured"])),
     ("tracking_rms_estimated", "m", "RMS distance between the setpoint and cloud's estimated "
      "position.", lambda flight: rms(flight.control["setpoint"] - flight.control["position"])),
+)  # fmt: skip
+add_metrics(
+    "Real time",
     ("world_lateness_p99", "s", "Lateness of world's wakes: 99th percentile; real time only.",
      lambda flight: percentile(wakes(flight, "world")["lateness"], 99.0)),
     ("cloud_lateness_p99", "s", "Lateness of cloud's wakes: 99th percentile; real time only.",

@@ -183,15 +183,16 @@ class Metric:
     unit: str  # SI unit as text; "1" for counts and shares
     meaning: str  # one sentence
     measure: Measure
+    group: str = "Others"  # title above the metric in report.html
 
 
 SHIPPED: dict[str, Metric] = {}
 """The metrics of cloudrc by name; complete once `cloudrc.metrics` is imported."""
 
 
-def add_metrics(*rows: tuple[str, str, str, Measure]) -> None:
-    """Add metrics of cloudrc; each row has the attributes of a `Metric`."""
-    SHIPPED.update({row[0]: Metric(*row) for row in rows})
+def add_metrics(group: str, *rows: tuple[str, str, str, Measure]) -> None:
+    """Add metrics of cloudrc to a group; each row has the other attributes of a `Metric`."""
+    SHIPPED.update({row[0]: Metric(*row, group) for row in rows})
 
 
 def mean(values: Array) -> float | None:
@@ -233,10 +234,14 @@ def _speed_max(flight: Flight) -> float | None:
 
 
 add_metrics(
+    "Mission",
     ("duration", "s", "Time from the start of the mission to its end.",
      lambda flight: None if flight.end_ns is None else float(flight.seconds(flight.end_ns))),
     ("distance_flown", "m", "Length of the path that the robot's base flew.", _distance),
     ("speed_max", "m/s", "Largest true speed of the robot's base.", _speed_max),
+)  # fmt: skip
+add_metrics(
+    "Distance to the pipes",
     ("min_clearance", "m", "Smallest distance between the robot and a pipe's wall while the base "
      "is inside a pipe.", partial(_least_clearance, inside=True)),
     ("min_clearance_flight", "m", "Smallest distance between the robot and a pipe during the whole "
