@@ -39,7 +39,7 @@ RC: dict[Any, Any] = {
     **dict.fromkeys(("xtick.direction", "ytick.direction"), "out"),
     **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
     **dict.fromkeys(("axes.grid", "axes.axisbelow"), True),
-    **dict.fromkeys(("grid.linewidth", "hatch.linewidth"), 0.5),
+    "grid.linewidth": 0.5,
     "axes.edgecolor": BLACK,
     "grid.color": "#e6e6e6",
     "lines.linewidth": 1.1,
