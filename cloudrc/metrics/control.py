@@ -63,10 +63,9 @@ def _slip(flight: Flight) -> float | None:
 
 def _real_time_factor(flight: Flight) -> float | None:
     slipped = _slip(flight)
-    if slipped is None or not flight.end_ns:
+    if slipped is None or flight.duration <= 0.0:
         return None
-    simulated = float(flight.seconds(flight.end_ns))
-    return simulated / (simulated + slipped) if simulated > 0 else None
+    return flight.duration / (flight.duration + slipped)
 
 
 def _missed_periods(flight: Flight) -> float | None:

@@ -58,6 +58,11 @@ class Flight:
         stamps = self.recording["/ground_truth"]["stamp_ns"]
         return int(stamps[-1]) if len(stamps) else self.start_ns
 
+    @property
+    def duration(self) -> float:
+        """Duration of the flight [s]; 0 if the robot never flew."""
+        return 0.0 if self.end_ns is None else float(self.seconds(self.end_ns))
+
     @cached_property
     def ending(self) -> tuple[int, str, str] | None:
         """Event that ended the mission: stamp [ns], name, text; None if there is no such event."""
@@ -236,7 +241,7 @@ def _speed_max(flight: Flight) -> float | None:
 add_metrics(
     "Mission",
     ("duration", "s", "Time from the start of the mission to its end.",
-     lambda flight: None if flight.end_ns is None else float(flight.seconds(flight.end_ns))),
+     lambda flight: flight.count(flight.duration)),
     ("distance_flown", "m", "Length of the path that the robot's base flew.", _distance),
     ("speed_max", "m/s", "Largest true speed of the robot's base.", _speed_max),
 )  # fmt: skip

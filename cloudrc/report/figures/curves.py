@@ -35,7 +35,7 @@ MARGIN = 1.25
 def draw_delay(subject: Subject) -> Figure:
     """Draw the one-way delay of each datagram, and the loop delay with cloud's estimate of it."""
     figure, (one_way, loop) = subject.look.two_panels()
-    flight, time = subject.flight, np.linspace(0.0, subject.duration, 600)
+    flight, time = subject.flight, np.linspace(0.0, subject.flight.duration, 600)
     limits = [bounds(subject, time, uplink=uplink) for uplink in (True, False)]
 
     panel(one_way, "a")
@@ -97,7 +97,7 @@ def _finish(axes: Axes, subject: Subject, label: str, columns: int) -> None:
 
 
 def _time_axis(axes: Axes, subject: Subject) -> None:
-    axes.set_xlim(0.0, max(subject.duration, 1e-3))
+    axes.set_xlim(0.0, max(subject.flight.duration, 1e-3))
     axes.set_xlabel(TIME)
 
 

@@ -115,9 +115,10 @@ def _draw_top(axes: Axes, subject: Subject, position: Array) -> LineCollection |
     if board is not None:
         axes.plot([board.x, board.x], board.y, color=BLACK, lw=3, solid_capstyle="butt", zorder=3)
     coloured = _draw_path(axes, subject, position[:, 0], position[:, 1])
-    for index, (x, y, _) in subject.waypoints.items():
-        axes.plot(x, y, "o", ms=4, mfc="white", mec=BLACK, mew=0.8, zorder=5)
-        free_label(axes, str(index + 1), (x, y))
+    for number, waypoint in enumerate(subject.flight.mission.waypoints, start=1):
+        place = waypoint.position_m[:2]
+        axes.plot(*place, "o", ms=4, mfc="white", mec=BLACK, mew=0.8, zorder=5)
+        free_label(axes, str(number), place)
     tip = _touch_point(subject)
     if tip is not None:
         axes.plot(*tip[:2], "*", ms=9, color=VERMILION, mec="white", mew=0.5, zorder=7)

@@ -98,7 +98,7 @@ def set_in_flight(subject: Subject) -> list[tuple[float, str]]:
     found: list[tuple[float, str]] = []
     both = parts(subject, uplink=True) + parts(subject, uplink=False)
     for part in sorted(both, key=lambda part: part.begin):
-        if not part.cause or not 0.0 < part.begin < subject.duration:
+        if not part.cause or not 0.0 < part.begin < subject.flight.duration:
             continue
         if not found or found[-1][1] != part.cause or part.begin - found[-1][0] > SAME_CAUSE:
             found.append((part.begin, part.cause))

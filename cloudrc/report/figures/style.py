@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cloudrc.config.schema import Direction
-from cloudrc.messages import Vector
 from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Array
 
@@ -112,24 +110,6 @@ class Subject:
     uplink: Direction
     downlink: Direction
     look: Look = Look()
-
-    @cached_property
-    def waypoints(self) -> dict[int, Vector]:
-        """Waypoints to which the robot flew: index -> position [m], world frame."""
-        control = self.flight.control
-        indices, rows = np.unique(control["waypoint"], return_index=True)
-        points = control["setpoint"][rows].tolist()
-        return {
-            int(index): (x, y, z)
-            for index, (x, y, z) in zip(indices, points, strict=True)
-            if index >= 0
-        }
-
-    @cached_property
-    def duration(self) -> float:
-        """Duration of the flight [s]."""
-        end_ns = self.flight.end_ns
-        return 0.0 if end_ns is None else float(self.flight.seconds(end_ns))
 
     @cached_property
     def link_start(self) -> float:
