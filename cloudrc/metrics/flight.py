@@ -143,26 +143,20 @@ class Flight:
     def applied(self) -> Columns:
         """Commands that world applied in the flight, with the values of their control periods.
 
-        `stamp_ns` is the time of application or, for a command with a plan, the start of the plan
-        [ns]; `position` is the predicted position [m].
+        Commands without a recorded control period are left out. `stamp_ns` is the time of
+        application or, for a command with a plan, the start of the plan [ns]; `position` is the
+        predicted position [m].
         """
-        columns = self.join_control(self.during("/command_applied"))
-        planned, stamp = columns["planned_ns"], columns["stamp_ns"]
-        return columns | {"stamp_ns": np.where(planned >= 0, planned, stamp)}
-
-    def join_control(self, commands: Columns) -> Columns:
-        """Add to each command (`epoch`, `counter`) the values of its control period.
-
-        Commands without a recorded control period are left out. If both have a column of the same
-        name, the value of the command is kept.
-        """
+        commands = self.during("/command_applied")
         keys = zip(self._control["epoch"], self._control["counter"], strict=True)
         rows = {key: row for row, key in enumerate(keys)}
         keys = zip(commands["epoch"], commands["counter"], strict=True)
         joined = np.array([rows.get(key, -1) for key in keys], dtype=np.int64)
         known, source = joined >= 0, joined[joined >= 0]
-        periods = {name: column[source] for name, column in self._control.items()}
-        return periods | {name: column[known] for name, column in commands.items()}
+        columns = {name: column[source] for name, column in self._control.items()}
+        columns |= {name: column[known] for name, column in commands.items()}
+        planned, stamp = columns["planned_ns"], columns["stamp_ns"]
+        return columns | {"stamp_ns": np.where(planned >= 0, planned, stamp)}
 
     def _within(self, columns: Columns) -> Columns:
         stamps = columns["stamp_ns"]
