@@ -130,9 +130,7 @@ class Recording:
     def read(cls, path: Path) -> Self:
         """Read an MCAP file up to its end or to its first damaged part.
 
-        Raises:
-            BadInputError: If nothing in the file can be read.
-            MissingPrerequisiteError: If `cloudrc[record]` is not installed.
+        Raise a BadInputError if nothing in the file can be read.
         """
         from cloudrc.record.reader import read_contents
 

@@ -20,9 +20,16 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Self
 
+import lz4.frame
+import zstandard
+from mcap import records as mcap
+from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
+from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.writer import MCAP0_MAGIC
+
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import atomic_file, open_file
-from cloudrc.record import missing, wall_time
+from cloudrc.record import wall_time
 from cloudrc.record.columns import Recording
 from cloudrc.record.ros import is_known
 from cloudrc.record.topics import TOPICS, VIEWS
@@ -34,16 +41,6 @@ from cloudrc.record.writer import (
     STARTED,
     McapWriter,
 )
-
-try:
-    import lz4.frame
-    import zstandard
-    from mcap import records as mcap
-    from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
-    from mcap.stream_reader import CRCValidationError, StreamReader
-    from mcap.writer import MCAP0_MAGIC
-except ImportError as error:
-    raise missing(error) from error
 
 UNPACKED_MAX = 64
 """Largest ratio of a recording's size in memory to its size in the file; a file below 1 MiB counts

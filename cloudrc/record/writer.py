@@ -20,20 +20,16 @@ from operator import itemgetter
 from pathlib import Path
 from typing import IO, Any, Self
 
+from mcap.data_stream import RecordBuilder
+from mcap.records import DataEnd, Footer, Metadata
+from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
+
 from cloudrc import __version__
-from cloudrc.record import WALL_OFFSET, missing
+from cloudrc.record import WALL_OFFSET
 from cloudrc.record.hash import add_message
 from cloudrc.record.ros import definition, encode, type_hash
 from cloudrc.record.topics import TOPICS, VIEWS, Row, rows
 from cloudrc.records import Record
-
-try:
-    import zstandard  # noqa: F401  (mcap imports it, but with a worse error if it is missing)
-    from mcap.data_stream import RecordBuilder
-    from mcap.records import DataEnd, Footer, Metadata
-    from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
-except ImportError as error:
-    raise missing(error) from error
 
 CHUNK_NS = 500_000_000
 """Longest time between the first and the last message of a chunk [ns]."""

@@ -76,17 +76,6 @@ def run(code):
     return subprocess.run(words, capture_output=True, text=True, check=True).stdout
 
 
-def test_a_missing_package_is_named_with_its_remedy():
-    said = run(
-        "import sys; sys.modules['mcap'] = None\n"
-        "from cloudrc.errors import MissingPrerequisiteError\n"
-        "try: import cloudrc.record.reader\n"
-        "except MissingPrerequisiteError as error: print(error)"
-    )
-    assert said.startswith("recording needs the package mcap, which is not installed")
-    assert said.endswith("install it with: pip install 'cloudrc[record]'\n")
-
-
 def test_a_flight_needs_no_package_for_recording():
     code = (
         f"import sys; sys.modules.update(dict.fromkeys({NEEDED}))\n"
