@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from io import BufferedReader, BytesIO
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import lz4.frame
 import zstandard
@@ -50,7 +50,7 @@ MESSAGE_COST = 128
 LISTED_MAX = 3
 """Largest number of topics that an error message lists."""
 LOSSY_SHARE_MAX = 0.999
-"""Largest value of `Recovery.share` if something is missing."""
+"""Largest value of `Recovery.share` if something is missing [1]."""
 KINDS = {
     b"": "is empty; name a recording (.mcap)",
     b"#ROSBAG V": "is a ROS 1 bag, not an MCAP file; convert it with: rosbags-convert",
@@ -140,9 +140,9 @@ class Records:
         )
         for record in reader.records:
             if isinstance(record, mcap.Chunk):
-                yield from map(self._check, self._unpack(record))
+                yield from map(self._store, self._unpack(record))
             elif not self.data_ended:  # records after the data repeat the definitions
-                yield self._check(record)
+                yield self._store(record)
             if isinstance(record, mcap.Statistics):
                 self.stated = record.message_count
             self.data_ended |= isinstance(record, mcap.DataEnd)
@@ -162,16 +162,16 @@ class Records:
         if self._room < 0:
             raise _StopError(f"unpacks to more than {UNPACKED_MAX} times its size")
 
-    def _check(self, record: mcap.McapRecord) -> mcap.McapRecord:
-        """Store definitions; raise a ValueError for a number with no or with two definitions."""
+    def _store(self, record: mcap.McapRecord) -> mcap.McapRecord:
+        """Store a definition; raise a ValueError for a message whose channel is not defined."""
         if isinstance(record, mcap.Message):
             self._take_room(MESSAGE_COST)
             if record.channel_id not in self.channels:
                 raise ValueError("a message of no channel")
-        elif isinstance(record, mcap.Schema | mcap.Channel):
-            known: Any = self.schemas if isinstance(record, mcap.Schema) else self.channels
-            if known.setdefault(record.id, record) != record:
-                raise ValueError("two definitions have the same number")
+        elif isinstance(record, mcap.Schema):
+            self.schemas[record.id] = record
+        elif isinstance(record, mcap.Channel):
+            self.channels[record.id] = record
         return record
 
     def _unpack(self, chunk: mcap.Chunk) -> Iterator[mcap.McapRecord]:
@@ -343,29 +343,14 @@ def _list(topics: list[str]) -> str:
 class Recovery:
     """The result of `recover`."""
 
+    complete: bool  # whether nothing is missing or doubtful
+    share: float  # share of the messages that were kept, in [0, 1]; if unknown, of the bytes
     size: int  # size of the damaged file [bytes]
     kept: dict[str, int]  # number of objects in the new file, by kind
     dropped: dict[str, int]  # {"messages": number of lost messages}; {} if none or unknown
     bytes_lost: int  # number of bytes after the last intact record
     notes: list[str]  # what is missing or doubtful, in words
     index_is_new: bool  # whether the old file had no readable index
-
-    @property
-    def complete(self) -> bool:
-        """Whether nothing is missing or doubtful."""
-        return not self.notes
-
-    @property
-    def share(self) -> float:
-        """Share of the messages that were kept, in [0, 1]; 1 only if the recording is complete.
-
-        If the number of lost messages is unknown, return the share of the bytes.
-        """
-        if self.complete:
-            return 1.0
-        kept, lost = self.kept["messages"], self.dropped.get("messages", 0)
-        share = kept / (kept + lost) if lost else 1.0 - self.bytes_lost / self.size
-        return min(share, LOSSY_SHARE_MAX)
 
 
 def recover(source: Path, target: Path) -> Recovery:
@@ -387,8 +372,15 @@ def recover(source: Path, target: Path) -> Recovery:
     if notes:
         contents.metadata[MISSING] = "; ".join(notes)
     contents.write(target)
-    counts = Counter(topic for topic, _, _ in contents.messages)
-    kept = {"messages": counts.total(), "attachments": len(contents.attachments)}
-    kept["topics"] = len(counts)
-    dropped = {"messages": lost} if lost else {}
-    return Recovery(records.size, kept, dropped, records.unread, notes, not records.ended)
+    count, topics = len(contents.messages), {topic for topic, _, _ in contents.messages}
+    share = count / (count + lost) if lost else 1.0 - records.unread / records.size
+    return Recovery(
+        complete=not notes,
+        share=min(share, LOSSY_SHARE_MAX) if notes else 1.0,
+        size=records.size,
+        kept={"messages": count, "attachments": len(contents.attachments), "topics": len(topics)},
+        dropped={"messages": lost} if lost else {},
+        bytes_lost=records.unread,
+        notes=notes,
+        index_is_new=not records.ended,
+    )
