@@ -30,9 +30,9 @@ from mcap.writer import MCAP0_MAGIC
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import atomic_file, open_file
 from cloudrc.record import wall_time
-from cloudrc.record.columns import Recording
-from cloudrc.record.ros import is_known
-from cloudrc.record.topics import TOPICS, VIEWS
+from cloudrc.record.columns import Recording, Table
+from cloudrc.record.ros import decode, is_known
+from cloudrc.record.topics import TOPICS, VIEWS, Values
 from cloudrc.record.writer import (
     CHANGED,
     CLOCK,
@@ -215,16 +215,24 @@ class Contents:
     remarks: tuple[str, ...] = ()  # what was ignored or sorted; "The recording" precedes each
 
     def recording(self) -> Recording:
-        """Convert the messages to tables."""
-        return Recording.from_contents(self)
+        """Convert the messages to tables; unreadable messages are left out and noted."""
+        rows: dict[str, list[tuple[int, Values]]] = {name: [] for name in TOPICS}
+        unreadable = 0
+        for topic, _, data in self.messages:
+            try:
+                rows[topic].append(decode(TOPICS[topic], data))
+            except Exception:  # rosbags may raise anything on malformed bytes
+                unreadable += 1
+        recording = Recording(lambda topic: Table.from_rows(topic, rows[topic.name]), self)
+        if unreadable:
+            text = f"{unreadable} messages are not readable"
+            recording.note = f"{recording.note}; {text}".removeprefix("; ")
+            recording.lacking = f"{recording.lacking}; {text}".removeprefix("; ")
+        return recording
 
     def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
         """Write the contents and further `attachments` to a file, atomically; may raise OSError."""
-        clock, clock_id = self.metadata.get(CLOCK, ""), self.metadata.get("clock_id", "")
-        with (
-            atomic_file(target) as file,
-            McapWriter(file, clock=clock, clock_id=clock_id) as writer,
-        ):
+        with atomic_file(target) as file, McapWriter(file, clock="") as writer:
             writer.note(self.metadata)
             if self.messages and (began := wall_time(self.metadata, self.messages[0][1])):
                 writer.note({STARTED: began.isoformat(timespec="milliseconds")})

@@ -135,9 +135,10 @@ def _marker(
     look = part("geometry_msgs/msg/Vector3", *(size,) * 3), part("std_msgs/msg/ColorRGBA", *colour)
     corners = [part(point, *xyz) for xyz in np.asarray(points, np.float32).tolist()]
     paint = [part("std_msgs/msg/ColorRGBA", *each) for each in colours]
-    rest = "", picture, [], "", "", mesh, False
     return part(
-        "visualization_msgs/msg/Marker", *about, *look, forever, True, corners, paint, *rest
+        "visualization_msgs/msg/Marker",
+        *(*about, *look, forever, True, corners, paint),
+        *("", picture, [], "", "", mesh, False),  # no texture, text or mesh
     )
 
 
@@ -155,4 +156,5 @@ def _solid(name: str, frame: str, faces: list[Face]) -> _Shape:
 def _pipe(pipe: Pipe) -> list[Face]:
     """Build the inner face of a pipe, open at both ends, from 32 flat strips."""
     across = np.eye(3)[np.abs(pipe.axis).argmin()]
-    return strip(*bore(pipe, across, np.pi, 33, 2), GLASS, 0.35)
+    low, high = bore(pipe, across, np.pi, 33, 2)
+    return strip(low, high, GLASS, 0.35)

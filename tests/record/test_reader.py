@@ -124,7 +124,7 @@ def test_an_unusual_layout_is_read(whole, path, options):
     rewrite(whole, path, **options)
     contents = read_contents(path)
     assert contents.note == ""
-    assert_equal(Recording.from_contents(contents), EXPECTED)
+    assert_equal(contents.recording(), EXPECTED)
     assert messages_sha256(contents.messages) == contents.metadata[SHA256]
     assert [remark[:9] for remark in contents.remarks] == ["was not i"] * ("shuffle" in options)
     recovery = recover(path, path.with_name("new.mcap"))
