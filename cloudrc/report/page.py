@@ -41,8 +41,8 @@ MAIN = {
     "waypoints_reached": "waypoints reached",
     "duration": "mission took",
     "contact_time": "arm touches the board at",
-    "tip_speed": "with the tip at",
-    "steady_contact_force": "and then presses with",
+    "tip_speed": "speed of the tip at the touch",
+    "steady_contact_force": "steady contact force",
     "min_clearance": "least clearance in the pipes",
     "rtt_mean": "round trip, mean",
     "prediction_error_rms": "prediction error, RMS",
@@ -82,7 +82,9 @@ def render(
         accent=accent,
         kicker=escape(kicker),
         headline=escape(headline),
-        summary=_pairs({text: f"{n} {unit}" for text, n, unit in main_numbers(assessment.numbers)}),
+        summary=_pairs(
+            {text: f"{n} {unit}".rstrip() for text, n, unit in main_numbers(assessment.numbers)}
+        ),
         failures=_list([_failure(failure) for failure in verdict.failures], "failures"),
         notes=_list([escape(note) for note in assessment.notes], "note"),
         facts=_facts(run, experiment, assessment.flight),

@@ -35,7 +35,7 @@ def robot_faces() -> list[Face]:
     faces = _box((0.0, 0.0, 0.0), body.BASE_HALF, BASE)
     faces += _box((0.0, 0.0, body.ROD_BOTTOM + rod), (wide, wide, rod), ROD)
     faces += _box((arm, 0.0, body.ARM_HEIGHT), (arm, thin, thin), ARM)
-    angle = np.linspace(0.0, 2 * np.pi, 28, endpoint=False)
+    angle = np.linspace(0.0, 2 * np.pi, 20, endpoint=False)
     disc = body.ROTOR_RADIUS * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1)):
         hub = np.array([x * body.ROTOR_ARM, y * body.ROTOR_ARM, body.ROTOR_HEIGHT])

@@ -143,14 +143,15 @@ def _marker(
 
 
 def _solid(name: str, frame: str, faces: list[Face]) -> _Shape:
-    """Make a shape of triangles; each has the colour of its face."""
+    """Make a shape of triangles; each has the colour of its face, unless all are equal."""
     points: list[Any] = []
     colours: list[_Colour] = []
     for corners, colour, opacity in faces:
         for n in range(1, len(corners) - 1):
             points += [corners[0], corners[n], corners[n + 1]]
             colours += [(*colour, opacity)] * 3
-    return name, TRIANGLE_LIST, frame, 1.0, (1.0, 1.0, 1.0, 1.0), points, colours
+    several = colours if len(set(colours)) > 1 else []
+    return name, TRIANGLE_LIST, frame, 1.0, colours[0], points, several
 
 
 def _pipe(pipe: Pipe) -> list[Face]:

@@ -41,8 +41,8 @@ def test_the_page_says_what_the_flight_did(folder):
     text = re.sub(r"\s", " ", re.sub(r"<[^>]+>", "", page))
     for said in (
         "The mission succeeded.",
-        "waypoints reached7 mission took30.9",
-        "arm touches the board at27.8",
+        "waypoints reached7 mission took31.05 s",
+        "arm touches the board at27.78 s",
         "least clearance in the pipes0.153 m",
         "cloudrc run config.yaml --mode virtual",
         "a" * 64,
