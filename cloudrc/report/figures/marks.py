@@ -61,12 +61,11 @@ class Part(NamedTuple):
 
 def parts(subject: Subject, *, uplink: bool) -> list[Part]:
     """List the profiles of one direction of the link, the earliest first."""
-    configured = subject.uplink if uplink else subject.downlink
-    found, table = (
-        [Part(-inf, subject.link_start, configured, "")],
-        subject.flight.recording["/link"],
-    )
-    begins = subject.flight.seconds(table["stamp_ns"]) - table["age"]
+    recording, seconds = subject.flight.recording, subject.flight.seconds
+    sent, table = recording["/telemetry"]["stamp_ns"], recording["/link"]
+    start = float(seconds(sent[0])) if len(sent) else 0.0
+    found = [Part(-inf, start, subject.uplink if uplink else subject.downlink, "")]
+    begins = seconds(table["stamp_ns"]) - table["age"]
     for row in np.argsort(begins, kind="stable"):
         if table["uplink"][row] != uplink:
             continue
@@ -74,7 +73,7 @@ def parts(subject: Subject, *, uplink: bool) -> list[Part]:
             direction = Direction.model_validate_json(str(table["conditions"][row]))
         except ValueError:  # another version of cloudrc has recorded this flight
             continue
-        origin = subject.flight.seconds(table["stamp_ns"][row]) - table["time_line"][row]
+        origin = seconds(table["stamp_ns"][row]) - table["time_line"][row]
         origin = found[-1].origin if isnan(origin) else float(origin)
         found.append(Part(float(begins[row]), origin, direction, str(table["cause"][row])))
     return found

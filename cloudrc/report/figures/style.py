@@ -7,7 +7,6 @@ Source: M. Okabe, K. Ito, "Color Universal Design", 2008.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -102,7 +101,7 @@ def dots(axes: Axes, x: Array, y: Array, colour: str, name: str, size: float = 1
     axes.plot([], [], "o", ms=3.5, mew=0, color=colour, label=name)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Subject:
     """A flight, the link profile of each direction at its start, and the look of its figures."""
 
@@ -110,9 +109,3 @@ class Subject:
     uplink: Direction
     downlink: Direction
     look: Look = Look()
-
-    @cached_property
-    def link_start(self) -> float:
-        """Time of world's first telemetry [s since the start of the flight]."""
-        stamps = self.flight.recording["/telemetry"]["stamp_ns"]
-        return float(self.flight.seconds(stamps[0])) if len(stamps) else 0.0
