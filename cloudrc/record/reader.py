@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from io import BufferedReader, BytesIO
 from itertools import pairwise
 from pathlib import Path
-from typing import Self
 
 import lz4.frame
 import zstandard
@@ -78,125 +77,6 @@ _UNPACK: dict[str, Callable[[bytes, int], bytes]] = {
 used, because they allocate whatever size the file claims."""
 
 
-class Records:
-    """Iterates over the records of one MCAP file, also over those inside its chunks."""
-
-    def __init__(self, path: Path) -> None:
-        """Open a file; use `with` to close it. Raise a BadInputError if it cannot be opened."""
-        self.path = path
-        try:
-            self._stream = BufferedReader(open_file(path))
-        except (OSError, ValueError) as error:  # ValueError: a pipe or a device
-            reason = getattr(error, "strerror", "not a file")
-            raise BadInputError(
-                f"{path}: cannot be read: {reason}; name a recording (.mcap)"
-            ) from error
-        self.size = os.fstat(self._stream.fileno()).st_size  # [bytes]
-        self.position = 0  # end of the last intact record in the file [bytes]
-        self.schemas: dict[int, mcap.Schema] = {}
-        self.channels: dict[int, mcap.Channel] = {}
-        self.data_ended = False  # whether all messages were read; only the index follows
-        self.ended = False  # whether the whole file was read
-        self.fault = ""  # why reading stopped or what is wrong, in words; "" if nothing is wrong
-        self.cut = False  # whether the file breaks off at the fault, as after a kill
-        self.stated: int | None = None  # number of messages according to the index
-        self._room = UNPACKED_MAX * max(self.size, 1 << 20)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._stream.close()
-
-    def __iter__(self) -> Iterator[mcap.McapRecord]:
-        """Yield the records up to the file's end or to its first damaged part.
-
-        Raise a BadInputError if the file is not MCAP.
-        """
-        head = self._stream.read(16)
-        if not head.startswith(MCAP0_MAGIC):
-            kind = next((one for one in KINDS if one and head.startswith(one)), head.strip(b"\0"))
-            text = KINDS.get(kind, "is not an MCAP file; name a recording (.mcap)")
-            raise (BadInputError if kind else NothingReadableError)(f"{self.path}: {text}")
-        self._stream.seek(0)
-        try:
-            yield from self._read()
-        except CRCValidationError as error:
-            self.fault = "damaged: a checksum is wrong"
-            self.data_ended |= isinstance(error.record, mcap.DataEnd)
-        except (EndOfFile, RecordLengthLimitExceeded):  # a record longer than the rest of the file
-            self.fault, self.cut = "cut short", True
-        except _StopError as error:
-            self.fault = str(error)
-        except OSError as error:
-            self.fault = f"unreadable: {error.strerror}"
-        except Exception:  # the library may raise anything on damaged bytes
-            self.cut = self._stream.tell() >= self.size
-            self.fault = "cut short" if self.cut else "damaged"
-
-    def _read(self) -> Iterator[mcap.McapRecord]:
-        reader = StreamReader(
-            self._stream, emit_chunks=True, validate_crcs=True, record_size_limit=self.size
-        )
-        for record in reader.records:
-            if isinstance(record, mcap.Chunk):
-                yield from map(self._store, self._unpack(record))
-            elif not self.data_ended:  # records after the data repeat the definitions
-                yield self._store(record)
-            if isinstance(record, mcap.Statistics):
-                self.stated = record.message_count
-            self.data_ended |= isinstance(record, mcap.DataEnd)
-            self.position = self._stream.tell()
-        self.position = self._stream.tell()
-        self.ended = self.data_ended = True
-        if self.position < self.size:
-            self.fault = "something follows its end"
-
-    @property
-    def unread(self) -> int:
-        """Size of the part that was not read [bytes]; 0 if only the index is damaged."""
-        return 0 if self.data_ended and not self.ended else self.size - self.position
-
-    def _take_room(self, size: int) -> None:
-        self._room -= size
-        if self._room < 0:
-            raise _StopError(f"unpacks to more than {UNPACKED_MAX} times its size")
-
-    def _store(self, record: mcap.McapRecord) -> mcap.McapRecord:
-        """Store a definition; raise a ValueError for a message whose channel is not defined."""
-        if isinstance(record, mcap.Message):
-            self._take_room(MESSAGE_COST)
-            if record.channel_id not in self.channels:
-                raise ValueError("a message of no channel")
-        elif isinstance(record, mcap.Schema):
-            self.schemas[record.id] = record
-        elif isinstance(record, mcap.Channel):
-            self.channels[record.id] = record
-        return record
-
-    def _unpack(self, chunk: mcap.Chunk) -> Iterator[mcap.McapRecord]:
-        size = chunk.uncompressed_size
-        self._take_room(size)
-        if chunk.compression not in _UNPACK:
-            raise _StopError(
-                f"its chunks are compressed by {to_one_line(chunk.compression)!r}; cloudrc reads"
-                " zstd and lz4: convert it with: mcap compress"
-            )
-        data = _UNPACK[chunk.compression](chunk.data, size + 1)
-        if len(data) != size:
-            raise ValueError("the chunk is not as long as it states")
-        if chunk.uncompressed_crc not in (0, checksum := zlib.crc32(data)):
-            raise CRCValidationError(chunk.uncompressed_crc, checksum, chunk)
-        stream = BytesIO(data)
-        # `emit_chunks`: the library would unpack a chunk inside a chunk without a limit.
-        records = StreamReader(stream, skip_magic=True, emit_chunks=True).records
-        try:
-            while stream.tell() < size:  # one at a time: a chunk may hold millions
-                yield next(records)
-        except EndOfFile as error:
-            raise ValueError("a record is not as long as it states") from error
-
-
 @dataclass(slots=True)
 class Contents:
     """The contents of a file.
@@ -243,69 +123,177 @@ class Contents:
                 writer.attach(name, data)
 
 
+class _File:
+    """Reads one MCAP file, also the records inside its chunks, up to its first damaged part."""
+
+    def __init__(self, path: Path) -> None:
+        """Read a file; raise a BadInputError if it cannot be read or is not MCAP."""
+        self.contents = Contents()
+        self.position = 0  # end of the last intact record in the file [bytes]
+        self.data_ended = False  # whether all messages were read; only the index follows
+        self.ended = False  # whether the whole file was read
+        self.fault = ""  # why reading stopped or what is wrong, in words; "" if nothing is wrong
+        self.cut = False  # whether the file breaks off at the fault, as after a kill
+        self.total = 0  # number of messages, also of other programs, read or stated by the index
+        self.channels: dict[int, mcap.Channel] = {}
+        self.ours: dict[int, bool] = {}  # whether cloudrc records a channel's topic in this layout
+        self._schemas: dict[int, mcap.Schema] = {}
+        self._sequences = array("L")
+        try:
+            self._stream = BufferedReader(open_file(path))
+        except (OSError, ValueError) as error:  # ValueError: a pipe or a device
+            reason = getattr(error, "strerror", "not a file")
+            raise BadInputError(
+                f"{path}: cannot be read: {reason}; name a recording (.mcap)"
+            ) from error
+        with self._stream:
+            self.size = os.fstat(self._stream.fileno()).st_size  # [bytes]
+            self._room = UNPACKED_MAX * max(self.size, 1 << 20)
+            head = self._stream.peek(16)
+            if not head.startswith(MCAP0_MAGIC):
+                kind = next((k for k in KINDS if k and head.startswith(k)), head[:16].strip(b"\0"))
+                text = KINDS.get(kind, "is not an MCAP file; name a recording (.mcap)")
+                raise (BadInputError if kind else NothingReadableError)(f"{path}: {text}")
+            self._read()
+        if not self.data_ended and not self.contents.messages:
+            raise NothingReadableError(
+                f"{path}: holds no readable message: {self.fault}; name another recording"
+            )
+        self._sort()
+        _note(self)
+
+    def _read(self) -> None:
+        try:
+            for record in self._records():
+                self._store(record)
+        except CRCValidationError as error:
+            self.fault = "damaged: a checksum is wrong"
+            self.data_ended |= isinstance(error.record, mcap.DataEnd)
+        except (EndOfFile, RecordLengthLimitExceeded):  # a record longer than the rest of the file
+            self.fault, self.cut = "cut short", True
+        except _StopError as error:
+            self.fault = str(error)
+        except OSError as error:
+            self.fault = f"unreadable: {error.strerror}"
+        except Exception:  # the library may raise anything on damaged bytes
+            self.cut = self._stream.tell() >= self.size
+            self.fault = "cut short" if self.cut else "damaged"
+
+    def _records(self) -> Iterator[mcap.McapRecord]:
+        reader = StreamReader(
+            self._stream, emit_chunks=True, validate_crcs=True, record_size_limit=self.size
+        )
+        for record in reader.records:
+            if isinstance(record, mcap.Chunk):
+                yield from self._unpack(record)
+            elif not self.data_ended:  # records after the data repeat the definitions
+                yield record
+            if isinstance(record, mcap.Statistics):
+                self.total = max(self.total, record.message_count)
+            self.data_ended |= isinstance(record, mcap.DataEnd)
+            self.position = self._stream.tell()
+        self.position = self._stream.tell()
+        self.ended = self.data_ended = True
+        if self.position < self.size:
+            self.fault = "something follows its end"
+
+    def _store(self, record: mcap.McapRecord) -> None:
+        """Store a record; raise a KeyError for a message whose channel is not defined."""
+        contents = self.contents
+        if isinstance(record, mcap.Message):
+            self._take_room(MESSAGE_COST)
+            self.total += 1
+            topic = self.channels[record.channel_id].topic
+            if record.channel_id not in self.ours:
+                self.ours[record.channel_id] = self._is_ours(self.channels[record.channel_id])
+            if self.ours[record.channel_id] and topic in VIEWS:
+                contents.views.append((topic, record.log_time, record.data))
+            elif self.ours[record.channel_id]:
+                contents.messages.append((topic, record.log_time, record.data))
+                self._sequences.append(record.sequence)
+        elif isinstance(record, mcap.Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, mcap.Channel):
+            self.channels[record.id] = record
+        elif isinstance(record, mcap.Metadata):
+            contents.metadata.update(record.metadata)
+        elif isinstance(record, mcap.Attachment):
+            contents.attachments[record.name] = record.data
+
+    def _is_ours(self, channel: mcap.Channel) -> bool:
+        """Check whether a channel's topic and layout are those that cloudrc records."""
+        topic, schema = TOPICS.get(channel.topic), self._schemas.get(channel.schema_id)
+        ros_type = topic.ros_type if topic else VIEWS.get(channel.topic)
+        if schema is None or ros_type is None or schema.name != ros_type:
+            return False
+        return is_known(ros_type, schema.data.decode("utf-8", "replace"))
+
+    def _sort(self) -> None:
+        """Sort the messages by log time and sequence number."""
+        messages = self.contents.messages
+        if late := sum(after[1] < before[1] for before, after in pairwise(messages)):
+            keys = zip((message[1] for message in messages), self._sequences, strict=True)
+            order = [row for _, row in sorted(zip(keys, range(len(messages)), strict=True))]
+            self.contents.messages = [messages[row] for row in order]
+            self.contents.remarks += (f"was not in order of time: {late} messages were sorted",)
+
+    @property
+    def unread(self) -> int:
+        """Size of the part that was not read [bytes]; 0 if only the index is damaged."""
+        return 0 if self.data_ended and not self.ended else self.size - self.position
+
+    @property
+    def lost(self) -> int:
+        """Number of messages that are not in `contents`."""
+        return self.total - len(self.contents.messages) - len(self.contents.views)
+
+    def _take_room(self, size: int) -> None:
+        self._room -= size
+        if self._room < 0:
+            raise _StopError(f"unpacks to more than {UNPACKED_MAX} times its size")
+
+    def _unpack(self, chunk: mcap.Chunk) -> Iterator[mcap.McapRecord]:
+        size = chunk.uncompressed_size
+        self._take_room(size)
+        if chunk.compression not in _UNPACK:
+            raise _StopError(
+                f"its chunks are compressed by {to_one_line(chunk.compression)!r}; cloudrc reads"
+                " zstd and lz4: convert it with: mcap compress"
+            )
+        data = _UNPACK[chunk.compression](chunk.data, size + 1)
+        if len(data) != size:
+            raise ValueError("the chunk is not as long as it states")
+        if chunk.uncompressed_crc not in (0, checksum := zlib.crc32(data)):
+            raise CRCValidationError(chunk.uncompressed_crc, checksum, chunk)
+        stream = BytesIO(data)
+        # `emit_chunks`: the library would unpack a chunk inside a chunk without a limit.
+        records = StreamReader(stream, skip_magic=True, emit_chunks=True).records
+        try:
+            while stream.tell() < size:  # one at a time: a chunk may hold millions
+                yield next(records)
+        except EndOfFile as error:
+            raise ValueError("a record is not as long as it states") from error
+
+
 def read_contents(path: Path) -> Contents:
     """Read cloudrc's topics from a file, up to its end or to its first damaged part.
 
     Raise a BadInputError if nothing in the file can be read.
     """
-    return _read(path)[0]
+    return _File(path).contents
 
 
-def _read(path: Path) -> tuple[Contents, Records, int]:
-    """Return the contents of a file, its `Records` after reading, the number of lost messages."""
-    contents, sequences, total = Contents(), array("L"), 0
-    ours: dict[int, bool] = {}  # whether cloudrc records the topic of a channel, in this layout
-    with Records(path) as records:
-        for record in records:
-            if isinstance(record, mcap.Message):
-                channel, total = records.channels[record.channel_id], total + 1
-                if channel.id not in ours:
-                    ours[channel.id] = _is_ours(channel, records.schemas.get(channel.schema_id))
-                if ours[channel.id] and channel.topic in VIEWS:
-                    contents.views.append((channel.topic, record.log_time, record.data))
-                elif ours[channel.id]:
-                    contents.messages.append((channel.topic, record.log_time, record.data))
-                    sequences.append(record.sequence)
-            elif isinstance(record, mcap.Metadata):
-                contents.metadata.update(record.metadata)
-            elif isinstance(record, mcap.Attachment):
-                contents.attachments[record.name] = record.data
-    messages, fault = contents.messages, records.fault
-    if not records.data_ended and not messages:
-        raise NothingReadableError(
-            f"{path}: holds no readable message: {fault}; name another recording"
-        )
-    if late := sum(after[1] < before[1] for before, after in pairwise(messages)):
-        order = sorted(range(len(messages)), key=lambda n: (messages[n][1], sequences[n]))
-        contents.messages = [messages[n] for n in order]
-        contents.remarks += (f"was not in order of time: {late} messages were sorted",)
-    _note(contents, records, ours)
-    known = len(messages) + len(contents.views)
-    return contents, records, max(records.stated or 0, total) - known
-
-
-def _is_ours(channel: mcap.Channel, schema: mcap.Schema | None) -> bool:
-    """Check whether a channel's topic and layout are those that cloudrc records."""
-    topic = TOPICS.get(channel.topic)
-    ros_type = topic.ros_type if topic else VIEWS.get(channel.topic)
-    if schema is None or ros_type is None or schema.name != ros_type:
-        return False
-    return is_known(ros_type, schema.data.decode("utf-8", "replace"))
-
-
-def _note(contents: Contents, records: Records, ours: dict[int, bool]) -> None:
-    """Write into `contents` what is missing from it, in words.
-
-    `ours` maps the number of each channel with messages to whether cloudrc records it.
-    """
-    changed, metadata, fault = list[str](), contents.metadata, records.fault
-    if records.data_ended and records.cut:
+def _note(file: _File) -> None:
+    """Write into the contents of a file what is missing from them, in words."""
+    contents, fault = file.contents, file.fault
+    changed, metadata = list[str](), contents.metadata
+    if file.data_ended and file.cut:
         contents.remarks += ("had a torn index: all its messages were read",)
         fault = ""
-    elif fault and not records.data_ended:
+    elif fault and not file.data_ended:
         count, until = len(contents.messages), contents.messages[-1][1] * 1e-9
         fault += f": {count} messages were read, the last at {until:.2f} s"
-    channels = Counter((records.channels[number].topic, known) for number, known in ours.items())
+    channels = Counter((file.channels[number].topic, known) for number, known in file.ours.items())
     others = {name for name, known in channels if not known}
     if foreign := sorted(others - TOPICS.keys()):
         told = f"has topics that cloudrc does not record: {_list(foreign)}"
@@ -317,14 +305,14 @@ def _note(contents: Contents, records: Records, ours: dict[int, bool]) -> None:
         changed.append(f"two robots or two recordings are in one file: {', '.join(double)}")
     if not metadata.get(CLOCK):
         changed.append("the metadata of cloudrc, which names the clock, is not there")
-    if records.data_ended:
+    if file.data_ended:
         changed += _changed(contents)
     if before := to_one_line(metadata.get(CHANGED, "")):  # known when the file was written
         changed.append(before)
     if changed:
         metadata[CHANGED] = "; ".join(changed)
     told = to_one_line(metadata.get(MISSING, ""))
-    contents.lacking = "; ".join(filter(None, ["" if records.cut else fault, *changed]))
+    contents.lacking = "; ".join(filter(None, ["" if file.cut else fault, *changed]))
     anew = [text for text in changed if text not in told]
     contents.note = "; ".join(filter(None, [fault, *anew, told]))
 
@@ -368,27 +356,28 @@ def recover(source: Path, target: Path) -> Recovery:
     about what is missing. It ends before the first damaged part. Raise a BadInputError if the file
     has no readable message, or an OSError if the new file cannot be written.
     """
-    contents, records, lost = _read(source)
+    file = _File(source)
+    contents, lost = file.contents, file.lost
     if not contents.messages:
         reason = contents.note or "none is in it"
         raise BadInputError(f"{source}: holds no readable message: {reason}; nothing is written")
     notes = [contents.note] if contents.note else []
-    if records.unread:
-        notes.append(f"{records.unread} bytes after the last intact part were not read")
+    if file.unread:
+        notes.append(f"{file.unread} bytes after the last intact part were not read")
     if lost:
         notes.append(f"{lost} messages are lost, or of topics that cloudrc does not record")
     if notes:
         contents.metadata[MISSING] = "; ".join(notes)
     contents.write(target)
     count, topics = len(contents.messages), {topic for topic, _, _ in contents.messages}
-    share = count / (count + lost) if lost else 1.0 - records.unread / records.size
+    share = count / (count + lost) if lost else 1.0 - file.unread / file.size
     return Recovery(
         complete=not notes,
         share=min(share, LOSSY_SHARE_MAX) if notes else 1.0,
-        size=records.size,
+        size=file.size,
         kept={"messages": count, "attachments": len(contents.attachments), "topics": len(topics)},
         dropped={"messages": lost} if lost else {},
-        bytes_lost=records.unread,
+        bytes_lost=file.unread,
         notes=notes,
-        index_is_new=not records.ended,
+        index_is_new=not file.ended,
     )
