@@ -70,7 +70,10 @@ def bore(pipe: Pipe, towards: Array, half_angle: float, count: int, stations: in
 
 
 def strip(first: Array, second: Array, colour: Colour, opacity: float = 1.0) -> list[Face]:
-    """Build n - 1 faces between two lines of n points [m], shape (n, 3)."""
+    """Build n - 1 faces between two lines of points, `first` and `second` [m], shape (n, 3).
+
+    `opacity` is in [0, 1].
+    """
     corners = np.stack([first[:-1], second[:-1], second[1:], first[1:]], axis=1)
     return [Face(each, colour, opacity) for each in corners]
 
