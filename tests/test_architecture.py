@@ -31,7 +31,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "drivers": {"endpoint", "tunnel", "link", "exposition", "files", "record"},
     "record": {"endpoint", "files"},
     "metrics": {"record", "config", "geometry", "plugins"},
-    "report": {"record", "metrics", "config", "geometry", "link", "files", "console"},
+    "report": {"assembly", "record", "metrics", "config", "geometry", "link", "files", "console"},
     "console": {"config", "exposition", "geometry", "world"},
     "cluster": {"config", "link", "record", "report"},
     "sweep": {"assembly", "config", "files", "metrics", "plugins", "record", "report"},

@@ -9,7 +9,7 @@ from cloudrc.errors import MissingPrerequisiteError
 
 EXTRAS: dict[str, tuple[str, ...]] = {
     "world": ("mujoco",),
-    "record": ("mcap", "rosbags", "zstandard"),
+    "record": ("lz4", "mcap", "rosbags", "zstandard"),
     "report": ("matplotlib",),
     "kube": ("kubernetes",),
     "api": ("fastapi", "uvicorn"),

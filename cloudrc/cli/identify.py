@@ -35,19 +35,19 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Fit the model, write it to a file, and print it."""
     require("identify", ("record",))
-    from cloudrc.metrics.velocity_loop import DT, identify, series
+    from cloudrc.metrics.velocity_loop import DT, INPUT, OUTPUT, identify, series
     from cloudrc.record.columns import Recording
 
     path, out = options.run, options.out
     if os.path.lexists(out):
         raise BadInputError(f"{out}: already there; name another file with --out")
     path = path / "mission.mcap" if path.is_dir() else path
-    given, measured, topics = series(Recording.read(path), str(path))
+    given, measured = series(Recording.read(path), str(path))
     fits = [
         identify(given[:, axis], measured[:, axis], f"{path}: {name}")
         for axis, name in enumerate("xyz")
     ]
-    document = _document(fits, len(given) * DT, topics)
+    document = _document(fits, len(given) * DT, (INPUT, OUTPUT))
     try:
         out.write_text(format_document(document, "yaml") + "\n", encoding="utf-8")
     except OSError as error:
@@ -55,7 +55,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.output != "table":
         print(format_document(document, options.output))
         return 0
-    print(f"velocity loop from {document['seconds']} s, input {topics[0]}, output {topics[1]}\n")
+    print(f"velocity loop from {document['seconds']} s, input {INPUT}, output {OUTPUT}\n")
     rows: list[Sequence[str]] = [
         ("axis", "time constant [s]", "dead time [s]", "gain", "explained")
     ]

@@ -233,8 +233,7 @@ def _way(
     many = shown
     if timeline.only() is not None:
         many = send(range(0, options.packets * period_ns, period_ns))
-    counted = numbers(many)
-    return DirectionSample(asked, shown.sent, shown.delays, many.delays, counted.runs), counted
+    return DirectionSample(asked, shown.sent, shown.delays, many.delays), numbers(many)
 
 
 def _row_times(times: Sequence[float]) -> list[int]:

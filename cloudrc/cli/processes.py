@@ -25,6 +25,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from cloudrc.cli.extras import require
 from cloudrc.cli.output import print_line
 from cloudrc.drivers.process import EndProcess, Feed, StopSignal
 from cloudrc.drivers.realtime import Address, Peer, bind, split_address
@@ -315,6 +316,7 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     process ended. `--record-max` limits the size of both recordings together. `clock` is "world" or
     "cloud", the clock of the stamps; `clock_id` identifies this machine's monotonic clock.
     """
+    require("a recording", ("record",))
     from cloudrc.record.recorder import Recorder
     from cloudrc.record.writer import McapWriter
 
@@ -330,7 +332,7 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     return Recorder(
         path,
         lambda file: McapWriter(
-            file, clock=clock, clock_id=clock_id.hex(), wall_offset_ns=offset_ns
+            file, clock=clock, clock_id=clock_id.hex(), wall_offset_ns=offset_ns, index=False
         ),
         size_max=size_max,
     )

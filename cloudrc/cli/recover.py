@@ -45,8 +45,7 @@ def execute(options: argparse.Namespace) -> int:
         reason = error.strerror or error
         raise BadInputError(f"{target}: {reason}; name another file with --to") from error
     if options.output != "table":
-        head = {"schemaVersion": 1, "complete": recovery.complete, "share": recovery.share}
-        document = {**head, "file": str(target), **asdict(recovery)}
+        document = {"schemaVersion": 1, "file": str(target), **asdict(recovery)}
         print(format_document(document, options.output))
         return 0 if recovery.complete else LOSSY
     kept = ", ".join(f"{count} {kind}" for kind, count in recovery.kept.items() if count)

@@ -15,18 +15,6 @@ from cloudrc.cli.parser import figure_arguments
 from cloudrc.errors import BadInputError
 
 COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
-MAIN = {
-    "duration": "mission took",
-    "contact_time": "arm touches the board at",
-    "tip_speed": "with the tip at",
-    "steady_contact_force": "and then presses with",
-    "min_clearance": "least clearance in the pipes",
-    "rtt_mean": "round trip, mean",
-    "prediction_error_rms": "prediction error, RMS",
-    "hold_count": "times in HOLD",
-    "real_time_factor": "real-time factor",
-}
-"""Numbers that the summary shows, and their labels. The report files contain all numbers."""
 EPILOG = """\
 examples:
   cloudrc report runs/latest
@@ -81,7 +69,7 @@ def execute(options: argparse.Namespace) -> int:
 def summary(report: Mapping[str, Any], folder: Path) -> str:
     """Summarize a report as text: verdict, failures, main numbers and path of report.html."""
     from cloudrc.metrics import Number
-    from cloudrc.report.page import readable
+    from cloudrc.report.page import main_numbers
 
     outcome, failures = report["verdict"], report["failures"]
     first = failures[0]["text"] if failures else "every waypoint reached, every criterion met"
@@ -92,8 +80,7 @@ def summary(report: Mapping[str, Any], folder: Path) -> str:
     numbers = {
         name: Number(entry["value"], entry["unit"], "") for name, entry in report["numbers"].items()
     }
-    known = [(name, label) for name, label in MAIN.items() if name in numbers]
-    rows = [(f"  {label}", *readable(name, numbers[name])) for name, label in known]
+    rows = [(f"  {label}", digits, unit) for label, digits, unit in main_numbers(numbers)]
     lines += ["", table(rows, right=[1]) if rows else "  no numbers: nothing was flown"]
     if "fault_count" in numbers and numbers["fault_count"].value:
         count = numbers["fault_count"].value

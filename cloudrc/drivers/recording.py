@@ -93,7 +93,7 @@ class RecordingThread:
         while not self._stopping.wait(rest):
             rest = BUSY if recorder.drain(BATCH) == BATCH else IDLE
             if time.monotonic() - flushed >= FLUSH:
-                recorder.flush(sync=False)
+                recorder.flush()
                 self._flushed.set()
                 flushed = time.monotonic()
         recorder.close()

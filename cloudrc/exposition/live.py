@@ -354,14 +354,11 @@ NO_WAYPOINT = -1
 class Mission:
     """Metrics of missions, computed from mission events."""
 
-    def __init__(self, *, always: bool) -> None:
-        """Set whether to expose these metrics `always` or only after the first event."""
-        self._shown = always
+    def __init__(self) -> None:
         self._state, self._waypoint, self._reached = "idle", NO_WAYPOINT, 0
         self._ended = dict.fromkeys(table.MISSION_OUTCOMES, 0)
 
     def _on_missionevent(self, record: MissionEvent) -> None:
-        self._shown = True
         event = record.event
         if event not in UNDER_WAY:
             self._ended[event if event in self._ended else "other"] += 1
@@ -378,9 +375,7 @@ class Mission:
             self._state, self._waypoint = "starting", NO_WAYPOINT
 
     def read(self) -> Readings:
-        """Return the current metrics, without metrics whose values are unknown."""
-        if not self._shown:
-            return {}
+        """Return the current metrics."""
         return {
             "cloudrc_mission_state": unlabelled(table.MISSION_STATES.index(self._state)),
             "cloudrc_mission_waypoint": unlabelled(self._waypoint),
@@ -414,7 +409,7 @@ class LiveMetrics:
         self.end: End | None = ends[role](self._counts) if role in ends else None
         self.link = Link() if role == table.LINK else None
         has_mission = missions and role in (table.CLOUD, table.TELEOP)
-        mission = Mission(always=role == table.TELEOP) if has_mission else None
+        mission = Mission() if has_mission else None
         parts = self.end, self.end and self.end.check, self.link, mission
         self._parts = [part for part in parts if part is not None]
         # The method `_on_NAME` of a part handles the records of the class NAME.

@@ -63,10 +63,9 @@ def _slip(flight: Flight) -> float | None:
 
 def _real_time_factor(flight: Flight) -> float | None:
     slipped = _slip(flight)
-    if slipped is None or not flight.end_ns:
+    if slipped is None or flight.duration <= 0.0:
         return None
-    simulated = float(flight.seconds(flight.end_ns))
-    return simulated / (simulated + slipped) if simulated > 0 else None
+    return flight.duration / (flight.duration + slipped)
 
 
 def _missed_periods(flight: Flight) -> float | None:
@@ -76,6 +75,7 @@ def _missed_periods(flight: Flight) -> float | None:
 
 
 add_metrics(
+    "Link and loop",
     ("rtt_mean", "s", "Mean round trip from command to echo, without the hold time in world.",
      lambda flight: mean(round_trips(flight)["rtt"])),
     ("rtt_p95", "s", "Round trip from command to echo, without the hold time in world: 95th "
@@ -86,6 +86,9 @@ add_metrics(
      "command.", _age_of_information),
     ("commands_applied", "1", "Number of commands that reached the low-level controller.",
      lambda flight: flight.count(len(flight.during("/command_applied")["epoch"]))),
+)  # fmt: skip
+add_metrics(
+    "Estimation and tracking",
     ("prediction_error_rms", "m", "RMS distance from the predicted to the true position when each "
      "command was applied.", _prediction_error),
     ("estimate_error_rms", "m", "RMS distance from the predicted to the true position at the "
@@ -97,6 +100,9 @@ add_metrics(
      lambda flight: rms(flight.control["setpoint"] - flight.control["measured"])),
     ("tracking_rms_estimated", "m", "RMS distance between the setpoint and cloud's estimated "
      "position.", lambda flight: rms(flight.control["setpoint"] - flight.control["position"])),
+)  # fmt: skip
+add_metrics(
+    "Real time",
     ("world_lateness_p99", "s", "Lateness of world's wakes: 99th percentile; real time only.",
      lambda flight: percentile(wakes(flight, "world")["lateness"], 99.0)),
     ("cloud_lateness_p99", "s", "Lateness of cloud's wakes: 99th percentile; real time only.",

@@ -58,6 +58,11 @@ class Flight:
         stamps = self.recording["/ground_truth"]["stamp_ns"]
         return int(stamps[-1]) if len(stamps) else self.start_ns
 
+    @property
+    def duration(self) -> float:
+        """Duration of the flight [s]; 0 if the robot never flew."""
+        return 0.0 if self.end_ns is None else float(self.seconds(self.end_ns))
+
     @cached_property
     def ending(self) -> tuple[int, str, str] | None:
         """Event that ended the mission: stamp [ns], name, text; None if there is no such event."""
@@ -138,26 +143,20 @@ class Flight:
     def applied(self) -> Columns:
         """Commands that world applied in the flight, with the values of their control periods.
 
-        `stamp_ns` is the time of application or, for a command with a plan, the start of the plan
-        [ns]; `position` is the predicted position [m].
+        Commands without a recorded control period are left out. `stamp_ns` is the time of
+        application or, for a command with a plan, the start of the plan [ns]; `position` is the
+        predicted position [m].
         """
-        columns = self.join_control(self.during("/command_applied"))
-        planned, stamp = columns["planned_ns"], columns["stamp_ns"]
-        return columns | {"stamp_ns": np.where(planned >= 0, planned, stamp)}
-
-    def join_control(self, commands: Columns) -> Columns:
-        """Add to each command (`epoch`, `counter`) the values of its control period.
-
-        Commands without a recorded control period are left out. If both have a column of the same
-        name, the value of the command is kept.
-        """
+        commands = self.during("/command_applied")
         keys = zip(self._control["epoch"], self._control["counter"], strict=True)
         rows = {key: row for row, key in enumerate(keys)}
         keys = zip(commands["epoch"], commands["counter"], strict=True)
         joined = np.array([rows.get(key, -1) for key in keys], dtype=np.int64)
         known, source = joined >= 0, joined[joined >= 0]
-        periods = {name: column[source] for name, column in self._control.items()}
-        return periods | {name: column[known] for name, column in commands.items()}
+        columns = {name: column[source] for name, column in self._control.items()}
+        columns |= {name: column[known] for name, column in commands.items()}
+        planned, stamp = columns["planned_ns"], columns["stamp_ns"]
+        return columns | {"stamp_ns": np.where(planned >= 0, planned, stamp)}
 
     def _within(self, columns: Columns) -> Columns:
         stamps = columns["stamp_ns"]
@@ -183,15 +182,16 @@ class Metric:
     unit: str  # SI unit as text; "1" for counts and shares
     meaning: str  # one sentence
     measure: Measure
+    group: str = "Others"  # title above the metric in report.html
 
 
 SHIPPED: dict[str, Metric] = {}
 """The metrics of cloudrc by name; complete once `cloudrc.metrics` is imported."""
 
 
-def add_metrics(*rows: tuple[str, str, str, Measure]) -> None:
-    """Add metrics of cloudrc; each row has the attributes of a `Metric`."""
-    SHIPPED.update({row[0]: Metric(*row) for row in rows})
+def add_metrics(group: str, *rows: tuple[str, str, str, Measure]) -> None:
+    """Add metrics of cloudrc to a group; each row has the other attributes of a `Metric`."""
+    SHIPPED.update({row[0]: Metric(*row, group) for row in rows})
 
 
 def mean(values: Array) -> float | None:
@@ -233,10 +233,14 @@ def _speed_max(flight: Flight) -> float | None:
 
 
 add_metrics(
+    "Mission",
     ("duration", "s", "Time from the start of the mission to its end.",
-     lambda flight: None if flight.end_ns is None else float(flight.seconds(flight.end_ns))),
+     lambda flight: flight.count(flight.duration)),
     ("distance_flown", "m", "Length of the path that the robot's base flew.", _distance),
     ("speed_max", "m/s", "Largest true speed of the robot's base.", _speed_max),
+)  # fmt: skip
+add_metrics(
+    "Distance to the pipes",
     ("min_clearance", "m", "Smallest distance between the robot and a pipe's wall while the base "
      "is inside a pipe.", partial(_least_clearance, inside=True)),
     ("min_clearance_flight", "m", "Smallest distance between the robot and a pipe during the whole "

@@ -59,6 +59,7 @@ def _add_direction(way: str, words: str) -> None:
         return None if total is None else total * 1e-9
 
     add_metrics(
+        "Link and loop",
         (f"{way}_delay_mean", "s", f"Mean one-way delay {words} of all datagrams that arrived, "
          "late ones included.", partial(_delay_mean, way=way)),
         (f"late_{way}", "1", f"Share of the arrived datagrams {words} that were too late to be "

@@ -168,7 +168,10 @@ def _recorder_dropped(flight: Flight) -> float | None:
     return float(sum(last.values())) if last else None
 
 
+add_metrics("Distance to the pipes",
+            ("pipe_contacts", "1", "Number of contacts with a pipe.", _pipe_contacts))  # fmt: skip
 add_metrics(
+    "Mission",
     ("waypoints_reached", "1", "Number of waypoints at which the true position stayed within the "
      "tolerance for the dwell time.", _waypoints_reached),
     ("contact_time", "s", "Time from the start of the mission to the arm's first touch of the "
@@ -180,9 +183,11 @@ add_metrics(
      "first touch.", _impulse),
     ("steady_contact_force", "N", "Mean force on the arm's tip over the last 2 s of the mission.",
      _steady_force),
-    ("pipe_contacts", "1", "Number of contacts with a pipe.", _pipe_contacts),
     *((f"steady_error_{name}", "m", f"Mean distance from the setpoint along {name} over the last "
        "5 s of a hover.", partial(_steady_error, axis=axis)) for axis, name in enumerate("xyz")),
+)  # fmt: skip
+add_metrics(
+    "Guard and faults",
     ("hold_count", "1", "Number of times that the guard went to HOLD because fresh commands were "
      "missing.", lambda flight: flight.count(len(holds(flight)))),
     ("hold_time", "s", "Total time in HOLD, in which the guard flies without commands.",

@@ -139,6 +139,7 @@ def _tracking_errors(flight: Flight) -> Array:
 
 
 add_metrics(
+    "Steps",
     ("overshoot_mean", "1", "Mean overshoot of the steps, as a share of the step.",
      partial(_mean_of, name="overshoot")),
     ("overshoot_max", "1", "Largest overshoot of a step, as a share of the step.",
@@ -153,10 +154,13 @@ add_metrics(
      partial(_mean_of, name="ise")),
     ("control_effort_mean", "m^2/s", "Integral of the squared commanded velocity over time, mean "
      "of the steps.", partial(_mean_of, name="effort")),
+    ("unstable_steps", "1", "Number of steps in which the error oscillates without decay.",
+     lambda flight: flight.count(sum(step.unstable for step in steps(flight)))),
+)  # fmt: skip
+add_metrics(
+    "Estimation and tracking",
     ("tracking_error_p95", "m", "Distance from setpoint to true position: 95th percentile.",
      lambda flight: percentile(_tracking_errors(flight), 95.0)),
     ("tracking_error_peak", "m", "Largest distance from the setpoint to the true position.",
      lambda flight: percentile(_tracking_errors(flight), 100.0)),
-    ("unstable_steps", "1", "Number of steps in which the error oscillates without decay.",
-     lambda flight: flight.count(sum(step.unstable for step in steps(flight)))),
 )  # fmt: skip

@@ -20,9 +20,8 @@ from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
 
 Array: TypeAlias = NDArray[np.float64]
-INPUTS = {"/reference": "reference", "/command_applied": "velocity", "/cmd_vel": "command"}
-OUTPUTS = {"/ground_truth": "velocity", "/odometry": "velocity"}
-"""Topic -> column with velocities; the first topic that has rows is used."""
+INPUT, OUTPUT = "/reference", "/ground_truth"
+"""Topics with the commanded and the measured velocity."""
 DT = 0.01
 """Time between two samples of the fit [s]."""
 START = 100
@@ -43,27 +42,21 @@ class Fit(NamedTuple):
     share: float  # share of the variance of the velocity that the model explains [1]
 
 
-def series(recording: Recording, name: str) -> tuple[Array, Array, tuple[str, str]]:
-    """Return input and output velocities [m/s], shape (n, 3), at steps of DT, and their topics.
+def series(recording: Recording, name: str) -> tuple[Array, Array]:
+    """Return the velocities of INPUT and OUTPUT [m/s], shape (n, 3), at steps of DT.
 
-    The samples are from the longest time in TRACK, without the take-off; from the whole recording
-    if it does not contain the guard's states. `name` is the recording's name in error messages.
+    The samples are from the longest time in TRACK, without the take-off. `name` is the recording's
+    name in error messages.
     """
-    topics = []
-    for candidates in (INPUTS, OUTPUTS):
-        there = [topic for topic in candidates if len(recording[topic])]
-        if not there:
-            raise BadInputError(f"{name}: has no {' or '.join(candidates)}; record one of them")
-        topics.append(there[0])
-    source, sink = (recording[topic] for topic in topics)
-    start_ns, end_ns = sink["stamp_ns"][[0, -1]]
-    guard = recording["/guard"]
-    if len(guard):
-        ends_ns = np.append(guard["stamp_ns"][1:], end_ns)
-        tracks = np.where(guard["state"] == GuardState.TRACK, ends_ns - guard["stamp_ns"], 0)
-        longest = int(tracks.argmax())
-        start_ns, end_ns = guard["stamp_ns"][longest] + int(TAKE_OFF * 1e9), ends_ns[longest]
-        end_ns = end_ns if tracks[longest] else start_ns
+    for topic in (INPUT, OUTPUT, "/guard"):
+        if not len(recording[topic]):
+            raise BadInputError(f"{name}: has no {topic}; name the recording of a whole flight")
+    source, sink, guard = recording[INPUT], recording[OUTPUT], recording["/guard"]
+    ends_ns = np.append(guard["stamp_ns"][1:], sink["stamp_ns"][-1])
+    tracks = np.where(guard["state"] == GuardState.TRACK, ends_ns - guard["stamp_ns"], 0)
+    longest = int(tracks.argmax())
+    start_ns, end_ns = guard["stamp_ns"][longest] + int(TAKE_OFF * 1e9), ends_ns[longest]
+    end_ns = end_ns if tracks[longest] else start_ns
     if end_ns - start_ns < DURATION_MIN * 1e9:
         raise BadInputError(
             f"{name}: {max(0, end_ns - start_ns) * 1e-9:.1f} s of flight under commands after the "
@@ -71,10 +64,9 @@ def series(recording: Recording, name: str) -> tuple[Array, Array, tuple[str, st
         )
     at_ns = np.arange(start_ns, end_ns, int(DT * 1e9))
     held = source["stamp_ns"].searchsorted(at_ns, "right") - 1
-    given = source[INPUTS[topics[0]]][np.maximum(held, 0)]
-    columns = sink[OUTPUTS[topics[1]]].T
+    given, columns = source["reference"][np.maximum(held, 0)], sink["velocity"].T
     measured = np.stack([np.interp(at_ns, sink["stamp_ns"], column) for column in columns], axis=1)
-    return given, measured, (topics[0], topics[1])
+    return given, measured
 
 
 def identify(given: Array, measured: Array, name: str) -> Fit:

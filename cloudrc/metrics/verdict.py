@@ -38,6 +38,10 @@ PLUGIN_FAILURES_MAX = 0.01
 """Largest share of periods in which a plug-in may fail in a valid flight, in [0, 1]."""
 BROKEN_OFF = ("interrupted", "cancelled", "disk_full")
 """Codes of an `Ending` that interrupts a mission; the goals then need not be met."""
+NOT_STARTED = (
+    "the robot never left the ground, because it got no fresh commands or no request to"
+    " start; compare the delays of the link with guard.command_age_max_ms"
+)
 ADVICE = "close other programs or give the run more cores"
 
 Outcome = Literal["success", "failure", "invalid", "interrupted"]
@@ -202,7 +206,7 @@ def _ending(flight: Flight, interrupted: bool) -> Ending:
     if interrupted:
         return Ending("interrupted", "the run ended before the mission")
     if flight.end_ns is None:
-        return Ending("not_started", f"the robot never left the ground: {_why_grounded(flight)}")
+        return Ending("not_started", NOT_STARTED)
     return Ending("mission_not_ended", "the mission did not end")
 
 
@@ -288,26 +292,6 @@ def _not_real_time(numbers: Mapping[str, Number]) -> str:
     if slip.value > SLIP_MAX:
         return f"world's clock lost {slip.value:.3f} s, more than {SLIP_MAX} s: {ADVICE}"
     return ""
-
-
-def _why_grounded(flight: Flight) -> str:
-    """Describe why the guard applied no command, so that the flight never started."""
-    arrivals = flight.recording["/downlink_delay"]
-    if not len(arrivals):
-        return "no command arrived; its telemetry or cloud's commands were lost"
-    # The start of a mission opens a new session: commands of older sessions do not count.
-    last = arrivals["epoch"] == arrivals["epoch"].max()
-    if arrivals["used"][last].any():
-        return "fresh commands arrived, but no request to start"
-    commands = flight.join_control({name: arrivals[name][last] for name in arrivals.names})
-    ages_ns = commands["stamp_ns"] - commands["basis_stamp_ns"]
-    if not len(ages_ns):
-        return "no fresh command arrived"
-    return (
-        f"the odometry behind each command was {min(ages_ns) * 1e-9:.3f} s old or older when the"
-        " command arrived, above the limit guard.command_age_max_ms; shorten the delay or raise"
-        " the limit"
-    )
 
 
 def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, Number]) -> Verdict:

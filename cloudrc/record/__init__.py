@@ -9,20 +9,9 @@ from collections.abc import Mapping
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 
-from cloudrc.errors import MissingPrerequisiteError
-
 WALL_OFFSET = "wall_clock_offset_ns"
 """Metadata key, only in real time: wall time minus the stamps' clock at the opening of the file
 [ns]."""
-
-
-def missing(error: ImportError) -> MissingPrerequisiteError:
-    """Make an error that names a missing package and the command to install it."""
-    name = (error.name or str(error)).partition(".")[0]
-    return MissingPrerequisiteError(
-        f"recording needs the package {name}, which is not installed;"
-        " install it with: pip install 'cloudrc[record]'"
-    )
 
 
 def wall_time(metadata: Mapping[str, str], stamp_ns: int) -> datetime | None:

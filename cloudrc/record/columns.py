@@ -119,43 +119,22 @@ class Recording:
         """Whether no message of the flight is missing."""
         return not self.note
 
-    @classmethod
-    def from_records(cls, world: Iterable[Record], cloud: Iterable[Record] = ()) -> Recording:
+    @staticmethod
+    def from_records(world: Iterable[Record], cloud: Iterable[Record] = ()) -> Recording:
         """Make a recording from the records of each end, oldest first and all on one clock."""
         store = RecordStore()
         store.add(world, cloud)
         return store.recording()
 
-    @classmethod
-    def read(cls, path: Path) -> Self:
+    @staticmethod
+    def read(path: Path) -> Recording:
         """Read an MCAP file up to its end or to its first damaged part.
 
-        Raises:
-            BadInputError: If nothing in the file can be read.
-            MissingPrerequisiteError: If `cloudrc[record]` is not installed.
+        Raise a BadInputError if nothing in the file can be read.
         """
         from cloudrc.record.reader import read_contents
 
-        return cls.from_contents(read_contents(path))
-
-    @classmethod
-    def from_contents(cls, contents: Contents) -> Self:
-        """Decode the contents of a file."""
-        from cloudrc.record.ros import decode
-
-        rows: dict[str, list[tuple[int, Values]]] = {name: [] for name in TOPICS}
-        unreadable = 0
-        for topic, _, data in contents.messages:
-            try:
-                rows[topic].append(decode(TOPICS[topic], data))
-            except Exception:  # rosbags may raise anything on malformed bytes
-                unreadable += 1
-        recording = cls(lambda topic: Table.from_rows(topic, rows[topic.name]), contents)
-        if unreadable:
-            text = f"{unreadable} messages are not readable"
-            recording.note = f"{recording.note}; {text}".removeprefix("; ")
-            recording.lacking = f"{recording.lacking}; {text}".removeprefix("; ")
-        return recording
+        return read_contents(path).recording()
 
     def __getitem__(self, topic: str) -> Table:
         if topic not in self._tables:

@@ -18,14 +18,20 @@ from dataclasses import dataclass, field
 from io import BufferedReader, BytesIO
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Self
+
+import lz4.frame
+import zstandard
+from mcap import records as mcap
+from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
+from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.writer import MCAP0_MAGIC
 
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import atomic_file, open_file
-from cloudrc.record import missing, wall_time
-from cloudrc.record.columns import Recording
-from cloudrc.record.ros import is_known
-from cloudrc.record.topics import TOPICS, VIEWS
+from cloudrc.record import wall_time
+from cloudrc.record.columns import Recording, Table
+from cloudrc.record.ros import decode, is_known
+from cloudrc.record.topics import TOPICS, VIEWS, Values
 from cloudrc.record.writer import (
     CHANGED,
     CLOCK,
@@ -35,16 +41,6 @@ from cloudrc.record.writer import (
     McapWriter,
 )
 
-try:
-    import lz4.frame
-    import zstandard
-    from mcap import records as mcap
-    from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
-    from mcap.stream_reader import CRCValidationError, StreamReader
-    from mcap.writer import MCAP0_MAGIC
-except ImportError as error:
-    raise missing(error) from error
-
 UNPACKED_MAX = 64
 """Largest ratio of a recording's size in memory to its size in the file; a file below 1 MiB counts
 as 1 MiB. Recordings of flights need a ratio of 10, recordings of an idle robot 30."""
@@ -53,7 +49,7 @@ MESSAGE_COST = 128
 LISTED_MAX = 3
 """Largest number of topics that an error message lists."""
 LOSSY_SHARE_MAX = 0.999
-"""Largest value of `Recovery.share` if something is missing."""
+"""Largest value of `Recovery.share` if something is missing [1]."""
 KINDS = {
     b"": "is empty; name a recording (.mcap)",
     b"#ROSBAG V": "is a ROS 1 bag, not an MCAP file; convert it with: rosbags-convert",
@@ -81,12 +77,68 @@ _UNPACK: dict[str, Callable[[bytes, int], bytes]] = {
 used, because they allocate whatever size the file claims."""
 
 
-class Records:
-    """Iterates over the records of one MCAP file, also over those inside its chunks."""
+@dataclass(slots=True)
+class Contents:
+    """The contents of a file.
+
+    `lacking` is the part of `note` about damaged, removed or added messages. It does not mention
+    messages that are missing because the recording process was killed.
+    """
+
+    # Topic, log time [ns] and CDR bytes of each message, in the order of log times.
+    messages: list[tuple[str, int, bytes]] = field(default_factory=list)
+    metadata: dict[str, str] = field(default_factory=dict)  # of a repeated key, the last value
+    attachments: dict[str, bytes] = field(default_factory=dict)  # name -> content of a file
+    views: list[tuple[str, int, bytes]] = field(default_factory=list)  # messages of `VIEWS`
+    note: str = ""  # what is missing, in words; "" if nothing is missing
+    lacking: str = ""
+    remarks: tuple[str, ...] = ()  # what was ignored or sorted; "The recording" precedes each
+
+    def recording(self) -> Recording:
+        """Convert the messages to tables; unreadable messages are left out and noted."""
+        rows: dict[str, list[tuple[int, Values]]] = {name: [] for name in TOPICS}
+        unreadable = 0
+        for topic, _, data in self.messages:
+            try:
+                rows[topic].append(decode(TOPICS[topic], data))
+            except Exception:  # rosbags may raise anything on malformed bytes
+                unreadable += 1
+        recording = Recording(lambda topic: Table.from_rows(topic, rows[topic.name]), self)
+        if unreadable:
+            text = f"{unreadable} messages are not readable"
+            recording.note = f"{recording.note}; {text}".removeprefix("; ")
+            recording.lacking = f"{recording.lacking}; {text}".removeprefix("; ")
+        return recording
+
+    def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
+        """Write the contents and further `attachments` to a file, atomically; may raise OSError."""
+        with atomic_file(target) as file, McapWriter(file, clock="") as writer:
+            writer.note(self.metadata)
+            if self.messages and (began := wall_time(self.metadata, self.messages[0][1])):
+                writer.note({STARTED: began.isoformat(timespec="milliseconds")})
+            for message in self.messages:
+                writer.write_message(*message)
+            writer.write_views(self.views)
+            for name, data in {**self.attachments, **(attachments or {})}.items():
+                writer.attach(name, data)
+
+
+class _File:
+    """Reads one MCAP file, also the records inside its chunks, up to its first damaged part."""
 
     def __init__(self, path: Path) -> None:
-        """Open a file; use `with` to close it. Raise a BadInputError if it cannot be opened."""
-        self.path = path
+        """Read a file; raise a BadInputError if it cannot be read or is not MCAP."""
+        self.contents = Contents()
+        self.position = 0  # end of the last intact record in the file [bytes]
+        self.data_ended = False  # whether all messages were read; only the index follows
+        self.ended = False  # whether the whole file was read
+        self.fault = ""  # why reading stopped or what is wrong, in words; "" if nothing is wrong
+        self.cut = False  # whether the file breaks off at the fault, as after a kill
+        self.total = 0  # number of messages, also of other programs, read or stated by the index
+        self.channels: dict[int, mcap.Channel] = {}
+        self.ours: dict[int, bool] = {}  # whether cloudrc records a channel's topic in this layout
+        self._schemas: dict[int, mcap.Schema] = {}
+        self._sequences = array("L")
         try:
             self._stream = BufferedReader(open_file(path))
         except (OSError, ValueError) as error:  # ValueError: a pipe or a device
@@ -94,36 +146,26 @@ class Records:
             raise BadInputError(
                 f"{path}: cannot be read: {reason}; name a recording (.mcap)"
             ) from error
-        self.size = os.fstat(self._stream.fileno()).st_size  # [bytes]
-        self.position = 0  # end of the last intact record in the file [bytes]
-        self.schemas: dict[int, mcap.Schema] = {}
-        self.channels: dict[int, mcap.Channel] = {}
-        self.data_ended = False  # whether all messages were read; only the index follows
-        self.ended = False  # whether the whole file was read
-        self.fault = ""  # why reading stopped or what is wrong, in words; "" if nothing is wrong
-        self.cut = False  # whether the file breaks off at the fault, as after a kill
-        self.stated: int | None = None  # number of messages according to the index
-        self._room = UNPACKED_MAX * max(self.size, 1 << 20)
+        with self._stream:
+            self.size = os.fstat(self._stream.fileno()).st_size  # [bytes]
+            self._room = UNPACKED_MAX * max(self.size, 1 << 20)
+            head = self._stream.peek(16)
+            if not head.startswith(MCAP0_MAGIC):
+                kind = next((k for k in KINDS if k and head.startswith(k)), head[:16].strip(b"\0"))
+                text = KINDS.get(kind, "is not an MCAP file; name a recording (.mcap)")
+                raise (BadInputError if kind else NothingReadableError)(f"{path}: {text}")
+            self._read()
+        if not self.data_ended and not self.contents.messages:
+            raise NothingReadableError(
+                f"{path}: holds no readable message: {self.fault}; name another recording"
+            )
+        self._sort()
+        _note(self)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._stream.close()
-
-    def __iter__(self) -> Iterator[mcap.McapRecord]:
-        """Yield the records up to the file's end or to its first damaged part.
-
-        Raise a BadInputError if the file is not MCAP.
-        """
-        head = self._stream.read(16)
-        if not head.startswith(MCAP0_MAGIC):
-            kind = next((one for one in KINDS if one and head.startswith(one)), head.strip(b"\0"))
-            text = KINDS.get(kind, "is not an MCAP file; name a recording (.mcap)")
-            raise (BadInputError if kind else NothingReadableError)(f"{self.path}: {text}")
-        self._stream.seek(0)
+    def _read(self) -> None:
         try:
-            yield from self._read()
+            for record in self._records():
+                self._store(record)
         except CRCValidationError as error:
             self.fault = "damaged: a checksum is wrong"
             self.data_ended |= isinstance(error.record, mcap.DataEnd)
@@ -137,17 +179,17 @@ class Records:
             self.cut = self._stream.tell() >= self.size
             self.fault = "cut short" if self.cut else "damaged"
 
-    def _read(self) -> Iterator[mcap.McapRecord]:
+    def _records(self) -> Iterator[mcap.McapRecord]:
         reader = StreamReader(
             self._stream, emit_chunks=True, validate_crcs=True, record_size_limit=self.size
         )
         for record in reader.records:
             if isinstance(record, mcap.Chunk):
-                yield from map(self._check, self._unpack(record))
+                yield from self._unpack(record)
             elif not self.data_ended:  # records after the data repeat the definitions
-                yield self._check(record)
+                yield record
             if isinstance(record, mcap.Statistics):
-                self.stated = record.message_count
+                self.total = max(self.total, record.message_count)
             self.data_ended |= isinstance(record, mcap.DataEnd)
             self.position = self._stream.tell()
         self.position = self._stream.tell()
@@ -155,27 +197,60 @@ class Records:
         if self.position < self.size:
             self.fault = "something follows its end"
 
+    def _store(self, record: mcap.McapRecord) -> None:
+        """Store a record; raise a KeyError for a message whose channel is not defined."""
+        contents = self.contents
+        if isinstance(record, mcap.Message):
+            self._take_room(MESSAGE_COST)
+            self.total += 1
+            topic = self.channels[record.channel_id].topic
+            if record.channel_id not in self.ours:
+                self.ours[record.channel_id] = self._is_ours(self.channels[record.channel_id])
+            if self.ours[record.channel_id] and topic in VIEWS:
+                contents.views.append((topic, record.log_time, record.data))
+            elif self.ours[record.channel_id]:
+                contents.messages.append((topic, record.log_time, record.data))
+                self._sequences.append(record.sequence)
+        elif isinstance(record, mcap.Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, mcap.Channel):
+            self.channels[record.id] = record
+        elif isinstance(record, mcap.Metadata):
+            contents.metadata.update(record.metadata)
+        elif isinstance(record, mcap.Attachment):
+            contents.attachments[record.name] = record.data
+
+    def _is_ours(self, channel: mcap.Channel) -> bool:
+        """Check whether a channel's topic and layout are those that cloudrc records."""
+        topic, schema = TOPICS.get(channel.topic), self._schemas.get(channel.schema_id)
+        ros_type = topic.ros_type if topic else VIEWS.get(channel.topic)
+        if schema is None or ros_type is None or schema.name != ros_type:
+            return False
+        return is_known(ros_type, schema.data.decode("utf-8", "replace"))
+
+    def _sort(self) -> None:
+        """Sort the messages by log time and sequence number."""
+        messages = self.contents.messages
+        if late := sum(after[1] < before[1] for before, after in pairwise(messages)):
+            keys = zip((message[1] for message in messages), self._sequences, strict=True)
+            order = [row for _, row in sorted(zip(keys, range(len(messages)), strict=True))]
+            self.contents.messages = [messages[row] for row in order]
+            self.contents.remarks += (f"was not in order of time: {late} messages were sorted",)
+
     @property
     def unread(self) -> int:
         """Size of the part that was not read [bytes]; 0 if only the index is damaged."""
         return 0 if self.data_ended and not self.ended else self.size - self.position
 
+    @property
+    def lost(self) -> int:
+        """Number of messages that are not in `contents`."""
+        return self.total - len(self.contents.messages) - len(self.contents.views)
+
     def _take_room(self, size: int) -> None:
         self._room -= size
         if self._room < 0:
             raise _StopError(f"unpacks to more than {UNPACKED_MAX} times its size")
-
-    def _check(self, record: mcap.McapRecord) -> mcap.McapRecord:
-        """Store definitions; raise a ValueError for a number with no or with two definitions."""
-        if isinstance(record, mcap.Message):
-            self._take_room(MESSAGE_COST)
-            if record.channel_id not in self.channels:
-                raise ValueError("a message of no channel")
-        elif isinstance(record, mcap.Schema | mcap.Channel):
-            known: Any = self.schemas if isinstance(record, mcap.Schema) else self.channels
-            if known.setdefault(record.id, record) != record:
-                raise ValueError("two definitions have the same number")
-        return record
 
     def _unpack(self, chunk: mcap.Chunk) -> Iterator[mcap.McapRecord]:
         size = chunk.uncompressed_size
@@ -200,107 +275,25 @@ class Records:
             raise ValueError("a record is not as long as it states") from error
 
 
-@dataclass(slots=True)
-class Contents:
-    """The contents of a file.
-
-    `lacking` is the part of `note` about damaged, removed or added messages. It does not mention
-    messages that are missing because the recording process was killed.
-    """
-
-    # Topic, log time [ns] and CDR bytes of each message, in the order of log times.
-    messages: list[tuple[str, int, bytes]] = field(default_factory=list)
-    metadata: dict[str, str] = field(default_factory=dict)  # of a repeated key, the last value
-    attachments: dict[str, bytes] = field(default_factory=dict)  # name -> content of a file
-    views: list[tuple[str, int, bytes]] = field(default_factory=list)  # messages of `VIEWS`
-    note: str = ""  # what is missing, in words; "" if nothing is missing
-    lacking: str = ""
-    remarks: tuple[str, ...] = ()  # what was ignored or sorted; "The recording" precedes each
-
-    def recording(self) -> Recording:
-        """Convert the messages to tables."""
-        return Recording.from_contents(self)
-
-    def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
-        """Write the contents and further `attachments` to a file, atomically; may raise OSError."""
-        clock, clock_id = self.metadata.get(CLOCK, ""), self.metadata.get("clock_id", "")
-        with (
-            atomic_file(target) as file,
-            McapWriter(file, clock=clock, clock_id=clock_id) as writer,
-        ):
-            writer.note(self.metadata)
-            if self.messages and (began := wall_time(self.metadata, self.messages[0][1])):
-                writer.note({STARTED: began.isoformat(timespec="milliseconds")})
-            for message in self.messages:
-                writer.write_message(*message)
-            writer.write_views(self.views)
-            for name, data in {**self.attachments, **(attachments or {})}.items():
-                writer.attach(name, data)
-
-
 def read_contents(path: Path) -> Contents:
     """Read cloudrc's topics from a file, up to its end or to its first damaged part.
 
     Raise a BadInputError if nothing in the file can be read.
     """
-    return _read(path)[0]
+    return _File(path).contents
 
 
-def _read(path: Path) -> tuple[Contents, Records, int]:
-    """Return the contents of a file, its `Records` after reading, the number of lost messages."""
-    contents, sequences, total = Contents(), array("L"), 0
-    ours: dict[int, bool] = {}  # whether cloudrc records the topic of a channel, in this layout
-    with Records(path) as records:
-        for record in records:
-            if isinstance(record, mcap.Message):
-                channel, total = records.channels[record.channel_id], total + 1
-                if channel.id not in ours:
-                    ours[channel.id] = _is_ours(channel, records.schemas.get(channel.schema_id))
-                if ours[channel.id] and channel.topic in VIEWS:
-                    contents.views.append((channel.topic, record.log_time, record.data))
-                elif ours[channel.id]:
-                    contents.messages.append((channel.topic, record.log_time, record.data))
-                    sequences.append(record.sequence)
-            elif isinstance(record, mcap.Metadata):
-                contents.metadata.update(record.metadata)
-            elif isinstance(record, mcap.Attachment):
-                contents.attachments[record.name] = record.data
-    messages, fault = contents.messages, records.fault
-    if not records.data_ended and not messages:
-        raise NothingReadableError(
-            f"{path}: holds no readable message: {fault}; name another recording"
-        )
-    if late := sum(after[1] < before[1] for before, after in pairwise(messages)):
-        order = sorted(range(len(messages)), key=lambda n: (messages[n][1], sequences[n]))
-        contents.messages = [messages[n] for n in order]
-        contents.remarks += (f"was not in order of time: {late} messages were sorted",)
-    _note(contents, records, ours)
-    known = len(messages) + len(contents.views)
-    return contents, records, max(records.stated or 0, total) - known
-
-
-def _is_ours(channel: mcap.Channel, schema: mcap.Schema | None) -> bool:
-    """Check whether a channel's topic and layout are those that cloudrc records."""
-    topic = TOPICS.get(channel.topic)
-    ros_type = topic.ros_type if topic else VIEWS.get(channel.topic)
-    if schema is None or ros_type is None or schema.name != ros_type:
-        return False
-    return is_known(ros_type, schema.data.decode("utf-8", "replace"))
-
-
-def _note(contents: Contents, records: Records, ours: dict[int, bool]) -> None:
-    """Write into `contents` what is missing from it, in words.
-
-    `ours` maps the number of each channel with messages to whether cloudrc records it.
-    """
-    changed, metadata, fault = list[str](), contents.metadata, records.fault
-    if records.data_ended and records.cut:
+def _note(file: _File) -> None:
+    """Write into the contents of a file what is missing from them, in words."""
+    contents, fault = file.contents, file.fault
+    changed, metadata = list[str](), contents.metadata
+    if file.data_ended and file.cut:
         contents.remarks += ("had a torn index: all its messages were read",)
         fault = ""
-    elif fault and not records.data_ended:
+    elif fault and not file.data_ended:
         count, until = len(contents.messages), contents.messages[-1][1] * 1e-9
         fault += f": {count} messages were read, the last at {until:.2f} s"
-    channels = Counter((records.channels[number].topic, known) for number, known in ours.items())
+    channels = Counter((file.channels[number].topic, known) for number, known in file.ours.items())
     others = {name for name, known in channels if not known}
     if foreign := sorted(others - TOPICS.keys()):
         told = f"has topics that cloudrc does not record: {_list(foreign)}"
@@ -312,14 +305,14 @@ def _note(contents: Contents, records: Records, ours: dict[int, bool]) -> None:
         changed.append(f"two robots or two recordings are in one file: {', '.join(double)}")
     if not metadata.get(CLOCK):
         changed.append("the metadata of cloudrc, which names the clock, is not there")
-    if records.data_ended:
+    if file.data_ended:
         changed += _changed(contents)
     if before := to_one_line(metadata.get(CHANGED, "")):  # known when the file was written
         changed.append(before)
     if changed:
         metadata[CHANGED] = "; ".join(changed)
     told = to_one_line(metadata.get(MISSING, ""))
-    contents.lacking = "; ".join(filter(None, ["" if records.cut else fault, *changed]))
+    contents.lacking = "; ".join(filter(None, ["" if file.cut else fault, *changed]))
     anew = [text for text in changed if text not in told]
     contents.note = "; ".join(filter(None, [fault, *anew, told]))
 
@@ -346,29 +339,14 @@ def _list(topics: list[str]) -> str:
 class Recovery:
     """The result of `recover`."""
 
+    complete: bool  # whether nothing is missing or doubtful
+    share: float  # share of the messages that were kept, in [0, 1]; if unknown, of the bytes
     size: int  # size of the damaged file [bytes]
     kept: dict[str, int]  # number of objects in the new file, by kind
     dropped: dict[str, int]  # {"messages": number of lost messages}; {} if none or unknown
     bytes_lost: int  # number of bytes after the last intact record
     notes: list[str]  # what is missing or doubtful, in words
     index_is_new: bool  # whether the old file had no readable index
-
-    @property
-    def complete(self) -> bool:
-        """Whether nothing is missing or doubtful."""
-        return not self.notes
-
-    @property
-    def share(self) -> float:
-        """Share of the messages that were kept, in [0, 1]; 1 only if the recording is complete.
-
-        If the number of lost messages is unknown, return the share of the bytes.
-        """
-        if self.complete:
-            return 1.0
-        kept, lost = self.kept["messages"], self.dropped.get("messages", 0)
-        share = kept / (kept + lost) if lost else 1.0 - self.bytes_lost / self.size
-        return min(share, LOSSY_SHARE_MAX)
 
 
 def recover(source: Path, target: Path) -> Recovery:
@@ -378,20 +356,28 @@ def recover(source: Path, target: Path) -> Recovery:
     about what is missing. It ends before the first damaged part. Raise a BadInputError if the file
     has no readable message, or an OSError if the new file cannot be written.
     """
-    contents, records, lost = _read(source)
+    file = _File(source)
+    contents, lost = file.contents, file.lost
     if not contents.messages:
         reason = contents.note or "none is in it"
         raise BadInputError(f"{source}: holds no readable message: {reason}; nothing is written")
     notes = [contents.note] if contents.note else []
-    if records.unread:
-        notes.append(f"{records.unread} bytes after the last intact part were not read")
+    if file.unread:
+        notes.append(f"{file.unread} bytes after the last intact part were not read")
     if lost:
         notes.append(f"{lost} messages are lost, or of topics that cloudrc does not record")
     if notes:
         contents.metadata[MISSING] = "; ".join(notes)
     contents.write(target)
-    counts = Counter(topic for topic, _, _ in contents.messages)
-    kept = {"messages": counts.total(), "attachments": len(contents.attachments)}
-    kept["topics"] = len(counts)
-    dropped = {"messages": lost} if lost else {}
-    return Recovery(records.size, kept, dropped, records.unread, notes, not records.ended)
+    count, topics = len(contents.messages), {topic for topic, _, _ in contents.messages}
+    share = count / (count + lost) if lost else 1.0 - file.unread / file.size
+    return Recovery(
+        complete=not notes,
+        share=min(share, LOSSY_SHARE_MAX) if notes else 1.0,
+        size=file.size,
+        kept={"messages": count, "attachments": len(contents.attachments), "topics": len(topics)},
+        dropped={"messages": lost} if lost else {},
+        bytes_lost=file.unread,
+        notes=notes,
+        index_is_new=not file.ended,
+    )

@@ -80,13 +80,11 @@ class Recorder:
                 self._write(record)
         return taken
 
-    def flush(self, *, sync: bool = True) -> None:
-        """Pass the written data to the operating system; with `sync`, also to the disk."""
+    def flush(self) -> None:
+        """Pass the written data to the operating system; end the file after a failed `sync`."""
         if self._sink and not self._ended:
             try:
                 self._sink.flush()
-                if sync:
-                    self.sync()
                 if self._sync_error is not None:
                     raise self._sync_error
                 if self._size_max is not None and self._path.stat().st_size >= self._size_max:

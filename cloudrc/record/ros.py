@@ -17,15 +17,10 @@ from functools import cache
 from typing import Any, TypeAlias
 
 import numpy as np
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from cloudrc.messages import Quaternion, Vector
-from cloudrc.record import missing
 from cloudrc.record.topics import TOPICS, VIEWS, Kind, Topic, Values
-
-try:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-except ImportError as error:
-    raise missing(error) from error
 
 _OURS = "cloudrc_msgs/"
 _ROS_NAMES: dict[Kind, str] = {

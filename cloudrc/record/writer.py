@@ -12,31 +12,24 @@ import errno
 import hashlib
 import json
 import os
-import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import replace
-from io import BytesIO, FileIO
+from io import FileIO
 from operator import itemgetter
 from pathlib import Path
-from typing import IO, Any, Self, cast
+from typing import IO, Any, Self
+
+from mcap.data_stream import RecordBuilder
+from mcap.records import DataEnd, Footer, Metadata
+from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 
 from cloudrc import __version__
-from cloudrc.record import WALL_OFFSET, missing
+from cloudrc.record import WALL_OFFSET
 from cloudrc.record.hash import add_message
 from cloudrc.record.ros import definition, encode, type_hash
 from cloudrc.record.topics import TOPICS, VIEWS, Row, rows
 from cloudrc.records import Record
-
-try:
-    import zstandard  # noqa: F401  (mcap imports it, but with a worse error if it is missing)
-    from mcap.data_stream import RecordBuilder
-    from mcap.records import ChunkIndex, DataEnd, Footer, Metadata
-    from mcap.stream_reader import StreamReader
-    from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
-except ImportError as error:
-    raise missing(error) from error
 
 CHUNK_NS = 500_000_000
 """Longest time between the first and the last message of a chunk [ns]."""
@@ -66,12 +59,14 @@ class McapWriter:
         clock: str,
         clock_id: str = "",
         wall_offset_ns: int | None = None,
+        index: bool = True,
     ) -> None:
         """Open a file, or use a stream that the caller closes; every method may raise an OSError.
 
         `clock` is "world" or "cloud", the clock of the stamps. `clock_id` identifies the machine's
         clock ("" if unknown); files with the same `clock_id` need no clock offset.
-        `wall_offset_ns` is the wall time minus that clock [ns]; None in virtual time.
+        `wall_offset_ns` is the wall time minus that clock [ns]; None in virtual time. Without an
+        `index` of its chunks, a file of any length takes constant memory.
         """
         self._owned = isinstance(target, Path)
         # Unbuffered: mcap's writer has its own buffer, and `abandon` writes past it.
@@ -80,8 +75,12 @@ class McapWriter:
         )
         # Any, because mcap's writer is not annotated throughout.
         self._mcap: Any = Writer(
-            self._stream, compression=CompressionType.ZSTD, enable_data_crcs=True
+            self._stream,
+            compression=CompressionType.ZSTD,
+            enable_data_crcs=True,
+            index_types=IndexType.ALL if index else IndexType.ATTACHMENT | IndexType.METADATA,
         )
+        self._index = index
         self._whole = 0  # number of bytes in the file up to the last complete chunk
         self._open_records = 0  # number of records written after these bytes
         self._schemas: dict[str, int] = {}
@@ -92,7 +91,6 @@ class McapWriter:
         self._number = 0  # sequence number of the last message
         self._counts: Counter[str] = Counter()
         self._sha256 = hashlib.sha256()
-        self._mcap._Writer__chunk_indices = _ChunkIndexes()  # type: ignore[attr-defined]
         self._mcap.start(profile="ros2", library=f"cloudrc {__version__}")
         self.note({CLOCK: clock, "clock_id": clock_id, "version": __version__, COUNTS: ""})
         if wall_offset_ns is not None:
@@ -156,6 +154,8 @@ class McapWriter:
         """Complete the present chunk and pass it to the operating system."""
         self._chunk_start_ns = None
         self._mcap.flush()
+        if not self._index:  # mcap keeps the list even if it does not write it
+            self._mcap._Writer__chunk_indices.clear()
         self._whole = self._stream.tell()
         self._open_records = 0
 
@@ -222,38 +222,3 @@ class McapWriter:
         channel = int(self._mcap.register_channel(topic, "cdr", schema, metadata))
         self._channels[topic] = channel
         return channel
-
-
-class _ChunkIndexes:
-    """Compressed list of the indexes of all chunks that were written.
-
-    For an hour of recording, the list of `mcap` takes 12 MB; this list takes 0.33 MB, because it
-    stores offsets relative to the end of their chunk. Most bytes then repeat and compress well.
-    """
-
-    def __init__(self) -> None:
-        self._blocks: list[bytes] = []
-        self._compress = zlib.compressobj()
-
-    def append(self, index: ChunkIndex) -> None:
-        row: Any = RecordBuilder()
-        _moved(index, -1).write(row)
-        if block := self._compress.compress(row.end()):
-            self._blocks.append(block)
-
-    def __iter__(self) -> Iterator[ChunkIndex]:
-        data = zlib.decompress(b"".join([*self._blocks, self._compress.copy().flush()]))
-        stream = BytesIO(data)
-        rows = StreamReader(stream, skip_magic=True).records
-        while stream.tell() < len(data):
-            yield _moved(cast("ChunkIndex", next(rows)), 1)
-
-
-def _moved(index: ChunkIndex, sign: int) -> ChunkIndex:
-    """Add `sign` times the end of the chunk to the offsets in a chunk's index, modulo 2^64.
-
-    The sum may be negative: in a file without positions, such as /dev/null, every offset is 0.
-    """
-    end = sign * (index.chunk_start_offset + index.chunk_length)
-    offsets = {name: (at + end) % 2**64 for name, at in index.message_index_offsets.items()}
-    return replace(index, message_index_offsets=offsets)

@@ -1,4 +1,4 @@
-"""Make the page report.html with the verdict, a summary, numbers and figures.
+"""Make the page report.html with the verdict, the main numbers, all numbers and figures.
 
 The page is one file with all pictures. It uses the reader's fonts and loads nothing from a network.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from datetime import UTC, datetime
 from html import escape
 from importlib.resources import files
@@ -17,7 +16,7 @@ from typing import Any
 
 from cloudrc import __version__
 from cloudrc.config.load import ResolvedExperiment, dump
-from cloudrc.metrics import Flight, Number
+from cloudrc.metrics import SHIPPED, Flight, Number
 from cloudrc.metrics.verdict import Failure
 from cloudrc.record import wall_time
 from cloudrc.report.document import Assessment, Run
@@ -38,51 +37,28 @@ REPEAT = {
     "not identical:",
 }
 """Whether the run was in virtual time -> text above the command that repeats the run."""
-GROUPS = {
-    "Mission": "duration waypoints_reached distance_flown speed_max contact_time tip_speed "
-    "peak_contact_force contact_impulse steady_contact_force "
-    "steady_error_x steady_error_y steady_error_z",
-    "Steps": "overshoot_mean overshoot_max rise_time_mean settling_time_mean iae_mean ise_mean "
-    "control_effort_mean unstable_steps",
-    "Distance to the pipes": "min_clearance min_clearance_flight pipe_contacts",
-    "Estimation and tracking": "prediction_error_rms estimate_error_rms delay_estimate_error_rms "
-    "tracking_rms_measured tracking_rms_estimated tracking_error_p95 tracking_error_peak",
-    "Link and loop": "uplink_delay_mean downlink_delay_mean loss_uplink loss_downlink late_uplink "
-    "late_downlink rtt_mean rtt_p95 loop_delay_mean age_of_information_mean commands_applied",
-    "Guard and faults": "hold_count hold_time fault_count recorder_dropped",
-    "Real time": "real_time_factor world_slip world_lateness_p99 cloud_lateness_p99 missed_periods",
+MAIN = {
+    "waypoints_reached": "waypoints reached",
+    "duration": "mission took",
+    "contact_time": "arm touches the board at",
+    "tip_speed": "speed of the tip at the touch",
+    "steady_contact_force": "steady contact force",
+    "min_clearance": "least clearance in the pipes",
+    "rtt_mean": "round trip, mean",
+    "prediction_error_rms": "prediction error, RMS",
+    "hold_count": "times in HOLD",
+    "real_time_factor": "real-time factor",
 }
-"""Title of a group in the table of numbers -> names of its metrics. Other metrics are under
-"Others"."""
+"""Numbers that a summary shows, and their labels."""
 SHARES = ("loss_", "late_", "overshoot_")
 """Prefixes of the names of metrics that the page shows in per cent."""
 
 
-SENTENCES = (
-    "The drone reached {waypoints_reached:.0f} of {waypoints} waypoints.",
-    "The mission took {duration:.1f} s.",
-    "It flew {distance_flown:.1f} m.",
-    "In the pipes, its smallest distance from a wall was {min_clearance:.3f} m.",
-    "Its arm touched the board after {contact_time:.1f} s at {tip_speed:.2f} m/s.",
-    "It then pressed against the board with {steady_contact_force:.2f} N.",
-    "The mean round trip was {rtt_mean:.3f} s. The remote controller predicted the robot's "
-    "position with an error of {prediction_error_rms:.3f} m (RMS).",
-    "The guard on board took over {hold_count:.0f} times, for {hold_time:.1f} s in total.",
-)
-"""Sentences of the summary. A sentence with a metric that has no value is left out."""
-
-
-def summary(flight: Flight, numbers: Mapping[str, Number]) -> str:
-    """Summarize the flight in a few sentences."""
-    if flight.start_ns is None:
-        return "The robot never left the ground."
-    known: dict[str, float] = {name: number.value for name, number in numbers.items()}
-    known["waypoints"] = flight.waypoints
-    found: list[str] = []
-    for sentence in SENTENCES:
-        with suppress(KeyError):
-            found.append(sentence.format_map(known))
-    return " ".join(found)
+def main_numbers(numbers: Mapping[str, Number]) -> list[tuple[str, str, str]]:
+    """Return label, digits and unit of each number in `MAIN` that is known."""
+    return [
+        (text, *readable(name, numbers[name])) for name, text in MAIN.items() if name in numbers
+    ]
 
 
 def render(
@@ -106,7 +82,9 @@ def render(
         accent=accent,
         kicker=escape(kicker),
         headline=escape(headline),
-        summary=escape(summary(assessment.flight, assessment.numbers)),
+        summary=_pairs(
+            {text: f"{n} {unit}".rstrip() for text, n, unit in main_numbers(assessment.numbers)}
+        ),
         failures=_list([_failure(failure) for failure in verdict.failures], "failures"),
         notes=_list([escape(note) for note in assessment.notes], "note"),
         facts=_facts(run, experiment, assessment.flight),
@@ -136,6 +114,10 @@ def _facts(run: Run, experiment: ResolvedExperiment, flight: Flight) -> str:
         # A flight in virtual time has no date.
         "Flown" if flown else "Report written": f"{flown or datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     }
+    return _pairs(pairs)
+
+
+def _pairs(pairs: Mapping[str, str]) -> str:
     return "\n".join(
         f"<div><dt>{name}</dt><dd>{escape(value)}</dd></div>" for name, value in pairs.items()
     )
@@ -171,16 +153,15 @@ def _figure(number: int, picture: Picture) -> str:
 
 
 def _table_rows(numbers: Mapping[str, Number]) -> str:
-    groups = {title: names.split() for title, names in GROUPS.items()}
-    grouped = {name for names in groups.values() for name in names}
-    groups["Others"] = [name for name in numbers if name not in grouped]
+    groups: dict[str, list[str]] = {metric.group: [] for metric in SHIPPED.values()}
+    for name in sorted(numbers, key=[*SHIPPED, *numbers].index):
+        group = SHIPPED[name].group if name in SHIPPED else "Others"
+        groups.setdefault(group, []).append(_row(name, numbers[name]))
     bodies = []
-    for title, names in groups.items():
-        known = [name for name in names if name in numbers]
-        if known:
-            cells = "\n".join(_row(name, numbers[name]) for name in known)
+    for title, rows in groups.items():
+        if rows:
             head = f'<tr><th scope="rowgroup" colspan="4">{escape(title)}</th></tr>'
-            bodies.append(f"<tbody>\n{head}\n{cells}\n</tbody>")
+            bodies.append("\n".join(["<tbody>", head, *rows, "</tbody>"]))
     return "\n".join(bodies)
 
 

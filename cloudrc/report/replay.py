@@ -46,7 +46,7 @@ def write_section(flight: Flight, experiment: ResolvedExperiment) -> str:
     style = "<style>.mantine-Notifications-root { display: none }</style></head>"
     player = player.replace("</head>", style, 1)
     return Template(files(__package__).joinpath("replay.html").read_text("utf-8")).substitute(
-        duration=_duration(flight), player=json.dumps(player).replace("<", "\\u003c")
+        duration=max(flight.duration, 1e-3), player=json.dumps(player).replace("<", "\\u003c")
     )
 
 
@@ -61,13 +61,9 @@ def write_page(flight: Flight, experiment: ResolvedExperiment) -> str:
     )
 
 
-def _duration(flight: Flight) -> float:
-    return max(float(flight.seconds(flight.end_ns)), 1e-3)
-
-
 def _record(server: viser.ViserServer, flight: Flight, experiment: ResolvedExperiment) -> str:
     """Record the flight in the scene of a server; return viser's page with the player."""
-    scene, duration = FlightScene(server, experiment), _duration(flight)
+    scene, duration = FlightScene(server, experiment), max(flight.duration, 1e-3)
     truth, control, applied = flight.truth, flight.control, flight.applied
     times = np.linspace(0.0, duration, int(min(duration * RATE, FRAMES_MAX)) + 1)
     true, asked, predicted = (

@@ -11,7 +11,7 @@ import numpy as np
 
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
-from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, describe_error
+from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.files import write_atomically
 from cloudrc.geometry.scene import load_scene
 from cloudrc.metrics import Flight, measure_all
@@ -70,7 +70,6 @@ def write_report(
 
     `folder` is the folder of the run; files of an earlier report in it are replaced. `look` is the
     size of the figures. For the other arguments see `assess`. Return the content of report.json.
-    Raise a MissingPrerequisiteError, after writing report.json, if matplotlib is missing.
     """
     assessment = assess(recording, experiment, run, own)
     document, environment = assessment.document, environment_document(run.physics_steps)
@@ -100,14 +99,8 @@ def _driven(flight: Flight) -> str:
 def _write_page(
     folder: Path, assessment: Assessment, environment: dict[str, Any], look: Look | None
 ) -> None:
-    try:
-        from cloudrc.report.figures import draw_all
-        from cloudrc.report.figures.style import Look, Subject
-    except ImportError as error:
-        raise MissingPrerequisiteError(
-            f"report.html needs {error.name}, which is not installed; report.json is written; "
-            "for the page, run: pip install 'cloudrc[report]'"
-        ) from error
+    from cloudrc.report.figures import draw_all
+    from cloudrc.report.figures.style import Look, Subject
     from cloudrc.report.page import render
 
     link = assessment.experiment.uplink, assessment.experiment.downlink

@@ -40,6 +40,7 @@ def record_all(recorder, records, every):
         recorder.put(records[start : start + every])
         while recorder.drain():
             pass
+        recorder.sync()
         recorder.flush()
     recorder.close()
 
@@ -104,6 +105,7 @@ def test_disk_errors_are_reported_and_never_raised(step, code, words):
     recorder = Recorder(Path("w.mcap"), lambda path: shelf)
     recorder.put(counted(3))
     recorder.drain()
+    recorder.sync()
     recorder.flush()
     recorder.put(counted(2))
     recorder.close()
@@ -140,7 +142,7 @@ def test_a_sync_by_another_thread_reports_its_error_later(tmp_path, error):
     path.touch()
     assert recorder.sync() is (error is None)
     assert not shelf.closed
-    recorder.flush(sync=False)
+    recorder.flush()
     failed = isinstance(error, OSError)  # the other one means that the file was closed meanwhile
     assert (shelf.closed, recorder.error != "") == (failed, failed)
 

@@ -51,12 +51,12 @@ def test_log_times_never_fall_on_a_topic(tmp_path):
 
 
 def test_an_hour_of_recording_takes_no_memory(tmp_path):
-    """With a chunk every half a second, mcap's own list of chunks grows by 12 MB in an hour."""
+    """With a chunk every half a second, an index of the chunks takes 12 MB for an hour."""
     path, records = tmp_path / "long.mcap", world_records(1)
     grown, count = list[int](), 1000
     tracemalloc.start()
     try:
-        with McapWriter(path, clock="world") as writer:
+        with McapWriter(path, clock="world", index=False) as writer:
             for n in range(2 * count + 1):
                 stamp_ns = n * SECOND // 2
                 writer.write([record._replace(stamp_ns=stamp_ns) for record in records])
@@ -67,25 +67,13 @@ def test_an_hour_of_recording_takes_no_memory(tmp_path):
         tracemalloc.stop()
     assert (grown[2] - grown[1]) / count * 2 * 3600 < 1e6, "bytes in an hour"
     with path.open("rb") as stream:
-        reader = make_reader(stream)
-        assert len(reader.get_summary().chunk_indexes) == 2 * count + 1
-        assert sum(1 for _ in reader.iter_messages(["/odometry"])) == 2 * count + 1
+        assert sum(1 for _ in make_reader(stream).iter_messages(["/odometry"])) == 2 * count + 1
+    assert Recording.read(path).complete
 
 
 def run(code):
     words = [sys.executable, "-c", code]
     return subprocess.run(words, capture_output=True, text=True, check=True).stdout
-
-
-def test_a_missing_package_is_named_with_its_remedy():
-    said = run(
-        "import sys; sys.modules['mcap'] = None\n"
-        "from cloudrc.errors import MissingPrerequisiteError\n"
-        "try: import cloudrc.record.reader\n"
-        "except MissingPrerequisiteError as error: print(error)"
-    )
-    assert said.startswith("recording needs the package mcap, which is not installed")
-    assert said.endswith("install it with: pip install 'cloudrc[record]'\n")
 
 
 def test_a_flight_needs_no_package_for_recording():

@@ -3,15 +3,10 @@
 import getpass
 import json
 import platform
-import sys
 
-import pytest
-
-from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.record.columns import Recording
 from cloudrc.report.document import Run, environment_document
-from cloudrc.report.write import assess, write_report
-from tests.metrics.conftest import good, paper
+from cloudrc.report.write import assess
+from tests.metrics.conftest import paper
 
 RUN = Run("virtual", "virtual", "0" * 64)
 NAMES = {
@@ -56,13 +51,3 @@ def test_the_environment_names_software_but_no_user_or_host():
     assert environment_document("C (compiled by cc)")["physics_steps"] == "C (compiled by cc)"
     words = json.dumps(environment).replace('"', " ").split()
     assert {getpass.getuser(), platform.node()}.isdisjoint(words)
-
-
-def test_without_matplotlib_the_numbers_are_written(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    for name in [n for n in sys.modules if n.startswith("cloudrc.report.figures")]:
-        monkeypatch.delitem(sys.modules, name)
-    with pytest.raises(MissingPrerequisiteError, match=r"cloudrc\[report\]"):
-        write_report(tmp_path, Recording.from_records(*good().ends()), paper()[0], RUN)
-    assert json.loads((tmp_path / "report.json").read_text())["schemaVersion"] == 1
-    assert not (tmp_path / "report.html").exists()

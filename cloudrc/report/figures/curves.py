@@ -35,7 +35,7 @@ MARGIN = 1.25
 def draw_delay(subject: Subject) -> Figure:
     """Draw the one-way delay of each datagram, and the loop delay with cloud's estimate of it."""
     figure, (one_way, loop) = subject.look.two_panels()
-    flight, time = subject.flight, np.linspace(0.0, subject.duration, 600)
+    flight, time = subject.flight, np.linspace(0.0, subject.flight.duration, 600)
     limits = [bounds(subject, time, uplink=uplink) for uplink in (True, False)]
 
     panel(one_way, "a")
@@ -97,7 +97,7 @@ def _finish(axes: Axes, subject: Subject, label: str, columns: int) -> None:
 
 
 def _time_axis(axes: Axes, subject: Subject) -> None:
-    axes.set_xlim(0.0, max(subject.duration, 1e-3))
+    axes.set_xlim(0.0, max(subject.flight.duration, 1e-3))
     axes.set_xlabel(TIME)
 
 
@@ -199,11 +199,8 @@ ERROR = (
     "the paper. The distance to the next waypoint dominates both curves; a lower estimated curve "
     "says nothing about how accurate the estimate is. (b) Accuracy of the estimate: distance from "
     "the position estimated for each command to the true position when the command was applied. "
-    "Each dot is one command, the line is the RMS over half a second. RMS values in the legends "
-    "are over the whole flight."
+    "Each dot is one command. RMS values in the legends are over the whole flight."
 )
-SPAN = 0.5
-"""Length of the window of the moving RMS [s]."""
 
 
 def draw_error(subject: Subject) -> Figure:
@@ -223,23 +220,10 @@ def draw_error(subject: Subject) -> Figure:
     panel(accuracy, "b")
     error = applied["position"] - flight.true_position(applied["stamp_ns"])
     time, distance = flight.seconds(applied["stamp_ns"]), np.linalg.norm(error, axis=1) * 1e3
-    dots(accuracy, time, distance, style.SKY, "each command", 2.0)
-    label = f"over {SPAN:g} s{_rms(error, 'mm', 1e3)}"
-    accuracy.plot(time, _moving_rms(time, distance), color=style.ESTIMATED, label=label)
+    dots(accuracy, time, distance, style.SKY, f"each command{_rms(error, 'mm', 1e3)}", 2.0)
     accuracy.set_ylim(bottom=0.0)
     _finish(accuracy, subject, "distance to truth (mm)", 2)
     return figure
-
-
-def _moving_rms(time: Array, values: Array) -> Array:
-    """Compute, for each `time` [s], the RMS of the `values` of the last `SPAN` seconds."""
-    known = np.isfinite(values)
-    squares = np.concatenate([[0.0], np.cumsum(np.where(known, np.square(values), 0.0))])
-    counts = np.concatenate([[0], np.cumsum(known)])
-    first = np.searchsorted(time, time - SPAN)
-    rows = np.arange(1, len(time) + 1)
-    means: Array = (squares[rows] - squares[first]) / np.maximum(counts[rows] - counts[first], 1)
-    return np.asarray(np.sqrt(means))
 
 
 def _rms(error: Array, unit: str, scale: float) -> str:

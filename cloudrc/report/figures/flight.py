@@ -12,18 +12,9 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from cloudrc.geometry.clearance import (
-    ARM_HEIGHT,
-    ARM_LENGTH,
-    ARM_RADIUS,
-    CLEARANCE_SHOWN,
-    Spheres,
-    pipe_index,
-    place_points,
-)
+from cloudrc.geometry.clearance import CLEARANCE_SHOWN, pipe_index
 from cloudrc.geometry.scene import Pipe
 from cloudrc.metrics.flight import Array
-from cloudrc.metrics.mission import first_touch
 from cloudrc.report.figures.labels import free_label
 from cloudrc.report.figures.style import (
     BLACK,
@@ -40,8 +31,8 @@ CEILING = 2 * CLEARANCE_SHOWN
 """Upper end of the clearance axis in panel (c) [m]."""
 ALT = "The flown path from above and from the side through the pipes, coloured by clearance."
 CAPTION_PIPES = (
-    "Flight. (a) Path from above: pipes cut open, waypoints numbered, the board as a bar, a star "
-    "where the arm first touches it. (b) Height along the path, with the bore of each pipe. "
+    "Flight. (a) Path from above: pipes cut open, waypoints numbered, the board as a bar. "
+    "(b) Height along the path, with the bore of each pipe. "
     "(c) Clearance: distance from the robot (rotors, arm, body) to the nearest wall. The colour is "
     f"the clearance in all three panels. Panel (c) ends at {CEILING:.1f} m; outside the pipes the "
     "clearance can be larger."
@@ -115,27 +106,14 @@ def _draw_top(axes: Axes, subject: Subject, position: Array) -> LineCollection |
     if board is not None:
         axes.plot([board.x, board.x], board.y, color=BLACK, lw=3, solid_capstyle="butt", zorder=3)
     coloured = _draw_path(axes, subject, position[:, 0], position[:, 1])
-    for index, (x, y, _) in subject.waypoints.items():
-        axes.plot(x, y, "o", ms=4, mfc="white", mec=BLACK, mew=0.8, zorder=5)
-        free_label(axes, str(index + 1), (x, y))
-    tip = _touch_point(subject)
-    if tip is not None:
-        axes.plot(*tip[:2], "*", ms=9, color=VERMILION, mec="white", mew=0.5, zorder=7)
+    for number, waypoint in enumerate(subject.flight.mission.waypoints, start=1):
+        place = waypoint.position_m[:2]
+        axes.plot(*place, "o", ms=4, mfc="white", mec=BLACK, mew=0.8, zorder=5)
+        free_label(axes, str(number), place)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("$x$ (m)")
     axes.set_ylabel("$y$ (m)")
     return coloured
-
-
-def _touch_point(subject: Subject) -> Array | None:
-    """Compute where the tip of the arm first touches the board [m], world frame, shape (3,)."""
-    touch, truth = first_touch(subject.flight), subject.flight.truth
-    if touch is None or not len(truth["stamp_ns"]):
-        return None
-    rows = np.searchsorted(truth["stamp_ns"], touch["stamp_ns"], side="right") - 1
-    tip = Spheres(np.array([[ARM_LENGTH, 0.0, ARM_HEIGHT]]), np.array([ARM_RADIUS]))
-    placed = place_points(tip, touch["position"][None], truth["orientation_wxyz"][rows][None])
-    return np.asarray(placed[0, 0])
 
 
 def _draw_pipe(axes: Axes, pipe: Pipe) -> None:

@@ -1,4 +1,4 @@
-"""Draw the figure of `cloudrc link show`: delay and loss over time, their distributions."""
+"""Draw the figure of `cloudrc link show`: delay and loss over time, distribution of the delay."""
 
 from __future__ import annotations
 
@@ -8,16 +8,12 @@ from typing import Any, TypeAlias
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from cloudrc.config.schema import Direction
 from cloudrc.metrics.flight import Array
 from cloudrc.report.figures import marks, own_settings, save, style
 from cloudrc.report.figures.style import Look, dots, legend_above, new_figure, panel
 
-RUNS_SHOWN = 20
-"""Largest number of packets lost in a row in the figure; a longer run is shown as a run
-of this length."""
 BLACKOUT = "#f7dccb"
 """Colour of blackouts: the colour of losses, but lighter."""
 DOTS = 6000
@@ -32,7 +28,6 @@ class DirectionSample:
     sent: Array  # time of sending each packet, since the start of the link [s], shape (n,)
     delays: Array  # one-way delays, NaN for lost packets [s], shape (n,)
     many: Array  # one-way delays for the distribution, NaN for lost packets [s], shape (m,)
-    runs: tuple[int, ...]  # numbers of packets lost in a row, one per run, among the m packets
 
 
 _LabelledWay: TypeAlias = tuple[DirectionSample, str, str]
@@ -63,8 +58,7 @@ def _draw(title: str, uplink: DirectionSample, downlink: DirectionSample | None)
         axes = figure.add_subplot(grid[0, place] if downlink else grid[0, :])
         panel(axes, "ab"[place], name)
         _draw_delay(axes, way, colour, top)
-    _draw_tail(figure.add_subplot(grid[1, 0]), "bc"[len(ways) - 1], ways)
-    _draw_runs(figure.add_subplot(grid[1, 1]), "cd"[len(ways) - 1], ways)
+    _draw_tail(figure.add_subplot(grid[1, :]), "bc"[len(ways) - 1], ways)
     return figure
 
 
@@ -101,18 +95,13 @@ def _draw_tail(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
     panel(axes, letter, "distribution")
     least = 1e-2
     for (way, name, colour), dashes in zip(ways, ("-", "--"), strict=False):
-        delays = np.sort(way.many[np.isfinite(way.many)]) * 1e3
+        delays = way.many[np.isfinite(way.many)] * 1e3
         if not len(delays):
             continue
-        later = 1.0 - np.arange(1, len(delays) + 1) / len(delays)
         least = min(least, 1.0 / len(delays))
-        # Keep about 1500 packets from each end, because all packets would make a large file.
-        rows = np.unique(np.geomspace(1, len(delays), 1500).astype(int))
-        rows = np.unique(np.concatenate((rows - 1, len(delays) - rows)))
-        shown = np.concatenate(([0.0, delays[0]], delays[rows]))
-        share = np.concatenate(([1.0, 1.0], later[rows]))
+        shares = np.concatenate([np.linspace(1.0, 0.1, 500), np.geomspace(0.1, least, 500)])
         label = name if len(ways) == 2 else "_"
-        axes.plot(shown, share, color=colour, ls=dashes, drawstyle="steps-post", label=label)
+        axes.plot(np.quantile(delays, 1.0 - shares), shares, color=colour, ls=dashes, label=label)
     axes.set_yscale("log")
     axes.set_ylim(max(least, 1e-4) / 1.3, 1.3)
     for level, name in ((0.5, "median"), (0.01, "99 %")):
@@ -123,35 +112,4 @@ def _draw_tail(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
     axes.set_xlim(-0.005 * right, right)
     axes.set_xlabel("one-way delay (ms)")
     axes.set_ylabel("share with more delay")
-    legend_above(axes, 4)
-
-
-def _draw_runs(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
-    """Draw how often 1, 2, 3 ... packets were lost in a row, per 1000 packets sent."""
-    panel(axes, letter, "losses in a row")
-    longest, most, least = 1, 0.0, np.inf
-    offsets = (-0.2, 0.2) if len(ways) == 2 else (0.0,)
-    for offset, (way, name, colour) in zip(offsets, ways, strict=True):
-        if not way.runs:
-            continue
-        lengths = np.minimum(way.runs, RUNS_SHOWN)
-        counts = np.bincount(lengths, minlength=2)[1:] * 1e3 / len(way.many)
-        longest = max(longest, len(counts))
-        most, least = max(most, counts.max()), min(least, counts[counts > 0].min())
-        places = np.arange(1, len(counts) + 1) + offset
-        axes.bar(
-            places, counts, width=0.38, color=colour, lw=0, label=name if len(ways) == 2 else "_"
-        )
-    axes.set_xlabel("packets lost in a row" + f" ({RUNS_SHOWN}: or more)" * (longest == RUNS_SHOWN))
-    axes.set_ylabel("runs per 1000 packets")
-    axes.grid(visible=False, axis="x")
-    if not any(way.runs for way, _, _ in ways):
-        axes.text(0.5, 0.5, "no packet was lost", ha="center", transform=axes.transAxes)
-        axes.set_xticks([])
-        axes.set_yticks([])
-        return
-    axes.set_yscale("log")
-    axes.set_ylim(10.0 ** np.floor(np.log10(least) - 0.01), 10.0 ** np.ceil(np.log10(most) + 0.01))
-    axes.set_xlim(0.4, max(longest, 5) + 0.6)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     legend_above(axes, 4)

@@ -5,8 +5,8 @@ All bodies consist of small convex polygons, which are drawn from back to front.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import chain, pairwise
-from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,11 +14,12 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 from cloudrc.geometry import clearance as body
-from cloudrc.geometry.scene import Board, Pipe
+from cloudrc.geometry.scene import Pipe
 from cloudrc.metrics.flight import Array
 from cloudrc.metrics.mission import first_touch
 from cloudrc.report.figures.labels import free_label
 from cloudrc.report.figures.style import LIGHT, Subject, new_figure
+from cloudrc.report.solids import PATH, PIPE, Face, board_faces, bore, robot_faces, strip
 
 ALT = (
     "A drawing of the scene in perspective from above: pipes cut open, board, path, and the robot."
@@ -36,80 +37,25 @@ MARGIN, SMALLEST = 0.6, 4.0
 """Space around path and obstacles, and smallest width of the part that is drawn [m]."""
 FLATTEST, TALLEST = 0.3, 0.6
 """Limits of the drawing's ratio of height to width."""
-Colour = tuple[float, float, float]
-PIPE_COLOUR, WALL_COLOUR = (0.86, 0.88, 0.90), (0.45, 0.48, 0.52)
-BASE_COLOUR, ROD_COLOUR, ARM_COLOUR = (0.16, 0.33, 0.55), (0.30, 0.30, 0.32), (0.84, 0.37, 0.0)
-ROTOR_COLOUR, BOARD_COLOUR, PATH_COLOUR = (0.10, 0.10, 0.12), (0.95, 0.84, 0.58), (0.0, 0.45, 0.70)
+WALL_COLOUR = (0.45, 0.48, 0.52)
 
 
-class Face(NamedTuple):
-    """A flat convex polygon or a line: k corners [m], world frame, shape (k, 3), k >= 2.
-
-    `opacity` is in [0, 1].
-    """
-
-    corners: Array
-    colour: Colour
-    opacity: float = 1.0
-
-
-def _robot_faces(position: Array, orientation_wxyz: Array) -> list[Face]:
-    rod, arm = (body.ROD_TOP - body.ROD_BOTTOM) / 2, body.ARM_LENGTH / 2
-    wide, thin = body.ROD_RADIUS, body.ARM_RADIUS
-    faces = _box((0.0, 0.0, 0.0), body.BASE_HALF, BASE_COLOUR)
-    faces += _box((0.0, 0.0, body.ROD_BOTTOM + rod), (wide, wide, rod), ROD_COLOUR)
-    faces += _box((arm, 0.0, body.ARM_HEIGHT), (arm, thin, thin), ARM_COLOUR)
-    angle = np.linspace(0.0, 2 * np.pi, 28, endpoint=False)
-    disc = body.ROTOR_RADIUS * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
-    for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1)):
-        hub = np.array([x * body.ROTOR_ARM, y * body.ROTOR_ARM, body.ROTOR_HEIGHT])
-        # The simulated robot has no struts; in the figure they connect the rotors to the base.
-        strut = *(abs(end) * body.ROTOR_ARM / 2 + 0.006 for end in (x, y)), 0.006
-        faces += _box(hub * (0.5, 0.5, 1.0), strut, ROD_COLOUR)
-        faces.append(Face(hub + disc, ROTOR_COLOUR, 0.35))
+def _robot(position: Array, orientation_wxyz: Array) -> list[Face]:
+    faces = robot_faces()
     points = body.Spheres(np.concatenate([face.corners for face in faces]), np.zeros(0))
     placed = body.place_points(points, position[None], orientation_wxyz[None])[0]
     corners = np.split(placed, np.cumsum([len(face.corners) for face in faces])[:-1])
     return [face._replace(corners=each) for face, each in zip(faces, corners, strict=True)]
 
 
-def _pipe_faces(pipe: Pipe, view: _View) -> list[Face]:
+def _pipe(pipe: Pipe, view: _View) -> list[Face]:
     """Build the half of a pipe that is farther from the viewer."""
-    centre, axis, half = np.array(pipe.centre), np.array(pipe.axis), pipe.length / 2
-    up = view.towards - (view.towards @ axis) * axis
-    up /= np.linalg.norm(up)
-    angles = np.linspace(-np.pi / 2, np.pi / 2, 17)
-    away = -np.cos(angles)[:, None] * up + np.sin(angles)[:, None] * np.cross(axis, up)
-    stations = np.linspace(-half, half, 1 + max(1, round(pipe.length / 0.25)))
-    inner = centre + stations[:, None, None] * axis + pipe.inner * away
-    outer = inner + (pipe.outer - pipe.inner) * away
-    faces = [
-        face for ring, following in pairwise(inner) for face in _strip(ring, following, PIPE_COLOUR)
-    ]
+    stations = 1 + max(1, round(pipe.length / 0.25))
+    inner = bore(pipe, view.towards, np.pi / 2, 17, stations)
+    outer = bore(replace(pipe, inner=pipe.outer), view.towards, np.pi / 2, 17, stations)
+    faces = [face for pair in pairwise(inner) for face in strip(*pair, PIPE)]
     for edge in (0, -1):
-        faces += _strip(inner[:, edge], outer[:, edge], WALL_COLOUR)
-    return faces
-
-
-def _strip(first: Array, second: Array, colour: Colour) -> list[Face]:
-    """Build n - 1 faces between two lines of n points [m], shape (n, 3)."""
-    corners = np.stack([first[:-1], second[:-1], second[1:], first[1:]], axis=1)
-    return [Face(each, colour) for each in corners]
-
-
-def _board_faces(board: Board) -> list[Face]:
-    low = np.array([board.x, board.y[0], board.z[0]])
-    high = np.array([board.x + 0.05, board.y[1], board.z[1]])
-    faces = _box((low + high) / 2, (high - low) / 2, BOARD_COLOUR)
-    return [face._replace(opacity=0.6) for face in faces]  # the arm may be behind it
-
-
-def _box(centre: Any, half: Any, colour: Colour) -> list[Face]:
-    faces = []
-    for axis in range(3):
-        for side in (-1.0, 1.0):
-            corners = np.insert([(-1, -1), (1, -1), (1, 1), (-1, 1)], axis, side, axis=1)
-            faces.append(Face(np.array(centre) + corners * half, colour))
+        faces += strip(inner[:, edge], outer[:, edge], WALL_COLOUR)
     return faces
 
 
@@ -159,12 +105,12 @@ def draw(subject: Subject) -> Figure:
     ends = [centre + side * along for centre, along in axes_ends for side in (-0.5, 0.5)]
     points = np.concatenate([[scene.spawn], path, np.reshape(ends, (-1, 3))])
     view = _View(points, scene.spawn - (axes_ends[0][0] if ends else np.array(scene.spawn)))
-    robots = [_robot_faces(path[row], truth["orientation_wxyz"][row]) for row in rows]
-    faces = [face for pipe in scene.pipes for face in _pipe_faces(pipe, view)]
-    faces += [*chain(*robots), *(_board_faces(scene.board) if scene.board else [])]
+    robots = [_robot(path[row], truth["orientation_wxyz"][row]) for row in rows]
+    faces = [face for pipe in scene.pipes for face in _pipe(pipe, view)]
+    faces += [*chain(*robots), *(board_faces(scene.board) if scene.board else [])]
     shown = view.project(np.concatenate([points, *[face.corners for face in faces]]))
     steps = path[np.append(np.arange(0, len(path) - 1, 5), len(path) - 1)] if len(path) else path
-    faces += [Face(np.stack(pair), PATH_COLOUR) for pair in pairwise(steps)]
+    faces += [Face(np.stack(pair), PATH) for pair in pairwise(steps)]
     middle, size = (shown.max(axis=0) + shown.min(axis=0)) / 2, np.ptp(shown, axis=0) + 2 * MARGIN
     size = np.maximum(size, (SMALLEST, SMALLEST * FLATTEST))
     ratio = float(np.clip(size[1] / size[0], FLATTEST, TALLEST))

@@ -7,15 +7,12 @@ Source: M. Okabe, K. Ito, "Color Universal Design", 2008.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cloudrc.config.schema import Direction
-from cloudrc.messages import Vector
 from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Array
 
@@ -39,7 +36,7 @@ RC: dict[Any, Any] = {
     **dict.fromkeys(("xtick.direction", "ytick.direction"), "out"),
     **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon"), False),
     **dict.fromkeys(("axes.grid", "axes.axisbelow"), True),
-    **dict.fromkeys(("grid.linewidth", "hatch.linewidth"), 0.5),
+    "grid.linewidth": 0.5,
     "axes.edgecolor": BLACK,
     "grid.color": "#e6e6e6",
     "lines.linewidth": 1.1,
@@ -104,7 +101,7 @@ def dots(axes: Axes, x: Array, y: Array, colour: str, name: str, size: float = 1
     axes.plot([], [], "o", ms=3.5, mew=0, color=colour, label=name)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Subject:
     """A flight, the link profile of each direction at its start, and the look of its figures."""
 
@@ -112,27 +109,3 @@ class Subject:
     uplink: Direction
     downlink: Direction
     look: Look = Look()
-
-    @cached_property
-    def waypoints(self) -> dict[int, Vector]:
-        """Waypoints to which the robot flew: index -> position [m], world frame."""
-        control = self.flight.control
-        indices, rows = np.unique(control["waypoint"], return_index=True)
-        points = control["setpoint"][rows].tolist()
-        return {
-            int(index): (x, y, z)
-            for index, (x, y, z) in zip(indices, points, strict=True)
-            if index >= 0
-        }
-
-    @cached_property
-    def duration(self) -> float:
-        """Duration of the flight [s]."""
-        end_ns = self.flight.end_ns
-        return 0.0 if end_ns is None else float(self.flight.seconds(end_ns))
-
-    @cached_property
-    def link_start(self) -> float:
-        """Time of world's first telemetry [s since the start of the flight]."""
-        stamps = self.flight.recording["/telemetry"]["stamp_ns"]
-        return float(self.flight.seconds(stamps[0])) if len(stamps) else 0.0
