@@ -66,7 +66,7 @@ def test_the_rules_use_existing_metrics_and_name_a_runbook():
 @pytest.mark.skipif(shutil.which("promtool") is None, reason="Debian package prometheus")
 def test_the_alerts_fire_when_they_should_and_only_then(tmp_path):
     shutil.copy(RULES, tmp_path)
-    shutil.copy(ROOT / "tests" / "e2e" / "alerts.yaml", tmp_path)
+    shutil.copy(ROOT / "tests" / "exposition" / "alerts.yaml", tmp_path)
     for words in (["check", "rules", RULES], ["test", "rules", tmp_path / "alerts.yaml"]):
         done = subprocess.run(["promtool", *words], capture_output=True, text=True)
         assert "SUCCESS" in done.stdout, done.stdout + done.stderr

@@ -14,11 +14,10 @@ import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
-from cloudrc.cli.client import Api
 from cloudrc.cluster.client import connect
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
-from cloudrc.cluster.pods import api_url, fetch_metrics, fetch_recording, operator_token
+from cloudrc.cluster.pods import fetch_metrics, fetch_recording
 from cloudrc.errors import CloudrcError
 from tests.drivers.conftest import WORK, slower
 
@@ -170,13 +169,6 @@ def value(samples, name, **labels):
     ]
     assert found, f"no sample {name} {labels}"
     return sum(found)
-
-
-def missions():
-    """Return all missions that the API knows, the oldest first."""
-    token = operator_token(place())
-    with api_url(place()) as url:
-        return list(Api(url, lambda: token).get("/v1/missions")["missions"])
 
 
 def job_end(name, timeout=150.0):
@@ -331,18 +323,11 @@ def installed(cluster, values):
 
 
 @pytest.fixture(scope="session")
-def prometheus_image(cluster):
-    """Name of an image with Prometheus and promtool."""
-    found = command("docker", "images", "--format={{.Repository}}:{{.Tag}}", "cloudrc/prometheus")
-    return found.split()[0]
-
-
-@pytest.fixture(scope="session")
-def prometheus(installed, prometheus_image):
+def prometheus(installed):
     """A Prometheus that scrapes the release from now on."""
     from tests.e2e.neighbours import install_prometheus
 
-    install_prometheus(prometheus_image)
+    install_prometheus()
 
 
 def processor_times():

@@ -34,7 +34,7 @@ from tests.e2e.conftest import (
     set_link,
     value,
 )
-from tests.e2e.neighbours import Prometheus
+from tests.e2e.neighbours import queries
 from tools.dashboards import draw, fetch
 
 SET_WITHIN = 1.0
@@ -208,18 +208,18 @@ def test_each_query_of_each_dashboard_returns_data(flight, note):
     maps = read("configmaps", "--selector=grafana_dashboard=1")["items"]
     dashboards = [json.loads(text) for one in maps for text in one["data"].values()]
     assert len(dashboards) == len(list((CHART / "files" / "dashboards").iterdir()))
-    with Prometheus() as prometheus:
+    with queries() as ask:
         for _ in range(TRIES):
-            shown = [(each, fetch(each, prometheus.ask, SHOWN)) for each in dashboards]
-            queries = [query for _, curves in shown for query in curves.items()]
-            missing = [key for key, curves in queries if not any(each.points for each in curves)]
+            shown = [(each, fetch(each, ask, SHOWN)) for each in dashboards]
+            found = [query for _, curves in shown for query in curves.items()]
+            missing = [key for key, curves in found if not any(each.points for each in curves)]
             if not missing:
                 break
             time.sleep(5.0)
     assert missing == []
     draw(shown, BUILD / "dashboards.webp")
     took = time.monotonic() - began
-    note(f"{len(queries)} queries of dashboards have data, and a picture: {took:.0f} s")
+    note(f"{len(found)} queries of dashboards have data, and a picture: {took:.0f} s")
 
 
 @pytest.mark.full

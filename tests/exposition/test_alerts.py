@@ -18,7 +18,7 @@ from cloudrc.records import Counted
 
 ROOT = Path(__file__).resolve().parents[2]
 RULES = ROOT / "charts" / "cloudrc" / "files" / "rules.yaml"
-MADE_UP = (ROOT / "tests" / "e2e" / "alerts.yaml").read_text(encoding="utf-8")
+MADE_UP = (ROOT / "tests" / "exposition" / "alerts.yaml").read_text(encoding="utf-8")
 FIRES = {
     "F3": ["CloudrcHolding", "CloudrcLanded"],
     "F8": ["CloudrcTagFailures"],
