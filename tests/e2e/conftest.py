@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CHART = ROOT / "charts" / "cloudrc"
 EXAMPLES = CHART / "examples"
 NAMESPACE = "cloudrc-e2e"
-NAMESPACES = (NAMESPACE, f"{NAMESPACE}-monitoring", f"{NAMESPACE}-bad")
+NAMESPACES = (NAMESPACE, f"{NAMESPACE}-monitoring")
 """Namespaces that these tests create."""
 NAME = "cloudrc"
 ENDS = ("world", "cloud")
@@ -34,10 +34,6 @@ SUMMARY: list[str] = []
 """Lines that pytest prints after the tests."""
 TIMES: dict[str, float] = {}
 """Event of the test session -> its time on the monotonic clock [s]."""
-
-
-class CommandFailedError(AssertionError):
-    """The exit code of a command was not 0."""
 
 
 def command(*words, given="", timeout=120.0):
@@ -52,7 +48,7 @@ def command(*words, given="", timeout=120.0):
     )
     if done.returncode != 0:
         line = " ".join(map(str, words))
-        raise CommandFailedError(f"{line}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
+        raise AssertionError(f"{line}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
     return done.stdout
 
 

@@ -2,20 +2,15 @@
 
 import json
 import math
-import re
 import time
 from itertools import pairwise
 
 import pytest
-import yaml
 
-from cloudrc.cluster.link import send_change
-from cloudrc.link.follow import PROFILE, Handed
 from tests.e2e.conftest import (
     BUILD,
     CHART,
     NAME,
-    CommandFailedError,
     eventually,
     fly,
     helm,
@@ -27,7 +22,6 @@ from tests.e2e.conftest import (
     memory,
     metrics,
     pace,
-    place,
     pod,
     processor_times,
     read,
@@ -67,8 +61,6 @@ LONG = [
     {"position_m": [0.5, 1.0, 0.7], "dwell_s": 200.0, "time_limit_s": 300.0},
 ]
 """A mission that waits at its second point for longer than the tests of this module take."""
-LINK_TEST = f"{NAME}-test-link"
-"""Pod of `helm test` that verifies the link; Helm keeps the pod after a failure."""
 SHOWN = 600
 """Time that the dashboards show [s]: the missions so far."""
 TRIES = 12
@@ -220,30 +212,6 @@ def test_each_query_of_each_dashboard_returns_data(flight, note):
     draw(shown, BUILD / "dashboards.webp")
     took = time.monotonic() - began
     note(f"{len(found)} queries of dashboards have data, and a picture: {took:.0f} s")
-
-
-@pytest.mark.full
-def test_helm_test_refuses_a_link_whose_delay_was_doubled(flight, note):
-    """Only cloud's link container gets the doubled delay; the profile of the release stays."""
-    began = time.monotonic()
-    try:
-        told = set_link("downlink.delay_ms=46")  # earlier datagrams are not judged after a change
-        profile = told["links"]["downlink"]["profile"]
-        profile["downlink"]["delay_ms"] = 92
-        change = {"number": str(time.time_ns()), "cause": "a seeded fault", "restart": False}
-        handed = Handed(json.dumps(change), {PROFILE: yaml.safe_dump(profile)})
-        state = json.loads(send_change(place(), str(pod("cloud")["metadata"]["name"]), handed))
-        assert state["change"] == change["number"], state
-        with pytest.raises(CommandFailedError):
-            helm("test", NAME, f"--filter=name={LINK_TEST}", "--timeout=300s", timeout=320.0)
-        said = kubectl("logs", LINK_TEST)
-    finally:
-        set_link("--profile", "paper-p2")
-        kubectl("delete", "pod", LINK_TEST, "--ignore-not-found", "--wait=false")
-    note(f"helm test, a doubled downlink: refused within {time.monotonic() - began:.0f} s")
-    assert "NOT BELIEVED" in said
-    causes = set(re.findall(r"^ *(\w+): .*  \[(\w+)\]$", said, re.MULTILINE))
-    assert causes - {("downlink", "throttled")} == {("downlink", "doubled_delay")}, said
 
 
 def objects():

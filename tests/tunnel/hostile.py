@@ -13,20 +13,35 @@ import atexit
 import resource
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 sys.path.append(str(Path(__file__).parents[2]))  # it is a program, too
 
+from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.records import Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
+from cloudrc.tunnel.end import Identity
 from cloudrc.tunnel.session import pair
-from tests.flights.conftest import MS, Bare, BareCloud, bare_cloud, ring
+from tests.cloud.conftest import loop
+from tests.flights.conftest import CLOCK, MS, Bare, BareCloud, ring
 
 STEPS_NS = tuple(round(ms * MS) for ms in (1, 30, 400, 1_500, 6_000, 150_000))
 """Steps of time [ns]; cloud asks for a session after 0.5 s of silence."""
 TOLD_MAX = 256
 """Largest number of faults of a cloud without a session: one per version, one for the key."""
 DOWNLINK = (Kind.COMMAND, Kind.OPERATOR, Kind.ALIVE)
+
+
+def bare_cloud(nonce, keys, start_ns=0):
+    """Make cloud's end; it sends the messages in its `teleop.outputs`."""
+    teleop = SimpleNamespace(
+        outputs=[], outcome=None, settled=True,
+        see=lambda seen, now_ns: None, handle_deadline=lambda now_ns: None,
+    )  # fmt: skip
+    teleop.take_outputs = lambda: [teleop.outputs.pop(0) for _ in teleop.outputs[:]]
+    identity = Identity(CLOCK, nonce.ljust(16), keys)
+    return CloudEndpoint(loop(), teleop, identity, newest_wins=True, start_ns=start_ns)
 
 
 class Target:

@@ -11,6 +11,7 @@ from cloudrc import assembly
 from cloudrc.config.load import load_experiment
 from cloudrc.geometry import fence
 from cloudrc.messages import Command, GuardState
+from cloudrc.sweep.flight import fly_in_memory
 from cloudrc.tunnel.end import Identity
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.limits import Limits
@@ -23,7 +24,6 @@ from cloudrc.world.native.robot import NativeRobot, make_robot, usable
 from cloudrc.world.robot import Robot
 from cloudrc.world.scene import FOLDER, mujoco
 from cloudrc.world.simulator import Simulator
-from tests.flights.conftest import digest
 from tests.world.guard.conftest import MS, SECOND, UP, hostile
 
 pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
@@ -215,9 +215,9 @@ def test_geoms_that_air_acts_on_are_always_placed(setting):
 def test_an_experiment_has_the_same_records_in_c(name, settings, monkeypatch):
     experiment, identity = load_experiment(name, settings), Identity(bytes(16), bytes(16))
     assert isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
-    in_c = digest(experiment)
+    in_c = fly_in_memory(experiment).run.records_sha256
     monkeypatch.setenv(SWITCH, "0")
-    assert digest(experiment) == in_c
+    assert fly_in_memory(experiment).run.records_sha256 == in_c
     assert not isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
 
 
