@@ -1,7 +1,5 @@
 """The missions and their required numbers, in virtual time; `-m full` flies more seeds."""
 
-from statistics import mean
-
 import pytest
 
 from cloudrc import assembly
@@ -30,10 +28,8 @@ def test_the_paper_flies(profile, seed):
 def test_verbatim_flies_although_late_commands_win():
     flight = fly("paper-verbatim")
     assert flight.verdict.failures == ()
-    assert (
-        numbers(flight)["loop_delay_mean"]
-        > numbers(fly("paper", "link.profile=paper-p2", "seed=1"))["loop_delay_mean"]
-    )
+    newest = fly("paper", "link.profile=paper-p2", "seed=1")
+    assert numbers(flight)["loop_delay_mean"] > numbers(newest)["loop_delay_mean"]
 
 
 @pytest.mark.parametrize(
@@ -46,27 +42,6 @@ def test_verbatim_flies_although_late_commands_win():
 )
 def test_the_paper_flies_under_other_conditions_too(setting):
     assert fly("paper", setting).verdict.failures == ()
-
-
-def prediction_error(predictor, seeds):
-    settings = ("link.profile=paper-p3", f"cloud.predictor={predictor}")
-    flights = [fly("steps", *settings, f"seed={seed}") for seed in seeds]
-    return mean(numbers(flight)["prediction_error_rms"] for flight in flights)
-
-
-@pytest.mark.parametrize("seeds", [range(1, 2), *nightly(range(1, 11))])
-def test_constant_velocity_predicts_far_better_than_nothing(seeds):
-    better, worse = (prediction_error(n, seeds) for n in ("constant_velocity", "last_sample"))
-    assert better < 0.3 * worse
-    if len(seeds) > 1:
-        assert better <= 0.013
-        assert 0.045 <= worse <= 0.065
-
-
-def test_split_estimates_the_delay_better_than_the_running_mean():
-    flights = (fly("steps", f"cloud.estimator={name}") for name in ("split", "running_mean"))
-    split, mean_ = (numbers(flight)["delay_estimate_error_rms"] for flight in flights)
-    assert split < 0.8 * mean_
 
 
 def test_the_limit_of_a_leg_defaults_to_three_times_its_time():
