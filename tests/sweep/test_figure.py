@@ -107,7 +107,7 @@ def test_a_sweep_without_axes_or_rows_has_no_figure(tmp_path):
         read_flights(sweep(tmp_path / "s", rows=0))
 
 
-def test_missing_flights_are_reported(tmp_path, capsys):
+def test_missing_flights_are_reported(tmp_path, capsys, drawn):
     """An unfinished sweep may give another result in the end."""
     folder = sweep(tmp_path / "s", rows=22)
     assert "s, of which 2 flights are not done, over" in of_sweep(folder, "none", "kalman").what
