@@ -43,8 +43,9 @@ def test_the_last_line_is_the_report_and_the_folder_is_complete(folder, call):
 
 
 @pytest.mark.usefixtures("no_page")
-def test_a_run_that_c_cannot_fly_says_so(folder):
-    main([*FLY, "--set=world.wind.gust_mps=1", "--out", "a"])
+@pytest.mark.parametrize("key", ["wind.gust_mps=1", "plant.mass_factor=1.1"])
+def test_a_run_that_c_cannot_fly_says_so(key, folder):
+    main([*FLY, f"--set=world.{key}", "--out", "a"])
     steps = json.loads((folder / "a/environment.json").read_text())["physics_steps"]
     assert steps == "Python (wind, or a robot that differs from its model)"
 

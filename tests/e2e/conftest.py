@@ -134,9 +134,6 @@ def identity():
     return found
 
 
-Sample = tuple[str, tuple[tuple[str, str], ...]]
-
-
 def scrapes(component):
     """Return the page /metrics of each container of a pod."""
     return fetch_metrics(place(), component)
@@ -165,6 +162,29 @@ def value(samples, name, **labels):
     ]
     assert found, f"no sample {name} {labels}"
     return sum(found)
+
+
+DIRECTIONS = {"uplink": "cloud", "downlink": "world"}
+"""Direction -> end that measures its delay."""
+
+
+def _delays():
+    """Return per direction the sum [s] and the number of the one-way delays measured so far."""
+    found = {}
+    for direction, end in DIRECTIONS.items():
+        samples, name = metrics(end), f"cloudrc_{direction}_delay_seconds"
+        found[direction] = value(samples, f"{name}_sum"), value(samples, f"{name}_count")
+    return found
+
+
+def mean_delays(seconds):
+    """Return per direction the mean delay [s] and the number of datagrams of the next seconds."""
+    before, found = _delays(), {}
+    time.sleep(seconds)
+    for direction, (total, count) in _delays().items():
+        new = count - before[direction][1]
+        found[direction] = (total - before[direction][0]) / new, new
+    return found
 
 
 def job_end(name, timeout=150.0):

@@ -19,14 +19,13 @@ from tests.e2e.conftest import (
     job_end,
     job_log,
     kubectl,
+    mean_delays,
     memory,
-    metrics,
     pace,
     pod,
     processor_times,
     read,
     set_link,
-    value,
 )
 from tests.e2e.neighbours import queries
 from tools.dashboards import draw, fetch
@@ -54,8 +53,6 @@ SETTLE = 1.0
 """Time after a change until the datagrams sent before the change have arrived [s]."""
 INTERRUPTED = 130
 """Exit code of a mission that was cancelled."""
-DIRECTIONS = {"uplink": "cloud", "downlink": "world"}
-"""Direction -> end that measures its delay."""
 LONG = [
     {"position_m": [0.5, 0.0, 0.7]},
     {"position_m": [0.5, 1.0, 0.7], "dwell_s": 200.0, "time_limit_s": 300.0},
@@ -90,13 +87,6 @@ def readings(flight):
     return [processor_times()]
 
 
-def counts(direction):
-    """Return the sum [s] and the number of the one-way delays measured so far."""
-    samples = metrics(DIRECTIONS[direction])
-    name = f"cloudrc_{direction}_delay_seconds"
-    return value(samples, f"{name}_sum"), value(samples, f"{name}_count")
-
-
 def changes(component):
     """Count the profiles that the link container of a pod has applied."""
     return kubectl("logs", pod(component)["metadata"]["name"], "-c", "link").count("in force")
@@ -121,12 +111,8 @@ def test_both_delays_are_the_profiles_within_two_milliseconds(
 ):
     change_profile(profile)
     time.sleep(SETTLE)
-    before = {direction: counts(direction) for direction in DIRECTIONS}
-    time.sleep(seconds)
-    for direction, (total, number) in before.items():
-        later_total, later_number = counts(direction)
-        assert later_number - number > 50 * seconds, "datagrams arrive all the time"
-        mean = (later_total - total) / (later_number - number)
+    for direction, (mean, count) in mean_delays(seconds).items():
+        assert count > 50 * seconds, "datagrams arrive all the time"
         note(f"{profile} {direction}: {mean * 1e3:.2f} ms, wanted {wanted * 1e3:.0f} ms")
         assert abs(mean - wanted) < TOLERANCE
     readings.append(processor_times())
@@ -140,10 +126,7 @@ def test_the_link_is_set_by_hand_and_read_back(readings, note):
             took.append(told["seconds"])
         assert told["links"]["downlink"]["asked"]["delay"] == 0.12
         time.sleep(SETTLE)
-        total, number = counts("downlink")
-        time.sleep(5.0)
-        later_total, later_number = counts("downlink")
-        mean = (later_total - total) / (later_number - number)
+        mean, _ = mean_delays(5.0)["downlink"]
         note(f"set by hand downlink: {mean * 1e3:.2f} ms, wanted 120 ms")
         assert abs(mean - 0.12) < TOLERANCE
     finally:
