@@ -77,19 +77,5 @@ def test_without_its_cloud_the_robot_stops_wherever_it_is(k, kill, figure):
         interrupt(figure, kill, mid_pipe()[k], calm=1.4)
 
 
-@pytest.mark.parametrize(
-    ("settings", "until", "states"),
-    [
-        # It receives the start but not the end of the mission.
-        (("link.downlink.blackouts=[{start_s: 0.29, duration_s: 100}]",), 110, ["GROUND", "LAND"]),
-        # The first command comes a round trip after the start, however short a HOLD may be.
-        (("link.profile=satellite", "guard.hold_max_s=0.1"), 4, ["GROUND", "TRACK"]),
-    ],
-)
-def test_a_start_without_commands(settings, until, states):
-    flight = Flight(*settings).fly(until)
-    assert [change.state.name for change in flight.changes] == states
-
-
 def test_a_flight_without_faults_never_meets_the_fence():
     assert undisturbed().robot.guard.counts == {}
