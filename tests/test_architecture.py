@@ -138,7 +138,6 @@ def test_no_file_and_no_function_is_too_long():
     files = [*FILES, *(ROOT / "tests").rglob("*.py")]
     long = {str(path.relative_to(ROOT)) for path in files if path.read_text().count("\n") > 700}
     for path, tree in TREES.items():
-        assert not tree.body or ast.get_docstring(tree), f"{place_of(path)}: no docstring"
         for node in ast.walk(tree):
             function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
             if function and node.end_lineno - node.lineno >= 50:
