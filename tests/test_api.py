@@ -24,7 +24,8 @@ def result():
     return cloudrc.fly("steps", SHORT, seed=3)
 
 
-def test_a_flight_equals_that_of_the_command(result, tmp_path, capsys):
+def test_a_flight_equals_that_of_the_command(result, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *given: None)
     sets = [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
     main(["run", "steps", "--mode=virtual", "--seed=3", *sets, f"--out={tmp_path}/run", "-o=json"])
     report = json.loads(capsys.readouterr().out)

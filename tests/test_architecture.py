@@ -45,12 +45,8 @@ MAY_IMPORT: dict[str, set[str]] = {
 }
 ALWAYS = {"errors", "messages", "records", "__version__"}
 
-# Parts that run in real time besides the drivers: link shapers, teleop's API, the console's page.
-SHAPERS = ("link/relay", "link/verify/probe", "link/verify/monitor")
-API = ("teleop/api", "teleop/auth")
-CONSOLE = ("console/page", "console/steering")
-
-# Module from outside -> the places (path prefixes below cloudrc/) that may import it.
+# Module from outside -> the places (path prefixes below cloudrc/) that may import it. Ruff checks
+# clocks, sockets, threads, signals, chance, and calls such as `eval` and `print` (pyproject.toml).
 RESERVED: dict[str, tuple[str, ...]] = {
     "mujoco": ("world/",),
     # The simulator packs forces into MuJoCo's buffers; this is the fastest way.
@@ -76,11 +72,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "subprocess": ("drivers/", "cli/", "cluster/", "world/native/library"),
     "multiprocessing": ("drivers/", "cli/"),
     "concurrent": ("cli/", "cluster/", "teleop/"),
-    **dict.fromkeys(
-        ("time", "socket", "selectors", "select", "threading", "asyncio", "signal"),
-        ("drivers/", *SHAPERS, *API, *CONSOLE, "cluster/", "cli/", "faults/search"),
-    ),
-    **dict.fromkeys(("random", "secrets", "uuid"), ("drivers/", "cluster/", "cli/")),
+    **dict.fromkeys(("secrets", "uuid"), ("drivers/", "cluster/", "cli/")),
     **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),
 }
 # Imported package -> its name in pyproject.toml.
@@ -90,7 +82,6 @@ ASKED_AS = {
     "starlette": "fastapi",
     "urllib3": "kubernetes",
 }
-FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__"}
 
 
 def place_of(path):
@@ -108,7 +99,7 @@ def imports(tree):
 
 
 def violations(place, tree):
-    """Return the forbidden imports and calls of a file at `place`, a path below cloudrc/."""
+    """Return the forbidden imports of a file at `place`, a path below cloudrc/."""
     part = place.split("/")[0].removesuffix(".py")
     allowed = MAY_IMPORT[part] | ALWAYS | {part}
     found = []
@@ -119,9 +110,7 @@ def violations(place, tree):
         for reserved, places in RESERVED.items():
             if f"{name}.".startswith(f"{reserved}.") and not place.startswith(places):
                 found.append(f"imports {name}")
-    calls = [node.func for node in ast.walk(tree) if isinstance(node, ast.Call)]
-    forbidden = FORBIDDEN_CALLS | ({"print"} if part != "cli" else set())
-    return found + [f"calls {f.id}" for f in calls if isinstance(f, ast.Name) and f.id in forbidden]
+    return found
 
 
 def test_a_file_imports_only_allowed_modules():
@@ -149,17 +138,8 @@ def test_no_file_and_no_function_is_too_long():
     files = [*FILES, *(ROOT / "tests").rglob("*.py")]
     long = {str(path.relative_to(ROOT)) for path in files if path.read_text().count("\n") > 700}
     for path, tree in TREES.items():
-        assert not tree.body or ast.get_docstring(tree), f"{place_of(path)}: no docstring"
         for node in ast.walk(tree):
             function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
             if function and node.end_lineno - node.lineno >= 50:
                 long.add(f"{place_of(path)}: {node.name}")
     assert long == set()
-
-
-def test_the_global_random_state_of_numpy_is_not_used():
-    """Only generators with a seed, such as `default_rng(seed)`, are allowed."""
-    allowed = {"default_rng", "Generator", "Philox", "PCG64", "SeedSequence"}
-    used = re.compile(r"\b(?:np|numpy)\.random\.(\w+)")
-    found = {place_of(path): {*used.findall(path.read_text())} - allowed for path in FILES}
-    assert {place: names for place, names in found.items() if names} == {}

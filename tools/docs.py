@@ -18,6 +18,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import yaml
 from annotated_types import MaxLen
 from pydantic import BaseModel
 
@@ -79,10 +80,10 @@ def outputs() -> dict[Path, str]:
     values = (CHART / "values.yaml").read_text()
     rows = table("key | default | meaning", table_rows(values))
     return {
-        **_insert(ROOT / "docs" / "experiment.md", _experiment()),
-        **_insert(ROOT / "docs" / "topics.md", _topics()),
-        **_insert(ROOT / "docs" / "metrics.md", _metrics()),
-        **_insert(CHART / "README.md", f"\n{rows}"),
+        **insert(ROOT / "docs" / "experiment.md", _experiment()),
+        **insert(ROOT / "docs" / "topics.md", _topics()),
+        **insert(ROOT / "docs" / "metrics.md", _metrics()),
+        **insert(CHART / "README.md", f"\n{rows}"),
         CHART / "values.schema.json": json.dumps(make_schema(values), indent=2) + "\n",
         **{
             CHART / "files" / f"{kind}s" / path.name: path.read_text()
@@ -98,9 +99,9 @@ def leftovers() -> list[Path]:
     return sorted(copies - outputs().keys())
 
 
-def _insert(page: Path, text: str) -> dict[Path, str]:
+def insert(page: Path, text: str) -> dict[Path, str]:
     """Replace the text between the marks of a page by generated text."""
-    parts = re.split("(<!-- made by `make docs`.*-->\n|<!-- end -->\n)", page.read_text())
+    parts = re.split("(<!-- made by `make .*-->\n|<!-- end -->\n)", page.read_text("utf-8"))
     if len(parts) != 5:
         raise ValueError(f"{page.name}: needs one pair of marks around the generated text")
     parts[2] = text
@@ -125,15 +126,9 @@ def plain(value: Any) -> Any:
 
 
 def flow(value: Any) -> str:
-    """Format a value as YAML on one line."""
-    if isinstance(value, dict):
-        inner = ", ".join(f"{key}: {flow(item)}" for key, item in value.items())
-        return f"{{{inner}}}"
-    if isinstance(value, list):
-        return f"[{', '.join(map(flow, value))}]"
-    if isinstance(value, str) and re.fullmatch(r"[A-Za-z][\w./-]*|[0-9]+[A-Za-z]+", value):
-        return value
-    return json.dumps(value)
+    """Format a default value as YAML on one line."""
+    text = yaml.safe_dump(plain(value), default_flow_style=True, sort_keys=False, width=10**6)
+    return text.removesuffix("...\n").strip()
 
 
 def _experiment() -> str:
@@ -184,7 +179,7 @@ def _row(model: type[BaseModel], path: tuple[str, ...]) -> tuple[str, ...] | Non
 
 
 def _default(value: Any) -> str:
-    return "{}" if isinstance(value, BaseModel) else flow(plain(value))
+    return "{}" if isinstance(value, BaseModel) else flow(value)
 
 
 def _value(model: type[BaseModel], path: tuple[str, ...], words: str) -> str:
@@ -212,7 +207,7 @@ def _plug_ins() -> str:
             rows.append((f"`{name}`", "", "", plugins.describe(kind, name)))
             texts = _arguments(plugins.find(kind, name).build)
             for parameter in plugins.signature(kind, name).parameters.values():
-                default = f"`{flow(plain(parameter.default))}`"
+                default = f"`{flow(parameter.default)}`"
                 rows.append(("", f"`{parameter.name}`", default, texts[parameter.name]))
         blocks.append(table(f"`cloud.{key}` | parameter | default | meaning", rows))
     return "\n".join(blocks)

@@ -16,11 +16,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from cloudrc.sweep.statistics import median_interval
-from tools.docs import table
+from tools.docs import insert, table
 
 ROOT = Path(__file__).resolve().parents[1]
 README, SWEEPS = ROOT / "README.md", ROOT / "docs" / "sweeps"
-MARK = "<!-- made by `make results` -->\n"
 LINKS = "paper-p3", "far"
 """Link profiles in `predictors.yaml`."""
 ERROR = "prediction_error_rms"
@@ -69,11 +68,7 @@ def main() -> None:
         fly("delay", delay := Path(folder, "delay"))
         cloudrc("sweep", "figure", delay, "--number", ERROR, "--by", "predictor")
         shutil.copy(delay / "figure.png", ROOT / "docs" / "delay.png")
-    before, begin, rest = README.read_text(encoding="utf-8").partition(MARK)
-    _, end, after = rest.partition("<!-- end -->\n")
-    assert begin, f"README.md has no mark {MARK}"
-    assert end, "README.md has no end of the table"
-    README.write_text(f"{before}{begin}{made}{end}{after}", encoding="utf-8")
+    README.write_text(insert(README, made)[README], encoding="utf-8")
 
 
 if __name__ == "__main__":

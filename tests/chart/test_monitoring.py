@@ -4,17 +4,24 @@ import json
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
 import yaml
 
 from cloudrc.exposition import table
 from cloudrc.exposition.table import METRICS, Kind
-from tests.chart.conftest import CHART, OPERATOR, ROOT, metrics_ports, of_kind, pod_specs, render
+from tests.chart.conftest import CHART, OPERATOR, metrics_ports, of_kind, pod_specs, render
 from tools.dashboards import draw, expressions, fetch
 
 KINDS = {"PodMonitor", "PrometheusRule"}
-RULES = CHART / "files" / "rules.yaml"
+needs_promtool = pytest.mark.skipif(
+    shutil.which("promtool") is None, reason="Debian package prometheus"
+)
+FILE = CHART / "files" / "rules.yaml"
+RULES = [rule for group in yaml.safe_load(FILE.read_text())["groups"] for rule in group["rules"]]
+ALERTS = {rule["alert"]: rule for rule in RULES if "alert" in rule}
+RECORDED = {rule["record"] for rule in RULES if "record" in rule}
 
 
 def test_monitors_need_the_value_and_the_kind_or_force():
@@ -50,10 +57,8 @@ def series():
 
 
 def test_the_rules_use_existing_metrics_and_name_a_runbook():
-    groups = yaml.safe_load(RULES.read_text())["groups"]
-    rules = [rule for group in groups for rule in group["rules"]]
-    known = series() | {rule["record"] for rule in rules if "record" in rule}
-    for rule in rules:
+    known = series() | RECORDED
+    for rule in RULES:
         asked = re.findall(r"(?:\w+:)?cloudrc_\w+(?::\w+)?", rule["expr"])
         assert asked
         assert set(asked) <= known
@@ -63,11 +68,38 @@ def test_the_rules_use_existing_metrics_and_name_a_runbook():
             assert runbook.endswith(f"README.md#{rule['alert'].lower()}")
 
 
-@pytest.mark.skipif(shutil.which("promtool") is None, reason="Debian package prometheus")
+def promtool_test(case):
+    """Convert a case of alerts.yaml to the format of `promtool test rules`."""
+    alerts = []
+    for time, name, *fired in case.get("fires", ()):
+        more, texts = ALERTS[name]["labels"], ALERTS[name]["annotations"]
+        expected = [{"exp_labels": labels | more, "exp_annotations": texts} for labels in fired]
+        alerts.append({"eval_time": time, "alertname": name, "exp_alerts": expected})
+    samples = [
+        {"labels": f'{{rule="{rule}",{labels}}}', "value": value}
+        for rule, (value, labels) in case.get("recorded", {}).items()
+    ]
+    round_all = 'round(label_replace({__name__=~"pod:.+"}, "rule", "$1", "__name__", "(.+)"), 0.01)'
+    asked = {"expr": round_all, "eval_time": "2m", "exp_samples": samples}
+    return {
+        "interval": "5s",
+        "input_series": [{"series": k, "values": v} for k, v in case["series"].items()],
+        "alert_rule_test": alerts,
+        "promql_expr_test": [asked] if samples else [],
+    }
+
+
+@needs_promtool
 def test_the_alerts_fire_when_they_should_and_only_then(tmp_path):
-    shutil.copy(RULES, tmp_path)
-    shutil.copy(ROOT / "tests" / "e2e" / "alerts.yaml", tmp_path)
-    for words in (["check", "rules", RULES], ["test", "rules", tmp_path / "alerts.yaml"]):
+    cases = yaml.safe_load((Path(__file__).parent / "alerts.yaml").read_text())
+    rows = [row for case in cases for row in case.get("fires", ())]
+    assert {name for _, name, *fired in rows if fired} == ALERTS.keys(), "each alert has a case"
+    assert cases[-1]["recorded"].keys() == RECORDED
+    document = {"rule_files": [str(FILE)], "evaluation_interval": "5s"}
+    (tmp_path / "tests.yaml").write_text(
+        yaml.safe_dump(document | {"tests": list(map(promtool_test, cases))})
+    )
+    for words in (["check", "rules", FILE], ["test", "rules", tmp_path / "tests.yaml"]):
         done = subprocess.run(["promtool", *words], capture_output=True, text=True)
         assert "SUCCESS" in done.stdout, done.stdout + done.stderr
 
@@ -148,7 +180,7 @@ def test_panels_query_metrics_of_the_release_alone():
             assert 'namespace=~"lab",pod=~"demo-cloudrc(-.*)?"' in selector
 
 
-@pytest.mark.skipif(shutil.which("promtool") is None, reason="Debian package prometheus")
+@needs_promtool
 def test_promtool_accepts_the_queries_of_the_panels(tmp_path):
     rules = [{"record": f"query{n}", "expr": query} for n, query in enumerate(queries())]
     path = tmp_path / "rules.yaml"

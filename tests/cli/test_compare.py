@@ -5,6 +5,7 @@ import json
 import pytest
 
 from tests.cli.conftest import SHORT
+from tests.sweep.conftest import flown
 
 A, B = "cloud.predictor=last_sample", "cloud.predictor=constant_velocity"
 COMPARE = f"compare {A} {B} "
@@ -18,9 +19,7 @@ def fly_with(replace_flights):
         def fly(experiment):
             verdict, error = measure(experiment.cloud.predictor.name in A, experiment.seed)
             failures = ["unstable"] * (verdict == "failure")
-            numbers = {"prediction_error_rms": error}
-            return {"verdict": verdict, "failures": failures, "text": "it broke",
-                    "numbers": numbers}  # fmt: skip
+            return flown(verdict, *failures, prediction_error_rms=error)
 
         replace_flights(fly)
 

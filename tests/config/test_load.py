@@ -22,8 +22,13 @@ def again(experiment, folder, *settings):
     return load_experiment(path, settings)
 
 
-@pytest.mark.parametrize("experiment", ["paper", "paper-verbatim", "steps", "hover"])
-@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize(
+    ("experiment", "profile"),
+    [
+        *(("paper", name) for name in PROFILES),
+        *((name, "lossy") for name in ("paper-verbatim", "steps", "hover")),
+    ],
+)
 def test_a_dump_loads_to_the_same(experiment, profile, tmp_path):
     loaded = load_experiment(experiment, [f"link.profile={profile}"])
     assert again(loaded, tmp_path) == loaded

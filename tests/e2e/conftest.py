@@ -14,11 +14,10 @@ import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
-from cloudrc.cli.client import Api
 from cloudrc.cluster.client import connect
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
-from cloudrc.cluster.pods import api_url, fetch_metrics, fetch_recording, operator_token
+from cloudrc.cluster.pods import fetch_metrics, fetch_recording
 from cloudrc.errors import CloudrcError
 from tests.drivers.conftest import WORK, slower
 
@@ -26,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CHART = ROOT / "charts" / "cloudrc"
 EXAMPLES = CHART / "examples"
 NAMESPACE = "cloudrc-e2e"
-NAMESPACES = (NAMESPACE, f"{NAMESPACE}-monitoring", f"{NAMESPACE}-bad")
+NAMESPACES = (NAMESPACE, f"{NAMESPACE}-monitoring")
 """Namespaces that these tests create."""
 NAME = "cloudrc"
 ENDS = ("world", "cloud")
@@ -35,10 +34,6 @@ SUMMARY: list[str] = []
 """Lines that pytest prints after the tests."""
 TIMES: dict[str, float] = {}
 """Event of the test session -> its time on the monotonic clock [s]."""
-
-
-class CommandFailedError(AssertionError):
-    """The exit code of a command was not 0."""
 
 
 def command(*words, given="", timeout=120.0):
@@ -53,7 +48,7 @@ def command(*words, given="", timeout=120.0):
     )
     if done.returncode != 0:
         line = " ".join(map(str, words))
-        raise CommandFailedError(f"{line}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
+        raise AssertionError(f"{line}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
     return done.stdout
 
 
@@ -139,9 +134,6 @@ def identity():
     return found
 
 
-Sample = tuple[str, tuple[tuple[str, str], ...]]
-
-
 def scrapes(component):
     """Return the page /metrics of each container of a pod."""
     return fetch_metrics(place(), component)
@@ -172,11 +164,27 @@ def value(samples, name, **labels):
     return sum(found)
 
 
-def missions():
-    """Return all missions that the API knows, the oldest first."""
-    token = operator_token(place())
-    with api_url(place()) as url:
-        return list(Api(url, lambda: token).get("/v1/missions")["missions"])
+DIRECTIONS = {"uplink": "cloud", "downlink": "world"}
+"""Direction -> end that measures its delay."""
+
+
+def _delays():
+    """Return per direction the sum [s] and the number of the one-way delays measured so far."""
+    found = {}
+    for direction, end in DIRECTIONS.items():
+        samples, name = metrics(end), f"cloudrc_{direction}_delay_seconds"
+        found[direction] = value(samples, f"{name}_sum"), value(samples, f"{name}_count")
+    return found
+
+
+def mean_delays(seconds):
+    """Return per direction the mean delay [s] and the number of datagrams of the next seconds."""
+    before, found = _delays(), {}
+    time.sleep(seconds)
+    for direction, (total, count) in _delays().items():
+        new = count - before[direction][1]
+        found[direction] = (total - before[direction][0]) / new, new
+    return found
 
 
 def job_end(name, timeout=150.0):
@@ -209,12 +217,7 @@ def save(folder):
 CLUSTER = "cloudrc-e2e"
 IMAGES = "world cloud prometheus"  # a real Prometheus is for these tests alone
 BUILD = ROOT / "build" / "e2e"
-TOOLS = {
-    "docker": "https://docs.docker.com/engine/install/",
-    "kind": "https://kind.sigs.k8s.io/",
-    "helm": "https://helm.sh/docs/intro/install/",
-    "kubectl": "https://kubernetes.io/docs/tasks/tools/",
-}
+TOOLS = ("docker", "kind", "helm", "kubectl")
 MISSING_PREREQUISITE = 3
 UP = pytest.StashKey[bool]()
 
@@ -241,10 +244,7 @@ def cluster(request):
     own = "KUBECONFIG" not in os.environ
     missing = [tool for tool in TOOLS if shutil.which(tool) is None]
     if missing:
-        where = "; ".join(f"{tool}: {TOOLS[tool]}" for tool in missing)
-        pytest.exit(
-            f"e2e needs {', '.join(missing)}, not installed ({where})", MISSING_PREREQUISITE
-        )
+        pytest.exit(f"e2e needs {', '.join(missing)}, not installed", MISSING_PREREQUISITE)
     BUILD.mkdir(parents=True, exist_ok=True)
     for folder in BUILD.iterdir():
         if folder.is_dir():  # of an earlier session; the kubeconfig beside them may be in use
@@ -331,18 +331,11 @@ def installed(cluster, values):
 
 
 @pytest.fixture(scope="session")
-def prometheus_image(cluster):
-    """Name of an image with Prometheus and promtool."""
-    found = command("docker", "images", "--format={{.Repository}}:{{.Tag}}", "cloudrc/prometheus")
-    return found.split()[0]
-
-
-@pytest.fixture(scope="session")
-def prometheus(installed, prometheus_image):
+def prometheus(installed):
     """A Prometheus that scrapes the release from now on."""
     from tests.e2e.neighbours import install_prometheus
 
-    install_prometheus(prometheus_image)
+    install_prometheus()
 
 
 def processor_times():

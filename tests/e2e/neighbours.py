@@ -1,11 +1,12 @@
 """Pods beside the release: a foreign pod that tries all ports, and an allowed Prometheus."""
 
 import json
+from contextlib import contextmanager
 from urllib.parse import urlencode
 
 from cloudrc.cluster.client import connect
 from cloudrc.cluster.pods import NO_PROXY, forwarded
-from tests.e2e.conftest import CHART, NAMESPACE, ROOT, apply, kubectl, pod
+from tests.e2e.conftest import NAMESPACE, apply, command, kubectl, pod
 
 MONITORING = f"{NAMESPACE}-monitoring"
 TRY_PORTS = """\
@@ -82,13 +83,14 @@ def targets():
     return json.dumps(found)
 
 
-def install_prometheus(prometheus_image):
+def install_prometheus():
     """Start a Prometheus in a namespace of its own, and wait until it is ready."""
+    found = command("docker", "images", "--format={{.Repository}}:{{.Tag}}", "cloudrc/prometheus")
     metadata = {"name": "prometheus", "namespace": MONITORING}
     config = {"name": "config", "mountPath": "/etc/prometheus"}
     prometheus = {
         "name": "prometheus",
-        "image": prometheus_image,
+        "image": found.split()[0],
         "readinessProbe": {"httpGet": {"path": "/-/ready", "port": 9090}, "periodSeconds": 1},
         "volumeMounts": [config],
     }
@@ -102,8 +104,6 @@ def install_prometheus(prometheus_image):
             "data": {
                 "prometheus.yml": CONFIG,
                 "pods.json": targets(),
-                "rules.yaml": (CHART / "files" / "rules.yaml").read_text(),
-                "alerts.yaml": (ROOT / "tests" / "e2e" / "alerts.yaml").read_text(),
             },
         },
         {
@@ -123,21 +123,16 @@ def promtool(*words, given=""):
     return kubectl(*where, "--", "promtool", *words, given=given)
 
 
-class Prometheus:
-    """Sends queries to the Prometheus of the tests while the block runs."""
+@contextmanager
+def queries():
+    """Yield a function that sends a PromQL query to Prometheus and returns the result."""
+    with forwarded(connect(None, MONITORING), "prometheus", [9090]) as ports:
 
-    def __enter__(self):
-        self._way = forwarded(connect(None, MONITORING), "prometheus", [9090])
-        self._port = self._way.__enter__()[9090]
-        return self
+        def ask(query):
+            url = f"http://127.0.0.1:{ports[9090]}/api/v1/query?{urlencode({'query': query})}"
+            with NO_PROXY.open(url, timeout=10) as answer:
+                said = json.load(answer)
+            assert said["status"] == "success", said
+            return list(said["data"]["result"])
 
-    def __exit__(self, *error):
-        self._way.__exit__(*error)
-
-    def ask(self, query):
-        """Return the result of a PromQL query."""
-        url = f"http://127.0.0.1:{self._port}/api/v1/query?{urlencode({'query': query})}"
-        with NO_PROXY.open(url, timeout=10) as answer:
-            said = json.load(answer)
-        assert said["status"] == "success", said
-        return list(said["data"]["result"])
+        yield ask

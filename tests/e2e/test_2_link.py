@@ -2,20 +2,15 @@
 
 import json
 import math
-import re
 import time
 from itertools import pairwise
 
 import pytest
-import yaml
 
-from cloudrc.cluster.link import send_change
-from cloudrc.link.follow import PROFILE, Handed
 from tests.e2e.conftest import (
     BUILD,
     CHART,
     NAME,
-    CommandFailedError,
     eventually,
     fly,
     helm,
@@ -24,17 +19,15 @@ from tests.e2e.conftest import (
     job_end,
     job_log,
     kubectl,
+    mean_delays,
     memory,
-    metrics,
     pace,
-    place,
     pod,
     processor_times,
     read,
     set_link,
-    value,
 )
-from tests.e2e.neighbours import Prometheus
+from tests.e2e.neighbours import queries
 from tools.dashboards import draw, fetch
 
 SET_WITHIN = 1.0
@@ -60,15 +53,11 @@ SETTLE = 1.0
 """Time after a change until the datagrams sent before the change have arrived [s]."""
 INTERRUPTED = 130
 """Exit code of a mission that was cancelled."""
-DIRECTIONS = {"uplink": "cloud", "downlink": "world"}
-"""Direction -> end that measures its delay."""
 LONG = [
     {"position_m": [0.5, 0.0, 0.7]},
     {"position_m": [0.5, 1.0, 0.7], "dwell_s": 200.0, "time_limit_s": 300.0},
 ]
 """A mission that waits at its second point for longer than the tests of this module take."""
-LINK_TEST = f"{NAME}-test-link"
-"""Pod of `helm test` that verifies the link; Helm keeps the pod after a failure."""
 SHOWN = 600
 """Time that the dashboards show [s]: the missions so far."""
 TRIES = 12
@@ -98,13 +87,6 @@ def readings(flight):
     return [processor_times()]
 
 
-def counts(direction):
-    """Return the sum [s] and the number of the one-way delays measured so far."""
-    samples = metrics(DIRECTIONS[direction])
-    name = f"cloudrc_{direction}_delay_seconds"
-    return value(samples, f"{name}_sum"), value(samples, f"{name}_count")
-
-
 def changes(component):
     """Count the profiles that the link container of a pod has applied."""
     return kubectl("logs", pod(component)["metadata"]["name"], "-c", "link").count("in force")
@@ -129,12 +111,8 @@ def test_both_delays_are_the_profiles_within_two_milliseconds(
 ):
     change_profile(profile)
     time.sleep(SETTLE)
-    before = {direction: counts(direction) for direction in DIRECTIONS}
-    time.sleep(seconds)
-    for direction, (total, number) in before.items():
-        later_total, later_number = counts(direction)
-        assert later_number - number > 50 * seconds, "datagrams arrive all the time"
-        mean = (later_total - total) / (later_number - number)
+    for direction, (mean, count) in mean_delays(seconds).items():
+        assert count > 50 * seconds, "datagrams arrive all the time"
         note(f"{profile} {direction}: {mean * 1e3:.2f} ms, wanted {wanted * 1e3:.0f} ms")
         assert abs(mean - wanted) < TOLERANCE
     readings.append(processor_times())
@@ -148,10 +126,7 @@ def test_the_link_is_set_by_hand_and_read_back(readings, note):
             took.append(told["seconds"])
         assert told["links"]["downlink"]["asked"]["delay"] == 0.12
         time.sleep(SETTLE)
-        total, number = counts("downlink")
-        time.sleep(5.0)
-        later_total, later_number = counts("downlink")
-        mean = (later_total - total) / (later_number - number)
+        mean, _ = mean_delays(5.0)["downlink"]
         note(f"set by hand downlink: {mean * 1e3:.2f} ms, wanted 120 ms")
         assert abs(mean - 0.12) < TOLERANCE
     finally:
@@ -208,42 +183,18 @@ def test_each_query_of_each_dashboard_returns_data(flight, note):
     maps = read("configmaps", "--selector=grafana_dashboard=1")["items"]
     dashboards = [json.loads(text) for one in maps for text in one["data"].values()]
     assert len(dashboards) == len(list((CHART / "files" / "dashboards").iterdir()))
-    with Prometheus() as prometheus:
+    with queries() as ask:
         for _ in range(TRIES):
-            shown = [(each, fetch(each, prometheus.ask, SHOWN)) for each in dashboards]
-            queries = [query for _, curves in shown for query in curves.items()]
-            missing = [key for key, curves in queries if not any(each.points for each in curves)]
+            shown = [(each, fetch(each, ask, SHOWN)) for each in dashboards]
+            found = [query for _, curves in shown for query in curves.items()]
+            missing = [key for key, curves in found if not any(each.points for each in curves)]
             if not missing:
                 break
             time.sleep(5.0)
     assert missing == []
     draw(shown, BUILD / "dashboards.webp")
     took = time.monotonic() - began
-    note(f"{len(queries)} queries of dashboards have data, and a picture: {took:.0f} s")
-
-
-@pytest.mark.full
-def test_helm_test_refuses_a_link_whose_delay_was_doubled(flight, note):
-    """Only cloud's link container gets the doubled delay; the profile of the release stays."""
-    began = time.monotonic()
-    try:
-        told = set_link("downlink.delay_ms=46")  # earlier datagrams are not judged after a change
-        profile = told["links"]["downlink"]["profile"]
-        profile["downlink"]["delay_ms"] = 92
-        change = {"number": str(time.time_ns()), "cause": "a seeded fault", "restart": False}
-        handed = Handed(json.dumps(change), {PROFILE: yaml.safe_dump(profile)})
-        state = json.loads(send_change(place(), str(pod("cloud")["metadata"]["name"]), handed))
-        assert state["change"] == change["number"], state
-        with pytest.raises(CommandFailedError):
-            helm("test", NAME, f"--filter=name={LINK_TEST}", "--timeout=300s", timeout=320.0)
-        said = kubectl("logs", LINK_TEST)
-    finally:
-        set_link("--profile", "paper-p2")
-        kubectl("delete", "pod", LINK_TEST, "--ignore-not-found", "--wait=false")
-    note(f"helm test, a doubled downlink: refused within {time.monotonic() - began:.0f} s")
-    assert "NOT BELIEVED" in said
-    causes = set(re.findall(r"^ *(\w+): .*  \[(\w+)\]$", said, re.MULTILINE))
-    assert causes - {("downlink", "throttled")} == {("downlink", "doubled_delay")}, said
+    note(f"{len(found)} queries of dashboards have data, and a picture: {took:.0f} s")
 
 
 def objects():

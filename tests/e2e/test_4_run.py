@@ -6,7 +6,7 @@ import pytest
 
 from cloudrc import __version__
 from cloudrc.config.load import load_experiment
-from tests.e2e.conftest import cloudrc, command, in_release
+from tests.e2e.conftest import CHART, NAMESPACE, cloudrc, command, helm, in_release
 from tests.flights.conftest import fly, numbers
 
 TIME_TOLERANCE = 0.05
@@ -34,6 +34,18 @@ def test_an_image_is_small_and_holds_no_more_than_its_role_needs(cluster, note, 
     assert size <= SIZES[role]
     look = ["docker", "run", "--rm", "--user=0", "--entrypoint=python", image, "-c", LOOK]
     assert json.loads(command(*look)) == holds
+
+
+def test_an_image_that_is_not_loaded_is_named(cluster):
+    helm("install", "no-image", str(CHART), "--set=image.tag=0.0.0-missing")
+    line = ["run", "hover", "--mode", "cluster", "-n", NAMESPACE, "--release", "no-image"]
+    done = cloudrc(*line, "--timeout", "60")
+    helm("uninstall", "no-image")
+    (said,) = [each for each in done.stderr.splitlines() if each.startswith("cloudrc: error:")]
+    assert done.returncode == 5
+    assert ":0.0.0-missing" in said
+    assert "make kind-load" in said
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize(

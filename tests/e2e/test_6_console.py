@@ -7,9 +7,7 @@ import time
 import pytest
 
 from cloudrc.cluster.flight import wait_ready
-from tests.e2e.conftest import CHART, NAME, NAMESPACE, ROOT, helm, metrics, place, value
-
-MEASURED = "cloudrc_uplink_delay_seconds"
+from tests.e2e.conftest import CHART, NAME, NAMESPACE, ROOT, helm, mean_delays, place
 
 
 @pytest.fixture(scope="module")
@@ -27,19 +25,6 @@ def console(installed):
     wait_ready(place(), timeout=120.0)
 
 
-def mean_delay(seconds):
-    """Return the mean delay of the uplink from now on [s], measured by cloud."""
-    before = totals()
-    time.sleep(seconds)
-    total, count = (new - old for new, old in zip(totals(), before, strict=True))
-    return total / count
-
-
-def totals():
-    samples = metrics("cloud")
-    return value(samples, f"{MEASURED}_sum"), value(samples, f"{MEASURED}_count")
-
-
 def test_a_slider_of_the_page_changes_the_link(console, browse):
     address = console.stdout.readline().split()[-1]
     page = browse(address)
@@ -53,4 +38,4 @@ def test_a_slider_of_the_page_changes_the_link(console, browse):
         delay.press("Enter")
         assert console.stdout.readline().strip() == f"link set uplink.delay_ms={asked}"
         time.sleep(1.0)  # the datagrams that were under way
-        assert mean_delay(3.0) == pytest.approx(float(asked) * 1e-3, abs=0.030)
+        assert mean_delays(3.0)["uplink"][0] == pytest.approx(float(asked) * 1e-3, abs=0.030)

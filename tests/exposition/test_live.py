@@ -49,8 +49,8 @@ def test_a_bucket_includes_its_upper_bound():
 
 @pytest.mark.promise("unknown-is-absent")
 def test_without_a_shared_clock_one_way_delays_are_absent():
-    experiment = load_experiment("hover", ["link.profile=paper-p1"])
-    both = records(experiment, offset_ns=7_000_000_000)
+    experiment = load_experiment("hover", ["link.profile=paper-p1", "cloud.clock_offset_s=7"])
+    both = records(experiment)
     for role, of_end in zip(table.ENDS, both, strict=True):
         live = LiveMetrics(role)
         live.see(of_end)

@@ -71,8 +71,8 @@ def test_a_prediction_is_compared_at_its_own_instant(lead, every_ms, judged):
 
 
 def test_delay_errors_of_a_flight_match_its_ground_truth():
-    experiment = load_experiment("hover", ["link.profile=paper-p2"])
-    world, cloud = records(experiment, offset_ns=5_000_000_000)
+    experiment = load_experiment("hover", ["link.profile=paper-p2", "cloud.clock_offset_s=5"])
+    world, cloud = records(experiment)
     controls = {(c.epoch, c.counter): c for c in cloud if isinstance(c, Control)}
     truth = set()
     for applied in (r for r in world if isinstance(r, CommandApplied)):

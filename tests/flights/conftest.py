@@ -1,13 +1,11 @@
 """Endpoints without robot and loop; flights in virtual time; a world and the test's own cloud."""
 
+from functools import lru_cache
 from types import SimpleNamespace
-from typing import NamedTuple
 from unittest.mock import Mock
 
 from cloudrc import assembly
-from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.config.load import load_experiment
-from cloudrc.drivers.virtual import Clock, VirtualRun
 from cloudrc.messages import (
     UPRIGHT,
     ZERO,
@@ -19,11 +17,8 @@ from cloudrc.messages import (
     Request,
     Start,
 )
-from cloudrc.record.columns import Recording
-from cloudrc.record.hash import RecordHash
 from cloudrc.records import Counted
-from cloudrc.report.document import Run
-from cloudrc.report.write import assess
+from cloudrc.sweep.flight import fly_in_memory
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.end import Identity
@@ -31,7 +26,6 @@ from cloudrc.tunnel.handshake import ClientHandshake
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import Session
 from cloudrc.world.endpoint import WorldEndpoint
-from tests.cloud.conftest import loop
 
 MS = 1_000_000
 CLOCK = bytes(16)
@@ -60,17 +54,6 @@ def bare_world(nonce=b"w", ring=None, start_ns=0):
         command_age_max_ns=250 * MS,
         start_ns=start_ns,
     )
-
-
-def bare_cloud(nonce, keys, start_ns=0):
-    """Make cloud's end; it sends the messages in its `teleop.outputs`."""
-    teleop = SimpleNamespace(
-        outputs=[], outcome=None, settled=True,
-        see=lambda seen, now_ns: None, handle_deadline=lambda now_ns: None,
-    )  # fmt: skip
-    teleop.take_outputs = lambda: [teleop.outputs.pop(0) for _ in teleop.outputs[:]]
-    identity = Identity(CLOCK, nonce.ljust(16), keys)
-    return CloudEndpoint(loop(), teleop, identity, newest_wins=True, start_ns=start_ns)
 
 
 def ring():
@@ -198,28 +181,6 @@ def talking():
     return talk
 
 
-SHARED_CLOCK = b"one clock for all"[:16]
-LIMIT_NS = 150_000_000_000
-
-
-class Ends(NamedTuple):
-    """Both endpoints and their link."""
-
-    world: WorldEndpoint
-    cloud: CloudEndpoint
-    run: VirtualRun
-
-
-def join(experiment, *, offset_ns=0, keys=None):
-    """Assemble an experiment; with an offset the two ends have different clocks."""
-    world_clock = b"another clock..." if offset_ns else SHARED_CLOCK
-    world = assembly.build_world(experiment, Identity(world_clock, b"world".ljust(16), keys))
-    identity = Identity(SHARED_CLOCK, b"cloud".ljust(16), keys)
-    cloud = assembly.build_cloud(experiment, identity, lambda: offset_ns)
-    links = assembly.build_links(experiment)
-    return Ends(world, cloud, VirtualRun(world, cloud, *links, cloud_clock=Clock(offset_ns)))
-
-
 def fly_on(run, until_ns, over=lambda: False):
     """Fly on; return the new records of world and of cloud."""
     of_world, of_cloud = [], []
@@ -232,17 +193,17 @@ def fly_on(run, until_ns, over=lambda: False):
     return of_world, of_cloud
 
 
-def records(experiment, **options):
+def records(experiment):
     """Fly and return the records of world and of cloud."""
-    _, cloud, run = join(experiment, **options)
-    return fly_on(run, LIMIT_NS, lambda: cloud.mission_over)
+    _, cloud, run = assembly.assemble(experiment)
+    limit_ns = round(assembly.flight_limit(experiment) * 1e9)
+    return fly_on(run, limit_ns, lambda: cloud.mission_over)
 
 
+@lru_cache(maxsize=8)
 def fly(name, *settings):
-    """Fly and return numbers and verdict."""
-    experiment = load_experiment(name, settings)
-    flown = Recording.from_records(*records(experiment))
-    return assess(flown, experiment, Run("virtual", "virtual"))
+    """Fly and return numbers and verdict; tests of the same flight share it."""
+    return fly_in_memory(load_experiment(name, settings))
 
 
 def numbers(assessment):
@@ -253,11 +214,3 @@ def both_ways(**keys):
     """Return settings for both directions of the link."""
     ways = ("uplink", "downlink")
     return [f"link.{way}.{key}={value}" for way in ways for key, value in keys.items()]
-
-
-def digest(experiment, **options):
-    """Compute the SHA-256 of all records of a flight."""
-    digest = RecordHash()
-    for each in records(experiment, **options):
-        digest.update(each)
-    return digest.hexdigest()

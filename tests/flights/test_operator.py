@@ -1,5 +1,7 @@
 """What teleop says reaches the robot in its own session only; an emergency stop in any."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from cloudrc import assembly
@@ -8,11 +10,17 @@ from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Sta
 from cloudrc.records import GuardChange
 from cloudrc.teleop.wire import ALARM
 from cloudrc.tunnel.codec import Kind, peek
-from tests.flights.conftest import HOVER, both_ways, fly_on, join
+from tests.flights.conftest import HOVER, both_ways, fly_on
 
 S = 1_000_000_000
 ELSEWHERE = (5.0, 5.0, 1.0)
 ESTOP = GuardState.ESTOP
+
+
+def join(experiment=HOVER):
+    """Assemble both ends and their flight."""
+    _, cloud, run = assembly.assemble(experiment)
+    return SimpleNamespace(cloud=cloud, run=run)
 
 
 def states(ends, seconds):
@@ -24,7 +32,7 @@ def states(ends, seconds):
 @pytest.fixture
 def ends():
     """Provide ends in flight."""
-    ends = join(HOVER)
+    ends = join()
     fly_on(ends.run, 4 * S)
     ends.cloud.take_datagrams()
     return ends
@@ -61,7 +69,7 @@ def test_requests_that_arm_nothing_are_always_passed_on(ends):
 
 
 def test_an_early_alarm_keeps_the_robot_on_the_ground():
-    ends = join(HOVER)
+    ends = join()
     ends.cloud.teleop.outputs.append(ALARM)
     assert states(ends, 3) == [ESTOP]
 

@@ -1,17 +1,11 @@
 """The missions and their required numbers, in virtual time; `-m full` flies more seeds."""
 
-import re
-from statistics import mean
-
 import pytest
 
 from cloudrc import assembly
-from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Mission
-from cloudrc.errors import BadInputError
-from cloudrc.records import MissionEvent
 from tests.conftest import nightly
-from tests.flights.conftest import fly, numbers, records
+from tests.flights.conftest import fly, numbers
 
 PROFILES = ("paper-p1", "paper-p2", "paper-p3")
 
@@ -34,7 +28,8 @@ def test_the_paper_flies(profile, seed):
 def test_verbatim_flies_although_late_commands_win():
     flight = fly("paper-verbatim")
     assert flight.verdict.failures == ()
-    assert numbers(flight)["loop_delay_mean"] > numbers(fly("paper"))["loop_delay_mean"]
+    newest = fly("paper", "link.profile=paper-p2", "seed=1")
+    assert numbers(flight)["loop_delay_mean"] > numbers(newest)["loop_delay_mean"]
 
 
 @pytest.mark.parametrize(
@@ -47,51 +42,6 @@ def test_verbatim_flies_although_late_commands_win():
 )
 def test_the_paper_flies_under_other_conditions_too(setting):
     assert fly("paper", setting).verdict.failures == ()
-
-
-@pytest.mark.parametrize(("limit", "low", "high"), [(0.10, 0.030, 0.034), (0.30, 0.0, 0.001)])
-def test_the_steady_error_is_that_of_the_integral_limit(limit, low, high):
-    n = numbers(fly("hover", f"world.low_level.integral_limit_xy={limit}"))
-    assert low <= n["steady_error_x"] <= high
-    assert max(n["steady_error_y"], n["steady_error_z"]) < 1e-4
-
-
-def prediction_error(predictor, seeds):
-    settings = ("link.profile=paper-p3", f"cloud.predictor={predictor}")
-    flights = [fly("steps", *settings, f"seed={seed}") for seed in seeds]
-    return mean(numbers(flight)["prediction_error_rms"] for flight in flights)
-
-
-@pytest.mark.parametrize("seeds", [range(1, 2), *nightly(range(1, 11))])
-def test_constant_velocity_predicts_far_better_than_nothing(seeds):
-    better, worse = (prediction_error(n, seeds) for n in ("constant_velocity", "last_sample"))
-    assert better < 0.3 * worse
-    if len(seeds) > 1:
-        assert better <= 0.013
-        assert 0.045 <= worse <= 0.065
-
-
-def test_split_estimates_the_delay_better_than_the_running_mean():
-    flights = (fly("steps", f"cloud.estimator={name}") for name in ("split", "running_mean"))
-    split, mean_ = (numbers(flight)["delay_estimate_error_rms"] for flight in flights)
-    assert split < 0.8 * mean_
-
-
-@pytest.mark.parametrize(
-    ("position", "scene"), [([9.2, 0.0, 1.0], "empty"), ([0.0, 0.0, 1.0], "pipes")]
-)
-def test_the_point_offered_for_an_illegal_one_is_reached(position, scene):
-    def load(point):
-        waypoint = f"mission.waypoints=[{{position_m: {point}}}]"
-        settings = [waypoint, f"world.scene={scene}", "criteria.time_limit_s=25"]
-        return load_experiment("hover", settings)
-
-    with pytest.raises(BadInputError) as caught:
-        load(position)
-    (offered,) = re.findall(r"nearest legal point found: (\[.*\])", str(caught.value))
-    _, cloud = records(load(offered))
-    events = [record.event for record in cloud if isinstance(record, MissionEvent)]
-    assert events == ["started", "reached", "done"]
 
 
 def test_the_limit_of_a_leg_defaults_to_three_times_its_time():

@@ -28,12 +28,6 @@ def test_a_replay_knows_where_the_robot_will_be(predictor, millimetres):
     assert n["prediction_error_rms"] < 12.5e-3
 
 
-def test_kalman_bears_the_noise_of_the_odometry():
-    noise = "world.sensors={position_noise_m: 0.005, velocity_noise_mps: 0.02}"
-    flight = fly("steps", *FAST, *LONG, noise, f"cloud.predictor={FILTERED}")
-    assert numbers(flight)["estimate_error_rms"] < 6e-3
-
-
 @pytest.mark.parametrize("case", [("command_history", 500), (BOX, 500), *nightly((BOX, 1000))])
 def test_a_replay_is_stable_at_round_trips_of_seconds(case):
     predictor, each_way_ms = case

@@ -5,24 +5,21 @@ from pathlib import Path
 import numpy as np
 
 from cloudrc.cli.link_record import one_way
-from cloudrc.config.load import load_experiment
 from cloudrc.link.logs import trace_of
 from cloudrc.link.traces import write_trace
-from cloudrc.record.columns import Recording
-from tests.flights.conftest import records
+from tests.flights.conftest import fly
 
 
-def fly(*settings):
+def uplink(*settings):
     settings = ("mission.steps.count=5", "guard.command_age_max_ms=1000", *settings)
-    recording = Recording.from_records(*records(load_experiment("steps", settings)))
-    return one_way(recording, Path("flight"), "uplink")
+    return one_way(fly("steps", *settings).flight.recording, Path("flight"), "uplink")
 
 
 def test_a_replayed_flight_gives_its_delays_and_losses_again(tmp_path):
     """A trace begins with its first packet, the link 4 packets earlier."""
-    path, flown = tmp_path / "t.csv", fly("link.profile=lossy")
+    path, flown = tmp_path / "t.csv", uplink("link.profile=lossy")
     path.write_text(write_trace(trace_of(flown)))
-    again = fly("link.profile=ideal", f"link.uplink.trace={path}")
+    again = uplink("link.profile=ideal", f"link.uplink.trace={path}")
     asked, got = (np.array([d or -1.0 for d in packets.delays]) for packets in (flown, again))
     assert np.sum(asked < 0) > 20
     assert np.abs(asked[204:1804] - got[200:1800]).max() < 1e-6

@@ -5,11 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from cloudrc.assembly import assemble
-from cloudrc.cli.run import fly
 from cloudrc.config.load import load_experiment
-from cloudrc.record.columns import Recording
-from tests.flights.conftest import fly_on
+from cloudrc.sweep.flight import fly_in_memory
+from tests.flights.conftest import numbers
 
 POINT = (0.5, 0.0, 0.9)
 
@@ -23,16 +21,7 @@ def waiting(*settings, seconds=1.0):
 
 
 def flown(*settings, seconds=1.0):
-    _, cloud, run = assemble(waiting(*settings, seconds=seconds))
-    return Recording.from_records(*fly_on(run, 30_000_000_000, lambda: cloud.mission_over))
-
-
-def numbers(folder, *settings):
-    """Fly and return the numbers of the report."""
-    folder.mkdir()
-    report = fly(waiting(*settings), "virtual", folder, page=False)
-    assert report["verdict"] == "success"
-    return {name: number["value"] for name, number in report["numbers"].items()}, report
+    return fly_in_memory(waiting(*settings, seconds=seconds)).flight.recording
 
 
 WEIGHT, ASSUMED = 1.06 * 9.8066, 1.05 * 9.81
@@ -88,19 +77,19 @@ def test_the_estimator_sees_compute_time_as_loop_delay():
     assert computed - usual == pytest.approx(0.008, abs=0.003)
 
 
-def test_measured_compute_time_marks_the_run(tmp_path):
-    _, report = numbers(tmp_path / "run", "cloud.compute_measured=true", "cloud.compute_ms=1")
-    assert report["notes"][0].startswith("Not repeatable: ")
+def test_measured_compute_time_marks_the_run():
+    measured = waiting("cloud.compute_measured=true", "cloud.compute_ms=1")
+    assert fly_in_memory(measured).notes[0].startswith("Not repeatable: ")
 
 
-def test_no_number_depends_on_the_clocks(tmp_path):
-    link = "link.profile=paper-p2"
-    same, _ = numbers(tmp_path / "same", link)
-    later, _ = numbers(tmp_path / "later", link, "cloud.clock_offset_s=86400.5")
+def test_no_number_depends_on_the_clocks():
+    clocks = ("seed=1", "cloud.clock_offset_s=86400.5", "cloud.clock_drift_ppm=-1000")
+    same, later, drift = (
+        numbers(fly_in_memory(waiting("link.profile=paper-p2", clock))) for clock in clocks
+    )
     of_one_clock = {"uplink_delay_mean", "downlink_delay_mean", "age_of_information_mean"}
     assert same.keys() - later.keys() == of_one_clock, "unknown, not wrong"
     assert later == {name: same[name] for name in later}
-    drift, _ = numbers(tmp_path / "drift", link, "cloud.clock_drift_ppm=-1000")
     assert drift.keys() == later.keys()
     for name in ("rtt_mean", "loop_delay_mean", "duration", "tracking_rms_measured"):
         assert drift[name] == pytest.approx(later[name], rel=0.03), name

@@ -7,7 +7,6 @@ commands per second. The mission lasts from 10 s to 20 s on the shared clock of 
 from dataclasses import dataclass, field
 from functools import cache
 
-from cloudrc.assembly import assemble
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Criteria, Mission, Waypoint
 from cloudrc.geometry.scene import Board, Pipe, Scene
@@ -25,6 +24,7 @@ from cloudrc.records import (
     SessionOpened,
     TelemetrySent,
 )
+from cloudrc.sweep.flight import fly_in_memory
 from tests.console.conftest import control
 
 SECOND = 1_000_000_000
@@ -156,12 +156,4 @@ def pressing(log, since, force):
 def paper():
     """Fly the shipped experiment once in virtual time."""
     experiment = load_experiment("paper")
-    _, cloud, run = assemble(experiment)
-    records: tuple[list[Record], list[Record]] = ([], [])
-
-    def sink(from_world, from_cloud):
-        records[0].extend(from_world)
-        records[1].extend(from_cloud)
-
-    run.fly(lambda: cloud.teleop.outcome is not None, 60 * SECOND, sink)
-    return experiment, Recording.from_records(*records)
+    return experiment, fly_in_memory(experiment).flight.recording

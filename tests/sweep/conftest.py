@@ -1,4 +1,4 @@
-"""Write the file of a short sweep."""
+"""The file of a short sweep, and results of its flights."""
 
 import pytest
 
@@ -12,6 +12,13 @@ SHORT = {
 }
 """Settings of `steps` for one second of flight."""
 GRID = {"cloud.predictor": ["last_sample", "constant_velocity"], "link.both.delay_ms": [40, 0]}
+
+
+def flown(verdict="success", *failures, **numbers):
+    """Return the result of a flight."""
+    text = "" if verdict == "success" else "a reason"
+    return {"verdict": verdict, "failures": [*failures], "text": text, "numbers": numbers,
+            "records_sha256": ""}  # fmt: skip
 
 
 @pytest.fixture

@@ -4,13 +4,9 @@ import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.sweep.compare import Pair, compare
+from tests.sweep.conftest import flown
 
 UNITS = {"iae_mean": "m", "rtt_mean": "s"}
-
-
-def flown(verdict="success", *failures, **numbers):
-    text = "" if verdict == "success" else "a reason"
-    return {"verdict": verdict, "failures": [*failures], "text": text, "numbers": numbers}
 
 
 def pairs(*both):

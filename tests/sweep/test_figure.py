@@ -8,6 +8,7 @@ from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
 from cloudrc.sweep.figure import draw_sweep
 from cloudrc.sweep.pairs import of_sweep, read_flights
+from tests.sweep.conftest import flown
 
 UNITS = {"iae_mean": "m s"}
 AXES = {"delay_ms": [20, 5, 10], "predictor": ["none", "kalman"], "gain": [[1, 2], [3, 4]]}
@@ -18,11 +19,10 @@ def sweep(folder, rows=None):
     points = [(d, p, g, seed) for seed in (2, 1) for g in AXES["gain"] for d in (5, 10, 20)
               for p in ("kalman", "none")]  # fmt: skip
     lines = [
-        {"key": str(n), "point": {"delay_ms": d, "predictor": p, "gain": g}, "seed": seed,
-         "verdict": "success" if d == 5 else "failure", "failures": [],
-         "numbers": {"iae_mean": d + seed + 0.5 * (p == "none")}, "text": "", "records_sha256": ""}
+        {"key": str(n), "point": {"delay_ms": d, "predictor": p, "gain": g}, "seed": seed}
+        | flown("success" if d == 5 else "failure", iae_mean=d + seed + 0.5 * (p == "none"))
         for n, (d, p, g, seed) in enumerate(points)
-    ]  # fmt: skip
+    ]
     folder.mkdir()
     summary = {"axes": AXES, "units": UNITS, "flights": 24}
     (folder / "sweep.json").write_text(json.dumps(summary))
@@ -63,8 +63,7 @@ def test_lines_prefer_axes_with_names(drawn):
 
 def row(point, seed, *failures):
     verdict = "failure" if failures else "success"
-    numbers = {"numbers": {"iae_mean": seed}}
-    return {"point": point, "seed": seed, "verdict": verdict, "failures": [*failures], **numbers}
+    return {"point": point, "seed": seed, **flown(verdict, *failures, iae_mean=seed)}
 
 
 def test_a_band_needs_six_values(drawn):
@@ -108,7 +107,7 @@ def test_a_sweep_without_axes_or_rows_has_no_figure(tmp_path):
         read_flights(sweep(tmp_path / "s", rows=0))
 
 
-def test_missing_flights_are_reported(tmp_path, capsys):
+def test_missing_flights_are_reported(tmp_path, capsys, drawn):
     """An unfinished sweep may give another result in the end."""
     folder = sweep(tmp_path / "s", rows=22)
     assert "s, of which 2 flights are not done, over" in of_sweep(folder, "none", "kalman").what

@@ -8,11 +8,7 @@ import pytest
 from cloudrc.errors import BadInputError
 from cloudrc.sweep import store
 from cloudrc.sweep.plan import read_plan
-
-
-def flown(**numbers):
-    rest = {"failures": [], "text": "", "records_sha256": ""}
-    return {"verdict": "success", "numbers": numbers, **rest}
+from tests.sweep.conftest import flown
 
 
 @pytest.fixture

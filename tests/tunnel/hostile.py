@@ -16,11 +16,13 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[2]))  # it is a program, too
 
+from cloudrc.assembly import build_cloud
 from cloudrc.records import Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
+from cloudrc.tunnel.end import Identity
 from cloudrc.tunnel.session import pair
-from tests.flights.conftest import MS, Bare, BareCloud, bare_cloud, ring
+from tests.flights.conftest import CLOCK, HOVER, MS, bare_world, ring
 
 STEPS_NS = tuple(round(ms * MS) for ms in (1, 30, 400, 1_500, 6_000, 150_000))
 """Steps of time [ns]; cloud asks for a session after 0.5 s of silence."""
@@ -35,9 +37,8 @@ class Target:
     def __init__(self, pace=5_000):
         """Begin a session; time passes after every `pace` datagrams."""
         self.pace, self.now_ns = pace, 0
-        self.bare = Bare(ring())
-        self.world = self.bare.world
-        self.cloud = bare_cloud(b"c" * 16, ring())
+        self.world = bare_world(ring=ring())
+        self.cloud = build_cloud(HOVER, Identity(CLOCK, b"c" * 16, ring()))
         self.frames: list[bytes] = []
         for _ in range(40):  # until both are in one session
             self.cloud.handle_deadline(self.cloud.next_deadline_ns())
@@ -48,11 +49,9 @@ class Target:
         assert self.cloud._session.epoch == self.world._session.epoch == 1
         self.captured = tuple(self.frames)
         self.frames.append(self.world._session.greet(Kind.BUSY, codec.encode_busy(b"c" * 16)))
-        talker = BareCloud(b"other", None)
-        talker.session = self.cloud._session
-        self.frames += [talker.command(), talker.start(1), talker.session.seal(Kind.ALIVE, b"")]
-        telemetry = bytes(codec.BODY_SIZES[Kind.TELEMETRY])
-        self.frames += [self.world._session.seal(Kind.TELEMETRY, telemetry) for _ in range(3)]
+        ends = dict.fromkeys(DOWNLINK, self.cloud) | {Kind.TELEMETRY: self.world}
+        for kind, end in ends.items():
+            self.frames.append(end._session.seal(kind, bytes(codec.BODY_SIZES[kind])))
         self.known, self.first = frozenset(self.frames), tuple(self.frames)
         self.strangers = pair(1, b"s" * 32)
         self.drain()

@@ -107,19 +107,20 @@ def simulator():
     return Simulator("pelican", "empty")
 
 
-PERIOD_NS = 10 * MS
 UP = (0.0, 0.0, 1.0)
 
 
 class Flight:
     """A robot in free air, commanded at 100 Hz."""
 
-    def __init__(self, simulator, limits=LIMITS):
-        self.guard = Guard(limits)
-        self.robot = Robot(simulator, LowLevel(), self.guard)
+    parts = (10,)
+    """Parts of a period [ms] in which the robot runs, as arrivals of commands divide it."""
+
+    def __init__(self, simulator, robot=None):
+        self.robot = robot or Robot(simulator, LowLevel(), Guard(LIMITS))
+        self.guard, self.now_ns = self.robot.guard, 0
         self.robot.put_on_ground(0, "test")
         self.guard.start_mission(0)
-        self.now_ns = 0
         self.room = 9.0  # smallest distance to a wall or the ceiling [m]
 
     @property
@@ -131,17 +132,24 @@ class Flight:
         return hypot(*self.readings.velocity)
 
     def fly(self, seconds, policy=None):
-        """Fly on; the policy gives the commands, None means silence."""
-        for _ in range(round(seconds * SECOND / PERIOD_NS)):
-            if policy is not None:
-                velocity = policy(self) if callable(policy) else policy
-                self.guard.accept_command(Command(0, self.now_ns, 0, velocity, 0.0), self.now_ns)
-            self.robot.run(self.now_ns, self.now_ns + PERIOD_NS)
-            self.now_ns += PERIOD_NS
-            x, y, z = self.readings.position
-            (ax, ay, _), (bx, by, bz) = fence.LOW, fence.HIGH
-            self.room = min(self.room, x - ax, bx - x, y - ay, by - y, bz - z)
+        """Fly on; the policy gives velocities or commands, None means silence."""
+        for _ in range(round(seconds * 100)):
+            sent = policy(self) if callable(policy) else policy
+            if sent is not None:
+                if type(sent) is not Command:
+                    sent = Command(0, self.now_ns, 0, sent, 0.0)
+                self.guard.accept_command(sent, self.now_ns)
+            for part in self.parts:
+                self.robot.run(self.now_ns, self.now_ns + part * MS)
+                self.now_ns += part * MS
+            self.look()
         return self
+
+    def look(self):
+        """Measure after each period."""
+        x, y, z = self.readings.position
+        (ax, ay, _), (bx, by, bz) = fence.LOW, fence.HIGH
+        self.room = min(self.room, x - ax, bx - x, y - ay, by - y, bz - z)
 
 
 def hostile(seed):

@@ -13,6 +13,7 @@ from cloudrc.messages import GuardState
 from cloudrc.world.guard.limits import COMMAND_MAX, growth
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, armed, command, sensed
 from tests.world.guard.test_limits import ANY, PLACES, SPEEDS, VECTORS
+from tests.world.guard.test_plan import PLANS
 
 TAKEN = st.tuples(*[st.floats(-COMMAND_MAX, COMMAND_MAX)] * 3)
 """Values that a command may have without being rejected."""
@@ -32,19 +33,25 @@ STEP_MAX = 0.04
     change=st.tuples(*[st.floats(-CHANGE_MAX, CHANGE_MAX)] * 3),
     age_ms=st.integers(-2, 300),
     after_ns=st.sampled_from([TICK, TICK, 300 * MS]),
+    plan=st.lists(st.one_of(SPEEDS, TAKEN, VECTORS), max_size=5).map(tuple),
+    planned_ms=st.sampled_from([0, 1, 20, 5000]),
 )
 @settings(max_examples=1000, deadline=None)
 def test_any_input_is_flown_inside_the_caps(
-    first, then, yaw_rate, place, velocity, change, age_ms, after_ns
+    first, then, yaw_rate, place, velocity, change, age_ms, after_ns, plan, planned_ms
 ):
-    """Fly one command, then another one or silence."""
-    guard = armed()
+    """Fly one command, then another one with its plan or silence."""
+    limits = PLANS if plan else LIMITS
+    guard = armed(limits)
     position = (1.0, 1.0, 1.0) if place is None else place
     guard.accept_command(command(first), 0)
     check_flown(guard, guard.step(0, sensed(position, velocity), 1.0), position)
     before, limited = guard.reference, guard.counts["limited_fence"]
+    sent = command(then, after_ns - age_ms * MS, yaw_rate)
     for _ in range(5 if age_ms < 0 else 1):  # five commands from the future lead to LAND
-        guard.accept_command(command(then, after_ns - age_ms * MS, yaw_rate), after_ns)
+        guard.accept_command(
+            sent._replace(plan=plan, planned_ns=after_ns + planned_ms * MS), after_ns
+        )
     if place is not None:
         position = tuple(at + STEP_MAX * d for at, d in zip(position, change, strict=True))
     velocity = tuple(v + d if abs(v) < 1e3 else v for v, d in zip(velocity, change, strict=True))
@@ -56,6 +63,9 @@ def test_any_input_is_flown_inside_the_caps(
         step_max = 12.0 * DT * (1 + 1e-9)
         assert hypot(*(growth(a, b) for a, b in zip(before, after, strict=True))) <= step_max
         assert dist(before, after) <= step_max or guard.counts["limited_fence"] > limited
+    for now_ns in range(after_ns + TICK, after_ns + 60 * MS, TICK):
+        check_flown(guard, guard.step(now_ns, sensed(position, velocity), DT), position)
+        assert hypot(*guard.reference) <= limits.speed_max
 
 
 def check_flown(guard, reference, position):

@@ -11,6 +11,7 @@ from cloudrc import assembly
 from cloudrc.config.load import load_experiment
 from cloudrc.geometry import fence
 from cloudrc.messages import Command, GuardState
+from cloudrc.sweep.flight import fly_in_memory
 from cloudrc.tunnel.end import Identity
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.limits import Limits
@@ -23,11 +24,9 @@ from cloudrc.world.native.robot import NativeRobot, make_robot, usable
 from cloudrc.world.robot import Robot
 from cloudrc.world.scene import FOLDER, mujoco
 from cloudrc.world.simulator import Simulator
-from tests.flights.conftest import digest
-from tests.world.guard.conftest import MS, SECOND, UP, hostile
+from tests.world.guard.conftest import LIMITS, MS, SECOND, UP, Flight, hostile
 
 pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
-LIMITS = Limits(fence.LOW, fence.HIGH)
 
 
 def robot_of(kind, scene="empty", limits=LIMITS, model="pelican"):
@@ -52,30 +51,20 @@ class Count:
         return ran
 
 
-class Pilot:
+class Pilot(Flight):
     """Flies a robot with the commands of a policy, and notes everything that is to be equal."""
 
-    def __init__(self, robot, start_ns=0):
-        self.robot, self.guard, self.now_ns = robot, robot.guard, start_ns
-        self.seen, self.states = [], set()
-        robot.put_on_ground(start_ns, "test")
-        self.guard.start_mission(start_ns)
+    parts = (4, 6)
 
-    def fly(self, seconds, policy, parts=(4, 6)):
-        """Fly; run every period in two parts [ms], as arrivals of commands divide it."""
-        for _ in range(round(seconds * 100)):
-            if (sent := policy(self)) is not None:
-                command = sent if type(sent) is Command else Command(0, self.now_ns, 0, sent, 0.0)
-                self.guard.accept_command(command, self.now_ns)
-            for part in parts:
-                self.robot.run(self.now_ns, self.now_ns + part * MS)
-                self.now_ns += part * MS
-            simulator, guard = self.robot.simulator, self.guard
-            self.states.add(guard.state)
-            self.seen += [simulator.readings, simulator.rotor_speeds, simulator.steps]
-            self.seen += [guard.state, guard.reference, dict(guard.counts)]
-            self.seen += [simulator.take_tip_force(), simulator.take_contacts()]
-        return self
+    def __init__(self, robot):
+        super().__init__(robot.simulator, robot)
+        self.seen = []
+
+    def look(self):
+        simulator, guard = self.robot.simulator, self.guard
+        self.seen += [simulator.readings, simulator.rotor_speeds, simulator.steps]
+        self.seen += [guard.state, guard.reference, dict(guard.counts)]
+        self.seen += [simulator.take_tip_force(), simulator.take_contacts()]
 
 
 def scaled(seed, scale):
@@ -116,7 +105,7 @@ def test_commands_fly_the_same_in_c(make, seconds, spawn, limits, least, scene_a
     assert count.steps >= least
     assert (model.ngeom, model.opt.disableflags) == before
     if limits is HOLDS:
-        assert {GuardState.TRACK, GuardState.HOLD, GuardState.LAND} <= pilots[1].states
+        assert {GuardState.TRACK, GuardState.HOLD, GuardState.LAND} <= {*pilots[1].seen[3::8]}
     if spawn is TOUCHING:
         assert any(touches and touches[0].body == "board" for touches in pilots[1].seen[7::8])
 
@@ -215,9 +204,9 @@ def test_geoms_that_air_acts_on_are_always_placed(setting):
 def test_an_experiment_has_the_same_records_in_c(name, settings, monkeypatch):
     experiment, identity = load_experiment(name, settings), Identity(bytes(16), bytes(16))
     assert isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
-    in_c = digest(experiment)
+    in_c = fly_in_memory(experiment).run.records_sha256
     monkeypatch.setenv(SWITCH, "0")
-    assert digest(experiment) == in_c
+    assert fly_in_memory(experiment).run.records_sha256 == in_c
     assert not isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
 
 
