@@ -9,7 +9,6 @@ from functools import partial
 from heapq import heappop, heappush
 from typing import TypeAlias, TypeVar
 
-from cloudrc.cloud.operator import Operator
 from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, RemoteTeleop, UnixPeer, send, turn
 from cloudrc.drivers.virtual import Clock
 from cloudrc.endpoint import Endpoint
@@ -25,7 +24,7 @@ from cloudrc.teleop.store import (
     UnavailableError,
     connect,
 )
-from cloudrc.teleop.wire import Output, RobotStatus
+from cloudrc.teleop.wire import Output
 
 T = TypeVar("T")
 FAR_NS = 1 << 62
@@ -214,33 +213,25 @@ class _Peer(UnixPeer):
 
 
 class TeleopModel:
-    """Teleop with a disk that survives restarts.
+    """Teleop in a process of its own, with a disk that survives restarts.
 
-    Teleop runs inside cloud's process, as an `Operator`, or in its own process. Its own process
-    wakes every 20 ms, and two Unix sockets connect it with cloud, as in production.
+    The process wakes every 20 ms. Two Unix sockets connect it with cloud, as in production.
 
     Attributes:
         service: Teleop's service; None while teleop is not running.
         events: Events of all missions, oldest first.
     """
 
-    outcome: MissionEvent | None = None
-    settled = True
-
-    def __init__(
-        self, contact_speed_max: float, name: bytes = b"desk", phase_ns: int | None = None
-    ) -> None:
+    def __init__(self, contact_speed_max: float, phase_ns: int) -> None:
         """Start teleop.
 
         Args:
             contact_speed_max: Limit of the speed of the arm's tip at the board [m/s].
-            name: Makes the mission numbers differ from those of another teleop.
-            phase_ns: First wake of teleop's own process [ns, virtual time]; None: no own process.
+            phase_ns: First wake of teleop's process [ns, virtual time].
         """
-        self._contact_speed_max, self._name, self._starts = contact_speed_max, name, 0
+        self._contact_speed_max, self._phase_ns, self._starts = contact_speed_max, phase_ns, 0
         self._disk = b""  # the bytes of its database
         self.events: list[MissionEvent] = []
-        self._phase_ns = phase_ns
         self._host: RestartableEndpoint | None = None
         self._peer = _Peer(lambda: self.service is not None)
         self._clouds = _Peer(lambda: self._host is not None and self._host.inner is not None)
@@ -250,14 +241,13 @@ class TeleopModel:
     def start(self, now_ns: int = 0) -> None:
         """Start a new process, which knows only what is on the disk; `now_ns` is ignored."""
         self._starts += 1
-        salt = b"%s %d" % (self._name, self._starts)  # random in production
         self._database = connect()
         if self._disk:
             self._database.deserialize(self._disk)
+        salt = b"desk %d" % self._starts  # random in production
         self.service: MissionService | None = MissionService(
             self._contact_speed_max, MissionStore(self._database, salt)
         )
-        self.outputs: Sequence[Output | Fault] = []
         self._peer.waiting.clear()
         self._calls, self._stops = list[Action](), list[Action]()
         self._unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
@@ -268,18 +258,15 @@ class TeleopModel:
         if self.service is not None:
             self._disk = self._database.serialize()
             self._database.close()
-        self.service, self.outputs = None, []
+        self.service = None
 
     def run_on(self, host: RestartableEndpoint) -> None:
-        """Run on the machine of `host`; teleop's own process wakes even if cloud is down."""
+        """Run on the machine of `host`; the process wakes even if cloud is down."""
         self._host = host
-        if self._phase_ns is not None:
-            host.at(self._phase_ns * 1e-9, self._wake)
+        host.at(self._phase_ns * 1e-9, self._wake)
 
-    def join(self, start_ns: int) -> Operator:
+    def join(self, start_ns: int) -> RemoteTeleop:
         """Return the `Operator` for a cloud that starts at `start_ns` on its clock [ns]."""
-        if self._phase_ns is None:
-            return self
         self._clouds.waiting.clear()  # lost with the previous cloud
         return RemoteTeleop(self._clouds, wire.encode, wire.decode, start_ns)
 
@@ -293,52 +280,24 @@ class TeleopModel:
         assert self.service is not None, "teleop is down"
         self.service.create(order, now_ns)
 
-    def ask(self, call: Call, now_ns: int) -> None:
-        """Call teleop's API at `now_ns` on cloud's clock [ns]; a refusal is ignored.
-
-        If teleop has its own process, it handles the call when the process wakes next.
-        """
-        if self._phase_ns is None:
-            self._call(call, now_ns)
-        else:
-            self._calls.append(partial(self._call, call))
+    def ask(self, call: Call) -> None:
+        """Call teleop's API; teleop handles the call when it wakes next. A refusal is ignored."""
+        self._calls.append(partial(self._call, call))
 
     def stop_rotors(self, now_ns: int) -> None:
-        """Make an emergency stop at `now_ns` on cloud's clock [ns].
+        """Make an emergency stop: send an alarm to cloud at once; `now_ns` is ignored.
 
-        If teleop is a process of its own, it sends an alarm to cloud at once. It stores the stop in
-        the next turn of its loop.
+        Teleop stores the stop when it wakes next.
         """
-        if self.service is not None and self._phase_ns is not None:
+        if self.service is not None:
             self._stops.append(partial(self._call, MissionService.stop_rotors))
             self._peer.send(wire.encode(wire.ALARM))
-        else:
-            self._call(MissionService.stop_rotors, now_ns)
 
     def freeze(self, now_ns: int, duration: float) -> None:
-        """Freeze teleop's own process as with SIGSTOP, from `now_ns` [ns] for `duration` [s]."""
-        if self.service is not None and self._phase_ns is not None and self._host is not None:
+        """Freeze the process as with SIGSTOP, from `now_ns` [ns] for `duration` [s]."""
+        if self.service is not None and self._host is not None:
             self._free_ns = max(self._free_ns, now_ns + round(duration * 1e9))
             self._host.at(self._free_ns * 1e-9, self._turn)  # a late process wakes at once
-
-    # The `Operator` of a cloud in the same process.
-
-    def see(self, seen: RobotStatus, now_ns: int) -> None:
-        """Implement `Operator.see`."""
-        if self.service is not None:
-            self.service.see(seen, now_ns)
-            self.outputs = [*self.outputs, *self._take(self.service)]
-
-    def handle_deadline(self, now_ns: int) -> None:
-        """Implement `Operator.handle_deadline`."""
-        if self.service is not None:
-            self.service.handle_deadline(now_ns)
-            self.outputs = [*self.outputs, *self._take(self.service)]
-
-    def take_outputs(self) -> Sequence[Output | Fault]:
-        """Implement `Operator.take_outputs`."""
-        outputs, self.outputs = self.outputs, []
-        return outputs
 
     def _call(self, call: Call, now_ns: int) -> None:
         if self.service is not None:

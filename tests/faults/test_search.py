@@ -30,7 +30,6 @@ def test_random_schedules_have_all_faults_and_calm_at_the_end():
     assert {event.kind for event in events} == set(KINDS)
     assert max(event.end for event in events) <= CALM
     assert 10 < sum(not schedule.events for schedule in drawn) < 60
-    assert 150 < sum(schedule.separate for schedule in drawn) < 250
     assert 70 < sum(schedule.hold_max < 60.0 for schedule in drawn) < 180
     # A hostile cloud flies alone or amid faults.
     hostile = {(chosen.policy, not chosen.events) for chosen in map(choose, range(200))}
@@ -59,9 +58,9 @@ def test_a_failing_schedule_is_shrunk_to_what_it_takes():
         return {"blackout", "loss"} <= kinds and schedule.seed == 5
 
     noise = [Event(kind, 0.5 + n, 1.0) for n, kind in enumerate(sorted(KINDS))]
-    smallest = shrink(Schedule(5, "lte", tuple(noise), reorder=0.2, separate=True), fails)
+    smallest = shrink(Schedule(5, "lte", tuple(noise), reorder=0.2), fails)
     assert sorted(event.kind for event in smallest.events) == ["blackout", "loss"]
-    assert (smallest.profile, smallest.reorder, smallest.separate) == ("paper-p2", 0.0, False)
+    assert (smallest.profile, smallest.reorder) == ("paper-p2", 0.0)
 
 
 BAD, INTERRUPTED = 5, 9

@@ -44,7 +44,7 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
 )
 def _cloud_paused(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
-    flight = Flight(seed=seed, separate=True)
+    flight = Flight(seed=seed)
     flight.cloud.at(at, partial(flight.cloud.freeze, duration=5.0))
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)

@@ -48,7 +48,7 @@ def _silence(outcome: Outcome, seed: int) -> None:
     for duration in (0.5, 3.0, 20.0):
         back, what = at + duration, f"{duration:g} s of silence"
         slow = ("guard.speed_max_mps=1.5", "criteria.time_limit_s=150")
-        flight = Flight(*slow, seed=seed, link=silent(at, duration), separate=True)
+        flight = Flight(*slow, seed=seed, link=silent(at, duration))
         fly_safely(outcome, flight, 150.0)
         measures.held_in_time(outcome, flight, f"{what}: HOLD after")
         if duration >= 3.0:
@@ -79,7 +79,7 @@ def _long_silence(outcome: Outcome, seed: int) -> None:
 def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
     """Interrupt the link at `at` [s] for 75 s: the robot must land and stop its rotors."""
     limit = "criteria.time_limit_s=200"
-    flight = Flight(limit, seed=seed, link=silent(at, 75.0), separate=True)
+    flight = Flight(limit, seed=seed, link=silent(at, 75.0))
     flight.fly(at + 80.0)
     measures.safe(outcome, flight)
     held = measures.first_into(flight, GuardState.HOLD)
