@@ -18,13 +18,13 @@ from cloudrc.cli import client
 from cloudrc.cli.client import Api, UnreachableError, mission_path, token_file, token_reader
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
-from cloudrc.cli.output import escape, format_document, output_argument, print_line, table
+from cloudrc.cli.output import format_document, output_argument, print_line, table
+from cloudrc.cli.parser import number
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.drivers.machine import Deadline
 from cloudrc.errors import (
     BadInputError,
     CloudrcError,
-    InterruptedRunError,
     MissingPrerequisiteError,
     TimedOutError,
 )
@@ -67,8 +67,6 @@ The second limit is longer, because the pod of the API may still have to load it
 TURN_MAX = 30.0
 """Longest time that a request and the pause after the request take [s]. If more time has passed,
 this process was suspended; the suspension does not count towards a time limit."""
-TERMINATION_LOG = Path("/dev/termination-log")
-"""File in a pod for the pod's last message, which `kubectl describe` shows after the pod's end."""
 LIMIT_MAX = 86_400.0
 """Time limit of a Job if the mission file gives no time limit [s]. Teleop ends the mission
 earlier, by the time limit of the release's experiment."""
@@ -118,9 +116,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         )
     follow = "keep printing new events"
     verbs["logs"].add_argument("-f", "--follow", action="store_true", help=follow)
+    about, metres = "[m], world frame", number(-1000, 1000, "metres")
     for axis in "XYZ":
-        about = "[m], world frame"
-        verbs["goto"].add_argument(axis.lower(), type=_metres, metavar=axis, help=about)
+        verbs["goto"].add_argument(axis.lower(), type=metres, metavar=axis, help=about)
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -141,13 +139,6 @@ def execute(options: argparse.Namespace) -> int:
         return _run_job(options)
     with _forwarded_api(options) as forwarded:
         return carry_out(options, forwarded)
-
-
-def _metres(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of metres") from None
 
 
 def read_mission(name: str, shown: str = "") -> Json:
@@ -221,41 +212,28 @@ def describe_verdict(verdict: Mapping[str, Any]) -> str:
 
 
 def _fly(options: argparse.Namespace, api: Api) -> int:
-    """Post a mission, wait for its verdict, return the exit code; on Ctrl-C cancel the mission."""
-    interrupt_on_signals()
-    mission_id, text = "", ""
-    follower = MissionFollower(api, API_TIMEOUT)
+    """Post a mission, follow it to its verdict, and return the exit code of the verdict.
+
+    After Ctrl-C the mission of `run` goes on; the mission of a Job (`fly`) is cancelled.
+    """
+    is_job = options.verb == "fly"
+    if is_job:
+        interrupt_on_signals()
+        order = {**read_mission(options.mission), "key": options.key}
+    else:
+        order = read_mission(options.mission, options.name)
+    follower = MissionFollower(api, API_TIMEOUT if is_job else RUN_TIMEOUT)
+    mission_id = follower.post({**order, "queue": options.queue})
     try:
-        mission = read_mission(options.mission)
-        mission_id = follower.post({**mission, "key": options.key, "queue": options.queue})
         verdict = follower.follow(mission_id)
-        text, code = escape(describe_verdict(verdict)), int(verdict["exit_code"])
     except KeyboardInterrupt:
-        if mission_id:
+        if is_job:
             with suppress(CloudrcError):
                 api.post(f"{mission_path(mission_id)}/cancel")
-        text = "INTERRUPTED: the Job was stopped, its mission is cancelled"
-        code = InterruptedRunError.exit_code
-    except CloudrcError as error:
-        text = str(error)
-        raise
-    finally:
-        with suppress(OSError):  # on failure Kubernetes shows the last line of the log instead
-            if text and TERMINATION_LOG.exists():
-                TERMINATION_LOG.write_text(text + "\n", encoding="utf-8")
-    print_line(text)
-    return code
-
-
-def _run(options: argparse.Namespace, api: Api) -> int:
-    mission = read_mission(options.mission, options.name)
-    follower = MissionFollower(api, RUN_TIMEOUT)
-    mission_id = follower.post({**mission, "queue": options.queue})
-    try:
-        verdict = follower.follow(mission_id)
-    except KeyboardInterrupt:
-        command = f"cloudrc mission cancel {mission_id}"
-        print_line(f"mission {mission_id} goes on; cancel it: {command}", sys.stderr)
+            print_line("INTERRUPTED: the Job was stopped, its mission is cancelled")
+        else:
+            command = f"cloudrc mission cancel {mission_id}"
+            print_line(f"mission {mission_id} goes on; cancel it: {command}", sys.stderr)
         raise
     print_line(describe_verdict(verdict))
     return int(verdict["exit_code"])
@@ -369,7 +347,7 @@ def _drive(_: argparse.Namespace, api: Api) -> int:
 
 
 VERBS: dict[str, tuple[str, Callable[[argparse.Namespace, Api], int]]] = {
-    "run": ("fly a mission and show its progress until the verdict", _run),
+    "run": ("fly a mission and show its progress until the verdict", _fly),
     "list": ("list all missions", _list),
     "status": ("show the robot's state, or the state of a mission", _status),
     "cancel": ("cancel a mission; the robot holds its position", _cancel),
