@@ -182,7 +182,7 @@ def test_the_token_file_comes_from_flag_or_environment(api, folder, monkeypatch,
     assert "no mission is under way" in hold(5, f"--token-file {api.token_file}")
     wrong.write_text("two words")
     error = hold(2)
-    assert "holds no token" in error
+    assert "a token is 16 to 512 visible" in error
     assert "two words" not in error
     assert "--token-file none: No such file or directory" in hold(2, "--token-file none")
 
