@@ -245,8 +245,8 @@ def _run_cloud(options: argparse.Namespace) -> int:
     experiment, identity, end = open_end(options, "cloud")
     teleop = None
     if options.teleop:
-        peer = UnixPeer(options.teleop / "cloud.sock", options.teleop / "teleop.sock")
-        teleop = RemoteTeleop(peer, wire.encode, wire.decode, time.monotonic_ns())
+        paths = options.teleop / "cloud.sock", options.teleop / "teleop.sock"
+        teleop = RemoteTeleop(UnixPeer(*paths, wire.encode, wire.decode), time.monotonic_ns())
     cloud = assembly.build_cloud(experiment, identity, time.monotonic_ns, teleop)
     if options.tap:
         end.tap = Tap(options.tap, lambda: cloud.telemetry)

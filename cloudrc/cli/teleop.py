@@ -172,9 +172,10 @@ def _fly(
     from cloudrc.teleop import wire
 
     feed = Feed.on_stdout(watched=options.feed)
-    peer = UnixPeer(options.socket / "teleop.sock", options.socket / "cloud.sock")
+    paths = options.socket / "teleop.sock", options.socket / "cloud.sock"
+    peer = UnixPeer(*paths, wire.encode, wire.decode)
     if server is not None:
-        server.bridge.alarm = lambda: peer.send(wire.encode(wire.ALARM))
+        server.bridge.alarm = lambda: peer.send(wire.ALARM)
         server.bridge.open(service)
     feed.ready()
 
@@ -196,7 +197,8 @@ def _fly(
     if notice := service.book.notice:
         tell([Fault(0, "journal", notice), Counted(0, "teleop", "journal_repaired", 1)])
     serve_teleop(
-        *(service, peer, wire.encode, wire.decode),
+        service,
+        peer,
         calls=server.bridge.take if server else list,
         stops=server.bridge.take_stops if server else list,
         tell=tell,

@@ -14,7 +14,6 @@ from cloudrc.drivers.virtual import Clock
 from cloudrc.endpoint import Endpoint
 from cloudrc.messages import NEVER_NS
 from cloudrc.records import Fault, Lateness, MissionEvent, Record
-from cloudrc.teleop import wire
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import (
     ConflictError,
@@ -24,7 +23,7 @@ from cloudrc.teleop.store import (
     UnavailableError,
     connect,
 )
-from cloudrc.teleop.wire import Output
+from cloudrc.teleop.wire import ALARM, Message, Output
 
 T = TypeVar("T")
 FAR_NS = 1 << 62
@@ -199,16 +198,16 @@ class _Peer(UnixPeer):
 
     def __init__(self, is_open: Callable[[], bool]) -> None:
         self.other, self._is_open = self, is_open
-        self.waiting: list[bytes] = []
+        self.waiting: list[Message | None] = []
 
-    def receive(self) -> list[bytes]:
+    def receive(self) -> list[Message | None]:
         return _take_all(self.waiting)
 
-    def send(self, data: bytes) -> bool:
-        """Implement `UnixPeer.send`: put a datagram into the other socket if it has room."""
+    def send(self, message: Message | None) -> bool:
+        """Implement `UnixPeer.send`: put a message into the other socket if it has room."""
         sent = self.other._is_open() and len(self.other.waiting) < UNIX_SOCKET_MAX
         if sent:
-            self.other.waiting.append(data)
+            self.other.waiting.append(message)
         return sent
 
 
@@ -250,7 +249,7 @@ class TeleopModel:
         )
         self._peer.waiting.clear()
         self._calls, self._stops = list[Action](), list[Action]()
-        self._unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
+        self._unsent: deque[MissionEvent] = deque(maxlen=EVENTS_KEPT)
         self._free_ns, self._turn_ns, self._blind = 0, NEVER_NS, 0
 
     def kill(self, now_ns: int = 0) -> None:
@@ -268,7 +267,7 @@ class TeleopModel:
     def join(self, start_ns: int) -> RemoteTeleop:
         """Return the `Operator` for a cloud that starts at `start_ns` on its clock [ns]."""
         self._clouds.waiting.clear()  # lost with the previous cloud
-        return RemoteTeleop(self._clouds, wire.encode, wire.decode, start_ns)
+        return RemoteTeleop(self._clouds, start_ns)
 
     @property
     def missions(self) -> list[Mission]:
@@ -291,7 +290,7 @@ class TeleopModel:
         """
         if self.service is not None:
             self._stops.append(partial(self._call, MissionService.stop_rotors))
-            self._peer.send(wire.encode(wire.ALARM))
+            self._peer.send(ALARM)
 
     def freeze(self, now_ns: int, duration: float) -> None:
         """Freeze the process as with SIGSTOP, from `now_ns` [ns] for `duration` [s]."""
@@ -321,7 +320,6 @@ class TeleopModel:
         self._blind = turn(
             self.service,
             self._peer,
-            wire.decode,
             partial(_take_all, self._calls),
             stops=partial(_take_all, self._stops),
             blind=self._blind,
@@ -329,7 +327,7 @@ class TeleopModel:
             now_ns=self._host.clock.at(now_ns),
         )
         # Events wait until cloud runs; all other outputs are repeated.
-        send(self._take(self.service), self._unsent, self._peer, wire.encode)
+        send(self._take(self.service), self._unsent, self._peer)
 
 
 def _take_all(waiting: list[T]) -> list[T]:

@@ -12,7 +12,6 @@ from cloudrc.config.load import load_experiment
 from cloudrc.drivers.teleop import turn
 from cloudrc.exposition.table import MISSION_OUTCOMES
 from cloudrc.messages import Cause, GuardState, Setpoint, Start
-from cloudrc.teleop import wire
 from cloudrc.teleop.api import Bridge
 from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX, next_step
 from cloudrc.teleop.store import ConflictError, Order, UnavailableError
@@ -283,9 +282,9 @@ def test_after_a_stall_the_stop_belongs_to_the_stopped_mission():
     bridge.open(flight.teleop)
     stopped = bridge.submit(type(flight.teleop).stop_rotors, "stop")
     flight.guard = ESTOP
-    cloud = Mock(receive=lambda: [wire.encode(flight.seen)])
+    cloud = Mock(receive=lambda: [flight.seen])
     how = {"stops": bridge.take_stops, "blind": 2, "late_ns": 0, "now_ns": flight.now_ns + 10**9}
-    turn(flight.teleop, cloud, wire.decode, bridge.take, **how)
+    turn(flight.teleop, cloud, bridge.take, **how)
     assert stopped.result()["id"] == mission_id
     assert flight.names(mission_id)[-1] == "emergency_stopped"
 
