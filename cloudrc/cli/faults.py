@@ -79,7 +79,7 @@ def _folder(text: str) -> Path:
 
 
 JOBS = (read_count, 1, "J", "number of parallel processes, at most one per core (default: 1)")
-STORED = f"folder for failing schedules, after reduction (default: ./{STORE})"
+STORED = f"folder for failing schedules (default: ./{STORE})"
 OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
     "run": {"--seed": (whole_number(0, SEED_MAX), 1, "N", "seed (default: 1)"), "--jobs": JOBS},
     "search": {

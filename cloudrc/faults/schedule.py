@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import yaml
@@ -163,20 +163,15 @@ def _change(profile: DirectionProfile, active: list[Event], at: float) -> Change
     return Change(at, delay=delay, jitter=jitter, loss=loss)
 
 
+_SCHEDULE = TypeAdapter(Schedule)
+
+
 def dump(schedule: Schedule, note: str = "") -> str:
     """Format a schedule as YAML, with a note at the top."""
-    values, plain = asdict(schedule).items(), asdict(Schedule(-1))
-    document: dict[str, Any] = {name: value for name, value in values if value != plain[name]}
-    document["events"] = [
-        {name: value for name, value in asdict(event).items() if value or name == "at"}
-        for event in sorted(schedule.events, key=lambda event: event.at)
-    ]
+    document = _SCHEDULE.dump_python(schedule, mode="json", exclude_defaults=True)
     head = "".join(f"# {line}\n" for line in note.splitlines())
     text: str = yaml.safe_dump(document, sort_keys=False, width=100)
     return head + text
-
-
-_SCHEDULE = TypeAdapter(Schedule)
 
 
 def load(path: Path) -> Schedule:
