@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from cloudrc.cloud.operator import EmergencyStopRepeater
 from cloudrc.faults.adversary import POLICIES, choose
 from cloudrc.faults.invariants import OrderInvariant, Watch
 from cloudrc.faults.schedule import Event, Schedule, compose, load
@@ -96,7 +97,7 @@ def fails_to_shut_down(patch):
         (ignores(GuardLimits, "ramp_ns", 0), "cap", replace(HELD, duration=9.0)),
         (ignores(GuardLimits, "alone_max_ns", lambda *_: 3_600_000 * MS), "hold", HELD),
         (applies_late_commands, "order", Schedule(1, reorder=0.5, duration=4.0)),
-        (ignores(MissionService, "stop_rotors"), "obeyed", HELD),
+        (ignores(EmergencyStopRepeater, "sound"), "obeyed", HELD),
         (ignores(MissionService, "acknowledge"), "stuck", HELD),
         (
             fails_to_shut_down,
