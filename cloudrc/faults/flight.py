@@ -19,7 +19,7 @@ from cloudrc.drivers.teleop import PERIOD_NS as WAKE_NS
 from cloudrc.drivers.virtual import Clock, VirtualRun
 from cloudrc.endpoint import Endpoint
 from cloudrc.faults.adversary import DishonestLoop, HostileOperator, Lie, Words
-from cloudrc.faults.invariants import OrderInvariant, Watch
+from cloudrc.faults.invariants import Watch
 from cloudrc.faults.models import EndpointGroup, RestartableEndpoint, TeleopModel
 from cloudrc.faults.scenario import generator
 from cloudrc.link.model import LinkDirection
@@ -81,10 +81,9 @@ class Flight:
         self.secrets, self.rings = {"world": SECRET, "cloud": SECRET}, dict[str, KeyRing]()
         self.generations = {"world": 0, "cloud": 0}
         self.of_world, self.of_cloud = list[Record](), list[Record]()
-        self.changes, self.world_starts_ns = list[GuardChange](), list[int]()
+        self.changes = list[GuardChange]()
         self._hash, self.watch = RecordHash(), Watch(self.experiment.guard)
-        order = OrderInvariant(self.watch, self.world_starts_ns)
-        self.listeners: list[Callable[[list[Record], int], None]] = [order.see]
+        self.listeners: list[Callable[[list[Record], int], None]] = [self.watch.see]
         self.teleop = TeleopModel(
             self.experiment.criteria.contact_speed_max_mps,
             int(generator(self.experiment.seed, 45).integers(WAKE_NS)),
@@ -180,7 +179,6 @@ class Flight:
         identity = self._begin("world", SHARED)
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
         self.watch.attach(world.robot, start_ns, honest=self._honest)
-        self.world_starts_ns.append(start_ns)
         return world
 
     def _build_cloud(self, start_ns: int) -> Endpoint:

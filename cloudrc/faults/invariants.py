@@ -90,7 +90,7 @@ class Breach(NamedTuple):
 
 
 class Watch:
-    """Collects the breaches of a flight, including those after a restart of world."""
+    """Collects the breaches of a flight, and checks the order of commands."""
 
     def __init__(self, limits: ResolvedGuard) -> None:
         self.limits = limits
@@ -98,44 +98,34 @@ class Watch:
         self.counts: Counter[str] = Counter()  # of breaches, by kind
         self.margin = 9.0  # smallest distance of the base to the fence, without the floor [m]
         self.speed = 0.0  # largest reference [m/s]
+        self.starts_ns: list[int] = []  # when world's processes began [ns]
+        self._newest = (0, 0, -1)  # newest command: process of world, epoch and counter
 
     def attach(self, robot: Robot, start_ns: int, *, honest: bool) -> None:
         """Check a robot from `start_ns` [ns] on; if cloud is `honest`, check its contacts, too."""
         robot.observers.append(RobotInvariants(robot, self, start_ns, honest))
+        self.starts_ns.append(start_ns)
+
+    def see(self, records: list[Record], now_ns: int) -> None:
+        """Check that new records of world show commands that are applied once and in order.
+
+        A restarted world continues from the last epoch that cloud knows. If cloud knows no epoch,
+        world starts with the first epoch again, which is allowed.
+        """
+        for record in records:
+            if isinstance(record, CommandApplied | SessionOpened):
+                counter = record.counter if isinstance(record, CommandApplied) else -1
+                process = bisect_right(self.starts_ns, record.stamp_ns)
+                if (this := (process, record.epoch, counter)) <= self._newest:
+                    text = f"command {counter} of epoch {record.epoch} after {self._newest[1:]}"
+                    self.note(record.stamp_ns, "order", text)
+                self._newest = max(self._newest, this)
 
     def note(self, now_ns: int, kind: str, text: str) -> None:
         """Record a breach at `now_ns` [ns]."""
         self.counts[kind] += 1
         if self.counts[kind] <= REPORTED:
             self.breaches.append(Breach(now_ns * 1e-9, kind, text))
-
-
-class OrderInvariant:
-    """Checks that commands are applied once and in order."""
-
-    def __init__(self, watch: Watch, world_starts_ns: list[int]) -> None:
-        """Check commands of world's processes, which began at `world_starts_ns` [ns]."""
-        self._watch, self._world_starts_ns = watch, world_starts_ns
-        self._newest = (0, 0, -1)  # process of world, epoch and counter
-
-    def see(self, records: list[Record], now_ns: int) -> None:
-        """Check new records of world.
-
-        A restarted world continues from the last epoch that cloud knows. If cloud knows no epoch,
-        world starts with the first epoch again, which is allowed.
-        """
-        for record in records:
-            if isinstance(record, CommandApplied):
-                self._check(record.epoch, record.counter, record.stamp_ns)
-            elif isinstance(record, SessionOpened):
-                self._check(record.epoch, -1, record.stamp_ns)
-
-    def _check(self, epoch: int, counter: int, stamp_ns: int) -> None:
-        this = bisect_right(self._world_starts_ns, stamp_ns), epoch, counter
-        if this <= self._newest:
-            text = f"command {counter} of epoch {epoch} after {self._newest[1:]}"
-            self._watch.note(stamp_ns, "order", text)
-        self._newest = max(self._newest, this)
 
 
 class RobotInvariants:
