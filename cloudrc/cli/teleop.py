@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import print_line
@@ -174,9 +174,11 @@ def _fly(
     feed = Feed.on_stdout(watched=options.feed)
     paths = options.socket / "teleop.sock", options.socket / "cloud.sock"
     peer = UnixPeer(*paths, wire.encode, wire.decode)
+    queued: dict[str, Any] = {}
     if server is not None:
         server.bridge.alarm = lambda: peer.send(wire.ALARM)
         server.bridge.open(service)
+        queued = {"calls": server.bridge.make_calls, "stops": server.bridge.make_stops}
     feed.ready()
 
     def tell(records: Sequence[Record]) -> None:
@@ -196,14 +198,7 @@ def _fly(
 
     if notice := service.book.notice:
         tell([Fault(0, "journal", notice), Counted(0, "teleop", "journal_repaired", 1)])
-    serve_teleop(
-        service,
-        peer,
-        calls=server.bridge.take if server else list,
-        stops=server.bridge.take_stops if server else list,
-        tell=tell,
-        stop=feed.alive_while(is_over),
-    )
+    serve_teleop(service, peer, tell=tell, stop=feed.alive_while(is_over), **queued)
 
 
 def _open_store(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -42,9 +42,8 @@ EVENTS_KEPT = 256
 LAST_WORD_NS = 800_000_000
 """Time for which cloud, when it has to end, still forwards teleop's request to hold [ns]. A process
 has 1.5 s to end."""
-Calls = Callable[[], Iterable[Callable[[int], None]]]
-"""Function that returns the calls that other threads have queued. Each call has one argument, the
-time [ns], monotonic clock."""
+Make = Callable[[int], None]
+"""Function that makes the calls that other threads have queued, at a time [ns], monotonic clock."""
 
 
 class UnixPeer:
@@ -187,15 +186,15 @@ def serve_teleop(
     machine: Any,
     peer: UnixPeer,
     *,
-    calls: Calls,
-    stops: Calls = list,
+    calls: Make = lambda now_ns: None,
+    stops: Make = lambda now_ns: None,
     tell: Callable[[list[MissionEvent | Fault]], None],
     stop: Callable[[], bool],
 ) -> None:
     """Run the loop of teleop's process at 50 Hz in real time until `stop()` returns true.
 
     `machine` is a `MissionService`, or has its methods hear, see, handle_deadline and take_outputs.
-    `stops` returns the queued emergency stops and holds, `calls` all other calls of the API. `tell`
+    `stops` makes the queued emergency stops and holds, `calls` all other calls of the API. `tell`
     is called with the events and faults of each period, and must not block.
     """
     unsent: deque[MissionEvent] = deque(maxlen=EVENTS_KEPT)
@@ -215,9 +214,9 @@ def serve_teleop(
 def turn(
     machine: Any,
     peer: UnixPeer,
-    calls: Calls,
+    calls: Make,
     *,
-    stops: Calls = list,
+    stops: Make,
     blind: int,
     late_ns: int,
     now_ns: int,
@@ -240,12 +239,10 @@ def turn(
     if arrived:
         machine.hear(now_ns)
     # A stop or a hold is queued before a state can show its effect, so these come first.
-    for stop in stops():
-        stop(now_ns)
+    stops(now_ns)
     if states:
         machine.see(states[-1], now_ns)
-    for call in calls():
-        call(now_ns)
+    calls(now_ns)
     machine.handle_deadline(now_ns)
     return 0
 

@@ -248,7 +248,7 @@ class TeleopModel:
             self._contact_speed_max, MissionStore(self._database, salt)
         )
         self._peer.waiting.clear()
-        self._calls, self._stops = list[Action](), list[Action]()
+        self._calls, self._stops = list[Call](), list[Call]()
         self._unsent: deque[MissionEvent] = deque(maxlen=EVENTS_KEPT)
         self._free_ns, self._turn_ns, self._blind = 0, NEVER_NS, 0
 
@@ -281,7 +281,7 @@ class TeleopModel:
 
     def ask(self, call: Call) -> None:
         """Call teleop's API; teleop handles the call when it wakes next. A refusal is ignored."""
-        self._calls.append(partial(self._call, call))
+        self._calls.append(call)
 
     def stop_rotors(self, now_ns: int) -> None:
         """Make an emergency stop: send an alarm to cloud at once; `now_ns` is ignored.
@@ -289,7 +289,7 @@ class TeleopModel:
         Teleop stores the stop when it wakes next.
         """
         if self.service is not None:
-            self._stops.append(partial(self._call, MissionService.stop_rotors))
+            self._stops.append(MissionService.stop_rotors)
             self._peer.send(ALARM)
 
     def freeze(self, now_ns: int, duration: float) -> None:
@@ -297,11 +297,6 @@ class TeleopModel:
         if self.service is not None and self._host is not None:
             self._free_ns = max(self._free_ns, now_ns + round(duration * 1e9))
             self._host.at(self._free_ns * 1e-9, self._turn)  # a late process wakes at once
-
-    def _call(self, call: Call, now_ns: int) -> None:
-        if self.service is not None:
-            with suppress(ConflictError, UnavailableError):
-                call(self.service, now_ns)
 
     def _take(self, service: MissionService) -> list[Output | Fault]:
         outputs = service.take_outputs()
@@ -320,14 +315,20 @@ class TeleopModel:
         self._blind = turn(
             self.service,
             self._peer,
-            partial(_take_all, self._calls),
-            stops=partial(_take_all, self._stops),
+            partial(_make, self.service, self._calls),
+            stops=partial(_make, self.service, self._stops),
             blind=self._blind,
             late_ns=now_ns - turned_ns - PERIOD_NS if turned_ns >= 0 else 0,
             now_ns=self._host.clock.at(now_ns),
         )
         # Events wait until cloud runs; all other outputs are repeated.
         send(self._take(self.service), self._unsent, self._peer)
+
+
+def _make(service: MissionService, calls: list[Call], now_ns: int) -> None:
+    for call in _take_all(calls):
+        with suppress(ConflictError, UnavailableError):
+            call(service, now_ns)
 
 
 def _take_all(waiting: list[T]) -> list[T]:

@@ -99,7 +99,7 @@ class Machine:
         return outputs
 
 
-def serve(machine, peer, wakes, calls=list, told=None):
+def serve(machine, peer, wakes, calls=lambda now_ns: None, told=None):
     """Serve for so many wakes."""
     left, tell = iter(range(wakes)), [].extend if told is None else told.extend
     how = {"calls": calls, "tell": tell, "stop": lambda: next(left, None) is None}
@@ -122,7 +122,7 @@ def test_after_a_stall_old_states_are_skipped_before_calls(peers, monkeypatch, w
     At each wake a new state has arrived (p), or the wake follows a stall (s) with an old one.
     """
     machine, clock, coming = Machine(), [SECOND], iter(wakes)
-    calls = [[lambda now_ns: machine.seen.append("asked")]]
+    calls = ["asked"]
     if wakes == "-":
         peers[1].send(PAST)
 
@@ -134,7 +134,7 @@ def test_after_a_stall_old_states_are_skipped_before_calls(peers, monkeypatch, w
 
     monkeypatch.setattr("cloudrc.drivers.teleop.time.sleep", sleep)
     monkeypatch.setattr("cloudrc.drivers.teleop.time.monotonic_ns", lambda: clock[0])
-    serve(machine, peers[0], len(wakes), lambda: calls.pop() if calls else [])
+    serve(machine, peers[0], len(wakes), lambda now_ns: calls and machine.seen.append(calls.pop()))
     assert machine.seen == done
     assert bool(machine.heard) == bool({POINT, PAST} & set(done)), "old signs of life do not count"
 
@@ -146,7 +146,7 @@ def test_events_wait_for_an_absent_cloud_in_order_and_bounded(peers, tmp_path):
     events = [event(number) for number in range(EVENTS_KEPT + 50)]
     machine, told = Machine(), []
     machine.outputs = [POINT, *events, Fault(0, "journal", "full")]
-    server = threading.Thread(target=serve, args=(machine, teleop, 40, list, told))
+    server = threading.Thread(target=serve, args=(machine, teleop, 40), kwargs={"told": told})
     server.start()
     received, back, limit = [], None, time.monotonic() + 5.0
     while len(received) < EVENTS_KEPT:

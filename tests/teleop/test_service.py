@@ -283,8 +283,8 @@ def test_after_a_stall_the_stop_belongs_to_the_stopped_mission():
     stopped = bridge.submit(type(flight.teleop).stop_rotors, "stop")
     flight.guard = ESTOP
     cloud = Mock(receive=lambda: [flight.seen])
-    how = {"stops": bridge.take_stops, "blind": 2, "late_ns": 0, "now_ns": flight.now_ns + 10**9}
-    turn(flight.teleop, cloud, bridge.take, **how)
+    how = {"stops": bridge.make_stops, "blind": 2, "late_ns": 0, "now_ns": flight.now_ns + 10**9}
+    turn(flight.teleop, cloud, bridge.make_calls, **how)
     assert stopped.result()["id"] == mission_id
     assert flight.names(mission_id)[-1] == "emergency_stopped"
 
