@@ -167,7 +167,7 @@ def _fly(
 ) -> None:
     """Serve missions and API requests until `over()` is true."""
     from cloudrc.drivers.process import Feed
-    from cloudrc.drivers.teleop import UnixPeer, serve_teleop
+    from cloudrc.drivers.teleop import TeleopLoop, UnixPeer
     from cloudrc.records import Counted, Fault
     from cloudrc.teleop import wire
 
@@ -198,7 +198,7 @@ def _fly(
 
     if notice := service.book.notice:
         tell([Fault(0, "journal", notice), Counted(0, "teleop", "journal_repaired", 1)])
-    serve_teleop(service, peer, tell=tell, stop=feed.alive_while(is_over), **queued)
+    TeleopLoop(service, peer, tell, **queued).run(feed.alive_while(is_over))
 
 
 def _open_store(

@@ -182,81 +182,75 @@ class LastWord:
         return not self._flies() or self._clock() >= self._until_ns
 
 
-def serve_teleop(
-    machine: Any,
-    peer: UnixPeer,
-    *,
-    calls: Make = lambda now_ns: None,
-    stops: Make = lambda now_ns: None,
-    tell: Callable[[list[MissionEvent | Fault]], None],
-    stop: Callable[[], bool],
-) -> None:
-    """Run the loop of teleop's process at 50 Hz in real time until `stop()` returns true.
+class TeleopLoop:
+    """Loop of teleop's process: receives the robot's state, makes queued calls, sends outputs."""
 
-    `machine` is a `MissionService`, or has its methods hear, see, handle_deadline and take_outputs.
-    `stops` makes the queued emergency stops and holds, `calls` all other calls of the API. `tell`
-    is called with the events and faults of each period, and must not block.
-    """
-    unsent: deque[MissionEvent] = deque(maxlen=EVENTS_KEPT)
-    deadline_ns, blind = time.monotonic_ns(), 0
-    while not stop():
-        # Do not wake for each datagram: only the newest state of the robot is needed per period.
-        time.sleep(max(0, deadline_ns - time.monotonic_ns()) * 1e-9)
-        now_ns = time.monotonic_ns()
-        late_ns = now_ns - deadline_ns
-        deadline_ns += (late_ns // PERIOD_NS + 1) * PERIOD_NS
-        how = {"blind": blind, "late_ns": late_ns, "now_ns": now_ns}
-        blind = turn(machine, peer, calls, stops=stops, **how)
-        if not blind and (reports := send(machine.take_outputs(), unsent, peer)):
-            tell(reports)
+    def __init__(
+        self,
+        machine: Any,
+        peer: UnixPeer,
+        tell: Callable[[list[MissionEvent | Fault]], None],
+        *,
+        calls: Make = lambda now_ns: None,
+        stops: Make = lambda now_ns: None,
+    ) -> None:
+        """Store what the loop connects.
 
+        `machine` is a `MissionService`, or has its methods hear, see, handle_deadline and
+        take_outputs. `tell` is called with the events and faults of each period, and must not
+        block. `stops` makes the queued emergency stops and holds, `calls` all other calls of the
+        API.
+        """
+        self._machine, self._peer, self._tell = machine, peer, tell
+        self._calls, self._stops = calls, stops
+        self._unsent: deque[MissionEvent] = deque(maxlen=EVENTS_KEPT)
+        self._blind = 0  # number of periods for which teleop still waits for a new state
 
-def turn(
-    machine: Any,
-    peer: UnixPeer,
-    calls: Make,
-    *,
-    stops: Make,
-    blind: int,
-    late_ns: int,
-    now_ns: int,
-) -> int:
-    """Run one period of teleop's loop: receive states of the robot, and make the queued calls.
+    def run(self, stop: Callable[[], bool]) -> None:
+        """Run at 50 Hz in real time until `stop()` returns true."""
+        deadline_ns = time.monotonic_ns()
+        while not stop():
+            # Do not wake for each message: only the newest state is needed per period.
+            time.sleep(max(0, deadline_ns - time.monotonic_ns()) * 1e-9)
+            now_ns = time.monotonic_ns()
+            late_ns = now_ns - deadline_ns
+            deadline_ns += (late_ns // PERIOD_NS + 1) * PERIOD_NS
+            self.wake(now_ns, late_ns)
 
-    The period begins at `now_ns`, later than planned by `late_ns` [ns]. After a stall, the socket
-    contains old states. Calls may depend on the robot's position; so teleop discards the old states
-    and waits for a new one, for at most `BLIND_WAKES` periods. Return the number of periods for
-    which teleop still waits, to be passed as `blind` in the next period; it is 0 at first.
-    """
-    arrived = peer.receive()
-    states = [state for state in arrived if state is not None]
-    if blind:  # ignore `late_ns`: otherwise a loop that is always late would wait forever
-        blind = 0 if states else blind - 1
-    elif late_ns > STALL_NS:
-        blind = BLIND_WAKES
-    if blind:
-        return blind
-    if arrived:
-        machine.hear(now_ns)
-    # A stop or a hold is queued before a state can show its effect, so these come first.
-    stops(now_ns)
-    if states:
-        machine.see(states[-1], now_ns)
-    calls(now_ns)
-    machine.handle_deadline(now_ns)
-    return 0
+    def wake(self, now_ns: int, late_ns: int) -> None:
+        """Run one period, which begins at `now_ns`, later than planned by `late_ns` [ns].
 
+        After a stall, the socket contains old states. Calls may depend on the robot's position; so
+        teleop discards the old states and waits for a new one, for at most `BLIND_WAKES` periods.
+        """
+        machine, arrived = self._machine, self._peer.receive()
+        states = [state for state in arrived if state is not None]
+        if self._blind:  # ignore `late_ns`: otherwise a loop that is always late would wait forever
+            self._blind = 0 if states else self._blind - 1
+        elif late_ns > STALL_NS:
+            self._blind = BLIND_WAKES
+        if self._blind:
+            return
+        if arrived:
+            machine.hear(now_ns)
+        # A stop or a hold is queued before a state can show its effect, so these come first.
+        self._stops(now_ns)
+        if states:
+            machine.see(states[-1], now_ns)
+        self._calls(now_ns)
+        machine.handle_deadline(now_ns)
+        self._send(machine.take_outputs())
 
-def send(
-    outputs: Sequence[Any], unsent: deque[MissionEvent], peer: UnixPeer
-) -> list[MissionEvent | Fault]:
-    """Send the events in `unsent` and then `outputs` to cloud; return new events and faults."""
-    while unsent and peer.send(unsent[0]):
-        unsent.popleft()
-    for output in outputs:
-        if isinstance(output, MissionEvent):  # queue an event behind unsent ones
-            if unsent or not peer.send(output):
-                unsent.append(output)
-        elif not isinstance(output, Fault):  # may be lost: teleop repeats these outputs
-            peer.send(output)
-    return [output for output in outputs if isinstance(output, MissionEvent | Fault)]
+    def _send(self, outputs: Sequence[Any]) -> None:
+        """Send the events that cloud has not accepted yet, then the new outputs; tell the news."""
+        unsent, peer = self._unsent, self._peer
+        while unsent and peer.send(unsent[0]):
+            unsent.popleft()
+        for output in outputs:
+            if isinstance(output, MissionEvent):  # queue an event behind unsent ones
+                if unsent or not peer.send(output):
+                    unsent.append(output)
+            elif not isinstance(output, Fault):  # may be lost: teleop repeats these outputs
+                peer.send(output)
+        if news := [output for output in outputs if isinstance(output, MissionEvent | Fault)]:
+            self._tell(news)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from heapq import heappop, heappush
 from typing import TypeAlias, TypeVar
 
-from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, RemoteTeleop, UnixPeer, send, turn
+from cloudrc.drivers.teleop import PERIOD_NS, RemoteTeleop, TeleopLoop, UnixPeer
 from cloudrc.drivers.virtual import Clock
 from cloudrc.endpoint import Endpoint
 from cloudrc.messages import NEVER_NS
@@ -23,7 +22,7 @@ from cloudrc.teleop.store import (
     UnavailableError,
     connect,
 )
-from cloudrc.teleop.wire import ALARM, Message, Output
+from cloudrc.teleop.wire import ALARM, Message
 
 T = TypeVar("T")
 FAR_NS = 1 << 62
@@ -244,13 +243,18 @@ class TeleopModel:
         if self._disk:
             self._database.deserialize(self._disk)
         salt = b"desk %d" % self._starts  # random in production
-        self.service: MissionService | None = MissionService(
-            self._contact_speed_max, MissionStore(self._database, salt)
-        )
+        service = MissionService(self._contact_speed_max, MissionStore(self._database, salt))
+        self.service: MissionService | None = service
         self._peer.waiting.clear()
         self._calls, self._stops = list[Call](), list[Call]()
-        self._unsent: deque[MissionEvent] = deque(maxlen=EVENTS_KEPT)
-        self._free_ns, self._turn_ns, self._blind = 0, NEVER_NS, 0
+        self._loop = TeleopLoop(
+            service,
+            self._peer,
+            self._take,
+            calls=partial(_make, service, self._calls),
+            stops=partial(_make, service, self._stops),
+        )
+        self._free_ns, self._turn_ns = 0, NEVER_NS
 
     def kill(self, now_ns: int = 0) -> None:
         """Kill the process; only the disk remains. `now_ns` is ignored."""
@@ -298,10 +302,8 @@ class TeleopModel:
             self._free_ns = max(self._free_ns, now_ns + round(duration * 1e9))
             self._host.at(self._free_ns * 1e-9, self._turn)  # a late process wakes at once
 
-    def _take(self, service: MissionService) -> list[Output | Fault]:
-        outputs = service.take_outputs()
-        self.events += [each for each in outputs if isinstance(each, MissionEvent)]
-        return outputs
+    def _take(self, news: list[MissionEvent | Fault]) -> None:
+        self.events += [each for each in news if isinstance(each, MissionEvent)]
 
     def _wake(self, now_ns: int) -> None:
         assert self._host is not None
@@ -311,18 +313,9 @@ class TeleopModel:
     def _turn(self, now_ns: int) -> None:
         if self.service is None or self._host is None or now_ns < self._free_ns:
             return
-        turned_ns, self._turn_ns = self._turn_ns, now_ns
-        self._blind = turn(
-            self.service,
-            self._peer,
-            partial(_make, self.service, self._calls),
-            stops=partial(_make, self.service, self._stops),
-            blind=self._blind,
-            late_ns=now_ns - turned_ns - PERIOD_NS if turned_ns >= 0 else 0,
-            now_ns=self._host.clock.at(now_ns),
-        )
-        # Events wait until cloud runs; all other outputs are repeated.
-        send(self._take(self.service), self._unsent, self._peer)
+        late_ns = max(0, now_ns - self._turn_ns - PERIOD_NS) if self._turn_ns >= 0 else 0
+        self._turn_ns = now_ns
+        self._loop.wake(self._host.clock.at(now_ns), late_ns)
 
 
 def _make(service: MissionService, calls: list[Call], now_ns: int) -> None:

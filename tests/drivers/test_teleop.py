@@ -10,8 +10,8 @@ from cloudrc.drivers.teleop import (
     EVENTS_KEPT,
     STALL_NS,
     RemoteTeleop,
+    TeleopLoop,
     UnixPeer,
-    serve_teleop,
 )
 from cloudrc.errors import BadInputError
 from cloudrc.messages import OperatorRequest, Request, Setpoint
@@ -102,8 +102,7 @@ class Machine:
 def serve(machine, peer, wakes, calls=lambda now_ns: None, told=None):
     """Serve for so many wakes."""
     left, tell = iter(range(wakes)), [].extend if told is None else told.extend
-    how = {"calls": calls, "tell": tell, "stop": lambda: next(left, None) is None}
-    serve_teleop(machine, peer, **how)
+    TeleopLoop(machine, peer, tell, calls=calls).run(lambda: next(left, None) is None)
 
 
 @pytest.mark.parametrize(
