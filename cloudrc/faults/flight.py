@@ -91,7 +91,7 @@ class Flight:
         if start:
             self.teleop.order(self.make_order(), self._clock.at(0))
         self.world = RestartableEndpoint(self._build_world, Clock())
-        self.cloud = RestartableEndpoint(self._build_cloud, self._clock, "cloud")
+        self.cloud = RestartableEndpoint(self._build_cloud, self._clock)
         self.teleop.run_on(self.cloud)
         self.uplink = self._make_link(uplink or link, up=True)
         self.downlink = self._make_link(downlink or link, up=False)

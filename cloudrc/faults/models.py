@@ -12,7 +12,7 @@ from cloudrc.drivers.teleop import PERIOD_NS, RemoteTeleop, TeleopLoop, UnixPeer
 from cloudrc.drivers.virtual import Clock
 from cloudrc.endpoint import Endpoint
 from cloudrc.messages import NEVER_NS
-from cloudrc.records import Fault, Lateness, MissionEvent, Record
+from cloudrc.records import Fault, MissionEvent, Record
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import (
     ConflictError,
@@ -45,9 +45,9 @@ class RestartableEndpoint:
 
     sealed = True  # world and cloud have keys
 
-    def __init__(self, build: Callable[[int], Endpoint], clock: Clock, name: str = "world") -> None:
+    def __init__(self, build: Callable[[int], Endpoint], clock: Clock) -> None:
         """Start the first process; `build` makes world or cloud at a time on its clock [ns]."""
-        self._build, self.clock, self._name = build, clock, name
+        self._build, self.clock = build, clock
         self.tamper: Tamper | None = None  # changes the datagrams that arrive
         self._scheduled, self._frozen_until_ns = 0, -1
         self._waiting: list[bytes] = []
@@ -116,18 +116,14 @@ class RestartableEndpoint:
         while self._actions and self._actions[0][0] <= now_ns:
             heappop(self._actions)[2](now_ns)
         inner = self.inner
-        was_due_ns = inner.next_deadline_ns() if inner is not None else FAR_NS
         if 0 <= self._frozen_until_ns <= now_ns:
             self._frozen_until_ns = -1
             waiting, self._waiting = self._waiting, []
             for data in waiting:
                 self.receive_now(data, now_ns)
         if inner is not None and self._frozen_until_ns < 0:
-            own_ns = self.clock.at(now_ns)
-            if own_ns >= inner.next_deadline_ns():
+            if (own_ns := self.clock.at(now_ns)) >= inner.next_deadline_ns():
                 inner.handle_deadline(own_ns)
-            if own_ns > was_due_ns + 1000:  # rounding of a drifting clock: 1 ns
-                self._note_late_wake(inner, own_ns, own_ns - was_due_ns)
         self._set_deadline()
 
     def take_datagrams(self) -> list[bytes]:
@@ -140,12 +136,6 @@ class RestartableEndpoint:
         """Implement `Endpoint.take_records`."""
         left, self._left = self._left, []
         return left + self.inner.take_records() if self.inner is not None else left
-
-    def _note_late_wake(self, inner: Endpoint, own_ns: int, late_ns: int) -> None:
-        """Record a late wake, as the real-time driver does."""
-        slip_ns = getattr(inner, "slip_ns", 0)
-        self._left = self.take_records()
-        self._left.append(Lateness(own_ns - slip_ns, self._name, late_ns * 1e-9, 0.0, slip_ns))
 
     def _set_deadline(self) -> None:
         due_ns = self._actions[0][0] if self._actions else FAR_NS

@@ -47,7 +47,7 @@ class Two:
             for way in ("up", "down")
         )
         self.world, self.cloud = (
-            RestartableEndpoint(partial(self.build, end), Clock(), end) for end in ENDS
+            RestartableEndpoint(partial(self.build, end), Clock()) for end in ENDS
         )
         self.run = VirtualRun(self.world, self.cloud, up, down)
         whatever = (self.rotate, self.leave, self.start)
