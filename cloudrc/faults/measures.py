@@ -11,13 +11,7 @@ from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, generator
 from cloudrc.messages import Cause, GuardState
 from cloudrc.record.columns import Recording
-from cloudrc.records import (
-    CommandApplied,
-    Fault,
-    GuardChange,
-    Record,
-    SessionOpened,
-)
+from cloudrc.records import CommandApplied, Fault, GuardChange, Record, SessionOpened
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 
@@ -33,16 +27,6 @@ ENDED = Cause.ENDED.words  # cause of a HOLD that the operator has requested
 def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
     """Choose a random time from `first` to `last` [s]; by default, a time among the pipes."""
     return float(generator(seed, 77).uniform(first, last))
-
-
-def seen_by(flight: Flight, role: str, until: float | None = None) -> list[Record]:
-    """Return the records of `role`: world, cloud or teleop; up to the virtual time `until` [s]."""
-    records: Iterable[Record] = flight.of_world if role == "world" else flight.of_cloud
-    records = flight.teleop.events if role == "teleop" else records
-    if until is None:
-        return list(records)
-    until_ns = (flight.world if role == "world" else flight.cloud).clock.at(round(until * 1e9))
-    return [record for record in records if record.stamp_ns <= until_ns]
 
 
 def refused(outcome: Outcome, flight: Flight, *reasons: str) -> None:
