@@ -46,7 +46,7 @@ FAILED = 1
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", title="actions")
     parsers = {}
     for name, text in ACTIONS.items():
         description = f"{text[0].upper()}{text[1:]}."
@@ -94,9 +94,6 @@ OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
 
 def execute(options: argparse.Namespace) -> int:
     """Run the chosen action; return 1 if a check failed, 130 after an interrupt signal."""
-    if options.action is None:
-        names = ", ".join(ACTIONS)
-        raise BadInputError(f"an action is missing: {names}; see 'cloudrc faults --help'")
     require("the fault suite", ("world", "record"))
     interrupt_on_signals()
     return {"list": print_faults, "run": run, "search": search}[options.action](options)
