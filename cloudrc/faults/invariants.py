@@ -16,10 +16,8 @@ collision  If the cloud is honest, only the arm's tip touches something, and it 
            the guard does not know what is below the robot.
 latch      The robot is in TRACK only during a mission that the operator has started. LAND and ESTOP
            last until the operator acknowledges them.
-hold       At least `SETTLE_NS` pass between two changes to TRACK, and between two changes to HOLD
-           for lack of commands. A HOLD may begin sooner if a command is based on older odometry
-           than an earlier command. In a mission, a robot without commands lands after the
-           configured time, or sooner after impossible commands.
+hold       At least `SETTLE_NS` pass between two changes to TRACK. In a mission, a robot without
+           commands lands after the configured time, or sooner after impossible commands.
 order      Each applied command is newer than the last one, and not of an old session.
 tick       The guard runs once in each step of the physics.
 
@@ -39,7 +37,6 @@ from cloudrc.geometry.fence import HIGH, LOW, inside
 from cloudrc.messages import (
     PLAN_STEP_NS,
     ZERO,
-    Cause,
     Command,
     GuardState,
     OperatorRequest,
@@ -69,8 +66,7 @@ REELS_NS = 1_000_000_000  # time after a collision in which it explains the robo
 THROWN_NS = 3_000_000_000  # time after a collision in which the robot may leave the fence [ns]
 RESUME_COMMANDS, RESUME_NS = 10, 500_000_000
 """Number of fresh commands that end a HOLD, and the time within which they must arrive [ns]."""
-SETTLE_NS = 1_000_000_000
-"""Shortest time between two changes to TRACK, or between two changes to HOLD [ns]."""
+SETTLE_NS = 1_000_000_000  # shortest time between two changes to TRACK [ns]
 INVALID_COMMANDS, INVALID_NS = 5, 1_000_000_000
 """Number of impossible commands that cause a landing, if they arrive within INVALID_NS [ns]."""
 INVALID = ("range", "future")  # reasons for which the guard rejects impossible commands
@@ -154,11 +150,10 @@ class RobotInvariants:
         # The operator, and the wait for commands.
         self._ramp_ns = round(max(RAMP_MIN, watch.limits.speed_max_mps / RAMP) * 1e9)
         self._ramp_until_ns, self._alone_ns = -1, 0
-        self._tracked_ns = self._held_ns = -SETTLE_NS
+        self._tracked_ns = -SETTLE_NS
         self._armed = False  # whether a mission is on
         self._released = set[GuardState]()  # states acknowledged since the last change
-        self._is_reset = self._impossible = self._goes_back = False
-        self._basis_ns = -1  # newest odometry stamp of commands in a mission [ns]
+        self._is_reset = self._impossible = False
         self._fresh_ns: deque[int] = deque(maxlen=RESUME_COMMANDS)
         self._invalid_ns: deque[int] = deque(maxlen=INVALID_COMMANDS)
 
@@ -211,8 +206,6 @@ class RobotInvariants:
                 end_ns = min(end_ns, now_ns + self._plan_ns)
                 self._fresh_until_ns = max(self._fresh_until_ns, end_ns)
             if self._armed:
-                self._goes_back = basis_ns < self._basis_ns
-                self._basis_ns = max(self._basis_ns, basis_ns)
                 if self._state is HOLD:
                     self._fresh_ns.append(now_ns)
                 elif self._state is GROUND:
@@ -230,7 +223,7 @@ class RobotInvariants:
             case Request.START:
                 if request.start is Start.SPAWN:
                     self._steps, self._is_asked = 0, True
-                    self._tracked_ns = self._held_ns = -SETTLE_NS
+                    self._tracked_ns = -SETTLE_NS
                     self._is_reset, self._ramp_until_ns = True, -1
                 if request.start is Start.SPAWN or not self._armed:
                     self.see_session(now_ns)
@@ -372,7 +365,9 @@ class RobotInvariants:
         self._armed = self._armed and state not in LATCHED
         self._ramp_until_ns = -1
         if state is TRACK:
-            self._check_settled("TRACK", self._tracked_ns, now_ns)
+            if now_ns - self._tracked_ns < SETTLE_NS:
+                text = f"TRACK again after {(now_ns - self._tracked_ns) * 1e-9:.3f} s"
+                self._note(now_ns, "hold", text)
             self._tracked_ns = now_ns
             if was is HOLD and not self._is_reset:
                 self._ramp_until_ns = now_ns + self._ramp_ns
@@ -382,9 +377,7 @@ class RobotInvariants:
                     self._note(now_ns, "stale", text)
         elif state is HOLD or (was is TRACK and state is GROUND and not self._is_reset):
             # To GROUND: the robot had not left the ground yet.
-            if state is HOLD and self._guard.cause is Cause.SILENCE and not self._goes_back:
-                self._check_settled("HOLD", self._held_ns, now_ns)
-            self._held_ns = self._alone_ns = now_ns
+            self._alone_ns = now_ns
         elif state is LAND and not self._impossible:
             alone_ns = now_ns - self._alone_ns
             if was is TRACK or alone_ns <= self._wait_ns(was):
@@ -404,10 +397,6 @@ class RobotInvariants:
         if self._armed and alone_ns > self._wait_ns(state) + STEP_NS:
             self._note(now_ns, "hold", f"{state.name} for {alone_ns * 1e-9:.3f} s of a mission")
             self._alone_ns = now_ns
-
-    def _check_settled(self, name: str, last_ns: int, now_ns: int) -> None:
-        if now_ns - last_ns < SETTLE_NS:
-            self._note(now_ns, "hold", f"{name} again after {(now_ns - last_ns) * 1e-9:.3f} s")
 
     def _wait_ns(self, state: GuardState) -> float:
         """Return how long a robot in a mission may wait for commands [ns]."""
