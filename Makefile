@@ -15,7 +15,7 @@ SCRIPTS := .ci/run .ci/once_more
 JOBS ?= $(shell nproc 2>/dev/null || echo 2)
 # Folder for the results of `make faults`, `make mutants` and `make nightly`.
 EVIDENCE := build/evidence
-# A failing schedule is shrunk and kept in --store; in tests/faults/regressions it becomes a test.
+# A failing schedule is kept in --store; in tests/faults/regressions it becomes a test.
 SEARCH = $(bin)/cloudrc faults search --jobs $(JOBS) --store $(EVIDENCE)/regressions
 # The duration of each search of `make faults` [min].
 MINUTES ?= 5

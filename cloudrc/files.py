@@ -6,15 +6,17 @@ Reading never blocks. Writing replaces the file in one step.
 from __future__ import annotations
 
 import os
+import re
 import stat
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from io import BufferedReader, FileIO
 from pathlib import Path
 from typing import IO
 
 SIZE_MAX = 1 << 20
 """Default size limit of a file that is read [bytes]: the size limit of a ConfigMap."""
+_TOKEN = re.compile(rb"[!-~]{16,512}")
 
 
 class TooLongError(ValueError):
@@ -58,18 +60,31 @@ def open_file(path: Path) -> FileIO:
     raise ValueError(f"{path}: not a file")
 
 
-def readable_by_others(path: Path) -> bool:
-    """Check whether other users can read this user's file; False for a missing file.
+def warn_if_readable(path: Path, warn: Callable[[str], None]) -> None:
+    """Call `warn` with one line if other users can read the secret in this file.
 
     If another user owns the file, its group may read it: Kubernetes gives the files of a Secret to
     root, and lets the pod's group read them.
     """
-    try:
+    with suppress(OSError):  # a missing file is reported by its reader
         status = path.stat()
-    except OSError:
-        return False
-    group = stat.S_IRGRP if status.st_uid == os.geteuid() else 0
-    return bool(status.st_mode & (stat.S_IROTH | group))
+        group = stat.S_IRGRP if status.st_uid == os.geteuid() else 0
+        if status.st_mode & (stat.S_IROTH | group):
+            warn(f"warning: {path} can be read by others: chmod 600 {path}")
+
+
+def read_token(path: Path) -> str:
+    """Read the token of teleop's API from a file; raise a ValueError with the reason if it fails.
+
+    The reason does not contain the token.
+    """
+    try:
+        token = read(path).strip()
+    except OSError as error:
+        raise ValueError(error.strerror) from None
+    if not _TOKEN.fullmatch(token):
+        raise ValueError("a token is 16 to 512 visible ASCII characters")
+    return token.decode("ascii")
 
 
 @contextmanager

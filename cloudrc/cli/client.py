@@ -11,7 +11,6 @@ import argparse
 import http.client
 import json
 import os
-import re
 import socket
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -22,7 +21,7 @@ from urllib.parse import quote, urlsplit
 
 from cloudrc.cli.output import escape, print_line
 from cloudrc.errors import BadInputError, CloudrcError
-from cloudrc.files import read, readable_by_others
+from cloudrc.files import read_token, warn_if_readable
 
 REQUEST_TIMEOUT = 10.0
 """Time limit of one request [s]."""
@@ -33,7 +32,6 @@ RETRY_STATUSES = (408, 429, 502, 503, 504)
 """HTTP status codes after which the same request may succeed later."""
 UNIX = "unix:"
 VARIABLE = "CLOUDRC_TOKEN_FILE"
-_TOKEN = re.compile(rb"[!-~]{16,512}")
 
 
 class ApiError(CloudrcError):
@@ -184,18 +182,12 @@ def token_reader(path: Path | None) -> Callable[[], str]:
     """
     if path is None:
         return lambda: ""
-    if readable_by_others(path):
-        print_line(f"cloudrc: warning: {path} can be read by others: chmod 600 {path}", sys.stderr)
+    warn_if_readable(path, lambda text: print_line(f"cloudrc: {text}", sys.stderr))
     return lambda: _read(path)
 
 
 def _read(path: Path) -> str:
     try:
-        found = _TOKEN.fullmatch(read(path).strip())
-    except OSError as error:
-        raise BadInputError(f"--token-file {path}: {error.strerror}; name a file") from None
-    except ValueError:  # a pipe, or a file that is too long
-        found = None
-    if found is None:
-        raise BadInputError(f"--token-file {path}: holds no token; name another file")
-    return found[0].decode("ascii")
+        return read_token(path)
+    except ValueError as error:
+        raise BadInputError(f"--token-file {path}: {error}; name another file") from None

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import escape, format_document, output_argument, paint, print_line, table
-from cloudrc.cli.parser import input_file, read_count, whole_number
+from cloudrc.cli.parser import input_file, number, read_count, whole_number
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.errors import BadInputError
 
@@ -33,7 +33,7 @@ exit codes: 0 all checks passed, 1 a check failed, 2 bad input,
   6 a worker was killed, 130 interrupted"""
 SEED_MAX = 2**52
 """Largest value of --seed and --first. A search counts up from --first, and seeds end at 2^53."""
-MINUTES_MAX = 10_000.0
+MINUTES_MAX = 10_000
 """Longest duration of a search [min]: about a week."""
 ACTIONS = {
     "list": "list all faults with their injection and the expected reaction",
@@ -46,7 +46,7 @@ FAILED = 1
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", title="actions")
     parsers = {}
     for name, text in ACTIONS.items():
         description = f"{text[0].upper()}{text[1:]}."
@@ -70,16 +70,6 @@ def _name_or_file(text: str) -> str | Path:
     return input_file(text) if is_path else text
 
 
-def _minutes(text: str) -> float:
-    try:
-        minutes = float(text)
-    except ValueError:
-        minutes = -1.0
-    if not 0.0 < minutes <= MINUTES_MAX:  # or it is NaN
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of minutes, such as 10")
-    return minutes
-
-
 def _folder(text: str) -> Path:
     path = Path(text)
     existing = next(each for each in (path, *path.absolute().parents) if each.exists())
@@ -89,11 +79,11 @@ def _folder(text: str) -> Path:
 
 
 JOBS = (read_count, 1, "J", "number of parallel processes, at most one per core (default: 1)")
-STORED = f"folder for failing schedules, after reduction (default: ./{STORE})"
+STORED = f"folder for failing schedules (default: ./{STORE})"
 OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
     "run": {"--seed": (whole_number(0, SEED_MAX), 1, "N", "seed (default: 1)"), "--jobs": JOBS},
     "search": {
-        "--minutes": (_minutes, 1.0, "M", "duration (default: 1)"),
+        "--minutes": (number(0, MINUTES_MAX, "minutes"), 1.0, "M", "duration (default: 1)"),
         "--first": (whole_number(0, SEED_MAX), 1, "SEED", "first seed (default: 1)"),
         "--jobs": JOBS,
         "--store": (_folder, STORE, "DIR", STORED),
@@ -104,9 +94,6 @@ OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
 
 def execute(options: argparse.Namespace) -> int:
     """Run the chosen action; return 1 if a check failed, 130 after an interrupt signal."""
-    if options.action is None:
-        names = ", ".join(ACTIONS)
-        raise BadInputError(f"an action is missing: {names}; see 'cloudrc faults --help'")
     require("the fault suite", ("world", "record"))
     interrupt_on_signals()
     return {"list": print_faults, "run": run, "search": search}[options.action](options)

@@ -6,7 +6,6 @@ In a cluster, `run` creates a Kubernetes Job, whose pod posts the mission to the
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -18,13 +17,13 @@ from cloudrc.cli import client
 from cloudrc.cli.client import Api, UnreachableError, mission_path, token_file, token_reader
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
-from cloudrc.cli.output import escape, format_document, output_argument, print_line, table
+from cloudrc.cli.output import format_document, output_argument, print_line, table
+from cloudrc.cli.parser import number
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.drivers.machine import Deadline
 from cloudrc.errors import (
     BadInputError,
     CloudrcError,
-    InterruptedRunError,
     MissingPrerequisiteError,
     TimedOutError,
 )
@@ -67,10 +66,8 @@ The second limit is longer, because the pod of the API may still have to load it
 TURN_MAX = 30.0
 """Longest time that a request and the pause after the request take [s]. If more time has passed,
 this process was suspended; the suspension does not count towards a time limit."""
-TERMINATION_LOG = Path("/dev/termination-log")
-"""File in a pod for the pod's last message, which `kubectl describe` shows after the pod's end."""
 LIMIT_MAX = 86_400.0
-"""Time limit of a Job if the mission file gives no time limit [s]. Teleop ends the mission
+"""Time limit of a Job if the mission file gives no valid time limit [s]. Teleop ends the mission
 earlier, by the time limit of the release's experiment."""
 
 _Answer = TypeVar("_Answer")
@@ -118,9 +115,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         )
     follow = "keep printing new events"
     verbs["logs"].add_argument("-f", "--follow", action="store_true", help=follow)
+    about, metres = "[m], world frame", number(-1000, 1000, "metres")
     for axis in "XYZ":
-        about = "[m], world frame"
-        verbs["goto"].add_argument(axis.lower(), type=_metres, metavar=axis, help=about)
+        verbs["goto"].add_argument(axis.lower(), type=metres, metavar=axis, help=about)
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -141,13 +138,6 @@ def execute(options: argparse.Namespace) -> int:
         return _run_job(options)
     with _forwarded_api(options) as forwarded:
         return carry_out(options, forwarded)
-
-
-def _metres(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of metres") from None
 
 
 def read_mission(name: str, shown: str = "") -> Json:
@@ -221,41 +211,28 @@ def describe_verdict(verdict: Mapping[str, Any]) -> str:
 
 
 def _fly(options: argparse.Namespace, api: Api) -> int:
-    """Post a mission, wait for its verdict, return the exit code; on Ctrl-C cancel the mission."""
-    interrupt_on_signals()
-    mission_id, text = "", ""
-    follower = MissionFollower(api, API_TIMEOUT)
+    """Post a mission, follow it to its verdict, and return the exit code of the verdict.
+
+    After Ctrl-C the mission of `run` goes on; the mission of a Job (`fly`) is cancelled.
+    """
+    is_job = options.verb == "fly"
+    if is_job:
+        interrupt_on_signals()
+        order = {**read_mission(options.mission), "key": options.key}
+    else:
+        order = read_mission(options.mission, options.name)
+    follower = MissionFollower(api, API_TIMEOUT if is_job else RUN_TIMEOUT)
+    mission_id = follower.post({**order, "queue": options.queue})
     try:
-        mission = read_mission(options.mission)
-        mission_id = follower.post({**mission, "key": options.key, "queue": options.queue})
         verdict = follower.follow(mission_id)
-        text, code = escape(describe_verdict(verdict)), int(verdict["exit_code"])
     except KeyboardInterrupt:
-        if mission_id:
+        if is_job:
             with suppress(CloudrcError):
                 api.post(f"{mission_path(mission_id)}/cancel")
-        text = "INTERRUPTED: the Job was stopped, its mission is cancelled"
-        code = InterruptedRunError.exit_code
-    except CloudrcError as error:
-        text = str(error)
-        raise
-    finally:
-        with suppress(OSError):  # on failure Kubernetes shows the last line of the log instead
-            if text and TERMINATION_LOG.exists():
-                TERMINATION_LOG.write_text(text + "\n", encoding="utf-8")
-    print_line(text)
-    return code
-
-
-def _run(options: argparse.Namespace, api: Api) -> int:
-    mission = read_mission(options.mission, options.name)
-    follower = MissionFollower(api, RUN_TIMEOUT)
-    mission_id = follower.post({**mission, "queue": options.queue})
-    try:
-        verdict = follower.follow(mission_id)
-    except KeyboardInterrupt:
-        command = f"cloudrc mission cancel {mission_id}"
-        print_line(f"mission {mission_id} goes on; cancel it: {command}", sys.stderr)
+            print_line("INTERRUPTED: the Job was stopped, its mission is cancelled")
+        else:
+            command = f"cloudrc mission cancel {mission_id}"
+            print_line(f"mission {mission_id} goes on; cancel it: {command}", sys.stderr)
         raise
     print_line(describe_verdict(verdict))
     return int(verdict["exit_code"])
@@ -369,7 +346,7 @@ def _drive(_: argparse.Namespace, api: Api) -> int:
 
 
 VERBS: dict[str, tuple[str, Callable[[argparse.Namespace, Api], int]]] = {
-    "run": ("fly a mission and show its progress until the verdict", _run),
+    "run": ("fly a mission and show its progress until the verdict", _fly),
     "list": ("list all missions", _list),
     "status": ("show the robot's state, or the state of a mission", _status),
     "cancel": ("cancel a mission; the robot holds its position", _cancel),
@@ -450,37 +427,17 @@ def _forwarded_api(options: argparse.Namespace) -> Iterator[Api]:
         yield Api(url, token_reader(path) if path else lambda: token, place)
 
 
-def _time_limit(name: str, mission: Json) -> float:
-    """Check the format of a mission before the Job is created; return the mission's time limit [s].
-
-    The API checks later whether the mission can be flown, for example inside the fence.
-
-    Raises:
-        BadInputError: If the mission is invalid; the text lists all problems.
-    """
-    from pydantic import ValidationError
-
-    from cloudrc.config import shipped
-    from cloudrc.config.problems import from_pydantic, raise_problems
-    from cloudrc.teleop.models import MissionRequest
-
-    try:
-        request = MissionRequest.model_validate_json(json.dumps(mission))
-    except ValidationError as error:
-        document = shipped.read("mission", name, Path())
-        raise_problems(document, from_pydantic(error, MissionRequest), name)
-        raise  # raise_problems found nothing to report
-    return request.time_limit_s or LIMIT_MAX
-
-
 def _run_job(options: argparse.Namespace) -> int:
+    """Create the Job of a mission and follow its log; the API checks the mission for the Job."""
     mission, release = read_mission(options.mission, options.name), _release(options)
     from cloudrc.cluster.flight import wait_ready
     from cloudrc.cluster.jobs import follow, follow_limit, run_job
     from cloudrc.cluster.pods import find_deployment
 
     find_deployment(release, "cloud")
-    limit = _time_limit(options.mission, mission)
+    given = mission.get("time_limit_s")
+    # The API refuses a mission with any other limit.
+    limit = given if isinstance(given, int | float) and 0 < given <= 1e6 else LIMIT_MAX
     # After 'helm install' without --wait, the release needs some seconds to become ready.
     wait_ready(release, timeout=options.timeout, tell=print_line)
     job = run_job(release, mission, limit=limit, queue=options.queue)

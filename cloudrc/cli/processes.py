@@ -30,7 +30,7 @@ from cloudrc.cli.output import print_line
 from cloudrc.drivers.process import EndProcess, Feed, StopSignal
 from cloudrc.drivers.realtime import Address, Peer, bind, split_address
 from cloudrc.errors import BadInputError
-from cloudrc.files import readable_by_others
+from cloudrc.files import warn_if_readable
 from cloudrc.link.follow import PROFILE_PERIOD, Loaded, ProfileFile
 from cloudrc.link.state import PROFILE_FILE, RELEASED_SUFFIX, LinkState, publish, summary, to_text
 from cloudrc.records import Counted
@@ -246,8 +246,8 @@ def _run_cloud(options: argparse.Namespace) -> int:
     experiment, identity, end = open_end(options, "cloud")
     teleop = None
     if options.teleop:
-        peer = UnixPeer(options.teleop / "cloud.sock", options.teleop / "teleop.sock")
-        teleop = RemoteTeleop(peer, wire.encode, wire.decode, time.monotonic_ns())
+        paths = options.teleop / "cloud.sock", options.teleop / "teleop.sock"
+        teleop = RemoteTeleop(UnixPeer(*paths, wire.encode, wire.decode), time.monotonic_ns())
     cloud = assembly.build_cloud(experiment, identity, time.monotonic_ns, teleop)
     if options.tap:
         end.tap = Tap(options.tap, lambda: cloud.telemetry)
@@ -279,8 +279,7 @@ def open_end(
     # Only cloud loads the plug-ins, which fill in their default parameters.
     experiment = load_experiment(path) if name == "cloud" else given
     keys = KeyFile(key, time.monotonic_ns())
-    if readable_by_others(key):
-        print_line(f"cloudrc: warning: {key} can be read by others: chmod 600 {key}", sys.stderr)
+    warn_if_readable(key, lambda text: print_line(f"cloudrc: {text}", sys.stderr))
     link = options.link
     if link is None and options.route is not None:
         link = Path(options.route).with_name("link.json")

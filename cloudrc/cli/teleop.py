@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import print_line
@@ -167,15 +167,18 @@ def _fly(
 ) -> None:
     """Serve missions and API requests until `over()` is true."""
     from cloudrc.drivers.process import Feed
-    from cloudrc.drivers.teleop import UnixPeer, serve_teleop
+    from cloudrc.drivers.teleop import TeleopLoop, UnixPeer
     from cloudrc.records import Counted, Fault
     from cloudrc.teleop import wire
 
     feed = Feed.on_stdout(watched=options.feed)
-    peer = UnixPeer(options.socket / "teleop.sock", options.socket / "cloud.sock")
+    paths = options.socket / "teleop.sock", options.socket / "cloud.sock"
+    peer = UnixPeer(*paths, wire.encode, wire.decode)
+    queued: dict[str, Any] = {}
     if server is not None:
-        server.bridge.alarm = lambda: peer.send(wire.encode(wire.ALARM))
+        server.bridge.alarm = lambda: peer.send(wire.ALARM)
         server.bridge.open(service)
+        queued = {"calls": server.bridge.make_calls, "stops": server.bridge.make_stops}
     feed.ready()
 
     def tell(records: Sequence[Record]) -> None:
@@ -195,13 +198,7 @@ def _fly(
 
     if notice := service.book.notice:
         tell([Fault(0, "journal", notice), Counted(0, "teleop", "journal_repaired", 1)])
-    serve_teleop(
-        *(service, peer, wire.encode, wire.decode),
-        calls=server.bridge.take if server else list,
-        stops=server.bridge.take_stops if server else list,
-        tell=tell,
-        stop=feed.alive_while(is_over),
-    )
+    TeleopLoop(service, peer, tell, **queued).run(feed.alive_while(is_over))
 
 
 def _open_store(

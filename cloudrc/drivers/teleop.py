@@ -10,7 +10,7 @@ from __future__ import annotations
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from cloudrc.records import Fault, MissionEvent
 DATAGRAM_MAX = 8_192
 """Size limit of a datagram between teleop and cloud [bytes]; all messages are smaller."""
 DRAIN_MAX = 1024
-"""Largest number of datagrams that `receive` returns at once: more than a socket can queue."""
+"""Largest number of messages that `receive` returns at once: more than a socket can queue."""
 PATH_MAX = 107
 """Longest path of a socket, without its final zero [bytes]. Source: unix(7), `sun_path`."""
 PERIOD_NS = 20_000_000
@@ -42,23 +42,26 @@ EVENTS_KEPT = 256
 LAST_WORD_NS = 800_000_000
 """Time for which cloud, when it has to end, still forwards teleop's request to hold [ns]. A process
 has 1.5 s to end."""
-Encode = Callable[[Any], bytes]
-Decode = Callable[[bytes], Any]
-"""Function that decodes a message; it raises a ValueError if the bytes are not a message."""
-Calls = Callable[[], Iterable[Callable[[int], None]]]
-"""Function that returns the calls that other threads have queued. Each call has one argument, the
-time [ns], monotonic clock."""
+Make = Callable[[int], None]
+"""Function that makes the calls that other threads have queued, at a time [ns], monotonic clock."""
 
 
 class UnixPeer:
-    """Exchanges datagrams with another process over two Unix sockets."""
+    """Exchanges messages with another process over two Unix sockets."""
 
-    def __init__(self, own: Path, other: Path) -> None:
+    def __init__(
+        self,
+        own: Path,
+        other: Path,
+        encode: Callable[[Any], bytes],
+        decode: Callable[[bytes], Any],
+    ) -> None:
         """Bind the path `own`, in place of an earlier process's socket; send to the path `other`.
 
-        Raise a BadInputError if `own` cannot be bound.
+        `decode` raises a ValueError if the bytes are not a message. Raise a BadInputError if `own`
+        cannot be bound.
         """
-        self._other = str(other)
+        self._other, self._encode, self._decode = str(other), encode, decode
         if len(bytes(own)) > PATH_MAX:
             raise BadInputError(f"--socket: {own} is longer than {PATH_MAX} bytes; choose another")
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -71,16 +74,22 @@ class UnixPeer:
             self._socket.close()
             raise BadInputError(f"--socket: cannot make {own}: {error.strerror}") from error
 
-    def receive(self) -> list[bytes]:
-        """Return the datagrams that have arrived."""
-        datagrams: list[bytes] = []
+    def receive(self) -> list[Any]:
+        """Return the messages that have arrived; None for an empty datagram."""
+        messages: list[Any] = []
         with suppress(BlockingIOError):
-            while len(datagrams) < DRAIN_MAX:
-                datagrams.append(self._socket.recv(DATAGRAM_MAX))
-        return datagrams
+            while len(messages) < DRAIN_MAX:
+                data = self._socket.recv(DATAGRAM_MAX)
+                with suppress(ValueError):
+                    messages.append(self._decode(data) if data else None)
+        return messages
 
-    def send(self, data: bytes) -> bool:
-        """Send a datagram; return whether the socket of the other process has accepted it."""
+    def send(self, message: Any) -> bool:
+        """Send a message, or an empty datagram for None; return whether it was accepted.
+
+        The socket of the other process accepts a message unless its queue is full.
+        """
+        data = b"" if message is None else self._encode(message)
         try:
             self._socket.sendto(data, self._other)
         except OSError:  # the other process does not run, or its queue is full
@@ -102,8 +111,8 @@ class RemoteTeleop:
     outcome = None  # cloud does not end when a mission ends
     settled = True
 
-    def __init__(self, peer: UnixPeer, encode: Encode, decode: Decode, start_ns: int) -> None:
-        self._peer, self._encode, self._decode = peer, encode, decode
+    def __init__(self, peer: UnixPeer, start_ns: int) -> None:
+        self._peer = peer
         # Time of teleop's last datagram; before one, time of the first telemetry sent to teleop.
         self._heard_ns: int | None = None
         self._silent = self._stalled = False
@@ -114,7 +123,7 @@ class RemoteTeleop:
         """Send the robot's state to teleop, at most every `TELL_NS`."""
         if now_ns >= self._tell_ns:
             self._tell_ns, self._alive_ns = now_ns + TELL_NS, now_ns + ALIVE_NS
-            self._peer.send(self._encode(seen))
+            self._peer.send(seen)
             if self._heard_ns is None:
                 self._heard_ns = now_ns
 
@@ -126,15 +135,13 @@ class RemoteTeleop:
         """
         if now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_NS
-            self._peer.send(b"")
+            self._peer.send(None)
         self._stalled = not self._stalled and now_ns - self._looked_ns > STALL_NS
         self._looked_ns = now_ns
-        for data in self._peer.receive():
-            with suppress(ValueError):
-                output = self._decode(data)
-                self._heard_ns, self._silent = now_ns, False
-                if not (self._stalled and _moves_robot(output)):
-                    self.outputs.append(output)
+        for output in self._peer.receive():
+            self._heard_ns, self._silent = now_ns, False
+            if not (self._stalled and _moves_robot(output)):
+                self.outputs.append(output)
         heard_ns = now_ns if self._heard_ns is None else self._heard_ns
         if not self._silent and now_ns - heard_ns > SILENCE_NS:
             self._silent = True
@@ -175,94 +182,75 @@ class LastWord:
         return not self._flies() or self._clock() >= self._until_ns
 
 
-def serve_teleop(
-    machine: Any,
-    peer: UnixPeer,
-    encode: Encode,
-    decode: Decode,
-    *,
-    calls: Calls,
-    stops: Calls = list,
-    tell: Callable[[list[MissionEvent | Fault]], None],
-    stop: Callable[[], bool],
-) -> None:
-    """Run the loop of teleop's process at 50 Hz in real time until `stop()` returns true.
+class TeleopLoop:
+    """Loop of teleop's process: receives the robot's state, makes queued calls, sends outputs."""
 
-    `machine` is a `MissionService`, or has its methods hear, see, handle_deadline and take_outputs.
-    `stops` returns the queued emergency stops and holds, `calls` all other calls of the API. `tell`
-    is called with the events and faults of each period, and must not block.
-    """
-    unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
-    deadline_ns, blind = time.monotonic_ns(), 0
-    while not stop():
-        # Do not wake for each datagram: only the newest state of the robot is needed per period.
-        time.sleep(max(0, deadline_ns - time.monotonic_ns()) * 1e-9)
-        now_ns = time.monotonic_ns()
-        late_ns = now_ns - deadline_ns
-        deadline_ns += (late_ns // PERIOD_NS + 1) * PERIOD_NS
-        how = {"blind": blind, "late_ns": late_ns, "now_ns": now_ns}
-        blind = turn(machine, peer, decode, calls, stops=stops, **how)
-        if not blind and (reports := send(machine.take_outputs(), unsent, peer, encode)):
-            tell(reports)
+    def __init__(
+        self,
+        machine: Any,
+        peer: UnixPeer,
+        tell: Callable[[list[MissionEvent | Fault]], None],
+        *,
+        calls: Make = lambda now_ns: None,
+        stops: Make = lambda now_ns: None,
+    ) -> None:
+        """Store what the loop connects.
 
+        `machine` is a `MissionService`, or has its methods hear, see, handle_deadline and
+        take_outputs. `tell` is called with the events and faults of each period, and must not
+        block. `stops` makes the queued emergency stops and holds, `calls` all other calls of the
+        API.
+        """
+        self._machine, self._peer, self._tell = machine, peer, tell
+        self._calls, self._stops = calls, stops
+        self._unsent: deque[MissionEvent] = deque(maxlen=EVENTS_KEPT)
+        self._blind = 0  # number of periods for which teleop still waits for a new state
 
-def turn(
-    machine: Any,
-    peer: UnixPeer,
-    decode: Decode,
-    calls: Calls,
-    *,
-    stops: Calls = list,
-    blind: int,
-    late_ns: int,
-    now_ns: int,
-) -> int:
-    """Run one period of teleop's loop: receive states of the robot, and make the queued calls.
+    def run(self, stop: Callable[[], bool]) -> None:
+        """Run at 50 Hz in real time until `stop()` returns true."""
+        deadline_ns = time.monotonic_ns()
+        while not stop():
+            # Do not wake for each message: only the newest state is needed per period.
+            time.sleep(max(0, deadline_ns - time.monotonic_ns()) * 1e-9)
+            now_ns = time.monotonic_ns()
+            late_ns = now_ns - deadline_ns
+            deadline_ns += (late_ns // PERIOD_NS + 1) * PERIOD_NS
+            self.wake(now_ns, late_ns)
 
-    The period begins at `now_ns`, later than planned by `late_ns` [ns]. After a stall, the socket
-    contains old states. Calls may depend on the robot's position; so teleop discards the old states
-    and waits for a new one, for at most `BLIND_WAKES` periods. Return the number of periods for
-    which teleop still waits, to be passed as `blind` in the next period; it is 0 at first.
-    """
-    arrived = peer.receive()
-    states = [data for data in arrived if data]  # an empty datagram carries no state
-    if blind:  # ignore `late_ns`: otherwise a loop that is always late would wait forever
-        blind = 0 if states else blind - 1
-    elif late_ns > STALL_NS:
-        blind = BLIND_WAKES
-    if blind:
-        return blind
-    if arrived:
-        machine.hear(now_ns)
-    # A stop or a hold is queued before a state can show its effect, so these come first.
-    for stop in stops():
-        stop(now_ns)
-    if (seen := _newest(states, decode)) is not None:
-        machine.see(seen, now_ns)
-    for call in calls():
-        call(now_ns)
-    machine.handle_deadline(now_ns)
-    return 0
+    def wake(self, now_ns: int, late_ns: int) -> None:
+        """Run one period, which begins at `now_ns`, later than planned by `late_ns` [ns].
 
+        After a stall, the socket contains old states. Calls may depend on the robot's position; so
+        teleop discards the old states and waits for a new one, for at most `BLIND_WAKES` periods.
+        """
+        machine, arrived = self._machine, self._peer.receive()
+        states = [state for state in arrived if state is not None]
+        if self._blind:  # ignore `late_ns`: otherwise a loop that is always late would wait forever
+            self._blind = 0 if states else self._blind - 1
+        elif late_ns > STALL_NS:
+            self._blind = BLIND_WAKES
+        if self._blind:
+            return
+        if arrived:
+            machine.hear(now_ns)
+        # A stop or a hold is queued before a state can show its effect, so these come first.
+        self._stops(now_ns)
+        if states:
+            machine.see(states[-1], now_ns)
+        self._calls(now_ns)
+        machine.handle_deadline(now_ns)
+        self._send(machine.take_outputs())
 
-def send(
-    outputs: Sequence[Any], unsent: deque[bytes], peer: UnixPeer, encode: Encode
-) -> list[MissionEvent | Fault]:
-    """Send the events in `unsent` and then `outputs` to cloud; return new events and faults."""
-    while unsent and peer.send(unsent[0]):
-        unsent.popleft()
-    for output in outputs:
-        if isinstance(output, MissionEvent):  # queue an event behind unsent ones
-            data = encode(output)
-            if unsent or not peer.send(data):
-                unsent.append(data)
-        elif not isinstance(output, Fault):  # may be lost: teleop repeats these outputs
-            peer.send(encode(output))
-    return [output for output in outputs if isinstance(output, MissionEvent | Fault)]
-
-
-def _newest(arrived: list[bytes], decode: Decode) -> Any:
-    for data in reversed(arrived):
-        with suppress(ValueError):
-            return decode(data)
-    return None
+    def _send(self, outputs: Sequence[Any]) -> None:
+        """Send the events that cloud has not accepted yet, then the new outputs; tell the news."""
+        unsent, peer = self._unsent, self._peer
+        while unsent and peer.send(unsent[0]):
+            unsent.popleft()
+        for output in outputs:
+            if isinstance(output, MissionEvent):  # queue an event behind unsent ones
+                if unsent or not peer.send(output):
+                    unsent.append(output)
+            elif not isinstance(output, Fault):  # may be lost: teleop repeats these outputs
+                peer.send(output)
+        if news := [output for output in outputs if isinstance(output, MissionEvent | Fault)]:
+            self._tell(news)

@@ -19,7 +19,7 @@ from cloudrc.drivers.teleop import PERIOD_NS as WAKE_NS
 from cloudrc.drivers.virtual import Clock, VirtualRun
 from cloudrc.endpoint import Endpoint
 from cloudrc.faults.adversary import DishonestLoop, HostileOperator, Lie, Words
-from cloudrc.faults.invariants import OrderInvariant, Watch
+from cloudrc.faults.invariants import Watch
 from cloudrc.faults.models import EndpointGroup, RestartableEndpoint, TeleopModel
 from cloudrc.faults.scenario import generator
 from cloudrc.link.model import LinkDirection
@@ -27,6 +27,7 @@ from cloudrc.link.profile import Blackout, DirectionProfile
 from cloudrc.messages import GuardState
 from cloudrc.record.hash import RecordHash
 from cloudrc.records import Counted, GroundTruth, GuardChange, MissionEvent, Record
+from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import Mission, Order
 from cloudrc.tunnel.end import Identity
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
@@ -71,7 +72,6 @@ class Flight:
         lies: Sequence[Lie] = (),  # change cloud's commands, one after the other
         words: Words | None = None,  # makes requests in place of the operator
         second: float | None = None,  # when a second cloud connects [s]
-        separate: bool = False,  # whether teleop has its own process
     ) -> None:
         """Prepare a flight; a second cloud connects at `second` [s], if that is not None."""
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
@@ -81,18 +81,17 @@ class Flight:
         self.secrets, self.rings = {"world": SECRET, "cloud": SECRET}, dict[str, KeyRing]()
         self.generations = {"world": 0, "cloud": 0}
         self.of_world, self.of_cloud = list[Record](), list[Record]()
-        self.changes, self.world_starts_ns = list[GuardChange](), list[int]()
+        self.changes = list[GuardChange]()
         self._hash, self.watch = RecordHash(), Watch(self.experiment.guard)
-        order = OrderInvariant(self.watch, self.world_starts_ns)
-        self.listeners: list[Callable[[list[Record], int], None]] = [order.see]
-        limit, phase_ns = self.experiment.criteria.contact_speed_max_mps, None
-        if separate:
-            phase_ns = int(generator(self.experiment.seed, 45).integers(WAKE_NS))
-        self.teleop = TeleopModel(limit, phase_ns=phase_ns)
+        self.listeners: list[Callable[[list[Record], int], None]] = [self.watch.see]
+        self.teleop = TeleopModel(
+            self.experiment.criteria.contact_speed_max_mps,
+            int(generator(self.experiment.seed, 45).integers(WAKE_NS)),
+        )
         if start:
             self.teleop.order(self.make_order(), self._clock.at(0))
         self.world = RestartableEndpoint(self._build_world, Clock())
-        self.cloud = RestartableEndpoint(self._build_cloud, self._clock, "cloud")
+        self.cloud = RestartableEndpoint(self._build_cloud, self._clock)
         self.teleop.run_on(self.cloud)
         self.uplink = self._make_link(uplink or link, up=True)
         self.downlink = self._make_link(downlink or link, up=False)
@@ -120,9 +119,9 @@ class Flight:
         return Order(plan, contact=bool(self.experiment.criteria.contact))
 
     def order_if_possible(self, now_ns: int) -> None:
-        """Order the experiment's mission at `now_ns` [ns, virtual time]; a refusal is ignored."""
-        order, own_ns = self.make_order(), self._clock.at(now_ns)
-        self.teleop.ask(lambda service, own_ns: service.create(order, own_ns), own_ns)
+        """Order the experiment's mission; a refusal, and the time `now_ns`, are ignored."""
+        order = self.make_order()
+        self.teleop.ask(lambda service, now_ns: service.create(order, now_ns))
 
     def fly(self, until: float, is_over: Callable[[], bool] = lambda: False) -> Flight:
         """Continue the flight until the virtual time `until` [s] or until `is_over` is True."""
@@ -180,7 +179,6 @@ class Flight:
         identity = self._begin("world", SHARED)
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
         self.watch.attach(world.robot, start_ns, honest=self._honest)
-        self.world_starts_ns.append(start_ns)
         return world
 
     def _build_cloud(self, start_ns: int) -> Endpoint:
@@ -198,9 +196,9 @@ class Flight:
         return EndpointGroup([cloud, self._build_rival(joins_ns)])
 
     def _build_rival(self, start_ns: int) -> CloudEndpoint:
-        """Build a second cloud with the same key and its own order of the same mission."""
-        teleop = TeleopModel(self.experiment.criteria.contact_speed_max_mps, name=b"rival")
-        teleop.order(Order(assembly.build_plan(self.experiment)), start_ns)
+        """Build a second cloud with the same key, which starts the same mission itself."""
+        teleop = Teleop()
+        teleop.start(start_ns, assembly.build_plan(self.experiment))
         identity = Identity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
         return assembly.build_cloud(self.experiment, identity, lambda: start_ns, teleop)
 

@@ -16,10 +16,8 @@ collision  If the cloud is honest, only the arm's tip touches something, and it 
            the guard does not know what is below the robot.
 latch      The robot is in TRACK only during a mission that the operator has started. LAND and ESTOP
            last until the operator acknowledges them.
-hold       At least `SETTLE_NS` pass between two changes to TRACK, and between two changes to HOLD
-           for lack of commands. A HOLD may begin sooner if a command is based on older odometry
-           than an earlier command. In a mission, a robot without commands lands after the
-           configured time, or sooner after impossible commands.
+hold       At least `SETTLE_NS` pass between two changes to TRACK. In a mission, a robot without
+           commands lands after the configured time, or sooner after impossible commands.
 order      Each applied command is newer than the last one, and not of an old session.
 tick       The guard runs once in each step of the physics.
 
@@ -39,7 +37,6 @@ from cloudrc.geometry.fence import HIGH, LOW, inside
 from cloudrc.messages import (
     PLAN_STEP_NS,
     ZERO,
-    Cause,
     Command,
     GuardState,
     OperatorRequest,
@@ -69,8 +66,7 @@ REELS_NS = 1_000_000_000  # time after a collision in which it explains the robo
 THROWN_NS = 3_000_000_000  # time after a collision in which the robot may leave the fence [ns]
 RESUME_COMMANDS, RESUME_NS = 10, 500_000_000
 """Number of fresh commands that end a HOLD, and the time within which they must arrive [ns]."""
-SETTLE_NS = 1_000_000_000
-"""Shortest time between two changes to TRACK, or between two changes to HOLD [ns]."""
+SETTLE_NS = 1_000_000_000  # shortest time between two changes to TRACK [ns]
 INVALID_COMMANDS, INVALID_NS = 5, 1_000_000_000
 """Number of impossible commands that cause a landing, if they arrive within INVALID_NS [ns]."""
 INVALID = ("range", "future")  # reasons for which the guard rejects impossible commands
@@ -90,7 +86,7 @@ class Breach(NamedTuple):
 
 
 class Watch:
-    """Collects the breaches of a flight, including those after a restart of world."""
+    """Collects the breaches of a flight, and checks the order of commands."""
 
     def __init__(self, limits: ResolvedGuard) -> None:
         self.limits = limits
@@ -98,44 +94,34 @@ class Watch:
         self.counts: Counter[str] = Counter()  # of breaches, by kind
         self.margin = 9.0  # smallest distance of the base to the fence, without the floor [m]
         self.speed = 0.0  # largest reference [m/s]
+        self.starts_ns: list[int] = []  # when world's processes began [ns]
+        self._newest = (0, 0, -1)  # newest command: process of world, epoch and counter
 
     def attach(self, robot: Robot, start_ns: int, *, honest: bool) -> None:
         """Check a robot from `start_ns` [ns] on; if cloud is `honest`, check its contacts, too."""
         robot.observers.append(RobotInvariants(robot, self, start_ns, honest))
+        self.starts_ns.append(start_ns)
+
+    def see(self, records: list[Record], now_ns: int) -> None:
+        """Check that new records of world show commands that are applied once and in order.
+
+        A restarted world continues from the last epoch that cloud knows. If cloud knows no epoch,
+        world starts with the first epoch again, which is allowed.
+        """
+        for record in records:
+            if isinstance(record, CommandApplied | SessionOpened):
+                counter = record.counter if isinstance(record, CommandApplied) else -1
+                process = bisect_right(self.starts_ns, record.stamp_ns)
+                if (this := (process, record.epoch, counter)) <= self._newest:
+                    text = f"command {counter} of epoch {record.epoch} after {self._newest[1:]}"
+                    self.note(record.stamp_ns, "order", text)
+                self._newest = max(self._newest, this)
 
     def note(self, now_ns: int, kind: str, text: str) -> None:
         """Record a breach at `now_ns` [ns]."""
         self.counts[kind] += 1
         if self.counts[kind] <= REPORTED:
             self.breaches.append(Breach(now_ns * 1e-9, kind, text))
-
-
-class OrderInvariant:
-    """Checks that commands are applied once and in order."""
-
-    def __init__(self, watch: Watch, world_starts_ns: list[int]) -> None:
-        """Check commands of world's processes, which began at `world_starts_ns` [ns]."""
-        self._watch, self._world_starts_ns = watch, world_starts_ns
-        self._newest = (0, 0, -1)  # process of world, epoch and counter
-
-    def see(self, records: list[Record], now_ns: int) -> None:
-        """Check new records of world.
-
-        A restarted world continues from the last epoch that cloud knows. If cloud knows no epoch,
-        world starts with the first epoch again, which is allowed.
-        """
-        for record in records:
-            if isinstance(record, CommandApplied):
-                self._check(record.epoch, record.counter, record.stamp_ns)
-            elif isinstance(record, SessionOpened):
-                self._check(record.epoch, -1, record.stamp_ns)
-
-    def _check(self, epoch: int, counter: int, stamp_ns: int) -> None:
-        this = bisect_right(self._world_starts_ns, stamp_ns), epoch, counter
-        if this <= self._newest:
-            text = f"command {counter} of epoch {epoch} after {self._newest[1:]}"
-            self._watch.note(stamp_ns, "order", text)
-        self._newest = max(self._newest, this)
 
 
 class RobotInvariants:
@@ -164,11 +150,10 @@ class RobotInvariants:
         # The operator, and the wait for commands.
         self._ramp_ns = round(max(RAMP_MIN, watch.limits.speed_max_mps / RAMP) * 1e9)
         self._ramp_until_ns, self._alone_ns = -1, 0
-        self._tracked_ns = self._held_ns = -SETTLE_NS
+        self._tracked_ns = -SETTLE_NS
         self._armed = False  # whether a mission is on
         self._released = set[GuardState]()  # states acknowledged since the last change
-        self._is_reset = self._impossible = self._goes_back = False
-        self._basis_ns = -1  # newest odometry stamp of commands in a mission [ns]
+        self._is_reset = self._impossible = False
         self._fresh_ns: deque[int] = deque(maxlen=RESUME_COMMANDS)
         self._invalid_ns: deque[int] = deque(maxlen=INVALID_COMMANDS)
 
@@ -221,8 +206,6 @@ class RobotInvariants:
                 end_ns = min(end_ns, now_ns + self._plan_ns)
                 self._fresh_until_ns = max(self._fresh_until_ns, end_ns)
             if self._armed:
-                self._goes_back = basis_ns < self._basis_ns
-                self._basis_ns = max(self._basis_ns, basis_ns)
                 if self._state is HOLD:
                     self._fresh_ns.append(now_ns)
                 elif self._state is GROUND:
@@ -240,7 +223,7 @@ class RobotInvariants:
             case Request.START:
                 if request.start is Start.SPAWN:
                     self._steps, self._is_asked = 0, True
-                    self._tracked_ns = self._held_ns = -SETTLE_NS
+                    self._tracked_ns = -SETTLE_NS
                     self._is_reset, self._ramp_until_ns = True, -1
                 if request.start is Start.SPAWN or not self._armed:
                     self.see_session(now_ns)
@@ -382,7 +365,9 @@ class RobotInvariants:
         self._armed = self._armed and state not in LATCHED
         self._ramp_until_ns = -1
         if state is TRACK:
-            self._check_settled("TRACK", self._tracked_ns, now_ns)
+            if now_ns - self._tracked_ns < SETTLE_NS:
+                text = f"TRACK again after {(now_ns - self._tracked_ns) * 1e-9:.3f} s"
+                self._note(now_ns, "hold", text)
             self._tracked_ns = now_ns
             if was is HOLD and not self._is_reset:
                 self._ramp_until_ns = now_ns + self._ramp_ns
@@ -392,9 +377,7 @@ class RobotInvariants:
                     self._note(now_ns, "stale", text)
         elif state is HOLD or (was is TRACK and state is GROUND and not self._is_reset):
             # To GROUND: the robot had not left the ground yet.
-            if state is HOLD and self._guard.cause is Cause.SILENCE and not self._goes_back:
-                self._check_settled("HOLD", self._held_ns, now_ns)
-            self._held_ns = self._alone_ns = now_ns
+            self._alone_ns = now_ns
         elif state is LAND and not self._impossible:
             alone_ns = now_ns - self._alone_ns
             if was is TRACK or alone_ns <= self._wait_ns(was):
@@ -414,10 +397,6 @@ class RobotInvariants:
         if self._armed and alone_ns > self._wait_ns(state) + STEP_NS:
             self._note(now_ns, "hold", f"{state.name} for {alone_ns * 1e-9:.3f} s of a mission")
             self._alone_ns = now_ns
-
-    def _check_settled(self, name: str, last_ns: int, now_ns: int) -> None:
-        if now_ns - last_ns < SETTLE_NS:
-            self._note(now_ns, "hold", f"{name} again after {(now_ns - last_ns) * 1e-9:.3f} s")
 
     def _wait_ns(self, state: GuardState) -> float:
         """Return how long a robot in a mission may wait for commands [ns]."""

@@ -1,4 +1,4 @@
-"""Measure a flight by its records and by the metrics of its processes."""
+"""Measure a flight by its records."""
 
 from __future__ import annotations
 
@@ -7,26 +7,17 @@ from itertools import pairwise
 from math import dist, hypot, nan
 from typing import Any
 
-from cloudrc.exposition.live import LiveMetrics
-from cloudrc.exposition.parts import Histogram
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenario import Outcome, generator
 from cloudrc.messages import Cause, GuardState
 from cloudrc.record.columns import Recording
-from cloudrc.records import (
-    CommandApplied,
-    Fault,
-    GuardChange,
-    Record,
-    SessionOpened,
-)
+from cloudrc.records import CommandApplied, Fault, GuardChange, Record, SessionOpened
 from cloudrc.report.document import Run
 from cloudrc.report.write import assess
 
 AGE_MAX = 0.252 + 1e-9
 """Largest age of the newest command's odometry when a HOLD begins [s]: the limit
 guard.command_age_max_ms plus one step."""
-SOON = 5.0  # time within which a fault has to show in its metric [s]
 STANDS = 0.05  # speed up to which the robot stands [m/s]
 SAMPLE = 0.01  # time between two records of the ground truth [s]
 WINDOW_NS = 1_000_000_000  # window in which changes of the guard are counted [ns]
@@ -38,48 +29,10 @@ def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
     return float(generator(seed, 77).uniform(first, last))
 
 
-# Metrics.
-
-
-def seen_by(flight: Flight, role: str, until: float | None = None) -> list[Record]:
-    """Return the records of `role`: world, cloud or teleop; up to the virtual time `until` [s]."""
-    records: Iterable[Record] = flight.of_world if role == "world" else flight.of_cloud
-    records = flight.teleop.events if role == "teleop" else records
-    if until is None:
-        return list(records)
-    until_ns = (flight.world if role == "world" else flight.cloud).clock.at(round(until * 1e9))
-    return [record for record in records if record.stamp_ns <= until_ns]
-
-
-def reading(
-    flight: Flight, role: str, name: str, *labels: str, until: float | None = None
-) -> float:
-    """Return a metric's value at `until` [s], for a histogram its mean; NaN if there is none."""
-    live = LiveMetrics(role)
-    live.see(seen_by(flight, role, until))
-    shown: Any = live.read().get(f"cloudrc_{name}", {})
-    if isinstance(shown, Histogram):
-        count = shown.cumulative()[-1]
-        return shown.total / count if count else nan
-    return float(shown.get(labels, nan))
-
-
-def moves(
-    outcome: Outcome, flight: Flight, *metrics: str, since: float, over: float | None = None
-) -> None:
-    """Check that metrics change within 5 s after a fault that begins at `since` [s].
-
-    If the fault ends at `over` [s], the 5 s begin at its end: a frozen process exports no metrics,
-    and losses are known only when newer datagrams arrive. Each metric is written as role, name and
-    labels, such as "world guard_transitions_total hold".
-    """
-    last = (since if over is None else over) + SOON
-    end = "" if over is None else " of its end"
-    for metric in metrics:
-        role, *name = metric.split()
-        before, after = (reading(flight, role, *name, until=each) for each in (since, last))
-        moved = after == after and before != after  # a new metric counts as changed
-        outcome.true(f"metric {' '.join(name)} moves within {SOON:g} s{end}", moved)
+def refused(outcome: Outcome, flight: Flight, *reasons: str) -> None:
+    """Check that world has refused datagrams, or commands, for each reason."""
+    for reason in reasons:
+        outcome.least(f"refused as {reason}", flight.count(reason), 1)
 
 
 # The guard.

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from heapq import heappop, heappush
 from typing import TypeAlias, TypeVar
 
-from cloudrc.cloud.operator import Operator
-from cloudrc.drivers.teleop import EVENTS_KEPT, PERIOD_NS, RemoteTeleop, UnixPeer, send, turn
+from cloudrc.drivers.teleop import PERIOD_NS, RemoteTeleop, TeleopLoop, UnixPeer
 from cloudrc.drivers.virtual import Clock
 from cloudrc.endpoint import Endpoint
 from cloudrc.messages import NEVER_NS
-from cloudrc.records import Fault, Lateness, MissionEvent, Record
-from cloudrc.teleop import wire
+from cloudrc.records import Fault, MissionEvent, Record
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import (
     ConflictError,
@@ -25,7 +22,7 @@ from cloudrc.teleop.store import (
     UnavailableError,
     connect,
 )
-from cloudrc.teleop.wire import Output, RobotStatus
+from cloudrc.teleop.wire import ALARM, Message
 
 T = TypeVar("T")
 FAR_NS = 1 << 62
@@ -48,9 +45,9 @@ class RestartableEndpoint:
 
     sealed = True  # world and cloud have keys
 
-    def __init__(self, build: Callable[[int], Endpoint], clock: Clock, name: str = "world") -> None:
+    def __init__(self, build: Callable[[int], Endpoint], clock: Clock) -> None:
         """Start the first process; `build` makes world or cloud at a time on its clock [ns]."""
-        self._build, self.clock, self._name = build, clock, name
+        self._build, self.clock = build, clock
         self.tamper: Tamper | None = None  # changes the datagrams that arrive
         self._scheduled, self._frozen_until_ns = 0, -1
         self._waiting: list[bytes] = []
@@ -119,18 +116,14 @@ class RestartableEndpoint:
         while self._actions and self._actions[0][0] <= now_ns:
             heappop(self._actions)[2](now_ns)
         inner = self.inner
-        was_due_ns = inner.next_deadline_ns() if inner is not None else FAR_NS
         if 0 <= self._frozen_until_ns <= now_ns:
             self._frozen_until_ns = -1
             waiting, self._waiting = self._waiting, []
             for data in waiting:
                 self.receive_now(data, now_ns)
         if inner is not None and self._frozen_until_ns < 0:
-            own_ns = self.clock.at(now_ns)
-            if own_ns >= inner.next_deadline_ns():
+            if (own_ns := self.clock.at(now_ns)) >= inner.next_deadline_ns():
                 inner.handle_deadline(own_ns)
-            if own_ns > was_due_ns + 1000:  # rounding of a drifting clock: 1 ns
-                self._note_late_wake(inner, own_ns, own_ns - was_due_ns)
         self._set_deadline()
 
     def take_datagrams(self) -> list[bytes]:
@@ -143,12 +136,6 @@ class RestartableEndpoint:
         """Implement `Endpoint.take_records`."""
         left, self._left = self._left, []
         return left + self.inner.take_records() if self.inner is not None else left
-
-    def _note_late_wake(self, inner: Endpoint, own_ns: int, late_ns: int) -> None:
-        """Record a late wake, as the real-time driver does."""
-        slip_ns = getattr(inner, "slip_ns", 0)
-        self._left = self.take_records()
-        self._left.append(Lateness(own_ns - slip_ns, self._name, late_ns * 1e-9, 0.0, slip_ns))
 
     def _set_deadline(self) -> None:
         due_ns = self._actions[0][0] if self._actions else FAR_NS
@@ -200,47 +187,39 @@ class _Peer(UnixPeer):
 
     def __init__(self, is_open: Callable[[], bool]) -> None:
         self.other, self._is_open = self, is_open
-        self.waiting: list[bytes] = []
+        self.waiting: list[Message | None] = []
 
-    def receive(self) -> list[bytes]:
+    def receive(self) -> list[Message | None]:
         return _take_all(self.waiting)
 
-    def send(self, data: bytes) -> bool:
-        """Implement `UnixPeer.send`: put a datagram into the other socket if it has room."""
+    def send(self, message: Message | None) -> bool:
+        """Implement `UnixPeer.send`: put a message into the other socket if it has room."""
         sent = self.other._is_open() and len(self.other.waiting) < UNIX_SOCKET_MAX
         if sent:
-            self.other.waiting.append(data)
+            self.other.waiting.append(message)
         return sent
 
 
 class TeleopModel:
-    """Teleop with a disk that survives restarts.
+    """Teleop in a process of its own, with a disk that survives restarts.
 
-    Teleop runs inside cloud's process, as an `Operator`, or in its own process. Its own process
-    wakes every 20 ms, and two Unix sockets connect it with cloud, as in production.
+    The process wakes every 20 ms. Two Unix sockets connect it with cloud, as in production.
 
     Attributes:
         service: Teleop's service; None while teleop is not running.
         events: Events of all missions, oldest first.
     """
 
-    outcome: MissionEvent | None = None
-    settled = True
-
-    def __init__(
-        self, contact_speed_max: float, name: bytes = b"desk", phase_ns: int | None = None
-    ) -> None:
+    def __init__(self, contact_speed_max: float, phase_ns: int) -> None:
         """Start teleop.
 
         Args:
             contact_speed_max: Limit of the speed of the arm's tip at the board [m/s].
-            name: Makes the mission numbers differ from those of another teleop.
-            phase_ns: First wake of teleop's own process [ns, virtual time]; None: no own process.
+            phase_ns: First wake of teleop's process [ns, virtual time].
         """
-        self._contact_speed_max, self._name, self._starts = contact_speed_max, name, 0
+        self._contact_speed_max, self._phase_ns, self._starts = contact_speed_max, phase_ns, 0
         self._disk = b""  # the bytes of its database
         self.events: list[MissionEvent] = []
-        self._phase_ns = phase_ns
         self._host: RestartableEndpoint | None = None
         self._peer = _Peer(lambda: self.service is not None)
         self._clouds = _Peer(lambda: self._host is not None and self._host.inner is not None)
@@ -250,38 +229,39 @@ class TeleopModel:
     def start(self, now_ns: int = 0) -> None:
         """Start a new process, which knows only what is on the disk; `now_ns` is ignored."""
         self._starts += 1
-        salt = b"%s %d" % (self._name, self._starts)  # random in production
         self._database = connect()
         if self._disk:
             self._database.deserialize(self._disk)
-        self.service: MissionService | None = MissionService(
-            self._contact_speed_max, MissionStore(self._database, salt)
-        )
-        self.outputs: Sequence[Output | Fault] = []
+        salt = b"desk %d" % self._starts  # random in production
+        service = MissionService(self._contact_speed_max, MissionStore(self._database, salt))
+        self.service: MissionService | None = service
         self._peer.waiting.clear()
-        self._calls, self._stops = list[Action](), list[Action]()
-        self._unsent: deque[bytes] = deque(maxlen=EVENTS_KEPT)
-        self._free_ns, self._turn_ns, self._blind = 0, NEVER_NS, 0
+        self._calls, self._stops = list[Call](), list[Call]()
+        self._loop = TeleopLoop(
+            service,
+            self._peer,
+            self._take,
+            calls=partial(_make, service, self._calls),
+            stops=partial(_make, service, self._stops),
+        )
+        self._free_ns, self._turn_ns = 0, NEVER_NS
 
     def kill(self, now_ns: int = 0) -> None:
         """Kill the process; only the disk remains. `now_ns` is ignored."""
         if self.service is not None:
             self._disk = self._database.serialize()
             self._database.close()
-        self.service, self.outputs = None, []
+        self.service = None
 
     def run_on(self, host: RestartableEndpoint) -> None:
-        """Run on the machine of `host`; teleop's own process wakes even if cloud is down."""
+        """Run on the machine of `host`; the process wakes even if cloud is down."""
         self._host = host
-        if self._phase_ns is not None:
-            host.at(self._phase_ns * 1e-9, self._wake)
+        host.at(self._phase_ns * 1e-9, self._wake)
 
-    def join(self, start_ns: int) -> Operator:
+    def join(self, start_ns: int) -> RemoteTeleop:
         """Return the `Operator` for a cloud that starts at `start_ns` on its clock [ns]."""
-        if self._phase_ns is None:
-            return self
         self._clouds.waiting.clear()  # lost with the previous cloud
-        return RemoteTeleop(self._clouds, wire.encode, wire.decode, start_ns)
+        return RemoteTeleop(self._clouds, start_ns)
 
     @property
     def missions(self) -> list[Mission]:
@@ -293,62 +273,27 @@ class TeleopModel:
         assert self.service is not None, "teleop is down"
         self.service.create(order, now_ns)
 
-    def ask(self, call: Call, now_ns: int) -> None:
-        """Call teleop's API at `now_ns` on cloud's clock [ns]; a refusal is ignored.
-
-        If teleop has its own process, it handles the call when the process wakes next.
-        """
-        if self._phase_ns is None:
-            self._call(call, now_ns)
-        else:
-            self._calls.append(partial(self._call, call))
+    def ask(self, call: Call) -> None:
+        """Call teleop's API; teleop handles the call when it wakes next. A refusal is ignored."""
+        self._calls.append(call)
 
     def stop_rotors(self, now_ns: int) -> None:
-        """Make an emergency stop at `now_ns` on cloud's clock [ns].
+        """Make an emergency stop: send an alarm to cloud at once; `now_ns` is ignored.
 
-        If teleop is a process of its own, it sends an alarm to cloud at once. It stores the stop in
-        the next turn of its loop.
+        Teleop stores the stop when it wakes next.
         """
-        if self.service is not None and self._phase_ns is not None:
-            self._stops.append(partial(self._call, MissionService.stop_rotors))
-            self._peer.send(wire.encode(wire.ALARM))
-        else:
-            self._call(MissionService.stop_rotors, now_ns)
+        if self.service is not None:
+            self._stops.append(MissionService.stop_rotors)
+            self._peer.send(ALARM)
 
     def freeze(self, now_ns: int, duration: float) -> None:
-        """Freeze teleop's own process as with SIGSTOP, from `now_ns` [ns] for `duration` [s]."""
-        if self.service is not None and self._phase_ns is not None and self._host is not None:
+        """Freeze the process as with SIGSTOP, from `now_ns` [ns] for `duration` [s]."""
+        if self.service is not None and self._host is not None:
             self._free_ns = max(self._free_ns, now_ns + round(duration * 1e9))
             self._host.at(self._free_ns * 1e-9, self._turn)  # a late process wakes at once
 
-    # The `Operator` of a cloud in the same process.
-
-    def see(self, seen: RobotStatus, now_ns: int) -> None:
-        """Implement `Operator.see`."""
-        if self.service is not None:
-            self.service.see(seen, now_ns)
-            self.outputs = [*self.outputs, *self._take(self.service)]
-
-    def handle_deadline(self, now_ns: int) -> None:
-        """Implement `Operator.handle_deadline`."""
-        if self.service is not None:
-            self.service.handle_deadline(now_ns)
-            self.outputs = [*self.outputs, *self._take(self.service)]
-
-    def take_outputs(self) -> Sequence[Output | Fault]:
-        """Implement `Operator.take_outputs`."""
-        outputs, self.outputs = self.outputs, []
-        return outputs
-
-    def _call(self, call: Call, now_ns: int) -> None:
-        if self.service is not None:
-            with suppress(ConflictError, UnavailableError):
-                call(self.service, now_ns)
-
-    def _take(self, service: MissionService) -> list[Output | Fault]:
-        outputs = service.take_outputs()
-        self.events += [each for each in outputs if isinstance(each, MissionEvent)]
-        return outputs
+    def _take(self, news: list[MissionEvent | Fault]) -> None:
+        self.events += [each for each in news if isinstance(each, MissionEvent)]
 
     def _wake(self, now_ns: int) -> None:
         assert self._host is not None
@@ -358,19 +303,15 @@ class TeleopModel:
     def _turn(self, now_ns: int) -> None:
         if self.service is None or self._host is None or now_ns < self._free_ns:
             return
-        turned_ns, self._turn_ns = self._turn_ns, now_ns
-        self._blind = turn(
-            self.service,
-            self._peer,
-            wire.decode,
-            partial(_take_all, self._calls),
-            stops=partial(_take_all, self._stops),
-            blind=self._blind,
-            late_ns=now_ns - turned_ns - PERIOD_NS if turned_ns >= 0 else 0,
-            now_ns=self._host.clock.at(now_ns),
-        )
-        # Events wait until cloud runs; all other outputs are repeated.
-        send(self._take(self.service), self._unsent, self._peer, wire.encode)
+        late_ns = max(0, now_ns - self._turn_ns - PERIOD_NS) if self._turn_ns >= 0 else 0
+        self._turn_ns = now_ns
+        self._loop.wake(self._host.clock.at(now_ns), late_ns)
+
+
+def _make(service: MissionService, calls: list[Call], now_ns: int) -> None:
+    for call in _take_all(calls):
+        with suppress(ConflictError, UnavailableError):
+            call(service, now_ns)
 
 
 def _take_all(waiting: list[T]) -> list[T]:

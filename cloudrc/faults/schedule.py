@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import yaml
@@ -97,8 +97,7 @@ class Event:
 class Schedule:
     """All faults of one flight.
 
-    `seed` determines the random numbers of the link and of the faults. With `separate`, teleop runs
-    in its own process, as in production.
+    `seed` determines the random numbers of the link and of the faults.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
@@ -112,13 +111,7 @@ class Schedule:
     cloud_drift: Annotated[int, Field(ge=-100_000, le=100_000)] = 0  # drift of cloud's clock [ppm]
     policy: str = ""  # policy of a dishonest cloud; "" for an honest cloud
     duration: Annotated[float, Field(ge=0.1, le=DURATION_MAX)] = 60.0  # [s]
-    separate: bool = False
     hold_max: Annotated[float, Field(ge=0.1, le=3600.0)] = 60.0  # HOLD becomes LAND then [s]
-
-    @property
-    def teleop_is_separate(self) -> bool:
-        """Whether teleop runs in its own process; faults that freeze teleop require that."""
-        return self.separate or bool(self.of("teleop_paused"))
 
     @property
     def quiet_from(self) -> float:
@@ -170,20 +163,15 @@ def _change(profile: DirectionProfile, active: list[Event], at: float) -> Change
     return Change(at, delay=delay, jitter=jitter, loss=loss)
 
 
+_SCHEDULE = TypeAdapter(Schedule)
+
+
 def dump(schedule: Schedule, note: str = "") -> str:
     """Format a schedule as YAML, with a note at the top."""
-    values, plain = asdict(schedule).items(), asdict(Schedule(-1))
-    document: dict[str, Any] = {name: value for name, value in values if value != plain[name]}
-    document["events"] = [
-        {name: value for name, value in asdict(event).items() if value or name == "at"}
-        for event in sorted(schedule.events, key=lambda event: event.at)
-    ]
+    document = _SCHEDULE.dump_python(schedule, mode="json", exclude_defaults=True)
     head = "".join(f"# {line}\n" for line in note.splitlines())
     text: str = yaml.safe_dump(document, sort_keys=False, width=100)
     return head + text
-
-
-_SCHEDULE = TypeAdapter(Schedule)
 
 
 def load(path: Path) -> Schedule:
@@ -231,7 +219,6 @@ def compose(seed: int) -> Schedule:
         cloud_offset=round(float(rng.uniform(-1e5, 1e5)), 3) if rng.random() < 0.5 else 0.0,
         cloud_drift=int(rng.integers(-500, 501)) if rng.random() < 0.3 else 0,
         duration=DURATION,
-        separate=bool(rng.random() < 0.5),
         # In a third of the schedules it is shorter than most silences, so the robot lands.
         hold_max=round(float(rng.uniform(*HOLDS)), 1) if rng.random() < 1 / 3 else 60.0,
     )

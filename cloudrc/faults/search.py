@@ -1,4 +1,4 @@
-"""Fly random schedules for some minutes to find breaches of invariants; shrink and store them.
+"""Fly random schedules for some minutes to find breaches of invariants, and store them.
 
 Seeds are consecutive numbers. To continue a search that ended before seed N, use `--first N`.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -19,7 +19,6 @@ from cloudrc.faults.trial import INVARIANTS, Finding, checked_in, fly
 KINDS: dict[str, Callable[[int], Schedule]] = {"random": compose, "adversarial": choose}
 """Kinds of search: random faults, and dishonest clouds with or without random faults."""
 CHUNK = 500  # number of seeds that are handed to the pool at once
-SHRINK_MAX = 120.0  # longest time to shrink one schedule [s]
 
 Job: TypeAlias = tuple[str, int]
 Map: TypeAlias = Callable[[Callable[[Job], Finding], Sequence[Job], int], Iterator[Finding]]
@@ -38,7 +37,7 @@ class Search:
     def __init__(self, kind: str, first: int, store: Path) -> None:
         """Prepare a search of a kind in `KINDS`; `store` is the folder for failing schedules."""
         self.kind, self.first, self.next, self._store = kind, first, first, store
-        self.failures: list[dict[str, Any]] = []  # schedules that broke an invariant, shrunk
+        self.failures: list[dict[str, Any]] = []  # schedules that broke an invariant
         self._checked: Counter[str] = Counter()
         self._broken: Counter[str] = Counter()
         self._margin, self._speed, self._seconds, self._missions = 9.0, 0.0, 0.0, 0
@@ -93,46 +92,17 @@ class Search:
         return self.failures[-1]
 
     def _keep(self, finding: Finding) -> dict[str, Any]:
-        kinds, until = finding.kinds, time.monotonic() + SHRINK_MAX
-
-        def fails(schedule: Schedule) -> bool:
-            return time.monotonic() < until and bool(fly(schedule).kinds & kinds)
-
-        smallest, seed = shrink(finding.schedule, fails), finding.schedule.seed
-        name = f"{'-'.join(sorted(kinds))}-{smallest.policy or 'seed'}-{seed}.yaml"
+        schedule, seed = finding.schedule, finding.schedule.seed
+        name = f"{'-'.join(sorted(finding.kinds))}-{schedule.policy or 'seed'}-{seed}.yaml"
         lines = [f"{each.time:.3f} s: {each.kind}: {each.text}" for each in finding.breaches[:3]]
-        note = "\n".join([f"Found by seed {seed}, before it was shrunk:", *lines])
         self._store.mkdir(parents=True, exist_ok=True)
-        (self._store / name).write_text(dump(smallest, note), encoding="utf-8")
+        (self._store / name).write_text(dump(schedule, "\n".join(lines)), encoding="utf-8")
         return {
             "seed": seed,
             "breaches": [breach._asdict() for breach in finding.breaches],
-            "schedule": asdict(smallest),
+            "schedule": asdict(schedule),
             "file": str(self._store / name),
         }
-
-
-def shrink(schedule: Schedule, fails: Callable[[Schedule], bool]) -> Schedule:
-    """Simplify a schedule as long as it still fails: fewer faults, then weaker faults."""
-    simpler = (each for each in _simpler(schedule) if each != schedule and fails(each))
-    found = next(simpler, None)
-    return schedule if found is None else shrink(found, fails)
-
-
-def _simpler(schedule: Schedule) -> Iterator[Schedule]:
-    """Yield variants of a schedule: fewer faults, default settings, shorter faults."""
-    events, size = schedule.events, len(schedule.events)
-    while size:
-        for at in range(0, len(events), size):
-            yield replace(schedule, events=events[:at] + events[at + size :])
-        size //= 2
-    plain = Schedule(schedule.seed)
-    for name in sorted(asdict(plain).keys() - {"seed", "events", "policy", "duration"}):
-        yield replace(schedule, **{name: getattr(plain, name)})
-    for n, event in enumerate(events):
-        shorter = replace(event, duration=round(event.duration / 2, 2))
-        if shorter.duration > 0.0:
-            yield replace(schedule, events=(*events[:n], shorter, *events[n + 1 :]))
 
 
 def search_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:

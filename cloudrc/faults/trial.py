@@ -143,7 +143,6 @@ def _prepare(schedule: Schedule, settings: tuple[str, ...], keep: bool) -> Fligh
         lies=lies,
         words=words,
         second=min((event.at for event in schedule.of("second_cloud")), default=None),
-        separate=schedule.teleop_is_separate,
     )
 
 
@@ -183,14 +182,13 @@ class Operator:
         if service is None or now_ns < self._next_ns or flight.cloud.inner is None:
             return
         # A restarted world is in GROUND without a change of state, so ask for the state.
-        own_ns = flight.cloud.clock.at(now_ns)
-        seen = service.state(own_ns)["seen"]
+        seen = service.state(flight.cloud.clock.at(now_ns))["seen"]
         is_over = not flight.teleop.missions or flight.mission.ended
         if seen is None or not (is_over or flight.mission.state == QUEUED):
             return
         self._next_ns = now_ns + PATIENCE_NS
         if seen["guard"] in [each.name for each in LATCHED]:
-            flight.teleop.ask(MissionService.acknowledge, own_ns)
+            flight.teleop.ask(MissionService.acknowledge)
         elif is_over:
             flight.order_if_possible(now_ns)
 
@@ -238,7 +236,7 @@ def _actions(
     gone = at + event.value * lasts  # end of teleop after it was asked to end
 
     def ask(call: Call) -> Action:
-        return lambda now_ns: teleop.ask(call, flight.cloud.clock.at(now_ns))
+        return lambda now_ns: teleop.ask(call)
 
     def read(end: str, keys: KeySet | None = None) -> Action:
         return lambda now_ns: flight.replace_key(end, keys or flight.secrets["world"])
@@ -257,7 +255,7 @@ def _actions(
         "key_rotated": ((at, read("world", NEXT_KEY)), (end, read("cloud", NEXT_KEY))),
         "key_wrong": ((at, read("cloud", WRONG_KEY)), (end, read("cloud"))),
         "second_order": ((at, flight.order_if_possible),),
-        "stopped": ((at, lambda now_ns: teleop.stop_rotors(flight.cloud.clock.at(now_ns))),),
+        "stopped": ((at, teleop.stop_rotors),),
         "held": ((at, ask(MissionService.hold)), (end, ask(MissionService.resume))),
     }
 

@@ -14,7 +14,6 @@ import threading
 from collections import deque
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -144,25 +143,25 @@ class Bridge:
 
         return await self.ask(checked)
 
-    def take_stops(self) -> list[Callable[[int], None]]:
-        """Remove and return stops and holds, which the loop makes before it reads telemetry."""
-        return self._take(self._urgent)
+    def make_stops(self, now_ns: int) -> None:
+        """Make the queued stops and holds; the loop does this before it reads telemetry."""
+        self._make(self._urgent, now_ns)
 
-    def take(self) -> list[Callable[[int], None]]:
-        """Remove and return all queued calls, the urgent ones first."""
-        return [*self.take_stops(), *self._take(self._calls)]
+    def make_calls(self, now_ns: int) -> None:
+        """Make all queued calls, the urgent ones first."""
+        self._make(self._urgent, now_ns)
+        self._make(self._calls, now_ns)
 
-    def _take(self, calls: deque[tuple[Call, Future[Any]]]) -> list[Callable[[int], None]]:
-        return [partial(self._make, *calls.popleft()) for _ in range(len(calls))]
-
-    def _make(self, call: Call, future: Future[Any], now_ns: int) -> None:
-        assert self._service is not None, "calls are taken after `open` only"
-        if future.set_running_or_notify_cancel():
-            try:
-                result = call(self._service, now_ns)
-                future.set_result(result.as_json() if isinstance(result, Mission) else result)
-            except Exception as error:  # the client gets the error
-                future.set_exception(error)
+    def _make(self, calls: deque[tuple[Call, Future[Any]]], now_ns: int) -> None:
+        for _ in range(len(calls)):
+            call, future = calls.popleft()
+            assert self._service is not None, "calls are made after `open` only"
+            if future.set_running_or_notify_cancel():
+                try:
+                    result = call(self._service, now_ns)
+                    future.set_result(result.as_json() if isinstance(result, Mission) else result)
+                except Exception as error:  # the client gets the error
+                    future.set_exception(error)
 
 
 def create_app(

@@ -10,7 +10,6 @@ import json
 import logging
 import os
 import queue
-import re
 import sys
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -27,12 +26,11 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cloudrc.errors import BadInputError
-from cloudrc.files import read, readable_by_others
+from cloudrc.files import read_token, warn_if_readable
 
 OPERATOR, READER = "operator", "reader"
 """Roles of callers; the token of a role is in a file with the name of the role."""
 BEARER = HTTPBearer(auto_error=False, description="An operator's token, or a reader's for GET")
-_TOKEN = re.compile(rb"[!-~]{16,512}")
 READS = ("GET", "HEAD")
 URGENT = ("/v1/estop", "/v1/hold")
 """Paths of commands that are accepted even if too many requests are open."""
@@ -78,8 +76,8 @@ class Tokens:
         """
         self._folder = folder
         self._read()
-        for path in filter(readable_by_others, (folder / OPERATOR, folder / READER)):
-            warn(f"warning: {path} can be read by others: chmod 600 {path}")
+        for role in (OPERATOR, READER):
+            warn_if_readable(folder / role, warn)
 
     def caller(self, token: str) -> Caller | None:
         """Return the caller with this token; None if the token is not valid.
@@ -96,23 +94,19 @@ class Tokens:
         for role in (OPERATOR, READER):
             path = self._folder / role
             if role == OPERATOR or path.exists():
-                digest = hashlib.sha256(_read_token(path)).digest()
+                digest = hashlib.sha256(_read_token(path).encode()).digest()
                 if digest in known:  # then a reader's token would allow commands
                     raise BadInputError(f"--tokens {self._folder}: both roles have the same token")
                 known[digest] = Caller(role, f"{role}-{digest.hex()[:8]}")
         return known
 
 
-def _read_token(path: Path) -> bytes:
-    reason = "a token is 16 to 512 visible ASCII characters"
+def _read_token(path: Path) -> str:
     try:
-        token = read(path).strip()
-    except (OSError, ValueError) as error:
-        token, reason = b"", getattr(error, "strerror", None) or str(error)
-    if not _TOKEN.fullmatch(token):
+        return read_token(path)
+    except ValueError as error:
         make = f"(umask 077; openssl rand -hex 32 > {path})"
-        raise BadInputError(f"--tokens: {path}: {reason}; make one: {make}")
-    return token
+        raise BadInputError(f"--tokens: {path}: {error}; make one: {make}") from None
 
 
 class Audit(RotatingFileHandler):

@@ -68,16 +68,13 @@ def test_run_follows_to_the_verdict(api, mission):
     assert lines[-1] == "SUCCESS: every waypoint reached, every criterion met"
 
 
-def test_fly_under_one_key_flies_once_and_leaves_its_verdict(api, mission, folder, monkeypatch):
-    log = folder / "termination-log"
-    log.touch()
-    monkeypatch.setattr(command, "TERMINATION_LOG", log)
+def test_fly_under_one_key_flies_once(api, mission):
     thread = pilot(api, A)
     end = threading.Thread(target=lambda: (thread.join(), api.post("/v1/missions/m1/cancel")))
     end.start()
     for _ in range(2):
-        assert "INTERRUPTED" in mission("fly --mission two.yaml --key uid", 130).out
-        assert log.read_text() == "INTERRUPTED: cancelled: mission cancelled\n"
+        lines = mission("fly --mission two.yaml --key uid", 130).out.splitlines()
+        assert lines[-1] == "INTERRUPTED: cancelled: mission cancelled"
     end.join()
     assert len(api.get("/v1/missions")["missions"]) == 1
 
@@ -185,7 +182,7 @@ def test_the_token_file_comes_from_flag_or_environment(api, folder, monkeypatch,
     assert "no mission is under way" in hold(5, f"--token-file {api.token_file}")
     wrong.write_text("two words")
     error = hold(2)
-    assert "holds no token" in error
+    assert "a token is 16 to 512 visible" in error
     assert "two words" not in error
     assert "--token-file none: No such file or directory" in hold(2, "--token-file none")
 

@@ -70,13 +70,6 @@ def test_the_other_verbs_go_to_the_api_of_the_release(running, teleop, capsys):
     assert re.match("cloudrc: error: .*secrets.*\n$", capsys.readouterr().err)
 
 
-def test_a_mission_of_the_wrong_format_makes_no_job(running, folder, capsys):
-    (folder / "wrong.yaml").write_text(f"time_limit_s: .nan\n{WAYPOINTS}")
-    assert main(["mission", "run", "wrong.yaml"]) == 2
-    assert "wrong.yaml:1: time_limit_s: nan: must be finite" in capsys.readouterr().err
-    assert running.jobs() == []
-
-
 def test_run_waits_until_the_release_is_ready(lands, capsys):
     """`helm install` does not wait for the pods."""
     lands.put("pods", pod("cloud-1", "cloud", ready=False, phase="Pending"))

@@ -10,8 +10,8 @@ from cloudrc.drivers.teleop import (
     EVENTS_KEPT,
     STALL_NS,
     RemoteTeleop,
+    TeleopLoop,
     UnixPeer,
-    serve_teleop,
 )
 from cloudrc.errors import BadInputError
 from cloudrc.messages import OperatorRequest, Request, Setpoint
@@ -31,25 +31,21 @@ def event(number):
 
 def test_a_full_socket_drops_and_never_blocks(peers):
     one, other = peers
-    assert not all([one.send(b"%d" % number) for number in range(5000)])
-    assert other.receive()[0] == b"0"
+    assert not all([one.send(event(number)) for number in range(5000)])
+    assert other.receive()[0] == event(0)
 
 
 def test_a_path_that_is_too_long_is_named(tmp_path):
     with pytest.raises(BadInputError, match="longer than 107 bytes"):
-        UnixPeer(tmp_path / ("x" * 120), tmp_path / "b")
+        UnixPeer(tmp_path / ("x" * 120), tmp_path / "b", encode, decode)
 
 
 # Cloud's side
 
 
-def remote(peer, start_ns=0):
-    return RemoteTeleop(peer, encode, decode, start_ns)
-
-
 def test_cloud_reports_each_silence_of_teleop_once(peers):
     one, other = peers
-    teleop = remote(one)
+    teleop = RemoteTeleop(one, 0)
     for now_ns in range(0, 3 * SECOND, PERIOD_NS):
         teleop.handle_deadline(now_ns)
     assert teleop.take_outputs() == [], "without telemetry teleop has nothing to say"
@@ -58,7 +54,7 @@ def test_cloud_reports_each_silence_of_teleop_once(peers):
         teleop.handle_deadline(now_ns)
     (fault,) = teleop.take_outputs()
     assert (type(fault), fault.code) == (Fault, "teleop_silent")
-    for data in (b"rubbish", b'["Nobody", []]', encode(POINT)):  # what is no message is ignored
+    for data in (b"rubbish", b'["Nobody", []]', POINT):  # what is no message is ignored
         other.send(data)
     for now_ns in range(6 * SECOND, 9 * SECOND, PERIOD_NS):
         teleop.handle_deadline(now_ns)
@@ -69,15 +65,15 @@ def test_cloud_reports_each_silence_of_teleop_once(peers):
 def test_after_a_stall_cloud_forwards_stops_but_not_waypoints(peers, stalled):
     """Teleop may have withdrawn the waypoints in a datagram that a full socket refused."""
     one, other = peers
-    teleop = remote(one, SECOND)
+    teleop = RemoteTeleop(one, SECOND)
     words = [OperatorRequest(n, each, mission_id=7) for n, each in enumerate(Request, 1)]
     words += [POINT, POINT._replace(waypoint=0), event(0)]
     for said in words:
-        other.send(encode(said))
+        other.send(said)
     teleop.handle_deadline(SECOND + STALL_NS + stalled)
     leads = [words[0], words[-2]] if stalled else []
     assert teleop.take_outputs() == [said for said in words if said not in leads]
-    other.send(encode(words[0]))  # the repeat must pass, even to a cloud that is always late
+    other.send(words[0])  # the repeat must pass, even to a cloud that is always late
     teleop.handle_deadline(3 * SECOND if stalled else SECOND + STALL_NS + PERIOD_NS)
     assert teleop.take_outputs() == words[:1]
 
@@ -103,11 +99,10 @@ class Machine:
         return outputs
 
 
-def serve(machine, peer, wakes, calls=list, told=None):
+def serve(machine, peer, wakes, calls=lambda now_ns: None, told=None):
     """Serve for so many wakes."""
     left, tell = iter(range(wakes)), [].extend if told is None else told.extend
-    how = {"calls": calls, "tell": tell, "stop": lambda: next(left, None) is None}
-    serve_teleop(machine, peer, encode, decode, **how)
+    TeleopLoop(machine, peer, tell, calls=calls).run(lambda: next(left, None) is None)
 
 
 @pytest.mark.parametrize(
@@ -126,19 +121,19 @@ def test_after_a_stall_old_states_are_skipped_before_calls(peers, monkeypatch, w
     At each wake a new state has arrived (p), or the wake follows a stall (s) with an old one.
     """
     machine, clock, coming = Machine(), [SECOND], iter(wakes)
-    calls = [[lambda now_ns: machine.seen.append("asked")]]
+    calls = ["asked"]
     if wakes == "-":
-        peers[1].send(encode(PAST))
+        peers[1].send(PAST)
 
     def sleep(seconds):
         what = next(coming)
         clock[0] += round(seconds * 1e9) + (2 * STALL_NS if what == "s" else 0)
         if what in "sp":
-            peers[1].send(encode(PAST if what == "s" else POINT))
+            peers[1].send(PAST if what == "s" else POINT)
 
     monkeypatch.setattr("cloudrc.drivers.teleop.time.sleep", sleep)
     monkeypatch.setattr("cloudrc.drivers.teleop.time.monotonic_ns", lambda: clock[0])
-    serve(machine, peers[0], len(wakes), lambda: calls.pop() if calls else [])
+    serve(machine, peers[0], len(wakes), lambda now_ns: calls and machine.seen.append(calls.pop()))
     assert machine.seen == done
     assert bool(machine.heard) == bool({POINT, PAST} & set(done)), "old signs of life do not count"
 
@@ -150,14 +145,14 @@ def test_events_wait_for_an_absent_cloud_in_order_and_bounded(peers, tmp_path):
     events = [event(number) for number in range(EVENTS_KEPT + 50)]
     machine, told = Machine(), []
     machine.outputs = [POINT, *events, Fault(0, "journal", "full")]
-    server = threading.Thread(target=serve, args=(machine, teleop, 40, list, told))
+    server = threading.Thread(target=serve, args=(machine, teleop, 40), kwargs={"told": told})
     server.start()
     received, back, limit = [], None, time.monotonic() + 5.0
     while len(received) < EVENTS_KEPT:
         assert time.monotonic() < limit
         if len(told) > len(events):
-            back = back or UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock")
-            received += map(decode, back.receive())
+            back = back or UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock", encode, decode)
+            received += back.receive()
         time.sleep(0.005)
     server.join()
     back.close()

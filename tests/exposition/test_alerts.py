@@ -11,7 +11,6 @@ import yaml
 from cloudrc.exposition.live import LiveMetrics
 from cloudrc.exposition.parts import Histogram
 from cloudrc.exposition.table import METRICS
-from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenarios import SCENARIOS
 from cloudrc.records import Counted
@@ -57,11 +56,18 @@ def series(flight):
     return [{"series": name, "values": " ".join(each)} for name, each in values.items()]
 
 
+def seen_by(flight, role, until):
+    """Return the records of a process up to a virtual time [s]."""
+    kept = {"world": flight.of_world, "cloud": flight.of_cloud, "teleop": flight.teleop.events}
+    until_ns = (flight.world if role == "world" else flight.cloud).clock.at(round(until * 1e9))
+    return [record for record in kept[role] if record.stamp_ns <= until_ns]
+
+
 def scrapes(flight, role, times):
     """Yield the readings of a process at each time [s]."""
     live, seen, sent = LiveMetrics(role, missions=role != "cloud"), 0, 0
     for time in times:
-        records = measures.seen_by(flight, role, time)
+        records = seen_by(flight, role, time)
         for record in records[seen:]:
             if isinstance(record, Counted) and record.name == "sent":
                 if record.total < sent:  # a new process, which counts from 0

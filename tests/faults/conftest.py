@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 from cloudrc.config.load import load_experiment
 from cloudrc.faults.invariants import FLOWN, TRACK, Watch
-from cloudrc.messages import ZERO, Cause, Command, OperatorRequest, Request, Start
+from cloudrc.messages import ZERO, Command, OperatorRequest, Request, Start
 from cloudrc.records import Contact
 from cloudrc.world.rotors import STOPPED
 
@@ -24,9 +24,7 @@ class FakeRobot:
     """A robot in a mission; it is in whatever state and place a test puts it."""
 
     def __init__(self, *, yaw_rate=0.0, honest=False, hold_ms=60_000):
-        self.guard = SimpleNamespace(
-            state=TRACK, reference=ZERO, yaw_rate=yaw_rate, cause=Cause.ENDED
-        )
+        self.guard = SimpleNamespace(state=TRACK, reference=ZERO, yaw_rate=yaw_rate)
         self.simulator = SimpleNamespace(steps=0, touch_age=float("inf"), touches=[])
         self.observers = []
         self.position, self.velocity = (1.0, 1.0, 1.0), ZERO

@@ -6,7 +6,7 @@ from operator import methodcaller
 import pytest
 
 from cloudrc.faults.invariants import ESTOP, GROUND, HOLD, LAND, RAMP, TRACK
-from cloudrc.messages import ZERO, Cause, Request, Start
+from cloudrc.messages import ZERO, Request, Start
 from tests.faults.conftest import FakeRobot
 
 step, offer, request, touch, put, skip = (
@@ -29,10 +29,6 @@ def play(*story, **options):
     for deed in story:
         deed(robot)
     return set(robot.watch.counts)
-
-
-def cause(cause):
-    return lambda robot: setattr(robot.guard, "cause", cause)
 
 
 def fly(*references):
@@ -110,11 +106,6 @@ def resumes(count, apart_ms):
     return (step(HOLD), *deeds, skip(took), step(TRACK, fresh=False))
 
 
-def held_again(why, apart_ms, *others):
-    begun = (step(TRACK, ms=1000), step(HOLD, ms=apart_ms - 20), offer(10), step(TRACK, ms=10))
-    return (*begun, step(TRACK, ms=10, fresh=False), *others, cause(why), step(HOLD))
-
-
 def ramp(growth):
     speeds = [n * growth * 0.002 for n in range(5)]
     return (step(HOLD, ms=1000), offer(10), *fly(*((0.6 * v, 0.0, 0.8 * v) for v in speeds)))
@@ -135,13 +126,9 @@ OPERATOR = [
     *(({"stale"}, resumes(*each)) for each in ((10, 56), (9, 10))),
     ({"stale"}, (*NINE, SESSION, offer(), step(TRACK))),
     ({"stale"}, (*NINE, offer(9, "stale"), step(TRACK, fresh=False), offer())),
-    # TRACK and HOLD for silence begin a second apart, unless commands go back.
+    # Two changes to TRACK are a second apart.
     ({"hold"}, (step(GROUND), step(TRACK, ms=100), step(HOLD, ms=898), offer(10), step(TRACK))),
     (set(), (step(GROUND), step(TRACK, ms=100), step(HOLD, ms=900), offer(10), step(TRACK))),
-    ({"hold"}, held_again(Cause.SILENCE, 998)),
-    (set(), held_again(Cause.SILENCE, 1000)),
-    ({"hold"}, held_again(Cause.SILENCE, 998, offer(basis_ms=1990), offer(basis_ms=1991))),
-    (set(), held_again(Cause.SILENCE, 998, offer(basis_ms=1991), offer(basis_ms=1990))),
     # After a HOLD the reference grows slowly at first.
     (set(), ramp(RAMP)),
     ({"cap"}, ramp(1.01 * RAMP)),

@@ -79,7 +79,7 @@ def test_the_list_names_every_fault(capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("", "an action is missing: list, run, search"),
+        ("", "the following arguments are required: ACTION"),
         ("run F1 --seed 9007199254740992", "argument --seed: '9007199254740992' is not a whole"),
         ("run /dev/null", "/dev/null: not a regular file"),
         ("run cloud-kiled", "no fault 'cloud-kiled'; there are: F1 short-blackout, F2 "),

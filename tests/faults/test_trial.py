@@ -6,8 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from cloudrc.cloud.operator import EmergencyStopRepeater
 from cloudrc.faults.adversary import POLICIES, choose
-from cloudrc.faults.invariants import OrderInvariant, Watch
+from cloudrc.faults.invariants import Watch
 from cloudrc.faults.schedule import Event, Schedule, compose, load
 from cloudrc.faults.trial import FORGETFUL, _check_waypoints, checked_in, fly
 from cloudrc.messages import ZERO
@@ -96,7 +97,7 @@ def fails_to_shut_down(patch):
         (ignores(GuardLimits, "ramp_ns", 0), "cap", replace(HELD, duration=9.0)),
         (ignores(GuardLimits, "alone_max_ns", lambda *_: 3_600_000 * MS), "hold", HELD),
         (applies_late_commands, "order", Schedule(1, reorder=0.5, duration=4.0)),
-        (ignores(MissionService, "stop_rotors"), "obeyed", HELD),
+        (ignores(EmergencyStopRepeater, "sound"), "obeyed", HELD),
         (ignores(MissionService, "acknowledge"), "stuck", HELD),
         (
             fails_to_shut_down,
@@ -124,10 +125,10 @@ def test_a_broken_part_is_found(breaks, kind, schedule, monkeypatch):
 )
 def test_a_command_is_applied_once_and_in_order(commands, kinds):
     watch = Watch(guard())
-    order = OrderInvariant(watch, [0, 3])
+    watch.starts_ns += [0, 3]
     for at, (epoch, counter) in enumerate(commands):
         opened = SessionOpened(at, "world", epoch, "cloud said hello")
-        order.see([opened if counter is None else CommandApplied(at, epoch, counter, 0, ZERO)], 0)
+        watch.see([opened if counter is None else CommandApplied(at, epoch, counter, 0, ZERO)], 0)
     assert set(watch.counts) == kinds
 
 

@@ -19,11 +19,11 @@ ESTOP, GROUND = GuardState.ESTOP, GuardState.GROUND
 
 
 class Drive:
-    """A flight whose operator drives over teleop's own process; it takes off at 0.5 s."""
+    """A flight whose operator drives; it takes off at 0.5 s."""
 
     def __init__(self, profile="paper-p3", seed=1, **link):
         settings = f"link.profile={profile}", "world.scene=empty"
-        self.flight = Flight(*settings, start=False, separate=True, seed=seed, **link)
+        self.flight = Flight(*settings, start=False, seed=seed, **link)
         ways = self.flight.experiment.uplink, self.flight.experiment.downlink
         self.rtt = sum(way.delay_ms for way in ways) * 1e-3
         self.random = generator(seed, 46).uniform
@@ -31,8 +31,7 @@ class Drive:
         self.press(1.5, 0.1, ZERO)
 
     def at(self, time, call):
-        teleop, clock = self.flight.teleop, self.flight.cloud.clock
-        self.flight.cloud.at(time, lambda now_ns: teleop.ask(call, clock.at(now_ns)))
+        self.flight.cloud.at(time, lambda now_ns: self.flight.teleop.ask(call))
 
     def press(self, time, lasts, velocity):
         """Repeat a request at 10 Hz; return the time of the last request [s]."""

@@ -341,7 +341,7 @@ class Running:
 
     def reset(self):
         """Begin again with another robot and service, and keep the server."""
-        vars(self.bridge).pop("take", None)
+        vars(self.bridge).pop("make_calls", None)
         self.bridge.overtakings = 0
         self.until(lambda: not self.gate._in_flight.total())
         for kept in (self.alarms, self.complaints, self.gate.counts):
@@ -352,15 +352,15 @@ class Running:
     @contextmanager
     def stalled(self):
         """Teleop's loop makes no calls, as while it waits for the disk."""
-        take = self.bridge.take
-        self.bridge.take = list
+        make = self.bridge.make_calls
+        self.bridge.make_calls = lambda now_ns: None
         yield
-        self.bridge.take = take
+        self.bridge.make_calls = make
 
     def _fly(self):
         while not self._stopping.wait(0.002):
-            for call in self.bridge.take() if self.bridge.closed != STARTING else ():
-                call(self.flight.now_ns)
+            if self.bridge.closed != STARTING:
+                self.bridge.make_calls(self.flight.now_ns)
             self.flight.step()
 
     def stop(self):

@@ -9,10 +9,9 @@ import pytest
 
 from cloudrc.cli.teleop import _start
 from cloudrc.config.load import load_experiment
-from cloudrc.drivers.teleop import turn
+from cloudrc.drivers.teleop import STALL_NS, TeleopLoop
 from cloudrc.exposition.table import MISSION_OUTCOMES
 from cloudrc.messages import Cause, GuardState, Setpoint, Start
-from cloudrc.teleop import wire
 from cloudrc.teleop.api import Bridge
 from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX, next_step
 from cloudrc.teleop.store import ConflictError, Order, UnavailableError
@@ -283,9 +282,11 @@ def test_after_a_stall_the_stop_belongs_to_the_stopped_mission():
     bridge.open(flight.teleop)
     stopped = bridge.submit(type(flight.teleop).stop_rotors, "stop")
     flight.guard = ESTOP
-    cloud = Mock(receive=lambda: [wire.encode(flight.seen)])
-    how = {"stops": bridge.take_stops, "blind": 2, "late_ns": 0, "now_ns": flight.now_ns + 10**9}
-    turn(flight.teleop, cloud, wire.decode, bridge.take, **how)
+    cloud = Mock(receive=lambda: [flight.seen])
+    queued = {"calls": bridge.make_calls, "stops": bridge.make_stops}
+    loop = TeleopLoop(flight.teleop, cloud, print, **queued)
+    for late_ns in (STALL_NS + 1, 0):
+        loop.wake(flight.now_ns + 10**9, late_ns)
     assert stopped.result()["id"] == mission_id
     assert flight.names(mission_id)[-1] == "emergency_stopped"
 

@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.measures import fly_safely, moves
+from cloudrc.faults.measures import fly_safely, refused
 from cloudrc.faults.scenario import Outcome, generator, scenario
 from cloudrc.faults.trial import flipped
 from cloudrc.tunnel import codec
@@ -42,8 +42,7 @@ def _check_no_effect(
     fly_safely(outcome, flight)
     same = clean.trajectory() == flight.trajectory()
     outcome.true("the same path, bit by bit", same)
-    metrics = (f"world datagrams_total downlink {refusal}" for refusal in refusals)
-    moves(outcome, flight, *metrics, since=since)
+    refused(outcome, flight, *refusals)
     outcome.least("hostile datagrams", sum(sent), 1000)
     same = measures.epochs(clean) == measures.epochs(flight)
     outcome.true("hostile datagrams opened no session", same)
@@ -69,7 +68,7 @@ def _corruption(outcome: Outcome, seed: int) -> None:
     flight.world.tamper = flight.cloud.tamper = tamper
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
-    moves(outcome, flight, "world datagrams_total downlink tag", since=at)
+    refused(outcome, flight, "tag")
     outcome.least("corrupted datagrams", len(sent), 100)
     outcome.same("epochs opened", len(measures.epochs(flight)), 2)
 

@@ -6,12 +6,10 @@ from math import nan
 
 from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight, conditions, silent
-from cloudrc.faults.measures import fly_safely, moves
+from cloudrc.faults.measures import fly_safely
 from cloudrc.faults.scenario import Outcome, scenario
 from cloudrc.link.profile import GilbertElliott
 from cloudrc.messages import Cause, GuardState
-
-HOLDS = "world guard_transitions_total hold"
 
 
 @scenario(
@@ -29,10 +27,7 @@ def _short_silence(outcome: Outcome, seed: int) -> None:
     for what, (up, down) in cases.items():
         flight = fly_safely(outcome, Flight(seed=seed, uplink=up, downlink=down))
         outcome.same(f"silent {what}: HOLDs", len(measures.held(flight)), 0)
-        ends = ("cloud", "uplink", flight.uplink, up), ("world", "downlink", flight.downlink, down)
-        for role, way, link, shape in ends:
-            if shape is not steady:
-                moves(outcome, flight, f"{role} datagrams_lost_total {way}", since=at)
+        for way, link, shape in (("up", flight.uplink, up), ("down", flight.downlink, down)):
             lost, most = link.counts()["blackout"], 0 if shape is steady else 11
             outcome.most(f"silent {what}: datagrams lost, {way}", lost, most)
 
@@ -48,7 +43,7 @@ def _silence(outcome: Outcome, seed: int) -> None:
     for duration in (0.5, 3.0, 20.0):
         back, what = at + duration, f"{duration:g} s of silence"
         slow = ("guard.speed_max_mps=1.5", "criteria.time_limit_s=150")
-        flight = Flight(*slow, seed=seed, link=silent(at, duration), separate=True)
+        flight = Flight(*slow, seed=seed, link=silent(at, duration))
         fly_safely(outcome, flight, 150.0)
         measures.held_in_time(outcome, flight, f"{what}: HOLD after")
         if duration >= 3.0:
@@ -57,7 +52,6 @@ def _silence(outcome: Outcome, seed: int) -> None:
             outcome.most(f"{what}: below 0.05 m/s after", calm, 1.0, "s")
             drift = measures.drift(flight, began + 2.0, back)
             outcome.most(f"{what}: drift", drift, 0.10, "m")
-        moves(outcome, flight, HOLDS, "cloud commands_frozen_total", since=at)
         outcome.most(f"{what}: resumed after", measures.resumed_after(flight, back), 1.0, "s")
 
 
@@ -79,7 +73,7 @@ def _long_silence(outcome: Outcome, seed: int) -> None:
 def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
     """Interrupt the link at `at` [s] for 75 s: the robot must land and stop its rotors."""
     limit = "criteria.time_limit_s=200"
-    flight = Flight(limit, seed=seed, link=silent(at, 75.0), separate=True)
+    flight = Flight(limit, seed=seed, link=silent(at, 75.0))
     flight.fly(at + 80.0)
     measures.safe(outcome, flight)
     held = measures.first_into(flight, GuardState.HOLD)
@@ -97,7 +91,6 @@ def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
     why = f"guard went to LAND ({Cause.ALONE.words})"
     told = flight.mission.state == "failed" and why in str(flight.mission.verdict)
     outcome.true(f"{where}: the mission failed: {why}", told)
-    moves(outcome, flight, "world guard_state", since=at)
     return flight
 
 
@@ -113,8 +106,6 @@ def _loss(outcome: Outcome, seed: int) -> None:
     outcome.same("HOLDs", len(measures.held(flight)), 0)
     error, usual = (measures.number(each, "tracking_rms_measured") for each in (flight, clean))
     outcome.most("tracking error, relative to that without loss", error / usual, 1.5)
-    lost = "world datagrams_lost_total downlink", "cloud datagrams_lost_total uplink"
-    moves(outcome, flight, *lost, since=0.0)
     outcome.least("loss in the report", measures.number(flight, "loss_uplink"), 0.25)
 
 
@@ -132,9 +123,6 @@ def _bursts(outcome: Outcome, seed: int) -> None:
         if packets < 50:  # else it hardly ever rests on the board for 4 s, and a leg may time out
             measures.done(outcome, flight)
         outcome.true("the mission has ended", flight.mission.ended)
-        # Most bursts have no effect; the fault begins with the first that is too long.
-        since = measures.first_into(flight, GuardState.HOLD) - measures.AGE_MAX
-        moves(outcome, flight, HOLDS, since=since)
         text, busiest = f"bursts of {packets * 10} ms", measures.busiest_second(flight.changes)
         outcome.most(f"{text}: changes of the guard in any second", busiest, 2)
         told, held = measures.number(flight, "hold_count"), len(measures.held(flight))

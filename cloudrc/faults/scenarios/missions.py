@@ -11,7 +11,6 @@ from cloudrc.config.schema import Mission
 from cloudrc.faults import measures
 from cloudrc.faults.adversary import Lie
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.measures import moves
 from cloudrc.faults.scenario import Outcome, scenario
 from cloudrc.geometry import fence
 from cloudrc.geometry.scene import Pipe, load_scene
@@ -48,7 +47,7 @@ def _invalid_values(outcome: Outcome, seed: int) -> None:
         outcome.same(f"{name}: flown again without the operator", len(again), 0)
         causes = [change.cause for change in measures.changes_into(flight, GuardState.LAND)]
         outcome.true(f"{name}: the cause is reported", "impossible commands" in " ".join(causes))
-        moves(outcome, flight, "world datagrams_total downlink range", since=at)
+        measures.refused(outcome, flight, "range")
     for limit, changes in EXCESSIVE.items():
         lie, harmless = _for_a_while(at, 1.0, changes), limit != "speed"  # it may hit a pipe
         flight = Flight(seed=seed, honest=harmless, lies=[lie]).fly(40.0)
@@ -56,7 +55,6 @@ def _invalid_values(outcome: Outcome, seed: int) -> None:
         refused = sum("impossible" in change.cause for change in flight.changes)
         outcome.same(f"100 times {limit}: rejected as impossible", refused, 0)
         outcome.least(f"100 times {limit}: limited", flight.count(f"limited_{limit}"), 20)
-        moves(outcome, flight, f"world guard_limited_total {limit}", since=at)
     one = Flight(seed=seed, lies=[_for_a_while(at, 0.005, IMPOSSIBLE["NaN"])]).fly(40.0)
     measures.safe(outcome, one)
     measures.done(outcome, one)
@@ -144,7 +142,6 @@ def _unreachable(outcome: Outcome, seed: int) -> None:
     leg, began = assembly.build_plan(flight.experiment).legs[len(reached)], reached[-1].stamp_ns
     off = abs(ended - began * 1e-9 - leg.time_limit)
     outcome.most("deviation of the leg's end from its limit", off, 0.05, "s")
-    moves(outcome, flight, "teleop missions_total leg_timed_out", since=ended - 0.01)
     flight.fly(flight.now + 10.0)
     outcome.true("the robot holds", flight.guard_now()[0] is GuardState.HOLD)
     drift = measures.drift(flight, ended, flight.now)
