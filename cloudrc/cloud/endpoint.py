@@ -183,16 +183,16 @@ class CloudEndpoint(TunnelEnd):
             if kind == TELEMETRY:
                 self._receive_telemetry(epoch, counter, body, now_ns)
             elif kind == Kind.ACCEPT:
-                self._receive_accept(epoch, codec.decode_accept(body), now_ns)
+                self._receive_accept(epoch, Accept(*codec.decode(Kind.ACCEPT, body)), now_ns)
             elif kind == Kind.CHALLENGE:
-                hello = self._handshake.answer_challenge(codec.decode_challenge(body))
+                (cookie,) = codec.decode(Kind.CHALLENGE, body)
+                hello = self._handshake.answer_challenge(cookie)
                 asks = self._wants_session(now_ns) or self._session.is_outdated
                 if hello is not None and asks:
                     self._greet(hello, self._session.greeting_key)
             elif kind == Kind.BUSY:
-                if self._handshake.is_refused(codec.decode_busy(body)) and self._wants_session(
-                    now_ns
-                ):
+                (nonce,) = codec.decode(Kind.BUSY, body)
+                if self._handshake.is_refused(nonce) and self._wants_session(now_ns):
                     self._counts["busy"] += 1
                     self._records += self._complaints.say("busy", BUSY_TEXT, now_ns)
             elif kind != Kind.ALIVE:

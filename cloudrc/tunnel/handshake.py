@@ -98,7 +98,7 @@ class ServerHandshake:
             if now_ns - self._challenged_ns < CHALLENGE_NS:
                 return HelloAnswer("unanswered", [])
             self._challenged_ns = now_ns
-            challenge = codec.encode_challenge(self._cookie(now_ns))
+            challenge = codec.encode(Kind.CHALLENGE, self._cookie(now_ns))
             return HelloAnswer("hello", [session.greet(Kind.CHALLENGE, challenge, key)])
         if counter <= self._counters.get(hello.nonce, -1):
             return HelloAnswer(REPEATED, [])
@@ -111,7 +111,7 @@ class ServerHandshake:
                 return HelloAnswer("hello", [self._accept()])
         elif now_ns <= self._fresh_until_ns:
             return HelloAnswer(
-                "busy", [session.greet(Kind.BUSY, codec.encode_busy(hello.nonce), key)]
+                "busy", [session.greet(Kind.BUSY, codec.encode(Kind.BUSY, hello.nonce), key)]
             )
         self._incumbent = hello
         if is_newer(hello.epoch, self._epoch):
@@ -150,7 +150,7 @@ class ServerHandshake:
 
     def _accept(self) -> bytes:
         accept = Accept(self._incumbent.nonce, self._nonce, self._clock)
-        return self._session.greet(Kind.ACCEPT, codec.encode_accept(accept))
+        return self._session.greet(Kind.ACCEPT, codec.encode(Kind.ACCEPT, *accept))
 
     def _cookie(self, now_ns: int, slots_ago: int = 0) -> bytes:
         slot = now_ns // COOKIE_NS - slots_ago
@@ -222,7 +222,7 @@ class ClientHandshake:
         return accept.nonce + accept.world_nonce
 
     def _hello(self) -> bytes:
-        return codec.encode_hello(Hello(self._nonce, self._clock, self._cookie, self._epoch))
+        return codec.encode(Kind.HELLO, self._nonce, self._clock, self._cookie, self._epoch)
 
 
 VERSION_TEXT = "peer speaks v{}, we speak v{}: run the same version of cloudrc at both ends"

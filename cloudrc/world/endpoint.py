@@ -200,7 +200,7 @@ class WorldEndpoint(TunnelEnd):
                 self._receive_command(epoch, counter, command, now_ns, world_ns)
             elif kind == Kind.HELLO:
                 self._advance(world_ns)
-                self._receive_hello(codec.decode_hello(body), counter, now_ns)
+                self._receive_hello(Hello(*codec.decode(Kind.HELLO, body)), counter, now_ns)
             else:
                 self._door.accept_once(kind, counter, now_ns)
                 if kind == Kind.OPERATOR:

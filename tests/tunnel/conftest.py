@@ -1,6 +1,6 @@
 """A world that answers hellos, for the tests of the handshake."""
 
-from cloudrc.tunnel.codec import Direction, Hello, Kind, decode_challenge
+from cloudrc.tunnel.codec import Direction, Hello, Kind, decode
 from cloudrc.tunnel.handshake import CHALLENGE_NS, COOKIE_NS, NO_COOKIE, ServerHandshake
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import NO_EPOCH, Session
@@ -44,4 +44,4 @@ class Doorstep:
         self.now_ns = max(self.now_ns, self.door._challenged_ns + CHALLENGE_NS)
         kind, _, body = self.answer(cookie=NO_COOKIE)
         assert kind == Kind.CHALLENGE
-        return decode_challenge(body)
+        return decode(Kind.CHALLENGE, body)[0]

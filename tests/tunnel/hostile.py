@@ -47,7 +47,7 @@ class Target:
                 self.give(datagrams, target)
         assert self.cloud._session.epoch == self.world._session.epoch == 1
         self.captured = tuple(self.frames)
-        self.frames.append(self.world._session.greet(Kind.BUSY, codec.encode_busy(b"c" * 16)))
+        self.frames.append(self.world._session.greet(Kind.BUSY, codec.encode(Kind.BUSY, b"c" * 16)))
         talker = BareCloud(b"other", None)
         talker.session = self.cloud._session
         self.frames += [talker.command(), talker.start(1), talker.session.seal(Kind.ALIVE, b"")]
