@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from cloudrc.messages import NEVER_NS
 from cloudrc.world import low_level, rotors
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard import state
@@ -38,7 +37,7 @@ _CONSTANTS = {
     low_level: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
     "thrust_max tiny nose_cosine_min yaw_sine_max",
     state: "overturned_cosine",
-    rules: "sink_lead_max fence_reaction reaction stop_coefficient recheck_distance",
+    rules: "sink_lead_max fence_reaction reaction stop_coefficient",
 }
 """Modules and their constants that `step.c` needs, in the order of its fields."""
 _VALUES = {
@@ -53,10 +52,8 @@ _FIELDS: dict[str, Any] = {
     **{"gains": _double * 9, "limit_xy": _double, "limit_z": _double, "dt": _double},
     **{"change_max": _double, "low": _double * 3, "high": _double * 3},
     **dict.fromkeys(("time_step", "robot_radius", "acceleration_max"), _double),
-    **dict.fromkeys(("recheck_ns", "never_ns", "step_ns"), _int64),
-    **dict.fromkeys(("check_steps", "obstacle_count", "unused"), _int64),
-    **{"reference": _double * 3, "wanted": _double * 3},
-    **dict.fromkeys(("settled", "steady_until_ns", "track_until_ns"), _int64),
+    **dict.fromkeys(("step_ns", "check_steps", "obstacle_count", "unused"), _int64),
+    **{"reference": _double * 3, "wanted": _double * 3, "track_until_ns": _int64},
     **{"force_peak": _double, "impulse": _double},
     **dict.fromkeys(("touching", "steps", "is_news", "free_steps"), _int64),
     **{"speeds": _double * 4, "integral": _double * 3, "error": _double * 3},
@@ -97,7 +94,7 @@ def make_flight(
         *_VALUES.values(),
         *(turning.up, turning.down, controller.gains, limit_xy, limit_z, dt),
         limits.acceleration_max * (step_ns * 1e-9),
-        *(low, high, simulator.dt, radius, ACCELERATION_MAX, rules.RECHECK_NS, NEVER_NS, step_ns),
+        *(low, high, simulator.dt, radius, ACCELERATION_MAX, step_ns),
         *(CONTACT_CHECK_STEPS, len(obstacles), UNUSED_WITHOUT_CONTACTS),
     )
     flight.keep = obstacles  # else Python frees their memory

@@ -19,7 +19,7 @@ from cloudrc.world.robot import STEP_NS, Robot
 from cloudrc.world.simulator import Simulator
 
 _TRACK, _MEMORY, _BEFORE = Flight.reference.offset, Flight.free_steps.offset, Flight.before.offset
-_pack_track, _unpack_track = Struct("6d3q2d2q").pack_into, Struct("3d24x2q8x2d3q8x4d").unpack_from
+_pack_track, _unpack_track = Struct("6dq2d2q").pack_into, Struct("3d32x2d3q8x4d").unpack_from
 _pack_memory, _unpack_memory = Struct("q10dq").pack_into, Struct("40x6d").unpack_from
 _unpack_before = Struct("13d").unpack_from
 
@@ -76,11 +76,10 @@ class NativeRobot(Robot):
                 self._in_c = True
                 # fmt: off
                 (
-                    x, y, z, settled, steady_ns, peak, impulse, contacts, total, news,
-                    front, left, back, right,
+                    x, y, z, peak, impulse, contacts, total, news, front, left, back, right,
                 ) = _unpack_track(self._flight, _TRACK)
                 # fmt: on
-                guard.continue_track(None if settled else (x, y, z), steady_ns)
+                guard.reference = (x, y, z)
                 before = self._before() if news else None
                 speeds = (front, left, back, right)
                 simulator.take_over(speeds, peak, impulse, contacts, total, before)
@@ -95,16 +94,12 @@ class NativeRobot(Robot):
             self._in_c = False
         return super().run(tick_ns, until_ns)
 
-    def _give(self, reference: Vector, wanted: Vector, steady_ns: int, track_ns: int) -> None:
+    def _give(self, reference: Vector, wanted: Vector, track_ns: int) -> None:
         """Give C the state before its first step; the arguments are from `Guard.plain_track`."""
-        simulator, (x, y, z), (to_x, to_y, to_z) = self.simulator, reference, wanted
-        # fmt: off
-        _pack_track(
-            self._flight, _TRACK, x, y, z, to_x, to_y, to_z, reference is wanted,
-            steady_ns, track_ns, simulator.tip_force_peak, simulator.tip_impulse,
-            simulator.contacts, simulator.steps,
-        )
-        # fmt: on
+        simulator = self.simulator
+        tip = simulator.tip_force_peak, simulator.tip_impulse
+        counts = simulator.contacts, simulator.steps
+        _pack_track(self._flight, _TRACK, *reference, *wanted, track_ns, *tip, *counts)
         if not self._in_c:
             integral, error = self._low_level.integral, self._low_level.error
             memory = (*integral, *(error or integral), error is not None)

@@ -5,7 +5,7 @@
 
      read          readings.Readings.of
      guard_step    guard.state.Guard.step, for a robot in TRACK with a fresh command
-     is_far        guard.limits.is_far_from_fence
+     is_far        guard.limits.limit_to_fence, where it changes nothing
      update        low_level.LowLevel.update
      turn_rotors   rotors.Rotors.step, simulator.Simulator.step
      feel          simulator.Simulator._feel
@@ -44,17 +44,16 @@ typedef struct {
   double mass, gravity, tilt_gain, yaw_gain, tilt_rate_gain, yaw_rate_gain;
   double thrust_max, tiny, nose_cosine_min, yaw_sine_max;
   double overturned_cosine, sink_lead_max;
-  double fence_reaction, reaction, stop_coefficient, recheck_distance;
+  double fence_reaction, reaction, stop_coefficient;
   /* Values of this robot: gains and limits of the controller, corners of the fence, and so on. */
   double up, down, gains[9], limit_xy, limit_z, dt;
   double change_max, low[3], high[3];
   double time_step, robot_radius, acceleration_max;
-  i64 recheck_ns, never_ns, step_ns, check_steps, obstacle_count;
+  i64 step_ns, check_steps, obstacle_count;
   i64 unused; /* flags of what MuJoCo does not need while nothing can touch the robot */
   /* State, which Python reads and writes between two runs. */
   double reference[3], wanted[3];
-  i64 settled; /* whether Python's `reference` is the object `wanted` */
-  i64 steady_until_ns, track_until_ns;
+  i64 track_until_ns;
   double force_peak, impulse;
   i64 touching, steps, is_news; /* number of contacts; whether Python has to look at them */
   i64 free_steps; /* steps without contact that are sure; below 0: steps until the next look */
@@ -81,8 +80,8 @@ static void read(const Flight *f, Readings *r) {
   a[6] = xz + wy, a[7] = yz - wx, a[8] = 1.0 - xx - yy;
 }
 
-/* Tell whether the fence limits no velocity within a distance `room` of the position. */
-static int is_far(const Flight *f, const double *velocity, const double *position, double room) {
+/* Tell whether the fence does not limit the velocity at the position. */
+static int is_far(const Flight *f, const double *velocity, const double *position) {
   for (int i = 0; i < 3; i++) {
     double low = f->low[i], high = f->high[i], v = velocity[i];
     double reaction = i == 2 ? f->reaction : f->fence_reaction; /* towards the lower face */
@@ -90,14 +89,13 @@ static int is_far(const Flight *f, const double *velocity, const double *positio
       high -= v * (f->fence_reaction + v * f->stop_coefficient);
     else
       low -= v * (reaction - v * f->stop_coefficient);
-    if (!(low + room <= position[i] && position[i] <= high - room)) return 0;
+    if (!(low + ROOM <= position[i] && position[i] <= high - ROOM)) return 0;
   }
   return 1;
 }
 
 /* Move the reference by one step; return 0, with nothing changed, if Python has to do this step. */
 static int guard_step(Flight *f, const Readings *r, i64 now_ns) {
-  if (now_ns <= f->steady_until_ns && f->settled) return 1;
   if (r->axes[8] < f->overturned_cosine || now_ns > f->track_until_ns) return 0;
   const double *from = f->reference, *to = f->wanted;
   double x = to[0] - from[0], y = to[1] - from[1], z = to[2] - from[2];
@@ -107,13 +105,8 @@ static int guard_step(Flight *f, const Readings *r, i64 now_ns) {
   double moved[3] = {from[0] + share * x, from[1] + share * y, from[2] + share * z};
   const double *reference = settles ? to : moved;
   if (reference[2] < r->twist[2] - f->sink_lead_max) return 0;
-  int far = is_far(f, reference, r->pose, f->recheck_distance);
-  if (!far && !is_far(f, reference, r->pose, ROOM)) return 0;
+  if (!is_far(f, reference, r->pose)) return 0;
   for (int i = 0; i < 3; i++) f->reference[i] = reference[i];
-  f->settled = settles;
-  i64 until_ns = now_ns + f->recheck_ns;
-  if (f->track_until_ns < until_ns) until_ns = f->track_until_ns;
-  f->steady_until_ns = far ? until_ns : f->never_ns;
   return 1;
 }
 
