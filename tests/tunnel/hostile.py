@@ -19,8 +19,8 @@ sys.path.append(str(Path(__file__).parents[2]))  # it is a program, too
 from cloudrc.records import Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
-from cloudrc.tunnel.session import pair
 from tests.flights.conftest import MS, Bare, BareCloud, bare_cloud, ring
+from tests.tunnel.conftest import pair
 
 STEPS_NS = tuple(round(ms * MS) for ms in (1, 30, 400, 1_500, 6_000, 150_000))
 """Steps of time [ns]; cloud asks for a session after 0.5 s of silence."""

@@ -6,7 +6,8 @@ from cloudrc.messages import ZERO, Command
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.tunnel.session import NO_EPOCH, Session, pair
+from cloudrc.tunnel.session import NO_EPOCH, Session
+from tests.tunnel.conftest import pair
 
 BODY = bytes(range(codec.BODY_SIZES[Kind.COMMAND]))
 NONCES = b"cloud".ljust(16) + b"world".ljust(16)

@@ -21,7 +21,7 @@ typedef long long i64;
 static const double ROOM = 1e-6; /* [m]: no rounding error matters, the fence limits nothing */
 double sqrt(double);
 
-/* Shared with Python: flight.py has the same fields, all of 8 bytes, in the same order. */
+/* Shared with Python: robot.py has the same fields, all of 8 bytes, in the same order. */
 typedef struct { /* a box with rounded edges that contains a geom of the scene */
   double centre[3], axes[9], half[3], radius;
 } Obstacle;

@@ -16,7 +16,6 @@ from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.limits import Limits
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
-from cloudrc.world.native import flight
 from cloudrc.world.native import robot as native
 from cloudrc.world.native.library import SWITCH, Library, library
 from cloudrc.world.native.robot import NativeRobot, make_robot, usable
@@ -249,13 +248,13 @@ def test_a_robot_that_moves_from_c_to_python_flies_on_the_same():
 @pytest.mark.parametrize(
     ("what", "value", "text"),
     [
-        ("_VALUES", flight._VALUES | {"mass": 1.05 + 1e-12}, "C and Python differ"),
+        ("_VALUES", native._VALUES | {"mass": 1.05 + 1e-12}, "C and Python differ"),
         ("_mujoco_library", lambda: {}["mjtNew"], "MuJoCo is not as expected: KeyError('mjtNew')"),
     ],
 )
 def test_a_failed_self_test_means_python_and_one_warning(what, value, text, monkeypatch, caplog):
     monkeypatch.setattr(native, "_self_test", cache(native._self_test.__wrapped__))
-    monkeypatch.setattr(flight, what, value)
+    monkeypatch.setattr(native, what, value)
     with caplog.at_level(logging.WARNING):
         assert usable() == Library(None, text)
         robot = make_robot(Simulator("pelican", "empty"), LowLevel(), Guard(LIMITS), LIMITS)
