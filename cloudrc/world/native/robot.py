@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import logging
+from copy import copy
 from functools import cache
 from math import dist, inf, prod
 from pathlib import Path
@@ -30,8 +31,8 @@ from cloudrc.world.scene import ROBOT_PREFIX, mujoco
 from cloudrc.world.simulator import CONTACT_CHECK_STEPS, Simulator
 
 _POINTERS = (
-    *("mj_step", "model", "data", "qpos", "qvel", "ctrl", "applied"),
-    *("tip_force", "contacts", "disable", "geoms", "timer", "obstacles"),
+    *("mj_step", "model", "free_model", "data", "qpos", "qvel", "ctrl", "applied"),
+    *("tip_force", "contacts", "timer", "obstacles"),
 )
 ACCELERATION_MAX = 400.0
 """Limit of the robot's acceleration in the air [m/s^2]. Full thrust gives a robot that is 10 %
@@ -65,7 +66,7 @@ _FIELDS: dict[str, Any] = {
     **{"gains": _double * 9, "limit_xy": _double, "limit_z": _double, "dt": _double},
     **{"change_max": _double, "low": _double * 3, "high": _double * 3},
     **dict.fromkeys(("time_step", "robot_radius", "acceleration_max"), _double),
-    **dict.fromkeys(("step_ns", "check_steps", "obstacle_count", "unused"), _int64),
+    **dict.fromkeys(("step_ns", "check_steps", "obstacle_count"), _int64),
     **{"reference": _double * 3, "wanted": _double * 3, "track_until_ns": _int64},
     **{"force_peak": _double, "impulse": _double},
     **dict.fromkeys(("touching", "steps", "is_news", "free_steps"), _int64),
@@ -91,24 +92,24 @@ def make_flight(simulator: Simulator, controller: LowLevel, limits: Limits) -> F
     limit_xy, limit_z, dt = controller.limits
     arrays = data.qpos, data.qvel, data.ctrl, data.qfrc_applied
     tip_force = data.sensordata[model.sensor(f"{ROBOT_PREFIX}tip").adr[0] :]
-    flags = model.opt.gravity.ctypes.data - _offset("mjOption", "gravity")
-    flags += _offset("mjOption", "disableflags")
-    geoms = model._address + _offset("mjModel", "ngeom")
+    free_model = copy(model)
+    free_model.opt.disableflags |= UNUSED_WITHOUT_CONTACTS
     obstacles, radius = _obstacles(model, data)
     library = _mujoco_library()
     timer = ctypes.addressof(ctypes.c_void_p.in_dll(library, "mjcb_time"))
     flight = Flight(
         ctypes.cast(library.mj_step, ctypes.c_void_p),
-        *(model._address, data._address),  # MuJoCo has no public name for them
+        # MuJoCo has no public name for the addresses.
+        *(model._address, free_model._address, data._address),
         *(array.ctypes.data for array in (*arrays, tip_force)),
-        *(data._address + _offset("mjData", "ncon"), flags, geoms, timer, obstacles.ctypes.data),
+        *(data._address + _contacts_offset(), timer, obstacles.ctypes.data),
         *_VALUES.values(),
         *(turning.up, turning.down, controller.gains, limit_xy, limit_z, dt),
         limits.acceleration_max * STEP,
         *(low, high, simulator.dt, radius, ACCELERATION_MAX, STEP_NS),
-        *(CONTACT_CHECK_STEPS, len(obstacles), UNUSED_WITHOUT_CONTACTS),
+        *(CONTACT_CHECK_STEPS, len(obstacles)),
     )
-    flight.keep = obstacles  # else Python frees their memory
+    flight.keep = obstacles, free_model  # else Python frees their memory
     return flight
 
 
@@ -150,20 +151,20 @@ def _mujoco_library() -> ctypes.CDLL:
     return ctypes.CDLL(str(files[0]))
 
 
-def _offset(struct: str, name: str) -> int:
-    """Return where a field is in a structure of MuJoCo [bytes].
+def _contacts_offset() -> int:
+    """Return where the number of contacts is in MuJoCo's `mjData` [bytes].
 
     The place depends on MuJoCo's version. The package describes its structures.
     """
     from mujoco.introspect import structs
 
     fields = []
-    for field in structs.STRUCTS[struct].fields:
+    for field in structs.STRUCTS["mjData"].fields:
         fields.append((field.name, _ctype(field.type, structs.STRUCTS)))
-        if field.name == name:
+        if field.name == "ncon":
             break
-    layout = type(struct, (ctypes.Structure,), {"_fields_": fields})
-    offset: int = getattr(layout, name).offset
+    layout: Any = type("Data", (ctypes.Structure,), {"_fields_": fields})
+    offset: int = layout.ncon.offset
     return offset
 
 

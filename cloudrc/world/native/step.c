@@ -10,7 +10,7 @@
      turn_rotors   rotors.Rotors.step, simulator.Simulator.step
      feel          simulator.Simulator._feel
 
-   Where nothing can touch the robot, `step_physics` tells MuJoCo to leave the geoms out.
+   Where nothing can touch the robot, `step_physics` lets MuJoCo look for no contacts.
 
    Every sum and product has the order of the Python code. Compile without contraction of
    a * b + c, and without fast-math. The only function from outside, apart from mj_step, is sqrt,
@@ -29,14 +29,12 @@ typedef struct { /* a box with rounded edges that contains a geom of the scene *
 typedef struct {
   /* MuJoCo: mj_step, its arguments, arrays and numbers of mjData, and the model's flags. */
   void (*mj_step)(const void *model, void *data);
-  const void *model;
+  const void *model, *free_model; /* free_model: without what a robot in free air does not need */
   void *data;
   const double *qpos, *qvel;
   double *ctrl, *applied;
   const double *tip_force;
   const int *contacts;
-  int *disable;
-  int *geoms; /* number of geoms, or its lower half: the processor is little-endian */
   double (**timer)(void); /* mjcb_time, which mj_step calls to measure its parts */
   const Obstacle *obstacles;
   /* Constants of the Python modules rotors, low_level and guard, with the same names. */
@@ -50,7 +48,6 @@ typedef struct {
   double change_max, low[3], high[3];
   double time_step, robot_radius, acceleration_max;
   i64 step_ns, check_steps, obstacle_count;
-  i64 unused; /* flags of what MuJoCo does not need while nothing can touch the robot */
   /* State, which Python reads and writes between two runs. */
   double reference[3], wanted[3];
   i64 track_until_ns;
@@ -211,23 +208,15 @@ static i64 free_steps(const Flight *f, const double *position, const double *vel
   return steps > 100 ? 100 : steps;
 }
 
-/* Do a step of MuJoCo. While nothing can touch the robot, MuJoCo need neither place the geoms nor
-   look for contacts. This changes no bit of the result, and takes half the time. */
+/* Do a step of MuJoCo. While nothing can touch the robot, MuJoCo need not look for contacts. This
+   changes no bit of the result, and takes half the time. */
 static void step_physics(Flight *f, const Readings *r) {
   if (f->free_steps == 0 && !f->touching) {
     f->free_steps = free_steps(f, r->pose, r->twist);
     if (f->free_steps <= 0) f->free_steps = -5;
   }
-  int disabled = *f->disable, geoms = *f->geoms;
-  if (f->free_steps > 0) {
-    *f->disable = disabled | (int)f->unused;
-    *f->geoms = 0;
-    f->free_steps--;
-  } else if (f->free_steps < 0)
-    f->free_steps++;
-  f->mj_step(f->model, f->data);
-  *f->disable = disabled;
-  *f->geoms = geoms;
+  f->mj_step(f->free_steps > 0 ? f->free_model : f->model, f->data);
+  f->free_steps += f->free_steps < 0 ? 1 : f->free_steps > 0 ? -1 : 0;
 }
 
 /* Run steps from now_ns up to until_ns [ns]; return their number. The run ends early before a step
