@@ -19,17 +19,18 @@ from __future__ import annotations
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable
+from copy import deepcopy
 from math import isfinite, nan
 from pathlib import Path
 from typing import Any, NoReturn
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
-from cloudrc.cloud.plan import PLUGIN_ERRORS, ControllerError, make_plan
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.errors import describe_error
 from cloudrc.messages import (
     NEVER_NS,
+    PLAN_STEP_NS,
     ZERO,
     Command,
     Odometry,
@@ -40,6 +41,7 @@ from cloudrc.messages import (
 )
 from cloudrc.records import Control, Fault
 from cloudrc.teleop.carrot import setpoint_at
+from cloudrc.tunnel.codec import as_planned
 
 PERIOD_NS = 10_000_000
 """Time between two commands, unless an experiment sets another rate [ns].
@@ -59,6 +61,15 @@ INSTEAD = {
 """Kind of plug-in -> what cloud does when a plug-in of this kind fails."""
 TRACEBACK_MAX = 4000
 """Largest size of a recorded traceback [characters]; the beginning of a longer one is cut off."""
+
+
+PLAN_STEP = PLAN_STEP_NS * 1e-9
+"""Time between two velocities of a plan [s]."""
+PLANNED_MAX = 1000.0
+"""Largest component of a planned velocity [m/s]; the guard refuses a plan with a larger one.
+Source: docs/reference/faults.md, "F23"."""
+PLUGIN_ERRORS = (Exception, SystemExit, GeneratorExit)
+"""What counts as the failure of a plug-in. A user's Ctrl-C does not."""
 
 
 class InvalidResultError(ValueError):
@@ -327,19 +338,38 @@ class ControlLoop:
             return STAND_STILL
 
     def _plan(self, setpoint: Setpoint, velocity: Vector, now_ns: int) -> tuple[Vector, ...]:
-        """Plan the commands after `velocity` [m/s]; a predictor without a model gives no plan."""
+        """Plan the velocities [m/s] after a command, one per PLAN_STEP: roll the model forward.
+
+        Args:
+            setpoint: Setpoint, with its motion.
+            velocity: Velocity of the command [m/s].
+            now_ns: Time of the command [ns], cloud's clock.
+
+        Returns:
+            The plan; it ends before a velocity that the guard would refuse. It is empty if the
+            predictor has no model, or if a plug-in fails.
+        """
+        plan, plug_in = list[Vector](), "predictor"
         try:
             model = self._predictor.model()
             if model is None:
                 return ()
-            count = self._planned
-            return make_plan(model, self._controller, setpoint, velocity, now_ns, count)
+            plug_in = "controller"
+            controller = deepcopy(self._controller)
+            for k in range(1, self._planned + 1):
+                plug_in = "predictor"
+                state = model.step(velocity, PLAN_STEP)
+                later = setpoint_at(setpoint, now_ns + k * PLAN_STEP_NS)
+                plug_in = "controller"
+                x, y, z = controller.update(state, later, PLAN_STEP).velocity
+                velocity = (float(x), float(y), float(z))
+                if not (isfinite(sum(velocity)) and max(map(abs, velocity)) <= PLANNED_MAX):
+                    break
+                plan.append(as_planned(velocity))
         except PLUGIN_ERRORS as error:
-            in_controller = isinstance(error, ControllerError)
-            kind = "controller" if in_controller else "predictor"
-            cause = (in_controller and error.__cause__) or error
-            self._note(kind, cause, "cloud sends this command without a plan")
+            self._note(plug_in, error, "cloud sends this command without a plan")
             return ()
+        return tuple(plan)
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
         """Whether the last new echo is older than the `horizon` [s] plus `freeze_after`."""
