@@ -192,7 +192,7 @@ class CloudEndpoint(TunnelEnd):
         if self._wants_session(now_ns):
             self._say_hello_if_due(now_ns)
             if now_ns - self._heard_ns > PATIENCE_NS:
-                self._records += self._complaints.say("no_session", SILENCE_TEXT, now_ns)
+                self._tell("no_session", SILENCE_TEXT, now_ns)
         elif self._session.is_outdated:
             self._hellos = 0  # the next hello has the new key
             self._say_hello_if_due(now_ns, KEY_PERIOD_NS)
@@ -232,7 +232,7 @@ class CloudEndpoint(TunnelEnd):
                 (nonce,) = codec.decode(Kind.BUSY, body)
                 if self._handshake.is_refused(nonce) and self._wants_session(now_ns):
                     self._counts["busy"] += 1
-                    self._records += self._complaints.say("busy", BUSY_TEXT, now_ns)
+                    self._tell("busy", BUSY_TEXT, now_ns)
             elif kind != Kind.ALIVE:
                 raise DecodeError("malformed")
         except DecodeError as error:
@@ -243,7 +243,7 @@ class CloudEndpoint(TunnelEnd):
         if outcome == "old_epoch" and codec.peek(data)[1] > self._session.epoch:
             self._say_hello_if_due(now_ns)  # world's ACCEPT of a new session may be lost
         elif self._wants_session(now_ns):
-            self._records += self._complaints.about(outcome, data, now_ns)
+            self._tell_refusal(outcome, data, now_ns)
 
     def _note_missed(self, count: int, now_ns: int) -> None:
         self._counts["missed_periods"] += count
@@ -251,7 +251,7 @@ class CloudEndpoint(TunnelEnd):
             self._late_ns, self._late_window_ns = 0, now_ns
         self._late_ns += count * self._period_ns
         if self._late_ns > LATE_NS:
-            self._records += self._complaints.say("late", LATE_TEXT, now_ns)
+            self._tell("late", LATE_TEXT, now_ns)
 
     def _say_hello_if_due(self, now_ns: int, period_ns: int = HELLO_PERIOD_NS) -> None:
         """Send a hello once per `period_ns`; while two keys are valid, use them in turn."""
@@ -276,7 +276,7 @@ class CloudEndpoint(TunnelEnd):
             self._counts["accept_ignored"] += 1
             return
         self._session.begin(epoch, nonces, self._session.greeting_key)
-        self._complaints.forget()
+        self._told.clear()
         self._channel.reset()
         self._loop.reset(now_ns)
         self._setpoint = None  # the robot may have moved; teleop sends a new one

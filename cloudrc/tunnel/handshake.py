@@ -1,4 +1,4 @@
-"""The handshake that opens a session: world's side, cloud's side, and the log of failures.
+"""The handshake that opens a session: world's side, cloud's side, and the texts of failures.
 
     cloud                                      world
       HELLO (nonce, clock, no cookie)   -->
@@ -20,7 +20,6 @@ import hmac
 from collections import deque
 from typing import NamedTuple
 
-from cloudrc.records import Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, Channel
 from cloudrc.tunnel.codec import Accept, DecodeError, Hello, Kind
@@ -231,33 +230,3 @@ BUSY_TEXT = "another cloud controls the robot: this one waits until the other is
 SILENCE_TEXT = (
     "world does not answer: is it running, is the link up, do both ends have the same key?"
 )
-
-
-class HandshakeLog:
-    """Logs why there is no session; logs each reason once until the next session begins."""
-
-    def __init__(self) -> None:
-        self._logged: set[str] = set()
-
-    def forget(self) -> None:
-        """Forget the logged reasons, because a session has begun."""
-        self._logged.clear()
-
-    def about(self, outcome: str, data: bytes, now_ns: int) -> list[Fault]:
-        """Log at `now_ns` [ns] why `data` was refused; `outcome` is the text of the DecodeError."""
-        if outcome == "version":
-            return self.say("version", VERSION_TEXT.format(data[0], codec.VERSION), now_ns)
-        if outcome == "tag" and codec.peek(data)[0] <= codec.LAST_GREETING:
-            return self.say("key", KEY_TEXT, now_ns)
-        return []
-
-    def say(self, code: str, text: str, now_ns: int) -> list[Fault]:
-        """Log a fault at `now_ns` [ns] unless the log already has the same text.
-
-        Faults with the same `code` and different texts are all logged. A forged datagram with a
-        wrong version therefore does not hide the version of the true peer.
-        """
-        if text in self._logged:
-            return []
-        self._logged.add(text)
-        return [Fault(now_ns, code, text)]

@@ -209,7 +209,7 @@ class WorldEndpoint(TunnelEnd):
         except DecodeError as error:
             self._counts[str(error)] += 1
             if not self._session.epoch:
-                self._records += self._complaints.about(str(error), data, world_ns)
+                self._tell_refusal(str(error), data, world_ns)
 
     def _follow(self, now_ns: int) -> int:
         """Return world's time at `now_ns` [ns]; extend the slip if world lags by too much.
@@ -309,7 +309,7 @@ class WorldEndpoint(TunnelEnd):
             self._records.append(Counted(now_ns, "world", name, count))
         passed_ns = COUNT_PERIOD_NS + self._slip_ns - (before_ns or 0)
         if before_ns is not None and COUNT_PERIOD_NS < REAL_TIME_FACTOR_MIN * passed_ns:
-            self._records += self._complaints.say("late", SLOW_TEXT, now_ns)
+            self._tell("late", SLOW_TEXT, now_ns)
 
     def _receive_hello(self, hello: Hello, counter: int, now_ns: int) -> None:
         if now_ns == self._stalled_wake_ns:
@@ -327,7 +327,7 @@ class WorldEndpoint(TunnelEnd):
         self.robot.guard.forget_commands()
         self._waiting = None
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
-        self._complaints.forget()
+        self._told.clear()
         epoch, now_ns = self._session.epoch, self._tick_ns
         self._records.append(SessionOpened(now_ns, "world", epoch, cause))
         for observer in self.robot.observers:
