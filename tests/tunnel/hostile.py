@@ -76,7 +76,7 @@ class Target:
             [[end._counts[name] for name in accepted] for end in ends],
             [end._session.epoch for end in ends],
             *(self.world._door._fresh_until_ns, self.cloud._heard_ns),
-            *(self.world._orders.number, self.world._waiting),
+            *(self.world._number, self.world._waiting),
         )
 
     def try_one(self, program):
