@@ -173,7 +173,8 @@ def _check_parts(model: Any, robot_path: Path, scene_path: Path) -> None:
 
 def _refuse_differences(path: Path, found: Facts, wanted: Facts) -> None:
     differs = [
-        f"{name} is {_words(have)}, not {_words(right)} +- {_words(slack)}"
+        f"{name} is {_words(have)}, not {_words(right)}"
+        + (f" +- {_words(slack)}" if np.any(slack) else "")
         for (name, (have, _)), (right, slack) in zip(found.items(), wanted.values(), strict=True)
         if not np.all(np.abs(np.subtract(have, right)) <= slack)
     ]
@@ -184,7 +185,7 @@ def _refuse_differences(path: Path, found: Facts, wanted: Facts) -> None:
 
 
 def _words(numbers: ArrayLike) -> str:
-    return " ".join(f"{number:.4g}" for number in np.atleast_1d(numbers))
+    return " ".join(f"{number:.4g}" for number in np.round(np.atleast_1d(numbers), 6) + 0.0)
 
 
 def _facts(model: Any) -> Facts:
