@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cloudrc.cloud.compute import ComputeTime
-from cloudrc.cloud.endpoint import CloudEndpoint
+from cloudrc.cloud.endpoint import CloudEndpoint, ComputeTime
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
 from cloudrc.config import schema

@@ -41,7 +41,7 @@ def is_slow(command):
 QUICK = [command for command in COMMANDS if not is_slow(command)]
 SLOW = [command for command in COMMANDS if is_slow(command)]
 SWEEPS = [command for command in SLOW if "--seeds" in command]
-# `make demo` is a step of .ci/run and flies in mode local; of the sweeps, only the first flies daily.
+# The demo is a step of .ci/run and flies in mode local; of the sweeps, only the first flies daily.
 STEPS = [command for command in SLOW if command.startswith("make") or "--mode local" in command]
 NIGHTLY = [*STEPS, *(c for c in SLOW if c.split()[1] in ANSWERS), *SWEEPS[1:]]
 FLIGHTS = [command for command in QUICK if command.startswith("cloudrc run")]

@@ -1,9 +1,8 @@
 """`cloudrc bench`: measure how much processor time the closed loop needs on this machine.
 
 The command flies the experiment `paper`. For comparison, it also replays only the physics of this
-flight, in C (`mujoco.rollout`, one thread). All repeats do the same work. The closed loop is timed
-in slices: the result is the sum of the shortest time of each slice. Therefore a program that
-interrupts some slices does not change the result.
+flight, in C (`mujoco.rollout`, one thread). The result of each part is the shortest processor time
+of all repeats.
 """
 
 from __future__ import annotations
@@ -12,8 +11,7 @@ import argparse
 import gc
 import time
 from collections.abc import Callable
-from itertools import pairwise
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import format_document, output_argument, table
@@ -29,9 +27,6 @@ STEP = 0.002
 LIMIT_NS = 120_000_000_000
 """Time limit of a measured flight, in its virtual time [ns]."""
 LOOP = "closed loop, records in memory"
-Part: TypeAlias = Callable[[Callable[[], None]], Callable[[], int]]
-"""Function that prepares a measurement and returns the work, another function. The work calls the
-argument `mark` after each slice, and returns the number of physics steps."""
 EPILOG = """\
 'raw mj_step' replays the thrusts and the drag of the same flight in C and must
 end in the same bits. Close other programs before you compare two machines; the
@@ -55,12 +50,10 @@ def execute(options: argparse.Namespace) -> int:
     experiment = load_experiment("paper")
     replay = _replay(experiment)
     count = replay()
-    parts: dict[str, Part] = {
-        "raw mj_step": lambda mark: replay,
-        LOOP: lambda mark: flight(experiment, mark),
-        "flight of a sweep, with its numbers": lambda mark: (
-            lambda: (fly_point(experiment), count)[1]
-        ),
+    parts = {
+        "raw mj_step": lambda: replay,
+        LOOP: lambda: flight(experiment),
+        "flight of a sweep, with its numbers": lambda: lambda: (fly_point(experiment), count)[1],
     }
     costs = measure(parts, options.repeats)
     raw, steps = costs["raw mj_step"], usable().text
@@ -80,29 +73,22 @@ def execute(options: argparse.Namespace) -> int:
     return 0
 
 
-def measure(parts: dict[str, Part], repeats: int) -> dict[str, float]:
+def measure(parts: dict[str, Callable[[], Callable[[], int]]], repeats: int) -> dict[str, float]:
     """Measure each part `repeats` times; return its shortest processor time per step [s].
 
-    In all repeats, a part calls `mark` after the same slices of its work.
+    A part is a function that prepares a measurement and returns the work, another function. The
+    work returns the number of its physics steps.
     """
-    marks: list[int] = []
-
-    def mark() -> None:
-        marks.append(time.process_time_ns())
-
-    shortest: dict[str, list[int]] = {}
-    counts: dict[str, int] = {}
+    shortest: dict[str, float] = {}
     for _ in range(repeats):
         for name, prepare in parts.items():
-            play = prepare(mark)
+            work = prepare()
             gc.collect()
-            marks.clear()
-            mark()
-            counts[name] = play()
-            mark()
-            slices = [end - start for start, end in pairwise(marks)]
-            shortest[name] = list(map(min, slices, shortest.get(name, slices)))
-    return {name: sum(slices) * 1e-9 / counts[name] for name, slices in shortest.items()}
+            start = time.process_time()
+            steps = work()
+            cost = (time.process_time() - start) / steps
+            shortest[name] = min(cost, shortest.get(name, cost))
+    return shortest
 
 
 def _replay(experiment: ResolvedExperiment) -> Callable[[], int]:
@@ -129,11 +115,8 @@ def _replay(experiment: ResolvedExperiment) -> Callable[[], int]:
     return play
 
 
-def flight(experiment: ResolvedExperiment, mark: Callable[[], None]) -> Callable[[], int]:
-    """Prepare a flight that keeps its records; return a function that flies and counts steps.
-
-    The flight calls `mark` every 100 ms of virtual time.
-    """
+def flight(experiment: ResolvedExperiment) -> Callable[[], int]:
+    """Prepare a flight that keeps its records; return a function that flies and counts steps."""
     from cloudrc.assembly import assemble
 
     _, cloud, run = assemble(experiment)
@@ -142,7 +125,6 @@ def flight(experiment: ResolvedExperiment, mark: Callable[[], None]) -> Callable
     def sink(of_world: list[Record], of_cloud: list[Record]) -> None:
         records.extend(of_world)
         records.extend(of_cloud)
-        mark()
 
     def play() -> int:
         run.fly(lambda: cloud.mission_over, LIMIT_NS, sink)

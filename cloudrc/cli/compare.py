@@ -23,8 +23,8 @@ from cloudrc.errors import BadInputError
 from cloudrc.plugins import unknown_name_text
 
 if TYPE_CHECKING:
+    from cloudrc.sweep.compare import Found
     from cloudrc.sweep.flight import Row
-    from cloudrc.sweep.pairs import Found
 
 EPILOG = """\
 A and B are one of:
@@ -68,14 +68,13 @@ def flight_arguments(parser: argparse.ArgumentParser, seeds: int) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Compare and print; return 0 whatever the answer, or the exit code of an early end."""
-    from cloudrc.sweep import pairs
-    from cloudrc.sweep.compare import compare
+    from cloudrc.sweep.compare import compare, of_sweep
 
     stopped, code = "", 0
     if options.set and options.sweep:
         raise BadInputError(f"--set {options.set[0]}: these flights are finished; leave it out")
     if options.sweep:
-        found = pairs.of_sweep(options.sweep, options.a, options.b)
+        found = of_sweep(options.sweep, options.a, options.b)
     else:
         found, stopped, code = _fly_both(options)
     if stopped:
@@ -97,9 +96,8 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
     from cloudrc.cli.advice import warn
     from cloudrc.cli.progress import SweepView
     from cloudrc.cli.run import load
-    from cloudrc.sweep.compare import Pair
+    from cloudrc.sweep.compare import Found, Pair
     from cloudrc.sweep.flight import fly_point, units
-    from cloudrc.sweep.pairs import Found
 
     for text in (options.a, options.b):
         if "=" not in text:

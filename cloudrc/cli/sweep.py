@@ -286,7 +286,7 @@ def draw_figure(options: argparse.Namespace) -> int:
     from cloudrc.files import write_atomically
     from cloudrc.report.figures.style import Look
     from cloudrc.sweep.figure import draw_sweep
-    from cloudrc.sweep.pairs import read_flights
+    from cloudrc.sweep.store import read_flights
 
     rows, units, missing = read_flights(options.folder)
     look = Look(options.width, options.font_size)

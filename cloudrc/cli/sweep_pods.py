@@ -47,7 +47,7 @@ def rows_from_pods(
     """
     from cloudrc.cluster import batch
     from cloudrc.cluster.client import ClusterError
-    from cloudrc.sweep.parcel import pack
+    from cloudrc.sweep.plan import pack
     from cloudrc.sweep.store import parse_row
 
     def tell(text: str) -> None:
@@ -78,7 +78,7 @@ def rows_from_pods(
 def print_rows(options: argparse.Namespace) -> int:
     """Fly one shard of the flights in a file, and print the row of each flight."""
     from cloudrc.sweep.flight import fly_point
-    from cloudrc.sweep.parcel import unpack
+    from cloudrc.sweep.plan import unpack
     from cloudrc.sweep.store import make_row
 
     interrupt_on_signals()  # the first process of a container ignores signals by default

@@ -11,10 +11,12 @@ the operator's requests.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from math import nan
 from typing import Any
 
-from cloudrc.cloud.compute import ComputeTime
+import numpy as np
+
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import (
     EmergencyStopRepeater,
@@ -64,6 +66,42 @@ COUNT_PERIOD_NS = 1_000_000_000
 """Time between two records of the counters [ns]."""
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
+
+
+class ComputeTime:
+    """Simulated time to compute a command: constant, random or measured.
+
+    A random time has a gamma distribution, which is never negative and sometimes long.
+    """
+
+    def __init__(
+        self,
+        mean_ns: float,
+        deviation_ns: float,
+        rng: np.random.Generator,
+        cpu_clock: Callable[[], int] | None = None,
+    ) -> None:
+        """Set the mean `mean_ns` [ns] and the standard deviation `deviation_ns` [ns].
+
+        If `cpu_clock` is given, its time [ns] between `begin` and `end` is added.
+        """
+        self._mean_ns, self._deviation_ns, self._rng = mean_ns, deviation_ns, rng
+        self._cpu_clock, self._began_ns = cpu_clock, 0
+
+    def begin(self) -> None:
+        """Note that the computation of a command begins."""
+        if self._cpu_clock is not None:
+            self._began_ns = self._cpu_clock()
+
+    def end(self) -> int:
+        """Return the time that the computation since `begin` takes in the simulation [ns]."""
+        time_ns = self._mean_ns
+        if self._deviation_ns:
+            shape = (self._mean_ns / self._deviation_ns) ** 2
+            time_ns = self._rng.gamma(shape, self._mean_ns / shape)
+        if self._cpu_clock is not None:
+            time_ns += self._cpu_clock() - self._began_ns
+        return round(time_ns)
 
 
 class CloudEndpoint(TunnelEnd):
@@ -154,7 +192,7 @@ class CloudEndpoint(TunnelEnd):
         if self._wants_session(now_ns):
             self._say_hello_if_due(now_ns)
             if now_ns - self._heard_ns > PATIENCE_NS:
-                self._records += self._complaints.say("no_session", SILENCE_TEXT, now_ns)
+                self._tell("no_session", SILENCE_TEXT, now_ns)
         elif self._session.is_outdated:
             self._hellos = 0  # the next hello has the new key
             self._say_hello_if_due(now_ns, KEY_PERIOD_NS)
@@ -183,18 +221,18 @@ class CloudEndpoint(TunnelEnd):
             if kind == TELEMETRY:
                 self._receive_telemetry(epoch, counter, body, now_ns)
             elif kind == Kind.ACCEPT:
-                self._receive_accept(epoch, codec.decode_accept(body), now_ns)
+                self._receive_accept(epoch, Accept(*codec.decode(Kind.ACCEPT, body)), now_ns)
             elif kind == Kind.CHALLENGE:
-                hello = self._handshake.answer_challenge(codec.decode_challenge(body))
+                (cookie,) = codec.decode(Kind.CHALLENGE, body)
+                hello = self._handshake.answer_challenge(cookie)
                 asks = self._wants_session(now_ns) or self._session.is_outdated
                 if hello is not None and asks:
                     self._greet(hello, self._session.greeting_key)
             elif kind == Kind.BUSY:
-                if self._handshake.is_refused(codec.decode_busy(body)) and self._wants_session(
-                    now_ns
-                ):
+                (nonce,) = codec.decode(Kind.BUSY, body)
+                if self._handshake.is_refused(nonce) and self._wants_session(now_ns):
                     self._counts["busy"] += 1
-                    self._records += self._complaints.say("busy", BUSY_TEXT, now_ns)
+                    self._tell("busy", BUSY_TEXT, now_ns)
             elif kind != Kind.ALIVE:
                 raise DecodeError("malformed")
         except DecodeError as error:
@@ -205,7 +243,7 @@ class CloudEndpoint(TunnelEnd):
         if outcome == "old_epoch" and codec.peek(data)[1] > self._session.epoch:
             self._say_hello_if_due(now_ns)  # world's ACCEPT of a new session may be lost
         elif self._wants_session(now_ns):
-            self._records += self._complaints.about(outcome, data, now_ns)
+            self._tell_refusal(outcome, data, now_ns)
 
     def _note_missed(self, count: int, now_ns: int) -> None:
         self._counts["missed_periods"] += count
@@ -213,7 +251,7 @@ class CloudEndpoint(TunnelEnd):
             self._late_ns, self._late_window_ns = 0, now_ns
         self._late_ns += count * self._period_ns
         if self._late_ns > LATE_NS:
-            self._records += self._complaints.say("late", LATE_TEXT, now_ns)
+            self._tell("late", LATE_TEXT, now_ns)
 
     def _say_hello_if_due(self, now_ns: int, period_ns: int = HELLO_PERIOD_NS) -> None:
         """Send a hello once per `period_ns`; while two keys are valid, use them in turn."""
@@ -238,7 +276,7 @@ class CloudEndpoint(TunnelEnd):
             self._counts["accept_ignored"] += 1
             return
         self._session.begin(epoch, nonces, self._session.greeting_key)
-        self._complaints.forget()
+        self._told.clear()
         self._channel.reset()
         self._loop.reset(now_ns)
         self._setpoint = None  # the robot may have moved; teleop sends a new one

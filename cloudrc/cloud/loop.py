@@ -19,17 +19,18 @@ from __future__ import annotations
 import traceback
 from collections import Counter, deque
 from collections.abc import Callable
+from copy import deepcopy
 from math import isfinite, nan
 from pathlib import Path
 from typing import Any, NoReturn
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
-from cloudrc.cloud.plan import PLUGIN_ERRORS, ControllerError, make_plan
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.errors import describe_error
 from cloudrc.messages import (
     NEVER_NS,
+    PLAN_STEP_NS,
     ZERO,
     Command,
     Odometry,
@@ -40,6 +41,7 @@ from cloudrc.messages import (
 )
 from cloudrc.records import Control, Fault
 from cloudrc.teleop.carrot import setpoint_at
+from cloudrc.tunnel.codec import as_planned
 
 PERIOD_NS = 10_000_000
 """Time between two commands, unless an experiment sets another rate [ns].
@@ -61,93 +63,20 @@ TRACEBACK_MAX = 4000
 """Largest size of a recorded traceback [characters]; the beginning of a longer one is cut off."""
 
 
+PLAN_STEP = PLAN_STEP_NS * 1e-9
+"""Time between two velocities of a plan [s]."""
+PLANNED_MAX = 1000.0
+"""Largest component of a planned velocity [m/s]; the guard refuses a plan with a larger one.
+Source: docs/reference/faults.md, "F23"."""
+PLUGIN_ERRORS = (Exception, SystemExit, GeneratorExit)
+"""What counts as the failure of a plug-in. A user's Ctrl-C does not."""
+
+
 class InvalidResultError(ValueError):
     """A plug-in returned a value that is not a number, or not finite."""
 
 
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
-
-
-class DelayMeter:
-    """Passes the delays of commands to a delay estimator, and gets the horizon from it.
-
-    Attributes:
-        rtt: Newest round-trip time, without the hold time on world [s]; NaN before the first.
-        loop_delay: Newest round-trip time, with the hold time [s]; NaN before the first.
-        newest_echo_ns: Stamp of the newest command that telemetry shows as applied [ns], cloud's
-            clock.
-        expected: Horizon while there is no echo and no estimate [s].
-    """
-
-    def __init__(
-        self,
-        estimator: Estimator,
-        counts: Counter[str],
-        horizon_max: float,
-        period_ns: int,
-        tell_applied: Callable[[int, int], None],
-    ) -> None:
-        """Use `estimator`, and count horizons outside of 0 to `horizon_max` [s] in `counts`.
-
-        `period_ns` is the time between two commands [ns]. `tell_applied` gets stamp and application
-        time of each command that an echo shows, once.
-        """
-        self._estimator, self._counts, self._horizon_max = estimator, counts, horizon_max
-        self._tell_applied = tell_applied
-        self._stamp_ns, self.newest_echo_ns = 0, NEVER_NS
-        self._fresh_ns = FRESH_ECHO_PERIODS * period_ns
-        self._echoes: deque[int] = deque(maxlen=max(ECHOES, ECHOES_NS // period_ns))
-        self.expected = 0.0
-        self.rtt = self.loop_delay = nan
-
-    def observe(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Process telemetry that arrived at `now_ns` [ns] and is newer than all earlier telemetry.
-
-        Every telemetry datagram with a short hold time gives one sample of the paper's eq. (1),
-        even if an earlier datagram had the same echo. A mean over the first datagrams of each echo
-        would be too small, because these have the shortest hold times.
-        Source: docs/reference/control.md, "The delay sample".
-        """
-        self._stamp_ns = telemetry.stamp_ns
-        echo_ns, hold_ns = telemetry.echo_stamp_ns, telemetry.echo_hold_ns
-        self.observe_echo(telemetry)
-        if echo_ns == NEVER_NS or hold_ns > self._fresh_ns:
-            return
-        loop_ns = now_ns - echo_ns
-        self.loop_delay, self.rtt = loop_ns * 1e-9, (loop_ns - hold_ns) * 1e-9
-        self._estimator.update(_new(DelaySample, (self.loop_delay, self.rtt)))
-
-    def observe_echo(self, telemetry: Telemetry) -> None:
-        """Process the echo of telemetry, which shows when a command was applied.
-
-        A command with a long delay is soon replaced by the next command, so its only echo may be in
-        telemetry that arrives late. Without this echo the average delay would be too small.
-        """
-        echo_ns = telemetry.echo_stamp_ns
-        if echo_ns > self.newest_echo_ns:
-            self.newest_echo_ns = echo_ns
-        elif echo_ns == NEVER_NS or echo_ns in self._echoes:
-            return
-        self._echoes.append(echo_ns)
-        applied_ns = telemetry.stamp_ns - telemetry.echo_hold_ns
-        self._tell_applied(echo_ns, applied_ns)
-        self._estimator.add_applied((applied_ns - echo_ns) * 1e-9)
-
-    def horizon(self, now_ns: int) -> float:
-        """Return the horizon for a command that leaves at `now_ns` [ns], within the limits.
-
-        Raises:
-            InvalidResultError: If the estimator's horizon is not finite.
-        """
-        horizon = float(self._estimator.horizon((now_ns - self._stamp_ns) * 1e-9))
-        if horizon == 0.0 and self.newest_echo_ns == NEVER_NS:
-            horizon = self.expected
-        if 0.0 <= horizon <= self._horizon_max:
-            return horizon
-        if not isfinite(horizon):
-            raise InvalidResultError(f"its horizon is {horizon}")
-        self._counts["horizon_clamped"] += 1
-        return min(max(horizon, 0.0), self._horizon_max)
 
 
 class ControlLoop:
@@ -204,9 +133,12 @@ class ControlLoop:
         self._begin(estimator)
 
     def _begin(self, estimator: Estimator) -> None:
-        self._delays = DelayMeter(
-            estimator, self.counts, self._horizon_max, self.period_ns, self._tell_applied
-        )
+        self._estimator = estimator
+        self._echoes: deque[int] = deque(maxlen=max(ECHOES, ECHOES_NS // self.period_ns))
+        self._newest_echo_ns = NEVER_NS  # stamp of the newest applied command [ns], cloud's clock
+        self._expected = 0.0  # horizon while there is no echo and no estimate [s]
+        # Newest round trip, without and with the hold time on world [s]; NaN before the first.
+        self._rtt = self._loop_delay = nan
         self._basis: Odometry | None = None
         self._basis_arrival_ns = 0
         self._horizon, self._echoed_ns = 0.0, NEVER_NS
@@ -230,20 +162,65 @@ class ControlLoop:
         """Process telemetry that arrived at `now_ns` [ns], cloud's clock."""
         self._basis, self._basis_arrival_ns = telemetry.odometry, now_ns
         self._now_ns = now_ns
-        self._call("estimator", self._delays.observe, telemetry, now_ns)
+        self._call("estimator", self._observe_delay, telemetry, now_ns)
         self._call("predictor", self._predictor.observe, telemetry.odometry)
 
     def expect(self, round_trip: float) -> None:
         """Use a round trip [s] as the horizon until a command has been echoed."""
-        self._delays.expected = round_trip
+        self._expected = round_trip
 
     def observe_late(self, telemetry: Telemetry, now_ns: int) -> None:
         """Process telemetry that arrived after newer telemetry; only its echo is used."""
         self._now_ns = now_ns
-        self._call("estimator", self._delays.observe_echo, telemetry)
+        self._call("estimator", self._observe_echo, telemetry)
 
-    def _tell_applied(self, command_stamp_ns: int, applied_ns: int) -> None:
-        self._call("predictor", self._predictor.applied, command_stamp_ns, applied_ns)
+    def _observe_delay(self, telemetry: Telemetry, now_ns: int) -> None:
+        """Process the delays in telemetry that is newer than all earlier telemetry.
+
+        Every telemetry datagram with a short hold time gives one sample of the paper's eq. (1),
+        even if an earlier datagram had the same echo. A mean over the first datagrams of each echo
+        would be too small, because these have the shortest hold times.
+        Source: docs/reference/control.md, "The delay sample".
+        """
+        echo_ns, hold_ns = telemetry.echo_stamp_ns, telemetry.echo_hold_ns
+        self._observe_echo(telemetry)
+        if echo_ns == NEVER_NS or hold_ns > FRESH_ECHO_PERIODS * self.period_ns:
+            return
+        loop_ns = now_ns - echo_ns
+        self._loop_delay, self._rtt = loop_ns * 1e-9, (loop_ns - hold_ns) * 1e-9
+        self._estimator.update(_new(DelaySample, (self._loop_delay, self._rtt)))
+
+    def _observe_echo(self, telemetry: Telemetry) -> None:
+        """Process the echo of telemetry, which shows when a command was applied.
+
+        A command with a long delay is soon replaced by the next command, so its only echo may be in
+        telemetry that arrives late. Without this echo the average delay would be too small.
+        """
+        echo_ns = telemetry.echo_stamp_ns
+        if echo_ns > self._newest_echo_ns:
+            self._newest_echo_ns = echo_ns
+        elif echo_ns == NEVER_NS or echo_ns in self._echoes:
+            return
+        self._echoes.append(echo_ns)
+        applied_ns = telemetry.stamp_ns - telemetry.echo_hold_ns
+        self._call("predictor", self._predictor.applied, echo_ns, applied_ns)
+        self._estimator.add_applied((applied_ns - echo_ns) * 1e-9)
+
+    def _estimate_horizon(self, age: float) -> float:
+        """Return the horizon [s], within the limits; `age` is as in `Estimator.horizon`.
+
+        Raises:
+            InvalidResultError: If the estimator's horizon is not finite.
+        """
+        horizon = float(self._estimator.horizon(age))
+        if horizon == 0.0 and self._newest_echo_ns == NEVER_NS:
+            horizon = self._expected
+        if 0.0 <= horizon <= self._horizon_max:
+            return horizon
+        if not isfinite(horizon):
+            raise InvalidResultError(f"its horizon is {horizon}")
+        self.counts["horizon_clamped"] += 1
+        return min(max(horizon, 0.0), self._horizon_max)
 
     def command(
         self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
@@ -257,13 +234,13 @@ class ControlLoop:
             epoch: Number of the session, for the record.
             counter: Counter of the command's datagram, for the record.
         """
-        basis, delays, moving = self._basis, self._delays, setpoint
+        basis, moving = self._basis, setpoint
         self._now_ns = now_ns
         if moving.motion is not None:
             setpoint = setpoint_at(moving, now_ns)
         assert basis is not None, "check `ready` first"
         try:
-            self._horizon = delays.horizon(now_ns)
+            self._horizon = self._estimate_horizon((now_ns - basis.stamp_ns) * 1e-9)
         except PLUGIN_ERRORS as error:
             self._note("estimator", error)
         horizon = self._horizon
@@ -285,7 +262,7 @@ class ControlLoop:
         _, position, orientation, predicted_velocity, _ = estimate
         # fmt: off
         control = _new(Control, (
-            now_ns, epoch, counter, basis.stamp_ns, horizon, delays.rtt, delays.loop_delay,
+            now_ns, epoch, counter, basis.stamp_ns, horizon, self._rtt, self._loop_delay,
             basis.position, position, orientation, predicted_velocity, setpoint.position,
             setpoint.waypoint, velocity, yaw_rate, proportional, integral, derivative,
         ))
@@ -327,24 +304,43 @@ class ControlLoop:
             return STAND_STILL
 
     def _plan(self, setpoint: Setpoint, velocity: Vector, now_ns: int) -> tuple[Vector, ...]:
-        """Plan the commands after `velocity` [m/s]; a predictor without a model gives no plan."""
+        """Plan the velocities [m/s] after a command, one per PLAN_STEP: roll the model forward.
+
+        Args:
+            setpoint: Setpoint, with its motion.
+            velocity: Velocity of the command [m/s].
+            now_ns: Time of the command [ns], cloud's clock.
+
+        Returns:
+            The plan; it ends before a velocity that the guard would refuse. It is empty if the
+            predictor has no model, or if a plug-in fails.
+        """
+        plan, plug_in = list[Vector](), "predictor"
         try:
             model = self._predictor.model()
             if model is None:
                 return ()
-            count = self._planned
-            return make_plan(model, self._controller, setpoint, velocity, now_ns, count)
+            plug_in = "controller"
+            controller = deepcopy(self._controller)
+            for k in range(1, self._planned + 1):
+                plug_in = "predictor"
+                state = model.step(velocity, PLAN_STEP)
+                later = setpoint_at(setpoint, now_ns + k * PLAN_STEP_NS)
+                plug_in = "controller"
+                x, y, z = controller.update(state, later, PLAN_STEP).velocity
+                velocity = (float(x), float(y), float(z))
+                if not (isfinite(sum(velocity)) and max(map(abs, velocity)) <= PLANNED_MAX):
+                    break
+                plan.append(as_planned(velocity))
         except PLUGIN_ERRORS as error:
-            in_controller = isinstance(error, ControllerError)
-            kind = "controller" if in_controller else "predictor"
-            cause = (in_controller and error.__cause__) or error
-            self._note(kind, cause, "cloud sends this command without a plan")
+            self._note(plug_in, error, "cloud sends this command without a plan")
             return ()
+        return tuple(plan)
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
         """Whether the last new echo is older than the `horizon` [s] plus `freeze_after`."""
-        if self._echoed_ns < self._delays.newest_echo_ns:
-            self._echoed_ns = self._delays.newest_echo_ns
+        if self._echoed_ns < self._newest_echo_ns:
+            self._echoed_ns = self._newest_echo_ns
         elif self._echoed_ns == NEVER_NS:
             self._echoed_ns = now_ns
         return now_ns - self._echoed_ns > horizon * 1e9 + self._freeze_after_ns

@@ -44,7 +44,7 @@ def start(
 ) -> None:
     """Create the Job `name` with `shards` pods for `flights`; keep a Job that has not failed.
 
-    `flights` is a file made by `cloudrc.sweep.parcel`, `image` an image with the simulator, `cpu`
+    `flights` is a file made by `sweep.plan.pack`, `image` an image with the simulator, `cpu`
     the CPU request of a pod, and `queue` a queue of Kueue. The Job belongs to no Helm release.
 
     Raises:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
 from cloudrc.errors import BadInputError
 from cloudrc.plugins import unknown_name_text
+from cloudrc.sweep import store
 from cloudrc.sweep.flight import Row, counts
 from cloudrc.sweep.statistics import LEVEL, paired, sign_test, wilson_interval
 
@@ -30,6 +33,14 @@ class Pair(NamedTuple):
     label: Mapping[str, Any]  # what both share, such as the seed
     a: Row
     b: Row
+
+
+class Found(NamedTuple):
+    """Finished flights in pairs."""
+
+    pairs: list[Pair]
+    units: dict[str, str]  # metric -> unit
+    what: str  # in words: the compared axis, the folder, and limits of the comparison
 
 
 def compare(
@@ -101,3 +112,41 @@ def scale(unit: str, largest: float) -> tuple[float, str]:
     if 0 < largest < {"m": 0.1, "s": 1.0}.get(unit, 0.0):
         return 1e3, f"m{unit}"
     return 1.0, "" if unit == "1" else unit
+
+
+def of_sweep(folder: Path, a: str, b: str) -> Found:
+    """Pair each row with the value `a` of an axis with the row that differs only in the value `b`.
+
+    `a` and `b` are texts: VALUE or AXIS=VALUE.
+
+    Raises:
+        BadInputError: If not exactly one axis has both values, or if they are the same.
+    """
+    rows, units, missing = store.read_flights(folder)
+    axes = store.values_of(rows)
+    sides = [
+        [(axis, v) for axis in axes for v in axes[axis] if text in (f"{v}", f"{axis}={v}")]
+        for text in (a, b)
+    ]
+    found = [(axis, x, y) for axis, x in sides[0] for other, y in sides[1] if axis == other]
+    if len(found) != 1 or found[0][1] == found[0][2]:
+        known = "; ".join(f"{axis}: {', '.join(map(str, values))}" for axis, values in axes.items())
+        raise BadInputError(
+            f"{folder}: A and B must be two values of one axis, VALUE or AXIS=VALUE; axes: {known}"
+        )
+    axis, first, second = found[0]
+    flown: dict[str, dict[Any, Row]] = {}
+    for row in rows:
+        rest = {name: value for name, value in row["point"].items() if name != axis}
+        shared = json.dumps({**rest, "seed": row["seed"]})
+        flown.setdefault(shared, {})[row["point"][axis]] = row
+    pairs = [
+        Pair(json.loads(shared), each[first], each[second])
+        for shared, each in flown.items()
+        if first in each and second in each
+    ]
+    what = f"{axis} in {folder}" + (f", of which {missing}" if missing else "")
+    if pooled := ", ".join(name for name, each in axes.items() if name != axis and len(each) > 1):
+        what += f", over all values of {pooled}; flights with equal seeds depend on each other, "
+        what += "so p is too small"
+    return Found(pairs, units, what)

@@ -13,8 +13,8 @@ from cloudrc.report.figures.bands import Panel, Point, draw
 from cloudrc.report.figures.style import Look
 from cloudrc.sweep.compare import NUMBERS, scale
 from cloudrc.sweep.flight import Row, counts
-from cloudrc.sweep.pairs import values_of
 from cloudrc.sweep.statistics import median_interval, wilson_interval
+from cloudrc.sweep.store import values_of
 
 COLUMN = Look(width=3.5)
 """Look of a figure in one column of a page. Source: IEEE conference template."""

@@ -145,6 +145,35 @@ def read_summary(folder: Path) -> dict[str, Any]:
     raise BadInputError(f"{folder}: is not a folder of 'cloudrc sweep run'; name one")
 
 
+def read_flights(folder: Path) -> tuple[list[Row], dict[str, str], str]:
+    """Read the rows of a sweep in the order of its grid.
+
+    Also return metric -> unit, and how many flights are missing, in words ("" if none). Values of
+    axes that are neither numbers nor text become JSON text. Raise a BadInputError if there are no
+    rows.
+    """
+    summary = read_summary(folder)
+    axes = summary["axes"]
+
+    def place(row: Row) -> list[int]:
+        return [*(axes[axis].index(value) for axis, value in row["point"].items()), row["seed"]]
+
+    rows = sorted(read_rows(folder).values(), key=place)
+    for row in rows:
+        row["point"] = {axis: value if type(value) in (str, int, float) else json.dumps(value)
+                        for axis, value in row["point"].items()}  # fmt: skip
+    if not rows:
+        raise BadInputError(f"{folder}: has no rows; run the sweep again with this --out")
+    missing = summary["flights"] - len(rows)
+    return rows, summary["units"], f"{missing} flights are not done" if missing else ""
+
+
+def values_of(rows: Sequence[Row]) -> dict[str, list[Any]]:
+    """Return the values of each axis in the order of the grid."""
+    return {axis: list(dict.fromkeys(row["point"][axis] for row in rows))
+            for axis in rows[0]["point"]}  # fmt: skip
+
+
 def _write_summary(folder: Path, plan: Plan, rows: Mapping[str, Row]) -> dict[str, str]:
     """Write the description of a sweep; return the units of all metrics."""
     own = {choice for point in plan.points for choice in point.report.metrics}

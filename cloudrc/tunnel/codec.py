@@ -11,7 +11,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from enum import IntEnum
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from cloudrc.messages import (
     NEVER_NS,
@@ -95,7 +95,8 @@ _BODIES = {
     Kind.OPERATOR: struct.Struct("<IBBQHq"),
     Kind.ALIVE: struct.Struct(""),
 }
-_HELLO, _ACCEPT, _CHALLENGE, _BUSY, _TELEMETRY, _COMMAND, _OPERATOR, _ = _BODIES.values()
+_TELEMETRY, _COMMAND = _BODIES[Kind.TELEMETRY], _BODIES[Kind.COMMAND]
+_OPERATOR = _BODIES[Kind.OPERATOR]
 BODY_SIZES = {kind: body.size for kind, body in _BODIES.items()}
 LAST_GREETING = int(Kind.BUSY)
 HEADER_SIZE, TAG_SIZE = _HEADER.size, 16
@@ -226,37 +227,14 @@ def decode_operator(body: bytes) -> OperatorRequest:
     return OperatorRequest(number, Request(kind), Start(start), mission_id, reached, basis_stamp_ns)
 
 
-def encode_hello(hello: Hello) -> bytes:
-    """Encode the body of a HELLO datagram."""
-    return _HELLO.pack(*hello)
+def encode(kind: Kind, *fields: Any) -> bytes:
+    """Encode the body of a handshake datagram: the fields of a `Hello` or `Accept`.
+
+    A CHALLENGE has one field, a cookie. A BUSY has one, the nonce of the hello that it answers.
+    """
+    return _BODIES[kind].pack(*fields)
 
 
-def encode_accept(accept: Accept) -> bytes:
-    """Encode the body of an ACCEPT datagram."""
-    return _ACCEPT.pack(*accept)
-
-
-encode_challenge: Callable[[bytes], bytes] = _CHALLENGE.pack
-"""Encode the body of a CHALLENGE datagram: a cookie, padded with zeros."""
-encode_busy: Callable[[bytes], bytes] = _BUSY.pack
-"""Encode the body of a BUSY datagram: the nonce of the hello that it answers."""
-
-
-def decode_hello(body: bytes) -> Hello:
-    """Decode the body of a HELLO datagram."""
-    return Hello(*_HELLO.unpack(body))
-
-
-def decode_accept(body: bytes) -> Accept:
-    """Decode the body of an ACCEPT datagram."""
-    return Accept(*_ACCEPT.unpack(body))
-
-
-def decode_challenge(body: bytes) -> bytes:
-    """Decode the cookie from the body of a CHALLENGE datagram."""
-    return body[:COOKIE_SIZE]
-
-
-def decode_busy(body: bytes) -> bytes:
-    """Decode the nonce from the body of a BUSY datagram."""
-    return body[:-1]
+def decode(kind: Kind, body: bytes) -> tuple[Any, ...]:
+    """Decode the fields of a handshake datagram, as in `encode`."""
+    return _BODIES[kind].unpack(body)

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from cloudrc.messages import Command, Datagram, Telemetry
-from cloudrc.records import Record
+from cloudrc.records import Fault, Record
+from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import Channel
 from cloudrc.tunnel.codec import Direction, encode_command, encode_telemetry
-from cloudrc.tunnel.handshake import HandshakeLog
+from cloudrc.tunnel.handshake import KEY_TEXT, VERSION_TEXT
 from cloudrc.tunnel.keys import KeyRing
 from cloudrc.tunnel.session import Session
 
@@ -33,7 +34,7 @@ class TunnelEnd:
         self._session = Session(sends, identity.ring)
         self._make_datagram = self._session.pass_on if identity.passes else self._encode
         self._channel = Channel(newest_wins)
-        self._complaints = HandshakeLog()
+        self._told: set[str] = set()  # texts of the faults in this session
         self._clock_is_shared = False
         self._datagrams: list[Datagram] = []
         self._records: list[Record] = []
@@ -58,6 +59,23 @@ class TunnelEnd:
         """Return the records made since the last call."""
         records, self._records = self._records, []
         return records
+
+    def _tell(self, code: str, text: str, now_ns: int) -> None:
+        """Record a fault at `now_ns` [ns], unless this session has one with the same text.
+
+        Faults with the same `code` and different texts are all recorded. A forged datagram with a
+        wrong version therefore does not hide the version of the true peer.
+        """
+        if text not in self._told:
+            self._told.add(text)
+            self._records.append(Fault(now_ns, code, text))
+
+    def _tell_refusal(self, outcome: str, data: bytes, now_ns: int) -> None:
+        """Record at `now_ns` [ns] why `data` opens no session; `outcome` is its DecodeError."""
+        if outcome == "version":
+            self._tell("version", VERSION_TEXT.format(data[0], codec.VERSION), now_ns)
+        elif outcome == "tag" and codec.peek(data)[0] <= codec.LAST_GREETING:
+            self._tell("key", KEY_TEXT, now_ns)
 
     def _send(self, kind: int, body: bytes) -> None:
         self._datagrams.append(self._session.seal(kind, body))

@@ -1,4 +1,4 @@
-"""The handshake that opens a session: world's side, cloud's side, and the log of failures.
+"""The handshake that opens a session: world's side, cloud's side, and the texts of failures.
 
     cloud                                      world
       HELLO (nonce, clock, no cookie)   -->
@@ -20,7 +20,6 @@ import hmac
 from collections import deque
 from typing import NamedTuple
 
-from cloudrc.records import Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import REPEATED, Channel
 from cloudrc.tunnel.codec import Accept, DecodeError, Hello, Kind
@@ -98,7 +97,7 @@ class ServerHandshake:
             if now_ns - self._challenged_ns < CHALLENGE_NS:
                 return HelloAnswer("unanswered", [])
             self._challenged_ns = now_ns
-            challenge = codec.encode_challenge(self._cookie(now_ns))
+            challenge = codec.encode(Kind.CHALLENGE, self._cookie(now_ns))
             return HelloAnswer("hello", [session.greet(Kind.CHALLENGE, challenge, key)])
         if counter <= self._counters.get(hello.nonce, -1):
             return HelloAnswer(REPEATED, [])
@@ -111,7 +110,7 @@ class ServerHandshake:
                 return HelloAnswer("hello", [self._accept()])
         elif now_ns <= self._fresh_until_ns:
             return HelloAnswer(
-                "busy", [session.greet(Kind.BUSY, codec.encode_busy(hello.nonce), key)]
+                "busy", [session.greet(Kind.BUSY, codec.encode(Kind.BUSY, hello.nonce), key)]
             )
         self._incumbent = hello
         if is_newer(hello.epoch, self._epoch):
@@ -150,7 +149,7 @@ class ServerHandshake:
 
     def _accept(self) -> bytes:
         accept = Accept(self._incumbent.nonce, self._nonce, self._clock)
-        return self._session.greet(Kind.ACCEPT, codec.encode_accept(accept))
+        return self._session.greet(Kind.ACCEPT, codec.encode(Kind.ACCEPT, *accept))
 
     def _cookie(self, now_ns: int, slots_ago: int = 0) -> bytes:
         slot = now_ns // COOKIE_NS - slots_ago
@@ -222,7 +221,7 @@ class ClientHandshake:
         return accept.nonce + accept.world_nonce
 
     def _hello(self) -> bytes:
-        return codec.encode_hello(Hello(self._nonce, self._clock, self._cookie, self._epoch))
+        return codec.encode(Kind.HELLO, self._nonce, self._clock, self._cookie, self._epoch)
 
 
 VERSION_TEXT = "peer speaks v{}, we speak v{}: run the same version of cloudrc at both ends"
@@ -231,33 +230,3 @@ BUSY_TEXT = "another cloud controls the robot: this one waits until the other is
 SILENCE_TEXT = (
     "world does not answer: is it running, is the link up, do both ends have the same key?"
 )
-
-
-class HandshakeLog:
-    """Logs why there is no session; logs each reason once until the next session begins."""
-
-    def __init__(self) -> None:
-        self._logged: set[str] = set()
-
-    def forget(self) -> None:
-        """Forget the logged reasons, because a session has begun."""
-        self._logged.clear()
-
-    def about(self, outcome: str, data: bytes, now_ns: int) -> list[Fault]:
-        """Log at `now_ns` [ns] why `data` was refused; `outcome` is the text of the DecodeError."""
-        if outcome == "version":
-            return self.say("version", VERSION_TEXT.format(data[0], codec.VERSION), now_ns)
-        if outcome == "tag" and codec.peek(data)[0] <= codec.LAST_GREETING:
-            return self.say("key", KEY_TEXT, now_ns)
-        return []
-
-    def say(self, code: str, text: str, now_ns: int) -> list[Fault]:
-        """Log a fault at `now_ns` [ns] unless the log already has the same text.
-
-        Faults with the same `code` and different texts are all logged. A forged datagram with a
-        wrong version therefore does not hide the version of the true peer.
-        """
-        if text in self._logged:
-            return []
-        self._logged.add(text)
-        return [Fault(now_ns, code, text)]

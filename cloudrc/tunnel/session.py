@@ -164,12 +164,3 @@ class Session:
             return NoCipher()
         use = b"session %d %d" % (direction, self.epoch)
         return AESGCM(self.epoch_key.derive(self._nonces, use))
-
-
-def pair(epoch: int = 1, secret: bytes | None = b"p" * 32) -> tuple[Session, Session]:
-    """Make world's and cloud's end of a session for tests; no encryption if `secret` is None."""
-    ring = None if secret is None else KeyRing(KeySet(Key(secret)))
-    ends = Session(Direction.UPLINK, ring), Session(Direction.DOWNLINK, ring)
-    for end in ends:
-        end.begin(epoch, b"cloud".ljust(16) + b"world".ljust(16))
-    return ends

@@ -13,7 +13,7 @@ a session, and when a mission starts from the spawn, the robot's initial place i
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from math import hypot, isnan, nan
 
 from cloudrc.messages import (
@@ -41,85 +41,12 @@ from cloudrc.tunnel.channel import REPEATED, USED
 from cloudrc.tunnel.codec import DecodeError, Direction, Hello, Kind
 from cloudrc.tunnel.end import Identity, TunnelEnd
 from cloudrc.tunnel.handshake import ServerHandshake
-from cloudrc.world.guard.state import Guard
 from cloudrc.world.robot import Robot
 from cloudrc.world.sensors import Sensors
 
 START_AGE_MAX_NS = 1_000_000_000
 """Largest accepted age of a start request [ns]; a larger age limit for commands applies instead.
 The age counts from the stamp of the newest odometry that cloud had when it sent the request."""
-
-
-class Orders:
-    """Carry out the operator's requests in the order of their numbers.
-
-    Attributes:
-        number: Number of the newest request carried out in this session.
-        mission_id: Number of the mission that was started last, in this or an earlier session.
-        reached: Number of reached waypoints of that mission, as reported by the requests.
-        pipes: Number of contacts with pipes since that mission started.
-        touch_speed: Speed of the arm's tip when it first touched the board in that mission [m/s];
-            NaN before the contact.
-    """
-
-    def __init__(
-        self, guard: Guard, counts: defaultdict[str, int], command_age_max_ns: int
-    ) -> None:
-        """Use `guard`; count each refused start in `counts` as "start_refused".
-
-        `command_age_max_ns` is the largest accepted age of a command [ns].
-        """
-        self._guard, self._counts = guard, counts
-        self._age_max_ns = max(START_AGE_MAX_NS, command_age_max_ns)
-        self.number = self.mission_id = self.reached = self.pipes = 0
-        self.touch_speed = nan
-
-    def note_touch(self, touch: Contact) -> None:
-        """Count a contact with a pipe; store the tip's speed at the first touch of the board."""
-        if touch.body.startswith("pipe"):
-            self.pipes += 1
-        elif touch.body == "board" and touch.tip and isnan(self.touch_speed):
-            self.touch_speed = hypot(*touch.tip_velocity)
-
-    def obey(self, request: OperatorRequest, now_ns: int, *, waited: bool) -> bool:
-        """Carry out a request at `now_ns` [ns], world's clock; return whether a mission begins.
-
-        `waited` tells whether the request may have waited in the socket during a stall. A
-        request to start a mission raises the DecodeError "stale" if `waited` is true or the request
-        is too old, and "future" if its odometry has a stamp later than `now_ns`.
-        """
-        kind, guard = request.request, self._guard
-        starts = kind is Request.START
-        if kind is not Request.PROGRESS:
-            if request.number <= self.number:
-                return False
-            if starts:
-                self._refuse_old(now_ns - request.basis_stamp_ns, waited)
-                # Telemetry does not confirm this request: the operator has to acknowledge first.
-                if guard.latched:
-                    self._counts["start_refused"] += 1
-                    return False
-            self.number = request.number
-        if starts and (request.mission_id != self.mission_id or request.start is Start.SPAWN):
-            self.mission_id, self.reached = request.mission_id, 0
-            self.pipes, self.touch_speed = 0, nan
-        if request.mission_id == self.mission_id:  # stored on board for a restarted cloud
-            self.reached = max(self.reached, request.reached)
-        if kind is Request.END:
-            guard.end_mission(now_ns)
-        elif kind is Request.ESTOP:
-            guard.stop(now_ns)
-        elif kind is Request.ACKNOWLEDGE:
-            guard.acknowledge(now_ns)
-        return starts
-
-    def _refuse_old(self, age_ns: int, waited: bool) -> None:
-        if waited or age_ns > self._age_max_ns:
-            raise DecodeError("stale")
-        if age_ns < 0:
-            raise DecodeError("future")
-
-
 ODOMETRY_PERIOD_NS = 10_000_000
 """Default time between two odometry samples, and longest time between two records of the true
 state [ns]. Source: docs/reference/plant.md, "Odometry"."""
@@ -169,7 +96,11 @@ class WorldEndpoint(TunnelEnd):
         self._counted_slip_ns: int | None = None
         self._waiting: tuple[int, int, Command] | None = None
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
-        self._orders = Orders(robot.guard, self._counts, command_age_max_ns)
+        self._number = 0  # of the newest operator request carried out in this session
+        # Of the mission that was started last: its number, waypoints reached as reported by the
+        # operator, contacts with pipes, and the speed of the tip at its first touch of the board.
+        self._mission_id = self._reached = self._pipes = 0
+        self._touch_speed = nan
 
     @property
     def counts(self) -> Counter[str]:
@@ -200,7 +131,7 @@ class WorldEndpoint(TunnelEnd):
                 self._receive_command(epoch, counter, command, now_ns, world_ns)
             elif kind == Kind.HELLO:
                 self._advance(world_ns)
-                self._receive_hello(codec.decode_hello(body), counter, now_ns)
+                self._receive_hello(Hello(*codec.decode(Kind.HELLO, body)), counter, now_ns)
             else:
                 self._door.accept_once(kind, counter, now_ns)
                 if kind == Kind.OPERATOR:
@@ -209,7 +140,7 @@ class WorldEndpoint(TunnelEnd):
         except DecodeError as error:
             self._counts[str(error)] += 1
             if not self._session.epoch:
-                self._records += self._complaints.about(str(error), data, world_ns)
+                self._tell_refusal(str(error), data, world_ns)
 
     def _follow(self, now_ns: int) -> int:
         """Return world's time at `now_ns` [ns]; extend the slip if world lags by too much.
@@ -262,7 +193,6 @@ class WorldEndpoint(TunnelEnd):
     def _sample(self, now_ns: int) -> None:
         """Record the true state and the events before it; send telemetry if it is due."""
         simulator, guard, records = self.robot.simulator, self.robot.guard, self._records
-        orders = self._orders
         tip_force = simulator.tip_force()
         truth = simulator.truth(now_ns)
         forces = (tip_force, *simulator.take_tip_force())
@@ -272,7 +202,7 @@ class WorldEndpoint(TunnelEnd):
         if simulator.touches:
             for touch in simulator.take_contacts():
                 records.append(touch._replace(stamp_ns=now_ns))
-                orders.note_touch(touch)
+                self._note_touch(touch)
         is_due = now_ns >= self._odometry_ns
         if is_due:
             self._odometry_ns += self._odometry_period_ns
@@ -284,12 +214,12 @@ class WorldEndpoint(TunnelEnd):
                 self._echo_stamp_ns,
                 now_ns - self._applied_ns if self._applied_ns >= 0 else 0,
                 self._slip_ns,
-                orders.number,
+                self._number,
                 guard.state,
-                orders.pipes,
-                orders.touch_speed,
-                orders.mission_id,
-                orders.reached,
+                self._pipes,
+                self._touch_speed,
+                self._mission_id,
+                self._reached,
                 guard.cause,
             )
             telemetry = _new(Telemetry, known)
@@ -309,7 +239,7 @@ class WorldEndpoint(TunnelEnd):
             self._records.append(Counted(now_ns, "world", name, count))
         passed_ns = COUNT_PERIOD_NS + self._slip_ns - (before_ns or 0)
         if before_ns is not None and COUNT_PERIOD_NS < REAL_TIME_FACTOR_MIN * passed_ns:
-            self._records += self._complaints.say("late", SLOW_TEXT, now_ns)
+            self._tell("late", SLOW_TEXT, now_ns)
 
     def _receive_hello(self, hello: Hello, counter: int, now_ns: int) -> None:
         if now_ns == self._stalled_wake_ns:
@@ -318,7 +248,7 @@ class WorldEndpoint(TunnelEnd):
         self._counts[answer.outcome] += 1
         if answer.opened:
             self._clock_is_shared = hello.clock == self._identity.clock_id
-            self._orders.number = 0
+            self._number = 0
             self._begin_epoch("cloud said hello")
         self._queue(answer.datagrams)
 
@@ -327,25 +257,63 @@ class WorldEndpoint(TunnelEnd):
         self.robot.guard.forget_commands()
         self._waiting = None
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
-        self._complaints.forget()
+        self._told.clear()
         epoch, now_ns = self._session.epoch, self._tick_ns
         self._records.append(SessionOpened(now_ns, "world", epoch, cause))
         for observer in self.robot.observers:
             observer.see_session(now_ns)
 
+    def _note_touch(self, touch: Contact) -> None:
+        if touch.body.startswith("pipe"):
+            self._pipes += 1
+        elif touch.body == "board" and touch.tip and isnan(self._touch_speed):
+            self._touch_speed = hypot(*touch.tip_velocity)
+
     def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
-        tick_ns, waited = self._tick_ns, now_ns == self._stalled_wake_ns
-        number = self._orders.number
-        starts = self._orders.obey(request, tick_ns, waited=waited)
-        if starts and request.start is Start.SPAWN:
-            self.robot.put_on_ground(tick_ns, "mission starts from spawn")
-            self._queue([self._door.begin_next_epoch(now_ns)])
-            self._begin_epoch("mission starts from spawn")
-        if starts:
-            self.robot.guard.start_mission(tick_ns)
-        if self._orders.number != number:
+        """Carry out the operator's requests in the order of their numbers.
+
+        Raise the DecodeError "stale" for a start that is too old or may have waited in the socket
+        during a stall, and "future" if its odometry has a stamp later than world's clock.
+        """
+        kind, guard, tick_ns = request.request, self.robot.guard, self._tick_ns
+        starts = kind is Request.START
+        if kind is not Request.PROGRESS:
+            if request.number <= self._number:
+                return
+            if starts:
+                self._refuse_old(tick_ns - request.basis_stamp_ns, now_ns)
+                # Telemetry does not confirm this request: the operator has to acknowledge first.
+                if guard.latched:
+                    self._counts["start_refused"] += 1
+                    return
+            self._number = request.number
+        if starts and (request.mission_id != self._mission_id or request.start is Start.SPAWN):
+            self._mission_id, self._reached = request.mission_id, 0
+            self._pipes, self._touch_speed = 0, nan
+        if request.mission_id == self._mission_id:  # stored on board for a restarted cloud
+            self._reached = max(self._reached, request.reached)
+        if kind is Request.END:
+            guard.end_mission(tick_ns)
+        elif kind is Request.ESTOP:
+            guard.stop(tick_ns)
+        elif kind is Request.ACKNOWLEDGE:
+            guard.acknowledge(tick_ns)
+        elif starts:
+            if request.start is Start.SPAWN:
+                self.robot.put_on_ground(tick_ns, "mission starts from spawn")
+                self._queue([self._door.begin_next_epoch(now_ns)])
+                self._begin_epoch("mission starts from spawn")
+            guard.start_mission(tick_ns)
+        if kind is not Request.PROGRESS:
             for observer in self.robot.observers:
                 observer.see_request(request, tick_ns)
+
+    def _refuse_old(self, age_ns: int, now_ns: int) -> None:
+        age_max_ns = max(START_AGE_MAX_NS, self._command_age_max_ns)
+        if now_ns == self._stalled_wake_ns or age_ns > age_max_ns:
+            raise DecodeError("stale")
+        if age_ns < 0:
+            raise DecodeError("future")
 
     def _receive_command(
         self, epoch: int, counter: int, command: Command, now_ns: int, world_ns: int

@@ -1,7 +1,7 @@
 """Compile a robot and a scene into one MuJoCo model.
 
-The robot may be a user's own model. The onboard controller and the rotors assume fixed numbers,
-such as the mass. A model with other numbers is refused, and the message lists the differences.
+The robot may be a user's own model. The onboard controller and the rotors are made for the robot
+`pelican`. A model that differs too much from it is refused, and the message lists the differences.
 Other modules of `world` import `mujoco` from here, because this module imports it without OpenGL.
 """
 
@@ -9,18 +9,17 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable
-from math import nan
+from math import inf, nan
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cloudrc.config.schema import Plant
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
-from cloudrc.world.low_level import GRAVITY, MASS, THRUST_MAX
+from cloudrc.world.low_level import GRAVITY, THRUST_MAX
 from cloudrc.world.plant import Array, Inertia, point_inertia, true_inertia
-from cloudrc.world.rotors import ARM, HEIGHT, TORQUE_RATIO
 
 ROBOT_PREFIX = "robot/"
 """Prefix of all names that belong to the robot in a compiled model."""
@@ -28,11 +27,11 @@ ROTORS = ("rotor_front", "rotor_left", "rotor_back", "rotor_right")
 """Names of a robot's actuators. Every tuple of four rotor values has the same order."""
 TIMESTEP = 0.002
 """Step of the physics [s]. Source: docs/reference/plant.md, "Physics step"."""
-INERTIA = (0.0121, 0.0116, 0.0226)
-"""Inertia about x, y, z for which the attitude gains were tuned: the pelican's [kg m^2]."""
-TIP = (0.40, 0.0, 0.17)
-"""Position of the arm's tip that a robot model must have [m], body frame."""
 FOLDER = Path(__file__).parent
+PELICAN = FOLDER / "robots" / "pelican.xml"
+"""The robot for which the onboard controller is made."""
+Facts: TypeAlias = dict[str, tuple[ArrayLike, ArrayLike]]
+"""Name of a quantity, with its unit -> its value and the largest difference that is accepted."""
 
 
 def import_mujoco() -> Any:
@@ -63,18 +62,6 @@ FUSES_WRONG = tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 11)
 mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
 
 
-def model_path(kind: str, name: str) -> Path:
-    """Find a shipped model by its name, or a user's model by the path of its .xml file.
-
-    `kind` is "robots" or "scenes". A missing file raises a BadInputError.
-    """
-    path = Path(name) if name.endswith(".xml") else FOLDER / kind / f"{name}.xml"
-    if not path.is_file():
-        shipped = ", ".join(sorted(file.stem for file in (FOLDER / kind).glob("*.xml")))
-        raise BadInputError(f"no {kind[:-1]} named {name!r}; available: {shipped}, or an .xml file")
-    return path
-
-
 def compile_model(robot: str, scene: str, plant: Plant | None = None) -> Any:
     """Attach the robot to the scene's frame `spawn` and compile both into an `MjModel`.
 
@@ -85,15 +72,28 @@ def compile_model(robot: str, scene: str, plant: Plant | None = None) -> Any:
 
     With `plant`, the result is the true robot. The check of the files ignores `plant`.
     """
-    paths = model_path("robots", robot), model_path("scenes", scene)
-    model = _compile(*paths)
-    _check_parts(model, *paths)
-    if FUSES_WRONG:
-        model = _compile(*paths, _inertia(_compile(*paths, fuse=False)))
-    _check_numbers(model, *paths)
+    paths = _path("robots", robot), _path("scenes", scene)
+    model = _compile_nominal(*paths)
+    gravity: Facts = {"gravity [m/s^2]": (model.opt.gravity, 0.0)}
+    _refuse_differences(paths[1], gravity, {"gravity [m/s^2]": ((0.0, 0.0, -GRAVITY), 0.2)})
+    if paths[0] != PELICAN:
+        _refuse_differences(paths[0], _facts(model), _facts(_compile_nominal(PELICAN, paths[1])))
     if plant is not None and plant != Plant():
         model = _compile(*paths, true_inertia(plant, _inertia(model)))
         model.actuator_gainprm[:, 0] *= plant.thrust_factor
+    return model
+
+
+def _path(kind: str, name: str) -> Path:
+    return Path(name) if name.endswith(".xml") else FOLDER / kind / f"{name}.xml"
+
+
+def _compile_nominal(robot_path: Path, scene_path: Path) -> Any:
+    model = _compile(robot_path, scene_path)
+    _check_parts(model, robot_path, scene_path)
+    if FUSES_WRONG:
+        inertia = _inertia(_compile(robot_path, scene_path, fuse=False))
+        model = _compile(robot_path, scene_path, inertia)
     return model
 
 
@@ -153,6 +153,8 @@ def _check_parts(model: Any, robot_path: Path, scene_path: Path) -> None:
     actuators = [model.actuator(number).name for number in range(model.nu)]
     if actuators != [f"{ROBOT_PREFIX}{rotor}" for rotor in ROTORS]:
         raise BadInputError(f"{robot_path}: needs the actuators {', '.join(ROTORS)}, in this order")
+    if (model.actuator_trntype != mujoco.mjtTrn.mjTRN_SITE).any():
+        raise BadInputError(f"{robot_path}: each actuator must act at a site")
     for kind in ("site", "sensor"):
         try:
             getattr(model, kind)(f"{ROBOT_PREFIX}tip")
@@ -169,79 +171,57 @@ def _check_parts(model: Any, robot_path: Path, scene_path: Path) -> None:
         )
 
 
-def _check_numbers(model: Any, robot_path: Path, scene_path: Path) -> None:
-    gravity = _compare("gravity [m/s^2]", -model.opt.gravity[2:], [GRAVITY], 0.02 * GRAVITY)
-    for path, differs in ((robot_path, _robot_differences(model)), (scene_path, gravity)):
-        if differs:
-            raise BadInputError(
-                f"{path}: the onboard controller is not made for it: {'; '.join(differs)}"
-            )
-
-
-def _compare(name: str, found: Iterable[float], wanted: Iterable[float], slack: float) -> list[str]:
-    """List in words the values of `found` that differ from `wanted` by more than `slack`.
-
-    AXIS in the quantity's `name` stands for x, y and z, one for each value.
-    """
-    return [
-        f"{name.replace('AXIS', axis)} is {have:.4g}, not {want:g} +- {slack:.2g}"
-        for axis, have, want in zip("xyz", found, wanted, strict=False)
-        if not abs(have - want) <= slack
+def _refuse_differences(path: Path, found: Facts, wanted: Facts) -> None:
+    differs = [
+        f"{name} is {_words(have)}, not {_words(right)}"
+        + (f" +- {_words(slack)}" if np.any(slack) else "")
+        for (name, (have, _)), (right, slack) in zip(found.items(), wanted.values(), strict=True)
+        if not np.all(np.abs(np.subtract(have, right)) <= slack)
     ]
+    if differs:
+        raise BadInputError(
+            f"{path}: the onboard controller is not made for it: {'; '.join(differs)}"
+        )
 
 
-def _robot_differences(model: Any) -> list[str]:
-    """List in words where a robot differs from what the onboard controller and the rotors assume.
+def _words(numbers: ArrayLike) -> str:
+    return " ".join(f"{number:.4g}" for number in np.round(np.atleast_1d(numbers), 6) + 0.0)
 
-    Differences that the controller can handle are accepted: the velocity loop compensates for a
-    weight that differs by 1 N, and the attitude gains work for an inertia that differs by 50 %.
+
+def _facts(model: Any) -> Facts:
+    """Return what the onboard controller and the rotors assume of a robot, by name.
+
+    The controller can handle the accepted differences: the velocity loop compensates for a weight
+    that differs by 1 N, and the attitude gains work for an inertia that differs by 50 %.
     """
     base = model.jnt_bodyid[0]
-    turned, centre = rotation(model.body_iquat[base]), model.body_ipos[base]
+    turned = rotation(model.body_iquat[base])
     inertia = np.diag(turned @ np.diag(model.body_inertia[base]) @ turned.T)
-    differs = _compare("mass [kg]", model.body_mass[[base]], [MASS], 0.1 * MASS)
-    differs += _compare("centre of mass, AXIS [m]", centre[:2], (0.0, 0.0), 0.01)
-    differs += _compare("centre of mass, z [m]", centre[2:], [0.0], 0.03)
-    for axis, found, wanted in zip("xyz", inertia, INERTIA, strict=True):
-        differs += _compare(f"inertia about {axis} [kg m^2]", [found], [wanted], 0.5 * wanted)
-    if model.dof_damping.any():
-        differs.append(f"damping of the base is {max(model.dof_damping):.4g}, not 0")
-    differs += _compare("tip, AXIS [m]", model.site(f"{ROBOT_PREFIX}tip").pos, TIP, 0.01)
-    for number, (x, y) in enumerate(((ARM, 0.0), (0.0, ARM), (-ARM, 0.0), (0.0, -ARM))):
-        differs += _rotor_differences(model, number, (x, y, HEIGHT), 1 if x else -1)
-    return differs
-
-
-def _rotor_differences(
-    model: Any, number: int, place: tuple[float, float, float], sign: int
-) -> list[str]:
-    """List in words where an actuator differs from the rotor at `place` [m], body frame.
-
-    `sign` is the sign of the rotor's reaction torque about z.
-    """
-    name = ROTORS[number]
-    if model.actuator_trntype[number] != mujoco.mjtTrn.mjTRN_SITE:
-        return [f"{name} transmission is {model.actuator_trntype[number]}, not a site"]
-    site, gear = model.actuator_trnid[number, 0], model.actuator_gear[number]
-    axes, torque = rotation(model.site_quat[site]), (0.0, 0.0, sign * TORQUE_RATIO)
-    differs = [
-        *_compare(f"{name} place, AXIS [m]", model.site_pos[site], place, 0.01),
-        *_compare(f"{name} gear, thrust along AXIS", axes @ gear[:3], (0.0, 0.0, 1.0), 0.01),
-        *_compare(f"{name} gear, torque about AXIS [m]", axes @ gear[3:], torque, 0.001),
-        *_compare(f"{name} gain", model.actuator_gainprm[number, :1], [1.0], 0.01),
-    ]
-    for kind in ("bias", "dyn"):
-        if found := getattr(model, f"actuator_{kind}type")[number]:
-            differs.append(f"{name} {kind}type is {found}, not 0 (none)")
-    for kind in ("ctrl", "force"):
-        low, high = getattr(model, f"actuator_{kind}range")[number]
-        if getattr(model, f"actuator_{kind}limited")[number]:
-            if high < THRUST_MAX:
-                wide = f"at least {THRUST_MAX:.3g}, the largest thrust"
-                differs.append(f"{name} {kind}range, end [N] is {high:.4g}, not {wide}")
-            if low > 0.0:
-                differs.append(f"{name} {kind}range, begin [N] is {low:.4g}, not 0 or less")
-    return differs
+    facts: Facts = {
+        "mass [kg]": (model.body_mass[base], 0.1),
+        "centre of mass [m]": (model.body_ipos[base], (0.01, 0.01, 0.03)),
+        "inertia [kg m^2]": (inertia, 0.5 * inertia),
+        "damping of the base": (model.dof_damping, 0.0),
+        "tip [m]": (model.site(f"{ROBOT_PREFIX}tip").pos, 0.01),
+    }
+    for number, name in enumerate(ROTORS):
+        site, gear = model.actuator_trnid[number, 0], model.actuator_gear[number]
+        axes, low, high = rotation(model.site_quat[site]), -inf, inf
+        for kind in ("ctrl", "force"):
+            if getattr(model, f"actuator_{kind}limited")[number]:
+                limits = getattr(model, f"actuator_{kind}range")[number]
+                low, high = max(low, limits[0]), min(high, limits[1])
+        facts |= {
+            f"{name} place [m]": (model.site_pos[site], 0.01),
+            f"{name} gear, thrust": (axes @ gear[:3], 0.01),
+            f"{name} gear, torque [m]": (axes @ gear[3:], 0.001),
+            f"{name} gain": (model.actuator_gainprm[number, 0], 0.01),
+            f"{name} biastype": (model.actuator_biastype[number], 0.0),
+            f"{name} dyntype": (model.actuator_dyntype[number], 0.0),
+            # A wider range than needed makes no difference.
+            f"{name} range [N]": (np.clip((low, high), (0.0, -inf), (inf, THRUST_MAX)), 0.0),
+        }
+    return facts
 
 
 def rotation(quaternion: Any) -> Any:

@@ -4,7 +4,6 @@ import pytest
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.controllers.pid import build as pid
-from cloudrc.cloud.plan import make_plan
 from cloudrc.cloud.predictors import Model
 from cloudrc.cloud.predictors.last_sample import LastSample
 from cloudrc.messages import UPRIGHT, ZERO, Motion, Odometry, Setpoint
@@ -14,7 +13,7 @@ from tests.cloud.conftest import HERE, MS, Integrating, command, loop
 class Obedient(Model):
     """A robot that has the commanded velocity at once."""
 
-    def __init__(self, position=ZERO):
+    def __init__(self, position):
         self.position = position
 
     def step(self, velocity, dt):
@@ -23,8 +22,17 @@ class Obedient(Model):
 
 
 class Modelled(LastSample):
+    def __init__(self, position=HERE):
+        self.position = position
+
     def model(self):
-        return Obedient(HERE)
+        return Obedient(self.position)
+
+
+def make_plan(controller, setpoint, velocity, now_ns, count):
+    """Plan `count` commands for a robot at the origin."""
+    a_loop = loop(None, Modelled(ZERO), controller, plan=0.01 * count)
+    return a_loop._plan(setpoint, velocity, now_ns)
 
 
 def along_x(plan):
@@ -33,10 +41,10 @@ def along_x(plan):
 
 def test_a_plan_has_the_commands_for_the_future_setpoints():
     controller = pid(gain_p=(10.0, 1.0, 1.0))
-    plan = make_plan(Obedient(), controller, Setpoint((1.0, 0.0, 0.0)), (10.0, 0.0, 0.0), 0, 3)
+    plan = make_plan(controller, Setpoint((1.0, 0.0, 0.0)), (10.0, 0.0, 0.0), 0, 3)
     assert along_x(plan) == pytest.approx([9.0, 8.1, 7.29])
     carrot = Setpoint((9.0, 0.0, 0.0), motion=Motion(ZERO, 0, 1.0, 100.0))
-    plan = make_plan(Obedient(), pid(gain_p=(1e-9,) * 3), carrot, ZERO, -20 * MS, 4)
+    plan = make_plan(pid(gain_p=(1e-9,) * 3), carrot, ZERO, -20 * MS, 4)
     assert along_x(plan) == pytest.approx([0.0, 0.0, 1.0, 1.0], abs=1e-6)
 
 
@@ -50,7 +58,7 @@ def test_a_plan_does_not_change_the_controller():
             return ControlOutput((float(len(self.seen)), 0.0, 0.0), 0.0)
 
     controller = Memory()
-    assert along_x(make_plan(Obedient(), controller, Setpoint(ZERO), ZERO, 0, 3)) == [1.0, 2.0, 3.0]
+    assert along_x(make_plan(controller, Setpoint(ZERO), ZERO, 0, 3)) == [1.0, 2.0, 3.0]
     assert controller.seen == []
 
 
@@ -61,7 +69,7 @@ def test_a_plan_ends_before_a_velocity_that_the_guard_refuses(bad):
             self.asked += 1
             return ControlOutput((1.0, bad if self.asked == 3 else 0.0, 0.0), 0.0)
 
-    assert len(make_plan(Obedient(), Breaking(), Setpoint(ZERO), ZERO, 0, 9)) == 2
+    assert len(make_plan(Breaking(), Setpoint(ZERO), ZERO, 0, 9)) == 2
 
 
 def test_a_command_has_the_plan_and_its_time():

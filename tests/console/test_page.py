@@ -231,7 +231,7 @@ def test_the_state_tells_a_drive_and_names_buttons(filled):
 
 
 def test_controls_of_a_browser_that_left_do_not_end_the_console(filled):
-    page, feed, steering = filled("hover")
+    page, _, steering = filled("hover")
     slider = page._server.gui.add_slider("Up", 0.0, 500.0, 1.0, 0.0)
     page._sliders, steering.conditions = {"uplink.delay_ms": slider}, {"uplink.delay_ms": 60.0}
     page.update(1.0)

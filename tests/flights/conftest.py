@@ -95,10 +95,10 @@ class BareCloud:
             return None
         self.heard.append(Kind(kind).name)
         if kind == Kind.CHALLENGE:
-            hello = self.handshake.answer_challenge(codec.decode_challenge(body))
+            hello = self.handshake.answer_challenge(codec.decode(Kind.CHALLENGE, body)[0])
             return hello and self.session.greet(Kind.HELLO, hello)
         if kind == Kind.ACCEPT:
-            accept = codec.decode_accept(body)
+            accept = codec.Accept(*codec.decode(Kind.ACCEPT, body))
             nonces = self.handshake.receive_accept(epoch, accept, asks=True)
             if nonces is not None:
                 self.session.begin(epoch, nonces)

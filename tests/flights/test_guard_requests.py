@@ -71,7 +71,7 @@ def test_after_a_stall_a_stop_counts_and_a_start_does_not(talk, request_):
     talk.send(captured)
     started = request_ is Request.START
     assert talk.world._counts["stale"] == started
-    assert talk.world._orders.number == (1 if started else 2)
+    assert talk.world._number == (1 if started else 2)
     assert talk.world.robot.guard.armed is started
 
 
@@ -93,7 +93,7 @@ def test_commands_during_a_stop_or_a_hold_are_not_echoed(talk):
 def test_contacts_are_reported_until_the_next_mission_starts(talk):
     """Cloud may die right after the touch; the next cloud must learn of it."""
     ask(talk, 2, Request.END)
-    talk.world._orders.pipes = 1
+    talk.world._pipes = 1
     talk.wait(300)
     talk.hello("another")
     for number, mission_id, contacts in ((3, 0, 1), (4, 7, 0)):

@@ -70,7 +70,7 @@ def spawn(bare):
     """Let the cloud with the session start a mission from the spawn."""
     for cloud in bare.clouds.values():
         if cloud.session.epoch == bare.world.epoch != 0:
-            bare.send(cloud.start(bare.world._orders.number + 1))
+            bare.send(cloud.start(bare.world._number + 1))
 
 
 def explore(actions, depth):

@@ -6,8 +6,9 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
+from cloudrc.sweep.compare import of_sweep
 from cloudrc.sweep.figure import draw_sweep
-from cloudrc.sweep.pairs import of_sweep, read_flights
+from cloudrc.sweep.store import read_flights
 from tests.sweep.conftest import flown
 
 UNITS = {"iae_mean": "m s"}

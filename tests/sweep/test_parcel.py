@@ -5,8 +5,7 @@ import gzip
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.sweep.parcel import pack, unpack
-from cloudrc.sweep.plan import read_plan
+from cloudrc.sweep.plan import pack, read_plan, unpack
 
 
 @pytest.fixture

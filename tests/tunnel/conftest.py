@@ -1,6 +1,6 @@
 """A world that answers hellos, for the tests of the handshake."""
 
-from cloudrc.tunnel.codec import Direction, Hello, Kind, decode_challenge
+from cloudrc.tunnel.codec import Direction, Hello, Kind, decode
 from cloudrc.tunnel.handshake import CHALLENGE_NS, COOKIE_NS, NO_COOKIE, ServerHandshake
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from cloudrc.tunnel.session import NO_EPOCH, Session
@@ -12,6 +12,15 @@ NEW = Key(b"n" * 32)
 NONCE, CLOCK, WORLD = b"n" * 16, b"c" * 16, b"w" * 16
 OTHER = b"m" * 16
 """Nonce of another cloud."""
+
+
+def pair(epoch=1, secret=b"p" * 32):
+    """Make world's and cloud's end of a session; no encryption if `secret` is None."""
+    ring = None if secret is None else KeyRing(KeySet(Key(secret)))
+    ends = Session(Direction.UPLINK, ring), Session(Direction.DOWNLINK, ring)
+    for end in ends:
+        end.begin(epoch, b"cloud".ljust(16) + b"world".ljust(16))
+    return ends
 
 
 class Doorstep:
@@ -44,4 +53,4 @@ class Doorstep:
         self.now_ns = max(self.now_ns, self.door._challenged_ns + CHALLENGE_NS)
         kind, _, body = self.answer(cookie=NO_COOKIE)
         assert kind == Kind.CHALLENGE
-        return decode_challenge(body)
+        return decode(Kind.CHALLENGE, body)[0]

@@ -21,8 +21,8 @@ from cloudrc.records import Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
 from cloudrc.tunnel.end import Identity
-from cloudrc.tunnel.session import pair
 from tests.flights.conftest import CLOCK, HOVER, MS, bare_world, ring
+from tests.tunnel.conftest import pair
 
 STEPS_NS = tuple(round(ms * MS) for ms in (1, 30, 400, 1_500, 6_000, 150_000))
 """Steps of time [ns]; cloud asks for a session after 0.5 s of silence."""
@@ -48,7 +48,7 @@ class Target:
                 self.give(datagrams, target)
         assert self.cloud._session.epoch == self.world._session.epoch == 1
         self.captured = tuple(self.frames)
-        self.frames.append(self.world._session.greet(Kind.BUSY, codec.encode_busy(b"c" * 16)))
+        self.frames.append(self.world._session.greet(Kind.BUSY, codec.encode(Kind.BUSY, b"c" * 16)))
         ends = dict.fromkeys(DOWNLINK, self.cloud) | {Kind.TELEMETRY: self.world}
         for kind, end in ends.items():
             self.frames.append(end._session.seal(kind, bytes(codec.BODY_SIZES[kind])))
@@ -75,7 +75,7 @@ class Target:
             [[end._counts[name] for name in accepted] for end in ends],
             [end._session.epoch for end in ends],
             *(self.world._door._fresh_until_ns, self.cloud._heard_ns),
-            *(self.world._orders.number, self.world._waiting),
+            *(self.world._number, self.world._waiting),
         )
 
     def try_one(self, program):

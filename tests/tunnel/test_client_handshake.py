@@ -1,10 +1,11 @@
-"""Cloud's side of the handshake, the log of its failures, and an end's datagrams."""
+"""Cloud's side of the handshake, the faults that it causes, and an end's datagrams."""
 
 import pytest
 
 from cloudrc.records import Fault, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Accept, Hello, Kind
+from cloudrc.tunnel.end import Identity, TunnelEnd
 from cloudrc.tunnel.handshake import (
     COOKIES_MAX,
     KEY_TEXT,
@@ -12,7 +13,6 @@ from cloudrc.tunnel.handshake import (
     REPLIES_MAX,
     WORLDS_MAX,
     ClientHandshake,
-    HandshakeLog,
 )
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 from tests.flights.conftest import Bare, BareCloud, ring
@@ -29,7 +29,7 @@ class Asking:
         self.handshake = ClientHandshake(NONCE, CLOCK)
 
     def hello(self):
-        return codec.decode_hello(self.handshake.make_hello())
+        return Hello(*codec.decode(Kind.HELLO, self.handshake.make_hello()))
 
     def accepts(self, epoch, world=WORLD, nonce=NONCE, *, asks=True):
         return self.handshake.receive_accept(epoch, Accept(nonce, world, CLOCK), asks=asks)
@@ -46,7 +46,8 @@ def test_a_hello_has_nonce_clock_cookie_and_newest_epoch(cloud):
     assert cloud.accepts(3) == NONCE + WORLD
     answer = cloud.handshake.answer_challenge(b"1" * 13)
     assert answer is not None
-    assert codec.decode_hello(answer) == cloud.hello() == Hello(NONCE, CLOCK, b"1" * 13, 3)
+    assert cloud.hello() == Hello(NONCE, CLOCK, b"1" * 13, 3)
+    assert codec.decode(Kind.HELLO, answer) == cloud.hello()
     assert cloud.handshake.is_refused(NONCE)
     assert not cloud.handshake.is_refused(b"m" * 16)
 
@@ -127,17 +128,16 @@ def test_another_version_or_key_is_logged_once(code, text):
     assert bare.world.take_records() == [], "within a session garbage is only counted"
 
 
-def test_a_text_is_logged_once_in_a_session():
-    log = HandshakeLog()
-    assert len(log.about("version", bytes(16), 7)) == 1
-    (fault,) = log.about("version", bytes([4]) + bytes(15), 8)  # garbage does not hide the peer's
-    assert log.say("version", fault.text, 8) == []
-    log.forget()
-    assert log.say("version", fault.text, 9) == [Fault(9, "version", fault.text)]
-    assert log.about("malformed", bytes(16), 0) == []
+def test_a_text_is_told_once_in_a_session():
+    end = TunnelEnd(Identity(CLOCK, NONCE), codec.Direction.UPLINK, True)
+    for data in (bytes(16), bytes([4]) + bytes(15), bytes(16)):
+        end._tell_refusal("version", data, 7)
+    end._tell_refusal("malformed", bytes(16), 7)
+    assert len(end.take_records()) == 2, "garbage does not hide the peer's version"
     for kind in Kind:
-        said = [Fault(7, "key", KEY_TEXT)] if kind <= Kind.BUSY else []
-        assert HandshakeLog().about("tag", codec.encode_header(kind, 1, 1, 1), 7) == said
+        end._told.clear()
+        end._tell_refusal("tag", codec.encode_header(kind, 1, 1, 1), 7)
+        assert end.take_records() == [Fault(7, "key", KEY_TEXT)] * (kind <= Kind.BUSY)
 
 
 def test_an_end_gives_its_datagrams_and_records_once():

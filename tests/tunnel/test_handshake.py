@@ -39,7 +39,7 @@ def test_a_hello_gets_a_cookie_and_with_the_cookie_a_session(step, now_ns):
     assert (answer.outcome, answer.opened, step.world.epoch) == ("hello", True, 1)
     kind, epoch, _, body = step.cloud.open(answer.datagrams[0])
     assert (kind, epoch) == (Kind.ACCEPT, 1)
-    assert codec.decode_accept(body) == Accept(NONCE, WORLD, CLOCK)
+    assert Accept(*codec.decode(Kind.ACCEPT, body)) == Accept(NONCE, WORLD, CLOCK)
 
 
 @pytest.mark.parametrize(("slots", "opened"), [(0, True), (1, True), (2, False)])
@@ -86,7 +86,7 @@ def test_another_cloud_is_refused_while_the_incumbent_is_fresh(step):
     step.now_ns += 250 * MS
     answer = step.receive_hello(OTHER)
     assert (answer.outcome, answer.opened) == ("busy", False)
-    assert codec.decode_busy(step.cloud.open(answer.datagrams[0])[-1]) == OTHER
+    assert codec.decode(Kind.BUSY, step.cloud.open(answer.datagrams[0])[-1])[0] == OTHER
     step.now_ns += 1
     assert step.receive_hello(OTHER).opened
     assert step.world.epoch == 2

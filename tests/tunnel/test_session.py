@@ -6,7 +6,8 @@ from cloudrc.messages import ZERO, Command
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.keys import Key, KeyRing, KeySet
-from cloudrc.tunnel.session import NO_EPOCH, Session, pair
+from cloudrc.tunnel.session import NO_EPOCH, Session
+from tests.tunnel.conftest import pair
 
 BODY = bytes(range(codec.BODY_SIZES[Kind.COMMAND]))
 NONCES = b"cloud".ljust(16) + b"world".ljust(16)
@@ -50,7 +51,7 @@ def test_without_a_session_only_greetings_are_opened():
     world, _ = pair(NO_EPOCH)
     telemetry = world.seal(Kind.TELEMETRY, bytes(codec.BODY_SIZES[Kind.TELEMETRY]))
     assert refuses(cloud, telemetry, "old_epoch")
-    challenge = codec.encode_challenge(b"c" * 13)
+    challenge = codec.encode(Kind.CHALLENGE, b"c" * 13)
     assert cloud.open(world.greet(Kind.CHALLENGE, challenge))[-1] == challenge
     with pytest.raises(AssertionError, match=r"^the handshake comes first$"):
         cloud.begin(1)

@@ -57,17 +57,19 @@ def test_the_tunnel_is_as_described_and_as_it_was():
 
     def answer(hello):
         _, _, counter, body = world.open(hello)
-        told = server.receive_hello(codec.decode_hello(body), counter, 7_999_999_999)
+        told = server.receive_hello(
+            codec.Hello(*codec.decode(Kind.HELLO, body)), counter, 7_999_999_999
+        )
         return told.datagrams[0]
 
     cookie = hmac.digest(derived(WORLD, b"cloudrc 6 cookies"), b"3", hashlib.sha256)[:13]
     first = cloud.greet(Kind.HELLO, client.make_hello())
     challenge = answer(first)
-    assert codec.decode_challenge(cloud.open(challenge)[-1]) == cookie
+    assert codec.decode(Kind.CHALLENGE, cloud.open(challenge)[-1])[0] == cookie
     second = cloud.greet(Kind.HELLO, client.answer_challenge(cookie) or b"")
     accept = answer(second)
     stranger = codec.Hello(b"m" * 16, CLOCK, cookie, 0)
-    busy = answer(cloud.greet(Kind.HELLO, codec.encode_hello(stranger)))
+    busy = answer(cloud.greet(Kind.HELLO, codec.encode(Kind.HELLO, *stranger)))
     hello, told = CLOUD + CLOCK, struct.pack("<I", 0)
     assert [first, challenge, second, accept, busy] == [
         greeting(1, 0, 1, 0, hello + bytes(13) + told),
@@ -78,7 +80,7 @@ def test_the_tunnel_is_as_described_and_as_it_was():
     ]
 
     _, epoch, _, body = cloud.open(accept)
-    nonces = client.receive_accept(epoch, codec.decode_accept(body), asks=True)
+    nonces = client.receive_accept(epoch, codec.Accept(*codec.decode(Kind.ACCEPT, body)), asks=True)
     assert nonces is not None
     cloud.begin(epoch, nonces)
     body = codec.encode_command(Command(1, 2, 3, (4.0, 5.0, 6.0), 7.0))
@@ -99,5 +101,5 @@ def test_names_and_nonces_are_derived_as_described():
     client = ClientHandshake(CLOUD, CLOCK)
     for world in (b"1" * 16, b"2" * 16, b"1" * 16):  # the first one comes back
         client.receive_accept(1, codec.Accept(CLOUD, world, CLOCK), asks=True)
-    nonce = codec.decode_hello(client.make_hello()).nonce
+    nonce = codec.Hello(*codec.decode(Kind.HELLO, client.make_hello())).nonce
     assert nonce == hashlib.sha256(CLOUD + b" 1").digest()[:16]

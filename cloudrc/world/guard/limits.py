@@ -34,10 +34,6 @@ Deviation: docs/reference/plant.md, "Stop rule", has 0.2 s and 0.1 m. With 0.2 s
 cloud can move the robot 0.3 m beyond the fence, because the robot reacts with a delay."""
 FAR = 1e6
 """Distance from a face of the fence beyond which the face limits no speed [m]."""
-RECHECK_DISTANCE, RECHECK_NS = 0.25, 10_000_000
-"""If the fence limits no velocity within RECHECK_DISTANCE [m] of the robot, the guard checks the
-fence only once per RECHECK_NS [ns]. In this time the robot moves by less than RECHECK_DISTANCE,
-because it is never faster than 25 m/s."""
 RETURN_GAIN, RETURN_SPEED_MAX = 1.0, 0.5
 """A robot that is too near to a face of the fence, or outside, flies back: velocity per distance
 [1/s], and largest speed [m/s]."""
@@ -76,31 +72,6 @@ def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
         root = sqrt(reaction * reaction + 4.0 * STOP_COEFFICIENT * distance)
         return 2.0 * distance / (reaction + root)
     return max(RETURN_GAIN * distance, -RETURN_SPEED_MAX) if distance < 0.0 else 0.0
-
-
-def is_far_from_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> bool:
-    """Tell whether `limit_to_fence` changes nothing within RECHECK_DISTANCE of `position`.
-
-    `velocity` [m/s], `position` [m], `low` and `high` [m] are the arguments of `limit_to_fence`.
-    """
-    (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
-    if vx > 0.0:
-        bx -= vx * (FENCE_REACTION + vx * STOP_COEFFICIENT)
-    else:
-        ax -= vx * (FENCE_REACTION - vx * STOP_COEFFICIENT)
-    if vy > 0.0:
-        by -= vy * (FENCE_REACTION + vy * STOP_COEFFICIENT)
-    else:
-        ay -= vy * (FENCE_REACTION - vy * STOP_COEFFICIENT)
-    if vz > 0.0:
-        bz -= vz * (FENCE_REACTION + vz * STOP_COEFFICIENT)
-    else:
-        az -= vz * (REACTION - vz * STOP_COEFFICIENT)
-    return (
-        ax + RECHECK_DISTANCE <= x <= bx - RECHECK_DISTANCE
-        and ay + RECHECK_DISTANCE <= y <= by - RECHECK_DISTANCE
-        and az + RECHECK_DISTANCE <= z <= bz - RECHECK_DISTANCE
-    )
 
 
 def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> Vector:

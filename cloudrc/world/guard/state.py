@@ -103,7 +103,7 @@ class Guard:
         self.armed = self._flies = False
         self.yaw_rate, self._alone_ns = 0.0, 0
         self.reference = self._wanted = ZERO
-        self._track_until_ns = self._steady_until_ns = self._ramp_until_ns = NEVER_NS
+        self._track_until_ns = self._ramp_until_ns = NEVER_NS
         self._tracked_ns = self._held_ns = -SETTLE_NS
         self._played = NO_COMMAND  # the newest command of a mission
         self._next_ns = FOREVER_NS  # when the plan's next velocity is due
@@ -163,7 +163,7 @@ class Guard:
 
     def forget_commands(self) -> None:
         """Forget earlier commands, because a new session or mission begins."""
-        self._track_until_ns = self._steady_until_ns = NEVER_NS
+        self._track_until_ns = NEVER_NS
         self._fresh_ns.clear()
         self._invalid_ns.clear()
         self._wanted, self.yaw_rate, self._next_ns = ZERO, 0.0, FOREVER_NS
@@ -258,9 +258,6 @@ class Guard:
         """
         if now_ns >= self._next_ns:
             self._play(self._played, now_ns)
-        # The usual case: the same command as in the last step, far from the fence.
-        if now_ns <= self._steady_until_ns and self.reference is self._wanted:
-            return self.reference
         if self._flies and readings.axes[8] < OVERTURNED_COSINE:
             self._enter(ESTOP, now_ns, Cause.OVERTURNED)
         elif not self._take_off.over:
@@ -277,44 +274,30 @@ class Guard:
         self._follow(reference, now_ns, readings, dt)
         return self.reference
 
-    def plain_track(self, now_ns: int) -> tuple[int, Vector, Vector, int, int] | None:
+    def plain_track(self, now_ns: int) -> tuple[int, Vector, Vector, int] | None:
         """Return the input of `native/step.c` for steps from `now_ns` [ns] on, or None.
 
         The input: time of the plan's next velocity [ns]; velocity reference and commanded velocity
-        [m/s], the same object once they are equal; end of the time without checks of the fence, and
-        end of the time in which the command is fresh [ns]. With None, only `step` can run the step.
+        [m/s]; end of the time in which the command is fresh [ns]. With None, only `step` can run
+        the step.
         """
         if not (self._take_off.over and self._ramp_until_ns <= now_ns <= self._track_until_ns):
             return None
         if now_ns >= self._next_ns:
             self._play(self._played, now_ns)
-        reference, wanted = self.reference, self._wanted
-        return self._next_ns, reference, wanted, self._steady_until_ns, self._track_until_ns
-
-    def continue_track(self, reference: Vector | None, steady_until_ns: int) -> None:
-        """Continue after steps that `native/step.c` has run.
-
-        `reference` is the velocity reference of the last step [m/s], shape (3,), or None if it is
-        the commanded velocity. The guard need not check again before `steady_until_ns` [ns].
-        """
-        self.reference = self._wanted if reference is None else reference
-        self._steady_until_ns = steady_until_ns
+        return self._next_ns, self.reference, self._wanted, self._track_until_ns
 
     def _follow(self, reference: Vector, now_ns: int, readings: Readings, dt: float) -> None:
         """Set the velocity reference, limited to keep the robot upright and inside the fence."""
         climb, position = readings.velocity[2], readings.position
         if reference[2] < climb - rules.SINK_LEAD_MAX:
             reference = rules.limit_sink(reference, self.reference, climb, self._speed_max)
-        if rules.is_far_from_fence(reference, position, self._low, self._high):
-            self._steady_until_ns = min(self._track_until_ns, now_ns + rules.RECHECK_NS)
-        else:
-            self._steady_until_ns = NEVER_NS
-            inside = rules.limit_to_fence(reference, position, self._low, self._high)
-            if inside != reference:
-                self.counts["limited_fence"] += 1
-                step = self._limits.acceleration_max * dt
-                inside = rules.limit_growth(self.reference, inside, step)
-                reference = rules.limit_length(inside, self._speed_max)
+        inside = rules.limit_to_fence(reference, position, self._low, self._high)
+        if inside != reference:
+            self.counts["limited_fence"] += 1
+            step = self._limits.acceleration_max * dt
+            inside = rules.limit_growth(self.reference, inside, step)
+            reference = rules.limit_length(inside, self._speed_max)
         if now_ns < self._ramp_until_ns:
             reference = rules.limit_growth(self.reference, reference, rules.BRAKE * dt)
         self.reference = reference
@@ -351,7 +334,7 @@ class Guard:
         if self.state is not HOLD or state is not LAND:  # LAND descends from the hold point
             self._position_hold.forget()
         self.state, self._flies = state, state is not GROUND and state is not ESTOP
-        self._track_until_ns = self._steady_until_ns = self._ramp_until_ns = NEVER_NS
+        self._track_until_ns = self._ramp_until_ns = NEVER_NS
         self._low = (*self._low[:2], -inf if state is LAND else self._floor)
         if state is TRACK:
             self._tracked_ns = now_ns

@@ -1,25 +1,195 @@
-"""A robot that runs its usual steps in C, and all others in Python, with the same results."""
+"""A robot that runs its usual steps in C, and all others in Python, with the same results.
+
+Python and `step.c` share a structure, `Flight`: numbers, MuJoCo's addresses and the present state.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import logging
+from copy import copy
 from functools import cache
+from math import dist, inf, prod
+from pathlib import Path
 from struct import Struct
+from typing import Any
+
+import numpy as np
 
 from cloudrc.geometry import fence
 from cloudrc.messages import Command, Vector
+from cloudrc.world import low_level, rotors
+from cloudrc.world.guard import limits as rules
+from cloudrc.world.guard import state
 from cloudrc.world.guard.limits import Limits
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
-from cloudrc.world.native.flight import Flight, make_flight
 from cloudrc.world.native.library import Library, library
 from cloudrc.world.readings import Readings
-from cloudrc.world.robot import STEP_NS, Robot
-from cloudrc.world.simulator import Simulator
+from cloudrc.world.robot import STEP, STEP_NS, Robot
+from cloudrc.world.scene import ROBOT_PREFIX, mujoco
+from cloudrc.world.simulator import CONTACT_CHECK_STEPS, Simulator
+
+_POINTERS = (
+    *("mj_step", "model", "free_model", "data", "qpos", "qvel", "ctrl", "applied"),
+    *("tip_force", "contacts", "timer", "obstacles"),
+)
+ACCELERATION_MAX = 400.0
+"""Limit of the robot's acceleration in the air [m/s^2]. Full thrust gives a robot that is 10 %
+lighter 153 m/s^2, and a spin of 50 rad/s about a centre of mass 3 cm away gives 75 m/s^2."""
+MARGIN = 1e-3
+"""Distance added to every geom with its own margin and gap [m]; it covers rounding errors."""
+HUGE = 1e4
+"""Half the edge of the box that stands for the space below a plane [m]."""
+UNUSED_WITHOUT_CONTACTS = sum(
+    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{part}", 0))  # old versions lack the last two
+    for part in ("CONTACT", "CONSTRAINT", "SENSOR", "SPRING", "DAMPER")
+)
+"""Parts of MuJoCo that do nothing while the robot touches nothing."""
+_CONSTANTS = {
+    rotors: "thrust_coefficient torque_ratio drag_coefficient arm height",
+    low_level: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
+    "thrust_max tiny nose_cosine_min yaw_sine_max",
+    state: "overturned_cosine",
+    rules: "sink_lead_max fence_reaction reaction stop_coefficient",
+}
+"""Modules and their constants that `step.c` needs, in the order of its fields."""
+_VALUES = {
+    name: getattr(module, name.upper())
+    for module, names in _CONSTANTS.items()
+    for name in names.split()
+}
+_double, _int64 = ctypes.c_double, ctypes.c_int64
+_FIELDS: dict[str, Any] = {
+    **dict.fromkeys(_POINTERS, ctypes.c_void_p),
+    **dict.fromkeys([*_VALUES, "up", "down"], _double),
+    **{"gains": _double * 9, "limit_xy": _double, "limit_z": _double, "dt": _double},
+    **{"change_max": _double, "low": _double * 3, "high": _double * 3},
+    **dict.fromkeys(("time_step", "robot_radius", "acceleration_max"), _double),
+    **dict.fromkeys(("step_ns", "check_steps", "obstacle_count"), _int64),
+    **{"reference": _double * 3, "wanted": _double * 3, "track_until_ns": _int64},
+    **{"force_peak": _double, "impulse": _double},
+    **dict.fromkeys(("touching", "steps", "is_news", "free_steps"), _int64),
+    **{"speeds": _double * 4, "integral": _double * 3, "error": _double * 3},
+    **{"has_error": _int64, "before": _double * 13},
+}
+
+
+class Flight(ctypes.Structure):
+    """The structure `Flight` of `step.c`, which explains the fields."""
+
+    _fields_ = tuple(_FIELDS.items())
+
+
+def make_flight(simulator: Simulator, controller: LowLevel, limits: Limits) -> Flight:
+    """Make a `Flight` with all fields except the present state.
+
+    Call `make_flight` after a reset of the simulator. Raise an OSError, AttributeError, KeyError or
+    ImportError if MuJoCo is not as expected.
+    """
+    model, data = simulator.model, simulator.data
+    turning, (low, high) = rotors.Rotors(simulator.dt), limits.inner_corners()
+    limit_xy, limit_z, dt = controller.limits
+    arrays = data.qpos, data.qvel, data.ctrl, data.qfrc_applied
+    tip_force = data.sensordata[model.sensor(f"{ROBOT_PREFIX}tip").adr[0] :]
+    free_model = copy(model)
+    free_model.opt.disableflags |= UNUSED_WITHOUT_CONTACTS
+    obstacles, radius = _obstacles(model, data)
+    library = _mujoco_library()
+    timer = ctypes.addressof(ctypes.c_void_p.in_dll(library, "mjcb_time"))
+    flight = Flight(
+        ctypes.cast(library.mj_step, ctypes.c_void_p),
+        # MuJoCo has no public name for the addresses.
+        *(model._address, free_model._address, data._address),
+        *(array.ctypes.data for array in (*arrays, tip_force)),
+        *(data._address + _contacts_offset(), timer, obstacles.ctypes.data),
+        *_VALUES.values(),
+        *(turning.up, turning.down, controller.gains, limit_xy, limit_z, dt),
+        limits.acceleration_max * STEP,
+        *(low, high, simulator.dt, radius, ACCELERATION_MAX, STEP_NS),
+        *(CONTACT_CHECK_STEPS, len(obstacles)),
+    )
+    flight.keep = obstacles, free_model  # else Python frees their memory
+    return flight
+
+
+def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
+    """Return a box with rounded edges around each geom of the scene, and the robot's radius [m].
+
+    A row has the centre (3,) and the axes (9,) of the box, its half sizes (3,), and the radius of
+    the edges, all [m]. The robot's radius is that of a ball around its base's origin; the radius is
+    infinite if forces act without a contact, for example of springs, constraints or a fluid.
+    """
+    option, rows, radius = model.opt, [], 0.0
+    other = option.density, option.viscosity, model.nflex, model.npair, model.neq, model.ntendon
+    each = model.dof_frictionloss, model.dof_damping, model.jnt_stiffness, model.body_gravcomp
+    if any(other) or any(values.any() for values in each):
+        radius = inf
+    for geom in range(model.ngeom):
+        size, bound = model.geom_size[geom], model.geom_rbound[geom]
+        place, axes = data.geom_xpos[geom], data.geom_xmat[geom]
+        margin = model.geom_margin[geom] + model.geom_gap[geom]
+        margin = MARGIN + max(margin, option.o_margin)
+        if model.geom_bodyid[geom]:  # a geom of the robot; those of the scene are fused to body 0
+            radius = max(radius, dist(place, data.qpos[:3]) + bound + margin)
+        elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+            rows.append([*place, *axes, *size, margin])
+        elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
+            normal = axes.reshape(3, 3)[:, 2]
+            rows.append([*(place - HUGE * normal), *axes, HUGE, HUGE, HUGE, margin])
+        else:
+            rows.append([*place, *axes, 0.0, 0.0, 0.0, bound + margin])
+    return np.array(rows, float), radius
+
+
+def _mujoco_library() -> ctypes.CDLL:
+    """Return MuJoCo's own library, which `import mujoco` has loaded."""
+    folder = Path(mujoco.__file__).parent
+    files = [*folder.glob("libmujoco.so*"), *folder.glob("libmujoco*.dylib")]
+    if len(files) != 1:
+        raise OSError(f"{folder}: has {len(files)} files of MuJoCo's library, not 1")
+    return ctypes.CDLL(str(files[0]))
+
+
+def _contacts_offset() -> int:
+    """Return where the number of contacts is in MuJoCo's `mjData` [bytes].
+
+    The place depends on MuJoCo's version. The package describes its structures.
+    """
+    from mujoco.introspect import structs
+
+    fields = []
+    for field in structs.STRUCTS["mjData"].fields:
+        fields.append((field.name, _ctype(field.type, structs.STRUCTS)))
+        if field.name == "ncon":
+            break
+    layout: Any = type("Data", (ctypes.Structure,), {"_fields_": fields})
+    offset: int = layout.ncon.offset
+    return offset
+
+
+_SCALARS = {
+    **dict.fromkeys(("int", "float", "mjtTimer"), ctypes.c_int32),
+    **dict.fromkeys(("mjtBool", "mjtByte"), ctypes.c_uint8),
+    **dict.fromkeys(("mjtNum", "mjtSize", "size_t", "uintptr_t", "uint64_t"), _int64),
+}
+"""Types of `mujoco.introspect`, as types of the same size."""
+
+
+def _ctype(kind: Any, structs: Any) -> Any:
+    """Return the type of ctypes for a type of `mujoco.introspect`; KeyError if it is unknown."""
+    if hasattr(kind, "extents"):
+        return _ctype(kind.inner_type, structs) * prod(kind.extents)
+    if not hasattr(kind, "name"):
+        return ctypes.c_void_p
+    if kind.name in _SCALARS:
+        return _SCALARS[kind.name]
+    fields = [(field.name, _ctype(field.type, structs)) for field in structs[kind.name].fields]
+    return type(kind.name, (ctypes.Structure,), {"_fields_": fields})
+
 
 _TRACK, _MEMORY, _BEFORE = Flight.reference.offset, Flight.free_steps.offset, Flight.before.offset
-_pack_track, _unpack_track = Struct("6d3q2d2q").pack_into, Struct("3d24x2q8x2d3q8x4d").unpack_from
+_pack_track, _unpack_track = Struct("6dq2d2q").pack_into, Struct("3d32x2d3q8x4d").unpack_from
 _pack_memory, _unpack_memory = Struct("q10dq").pack_into, Struct("40x6d").unpack_from
 _unpack_before = Struct("13d").unpack_from
 
@@ -52,7 +222,7 @@ class NativeRobot(Robot):
     ) -> None:
         """Connect the parts; `limits` are those of the guard."""
         super().__init__(simulator, low_level, guard)
-        self._flight = make_flight(simulator, low_level, limits, STEP_NS)
+        self._flight = make_flight(simulator, low_level, limits)
         self._address = ctypes.addressof(self._flight)
         run = library().run
         assert run is not None
@@ -76,11 +246,10 @@ class NativeRobot(Robot):
                 self._in_c = True
                 # fmt: off
                 (
-                    x, y, z, settled, steady_ns, peak, impulse, contacts, total, news,
-                    front, left, back, right,
+                    x, y, z, peak, impulse, contacts, total, news, front, left, back, right,
                 ) = _unpack_track(self._flight, _TRACK)
                 # fmt: on
-                guard.continue_track(None if settled else (x, y, z), steady_ns)
+                guard.reference = (x, y, z)
                 before = self._before() if news else None
                 speeds = (front, left, back, right)
                 simulator.take_over(speeds, peak, impulse, contacts, total, before)
@@ -95,16 +264,12 @@ class NativeRobot(Robot):
             self._in_c = False
         return super().run(tick_ns, until_ns)
 
-    def _give(self, reference: Vector, wanted: Vector, steady_ns: int, track_ns: int) -> None:
+    def _give(self, reference: Vector, wanted: Vector, track_ns: int) -> None:
         """Give C the state before its first step; the arguments are from `Guard.plain_track`."""
-        simulator, (x, y, z), (to_x, to_y, to_z) = self.simulator, reference, wanted
-        # fmt: off
-        _pack_track(
-            self._flight, _TRACK, x, y, z, to_x, to_y, to_z, reference is wanted,
-            steady_ns, track_ns, simulator.tip_force_peak, simulator.tip_impulse,
-            simulator.contacts, simulator.steps,
-        )
-        # fmt: on
+        simulator = self.simulator
+        tip = simulator.tip_force_peak, simulator.tip_impulse
+        counts = simulator.contacts, simulator.steps
+        _pack_track(self._flight, _TRACK, *reference, *wanted, track_ns, *tip, *counts)
         if not self._in_c:
             integral, error = self._low_level.integral, self._low_level.error
             memory = (*integral, *(error or integral), error is not None)

@@ -5,12 +5,12 @@
 
      read          readings.Readings.of
      guard_step    guard.state.Guard.step, for a robot in TRACK with a fresh command
-     is_far        guard.limits.is_far_from_fence
+     is_far        guard.limits.limit_to_fence, where it changes nothing
      update        low_level.LowLevel.update
      turn_rotors   rotors.Rotors.step, simulator.Simulator.step
      feel          simulator.Simulator._feel
 
-   Where nothing can touch the robot, `step_physics` tells MuJoCo to leave the geoms out.
+   Where nothing can touch the robot, `step_physics` lets MuJoCo look for no contacts.
 
    Every sum and product has the order of the Python code. Compile without contraction of
    a * b + c, and without fast-math. The only function from outside, apart from mj_step, is sqrt,
@@ -21,7 +21,7 @@ typedef long long i64;
 static const double ROOM = 1e-6; /* [m]: no rounding error matters, the fence limits nothing */
 double sqrt(double);
 
-/* Shared with Python: flight.py has the same fields, all of 8 bytes, in the same order. */
+/* Shared with Python: robot.py has the same fields, all of 8 bytes, in the same order. */
 typedef struct { /* a box with rounded edges that contains a geom of the scene */
   double centre[3], axes[9], half[3], radius;
 } Obstacle;
@@ -29,14 +29,12 @@ typedef struct { /* a box with rounded edges that contains a geom of the scene *
 typedef struct {
   /* MuJoCo: mj_step, its arguments, arrays and numbers of mjData, and the model's flags. */
   void (*mj_step)(const void *model, void *data);
-  const void *model;
+  const void *model, *free_model; /* free_model: without what a robot in free air does not need */
   void *data;
   const double *qpos, *qvel;
   double *ctrl, *applied;
   const double *tip_force;
   const int *contacts;
-  int *disable;
-  int *geoms; /* number of geoms, or its lower half: the processor is little-endian */
   double (**timer)(void); /* mjcb_time, which mj_step calls to measure its parts */
   const Obstacle *obstacles;
   /* Constants of the Python modules rotors, low_level and guard, with the same names. */
@@ -44,17 +42,15 @@ typedef struct {
   double mass, gravity, tilt_gain, yaw_gain, tilt_rate_gain, yaw_rate_gain;
   double thrust_max, tiny, nose_cosine_min, yaw_sine_max;
   double overturned_cosine, sink_lead_max;
-  double fence_reaction, reaction, stop_coefficient, recheck_distance;
+  double fence_reaction, reaction, stop_coefficient;
   /* Values of this robot: gains and limits of the controller, corners of the fence, and so on. */
   double up, down, gains[9], limit_xy, limit_z, dt;
   double change_max, low[3], high[3];
   double time_step, robot_radius, acceleration_max;
-  i64 recheck_ns, never_ns, step_ns, check_steps, obstacle_count;
-  i64 unused; /* flags of what MuJoCo does not need while nothing can touch the robot */
+  i64 step_ns, check_steps, obstacle_count;
   /* State, which Python reads and writes between two runs. */
   double reference[3], wanted[3];
-  i64 settled; /* whether Python's `reference` is the object `wanted` */
-  i64 steady_until_ns, track_until_ns;
+  i64 track_until_ns;
   double force_peak, impulse;
   i64 touching, steps, is_news; /* number of contacts; whether Python has to look at them */
   i64 free_steps; /* steps without contact that are sure; below 0: steps until the next look */
@@ -81,8 +77,8 @@ static void read(const Flight *f, Readings *r) {
   a[6] = xz + wy, a[7] = yz - wx, a[8] = 1.0 - xx - yy;
 }
 
-/* Tell whether the fence limits no velocity within a distance `room` of the position. */
-static int is_far(const Flight *f, const double *velocity, const double *position, double room) {
+/* Tell whether the fence does not limit the velocity at the position. */
+static int is_far(const Flight *f, const double *velocity, const double *position) {
   for (int i = 0; i < 3; i++) {
     double low = f->low[i], high = f->high[i], v = velocity[i];
     double reaction = i == 2 ? f->reaction : f->fence_reaction; /* towards the lower face */
@@ -90,14 +86,13 @@ static int is_far(const Flight *f, const double *velocity, const double *positio
       high -= v * (f->fence_reaction + v * f->stop_coefficient);
     else
       low -= v * (reaction - v * f->stop_coefficient);
-    if (!(low + room <= position[i] && position[i] <= high - room)) return 0;
+    if (!(low + ROOM <= position[i] && position[i] <= high - ROOM)) return 0;
   }
   return 1;
 }
 
 /* Move the reference by one step; return 0, with nothing changed, if Python has to do this step. */
 static int guard_step(Flight *f, const Readings *r, i64 now_ns) {
-  if (now_ns <= f->steady_until_ns && f->settled) return 1;
   if (r->axes[8] < f->overturned_cosine || now_ns > f->track_until_ns) return 0;
   const double *from = f->reference, *to = f->wanted;
   double x = to[0] - from[0], y = to[1] - from[1], z = to[2] - from[2];
@@ -107,13 +102,8 @@ static int guard_step(Flight *f, const Readings *r, i64 now_ns) {
   double moved[3] = {from[0] + share * x, from[1] + share * y, from[2] + share * z};
   const double *reference = settles ? to : moved;
   if (reference[2] < r->twist[2] - f->sink_lead_max) return 0;
-  int far = is_far(f, reference, r->pose, f->recheck_distance);
-  if (!far && !is_far(f, reference, r->pose, ROOM)) return 0;
+  if (!is_far(f, reference, r->pose)) return 0;
   for (int i = 0; i < 3; i++) f->reference[i] = reference[i];
-  f->settled = settles;
-  i64 until_ns = now_ns + f->recheck_ns;
-  if (f->track_until_ns < until_ns) until_ns = f->track_until_ns;
-  f->steady_until_ns = far ? until_ns : f->never_ns;
   return 1;
 }
 
@@ -218,23 +208,15 @@ static i64 free_steps(const Flight *f, const double *position, const double *vel
   return steps > 100 ? 100 : steps;
 }
 
-/* Do a step of MuJoCo. While nothing can touch the robot, MuJoCo need neither place the geoms nor
-   look for contacts. This changes no bit of the result, and takes half the time. */
+/* Do a step of MuJoCo. While nothing can touch the robot, MuJoCo need not look for contacts. This
+   changes no bit of the result, and takes half the time. */
 static void step_physics(Flight *f, const Readings *r) {
   if (f->free_steps == 0 && !f->touching) {
     f->free_steps = free_steps(f, r->pose, r->twist);
     if (f->free_steps <= 0) f->free_steps = -5;
   }
-  int disabled = *f->disable, geoms = *f->geoms;
-  if (f->free_steps > 0) {
-    *f->disable = disabled | (int)f->unused;
-    *f->geoms = 0;
-    f->free_steps--;
-  } else if (f->free_steps < 0)
-    f->free_steps++;
-  f->mj_step(f->model, f->data);
-  *f->disable = disabled;
-  *f->geoms = geoms;
+  f->mj_step(f->free_steps > 0 ? f->free_model : f->model, f->data);
+  f->free_steps += f->free_steps < 0 ? 1 : f->free_steps > 0 ? -1 : 0;
 }
 
 /* Run steps from now_ns up to until_ns [ns]; return their number. The run ends early before a step

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from cloudrc.messages import GuardState
-from cloudrc.world.guard.limits import RECHECK_NS, Limits
+from cloudrc.world.guard.limits import Limits
 from cloudrc.world.guard.state import Guard
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, command, sensed
 
@@ -144,7 +144,7 @@ class GuardMachine(RuleBasedStateMachine):
         calm = sensed((1.0, 1.0, self.height), (0.0, 0.0, self.climb))
         flew = self.guard.step(self.now_ns, calm, DT) is not None
         self.noted("time")
-        self.now_ns += RECHECK_NS + TICK  # the guard checks at the latest then
+        self.now_ns += TICK
         over = calm._replace(axes=(*calm.axes[:8], -1.0))
         self.flown = self.guard.step(self.now_ns, over, DT)
         self.noted("turn_over")

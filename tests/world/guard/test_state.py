@@ -8,7 +8,7 @@ import pytest
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.world.guard.hold import LAND_SPEED, STILL_SPEED
-from cloudrc.world.guard.limits import COMMAND_MAX, RECHECK_NS
+from cloudrc.world.guard.limits import COMMAND_MAX
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.readings import Readings
 from tests.world.guard.conftest import (
@@ -422,25 +422,15 @@ def test_a_robot_that_turns_over_stops_its_rotors(make, tilt_deg):
     assert guard.state is GROUND
 
 
-def test_between_two_checks_the_readings_are_not_used():
-    """The usual tick is fast."""
-    guard = tracking((0.5, 0.0, 0.0))
-    run(guard, 0, 200 * MS)
-    guard.accept_command(command((0.5, 0.0, 0.0), 200 * MS), 200 * MS)
-    run(guard, 300 * MS, 300 * MS + TICK)
-    for now_ns in (302 * MS, 310 * MS):
-        assert guard.step(now_ns, None, DT) == (0.5, 0.0, 0.0)
-
-
-@pytest.mark.parametrize("flown_ticks", range(50, 57))
-def test_a_steady_flight_notices_it_within_12_ms(flown_ticks):
+@pytest.mark.parametrize("flown_ticks", [50, 53])
+def test_a_steady_flight_notices_it_at_once(flown_ticks):
     guard = armed()
     for now_ns in range(0, (flown_ticks + 7) * TICK, TICK):
         guard.accept_command(command((0.0, 0.0, 0.5), now_ns), now_ns)
         guard.step(now_ns, felt(120.0 * (now_ns >= flown_ticks * TICK)), DT)
     tracks, hit = guard.take_changes()
     assert (tracks.state, hit.state) == (TRACK, ESTOP)
-    assert hit.stamp_ns - flown_ticks * TICK <= RECHECK_NS + TICK
+    assert hit.stamp_ns == flown_ticks * TICK
 
 
 # Taking off
@@ -492,15 +482,12 @@ def test_after_flying_the_rotors_do_not_stop_where_it_stood():
 
 def test_c_may_run_the_steps_of_a_fresh_command_in_the_air():
     guard, half, wanted = taking_off(1.0), (0.0, 0.0, 0.5), (0.0, 0.0, 1.0)
-    next_ns, *track, steady_ns, track_ns = guard.plain_track(10 * MS)
-    assert (*track, track_ns) == (guard.reference, wanted, 250 * MS)
-    assert steady_ns <= track_ns < next_ns, "there is no plan"
+    next_ns, *track = guard.plain_track(10 * MS)
+    assert track == [guard.reference, wanted, 250 * MS]
+    assert next_ns > 250 * MS, "there is no plan"
     assert guard.plain_track(252 * MS) is None
-    guard.continue_track(half, 20 * MS)
-    assert guard.plain_track(20 * MS)[1:] == (half, wanted, 20 * MS, 250 * MS)
-    guard.continue_track(None, 30 * MS)
-    _, reference, asked, *_ = guard.plain_track(30 * MS)
-    assert reference is asked
+    guard.reference = half
+    assert guard.plain_track(20 * MS)[1:] == (half, wanted, 250 * MS)
     planned = command(wanted, 30 * MS)._replace(plan=(half, ZERO), planned_ns=32 * MS)
     assert guard.accept_command(planned, 30 * MS) is None
     for now_ms, next_ms, velocity in ((40, 42, wanted), (42, 52, half)):
