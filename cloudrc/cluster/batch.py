@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from cloudrc.cluster.client import ClusterError, Release, retry
+from cloudrc.cluster.client import ClusterError, Release
 from cloudrc.cluster.jobs import create_job, delete_job, failure_of
 from cloudrc.cluster.pods import container_statuses, list_pods, one_line, pod_failure, pod_log
 
@@ -130,8 +130,8 @@ def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iter
     ending = None
     while ending is None:
         time.sleep(LOOK_PERIOD)
-        ending = failure_of(retry(lambda: release.request("get", "jobs", name=name), tell_once))
-        for pod in retry(lambda: list_pods(release, COMPONENT), tell_once):
+        ending = failure_of(release.request("get", "jobs", name=name))
+        for pod in list_pods(release, COMPONENT):
             if (pod.metadata.labels or {}).get(JOB_LABEL) != name or pod.metadata.uid in fetched:
                 continue
             if pod.status.phase == "Pending":
@@ -152,7 +152,7 @@ def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iter
 
 def _log(release: Release, pod: str, last: int | None) -> list[str]:
     try:
-        return retry(lambda: pod_log(release, pod, COMPONENT, last), lambda text: None).splitlines()
+        return pod_log(release, pod, COMPONENT, last).splitlines()
     except ClusterError:  # the pod is gone; its successor flies the same flights
         return []
 

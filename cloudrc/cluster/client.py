@@ -6,16 +6,15 @@ Every error of the cluster or of a program becomes a message of one sentence.
 from __future__ import annotations
 
 import json
-import re
+import logging
 import shutil
 import subprocess
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import IO, Any
 
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError, TimedOutError
 
@@ -24,14 +23,13 @@ COMPONENTS = ("world", "cloud")
 """Components of a release that have a pod of their own."""
 REQUEST_TIMEOUT = 15.0
 """Time limit for one request to the API server [s]."""
-OUTAGE_MAX = 30.0
-"""Longest time for which a request is tried again while the API server does not answer [s]."""
-OUTAGE_PERIOD = 1.0
-"""Time between two attempts of a request [s]."""
+RETRIES: dict[str, Any] = {"total": 6, "connect": 3, "backoff_factor": 0.5}
+"""How often urllib3 repeats a request: for 31 s while the API server is overloaded, and for 3 s
+while nothing answers. An overloaded server gets a request to create an object only once."""
+BUSY = (429, 500, 502, 503, 504)
+"""HTTP status codes after which the same request may succeed later."""
 STOP_LIMIT = 2.0
 """Time from SIGTERM to SIGKILL, in which a program can end by itself [s]."""
-OLDEST = (1, 29)
-"""Oldest Kubernetes version that the chart supports (`kubeVersion` in Chart.yaml)."""
 PACKAGE = Path(__file__).resolve().parents[1]
 _KINDS = {
     **{name: ("CoreV1Api", name[:-1]) for name in ("pods", "services", "secrets", "events")},
@@ -42,17 +40,11 @@ _KINDS = {
 }
 """Kind of objects -> class of the Kubernetes client, and the name of the kind in its methods."""
 
-_Answer = TypeVar("_Answer")
-
 
 class ClusterError(CloudrcError):
     """Report that the cluster refused a request, or that an object in the cluster failed."""
 
     exit_code = 5
-
-
-class UnavailableError(ClusterError):
-    """Report that the API server does not answer or is overloaded; a later attempt may succeed."""
 
 
 @dataclass(frozen=True)
@@ -97,12 +89,14 @@ class Release:
     def client(self) -> Any:
         """Client of the Kubernetes API with the kubeconfig's login."""
         from kubernetes import client, config
+        from urllib3 import Retry
 
+        logging.getLogger("urllib3").setLevel(logging.ERROR)  # it prints a warning per repetition
         configuration = client.Configuration()
         with explain_errors("read the kubeconfig", self.where):
             load: Any = config.load_kube_config  # not annotated
             load(context=self.context, client_configuration=configuration)
-        configuration.retries = False  # callers repeat a request themselves, with a message
+        configuration.retries = Retry(**RETRIES, status_forcelist=BUSY, raise_on_status=False)
         return client.ApiClient(configuration)
 
     def request(
@@ -167,17 +161,6 @@ def connect(
     return Release(context, namespace or inherited or "default", release)
 
 
-def server_version(release: Release) -> tuple[int, int]:
-    """Ask the API server for its major and minor version."""
-    from kubernetes import client
-
-    with explain_errors("get the version", release.where):
-        code = client.VersionApi(release.client).get_code(_request_timeout=REQUEST_TIMEOUT)
-    # The minor version of some vendors has a suffix: "29+".
-    major, minor = (int(re.sub(r"\D.*", "", text) or 0) for text in (code.major, code.minor))
-    return major, minor
-
-
 @contextmanager
 def explain_errors(doing: str, where: str) -> Iterator[None]:
     """Convert exceptions of the Kubernetes client to a ClusterError with a message of one sentence.
@@ -193,11 +176,9 @@ def explain_errors(doing: str, where: str) -> Iterator[None]:
     try:
         yield
     except ApiException as error:
-        status = int(error.status or 0)
-        kind = UnavailableError if status == 429 or status >= 500 else ClusterError
-        raise kind(f"cannot {doing} {where}: {_refusal(error, status, doing)}") from error
+        raise ClusterError(f"cannot {doing} {where}: {_refusal(error, doing)}") from error
     except (HTTPError, OSError) as error:
-        raise UnavailableError(
+        raise ClusterError(
             f"cannot {doing} {where}: the API server does not answer ({_root(error)}); "
             "is the cluster up? ask it: kubectl cluster-info"
         ) from error
@@ -205,17 +186,13 @@ def explain_errors(doing: str, where: str) -> Iterator[None]:
         raise ClusterError(f"cannot {doing} {where}: {str(error).partition(chr(10))[0]}") from error
 
 
-def _refusal(error: Any, status: int, doing: str) -> str:
+def _refusal(error: Any, doing: str) -> str:
     try:
         message = json.loads(error.body)["message"]
     except (ValueError, KeyError, TypeError):
-        message = error.reason or f"the API server answered {status}"
-    message = " ".join(str(message).split())
-    if status == 401 or "system:anonymous" in message:
-        return "the API server does not know you; log in to the cluster again"
-    if status == 403 and "exceeded quota" not in message:
-        return f"{message}; ask for the permission, and check it: kubectl auth can-i {doing}"
-    return message
+        message = error.reason or f"the API server answered {error.status}"
+    remedy = f"; check your permission: kubectl auth can-i {doing}"
+    return " ".join(str(message).split()) + remedy * (error.status in (401, 403))
 
 
 def _root(error: BaseException) -> str:
@@ -224,24 +201,6 @@ def _root(error: BaseException) -> str:
     if isinstance(reason, BaseException):
         return _root(reason)
     return str(error).strip().partition("\n")[0].rpartition(": ")[2] or type(error).__name__
-
-
-def retry(ask: Callable[[], _Answer], tell: Callable[[str], None]) -> _Answer:
-    """Call `ask` again while the API server does not answer, for `OUTAGE_MAX` at most.
-
-    `tell` gets the first error. The last error is raised.
-    """
-    until = None
-    while True:
-        try:
-            return ask()
-        except UnavailableError as error:
-            if until is None:
-                until = time.monotonic() + OUTAGE_MAX
-                tell(f"{error}; trying again for {OUTAGE_MAX:g} s")
-            elif time.monotonic() > until:
-                raise
-        time.sleep(OUTAGE_PERIOD)
 
 
 def program(name: str) -> str:

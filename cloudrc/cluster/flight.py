@@ -7,15 +7,13 @@ the recordings of the pods of world and cloud, and writes the report.
 from __future__ import annotations
 
 import json
-import re
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cluster import pods
-from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, chart_folder, retry, run
+from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, chart_folder, run
 from cloudrc.cluster.jobs import Ask, delete_job, find_flight, follow, follow_limit, run_job
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 
@@ -77,7 +75,7 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
     see = f"see: kubectl {' '.join(release.flags)} describe pods -l {selector}"
     until, failing_since, last = time.monotonic() + timeout, None, ""
     while True:
-        states = retry(lambda: {each: _state(release, each) for each in COMPONENTS}, tell)
+        states = {each: _state(release, each) for each in COMPONENTS}
         words = "; ".join(f"{component}: {why}" for component, (why, _) in states.items() if why)
         if not words:
             return
@@ -133,7 +131,7 @@ def fly_in_cluster(
 
     Args:
         experiment: A complete and checked experiment.
-        folder: Folder of the run, which gets configuration, recordings, metrics, logs and report.
+        folder: Folder of the run, which gets configuration, recordings, logs and report.
         release: The release that flies; it is installed if it is missing, and stays afterwards.
         timeout: Time limit for the release to become ready [s].
         tell: Receives the progress, one line per call.
@@ -203,10 +201,10 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
 
 
 def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Contents:
-    """Fetch recordings, metrics and logs into a folder; return the merged recording.
+    """Fetch recordings and logs into a folder; return the merged recording.
 
-    If metrics or logs cannot be fetched, `tell` receives the error. With `want_end`, fetch
-    the recordings again until they contain the end of the mission.
+    If logs cannot be fetched, `tell` receives the error. With `want_end`, fetch the recordings
+    again until they contain the end of the mission.
     """
     from cloudrc.record.merge import cut_to_last_mission, merge
 
@@ -225,15 +223,13 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
             break
     for component in COMPONENTS:
         _fetch_previous(release, component, folder / f"{component}.before.mcap", tell)
-        for fetch, suffix in ((pods.fetch_metrics, "metrics"), (pods.fetch_logs, "log")):
-            try:
-                texts = fetch(release, component)
-            except CloudrcError as error:
-                tell(f"the report is written without the {component} pod's {suffix}: {error}")
-                continue
-            for container, text in texts.items():
-                path = folder / f"{component}-{container}.{suffix}"
-                path.write_text(text, encoding="utf-8")
+        try:
+            logs = pods.fetch_logs(release, component)
+        except CloudrcError as error:
+            tell(f"the report is written without the {component} pod's logs: {error}")
+            continue
+        for container, text in logs.items():
+            (folder / f"{component}-{container}.log").write_text(text, encoding="utf-8")
     return mission
 
 
@@ -257,15 +253,11 @@ def _report(
     from cloudrc.report.views import add_views
     from cloudrc.report.write import attachments, write_report
 
-    # The metrics of the link containers name the shaper: netem or relay.
-    texts = [path.read_text(encoding="utf-8") for path in sorted(folder.glob("*-link.metrics"))]
-    found = re.findall(r'cloudrc_link_info\{[^}]*shaper="(\w+)"', "\n".join(texts))
-    shaper = "+".join(sorted(set(found))) or "unknown"
-    digest = messages_sha256(mission.messages)
-    run_facts = replace(Run("cluster", shaper, digest), interrupted=interrupted)
     try:
         recording = add_views(mission, experiment)
+        shaper = "+".join(sorted(set(recording["/link"]["shaper"]))) or "unknown"
+        run = Run("cluster", shaper, messages_sha256(mission.messages), interrupted)
         own = experiment.report.metrics  # evaluated here, so the pods do not need the file
-        return write_report(folder, recording, experiment, run_facts, own=own)
+        return write_report(folder, recording, experiment, run, own=own)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))

@@ -13,13 +13,12 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from math import ceil
 from typing import Any, TypeAlias
 
 import yaml
 
-from cloudrc.cluster.client import ClusterError, Release, chart_folder, retry
+from cloudrc.cluster.client import ClusterError, Release, chart_folder
 from cloudrc.cluster.pods import (
     api_url,
     container_statuses,
@@ -194,8 +193,8 @@ def find_flight(release: Release, ask: Ask) -> tuple[str, str] | None:
 def delete_job(release: Release, name: str, component: str = COMPONENT) -> None:
     """Delete a Job with its pods and ConfigMap; the pod of a mission first cancels the mission."""
     release.request("delete", "jobs", name=name, propagation_policy="Foreground")
-    until, jobs = time.monotonic() + DELETE_LIMIT, partial(release.find, "jobs", component)
-    while any(job.metadata.name == name for job in retry(jobs, lambda text: None)):
+    until = time.monotonic() + DELETE_LIMIT
+    while any(job.metadata.name == name for job in release.find("jobs", component)):
         if time.monotonic() > until:
             raise TimedOutError(
                 f"Job '{name}' has not ended {DELETE_LIMIT:g} s after its deletion; "
@@ -240,7 +239,7 @@ def follow(
     """
     until, written = time.monotonic() + timeout, 0
     while True:
-        status, lines = retry(lambda: _look(release, name), write)
+        status, lines = _look(release, name)
         for line in lines[written:]:
             write(line)
         written = max(written, len(lines))

@@ -55,7 +55,7 @@ START_LIMIT = 20.0
 LOOK_PERIOD = 0.05
 """Time between two checks of kubectl's output [s]."""
 COPY_LIMIT, READ_LIMIT = 120.0, 30.0
-"""Time limits to copy one recording, and to read the metrics or the log of one container [s]."""
+"""Time limits to copy one recording, and to read the log of one container [s]."""
 _FORWARDING = re.compile(rb"Forwarding from 127\.0\.0\.1:(\d+) -> (\d+)")
 
 
@@ -227,23 +227,6 @@ def fetch_recording(
     arguments = [*release.flags, "exec", pod, f"--container={component}", "--", "cat", path]
     with target.open("wb") as file:
         run("kubectl", arguments, timeout=COPY_LIMIT, stdout=file)
-
-
-def fetch_metrics(release: Release, component: str) -> dict[str, str]:
-    """Read the metrics of a component's pod: container -> text in Prometheus' format."""
-    pod, ports = find_pod(release, component).metadata.name, METRICS[component]
-    texts = {}
-    with forwarded(release, pod, list(ports.values())) as local:
-        for container, port in ports.items():
-            url = f"http://127.0.0.1:{local[port]}/metrics"
-            try:
-                with NO_PROXY.open(url, timeout=READ_LIMIT) as answer:
-                    texts[container] = answer.read().decode()
-            except OSError as error:
-                raise ClusterError(
-                    f"cannot read the metrics of container '{container}' of pod '{pod}': {error}"
-                ) from error
-    return texts
 
 
 def fetch_logs(release: Release, component: str) -> dict[str, str]:

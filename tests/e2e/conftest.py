@@ -15,10 +15,11 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 from cloudrc.cli.client import Api
+from cloudrc.cli.link_verify import fetch
 from cloudrc.cluster.client import connect
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
-from cloudrc.cluster.pods import api_url, fetch_metrics, fetch_recording, operator_token
+from cloudrc.cluster.pods import METRICS, api_url, fetch_recording, forwarded, operator_token
 from cloudrc.errors import CloudrcError
 from tests.drivers.conftest import WORK, slower
 
@@ -144,7 +145,10 @@ Sample = tuple[str, tuple[tuple[str, str], ...]]
 
 def scrapes(component):
     """Return the page /metrics of each container of a pod."""
-    return fetch_metrics(place(), component)
+    name, ports = pod(component)["metadata"]["name"], METRICS[component]
+    with forwarded(place(), name, list(ports.values())) as local:
+        urls = {each: f"http://127.0.0.1:{local[port]}/metrics" for each, port in ports.items()}
+        return {container: fetch(url) for container, url in urls.items()}
 
 
 def samples(text):
