@@ -13,7 +13,8 @@ from typing import Any
 
 from cloudrc.cluster.client import ClusterError, Release
 from cloudrc.cluster.jobs import create_job, delete_job, failure_of
-from cloudrc.cluster.pods import container_statuses, list_pods, one_line, pod_failure, pod_log
+from cloudrc.cluster.pods import container_statuses, list_pods, pod_failure, pod_log
+from cloudrc.errors import to_one_line
 
 COMPONENT = "sweep"
 """Label `component` of the Jobs and pods of sweeps, and name of their container."""
@@ -162,7 +163,7 @@ def _failure(pod: Any) -> str:
     for container in container_statuses(pod):
         ended = container.state.terminated
         if container.name == COMPONENT and ended and ended.exit_code:
-            words = one_line(ended.message) or ended.reason
+            words = to_one_line(ended.message or "") or ended.reason
             return f"a pod failed with exit code {ended.exit_code}: {words}"
     return ""
 

@@ -24,13 +24,12 @@ from cloudrc.cluster.pods import (
     container_statuses,
     find_deployment,
     list_pods,
-    one_line,
     operator_token,
     pod_failure,
     pod_log,
     tokens_secret,
 )
-from cloudrc.errors import CloudrcError, TimedOutError
+from cloudrc.errors import CloudrcError, TimedOutError, to_one_line
 
 EXAMPLE = "examples/mission-job.yaml"
 """File in the chart with the Job and the ConfigMap of a mission, the template for `run_job`."""
@@ -210,7 +209,7 @@ def _status(job: Any, pod: Any) -> JobStatus:
             ended = container.state.terminated
             state = "flying" if ended or container.state.running else state
             exit_code = ended and ended.exit_code
-            message = one_line(ended and ended.message)
+            message = to_one_line((ended and ended.message) or "")
     cause = failure_of(job)
     if cause is not None:
         state, message = ("failed", message or cause) if cause else ("complete", message)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from cloudrc.cluster.client import ClusterError, Release, end_process, last_words, program, run
-from cloudrc.errors import BadInputError, TimedOutError
+from cloudrc.errors import BadInputError, TimedOutError, to_one_line
 
 FATAL = {
     **dict.fromkeys(
@@ -105,8 +105,12 @@ def pod_failure(pod: Any) -> str:
         if (status.restart_count or 0) > RESTARTS_MAX and reason not in FATAL:
             reason = "CrashLoopBackOff"
         if reason in FATAL:
-            message = one_line(waiting and waiting.message)
-            end = f" (exit code {ended.exit_code}): {one_line(ended.message)}" if ended else ""
+            message = to_one_line((waiting and waiting.message) or "")
+            end = (
+                f" (exit code {ended.exit_code}): {to_one_line(ended.message or '')}"
+                if ended
+                else ""
+            )
             words = {"name": status.name, "image": status.image, "reason": reason}
             return FATAL[reason].format(**words, message=message, end=end.removesuffix(": "))
     for condition in pod.status.conditions or []:
@@ -130,11 +134,6 @@ def refuse_local_files(values: Mapping[str, Any], remedy: str) -> None:
 def container_statuses(pod: Any) -> list[Any]:
     """List the statuses of a pod's containers, init containers first."""
     return [*(pod.status.init_container_statuses or []), *(pod.status.container_statuses or [])]
-
-
-def one_line(text: str | None) -> str:
-    """Join the lines of a text from Kubernetes."""
-    return " ".join((text or "").split())
 
 
 def tokens_secret(release: Release) -> str:
