@@ -163,7 +163,7 @@ def _failure(pod: Any) -> str:
     for container in container_statuses(pod):
         ended = container.state.terminated
         if container.name == COMPONENT and ended and ended.exit_code:
-            words = to_one_line(ended.message or "") or ended.reason
+            words = to_one_line(ended.message) or ended.reason
             return f"a pod failed with exit code {ended.exit_code}: {words}"
     return ""
 

@@ -209,7 +209,7 @@ def _status(job: Any, pod: Any) -> JobStatus:
             ended = container.state.terminated
             state = "flying" if ended or container.state.running else state
             exit_code = ended and ended.exit_code
-            message = to_one_line((ended and ended.message) or "")
+            message = to_one_line(ended and ended.message)
     cause = failure_of(job)
     if cause is not None:
         state, message = ("failed", message or cause) if cause else ("complete", message)

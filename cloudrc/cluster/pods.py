@@ -105,12 +105,8 @@ def pod_failure(pod: Any) -> str:
         if (status.restart_count or 0) > RESTARTS_MAX and reason not in FATAL:
             reason = "CrashLoopBackOff"
         if reason in FATAL:
-            message = to_one_line((waiting and waiting.message) or "")
-            end = (
-                f" (exit code {ended.exit_code}): {to_one_line(ended.message or '')}"
-                if ended
-                else ""
-            )
+            message = to_one_line(waiting and waiting.message)
+            end = f" (exit code {ended.exit_code}): {to_one_line(ended.message)}" if ended else ""
             words = {"name": status.name, "image": status.image, "reason": reason}
             return FATAL[reason].format(**words, message=message, end=end.removesuffix(": "))
     for condition in pod.status.conditions or []:
