@@ -9,12 +9,13 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cluster import pods
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, chart_folder, run
-from cloudrc.cluster.jobs import Ask, delete_job, find_flight, follow, follow_limit, run_job
+from cloudrc.cluster.jobs import delete_job, follow, run_job
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 
 if TYPE_CHECKING:
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from cloudrc.record.reader import Contents
 
 Tell = Callable[[str], None]
+Ask = Callable[[str, str], Any]
+"""Function that gets the state of robot and missions from the API with a given URL and token."""
 
 LOOK_PERIOD = 1.0
 """Time between two requests for the state of the pods [s]."""
@@ -116,11 +119,18 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
 
 
 def refuse_second_flight(release: Release, ask: Ask) -> None:
-    """Raise a ClusterError if a mission is under way: installing would replace the pods."""
-    if found := find_flight(release, ask):
+    """Raise a ClusterError if a mission is under way: installing would replace the pods.
+
+    If the API does not answer, nothing is raised: to install again can repair the release.
+    """
+    mission = None
+    with suppress(CloudrcError), pods.api_url(release) as url:
+        mission = ask(url, pods.operator_token(release))["mission"]
+    if mission is not None:
+        cancel = f"cloudrc mission cancel {mission['id']} {' '.join(release.cloudrc_flags)}"
         raise ClusterError(
-            f"{found[0]} is under way on release '{release.name}' {release.where}; wait for it, "
-            f"end it: {found[1]}, or fly on a release of your own: --release NAME"
+            f"mission {mission['id']} is under way on release '{release.name}' {release.where}; "
+            f"wait for it, end it: {cancel}, or fly on a release of your own: --release NAME"
         )
 
 
@@ -188,7 +198,7 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
     job = run_job(release, document, limit=limit)
     tell(f"Job {job.name} flies {experiment.name}")
     try:
-        ended = follow(release, job.name, tell, timeout=follow_limit(limit, False))
+        ended = follow(release, job.name, tell)
     except KeyboardInterrupt:
         tell("cancelling the mission")
         try:

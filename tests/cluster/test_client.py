@@ -63,19 +63,19 @@ def test_only_a_short_outage_is_waited_for(running, release):
     running.end("first", "Complete")
     for plural, code in (("jobs", 429), ("pods", 500)):
         left, lines = running.away(plural, code, 3), []
-        assert follow(release, "first", lines.append, timeout=10.0).exit_code == 0
+        assert follow(release, "first", lines.append).exit_code == 0
         assert (left, lines) == ([], ["waypoint 1 of 1 reached"])
     left = running.away("deployments", 500, 2)
     wait_ready(release, timeout=10.0)
     assert left == []
     left = running.away("jobs", 403, 5)
     with pytest.raises(ClusterError, match="can-i get jobs"):
-        follow(release, "first", print, timeout=10.0)
+        follow(release, "first", print)
     assert len(left) == 4, "a refusal is not repeated"
     left.clear()
     running.away("jobs", 500, 1_000_000)
     with pytest.raises(ClusterError, match="leader changed"):
-        follow(release, "first", print, timeout=10.0)
+        follow(release, "first", print)
 
 
 def test_the_chart_is_found_in_the_repository_and_in_a_wheel(tmp_path):

@@ -183,10 +183,10 @@ def missions():
         return list(Api(url, lambda: token).get("/v1/missions")["missions"])
 
 
-def job_end(name, timeout=150.0):
+def job_end(name):
     """Wait for the end of a Job; return its final state and its log."""
     lines: list[str] = []
-    return follow(place(), name, lines.append, timeout=timeout), "\n".join(lines)
+    return follow(place(), name, lines.append), "\n".join(lines)
 
 
 def job_log(name):

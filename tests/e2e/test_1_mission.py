@@ -50,7 +50,7 @@ def first(prometheus):
     kubectl("apply", f"--filename={EXAMPLES / 'mission-paper.yaml'}")
     eventually(lambda: "waypoint 1 of 7" in job_log(MISSION), "the mission flies", 60.0)
     fly("second", [{"position_m": [0.5, 0.0, 0.7]}])
-    second, _ = job_end("second", 30.0)
+    second, _ = job_end("second")
     tried = {
         "tcp": [(ip(component), port) for component, ports in PORTS.items() for port in ports],
         "udp": [(ip("world"), 7400), (ip("cloud"), 7400)],
