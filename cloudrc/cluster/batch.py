@@ -19,8 +19,6 @@ from cloudrc.errors import to_one_line
 COMPONENT = "sweep"
 """Label `component` of the Jobs and pods of sweeps, and name of their container."""
 FILE = "flights.json.gz"
-SIZE_MAX = 700_000
-"""Largest size of the file of flights [bytes]; a ConfigMap has at most 1 MiB of base64."""
 RETRIES = 3
 """Largest number of restarts after a pod has failed; pods of a drained node do not count."""
 KEEP_FINISHED = 86_400
@@ -49,11 +47,8 @@ def start(
     the CPU request of a pod, and `queue` a queue of Kueue. The Job belongs to no Helm release.
 
     Raises:
-        ClusterError: If the cluster refuses the Job, or if the sweep is too large.
+        ClusterError: If the cluster refuses the Job, for example because the sweep is too large.
     """
-    if len(flights) > SIZE_MAX:
-        text = f"the flights need {len(flights)} bytes, and a ConfigMap takes {SIZE_MAX}"
-        raise ClusterError(f"{text}; split the file of the sweep")
     for job in release.find("jobs", COMPONENT):
         if job.metadata.name == name:
             if not failure_of(job):  # flies, or is complete
