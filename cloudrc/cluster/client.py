@@ -28,6 +28,8 @@ RETRIES: dict[str, Any] = {"total": 6, "connect": 3, "backoff_factor": 0.5}
 while nothing answers. An overloaded server gets a request to create an object only once."""
 BUSY = (429, 500, 502, 503, 504)
 """HTTP status codes after which the same request may succeed later."""
+PROGRAM_LIMIT = 120.0
+"""Time limit for one command of kubectl or helm [s], such as the copy of a recording."""
 STOP_LIMIT = 2.0
 """Time from SIGTERM to SIGKILL, in which a program can end by itself [s]."""
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -72,11 +74,6 @@ class Release:
         """Flags that select context and namespace in helm."""
         return [flag.replace("--context", "--kube-context") for flag in self.flags]
 
-    @property
-    def cloudrc_flags(self) -> list[str]:
-        """Flags that select context, namespace and release in cloudrc."""
-        return [*self.flags, f"--release={self.name}"]
-
     def labels(self, component: str) -> dict[str, str]:
         """Return the Kubernetes labels of a component: "world", "cloud" or "mission"."""
         return {
@@ -99,15 +96,12 @@ class Release:
         configuration.retries = Retry(**RETRIES, status_forcelist=BUSY, raise_on_status=False)
         return client.ApiClient(configuration)
 
-    def request(
-        self, verb: str, kind: str, *, timeout: float = REQUEST_TIMEOUT, **arguments: Any
-    ) -> Any:
+    def request(self, verb: str, kind: str, **arguments: Any) -> Any:
         """Send a request about objects in the release's namespace; return the client's answer.
 
         Args:
             verb: "list", which returns a list; or "get", "create" or "delete".
             kind: Kind of the objects, such as "pods".
-            timeout: Time limit [s].
             arguments: Arguments of the Kubernetes client, such as `name`.
 
         Raises:
@@ -119,7 +113,7 @@ class Release:
         method = f"{'read' if verb == 'get' else verb}_namespaced_{noun}"
         call = getattr(getattr(client, name)(self.client), method)
         with explain_errors(f"{verb} {kind}", self.where):
-            answer = call(namespace=self.namespace, _request_timeout=timeout, **arguments)
+            answer = call(namespace=self.namespace, _request_timeout=REQUEST_TIMEOUT, **arguments)
         return answer.items if verb == "list" else answer
 
     def find(self, kind: str, component: str) -> list[Any]:
@@ -213,12 +207,7 @@ def program(name: str) -> str:
 
 
 def run(
-    name: str,
-    arguments: Sequence[str],
-    *,
-    timeout: float,
-    given: str = "",
-    stdout: IO[bytes] | None = None,
+    name: str, arguments: Sequence[str], *, given: str = "", stdout: IO[bytes] | None = None
 ) -> str:
     """Run kubectl or helm with the standard input `given`, and return the program's output.
 
@@ -226,18 +215,16 @@ def run(
 
     Raises:
         ClusterError: If the program fails; the message is that of the program.
-        TimedOutError: If the program takes longer than `timeout` [s].
+        TimedOutError: If the program takes longer than `PROGRAM_LIMIT`.
         MissingPrerequisiteError: If the program is not installed.
     """
     command = [program(name), *arguments]
     short = " ".join([name, *[word for word in arguments if not word.startswith("-")][:2]])
-    target = subprocess.PIPE if stdout is None else stdout
+    how: dict[str, Any] = {"stdout": stdout or subprocess.PIPE, "stderr": subprocess.PIPE}
     try:
-        done = subprocess.run(
-            command, input=given.encode(), stdout=target, stderr=subprocess.PIPE, timeout=timeout
-        )
+        done = subprocess.run(command, input=given.encode(), timeout=PROGRAM_LIMIT, **how)
     except subprocess.TimeoutExpired as error:
-        raise TimedOutError(f"'{short}' took more than {timeout:g} s") from error
+        raise TimedOutError(f"'{short}' took more than {PROGRAM_LIMIT:g} s") from error
     if done.returncode != 0:
         raise ClusterError(f"'{short}' failed: {last_words(done.stderr)}")
     return (done.stdout or b"").decode(errors="replace")

@@ -28,8 +28,6 @@ Ask = Callable[[str, str], Any]
 
 LOOK_PERIOD = 1.0
 """Time between two requests for the state of the pods [s]."""
-HELM_LIMIT = 120.0
-"""Time limit for one helm command [s]; helm does not wait for pods."""
 FAILURE_TIME = 5.0
 """Time for which a pod's failure must last before it is reported [s]: at first, Kubernetes may not
 yet have made all objects that the pod needs."""
@@ -52,17 +50,17 @@ def install(release: Release, values: Mapping[str, Any], timeout: float, tell: T
     """
     arguments = ["upgrade", "--install", release.name, str(chart_folder()), *release.helm_flags]
     arguments += ["--create-namespace", "--values=-"]
-    run("helm", arguments, timeout=HELM_LIMIT, given=json.dumps(values))
+    run("helm", arguments, given=json.dumps(values))
     wait_ready(release, timeout=timeout, tell=tell)
 
 
 def current_values(release: Release) -> dict[str, Any]:
     """Read the values with which a release was installed; {} if the release does not exist."""
     arguments = ["list", "--output=json", f"--filter=^{release.name}$", *release.helm_flags]
-    if not json.loads(run("helm", arguments, timeout=HELM_LIMIT) or "[]"):
+    if not json.loads(run("helm", arguments) or "[]"):
         return {}
     arguments = ["get", "values", release.name, "--output=json", *release.helm_flags]
-    return json.loads(run("helm", arguments, timeout=HELM_LIMIT)) or {}
+    return json.loads(run("helm", arguments)) or {}
 
 
 def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: None) -> None:
@@ -127,7 +125,8 @@ def refuse_second_flight(release: Release, ask: Ask) -> None:
     with suppress(CloudrcError), pods.api_url(release) as url:
         mission = ask(url, pods.operator_token(release))["mission"]
     if mission is not None:
-        cancel = f"cloudrc mission cancel {mission['id']} {' '.join(release.cloudrc_flags)}"
+        flags = " ".join([*release.flags, f"--release={release.name}"])
+        cancel = f"cloudrc mission cancel {mission['id']} {flags}"
         raise ClusterError(
             f"mission {mission['id']} is under way on release '{release.name}' {release.where}; "
             f"wait for it, end it: {cancel}, or fly on a release of your own: --release NAME"

@@ -54,8 +54,6 @@ START_LIMIT = 20.0
 """Time limit for kubectl to start to forward ports [s]."""
 LOOK_PERIOD = 0.05
 """Time between two checks of kubectl's output [s]."""
-COPY_LIMIT, READ_LIMIT = 120.0, 30.0
-"""Time limits to copy one recording, and to read the log of one container [s]."""
 _FORWARDING = re.compile(rb"Forwarding from 127\.0\.0\.1:(\d+) -> (\d+)")
 
 
@@ -221,7 +219,7 @@ def fetch_recording(
     path = f"{DATA}/{component}{'.before' if previous else ''}.mcap"
     arguments = [*release.flags, "exec", pod, f"--container={component}", "--", "cat", path]
     with target.open("wb") as file:
-        run("kubectl", arguments, timeout=COPY_LIMIT, stdout=file)
+        run("kubectl", arguments, stdout=file)
 
 
 def fetch_logs(release: Release, component: str) -> dict[str, str]:
@@ -235,7 +233,5 @@ def fetch_logs(release: Release, component: str) -> dict[str, str]:
 
 def pod_log(release: Release, pod: str, container: str, last: int | None = None) -> str:
     """Read the log of a container, or only that of the `last` seconds [s]."""
-    words: dict[str, Any] = {"name": pod, "container": container, "timeout": READ_LIMIT}
-    if last is not None:
-        words["since_seconds"] = last
-    return str(release.request("get", "pods/log", **words))
+    since = {} if last is None else {"since_seconds": last}
+    return str(release.request("get", "pods/log", name=pod, container=container, **since))
