@@ -174,8 +174,8 @@ def _show_release(options: argparse.Namespace) -> int:
         raise BadInputError("RUN names a run here, the other flags a cluster; give one")
     release = release_from_flags(options)
     from cloudrc.cli.link_set import note_of
-    from cloudrc.cluster.console import follow_page
     from cloudrc.cluster.link import keep, read_link, send
+    from cloudrc.cluster.pods import follow_page
 
     for line in follow_page(release, options.port, lambda url: print_line(f"console: {url}")):
         if not line.startswith(LINK_SET):

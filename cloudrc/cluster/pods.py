@@ -13,7 +13,7 @@ import subprocess
 import tempfile
 import time
 import urllib.request
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -41,6 +41,9 @@ TOKENS, OPERATOR = "tokens", "operator"
 """Name of the volume with the API's tokens, and of the file in it with the operator's token."""
 API_PORT = 8080
 """TCP port of teleop's API in cloud's pod."""
+CONSOLE, CONSOLE_PORT = "console", 8090
+"""Container of cloud's pod that serves the console's page, and its port on the pod's loopback
+address."""
 METRICS = {
     "world": {"world": 9100, "link": 9102},
     "cloud": {"cloud": 9100, "teleop": 9101, "link": 9102},
@@ -202,6 +205,36 @@ def forwarded(
 def _forwarded_ports(output: IO[bytes]) -> dict[int, int]:
     text = os.pread(output.fileno(), 4096, 0)
     return {int(remote): int(local) for local, remote in _FORWARDING.findall(text)}
+
+
+def follow_page(release: Release, port: int, tell: Callable[[str], None]) -> Iterator[str]:
+    """Forward the page to `port` of 127.0.0.1 (0: any), and yield the lines of the console's log.
+
+    `tell` is called with the page's address on this machine.
+
+    Raises:
+        ClusterError: If the release has no console, or if the port cannot be forwarded.
+    """
+    pod = find_pod(release, "cloud")
+    if CONSOLE not in {container.name for container in pod.spec.containers}:
+        raise ClusterError(
+            f"release '{release.name}' {release.where} has no console; add it: helm upgrade "
+            f"{release.name} charts/cloudrc {' '.join(release.helm_flags)} --reuse-values "
+            "--set console.enabled=true"
+        )
+    name = pod.metadata.name
+    words = ["logs", f"pod/{name}", f"--container={CONSOLE}", "--follow", "--since=1s"]
+    command = [program("kubectl"), *release.flags, *words]
+    with forwarded(release, name, [CONSOLE_PORT], local=port) as ports:
+        tell(f"http://127.0.0.1:{ports[CONSOLE_PORT]}")
+        with subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
+        ) as process:
+            assert process.stdout is not None
+            try:
+                yield from map(str.strip, process.stdout)
+            finally:
+                end_process(process)
 
 
 def fetch_recording(
