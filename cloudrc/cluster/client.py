@@ -23,9 +23,10 @@ COMPONENTS = ("world", "cloud")
 """Components of a release that have a pod of their own."""
 REQUEST_TIMEOUT = 15.0
 """Time limit for one request to the API server [s]."""
-RETRIES: dict[str, Any] = {"total": 6, "connect": 3, "backoff_factor": 0.5}
-"""How often urllib3 repeats a request: for 31 s while the API server is overloaded, and for 3 s
-while nothing answers. An overloaded server gets a request to create an object only once."""
+RETRIES: dict[str, Any] = {"total": 6, "connect": 4, "read": 1, "backoff_factor": 0.5}
+"""How often urllib3 repeats a request: for 31 s while the API server is overloaded, for 7 s while
+it refuses connections, and once if it does not answer. A request to create an object is repeated
+only after a refused connection."""
 BUSY = (429, 500, 502, 503, 504)
 """HTTP status codes after which the same request may succeed later."""
 PROGRAM_LIMIT = 120.0
