@@ -117,19 +117,17 @@ def make_schema(text: str) -> Schema:
     """Make the JSON schema of the values: draft 7, unknown keys are not allowed."""
     described = descriptions(text)
 
-    def section(above: Path, values: dict[str, Any], about: str) -> Schema:
-        parts = {key: part((*above, key), value) for key, value in values.items()}
+    def part(path: Path, value: Any, about: str) -> Schema:
+        if not any(other[:-1] == path for other in described):
+            return {"description": about, **(RULES.get(path[-1]) or TYPES[type(value)])}
+        parts = {
+            key: part((*path, key), each, described[*path, key]) for key, each in value.items()
+        }
         # Templates need the sections, so null is refused for them.
         needed = [key for key, each in parts.items() if "$ref" in each or "properties" in each]
         return {**_closed(about, parts), "required": needed}
 
-    def part(path: Path, value: Any) -> Schema:
-        about = described[path]
-        if any(other[:-1] == path for other in described):
-            return section(path, value, about)
-        return {"description": about, **(RULES.get(path[-1]) or TYPES[type(value)])}
-
-    made = section((), yaml.safe_load(text), "All values of the chart")
+    made = part((), yaml.safe_load(text), "All values of the chart")
     about = "Values that Helm passes to subcharts; this chart ignores them"
     made["properties"]["global"] = {**_either(OBJECT, NULL), "description": about}
     models = [(model, "validation") for model in (Experiment, Mission, Profile)]
@@ -139,17 +137,10 @@ def make_schema(text: str) -> Schema:
         "type": ["number", "string", "boolean", "array", "null"],
     }
     amount = _either(*QUANTITY["anyOf"], NULL)
-    amounts = _closed(
-        "Amounts of CPU and memory",
-        {
-            "cpu": {"description": "CPU [cores; 250m is a quarter of a core]", **amount},
-            "memory": {"description": "Memory [bytes; 64Mi is 64 * 2^20]", **amount},
-        },
-    )
-    defined["Resources"] = _closed(
-        "Requests and limits of one container; if all are equal, the QoS class is Guaranteed",
-        {"requests": amounts, "limits": amounts},
-    )
+    about = "CPU [cores; 250m is a quarter of a core] and memory [bytes; 64Mi is 64 * 2^20]"
+    amounts = _closed(about, {"cpu": amount, "memory": amount})
+    about = "Requests and limits of one container; if all are equal, the QoS class is Guaranteed"
+    defined["Resources"] = _closed(about, {"requests": amounts, "limits": amounts})
     head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "cloudrc"}
     return {**head, **made, "$defs": defined}
 
