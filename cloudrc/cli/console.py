@@ -181,9 +181,7 @@ def _show_release(options: argparse.Namespace) -> int:
         if not line.startswith(LINK_SET):
             continue
         try:
-            if (link := read_link(release)) is None:
-                raise BadInputError("the pods of the release do not run")
-            settings = line.removeprefix(LINK_SET).split()
+            link, settings = read_link(release), line.removeprefix(LINK_SET).split()
             note = partial(note_of, number=token_hex(4))
             keep(release, link, send(release, link, None, settings, note))
             print_line(line)

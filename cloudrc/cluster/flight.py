@@ -186,14 +186,9 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
 
 
 def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
-    mission, limit = experiment.mission.model_dump(mode="json"), experiment.criteria.time_limit_s
-    document = {
-        "name": experiment.name,
-        "start": mission["start"],
-        "time_limit_s": limit,
-        "waypoints": mission["waypoints"],
-        "carrot": mission["carrot"],
-    }
+    flown, limit = {"start", "waypoints", "carrot"}, experiment.criteria.time_limit_s
+    mission = experiment.mission.model_dump(mode="json", include=flown)
+    document = {"name": experiment.name, "time_limit_s": limit, **mission}
     job = run_job(release, document, limit=limit)
     tell(f"Job {job.name} flies {experiment.name}")
     try:

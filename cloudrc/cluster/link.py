@@ -46,8 +46,11 @@ class LinkParts:
     pods: dict[str, str]  # component -> name of its newest running pod
 
 
-def read_link(release: Release) -> LinkParts | None:
-    """Read a release's link with one kubectl command; None if the ConfigMap or a pod is missing."""
+def read_link(release: Release) -> LinkParts:
+    """Read a release's link with one kubectl command.
+
+    Raise a ClusterError if the release has no link, or if a pod does not run.
+    """
     selector = f"app.kubernetes.io/name=cloudrc,app.kubernetes.io/instance={release.name}"
     words = [*release.flags, "get", "configmaps,pods", f"--selector={selector}", "--output=json"]
     found = json.loads(run("kubectl", words))["items"]
@@ -62,7 +65,10 @@ def read_link(release: Release) -> LinkParts | None:
         and "deletionTimestamp" not in each["metadata"]
     }
     if not maps or not pods.keys() >= set(COMPONENTS):
-        return None
+        raise ClusterError(
+            f"release '{release.name}' has no link to change; is it a release of cloudrc? see: "
+            "helm list --all-namespaces"
+        )
     return LinkParts(maps[0]["metadata"]["name"], maps[0]["data"], pods)
 
 
