@@ -57,7 +57,6 @@ RELAY_LOG = "relay.log"
 """File in the folder of every run in real time."""
 RUN, SESSION = "run", "session"
 """Kinds of flights: a run (`cloudrc run`) ends with its mission, a session with `cloudrc down`."""
-UNANNOUNCED = "no folder for the flight file (XDG_RUNTIME_DIR); use: cloudrc mission --api {}"
 
 
 def flights_folder() -> Path:
@@ -78,8 +77,8 @@ class FlightFile(NamedTuple):
 
 
 @contextlib.contextmanager
-def announced(run: Path, api: str = "", kind: str = RUN) -> Iterator[bool]:
-    """Keep a flight file while the block runs; yield whether the file could be written.
+def announced(run: Path, api: str = "", kind: str = RUN) -> Iterator[None]:
+    """Keep a flight file while the block runs, if its folder can be written.
 
     `run` is the folder of the run, `api` the address of the operator's API ("" without an API).
     """
@@ -96,7 +95,7 @@ def announced(run: Path, api: str = "", kind: str = RUN) -> Iterator[bool]:
             fcntl.flock(file, fcntl.LOCK_EX)
             file.write(flight.encode())
             new.rename(path)
-        yield path.exists()
+        yield
 
 
 def under_way() -> dict[Path, str]:
@@ -202,22 +201,19 @@ class LocalRun:
         # Their folder is private: it also contains this run's key.
         with tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder()) as sockets:
             url = f"unix:{sockets}/api.sock" if self._api else ""
-            with contextlib.ExitStack() as stack:
-                kind = SESSION if self._session else RUN
-                is_announced = stack.enter_context(announced(self._folder, url, kind))
-                if url and not is_announced:
-                    self._see([Fault(0, "unannounced", UNANNOUNCED.format(url))])
-                key = Path(sockets, "key")
-                key.touch(0o600)
-                key.write_text(write(KeySet(Key(os.urandom(KEY_SIZE)))), encoding="ascii")
-                try:
-                    self._fly(limit, Path(sockets), url)
-                finally:
-                    self._stop()
-                    (self._folder / API_FILE).unlink(missing_ok=True)
-                    shutil.rmtree(self._folder / LINK_FOLDER, ignore_errors=True)
-                    if self._session:
-                        self.announcement = stack.pop_all()
+            kind = SESSION if self._session else RUN
+            self.announcement.enter_context(announced(self._folder, url, kind))
+            key = Path(sockets, "key")
+            key.touch(0o600)
+            key.write_text(write(KeySet(Key(os.urandom(KEY_SIZE)))), encoding="ascii")
+            try:
+                self._fly(limit, Path(sockets), url)
+            finally:
+                self._stop()
+                (self._folder / API_FILE).unlink(missing_ok=True)
+                shutil.rmtree(self._folder / LINK_FOLDER, ignore_errors=True)
+                if not self._session:
+                    self.announcement.close()
 
     def _fly(self, limit: float, sockets: Path, url: str) -> None:
         folder, link, session = self._folder, self._folder / LINK_FOLDER, self._session
