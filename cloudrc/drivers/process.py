@@ -67,8 +67,6 @@ recorded again, for recordings whose earlier part is cut off."""
 CLOCK_STEP = 0.1
 """Smallest step of the wall clock that is recorded [s]."""
 SINCE_BOOT = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # Linux has CLOCK_BOOTTIME
-NONSENSE = (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError)
-"""Errors that an unreadable or malformed file can raise."""
 
 
 class StopSignal:
@@ -229,11 +227,11 @@ class LinkNotes:
             seen = version(self._path)
             if begins or seen != self._seen:
                 self._seen = seen  # do not read a malformed file again and again
-                with suppress(*NONSENSE):
+                with suppress(Exception):  # a missing or malformed file
                     noted += self._read_state(begins, now_ns, slip_ns)
         if now_ns >= self._released_ns:
             self._released_ns = now_ns + RELEASED_PERIOD_NS
-            with suppress(*NONSENSE):
+            with suppress(Exception):
                 noted += self._read_lateness(now_ns - slip_ns)
         return noted
 
@@ -347,11 +345,8 @@ class EndProcess:
 
     def _clock_step(self) -> float:
         """Return by how much the wall clock was set since the last call [s]; 0 if it was not."""
-        before, wall = time.clock_gettime(SINCE_BOOT), time.time()
-        boot = time.clock_gettime(SINCE_BOOT)
-        if boot - before > CLOCK_STEP / 2.0:
-            return 0.0  # the process was paused while it read the clocks: the next call compares
-        step, self._clock_offset = wall - boot - self._clock_offset, wall - boot
+        offset = time.time() - time.clock_gettime(SINCE_BOOT)
+        step, self._clock_offset = offset - self._clock_offset, offset
         return step if abs(step) > CLOCK_STEP else 0.0
 
     def _count_losses(self, stamp_ns: int) -> Counted:
