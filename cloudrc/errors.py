@@ -73,7 +73,5 @@ def describe_error(error: BaseException) -> str:
     name = type(error).__name__
     try:
         return to_one_line(f"{name}: {error}")
-    except KeyboardInterrupt:
-        raise
-    except BaseException:  # the exception's __str__ may raise, too
+    except Exception:  # the exception's __str__ may raise, too
         return to_one_line(name)
