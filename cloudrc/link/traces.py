@@ -29,29 +29,29 @@ _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
 _ROWS_TO_JUDGE = 10  # with fewer rows, delays of 0 are accepted, as a user may have typed them
 
 
-def read_trace(path: Path) -> Trace:
-    """Read a trace from a CSV file.
+def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
+    """Read a trace from a CSV file of at most `size_max` bytes.
 
     Raises:
         BadInputError: If the file cannot be read or is no trace; the text names file, line, value
             and remedy.
     """
     remedy = "give a CSV file with the columns time_s,delay_ms"
-    return parse_trace(read_lines(path, f"trace {path}", remedy), str(path))
+    return parse_trace(read_lines(path, f"trace {path}", remedy, size_max), str(path))
 
 
-def read_lines(path: Path, name: str, remedy: str) -> list[str]:
+def read_lines(path: Path, name: str, remedy: str, size_max: int = SIZE_MAX) -> list[str]:
     """Read the lines of a text file; if that fails, raise a BadInputError with `remedy`.
 
     A file whose name ends in .gz is unpacked. Accepted encodings are UTF-8, UTF-16 with a byte
     order mark (Windows writes it if output is redirected), and one byte per character.
     """
     try:
-        data = read(path, SIZE_MAX)
+        data = read(path, size_max)
         if path.suffix == ".gz":
-            data = gzip.GzipFile(fileobj=BytesIO(data)).read(SIZE_MAX + 1)
-        if len(data) > SIZE_MAX:
-            raise ValueError(f"longer than {SIZE_MAX} bytes when unpacked")
+            data = gzip.GzipFile(fileobj=BytesIO(data)).read(size_max + 1)
+        if len(data) > size_max:
+            raise ValueError(f"longer than {size_max} bytes when unpacked")
         return _decode(data)
     except (OSError, EOFError, ValueError, zlib.error) as error:
         reason = getattr(error, "strerror", None) or str(error).removeprefix(f"{path}: ")
@@ -69,13 +69,13 @@ def _decode(data: bytes) -> list[str]:
         return data.decode("latin-1").splitlines()
 
 
-def read_table(path: Path) -> tuple[float, ...]:
+def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
     """Read the distribution of a trace's delays, without lost packets; errors as in `read_trace`.
 
     Returns:
         The delays, shifted and scaled to mean 0 and standard deviation 1, rising, shape (n,).
     """
-    trace = read_trace(path)
+    trace = read_trace(path, size_max)
     losses = trace.losses or (0.0,) * len(trace.delays)
     delays = [delay for delay, loss in zip(trace.delays, losses, strict=True) if loss < 1.0]
     mean = fsum(delays) / max(len(delays), 1)
