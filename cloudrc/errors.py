@@ -62,9 +62,9 @@ class InterruptedRunError(CloudrcError):
     exit_code = 130
 
 
-def to_one_line(text: str) -> str:
-    """Convert text from another program or file to one printable line of limited length."""
-    line = " ".join(text[:TEXT_MAX].split())
+def to_one_line(text: str | None) -> str:
+    """Convert text from another program or file to one printable line; None becomes ""."""
+    line = " ".join((text or "")[:TEXT_MAX].split())
     return line.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
@@ -73,7 +73,5 @@ def describe_error(error: BaseException) -> str:
     name = type(error).__name__
     try:
         return to_one_line(f"{name}: {error}")
-    except KeyboardInterrupt:
-        raise
-    except BaseException:  # the exception's __str__ may raise, too
+    except Exception:  # the exception's __str__ may raise, too
         return to_one_line(name)

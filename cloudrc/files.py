@@ -24,12 +24,12 @@ class TooLongError(ValueError):
 
 
 def version(path: Path | str) -> tuple[int, int, int] | None:
-    """Return a value that changes whenever the file changes; None if the file is missing."""
+    """Return a value that changes with a file's content or permissions; None without a file."""
     try:
         status = os.stat(path)
     except OSError:
         return None
-    return status.st_mtime_ns, status.st_ino, status.st_size
+    return status.st_ctime_ns, status.st_ino, status.st_size
 
 
 def read(path: Path, size_max: int = SIZE_MAX) -> bytes:

@@ -16,13 +16,14 @@ import importlib.util
 import inspect
 import pkgutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import BadInputError, CloudrcError, describe_error, to_one_line
 
 PACKAGES = {
     "estimators": "cloudrc.cloud.estimators",
@@ -50,38 +51,30 @@ def describe(kind: str, name: str) -> str:
 def signature(kind: str, name: str) -> inspect.Signature:
     """Return the parameters of a plug-in's `build`; their annotations are types, not strings."""
     build = _build(kind, name)
-    try:
+    with _explained(kind, name, "has a build() with annotations that cannot be read"):
         return inspect.signature(build, eval_str=True)
-    except Exception as error:
-        text = f"{_one(kind)} {name!r}: annotations of build() cannot be read: {error}"
-        raise BadInputError(text) from error
 
 
 def load(kind: str, name: str, **parameters: Any) -> Any:
     """Find a plug-in and build it; raise a BadInputError if it is missing or its `build` fails."""
     build = _build(kind, name)
-    try:
+    with _explained(kind, name, "cannot be built"):
         return build(**parameters)
-    except Exception as error:  # a plug-in may raise anything; the user gets one line
-        raise BadInputError(f"{_one(kind)} {name!r} cannot be built: {_reason(error)}") from error
 
 
 def find(kind: str, name: str) -> Any:
     """Import a plug-in by kind and name or path; return its module or its entry point's object."""
-    try:
+    if is_path(name):
+        if not Path(name).is_file():
+            raise BadInputError(f"{_one(kind)} {name!r}: there is no such file")
+    elif name not in names(kind):
+        raise BadInputError(unknown_name_text(_one(kind), name, names(kind)))
+    with _explained(kind, name, "cannot be imported"):
         if is_path(name):
-            return _load_file(kind, Path(name))
+            return _load_file(Path(name))
         if name in _shipped(kind):
             return importlib.import_module(f"{PACKAGES[kind]}.{name}")
-        installed = _installed(kind)
-        if name in installed:
-            return installed[name].load()
-    except CloudrcError:
-        raise
-    except Exception as error:  # as in load
-        text = f"{_one(kind)} {name!r} cannot be imported: {_reason(error)}"
-        raise BadInputError(text) from error
-    raise BadInputError(unknown_name_text(_one(kind), name, names(kind)))
+        return _installed(kind)[name].load()
 
 
 def is_path(name: str) -> bool:
@@ -124,14 +117,12 @@ def _installed(kind: str) -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=f"cloudrc.{kind}")}
 
 
-def _load_file(kind: str, path: Path) -> ModuleType:
-    if not path.is_file():
-        raise BadInputError(f"{_one(kind)} {str(path)!r}: there is no such file")
+def _load_file(path: Path) -> ModuleType:
     # The module name contains the whole path, because two files may have the same name.
     module_name = f"cloudrc_plugin:{path.resolve()}"
     spec = importlib.util.spec_from_file_location(module_name, path)
     if spec is None or spec.loader is None:
-        raise BadInputError(f"{_one(kind)} {str(path)!r} is not a Python file; name it *.py")
+        raise ValueError("it is not a Python file; name it *.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[module_name] = module  # dataclasses look up their module there
     spec.loader.exec_module(module)
@@ -142,10 +133,12 @@ def _one(kind: str) -> str:
     return kind.removesuffix("s")
 
 
-def _reason(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    return (
-        text
-        if isinstance(error, ValueError | CloudrcError) and text
-        else f"{type(error).__name__}: {text}"
-    )
+@contextmanager
+def _explained(kind: str, name: str, what: str) -> Iterator[None]:
+    """Convert an exception of a plug-in, which may raise anything, to one line for the user."""
+    try:
+        yield
+    except Exception as error:
+        plain = isinstance(error, ValueError | CloudrcError) and str(error)
+        text = to_one_line(str(error)) if plain else describe_error(error)
+        raise BadInputError(f"{_one(kind)} {name!r} {what}: {text}") from error

@@ -56,7 +56,6 @@ def flights_of_others_are_not_seen(request, tmp_path_factory, monkeypatch):
         return  # kind's containers may need XDG_RUNTIME_DIR
     base = tmp_path_factory.getbasetemp()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(base))
-    monkeypatch.setenv("XDG_STATE_HOME", str(base / "state"))
 
 
 ROUNDING = 1e-9

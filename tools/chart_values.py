@@ -25,23 +25,14 @@ def _either(*parts: Schema) -> Schema:
     return {"anyOf": [*parts]}
 
 
-def _text(pattern: str) -> Schema:
-    return {"type": "string", "pattern": pattern}
-
-
-def _one_of(*names: str) -> Schema:
-    return {"type": "string", "enum": [*names]}
-
-
 def _ref(name: str) -> Schema:
     return {"$ref": f"#/$defs/{name}"}
 
 
 NULL, OBJECT, STRING = {"type": "null"}, {"type": "object"}, {"type": "string"}
 TEXTS = {**OBJECT, "additionalProperties": STRING}
-NAME = _text(r"^$|^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$")
 NUMBER = {"type": "number", "minimum": 0}
-QUANTITY = _either(_text(r"^[0-9]+(\.[0-9]+)?(m|k|Ki|M|Mi|G|Gi|T|Ti)?$"), NUMBER)
+QUANTITY = _either({**STRING, "pattern": r"^[0-9]+(\.[0-9]+)?(m|k|Ki|M|Mi|G|Gi|T|Ti)?$"}, NUMBER)
 PEERS = {
     "type": "array",
     "items": {
@@ -52,18 +43,14 @@ PEERS = {
     },
 }
 RULES = {
-    "fullnameOverride": _text(r"^$|^[a-z]([-a-z0-9]*[a-z0-9])?$"),
-    "tag": _text(r"^$|^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$"),
-    "digest": _text(r"^$|^sha256:[0-9a-f]{64}$"),
-    "pullPolicy": _one_of("Always", "IfNotPresent", "Never"),
     "experiment": _ref("Experiment"),
-    "mode": _one_of("auto", "netem", "relay"),
+    "mode": {**STRING, "enum": ["auto", "netem", "relay"]},
     "profile": _either(STRING, _ref("Profile"), NULL),
     "traces": {
         **TEXTS,
         # Names of other files in the same folder are refused.
         "propertyNames": {
-            **_text(r"^[-._a-zA-Z0-9]+$"),
+            "pattern": r"^[-._a-zA-Z0-9]+$",
             "not": {"enum": ["profile.yaml", "change.json", "experiment.yaml"]},
         },
     },
@@ -73,21 +60,16 @@ RULES = {
     "podLabels": {**TEXTS, "propertyNames": {"not": {"pattern": r"^app\.kubernetes\.io/"}}},
     "recordingSizeLimit": QUANTITY,
     "workers": {"type": "integer", "minimum": 1, "maximum": 64},
-    "existingClaim": NAME,
-    "existingSecret": NAME,
     "size": QUANTITY,
-    "type": _one_of("ClusterIP", "NodePort", "LoadBalancer"),
-    "port": {"type": "integer", "minimum": 1, "maximum": 65_535},
     "allowFrom": PEERS,
     "dns": PEERS,
     "plan": _either(STRING, _ref("Mission"), NULL),
-    "interval": _text(r"^[0-9]+(ms|s|m)$"),
-    "name": NAME,
-    "ipFamilyPolicy": _either(_one_of("SingleStack", "PreferDualStack", "RequireDualStack"), NULL),
+    "ipFamilyPolicy": _either(STRING, NULL),
     "podSecurityContext": _either(OBJECT, NULL),
     "containerSecurityContext": _either(OBJECT, NULL),
 }
-"""Last part of a key -> schema of its value, if the type of the default is not enough."""
+"""Last part of a key -> schema of its value, if the type of the default is not enough. Names, ports
+and words of Kubernetes are not listed: the API server checks them."""
 TYPES: dict[type, Schema] = {
     bool: {"type": "boolean"},
     int: {"type": "integer", "minimum": 0},
@@ -135,19 +117,17 @@ def make_schema(text: str) -> Schema:
     """Make the JSON schema of the values: draft 7, unknown keys are not allowed."""
     described = descriptions(text)
 
-    def section(above: Path, values: dict[str, Any], about: str) -> Schema:
-        parts = {key: part((*above, key), value) for key, value in values.items()}
+    def part(path: Path, value: Any, about: str) -> Schema:
+        if not any(other[:-1] == path for other in described):
+            return {"description": about, **(RULES.get(path[-1]) or TYPES[type(value)])}
+        parts = {
+            key: part((*path, key), each, described[*path, key]) for key, each in value.items()
+        }
         # Templates need the sections, so null is refused for them.
         needed = [key for key, each in parts.items() if "$ref" in each or "properties" in each]
         return {**_closed(about, parts), "required": needed}
 
-    def part(path: Path, value: Any) -> Schema:
-        about = described[path]
-        if any(other[:-1] == path for other in described):
-            return section(path, value, about)
-        return {"description": about, **(RULES.get(path[-1]) or TYPES[type(value)])}
-
-    made = section((), yaml.safe_load(text), "All values of the chart")
+    made = part((), yaml.safe_load(text), "All values of the chart")
     about = "Values that Helm passes to subcharts; this chart ignores them"
     made["properties"]["global"] = {**_either(OBJECT, NULL), "description": about}
     models = [(model, "validation") for model in (Experiment, Mission, Profile)]
@@ -157,17 +137,10 @@ def make_schema(text: str) -> Schema:
         "type": ["number", "string", "boolean", "array", "null"],
     }
     amount = _either(*QUANTITY["anyOf"], NULL)
-    amounts = _closed(
-        "Amounts of CPU and memory",
-        {
-            "cpu": {"description": "CPU [cores; 250m is a quarter of a core]", **amount},
-            "memory": {"description": "Memory [bytes; 64Mi is 64 * 2^20]", **amount},
-        },
-    )
-    defined["Resources"] = _closed(
-        "Requests and limits of one container; if all are equal, the QoS class is Guaranteed",
-        {"requests": amounts, "limits": amounts},
-    )
+    about = "CPU [cores; 250m is a quarter of a core] and memory [bytes; 64Mi is 64 * 2^20]"
+    amounts = _closed(about, {"cpu": amount, "memory": amount})
+    about = "Requests and limits of one container; if all are equal, the QoS class is Guaranteed"
+    defined["Resources"] = _closed(about, {"requests": amounts, "limits": amounts})
     head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "cloudrc"}
     return {**head, **made, "$defs": defined}
 

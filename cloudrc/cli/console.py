@@ -178,8 +178,8 @@ def _show_release(options: argparse.Namespace) -> int:
         raise BadInputError("RUN names a run here, the other flags a cluster; give one")
     release = release_from_flags(options)
     from cloudrc.cli.link_set import note_of
-    from cloudrc.cluster.console import follow_page
     from cloudrc.cluster.link import keep, read_link, send
+    from cloudrc.cluster.pods import follow_page
 
     def ready(url: str) -> None:
         print_line(f"console: {url}")
@@ -190,9 +190,7 @@ def _show_release(options: argparse.Namespace) -> int:
         if not line.startswith(LINK_SET):
             continue
         try:
-            if (link := read_link(release)) is None:
-                raise BadInputError("the pods of the release do not run")
-            settings = line.removeprefix(LINK_SET).split()
+            link, settings = read_link(release), line.removeprefix(LINK_SET).split()
             note = partial(note_of, number=token_hex(4))
             keep(release, link, send(release, link, None, settings, note))
             print_line(line)

@@ -17,7 +17,7 @@ from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
 from cloudrc.cli.output import format_document, output_argument, print_line, table
 from cloudrc.cluster.client import DEFAULT_RELEASE, ClusterError, Release
-from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, TimedOutError
+from cloudrc.errors import BadInputError, MissingPrerequisiteError, TimedOutError
 
 if TYPE_CHECKING:
     from cloudrc.cluster.link import LinkParts
@@ -140,25 +140,18 @@ def set_here(
 def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
     """Return the link of a release; raise an error with the reason if the release has no link."""
     from cloudrc.cluster.link import read_link
-
-    failed: CloudrcError = ClusterError(
-        f"release '{where.name}' has no link to change; is it a release of cloudrc? see: "
-        "helm list --all-namespaces"
-    )
-    try:
-        if found := read_link(where):
-            return found
-    except (ClusterError, MissingPrerequisiteError) as error:  # or kubectl is missing
-        failed = error
     from cloudrc.cluster.pods import find_pod
 
     try:
-        release = release_from_flags(options)
-        for part in ("world", "cloud"):
-            find_pod(release, part)  # raises the most precise error
-    except MissingPrerequisiteError as error:
-        raise no_run_error(options, error, "--run") from None
-    raise failed
+        return read_link(where)
+    except (ClusterError, MissingPrerequisiteError):  # such as kubectl
+        try:
+            release = release_from_flags(options)
+            for part in ("world", "cloud"):
+                find_pod(release, part)  # raises the most precise error
+        except MissingPrerequisiteError as error:
+            raise no_run_error(options, error, "--run") from None
+        raise
 
 
 def note_of(edit: Edit, number: str) -> str:

@@ -431,7 +431,7 @@ def _run_job(options: argparse.Namespace) -> int:
     """Create the Job of a mission and follow its log; the API checks the mission for the Job."""
     mission, release = read_mission(options.mission, options.name), _release(options)
     from cloudrc.cluster.flight import wait_ready
-    from cloudrc.cluster.jobs import follow, follow_limit, run_job
+    from cloudrc.cluster.jobs import follow, run_job
     from cloudrc.cluster.pods import find_deployment
 
     find_deployment(release, "cloud")
@@ -443,7 +443,7 @@ def _run_job(options: argparse.Namespace) -> int:
     job = run_job(release, mission, limit=limit, queue=options.queue)
     print_line(f"Job {job.name} on release '{release.name}' in namespace '{release.namespace}'")
     try:
-        ended = follow(release, job.name, print_line, timeout=follow_limit(limit, options.queue))
+        ended = follow(release, job.name, print_line)
     except KeyboardInterrupt:
         command = f"kubectl {' '.join(release.flags)} delete job {job.name}"
         print_line(f"Job {job.name} is still running; cancel its mission: {command}", sys.stderr)

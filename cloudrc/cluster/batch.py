@@ -11,15 +11,14 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from cloudrc.cluster.client import ClusterError, Release, retry
+from cloudrc.cluster.client import ClusterError, Release
 from cloudrc.cluster.jobs import create_job, delete_job, failure_of
-from cloudrc.cluster.pods import container_statuses, list_pods, one_line, pod_failure, pod_log
+from cloudrc.cluster.pods import container_statuses, list_pods, pod_failure, pod_log
+from cloudrc.errors import to_one_line
 
 COMPONENT = "sweep"
 """Label `component` of the Jobs and pods of sweeps, and name of their container."""
 FILE = "flights.json.gz"
-SIZE_MAX = 700_000
-"""Largest size of the file of flights [bytes]; a ConfigMap has at most 1 MiB of base64."""
 RETRIES = 3
 """Largest number of restarts after a pod has failed; pods of a drained node do not count."""
 KEEP_FINISHED = 86_400
@@ -48,11 +47,8 @@ def start(
     the CPU request of a pod, and `queue` a queue of Kueue. The Job belongs to no Helm release.
 
     Raises:
-        ClusterError: If the cluster refuses the Job, or if the sweep is too large.
+        ClusterError: If the cluster refuses the Job, for example because the sweep is too large.
     """
-    if len(flights) > SIZE_MAX:
-        text = f"the flights need {len(flights)} bytes, and a ConfigMap takes {SIZE_MAX}"
-        raise ClusterError(f"{text}; split the file of the sweep")
     for job in release.find("jobs", COMPONENT):
         if job.metadata.name == name:
             if not failure_of(job):  # flies, or is complete
@@ -130,8 +126,8 @@ def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iter
     ending = None
     while ending is None:
         time.sleep(LOOK_PERIOD)
-        ending = failure_of(retry(lambda: release.request("get", "jobs", name=name), tell_once))
-        for pod in retry(lambda: list_pods(release, COMPONENT), tell_once):
+        ending = failure_of(release.request("get", "jobs", name=name))
+        for pod in list_pods(release, COMPONENT):
             if (pod.metadata.labels or {}).get(JOB_LABEL) != name or pod.metadata.uid in fetched:
                 continue
             if pod.status.phase == "Pending":
@@ -152,7 +148,7 @@ def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iter
 
 def _log(release: Release, pod: str, last: int | None) -> list[str]:
     try:
-        return retry(lambda: pod_log(release, pod, COMPONENT, last), lambda text: None).splitlines()
+        return pod_log(release, pod, COMPONENT, last).splitlines()
     except ClusterError:  # the pod is gone; its successor flies the same flights
         return []
 
@@ -162,7 +158,7 @@ def _failure(pod: Any) -> str:
     for container in container_statuses(pod):
         ended = container.state.terminated
         if container.name == COMPONENT and ended and ended.exit_code:
-            words = one_line(ended.message) or ended.reason
+            words = to_one_line(ended.message) or ended.reason
             return f"a pod failed with exit code {ended.exit_code}: {words}"
     return ""
 

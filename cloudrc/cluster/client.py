@@ -6,16 +6,15 @@ Every error of the cluster or of a program becomes a message of one sentence.
 from __future__ import annotations
 
 import json
-import re
+import logging
 import shutil
 import subprocess
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import IO, Any
 
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError, TimedOutError
 
@@ -24,14 +23,16 @@ COMPONENTS = ("world", "cloud")
 """Components of a release that have a pod of their own."""
 REQUEST_TIMEOUT = 15.0
 """Time limit for one request to the API server [s]."""
-OUTAGE_MAX = 30.0
-"""Longest time for which a request is tried again while the API server does not answer [s]."""
-OUTAGE_PERIOD = 1.0
-"""Time between two attempts of a request [s]."""
+RETRIES: dict[str, Any] = {"total": 6, "connect": 4, "read": 1, "backoff_factor": 0.5}
+"""How often urllib3 repeats a request: for 31 s while the API server is overloaded, for 7 s while
+it refuses connections, and once if it does not answer. A request to create an object is repeated
+only after a refused connection."""
+BUSY = (429, 500, 502, 503, 504)
+"""HTTP status codes after which the same request may succeed later."""
+PROGRAM_LIMIT = 120.0
+"""Time limit for one command of kubectl or helm [s], such as the copy of a recording."""
 STOP_LIMIT = 2.0
 """Time from SIGTERM to SIGKILL, in which a program can end by itself [s]."""
-OLDEST = (1, 29)
-"""Oldest Kubernetes version that the chart supports (`kubeVersion` in Chart.yaml)."""
 PACKAGE = Path(__file__).resolve().parents[1]
 _KINDS = {
     **{name: ("CoreV1Api", name[:-1]) for name in ("pods", "services", "secrets", "events")},
@@ -42,17 +43,11 @@ _KINDS = {
 }
 """Kind of objects -> class of the Kubernetes client, and the name of the kind in its methods."""
 
-_Answer = TypeVar("_Answer")
-
 
 class ClusterError(CloudrcError):
     """Report that the cluster refused a request, or that an object in the cluster failed."""
 
     exit_code = 5
-
-
-class UnavailableError(ClusterError):
-    """Report that the API server does not answer or is overloaded; a later attempt may succeed."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +75,6 @@ class Release:
         """Flags that select context and namespace in helm."""
         return [flag.replace("--context", "--kube-context") for flag in self.flags]
 
-    @property
-    def cloudrc_flags(self) -> list[str]:
-        """Flags that select context, namespace and release in cloudrc."""
-        return [*self.flags, f"--release={self.name}"]
-
     def labels(self, component: str) -> dict[str, str]:
         """Return the Kubernetes labels of a component: "world", "cloud" or "mission"."""
         return {
@@ -97,23 +87,22 @@ class Release:
     def client(self) -> Any:
         """Client of the Kubernetes API with the kubeconfig's login."""
         from kubernetes import client, config
+        from urllib3 import Retry
 
+        logging.getLogger("urllib3").setLevel(logging.ERROR)  # it prints a warning per repetition
         configuration = client.Configuration()
         with explain_errors("read the kubeconfig", self.where):
             load: Any = config.load_kube_config  # not annotated
             load(context=self.context, client_configuration=configuration)
-        configuration.retries = False  # callers repeat a request themselves, with a message
+        configuration.retries = Retry(**RETRIES, status_forcelist=BUSY, raise_on_status=False)
         return client.ApiClient(configuration)
 
-    def request(
-        self, verb: str, kind: str, *, timeout: float = REQUEST_TIMEOUT, **arguments: Any
-    ) -> Any:
+    def request(self, verb: str, kind: str, **arguments: Any) -> Any:
         """Send a request about objects in the release's namespace; return the client's answer.
 
         Args:
             verb: "list", which returns a list; or "get", "create" or "delete".
             kind: Kind of the objects, such as "pods".
-            timeout: Time limit [s].
             arguments: Arguments of the Kubernetes client, such as `name`.
 
         Raises:
@@ -125,7 +114,7 @@ class Release:
         method = f"{'read' if verb == 'get' else verb}_namespaced_{noun}"
         call = getattr(getattr(client, name)(self.client), method)
         with explain_errors(f"{verb} {kind}", self.where):
-            answer = call(namespace=self.namespace, _request_timeout=timeout, **arguments)
+            answer = call(namespace=self.namespace, _request_timeout=REQUEST_TIMEOUT, **arguments)
         return answer.items if verb == "list" else answer
 
     def find(self, kind: str, component: str) -> list[Any]:
@@ -167,17 +156,6 @@ def connect(
     return Release(context, namespace or inherited or "default", release)
 
 
-def server_version(release: Release) -> tuple[int, int]:
-    """Ask the API server for its major and minor version."""
-    from kubernetes import client
-
-    with explain_errors("get the version", release.where):
-        code = client.VersionApi(release.client).get_code(_request_timeout=REQUEST_TIMEOUT)
-    # The minor version of some vendors has a suffix: "29+".
-    major, minor = (int(re.sub(r"\D.*", "", text) or 0) for text in (code.major, code.minor))
-    return major, minor
-
-
 @contextmanager
 def explain_errors(doing: str, where: str) -> Iterator[None]:
     """Convert exceptions of the Kubernetes client to a ClusterError with a message of one sentence.
@@ -193,11 +171,9 @@ def explain_errors(doing: str, where: str) -> Iterator[None]:
     try:
         yield
     except ApiException as error:
-        status = int(error.status or 0)
-        kind = UnavailableError if status == 429 or status >= 500 else ClusterError
-        raise kind(f"cannot {doing} {where}: {_refusal(error, status, doing)}") from error
+        raise ClusterError(f"cannot {doing} {where}: {_refusal(error, doing)}") from error
     except (HTTPError, OSError) as error:
-        raise UnavailableError(
+        raise ClusterError(
             f"cannot {doing} {where}: the API server does not answer ({_root(error)}); "
             "is the cluster up? ask it: kubectl cluster-info"
         ) from error
@@ -205,17 +181,13 @@ def explain_errors(doing: str, where: str) -> Iterator[None]:
         raise ClusterError(f"cannot {doing} {where}: {str(error).partition(chr(10))[0]}") from error
 
 
-def _refusal(error: Any, status: int, doing: str) -> str:
+def _refusal(error: Any, doing: str) -> str:
     try:
         message = json.loads(error.body)["message"]
     except (ValueError, KeyError, TypeError):
-        message = error.reason or f"the API server answered {status}"
-    message = " ".join(str(message).split())
-    if status == 401 or "system:anonymous" in message:
-        return "the API server does not know you; log in to the cluster again"
-    if status == 403 and "exceeded quota" not in message:
-        return f"{message}; ask for the permission, and check it: kubectl auth can-i {doing}"
-    return message
+        message = error.reason or f"the API server answered {error.status}"
+    remedy = f"; check your permission: kubectl auth can-i {doing}"
+    return " ".join(str(message).split()) + remedy * (error.status in (401, 403))
 
 
 def _root(error: BaseException) -> str:
@@ -224,24 +196,6 @@ def _root(error: BaseException) -> str:
     if isinstance(reason, BaseException):
         return _root(reason)
     return str(error).strip().partition("\n")[0].rpartition(": ")[2] or type(error).__name__
-
-
-def retry(ask: Callable[[], _Answer], tell: Callable[[str], None]) -> _Answer:
-    """Call `ask` again while the API server does not answer, for `OUTAGE_MAX` at most.
-
-    `tell` gets the first error. The last error is raised.
-    """
-    until = None
-    while True:
-        try:
-            return ask()
-        except UnavailableError as error:
-            if until is None:
-                until = time.monotonic() + OUTAGE_MAX
-                tell(f"{error}; trying again for {OUTAGE_MAX:g} s")
-            elif time.monotonic() > until:
-                raise
-        time.sleep(OUTAGE_PERIOD)
 
 
 def program(name: str) -> str:
@@ -254,12 +208,7 @@ def program(name: str) -> str:
 
 
 def run(
-    name: str,
-    arguments: Sequence[str],
-    *,
-    timeout: float,
-    given: str = "",
-    stdout: IO[bytes] | None = None,
+    name: str, arguments: Sequence[str], *, given: str = "", stdout: IO[bytes] | None = None
 ) -> str:
     """Run kubectl or helm with the standard input `given`, and return the program's output.
 
@@ -267,18 +216,16 @@ def run(
 
     Raises:
         ClusterError: If the program fails; the message is that of the program.
-        TimedOutError: If the program takes longer than `timeout` [s].
+        TimedOutError: If the program takes longer than `PROGRAM_LIMIT`.
         MissingPrerequisiteError: If the program is not installed.
     """
     command = [program(name), *arguments]
     short = " ".join([name, *[word for word in arguments if not word.startswith("-")][:2]])
-    target = subprocess.PIPE if stdout is None else stdout
+    how: dict[str, Any] = {"stdout": stdout or subprocess.PIPE, "stderr": subprocess.PIPE}
     try:
-        done = subprocess.run(
-            command, input=given.encode(), stdout=target, stderr=subprocess.PIPE, timeout=timeout
-        )
+        done = subprocess.run(command, input=given.encode(), timeout=PROGRAM_LIMIT, **how)
     except subprocess.TimeoutExpired as error:
-        raise TimedOutError(f"'{short}' took more than {timeout:g} s") from error
+        raise TimedOutError(f"'{short}' took more than {PROGRAM_LIMIT:g} s") from error
     if done.returncode != 0:
         raise ClusterError(f"'{short}' failed: {last_words(done.stderr)}")
     return (done.stdout or b"").decode(errors="replace")

@@ -7,16 +7,15 @@ the recordings of the pods of world and cloud, and writes the report.
 from __future__ import annotations
 
 import json
-import re
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cluster import pods
-from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, chart_folder, retry, run
-from cloudrc.cluster.jobs import Ask, delete_job, find_flight, follow, follow_limit, run_job
+from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, chart_folder, run
+from cloudrc.cluster.jobs import delete_job, follow, run_job
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 
 if TYPE_CHECKING:
@@ -24,11 +23,11 @@ if TYPE_CHECKING:
     from cloudrc.record.reader import Contents
 
 Tell = Callable[[str], None]
+Ask = Callable[[str, str], Any]
+"""Function that gets the state of robot and missions from the API with a given URL and token."""
 
 LOOK_PERIOD = 1.0
 """Time between two requests for the state of the pods [s]."""
-HELM_LIMIT = 120.0
-"""Time limit for one helm command [s]; helm does not wait for pods."""
 FAILURE_TIME = 5.0
 """Time for which a pod's failure must last before it is reported [s]: at first, Kubernetes may not
 yet have made all objects that the pod needs."""
@@ -51,17 +50,17 @@ def install(release: Release, values: Mapping[str, Any], timeout: float, tell: T
     """
     arguments = ["upgrade", "--install", release.name, str(chart_folder()), *release.helm_flags]
     arguments += ["--create-namespace", "--values=-"]
-    run("helm", arguments, timeout=HELM_LIMIT, given=json.dumps(values))
+    run("helm", arguments, given=json.dumps(values))
     wait_ready(release, timeout=timeout, tell=tell)
 
 
 def current_values(release: Release) -> dict[str, Any]:
     """Read the values with which a release was installed; {} if the release does not exist."""
     arguments = ["list", "--output=json", f"--filter=^{release.name}$", *release.helm_flags]
-    if not json.loads(run("helm", arguments, timeout=HELM_LIMIT) or "[]"):
+    if not json.loads(run("helm", arguments) or "[]"):
         return {}
     arguments = ["get", "values", release.name, "--output=json", *release.helm_flags]
-    return json.loads(run("helm", arguments, timeout=HELM_LIMIT)) or {}
+    return json.loads(run("helm", arguments)) or {}
 
 
 def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: None) -> None:
@@ -77,7 +76,7 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
     see = f"see: kubectl {' '.join(release.flags)} describe pods -l {selector}"
     until, failing_since, last = time.monotonic() + timeout, None, ""
     while True:
-        states = retry(lambda: {each: _state(release, each) for each in COMPONENTS}, tell)
+        states = {each: _state(release, each) for each in COMPONENTS}
         words = "; ".join(f"{component}: {why}" for component, (why, _) in states.items() if why)
         if not words:
             return
@@ -118,11 +117,19 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
 
 
 def refuse_second_flight(release: Release, ask: Ask) -> None:
-    """Raise a ClusterError if a mission is under way: installing would replace the pods."""
-    if found := find_flight(release, ask):
+    """Raise a ClusterError if a mission is under way: installing would replace the pods.
+
+    If the API does not answer, nothing is raised: to install again can repair the release.
+    """
+    mission = None
+    with suppress(CloudrcError), pods.api_url(release) as url:
+        mission = ask(url, pods.operator_token(release))["mission"]
+    if mission is not None:
+        flags = " ".join([*release.flags, f"--release={release.name}"])
+        cancel = f"cloudrc mission cancel {mission['id']} {flags}"
         raise ClusterError(
-            f"{found[0]} is under way on release '{release.name}' {release.where}; wait for it, "
-            f"end it: {found[1]}, or fly on a release of your own: --release NAME"
+            f"mission {mission['id']} is under way on release '{release.name}' {release.where}; "
+            f"wait for it, end it: {cancel}, or fly on a release of your own: --release NAME"
         )
 
 
@@ -133,7 +140,7 @@ def fly_in_cluster(
 
     Args:
         experiment: A complete and checked experiment.
-        folder: Folder of the run, which gets configuration, recordings, metrics, logs and report.
+        folder: Folder of the run, which gets configuration, recordings, logs and report.
         release: The release that flies; it is installed if it is missing, and stays afterwards.
         timeout: Time limit for the release to become ready [s].
         tell: Receives the progress, one line per call.
@@ -179,18 +186,13 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
 
 
 def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
-    mission, limit = experiment.mission.model_dump(mode="json"), experiment.criteria.time_limit_s
-    document = {
-        "name": experiment.name,
-        "start": mission["start"],
-        "time_limit_s": limit,
-        "waypoints": mission["waypoints"],
-        "carrot": mission["carrot"],
-    }
+    flown, limit = {"start", "waypoints", "carrot"}, experiment.criteria.time_limit_s
+    mission = experiment.mission.model_dump(mode="json", include=flown)
+    document = {"name": experiment.name, "time_limit_s": limit, **mission}
     job = run_job(release, document, limit=limit)
     tell(f"Job {job.name} flies {experiment.name}")
     try:
-        ended = follow(release, job.name, tell, timeout=follow_limit(limit, False))
+        ended = follow(release, job.name, tell)
     except KeyboardInterrupt:
         tell("cancelling the mission")
         try:
@@ -203,10 +205,10 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
 
 
 def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Contents:
-    """Fetch recordings, metrics and logs into a folder; return the merged recording.
+    """Fetch recordings and logs into a folder; return the merged recording.
 
-    If metrics or logs cannot be fetched, `tell` receives the error. With `want_end`, fetch
-    the recordings again until they contain the end of the mission.
+    If logs cannot be fetched, `tell` receives the error. With `want_end`, fetch the recordings
+    again until they contain the end of the mission.
     """
     from cloudrc.record.merge import cut_to_last_mission, merge
 
@@ -225,15 +227,13 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
             break
     for component in COMPONENTS:
         _fetch_previous(release, component, folder / f"{component}.before.mcap", tell)
-        for fetch, suffix in ((pods.fetch_metrics, "metrics"), (pods.fetch_logs, "log")):
-            try:
-                texts = fetch(release, component)
-            except CloudrcError as error:
-                tell(f"the report is written without the {component} pod's {suffix}: {error}")
-                continue
-            for container, text in texts.items():
-                path = folder / f"{component}-{container}.{suffix}"
-                path.write_text(text, encoding="utf-8")
+        try:
+            logs = pods.fetch_logs(release, component)
+        except CloudrcError as error:
+            tell(f"the report is written without the {component} pod's logs: {error}")
+            continue
+        for container, text in logs.items():
+            (folder / f"{component}-{container}.log").write_text(text, encoding="utf-8")
     return mission
 
 
@@ -257,15 +257,11 @@ def _report(
     from cloudrc.report.views import add_views
     from cloudrc.report.write import attachments, write_report
 
-    # The metrics of the link containers name the shaper: netem or relay.
-    texts = [path.read_text(encoding="utf-8") for path in sorted(folder.glob("*-link.metrics"))]
-    found = re.findall(r'cloudrc_link_info\{[^}]*shaper="(\w+)"', "\n".join(texts))
-    shaper = "+".join(sorted(set(found))) or "unknown"
-    digest = messages_sha256(mission.messages)
-    run_facts = replace(Run("cluster", shaper, digest), interrupted=interrupted)
     try:
         recording = add_views(mission, experiment)
+        shaper = "+".join(sorted(set(recording["/link"]["shaper"]))) or "unknown"
+        run = Run("cluster", shaper, messages_sha256(mission.messages), interrupted)
         own = experiment.report.metrics  # evaluated here, so the pods do not need the file
-        return write_report(folder, recording, experiment, run_facts, own=own)
+        return write_report(folder, recording, experiment, run, own=own)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))

@@ -13,25 +13,21 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from math import ceil
-from typing import Any, TypeAlias
+from typing import Any
 
 import yaml
 
-from cloudrc.cluster.client import ClusterError, Release, chart_folder, retry
+from cloudrc.cluster.client import ClusterError, Release, chart_folder
 from cloudrc.cluster.pods import (
-    api_url,
     container_statuses,
     find_deployment,
     list_pods,
-    one_line,
-    operator_token,
     pod_failure,
     pod_log,
     tokens_secret,
 )
-from cloudrc.errors import CloudrcError, TimedOutError
+from cloudrc.errors import CloudrcError, TimedOutError, to_one_line
 
 EXAMPLE = "examples/mission-job.yaml"
 """File in the chart with the Job and the ConfigMap of a mission, the template for `run_job`."""
@@ -48,16 +44,12 @@ START_ALLOWANCE = 120
 """Time to start the pod and to get the robot's state, added to the mission's time limit [s]."""
 QUEUE_ALLOWANCE = 3600
 """Time for earlier missions to end, added to the time limit of a Job that may wait [s]."""
-END_ALLOWANCE = 60.0
-"""Time in which Kubernetes ends a Job after the Job's time limit [s]."""
 KEEP_FINISHED = 3600
 """Time for which Kubernetes keeps a finished Job [s]."""
 LOOK_PERIOD = 0.5
 """Time between two requests for the state of a Job [s]."""
 DELETE_LIMIT = 40.0
 """Time limit for a deleted Job to end [s]; Kubernetes gives the Job's pod 30 s."""
-Ask: TypeAlias = Callable[[str, str], Any]
-"""Function that gets the state of robot and missions from the API with a given URL and token."""
 ENDED = ("complete", "failed")
 """States of a Job that has ended, in `JobStatus.state`."""
 
@@ -103,7 +95,7 @@ def run_job(
     deployment = find_deployment(release, "cloud")
     owner = owner_of("apps/v1", "Deployment", deployment)
     job["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
-    deadline = deadline_of(limit, queue)
+    deadline = ceil(limit) + START_ALLOWANCE + queue * QUEUE_ALLOWANCE
     job["spec"] |= {"activeDeadlineSeconds": deadline, "ttlSecondsAfterFinished": KEEP_FINISHED}
     job["spec"]["template"]["metadata"]["labels"] = labels
     _fill_pod(job["spec"]["template"]["spec"], release, deployment, name, queue)
@@ -163,39 +155,11 @@ def _api_address(release: Release) -> str:
     )
 
 
-def deadline_of(limit: float, queue: bool) -> int:
-    """Compute the time limit of a Job [s] from the time limit of its mission [s]."""
-    return ceil(limit) + START_ALLOWANCE + queue * QUEUE_ALLOWANCE
-
-
-def follow_limit(limit: float, queue: bool) -> float:
-    """Compute a time after which a Job has certainly ended [s], from its mission's limit [s]."""
-    return deadline_of(limit, queue) + END_ALLOWANCE
-
-
-def find_flight(release: Release, ask: Ask) -> tuple[str, str] | None:
-    """Find a Job that has not ended, or else the mission that the API shows as under way.
-
-    Returns:
-        The flight in words, and the command that ends the flight; None if nothing flies. Also
-            None if the API does not answer: the user can then upgrade to repair the release.
-    """
-    for job in release.find("jobs", COMPONENT):
-        if (status := _status(job, None)).state not in ENDED:
-            kubectl = f"kubectl {' '.join(release.flags)}"
-            return f"Job '{status.name}'", f"{kubectl} delete job {status.name}"
-    with suppress(CloudrcError), api_url(release) as url:
-        if (mission := ask(url, operator_token(release))["mission"]) is not None:
-            cancel = f"cloudrc mission cancel {mission['id']} {' '.join(release.cloudrc_flags)}"
-            return f"mission {mission['id']}", cancel
-    return None
-
-
 def delete_job(release: Release, name: str, component: str = COMPONENT) -> None:
     """Delete a Job with its pods and ConfigMap; the pod of a mission first cancels the mission."""
     release.request("delete", "jobs", name=name, propagation_policy="Foreground")
-    until, jobs = time.monotonic() + DELETE_LIMIT, partial(release.find, "jobs", component)
-    while any(job.metadata.name == name for job in retry(jobs, lambda text: None)):
+    until = time.monotonic() + DELETE_LIMIT
+    while any(job.metadata.name == name for job in release.find("jobs", component)):
         if time.monotonic() > until:
             raise TimedOutError(
                 f"Job '{name}' has not ended {DELETE_LIMIT:g} s after its deletion; "
@@ -211,7 +175,7 @@ def _status(job: Any, pod: Any) -> JobStatus:
             ended = container.state.terminated
             state = "flying" if ended or container.state.running else state
             exit_code = ended and ended.exit_code
-            message = one_line(ended and ended.message)
+            message = to_one_line(ended and ended.message)
     cause = failure_of(job)
     if cause is not None:
         state, message = ("failed", message or cause) if cause else ("complete", message)
@@ -229,28 +193,20 @@ def failure_of(job: Any) -> str | None:
     return None
 
 
-def follow(
-    release: Release, name: str, write: Callable[[str], None], *, timeout: float
-) -> JobStatus:
+def follow(release: Release, name: str, write: Callable[[str], None]) -> JobStatus:
     """Follow a Job until it has ended; `write` receives each line of the Job's log.
 
-    Raises:
-        ClusterError: If the Job's pod cannot run; the message names the cause.
-        TimedOutError: If the Job has not ended within `timeout` [s].
+    Kubernetes ends the Job after the Job's time limit. Raise a ClusterError if the Job's pod cannot
+    run; the message names the cause.
     """
-    until, written = time.monotonic() + timeout, 0
+    written = 0
     while True:
-        status, lines = retry(lambda: _look(release, name), write)
+        status, lines = _look(release, name)
         for line in lines[written:]:
             write(line)
         written = max(written, len(lines))
         if status.state in ENDED:
             return status
-        if time.monotonic() > until:
-            raise TimedOutError(
-                f"Job '{name}' has not ended within {timeout:g} s; it continues; "
-                f"see: kubectl {' '.join(release.flags)} describe job {name}"
-            )
         time.sleep(LOOK_PERIOD)
 
 

@@ -27,14 +27,10 @@ from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 from cloudrc.link.follow import HANDED_FILE, PROFILE, Handed, write_handed
 from cloudrc.link.state import CHANGE_FILE, STATE_FILE, LinkState, from_text, read_change
 
-READ_LIMIT = 15.0
-"""Time limit for the API server to answer [s]."""
 FOLDER = "/run/cloudrc"
 """Folder in a link container with the files of the link: route, state, received change."""
 APPLY_LIMIT = 5.0
 """Time limit for a link container to apply a change [s]; usually it takes 0.2 s."""
-SEND_LIMIT = 25.0
-"""Time limit to send a change to a container and to read the answer [s]."""
 SIZE_MAX = 1_000_000
 """Largest total size of the files in a ConfigMap [bytes], a little below Kubernetes' 1 MiB."""
 _LOOK_PERIOD = 0.02
@@ -50,11 +46,14 @@ class LinkParts:
     pods: dict[str, str]  # component -> name of its newest running pod
 
 
-def read_link(release: Release) -> LinkParts | None:
-    """Read a release's link with one kubectl command; None if the ConfigMap or a pod is missing."""
+def read_link(release: Release) -> LinkParts:
+    """Read a release's link with one kubectl command.
+
+    Raise a ClusterError if the release has no link, or if a pod does not run.
+    """
     selector = f"app.kubernetes.io/name=cloudrc,app.kubernetes.io/instance={release.name}"
     words = [*release.flags, "get", "configmaps,pods", f"--selector={selector}", "--output=json"]
-    found = json.loads(run("kubectl", words, timeout=READ_LIMIT))["items"]
+    found = json.loads(run("kubectl", words))["items"]
     # The newest pod comes last, and replaces older pods in the dictionary below.
     found.sort(key=lambda item: str(item["metadata"]["creationTimestamp"]))
     maps = [each for each in found if PROFILE in each.get("data", {})]
@@ -66,7 +65,10 @@ def read_link(release: Release) -> LinkParts | None:
         and "deletionTimestamp" not in each["metadata"]
     }
     if not maps or not pods.keys() >= set(COMPONENTS):
-        return None
+        raise ClusterError(
+            f"release '{release.name}' has no link to change; is it a release of cloudrc? see: "
+            "helm list --all-namespaces"
+        )
     return LinkParts(maps[0]["metadata"]["name"], maps[0]["data"], pods)
 
 
@@ -93,7 +95,7 @@ def send_change(release: Release, pod: str, handed: Handed) -> str:
     document, number = write_handed(handed), read_change(handed.change).number
     words = ["sh", "-c", APPLY_SCRIPT, "sh", FOLDER, number, str(len(document.encode()))]
     command = [*release.flags, "exec", "--stdin", pod, "--container=link", "--", *words]
-    return run("kubectl", command, timeout=SEND_LIMIT, given=document)
+    return run("kubectl", command, given=document)
 
 
 class Sent(NamedTuple):
@@ -162,7 +164,7 @@ def keep(release: Release, link: LinkParts, sent: Sent) -> None:
     words = ["patch", "configmap", link.name, "--type=merge", "--patch-file=/dev/stdin"]
     try:
         data = json.dumps({"data": sent.files})
-        run("kubectl", [*release.flags, *words], timeout=READ_LIMIT, given=data)
+        run("kubectl", [*release.flags, *words], given=data)
     except CloudrcError as error:
         said.append(f"the ConfigMap is unchanged: {error}")
         said += [f"the {s.direction} has the change until its pod is replaced" for s in sent.states]

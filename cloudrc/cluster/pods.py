@@ -13,13 +13,13 @@ import subprocess
 import tempfile
 import time
 import urllib.request
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 from cloudrc.cluster.client import ClusterError, Release, end_process, last_words, program, run
-from cloudrc.errors import BadInputError, TimedOutError
+from cloudrc.errors import BadInputError, TimedOutError, to_one_line
 
 FATAL = {
     **dict.fromkeys(
@@ -41,6 +41,9 @@ TOKENS, OPERATOR = "tokens", "operator"
 """Name of the volume with the API's tokens, and of the file in it with the operator's token."""
 API_PORT = 8080
 """TCP port of teleop's API in cloud's pod."""
+CONSOLE, CONSOLE_PORT = "console", 8090
+"""Container of cloud's pod that serves the console's page, and its port on the pod's loopback
+address."""
 METRICS = {
     "world": {"world": 9100, "link": 9102},
     "cloud": {"cloud": 9100, "teleop": 9101, "link": 9102},
@@ -54,8 +57,6 @@ START_LIMIT = 20.0
 """Time limit for kubectl to start to forward ports [s]."""
 LOOK_PERIOD = 0.05
 """Time between two checks of kubectl's output [s]."""
-COPY_LIMIT, READ_LIMIT = 120.0, 30.0
-"""Time limits to copy one recording, and to read the metrics or the log of one container [s]."""
 _FORWARDING = re.compile(rb"Forwarding from 127\.0\.0\.1:(\d+) -> (\d+)")
 
 
@@ -105,8 +106,8 @@ def pod_failure(pod: Any) -> str:
         if (status.restart_count or 0) > RESTARTS_MAX and reason not in FATAL:
             reason = "CrashLoopBackOff"
         if reason in FATAL:
-            message = one_line(waiting and waiting.message)
-            end = f" (exit code {ended.exit_code}): {one_line(ended.message)}" if ended else ""
+            message = to_one_line(waiting and waiting.message)
+            end = f" (exit code {ended.exit_code}): {to_one_line(ended.message)}" if ended else ""
             words = {"name": status.name, "image": status.image, "reason": reason}
             return FATAL[reason].format(**words, message=message, end=end.removesuffix(": "))
     for condition in pod.status.conditions or []:
@@ -130,11 +131,6 @@ def refuse_local_files(values: Mapping[str, Any], remedy: str) -> None:
 def container_statuses(pod: Any) -> list[Any]:
     """List the statuses of a pod's containers, init containers first."""
     return [*(pod.status.init_container_statuses or []), *(pod.status.container_statuses or [])]
-
-
-def one_line(text: str | None) -> str:
-    """Join the lines of a text from Kubernetes."""
-    return " ".join((text or "").split())
 
 
 def tokens_secret(release: Release) -> str:
@@ -211,6 +207,36 @@ def _forwarded_ports(output: IO[bytes]) -> dict[int, int]:
     return {int(remote): int(local) for local, remote in _FORWARDING.findall(text)}
 
 
+def follow_page(release: Release, port: int, tell: Callable[[str], None]) -> Iterator[str]:
+    """Forward the page to `port` of 127.0.0.1 (0: any), and yield the lines of the console's log.
+
+    `tell` is called with the page's address on this machine.
+
+    Raises:
+        ClusterError: If the release has no console, or if the port cannot be forwarded.
+    """
+    pod = find_pod(release, "cloud")
+    if CONSOLE not in {container.name for container in pod.spec.containers}:
+        raise ClusterError(
+            f"release '{release.name}' {release.where} has no console; add it: helm upgrade "
+            f"{release.name} charts/cloudrc {' '.join(release.helm_flags)} --reuse-values "
+            "--set console.enabled=true"
+        )
+    name = pod.metadata.name
+    words = ["logs", f"pod/{name}", f"--container={CONSOLE}", "--follow", "--since=1s"]
+    command = [program("kubectl"), *release.flags, *words]
+    with forwarded(release, name, [CONSOLE_PORT], local=port) as ports:
+        tell(f"http://127.0.0.1:{ports[CONSOLE_PORT]}")
+        with subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
+        ) as process:
+            assert process.stdout is not None
+            try:
+                yield from map(str.strip, process.stdout)
+            finally:
+                end_process(process)
+
+
 def fetch_recording(
     release: Release, component: str, target: Path, *, previous: bool = False
 ) -> None:
@@ -226,24 +252,7 @@ def fetch_recording(
     path = f"{DATA}/{component}{'.before' if previous else ''}.mcap"
     arguments = [*release.flags, "exec", pod, f"--container={component}", "--", "cat", path]
     with target.open("wb") as file:
-        run("kubectl", arguments, timeout=COPY_LIMIT, stdout=file)
-
-
-def fetch_metrics(release: Release, component: str) -> dict[str, str]:
-    """Read the metrics of a component's pod: container -> text in Prometheus' format."""
-    pod, ports = find_pod(release, component).metadata.name, METRICS[component]
-    texts = {}
-    with forwarded(release, pod, list(ports.values())) as local:
-        for container, port in ports.items():
-            url = f"http://127.0.0.1:{local[port]}/metrics"
-            try:
-                with NO_PROXY.open(url, timeout=READ_LIMIT) as answer:
-                    texts[container] = answer.read().decode()
-            except OSError as error:
-                raise ClusterError(
-                    f"cannot read the metrics of container '{container}' of pod '{pod}': {error}"
-                ) from error
-    return texts
+        run("kubectl", arguments, stdout=file)
 
 
 def fetch_logs(release: Release, component: str) -> dict[str, str]:
@@ -257,7 +266,5 @@ def fetch_logs(release: Release, component: str) -> dict[str, str]:
 
 def pod_log(release: Release, pod: str, container: str, last: int | None = None) -> str:
     """Read the log of a container, or only that of the `last` seconds [s]."""
-    words: dict[str, Any] = {"name": pod, "container": container, "timeout": READ_LIMIT}
-    if last is not None:
-        words["since_seconds"] = last
-    return str(release.request("get", "pods/log", **words))
+    since = {} if last is None else {"since_seconds": last}
+    return str(release.request("get", "pods/log", name=pod, container=container, **since))

@@ -20,7 +20,7 @@ class KeyFile:
 
     def __init__(self, path: Path, now_ns: int) -> None:
         """Read the file at `now_ns` [ns, monotonic clock]; raise the errors of `read_keys`."""
-        self._path, self._due_ns, self._trouble = path, now_ns, ""
+        self._path, self._due_ns = path, now_ns
         self._seen = version(path)
         self.ring = KeyRing(read_keys(path))
 
@@ -32,16 +32,14 @@ class KeyFile:
         if now_ns < self._due_ns:
             return []
         self._due_ns = now_ns + PERIOD_NS
-        seen, last, before = version(self._path), self._trouble, self.ring.keys
+        seen, before = version(self._path), self.ring.keys
         if seen == self._seen or seen is None:  # ignore a file that is missing for a moment
             return []
-        self._seen, self._trouble = seen, ""
+        self._seen = seen
         try:
             keys = read_keys(self._path)
         except BadInputError as error:
-            self._seen = None  # retry: `version` does not show new permissions
-            self._trouble = f"the old keys stay in use: {error}"
-            return [] if last == self._trouble else [Fault(now_ns, "key", self._trouble)]
+            return [Fault(now_ns, "key", f"the old keys stay in use: {error}")]
         if keys == before:
             return []
         self.ring.keys = keys

@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cloudrc.drivers.machine import Deadline, interpreter
-from cloudrc.drivers.process import PARENT, READY, from_line
+from cloudrc.drivers.process import READY, from_line
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.tap import TAP_FILE
 from cloudrc.drivers.teleop import PATH_MAX
@@ -57,17 +57,15 @@ RELAY_LOG = "relay.log"
 """File in the folder of every run in real time."""
 RUN, SESSION = "run", "session"
 """Kinds of flights: a run (`cloudrc run`) ends with its mission, a session with `cloudrc down`."""
-UNANNOUNCED = "no folder for the flight file (XDG_STATE_HOME); use: cloudrc mission --api {}"
 
 
-def places() -> list[Path]:
-    """List the folders for flight files: in XDG_RUNTIME_DIR, if it is set, and XDG_STATE_HOME.
+def flights_folder() -> Path:
+    """Return the folder for flight files: in XDG_RUNTIME_DIR or, if that is not set, in the home.
 
     Source: XDG Base Directory Specification.
     """
-    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
-    state = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
-    return [Path(root, "cloudrc", "flights") for root in (runtime, state) if os.path.isabs(root)]
+    root = os.environ.get("XDG_RUNTIME_DIR") or os.path.expanduser("~/.local/state")
+    return Path(root, "cloudrc", "flights")
 
 
 class FlightFile(NamedTuple):
@@ -79,32 +77,25 @@ class FlightFile(NamedTuple):
 
 
 @contextlib.contextmanager
-def announced(run: Path, api: str = "", kind: str = RUN) -> Iterator[bool]:
-    """Keep a flight file while the block runs; yield whether the file could be written.
+def announced(run: Path, api: str = "", kind: str = RUN) -> Iterator[None]:
+    """Keep a flight file while the block runs, if its folder can be written.
 
     `run` is the folder of the run, `api` the address of the operator's API ("" without an API).
     """
     about = FlightFile(api, kind, os.getpid())._asdict()
     flight = json.dumps({"schemaVersion": 1, "run": str(run.resolve()), **about})
+    path = flights_folder() / f"{os.getpid()}-{secrets.token_hex(4)}.json"
+    new = path.with_suffix(".new")  # renamed after it is locked
     with contextlib.ExitStack() as stack:
-        yield any(_write_flight(place, flight, stack) for place in places())
-
-
-def _write_flight(place: Path, flight: str, stack: contextlib.ExitStack) -> bool:
-    """Write a locked flight file, which `stack` removes; return False if this is impossible."""
-    path = place / f"{os.getpid()}-{secrets.token_hex(4)}.json"
-    with contextlib.suppress(OSError):
-        place.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if _is_private(place):
-            new = path.with_suffix(".new")  # renamed after it is locked
+        with contextlib.suppress(OSError):
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             file = stack.enter_context(new.open("xb", buffering=0))
             for name in (path, new):
                 stack.callback(name.unlink, missing_ok=True)
             fcntl.flock(file, fcntl.LOCK_EX)
             file.write(flight.encode())
             new.rename(path)
-            return True
-    return False
+        yield
 
 
 def under_way() -> dict[Path, str]:
@@ -115,7 +106,7 @@ def under_way() -> dict[Path, str]:
 def flight_files() -> dict[Path, FlightFile]:
     """Return the flights of this user: folder of the run -> content of the flight file."""
     found = {}
-    for path in (path for place in places() if _is_private(place) for path in place.glob("*.json")):
+    for path in flights_folder().glob("*.json"):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError), path.open() as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -140,17 +131,6 @@ def end_session(run: Path, limit: float) -> None:
         if time.monotonic() > deadline:
             raise TimedOutError(f"{run}: the session has not ended within {limit:g} s")
         time.sleep(0.05)
-
-
-def _is_private(place: Path) -> bool:
-    with contextlib.suppress(OSError):
-        state = place.stat()
-        return state.st_uid == os.getuid() and not state.st_mode & 0o077
-    return False
-
-
-class ProcessDiedError(InvalidRunError):
-    """A process ended before the mission was over."""
 
 
 @dataclass
@@ -213,7 +193,7 @@ class LocalRun:
         """Fly until the mission is over, at most `limit` [s]; then end all processes.
 
         Raises:
-            ProcessDiedError: If a process ends too early; the message names the process.
+            InvalidRunError: If a process ends too early; the message names the process.
             TimedOutError: If the limit is reached, or if a process hangs; the message names it.
             KeyboardInterrupt: If the user interrupts.
         """
@@ -221,22 +201,19 @@ class LocalRun:
         # Their folder is private: it also contains this run's key.
         with tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder()) as sockets:
             url = f"unix:{sockets}/api.sock" if self._api else ""
-            with contextlib.ExitStack() as stack:
-                kind = SESSION if self._session else RUN
-                is_announced = stack.enter_context(announced(self._folder, url, kind))
-                if url and not is_announced:
-                    self._see([Fault(0, "unannounced", UNANNOUNCED.format(url))])
-                key = Path(sockets, "key")
-                key.touch(0o600)
-                key.write_text(write(KeySet(Key(os.urandom(KEY_SIZE)))), encoding="ascii")
-                try:
-                    self._fly(limit, Path(sockets), url)
-                finally:
-                    self._stop()
-                    (self._folder / API_FILE).unlink(missing_ok=True)
-                    shutil.rmtree(self._folder / LINK_FOLDER, ignore_errors=True)
-                    if self._session:
-                        self.announcement = stack.pop_all()
+            kind = SESSION if self._session else RUN
+            self.announcement.enter_context(announced(self._folder, url, kind))
+            key = Path(sockets, "key")
+            key.touch(0o600)
+            key.write_text(write(KeySet(Key(os.urandom(KEY_SIZE)))), encoding="ascii")
+            try:
+                self._fly(limit, Path(sockets), url)
+            finally:
+                self._stop()
+                (self._folder / API_FILE).unlink(missing_ok=True)
+                shutil.rmtree(self._folder / LINK_FOLDER, ignore_errors=True)
+                if not self._session:
+                    self.announcement.close()
 
     def _fly(self, limit: float, sockets: Path, url: str) -> None:
         folder, link, session = self._folder, self._folder / LINK_FOLDER, self._session
@@ -277,7 +254,6 @@ class LocalRun:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=errors,
-                env={**os.environ, PARENT: str(os.getpid())},
                 start_new_session=True,  # Ctrl-C reaches only the supervisor, which ends them
             )
         assert process.stdout is not None
@@ -334,7 +310,7 @@ class LocalRun:
                 continue
             how = f"signal {-code}" if code < 0 else f"exit code {code}"
             said = child.log.read_text(errors="replace").strip() or "it left no message"
-            raise ProcessDiedError(
+            raise InvalidRunError(
                 f"the {child.name} process died in flight ({how}): {said.splitlines()[-1]}; "
                 f"see {child.log}"
             )

@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.record.recorder import Recorder
 
-PARENT = "CLOUDRC_PARENT"
-"""Environment variable with the process id of the supervisor."""
 READY = "ready"
 """Line that a process prints once it can receive datagrams, and then every `ALIVE_PERIOD`."""
 ALIVE_PERIOD = 1.0
@@ -67,8 +65,6 @@ recorded again, for recordings whose earlier part is cut off."""
 CLOCK_STEP = 0.1
 """Smallest step of the wall clock that is recorded [s]."""
 SINCE_BOOT = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)  # Linux has CLOCK_BOOTTIME
-NONSENSE = (OSError, ValueError, TypeError, AttributeError, OverflowError, RecursionError)
-"""Errors that an unreadable or malformed file can raise."""
 
 
 class StopSignal:
@@ -78,10 +74,7 @@ class StopSignal:
     """
 
     def __init__(self) -> None:
-        self._asked = False
-        # If the supervisor has ended before this line runs, getppid() is not the supervisor's id.
-        parent = os.environ.pop(PARENT, "")
-        self._parent = int(parent) if parent.isdecimal() else os.getppid()
+        self._asked, self._parent = False, os.getppid()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._ask)
 
@@ -229,11 +222,11 @@ class LinkNotes:
             seen = version(self._path)
             if begins or seen != self._seen:
                 self._seen = seen  # do not read a malformed file again and again
-                with suppress(*NONSENSE):
+                with suppress(Exception):  # a missing or malformed file
                     noted += self._read_state(begins, now_ns, slip_ns)
         if now_ns >= self._released_ns:
             self._released_ns = now_ns + RELEASED_PERIOD_NS
-            with suppress(*NONSENSE):
+            with suppress(Exception):
                 noted += self._read_lateness(now_ns - slip_ns)
         return noted
 
@@ -347,11 +340,8 @@ class EndProcess:
 
     def _clock_step(self) -> float:
         """Return by how much the wall clock was set since the last call [s]; 0 if it was not."""
-        before, wall = time.clock_gettime(SINCE_BOOT), time.time()
-        boot = time.clock_gettime(SINCE_BOOT)
-        if boot - before > CLOCK_STEP / 2.0:
-            return 0.0  # the process was paused while it read the clocks: the next call compares
-        step, self._clock_offset = wall - boot - self._clock_offset, wall - boot
+        offset = time.time() - time.clock_gettime(SINCE_BOOT)
+        step, self._clock_offset = offset - self._clock_offset, offset
         return step if abs(step) > CLOCK_STEP else 0.0
 
     def _count_losses(self, stamp_ns: int) -> Counted:

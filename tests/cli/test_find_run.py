@@ -24,7 +24,6 @@ def elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(folder)
     monkeypatch.setenv("KUBECONFIG", str(tmp_path / "none"))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     return folder
 
 

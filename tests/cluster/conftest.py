@@ -15,10 +15,6 @@ from cloudrc.cluster import client, flight, jobs
 from cloudrc.cluster.client import connect
 from cloudrc.cluster.jobs import UID_LABEL
 
-VERSION_KEYS = (
-    "buildDate compiler gitCommit gitTreeState gitVersion goVersion major minor platform".split()
-)
-
 
 class FakeApi:
     """Objects of a namespace by (plural, name); `refuse` maps a method and plural to an error."""
@@ -29,7 +25,6 @@ class FakeApi:
         self.refuse = {}
         self.seen = []
         self.hooks = []  # each gets the path that is read; what it returns is the reply
-        self.version = {"major": "1", "minor": "33"}
         self.lock = threading.RLock()
         self._clock = itertools.count()
         self.server = serve(lambda request, body: self.answer(request.command, request.path, body))
@@ -52,8 +47,6 @@ class FakeApi:
 
     def answer(self, method, path, body):
         address = urlsplit(path)
-        if address.path == "/version/":
-            return 200, {**dict.fromkeys(VERSION_KEYS, ""), **self.version}
         parts = address.path.strip("/").split("/")
         _, plural, *rest = parts[parts.index("namespaces") + 1 :]
         name, subresource = (*rest, "", "")[:2]
@@ -142,7 +135,7 @@ def serve(answer):
 
 
 class FakeTeleop:
-    """The API and the metrics of a cloud pod, with a record of its requests."""
+    """The API of a cloud pod, with a record of its requests."""
 
     def __init__(self):
         self.mission = None
@@ -151,8 +144,6 @@ class FakeTeleop:
         self.server = serve(self._answer)
 
     def _answer(self, request, body):
-        if request.path == "/metrics":
-            return 200, 'cloudrc_link_info{direction="uplink",shaper="relay"} 1.0\n'
         self.tokens.add(request.headers["Authorization"])
         if request.command == "GET":
             return 200, {"missions": [], "mission": self.mission}
@@ -160,10 +151,9 @@ class FakeTeleop:
         return 200, {}
 
     def forwards(self):
-        """Write a fake kubectl that forwards all ports of a pod to this server."""
-        here = f"Forwarding from 127.0.0.1:{self.server.server_port}"
-        lines = (f"echo '{here} -> {port}'" for port in (8080, 9100, 9101, 9102))
-        return "\n".join([*lines, "exec sleep 60"])
+        """Write a fake kubectl that forwards the API's port to this server."""
+        here = f"Forwarding from 127.0.0.1:{self.server.server_port} -> 8080"
+        return f"echo '{here}'\nexec sleep 60"
 
 
 def kubeconfig(url):
@@ -244,7 +234,7 @@ def api(tmp_path, monkeypatch):
     path.write_text(kubeconfig(server.url))
     monkeypatch.setattr(CONFIG_PLACE, str(path))
     monkeypatch.setattr(jobs, "LOOK_PERIOD", 0.01)
-    monkeypatch.setattr(client, "OUTAGE_PERIOD", 0.01)
+    monkeypatch.setattr(client, "RETRIES", {**client.RETRIES, "backoff_factor": 0.01})
     monkeypatch.setattr(flight, "LOOK_PERIOD", 0.01)
     monkeypatch.setattr(flight, "FAILURE_TIME", 0.0)
     yield server

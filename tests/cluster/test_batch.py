@@ -55,12 +55,6 @@ def test_a_running_job_is_kept_and_a_failed_job_is_replaced(started, api, releas
     assert api.get("jobs", "sweep-1")["metadata"]["uid"] != first
 
 
-def test_too_many_flights_are_refused(api, release):
-    with pytest.raises(ClusterError, match="split the file"):
-        batch.start(release, "sweep-1", bytes(batch.SIZE_MAX + 1), 4, **WORDS)
-    assert api.jobs() == []
-
-
 def test_the_lines_of_lost_and_complete_pods_are_read(started, api, release):
     add_pod(api, "a", "Running", "row 1\n")
     add_pod(api, "b", "Failed", "row 2\n", state=terminated(137, ""))

@@ -3,7 +3,7 @@
 import pytest
 
 from cloudrc.cluster import client
-from cloudrc.cluster.client import ClusterError, Release, UnavailableError, connect
+from cloudrc.cluster.client import ClusterError, Release, connect
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.pods import find_pod, list_pods
@@ -34,9 +34,8 @@ def test_a_missing_or_broken_kubeconfig_is_named_with_a_remedy(tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("code", "said", "expected"),
     [
-        (401, "Unauthorized", "log in"),
-        (403, 'User "system:anonymous" cannot list', "log in to the cluster again"),
-        (403, "exceeded quota: compute", "exceeded quota: compute$"),
+        (401, "Unauthorized", "Unauthorized; check your permission: kubectl auth can-i list pods"),
+        (403, 'User "me" cannot list', "can-i list pods"),
         (500, "etcd\nis gone", "etcd is gone"),
     ],
 )
@@ -57,30 +56,26 @@ def test_the_newest_pod_of_the_release_is_found(api, release):
     assert find_pod(release, "cloud").metadata.name == "new"
 
 
-def test_only_a_short_outage_is_waited_for(running, release, monkeypatch):
+def test_only_a_short_outage_is_waited_for(running, release):
     run_job(release, MISSION, name="first")
     running.start_pod("first", state=terminated(0, "done"))
     running.logs["first-x"] = "waypoint 1 of 1 reached\n"
     running.end("first", "Complete")
     for plural, code in (("jobs", 429), ("pods", 500)):
         left, lines = running.away(plural, code, 3), []
-        assert follow(release, "first", lines.append, timeout=10.0).exit_code == 0
-        assert left == []
-        told, last = lines
-        assert "leader changed" in told
-        assert last == "waypoint 1 of 1 reached"
+        assert follow(release, "first", lines.append).exit_code == 0
+        assert (left, lines) == ([], ["waypoint 1 of 1 reached"])
     left = running.away("deployments", 500, 2)
     wait_ready(release, timeout=10.0)
     assert left == []
-    monkeypatch.setattr(client, "OUTAGE_MAX", 0.05)
     left = running.away("jobs", 403, 5)
     with pytest.raises(ClusterError, match="can-i get jobs"):
-        follow(release, "first", print, timeout=10.0)
+        follow(release, "first", print)
     assert len(left) == 4, "a refusal is not repeated"
     left.clear()
     running.away("jobs", 500, 1_000_000)
-    with pytest.raises(UnavailableError, match="leader changed"):
-        follow(release, "first", print, timeout=10.0)
+    with pytest.raises(ClusterError, match="leader changed"):
+        follow(release, "first", print)
 
 
 def test_the_chart_is_found_in_the_repository_and_in_a_wheel(tmp_path):
@@ -101,10 +96,11 @@ def test_the_chart_is_found_in_the_repository_and_in_a_wheel(tmp_path):
     ],
 )
 def test_the_error_of_a_program_becomes_one_line(pretend, monkeypatch, script, kind, expected):
+    monkeypatch.setattr(client, "PROGRAM_LIMIT", 0.3 if "sleep" in script else 10.0)
     pretend("helm", f"exec >&2\n{script}\nexit 1")
     with pytest.raises(kind, match=expected) as caught:
-        client.run("helm", ["list", "--all"], timeout=0.3 if "sleep" in script else 10.0)
+        client.run("helm", ["list", "--all"])
     assert "\n" not in str(caught.value)
     monkeypatch.setenv("PATH", "")
     with pytest.raises(MissingPrerequisiteError, match=r"helm is not installed; .*doctor"):
-        client.run("helm", ["version"], timeout=1.0)
+        client.run("helm", ["version"])

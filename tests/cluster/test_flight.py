@@ -2,16 +2,17 @@
 
 import json
 from functools import cache
+from math import nan
 from unittest.mock import Mock
 
 import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.cluster import flight, pods
-from cloudrc.cluster.client import ClusterError, connect
-from cloudrc.cluster.jobs import run_job
+from cloudrc.cluster.client import ClusterError
 from cloudrc.config.load import load_experiment
 from cloudrc.record.writer import McapWriter
+from cloudrc.records import LinkChanged
 from tests.cluster.conftest import terminated
 from tests.flights.conftest import records
 
@@ -22,7 +23,9 @@ LINE = ["run", NAME, "--set", SETTING, "--mode", "cluster", "-o", "json"]
 
 @cache
 def flown():
-    return records(load_experiment(NAME, [SETTING]))
+    world, cloud = records(load_experiment(NAME, [SETTING]))
+    link = LinkChanged(world[0].stamp_ns, True, "relay", "", 0.0, nan, 0.02, 0.0, 0.0, nan, "{}")
+    return [link, *world], cloud
 
 
 def later(given, by_ns):
@@ -96,7 +99,7 @@ def test_a_flight_on_a_cluster_writes_a_whole_run(ready, tmp_path, capsys):
     assert report["numbers"]["two"]["value"] == 2.0, "measured here, not in a pod"
     left = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"config.yaml", "mission.mcap", "report.json", "environment.json"} <= left
-    assert {"world.mcap", "cloud.mcap", "world-link.metrics", "cloud-teleop.log"} <= left
+    assert {"world.mcap", "cloud.mcap", "cloud-teleop.log"} <= left
     assert not (tmp_path / "runs").exists()
     given = json.loads((tmp_path / "values").read_text())
     assert (given["experiment"]["name"], given["metrics"]) == (NAME, BEFORE["metrics"])
@@ -139,7 +142,7 @@ def test_the_recording_from_before_a_restart_is_copied(ready, tmp_path, capsys, 
     assert {path.name: path.read_text() for path in found} == wanted
 
 
-def test_a_broken_port_forward_loses_metrics_but_no_report(ready, tmp_path, capsys, monkeypatch):
+def test_a_broken_connection_loses_logs_but_no_report(ready, tmp_path, capsys, monkeypatch):
     def fails(*arguments):
         raise ClusterError("no way to the pod")
 
@@ -148,15 +151,14 @@ def test_a_broken_port_forward_loses_metrics_but_no_report(ready, tmp_path, caps
         fails()
 
     fetch_recording = pods.fetch_recording
-    monkeypatch.setattr(pods, "fetch_metrics", fails)
+    monkeypatch.setattr(pods, "fetch_logs", fails)
     monkeypatch.setattr(pods, "fetch_recording", fails_once)
     ends(ready)
     assert main([*LINE, "--out", "out"]) == 6
     captured = capsys.readouterr()
-    assert json.loads(captured.out)["shaper"] == "unknown"
-    assert "without the world pod's metrics: no way to the pod" in captured.err
+    assert json.loads(captured.out)["shaper"] == "relay"
+    assert "without the world pod's logs: no way to the pod" in captured.err
     assert "no way to the pod; trying again" in captured.err
-    assert (tmp_path / "out" / "cloud-teleop.log").is_file()
 
 
 def test_an_interrupted_flight_cancels_and_reports_its_mission(
@@ -178,9 +180,6 @@ def test_a_run_does_not_end_a_flight_in_progress(ready, teleop, tmp_path, capsys
     said = capsys.readouterr().err
     assert "mission m7 is under way on release 'cloudrc'" in said
     assert "end it: cloudrc mission cancel m7 --namespace=demo --release=cloudrc, or" in said
-    run_job(connect(), {}, name="first")
-    assert main([*LINE, "--out", "out"]) == 5
-    assert "Job 'first' is under way" in capsys.readouterr().err
     assert not (tmp_path / "helm").exists()
     assert not (tmp_path / "out").exists()
 

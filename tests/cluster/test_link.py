@@ -50,7 +50,7 @@ class Cluster:
         self.cannot = {}  # pod -> word in a profile that it refuses
         self.asked, self.handed, self.kept = [], {}, {}
 
-    def run(self, name, words, *, timeout, given=""):
+    def run(self, name, words, *, given=""):
         assert name == "kubectl"
         self.asked.append(words)
         verb = next(word for word in words if word in ("get", "patch", "exec"))

@@ -1,4 +1,4 @@
-"""Failures of pods are explained, ports are forwarded, tokens are read and never printed."""
+"""Failures of pods are explained, ports and pages forwarded, tokens read and never printed."""
 
 import os
 import re
@@ -104,3 +104,28 @@ def test_ports_are_forwarded_while_the_block_runs(release, pretend, monkeypatch,
         pretend("kubectl", script)
         with pytest.raises(error, match=words), pods.forwarded(release, "cloud-1", [8080]):
             pytest.fail("there is no way")
+
+
+KUBECTL = """\
+case "$*" in
+*port-forward*) echo "Forwarding from 127.0.0.1:4321 -> 8090"; exec sleep 60;;
+*logs*--container=console*) echo "console: http://127.0.0.1:8090"; echo "link set uplink.loss=0.1";;
+esac
+"""
+
+
+def test_a_release_without_a_console_says_how_to_get_one(api, release):
+    api.put("pods", pod("cloud-1", "cloud"))
+    with pytest.raises(ClusterError, match=r"no console; add it: helm upgrade .*console.enabled"):
+        next(pods.follow_page(release, 0, print))
+
+
+def test_the_page_is_forwarded_and_its_log_is_read(api, release, pretend):
+    made = pod("cloud-1", "cloud")
+    made["spec"]["containers"].append({"name": "console"})
+    api.put("pods", made)
+    pretend("kubectl", KUBECTL)
+    told = []
+    lines = list(pods.follow_page(release, 0, told.append))
+    assert told == ["http://127.0.0.1:4321"]
+    assert lines[-1] == "link set uplink.loss=0.1"

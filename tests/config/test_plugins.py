@@ -69,7 +69,7 @@ def test_parameters_are_checked_against_build(share, setting, reason):
         ("def build(:", "cannot be imported: SyntaxError"),
         ("x = 1", "has no function build()"),
         ("from __future__ import annotations\ndef build(a: Nowhere = 1): ...\n",
-         "annotations of build() cannot be read: name 'Nowhere' is not defined"),
+         "annotations that cannot be read: NameError: name 'Nowhere' is not defined"),
         ("def build():\n    return 1 / 0\n", "cannot be built: ZeroDivisionError"),
         ("def build(share: float): ...", "cloud.predictor.share: is missing"),
     ],

@@ -54,7 +54,7 @@ def test_a_file_is_followed_twice_a_second(path, keys):
 
 @pytest.mark.parametrize("wrong", [b"3" * 31, b"#" * 10_000_000, "pipe", "barred"])
 def test_a_wrong_file_leaves_the_keys_and_is_told_once(wrong, path, keys, monkeypatch):
-    """A reader of a pipe would stop the loop; permissions do not change a file's version."""
+    """A reader of a pipe would stop the loop."""
     with monkeypatch.context() as patch:
         if wrong == "pipe":
             path.unlink()
@@ -70,7 +70,9 @@ def test_a_wrong_file_leaves_the_keys_and_is_told_once(wrong, path, keys, monkey
         assert keys.ring.keys.current == FIRST
         with pytest.raises(BadInputError, match=r"; make one: cloudrc key new FILE$"):
             read_keys(path)
-    if wrong != "barred":
+    if wrong == "barred":
+        path.chmod(0o600)
+    else:
         put(path, b"2" * 32)
     keys.follow(3 * PERIOD_NS)
     assert keys.ring.keys.current == SECOND

@@ -14,10 +14,11 @@ import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
+from cloudrc.cli.link_verify import fetch
 from cloudrc.cluster.client import connect
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
-from cloudrc.cluster.pods import fetch_metrics, fetch_recording
+from cloudrc.cluster.pods import METRICS, fetch_recording, forwarded
 from cloudrc.errors import CloudrcError
 from tests.drivers.conftest import WORK, slower
 
@@ -136,7 +137,10 @@ def identity():
 
 def scrapes(component):
     """Return the page /metrics of each container of a pod."""
-    return fetch_metrics(place(), component)
+    name, ports = pod(component)["metadata"]["name"], METRICS[component]
+    with forwarded(place(), name, list(ports.values())) as local:
+        urls = {each: f"http://127.0.0.1:{local[port]}/metrics" for each, port in ports.items()}
+        return {container: fetch(url) for container, url in urls.items()}
 
 
 def samples(text):
@@ -187,10 +191,10 @@ def mean_delays(seconds):
     return found
 
 
-def job_end(name, timeout=150.0):
+def job_end(name):
     """Wait for the end of a Job; return its final state and its log."""
     lines: list[str] = []
-    return follow(place(), name, lines.append, timeout=timeout), "\n".join(lines)
+    return follow(place(), name, lines.append), "\n".join(lines)
 
 
 def job_log(name):

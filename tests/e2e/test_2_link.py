@@ -76,7 +76,7 @@ def flight(installed, prometheus):
     assert read("job", "long")["status"].get("active") == 1, "it flies still"
     assert identity() == before, "a profile's change must not restart anything"
     in_release("mission", "cancel")
-    end, _ = job_end("long", 30.0)
+    end, _ = job_end("long")
     assert (end.state, end.exit_code) == ("failed", INTERRUPTED), end
 
 

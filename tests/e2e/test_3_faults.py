@@ -94,7 +94,7 @@ def test_a_deleted_cloud_is_replaced_and_the_mission_goes_on(installed, note):
 def test_a_deleted_world_ends_the_mission_as_failed(installed):
     fly_until("orphaned", "waypoint 1 of 7 reached")
     replace("world")
-    end, _ = job_end("orphaned", 90.0)
+    end, _ = job_end("orphaned")
     assert (end.state, end.exit_code) == ("failed", 1), end
     assert "world_restarted" in end.message
     wait_ready(place(), timeout=60.0)
