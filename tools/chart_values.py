@@ -25,14 +25,23 @@ def _either(*parts: Schema) -> Schema:
     return {"anyOf": [*parts]}
 
 
+def _text(pattern: str) -> Schema:
+    return {"type": "string", "pattern": pattern}
+
+
+def _one_of(*names: str) -> Schema:
+    return {"type": "string", "enum": [*names]}
+
+
 def _ref(name: str) -> Schema:
     return {"$ref": f"#/$defs/{name}"}
 
 
 NULL, OBJECT, STRING = {"type": "null"}, {"type": "object"}, {"type": "string"}
 TEXTS = {**OBJECT, "additionalProperties": STRING}
+NAME = _text(r"^$|^[a-z0-9]([-a-z0-9.]*[a-z0-9])?$")
 NUMBER = {"type": "number", "minimum": 0}
-QUANTITY = _either({**STRING, "pattern": r"^[0-9]+(\.[0-9]+)?(m|k|Ki|M|Mi|G|Gi|T|Ti)?$"}, NUMBER)
+QUANTITY = _either(_text(r"^[0-9]+(\.[0-9]+)?(m|k|Ki|M|Mi|G|Gi|T|Ti)?$"), NUMBER)
 PEERS = {
     "type": "array",
     "items": {
@@ -43,14 +52,18 @@ PEERS = {
     },
 }
 RULES = {
+    "fullnameOverride": _text(r"^$|^[a-z]([-a-z0-9]*[a-z0-9])?$"),
+    "tag": _text(r"^$|^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$"),
+    "digest": _text(r"^$|^sha256:[0-9a-f]{64}$"),
+    "pullPolicy": _one_of("Always", "IfNotPresent", "Never"),
     "experiment": _ref("Experiment"),
-    "mode": {**STRING, "enum": ["auto", "netem", "relay"]},
+    "mode": _one_of("auto", "netem", "relay"),
     "profile": _either(STRING, _ref("Profile"), NULL),
     "traces": {
         **TEXTS,
         # Names of other files in the same folder are refused.
         "propertyNames": {
-            "pattern": r"^[-._a-zA-Z0-9]+$",
+            **_text(r"^[-._a-zA-Z0-9]+$"),
             "not": {"enum": ["profile.yaml", "change.json", "experiment.yaml"]},
         },
     },
@@ -60,16 +73,21 @@ RULES = {
     "podLabels": {**TEXTS, "propertyNames": {"not": {"pattern": r"^app\.kubernetes\.io/"}}},
     "recordingSizeLimit": QUANTITY,
     "workers": {"type": "integer", "minimum": 1, "maximum": 64},
+    "existingClaim": NAME,
+    "existingSecret": NAME,
     "size": QUANTITY,
+    "type": _one_of("ClusterIP", "NodePort", "LoadBalancer"),
+    "port": {"type": "integer", "minimum": 1, "maximum": 65_535},
     "allowFrom": PEERS,
     "dns": PEERS,
     "plan": _either(STRING, _ref("Mission"), NULL),
-    "ipFamilyPolicy": _either(STRING, NULL),
+    "interval": _text(r"^[0-9]+(ms|s|m)$"),
+    "name": NAME,
+    "ipFamilyPolicy": _either(_one_of("SingleStack", "PreferDualStack", "RequireDualStack"), NULL),
     "podSecurityContext": _either(OBJECT, NULL),
     "containerSecurityContext": _either(OBJECT, NULL),
 }
-"""Last part of a key -> schema of its value, if the type of the default is not enough. Names, ports
-and words of Kubernetes are not listed: the API server checks them."""
+"""Last part of a key -> schema of its value, if the type of the default is not enough."""
 TYPES: dict[type, Schema] = {
     bool: {"type": "boolean"},
     int: {"type": "integer", "minimum": 0},

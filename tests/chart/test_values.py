@@ -49,8 +49,10 @@ def test_the_defaults_are_valid_and_written_out():
         ({"world": {"resources": {"limits": {"memory": "64MB"}}}}, "64MB"),
         ({"world": {"podLabels": {"app.kubernetes.io/name": "x"}}}, "app.kubernetes.io/name"),
         ({"link": {"traces": {"profile.yaml": ""}}}, "profile.yaml"),
+        ({"fullnameOverride": "1abc"}, "1abc"),
         ({"metrics": {"allowFrom": [{"namespace": {"name": "x"}}]}}, "namespace"),
-        ({"teleop": {"service": {"port": "http"}}}, "http"),
+        ({"image": {"world": {"digest": "sha256:12"}}}, "sha256:12"),
+        ({"teleop": {"service": {"port": 70_000}}}, "70000"),
     ],
 )
 def test_a_wrong_value_is_refused_and_named(values, named):
