@@ -39,6 +39,7 @@ from cloudrc.config.document import write_yaml
 from cloudrc.config.load import ResolvedExperiment, dump, read_experiment
 from cloudrc.config.schema import Experiment, Profile
 from cloudrc.drivers.machine import interpreter
+from cloudrc.drivers.process import PARENT
 from cloudrc.drivers.realtime import bind, free_ports, split_address
 from cloudrc.errors import (
     BadInputError,
@@ -257,6 +258,7 @@ def _start(name: str, way: Way, shaper: str) -> subprocess.Popen[bytes]:
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
+            env={**os.environ, PARENT: str(os.getpid())},
             start_new_session=True,  # Ctrl-C reaches only this process, which ends its children
         )
 

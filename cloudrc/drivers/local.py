@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cloudrc.drivers.machine import Deadline, interpreter
-from cloudrc.drivers.process import READY, from_line
+from cloudrc.drivers.process import PARENT, READY, from_line
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.tap import TAP_FILE
 from cloudrc.drivers.teleop import PATH_MAX
@@ -254,6 +254,7 @@ class LocalRun:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=errors,
+                env={**os.environ, PARENT: str(os.getpid())},
                 start_new_session=True,  # Ctrl-C reaches only the supervisor, which ends them
             )
         assert process.stdout is not None

@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.record.recorder import Recorder
 
+PARENT = "CLOUDRC_PARENT"
+"""Environment variable with the process id of the supervisor."""
 READY = "ready"
 """Line that a process prints once it can receive datagrams, and then every `ALIVE_PERIOD`."""
 ALIVE_PERIOD = 1.0
@@ -74,7 +76,10 @@ class StopSignal:
     """
 
     def __init__(self) -> None:
-        self._asked, self._parent = False, os.getppid()
+        self._asked = False
+        # If the supervisor has ended before this line runs, getppid() is not the supervisor's id.
+        parent = os.environ.pop(PARENT, "")
+        self._parent = int(parent) if parent.isdecimal() else os.getppid()
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._ask)
 

@@ -11,6 +11,7 @@ import pytest
 from cloudrc.drivers import process
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.drivers.process import (
+    PARENT,
     PERIOD_NS,
     EndProcess,
     Feed,
@@ -33,11 +34,12 @@ from cloudrc.records import (
 from tests.console.conftest import told as sample
 
 
-def test_a_process_ends_with_its_parent(monkeypatch):
-    stop = StopSignal()
-    assert not stop()
-    monkeypatch.setattr(os, "getppid", lambda: 1)
-    assert stop()
+def test_it_ends_if_it_is_not_the_child_of_who_has_started_it(monkeypatch):
+    for told, ends in ((os.getppid(), False), (os.getpid(), True), ("nobody", False)):
+        monkeypatch.setenv(PARENT, str(told))
+        assert StopSignal()() is ends
+        assert PARENT not in os.environ  # children must not inherit it
+    assert StopSignal()() is False, "nothing was told"
 
 
 def test_cloud_ends_once_nothing_flies_or_after_its_last_word():
