@@ -130,7 +130,7 @@ def make_profile_loader(direction: str) -> Load:
 
 def _machine(options: argparse.Namespace, seed: int, programs: Programs, tables: Path) -> Machine:
     from cloudrc.link.model import LinkDirection
-    from cloudrc.link.netem import Netem, may_shape
+    from cloudrc.link.netem import Netem
     from cloudrc.link.profile import DirectionProfile
     from cloudrc.link.relay import RelayShaper, ask_for_fifo, settle
     from cloudrc.link.sidecar import Machine
@@ -150,8 +150,7 @@ def _machine(options: argparse.Namespace, seed: int, programs: Programs, tables:
             programs, profile, origin_ns=origin_ns, clock=clock, wait=wait, tables=tables, log=log
         )
 
-    allowed = may_shape(Path("/proc/self/status").read_text(encoding="ascii"))
-    return Machine(relay, netem, allowed, clock, wait, log)
+    return Machine(relay, netem, clock, wait, log)
 
 
 def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None:

@@ -18,12 +18,10 @@ net/sched/sch_netem.c (tabledist).
 from __future__ import annotations
 
 import json
-import re
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Sequence
 from hashlib import blake2b
-from itertools import pairwise
 from math import ceil, inf
 from pathlib import Path
 from statistics import NormalDist
@@ -115,16 +113,6 @@ def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
     )
 
 
-def may_shape(status: str) -> bool:
-    """Return whether a process is root with NET_ADMIN; `status` is the text of /proc/PID/status.
-
-    Source: Linux, include/uapi/linux/capability.h: CAP_NET_ADMIN is bit 12.
-    """
-    uid = re.search(r"^Uid:\s+\d+\s+0\s", status, re.MULTILINE)
-    effective = re.search(r"^CapEff:\s+([0-9a-fA-F]+)", status, re.MULTILINE)
-    return bool(uid and effective and int(effective[1], 16) >> 12 & 1)
-
-
 _QUANTILES: dict[str, Callable[[Floats], Floats]] = {
     "uniform": lambda share: 2.0 * share - 1.0,
     "normal": np.vectorize(NormalDist().inv_cdf),
@@ -197,22 +185,6 @@ def check(profile: DirectionProfile) -> None:
             )
 
 
-def notes(profile: DirectionProfile) -> list[str]:
-    """Describe the parts of a profile that netem realises differently than the relay."""
-    starts = Timeline(profile).pass_ns
-    passed_over = sum(after - before < STEP_NS for before, after in pairwise(starts))
-    differences = {
-        f"netem hardly applies correlation {profile.correlation:g}": (
-            profile.jitter and profile.correlation
-        ),
-        "netem corrupts frames, not datagrams: the receiving kernel drops most of them by their "
-        f"checksums, so that corrupt {profile.corrupt:g} is seen as loss": profile.corrupt,
-        f"netem changes at most every {STEP_NS * 1e-6:g} ms: {passed_over} of {len(starts)} steps "
-        "of the time line come sooner, and some are skipped": passed_over,
-    }
-    return [text for text, holds in differences.items() if holds]
-
-
 def options(profile: DirectionProfile, conditions: Conditions, room: int) -> list[str]:
     """Convert the conditions at one instant to arguments of `tc qdisc add|change ... netem`.
 
@@ -281,31 +253,6 @@ def _is_ours(root: dict[str, Any]) -> bool:
     return root["handle"] == ROOT and root.get("kind") == "prio"
 
 
-class Steps:
-    """Counts the changes that a time line makes to a qdisc, and how late each change is.
-
-    `applied` counts changes that were made. `passed_over` counts changes that were skipped because
-    the next change was already due.
-    """
-
-    def __init__(self) -> None:
-        self.applied = self.passed_over = 0
-        self._lateness_ns: deque[int] = deque(maxlen=_KEPT)
-
-    def note(self, lateness_ns: int, passed_over: int) -> None:
-        """Count a change made `lateness_ns` [ns] late, and `passed_over` skipped changes."""
-        self.applied += 1
-        self.passed_over += passed_over
-        self._lateness_ns.append(lateness_ns)
-
-    def counts(self) -> dict[str, int]:
-        """Return median and 99th percentile of the lateness [ns]; {} if there was no change."""
-        if not self._lateness_ns:
-            return {}
-        found = np.quantile(self._lateness_ns, (0.5, 0.99), method="inverted_cdf").tolist()
-        return {"step_lateness_p50_ns": found[0], "step_lateness_p99_ns": found[1]}
-
-
 class Netem:
     """Shapes one direction of the link with the kernel's netem."""
 
@@ -334,7 +281,7 @@ class Netem:
         self._looked_ns, self._stepped_ns = -PERIOD_NS, origin_ns
         self._applied: list[str] = []
         self._listed: object = None
-        self.steps = Steps()
+        self._lateness_ns: deque[int] = deque(maxlen=_KEPT)
         self._take(profile, origin_ns)
 
     def _take(self, profile: DirectionProfile, origin_ns: int) -> None:
@@ -404,14 +351,19 @@ class Netem:
                 return
 
     def counts(self) -> dict[str, int]:
-        """Return numbers of datagrams, the values of `Steps.counts`, and the count `restored`.
+        """Return numbers of datagrams, the lateness of the time line, and the count `restored`.
 
         The datagrams are `forwarded` (including copies), `lost` (dropped at random or because the
-        queue was full) and `held` (in the queue now); absent if the qdisc is missing. `restored` is
-        the number of times that another program removed or changed the qdiscs. The name is
-        historical: `Netem` does not restore them.
+        queue was full) and `held` (in the queue now); absent if the qdisc is missing.
+        `step_lateness_p50_ns` and `_p99_ns` are percentiles of the lateness with which the time
+        line changed the qdisc [ns]. `restored` is the number of times that another program removed
+        or changed the qdiscs. The name is historical: `Netem` does not restore them.
         """
-        return self._look() | self.steps.counts() | {"restored": self._damages}
+        found = self._look() | {"restored": self._damages}
+        if self._lateness_ns:
+            late_ns = np.quantile(self._lateness_ns, (0.5, 0.99), method="inverted_cdf").tolist()
+            found |= {"step_lateness_p50_ns": late_ns[0], "step_lateness_p99_ns": late_ns[1]}
+        return found
 
     def released(self) -> dict[str, int]:
         """Return an empty dict: the kernel does not report when datagrams leave the queue."""
@@ -476,7 +428,7 @@ class Netem:
         if 0 <= before < self._piece:  # the first piece of a time line is no change
             self._stepped_ns = self._clock()
             due_ns = self._origin_ns + starts_ns[self._piece]
-            self.steps.note(self._stepped_ns - due_ns, self._piece - before - 1)
+            self._lateness_ns.append(self._stepped_ns - due_ns)
 
     def _next_ns(self) -> float:
         """Return the time of the next change on `clock` [ns]; infinite after the last change."""

@@ -14,9 +14,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
 
-from cloudrc.errors import CloudrcError, MissingPrerequisiteError
+from cloudrc.errors import CloudrcError
 from cloudrc.link.follow import Loaded
-from cloudrc.link.netem import Iproute2, Netem, Run, notes
+from cloudrc.link.netem import Iproute2, Netem, Run
 from cloudrc.link.profile import DirectionProfile, Timeline, settled
 from cloudrc.link.relay import Address, RelayShaper
 from cloudrc.link.state import (
@@ -60,11 +60,10 @@ def find_netems(run: Run, host: str) -> dict[str, Any]:
 
 
 class Machine(NamedTuple):
-    """Functions and permissions of the machine on which a sidecar runs."""
+    """Functions of the machine on which a sidecar runs."""
 
     relay: Make  # makes a `RelayShaper`
     netem: Make  # makes a `Netem`, without changing the network yet
-    may_shape: bool  # whether this process is root with NET_ADMIN
     clock: Callable[[], int]  # returns the time on the monotonic clock [ns]
     wait: Callable[[float], None]  # sleeps for a time [s]
     log: Callable[[str], None]  # writes one line to the log
@@ -186,11 +185,6 @@ class Sidecar:
         if mode != "relay":
             netem = machine.netem(profile.direction, self._origin_ns)
             try:
-                if not machine.may_shape:
-                    raise MissingPrerequisiteError(
-                        "no uid 0 with NET_ADMIN; give this container both, or set "
-                        "link.mode=relay, which needs neither"
-                    )
                 return netem, netem.follow_peer(peer)
             except CloudrcError as error:
                 if mode == "netem":
@@ -228,8 +222,6 @@ class Sidecar:
         """Write the new state to the state file, and export it as metrics."""
         change, asked = self._change_of(profile), summary(profile.direction)
         before = self._in_force[0] if self._in_force else None
-        for note in notes(profile.direction) if shaper.name == "netem" else ():
-            self._machine.log(note)
         state = LinkState(
             shaper=shaper.name,
             reason=self._reason,

@@ -1,7 +1,6 @@
 """netem with a fake kernel: arguments of tc, set-up, restart, time line and removal."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +18,6 @@ from cloudrc.link.netem import (
     check,
     explain,
     limit,
-    may_shape,
-    notes,
     options,
     table,
     write_table,
@@ -179,13 +176,6 @@ def test_only_lossy_of_the_shipped_profiles_needs_the_relay():
     assert all(map(text, profiles.values()))
 
 
-def test_deviations_of_netem_are_reported():
-    profile = DirectionProfile(0.1, 0.01, correlation=0.3)
-    assert notes(profile) == ["netem hardly applies correlation 0.3"]
-    assert notes(replace(profile, correlation=0.0)) == []
-    assert "seen as loss" in notes(DirectionProfile(corrupt=0.01))[0]
-
-
 @pytest.mark.parametrize("distribution", sorted(STRETCH))
 def test_tables_are_the_models_distributions(distribution, tmp_path):
     profile = DirectionProfile(jitter=1.0, distribution=distribution)
@@ -216,13 +206,6 @@ def test_an_error_of_tc_becomes_one_sentence(answer, words):
     assert words in said
     assert "link.mode=relay" in said
     assert "\n" not in said
-
-
-def test_root_with_the_capability_may_shape():
-    status = "Name:\tpython\nUid:\t{0}\t{0}\t{0}\t{0}\nCapPrm:\t0\nCapEff:\t{1}\n"
-    assert may_shape(status.format("0", "0000000000001000"))
-    assert not may_shape(status.format("0", "00000000a80425fb")), "a container's default"
-    assert not may_shape(status.format("10001", "0000000000001000"))
 
 
 def test_only_tunnel_datagrams_go_to_netem_and_close_removes_all():
@@ -320,14 +303,14 @@ def test_a_step_is_taken_when_it_is_due():
         (pytest.approx(1511.0), "100000.000us", "100%"),
         (pytest.approx(1561.0), "100000.000us", "0%"),
     ]
-    assert (shaper.steps.applied, shaper.steps.passed_over) == (3, 0)
+    late_ns = [shaper.counts()[f"step_lateness_p{share}_ns"] for share in (50, 99)]
+    assert late_ns == pytest.approx([0, 0], abs=1000)
 
 
-def test_changes_faster_than_the_step_are_skipped_and_counted():
+def test_changes_faster_than_the_step_are_skipped():
     times = tuple(0.001 * n for n in range(1000))
     trace = Trace(times, tuple(0.03 + 1e-5 * n for n in range(1000)))
-    kernel, shaper = shaped(DirectionProfile(trace=trace), 1.2)
+    kernel, _ = shaped(DirectionProfile(trace=trace), 1.2)
     assert np.diff([at for at, _, _ in kernel.history]).min() >= 4.999
-    applied = shaper.steps.applied
-    assert (applied + shaper.steps.passed_over, applied >= 199) == (999, True)
+    assert len(kernel.history) >= 199
     assert kernel.history[-1][1] == "39990.000us"

@@ -51,7 +51,7 @@ class Shaper:
 class Bench:
     """A sidecar whose time passes in `wait`, which runs the planned events."""
 
-    def __init__(self, folder, mode, refuses=None, may_shape=True, profile=None):
+    def __init__(self, folder, mode, refuses=None, profile=None):
         self.did, self.log, self.routes, self.plan, self.now_ns = [], [], [], [], 0
         self.counted_ns, self.origins_ns, self.delays = [], [], []
         self.route, self.state = folder / "route", folder / "link.json"
@@ -67,7 +67,6 @@ class Bench:
         machine = Machine(
             relay=relay,
             netem=netem,
-            may_shape=may_shape,
             clock=lambda: self.now_ns,
             wait=self.wait,
             log=self.log.append,
@@ -134,20 +133,17 @@ def test_auto_takes_netem_where_it_works(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("refuses", "may_shape", "reason"),
+    ("refuses", "reason"),
     [
-        (NO_NETEM, True, "this kernel has no sch_netem"),
-        (REFUSED, True, "netem cannot do delay_ms above 274000 (far)"),
-        (None, False, "no uid 0 with NET_ADMIN"),
+        (NO_NETEM, "this kernel has no sch_netem"),
+        (REFUSED, "netem cannot do delay_ms above 274000 (far)"),
     ],
 )
-def test_where_netem_fails_auto_takes_the_relay_and_netem_ends(
-    tmp_path, refuses, may_shape, reason
-):
-    told = Bench(tmp_path, "auto", refuses, may_shape).run().told()
+def test_where_netem_fails_auto_takes_the_relay_and_netem_ends(tmp_path, refuses, reason):
+    told = Bench(tmp_path, "auto", refuses).run().told()
     said = f"netem does not work here: {reason}"
     assert (told["shaper"], told["reason"]) == ("relay", said)
-    bench = Bench(tmp_path, "netem", refuses, may_shape)
+    bench = Bench(tmp_path, "netem", refuses)
     with pytest.raises((MissingPrerequisiteError, BadInputError), match=re.escape(reason)):
         bench.run()
     assert not bench.route.exists()
