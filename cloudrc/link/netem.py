@@ -34,6 +34,7 @@ from cloudrc.link.draws import PARETO_CUT, Floats
 from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Loss, Timeline
 from cloudrc.link.relay import Address
 
+USE_RELAY = "use the relay (link.mode=relay, or --shaper relay)"
 NOT_FOUND = 127  # exit code that stands for a program that does not exist
 ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"  # root qdisc, band of the tunnel, its netem
 PERIOD_NS = 1_000_000_000  # time between two checks of the qdiscs [ns]
@@ -109,7 +110,7 @@ def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
             "a namespace for privileged pods, or "
         )
     return MissingPrerequisiteError(
-        f"{cause}; {remedy}set link.mode=relay, which needs no kernel module"
+        f"{cause}; {remedy}{USE_RELAY}, which needs no kernel module"
     )
 
 
@@ -180,9 +181,7 @@ def check(profile: DirectionProfile) -> None:
     }
     for what, holds in refused.items():
         if holds:
-            raise BadInputError(
-                f"netem cannot do {what}; set link.mode=relay, which can, or leave it out"
-            )
+            raise BadInputError(f"netem cannot do {what}; {USE_RELAY}, which can, or leave it out")
 
 
 def options(profile: DirectionProfile, conditions: Conditions, room: int) -> list[str]:
@@ -401,7 +400,7 @@ class Netem:
         if root["handle"] != "0:" and not _is_ours(root):
             raise MissingPrerequisiteError(
                 f"{self._device} has a qdisc already ({root['kind']} {root['handle']}) that is not "
-                f"cloudrc's; remove it ('tc qdisc del {' '.join(place)}'), or set link.mode=relay"
+                f"cloudrc's; remove it ('tc qdisc del {' '.join(place)}'), or {USE_RELAY}"
             )
         if not _is_ours(root):
             self._iproute2.tc("qdisc", "add", *place, "handle", ROOT, *_PRIO)

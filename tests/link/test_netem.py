@@ -164,7 +164,7 @@ def test_a_profile_becomes_arguments_of_tc(profile, at, words):
     ],
 )
 def test_a_profile_beyond_netem_is_refused_by_key(profile, key):
-    with pytest.raises(BadInputError, match=r"netem cannot do .*; set link\.mode=relay") as refused:
+    with pytest.raises(BadInputError, match=r"netem cannot do .*; use the relay") as refused:
         check(profile)
     assert key in str(refused.value)
 

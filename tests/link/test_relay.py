@@ -230,7 +230,7 @@ def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(tmp_path):
     command = [*(bare if os.geteuid() == 0 else []), sys.executable, "-m", "cloudrc", *words]
     refused = subprocess.run([*command, "netem"], cwd=ROOT, capture_output=True, text=True)
     assert refused.returncode == MissingPrerequisiteError.exit_code
-    assert "give it NET_ADMIN and uid 0, or set link.mode=relay" in refused.stderr
+    assert "give it NET_ADMIN and uid 0, or use the relay" in refused.stderr
     with subprocess.Popen([*command, "auto"], cwd=ROOT) as process:
         killer = Timer(PATIENCE, process.kill)  # where this test fails, the process ends, too
         killer.start()
