@@ -15,7 +15,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from dataclasses import asdict
+from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -29,11 +30,14 @@ from cloudrc.cli.processes import (
     warn_if_exposed,
 )
 from cloudrc.drivers.process import StopSignal
+from cloudrc.records import Counted
 
 if TYPE_CHECKING:
+    from cloudrc.drivers.exporter import Exporter
     from cloudrc.link.follow import Load
     from cloudrc.link.netem import Answer
     from cloudrc.link.sidecar import Machine, Sidecar
+    from cloudrc.link.state import LinkState
 
 EPILOG = ""
 TOOL_TIMEOUT = 5.0  # time limit of one call of tc or ip [s]
@@ -87,7 +91,8 @@ def execute(options: argparse.Namespace) -> int:
             mode=options.mode,
             direction=options.direction,
             route=options.route,
-            metrics=exporter,
+            tell=partial(export_state, exporter),
+            count=partial(export_counts, exporter),
         )
 
         def poll_profile() -> None:
@@ -162,11 +167,25 @@ def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None
     threading.Thread(target=work, daemon=True).start()
 
 
+def export_state(exporter: Exporter | None, state: LinkState) -> None:
+    """Export the state of one direction as metrics."""
+    if exporter:
+        exporter.shaped(state.shaper, state.direction, state.mode)
+        exporter.asked(state.direction, state.asked["delay"] or 0.0)
+        exporter.ready(True)
+
+
+def export_counts(exporter: Exporter | None, counts: dict[str, int]) -> None:
+    """Export the numbers of a shaper's datagrams by outcome as metrics."""
+    if exporter:
+        exporter.see([Counted(0, "link", name, number) for name, number in counts.items()])
+
+
 def status_page(sidecar: Sidecar) -> str:
     """Return the state of a sidecar as JSON. Any thread may call this function."""
-    peer = sidecar.peer
+    peer, state = sidecar.peer, sidecar.states.state
     netems = _find_netems(peer[0], int(time.monotonic())) if peer else {}
-    return json.dumps(sidecar.status() | netems) + "\n"
+    return json.dumps((asdict(state) if state else {}) | netems) + "\n"
 
 
 @lru_cache(maxsize=1)

@@ -21,7 +21,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -31,7 +30,7 @@ from cloudrc.drivers.realtime import Address, Peer, bind, split_address
 from cloudrc.errors import BadInputError
 from cloudrc.files import readable_by_others
 from cloudrc.link.follow import PROFILE_PERIOD, Loaded, ProfileFile
-from cloudrc.link.state import PROFILE_FILE, RELEASED_SUFFIX, LinkState, publish, summary, to_text
+from cloudrc.link.state import PROFILE_FILE, RELEASED_SUFFIX, StateFile, publish, summary
 from cloudrc.records import Counted
 
 if TYPE_CHECKING:
@@ -471,7 +470,7 @@ class RelayControl:
         self._files = {way: ProfileFile(file, make_profile_loader(way), _log) for way in links}
         self._pending: deque[tuple[str, Loaded]] = deque()
         self._applied: deque[tuple[str, Loaded, int]] = deque()
-        self._changes = dict.fromkeys(links, -1)
+        self._states = {way: StateFile(folder / f"{way}.json", "relay", way) for way in links}
         for way, loaded in first.items():
             self._publish(way, loaded, time.monotonic_ns())
 
@@ -506,25 +505,12 @@ class RelayControl:
                         publish(self._folder / f"{way}{RELEASED_SUFFIX}", json.dumps(released))
 
     def _publish(self, way: str, loaded: Loaded, since_ns: int) -> None:
-        changes, requested = self._changes[way] + 1, summary(loaded.direction)
-        state = LinkState(
-            shaper="relay",
-            reason="local mode",
-            mode="relay",
-            direction=way,
-            profile=loaded.values,
-            since=datetime.now(UTC).isoformat(timespec="seconds"),
-            since_ns=since_ns,
-            changes=changes,
-            change=loaded.change.number,
-            cause=loaded.change.cause if changes else "",
-            asked=requested,
-            # None: the time line of the first profile starts with the first datagram.
-            origin_ns=since_ns if changes and loaded.change.restart else None,
-        )
-        self._asked(way, requested["delay"] or 0.0)
-        publish(self._folder / f"{way}.json", to_text(state))
-        self._changes[way] = changes
+        states = self._states[way]
+        # None: the time line of the first profile starts with the first datagram.
+        origin_ns = since_ns if states.state and loaded.change.restart else None
+        state = states.next(loaded, "relay", "local mode", since_ns, origin_ns)
+        self._asked(way, state.asked["delay"] or 0.0)
+        states.publish(state)
 
 
 def _log(line: str) -> None:

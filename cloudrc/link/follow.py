@@ -160,28 +160,23 @@ class Profiles:
     def first(self) -> Loaded:
         """Read the profile at the start; raise a BadInputError if the profile is invalid."""
         loaded = self._file.first()
-        self._is_known(loaded)
+        self._known[loaded.change.number] = loaded.values
         return loaded
 
     def poll(self) -> Loaded | None:
         """Return the profile of a change that has arrived; None if no change has arrived."""
         for source in self._sources:
             loaded = source.poll()
-            if loaded is not None and not self._is_known(loaded):
+            if loaded is None:
+                continue
+            number = loaded.change.number
+            before = self._known.get(number) if number else None
+            self._known[number] = loaded.values
+            if before is None:
                 return loaded
+            if before != loaded.values:  # `helm upgrade` keeps the number of the previous change
+                return loaded._replace(change=Change())
         return None
-
-    def _is_known(self, loaded: Loaded) -> bool:
-        """Return whether the same change has arrived before; remember a new change.
-
-        Two changes are the same only if their numbers and their profiles are equal, because
-        `helm upgrade` changes the profile but keeps the number of the previous change.
-        """
-        number = loaded.change.number
-        if not number:
-            return False
-        before, self._known[number] = self._known.get(number), loaded.values
-        return before == loaded.values
 
 
 class PeerName:

@@ -109,9 +109,7 @@ def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
             "use nodes whose kernel has them ('modprobe -a sch_netem sch_prio cls_u32' there) and "
             "a namespace for privileged pods, or "
         )
-    return MissingPrerequisiteError(
-        f"{cause}; {remedy}{USE_RELAY}, which needs no kernel module"
-    )
+    return MissingPrerequisiteError(f"{cause}; {remedy}{USE_RELAY}, which needs no kernel module")
 
 
 _QUANTILES: dict[str, Callable[[Floats], Floats]] = {

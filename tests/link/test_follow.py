@@ -116,7 +116,7 @@ def test_an_upgrade_after_a_change_by_hand_takes_effect(pod):
     pod.put(120.0, "a1")
     assert pod.poll() == (0.12, "a1")
     pod.put(45.0, "")
-    assert pod.poll() == (0.045, "a1")
+    assert pod.poll() == (0.045, "")
     publish(pod.map / "change.json", '{"number": "a2"}')
     pod.put(50.0, "")
     assert pod.poll() == (0.05, "")
