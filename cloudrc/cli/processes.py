@@ -18,7 +18,6 @@ import socket
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -446,7 +445,7 @@ def open_relay(
 class RelayControl:
     """Applies the changes of `cloudrc link set` to a relay, and publishes the relay's state.
 
-    A separate thread reads and writes the files. The relay's loop replaces the profiles.
+    A separate thread reads the files. The relay's loop replaces the profiles.
     """
 
     def __init__(
@@ -468,47 +467,43 @@ class RelayControl:
         folder.mkdir(exist_ok=True)
         file, self._released_at = folder / PROFILE_FILE, 0.0
         self._files = {way: ProfileFile(file, make_profile_loader(way), _log) for way in links}
-        self._pending: deque[tuple[str, Loaded]] = deque()
-        self._applied: deque[tuple[str, Loaded, int]] = deque()
         self._states = {way: StateFile(folder / f"{way}.json", "relay", way) for way in links}
+        self._requested, self._applied = dict(first), dict(first)
         for way, loaded in first.items():
-            self._publish(way, loaded, time.monotonic_ns())
+            self._publish(way, loaded)
 
     def swap(self) -> None:
-        """Apply the pending profiles, between two datagrams, in the thread of the relay's loop."""
-        if self._pending:
-            self._relay.take_in()
-        while self._pending:
-            way, loaded = self._pending.popleft()
-            self._links[way].replace_profile(loaded.direction, restart=loaded.change.restart)
-            self._applied.append((way, loaded, time.monotonic_ns()))
+        """Apply the requested profiles between two datagrams, in the thread of the relay's loop."""
+        for way, loaded in self._requested.items():
+            if loaded is not self._applied[way]:
+                self._relay.take_in()
+                self._links[way].replace_profile(loaded.direction, restart=loaded.change.restart)
+                self._applied[way] = loaded
+                with suppress(OSError):  # the relay goes on even if the disk is full
+                    self._publish(way, loaded)
 
     def follow(self) -> None:
         """Call `look` periodically, in a thread that never ends."""
         while True:
             self.look()
-            time.sleep(PROFILE_PERIOD / 2 if self._pending else PROFILE_PERIOD)
+            time.sleep(PROFILE_PERIOD)
 
     def look(self) -> None:
-        """Read requested changes from the folder; publish applied changes and the lateness."""
+        """Read requested changes from the folder; publish the lateness of the datagrams."""
         for way, file in self._files.items():
-            if (loaded := file.poll()) is not None:
-                self._pending.append((way, loaded))
-        with suppress(OSError):  # such as a full disk: the next time tries again
-            while self._applied:  # written here, because the relay's loop must not wait for a disk
-                self._publish(*self._applied[0])
-                self._applied.popleft()
-            if time.monotonic() - self._released_at >= RELEASED_PERIOD:
-                self._released_at = time.monotonic()
-                for way in self._links:
-                    if released := self._relay.released(way):
+            self._requested[way] = file.poll() or self._requested[way]
+        if time.monotonic() - self._released_at >= RELEASED_PERIOD:
+            self._released_at = time.monotonic()
+            for way in self._links:
+                if released := self._relay.released(way):
+                    with suppress(OSError):
                         publish(self._folder / f"{way}{RELEASED_SUFFIX}", json.dumps(released))
 
-    def _publish(self, way: str, loaded: Loaded, since_ns: int) -> None:
-        states = self._states[way]
+    def _publish(self, way: str, loaded: Loaded) -> None:
+        now_ns, states = time.monotonic_ns(), self._states[way]
         # None: the time line of the first profile starts with the first datagram.
-        origin_ns = since_ns if states.state and loaded.change.restart else None
-        state = states.next(loaded, "relay", "local mode", since_ns, origin_ns)
+        origin_ns = now_ns if states.state and loaded.change.restart else None
+        state = states.next(loaded, "relay", "local mode", now_ns, origin_ns)
         self._asked(way, state.asked["delay"] or 0.0)
         states.publish(state)
 

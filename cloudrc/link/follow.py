@@ -68,23 +68,16 @@ class ProfileFile:
     def poll(self) -> Loaded | None:
         """Return the new profile if the file has changed and the profile is valid, otherwise None.
 
-        If the profile is invalid, log why. If the file changes while it is being read, return None,
-        so that the next call reads the file again.
+        If the profile is invalid, log why.
         """
-        seen = version(self._path)
-        if seen == self._seen:
+        before, self._seen = self._seen, version(self._path)
+        if self._seen == before:
             return None
-        loaded, refusal = None, ""
         try:
-            loaded = self._read()
+            return self._read()
         except (BadInputError, OSError, ValueError) as error:
-            refusal = f"the new profile is refused, the old one stays: {error}"
-        if version(self._path) != seen:
+            self._log(f"the new profile is refused, the old one stays: {error}")
             return None
-        self._seen = seen
-        if refusal:
-            self._log(refusal)
-        return loaded
 
     def _read(self) -> Loaded:
         loaded = self._load(self._path)
