@@ -28,7 +28,7 @@ import numpy as np
 
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import Trace
-from cloudrc.link.traces import Row, looks_lost, read_rows
+from cloudrc.link.traces import LATEST, Row, looks_lost, read_rows
 
 Direction: TypeAlias = Literal["uplink", "downlink"]
 Entry: TypeAlias = tuple[float, float | None]
@@ -290,7 +290,6 @@ _LOST_WORDS = {
 """Words in the delay column that mark a lost packet."""
 _LOST_NUMBERS = (-1.0, -999.0, -9999.0)  # mark a lost packet if no other delay is negative
 _FLAGS = {"0": False, "1": True, "false": False, "true": True, "no": False, "yes": True}
-LATEST = 1e11  # largest plausible time since 1970 [s]; a larger time has another unit
 
 
 def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool) -> Packets:
@@ -424,7 +423,7 @@ def _without_marks(raw: list[Entry], column: str, log: Log, *, has_losses: bool)
 _WRAP = 1 << 16
 _STAMP = re.compile(
     r"\[?(?P<unix>(?<=\[)\d+(?:\.\d+)?|\d{9,10}\.\d+)\]? +"
-    r"|(?P<date>\d{4}-\d\d-\d\d)?[T ]?(?P<clock>\d\d:\d\d:\d\d\.\d+)\S* +"
+    r"|(?P<clock>\d\d:\d\d:\d\d\.\d+)\S* +"
 )
 """Time stamp at the start of a line, from `ping -D`, `ts '[%.s]'` or `ping --apple-time`."""
 _NUMBER = re.compile(r"\b(?:icmp6?_)?(?:seq|req)[= ](\d{1,12})\b|(?<= : )\[(\d{1,12})\], ")
@@ -432,15 +431,11 @@ _ROUND_TRIP = re.compile(r"(?:[=<] ?|, )(\d+(?:[.,]\d+)?) ?(?:ms|msec|msek|мс|
 _REPLY = re.compile(r"ttl=|hlim=|bytes from", re.IGNORECASE)
 _SUMMARY = re.compile(r"xmt/rcv/%loss = (\d+)/(\d+)/|^(?!.*xmt/)\D*(\d+)\D+(\d+)\D.*%")
 """Summary at the end: packets sent, packets received."""
-_NO_STAMPS = {
-    r"(?<!_)\bseq=\d": "BusyBox's ping gives no times: ping HOST | ts '[%.s]', or use irtt",
-    r"\d data bytes|Request timeout": (
-        "on macOS -D forbids fragments: use ping --apple-time there; BSD: ping HOST | ts '[%.s]'"
-    ),
-    r"\], \d+ bytes": "run fping with -D",
-    "": "run ping with -D",
-}
-"""Pattern of a kind of ping -> how to get time stamps from it; the first match is used."""
+_STAMPS_BY = (
+    "Linux: ping -D; macOS: ping --apple-time (-D does not print times there); fping: -D; "
+    "BusyBox, BSD: ping HOST | ts '[%.s]'"
+)
+"""How to get time stamps from each kind of ping."""
 
 
 def is_ping(lines: list[str]) -> bool:
@@ -489,7 +484,7 @@ class _Ping:
 
     def __init__(self, lines: list[str], log: Log) -> None:
         self.replies: dict[int, tuple[float, float]] = {}
-        self._log, self._text = log, "\n".join(lines[:1000])
+        self._log = log
         self._told: dict[int, float] = {}  # number -> time stamp of its line, or 0 [s]
         self._summaries: list[tuple[int, int]] = []  # packets sent and received
         self._headers, self._base = 0, 1  # lines that begin a log; first number of this ping
@@ -508,9 +503,7 @@ class _Ping:
             log.unusable.append(f"{log.name}: {reason}; run: LC_ALL=C ping -D -O HOST")
             return
         if trip and stamp is None:
-            kinds = _NO_STAMPS.items()
-            remedy = next(words for kind, words in kinds if re.search(kind, self._text))
-            raise log.error(f"its lines have no [time]; {remedy}")
+            raise log.error(f"its lines have no time stamps; {_STAMPS_BY}")
         if "DUP!" in line:
             log.counts["duplicates left out"] += 1
             return
@@ -534,8 +527,6 @@ class _Ping:
             return float(stamp["unix"])
         hours, minutes, seconds = map(float, stamp["clock"].split(":"))
         clock = hours * 3600 + minutes * 60 + seconds
-        if stamp["date"]:
-            return datetime.fromisoformat(stamp["date"] + "T00:00+00:00").timestamp() + clock
         if self._clock - clock > 43_200:  # midnight
             self._midnight += 86_400.0
         self._clock = clock
