@@ -46,6 +46,7 @@ from cloudrc.errors import (
     MissingPrerequisiteError,
     TimedOutError,
 )
+from cloudrc.link.model import Stream
 from cloudrc.link.netem import check
 from cloudrc.link.sidecar import find_netems
 from cloudrc.link.state import STATE_FILE, from_text
@@ -180,23 +181,29 @@ def make_plans(
     return plans
 
 
-def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Findings]:
-    """Send all probes over a running link; return the findings on each direction."""
-    since_wall_ns, found, ends = time.time_ns() - time.monotonic_ns(), {}, []
-    states = {name: from_text((way.folder / STATE_FILE).read_text()) for name, way in ways.items()}
+def measure(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Stream]:
+    """Send all probes over a running link; return the measured stream of each direction."""
+    since_wall_ns, ends = time.time_ns() - time.monotonic_ns(), []
     for name, way in ways.items():
         route = split_address((way.folder / "route").read_text())
-        origin_ns = (states[name].origin_ns or 0) + since_wall_ns
+        origin_ns = (
+            from_text((way.folder / STATE_FILE).read_text()).origin_ns or 0
+        ) + since_wall_ns
         ends.append(ProbeEnd(way.own, route, plans[name], origin_ns))
-    streams = send_probes(ends)
+    return dict(zip(ways, send_probes(ends), strict=True))
+
+
+def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Findings]:
+    """Send all probes over a running link; return the findings on each direction."""
+    streams, found = measure(ways, plans), {}
     time.sleep(COUNTS_WAIT)
-    for (name, way), stream in zip(ways.items(), streams, strict=True):
-        with inside(way.namespace):
-            page = {"shaper": states[name].shaper, "reason": states[name].reason}
+    for name, way in ways.items():
+        page = json.loads((way.folder / STATE_FILE).read_text())
+        with inside(way.namespace):  # the process of the link may be stopped: ask the kernel
             page |= find_netems(run_tool, way.peer[0])
             metrics = read_metrics(fetch(f"http://{LOOPBACK}:{way.ports[1]}/metrics"))
-        known = read_evidence(page, metrics, len(stream.sent))
-        found[name] = Findings(plans[name].judge(stream), known)
+        known = read_evidence(page, metrics, len(streams[name].sent))
+        found[name] = Findings(plans[name].judge(streams[name]), known)
     return found
 
 
