@@ -198,19 +198,16 @@ class PeerName:
 
         If the resolution fails, return the last known address; None before the first success.
         """
-        before = self._known[-1:]
         try:
             addresses = sorted(self._resolve(self._name))
         except OSError as error:
             self.failures += 1
-            keeps = f"the link keeps {before[0]}" if before else "the link waits"
-            said, was = f"cannot be resolved ({error.strerror or error}); {keeps}", ""
+            said = f"cannot be resolved ({error.strerror or error}); its last address stays"
         else:
             kept = [address for address in self._known if address in addresses]
             self._known = kept + [address for address in addresses if address not in kept]
             said = f"is {self._known[-1]}"
-            was = f", was {before[0]}" if before and before != self._known[-1:] else ""
         if said != self._said:
             self._said = said
-            self._log(f"{self._name} {said}{was}")
+            self._log(f"{self._name} {said}")
         return (self._known[-1], self._port) if self._known else None
