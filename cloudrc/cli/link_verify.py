@@ -47,8 +47,7 @@ from cloudrc.errors import (
     TimedOutError,
 )
 from cloudrc.link.model import Stream
-from cloudrc.link.netem import check
-from cloudrc.link.sidecar import find_netems
+from cloudrc.link.netem import check, find_netems
 from cloudrc.link.state import STATE_FILE, from_text
 from cloudrc.link.verify.causes import (
     Findings,
@@ -288,20 +287,16 @@ def _namespaces() -> Iterator[dict[str, str]]:
     near, far = names.values()
     with contextlib.ExitStack() as stack:
         for name in names.values():
-            _ip("netns", "add", name)
-            stack.callback(_ip, "netns", "del", name)
-        _ip("-n", near, "link", "add", DEVICE, "type", "veth", "peer", DEVICE, "netns", far)
+            run_tool(("ip", "netns", "add", name))
+            stack.callback(run_tool, ("ip", "netns", "del", name))
+        run_tool(
+            ("ip", "-n", near, "link", "add", DEVICE, "type", "veth", "peer", DEVICE, "netns", far)
+        )
         for way, name in names.items():
-            _ip("-n", name, "addr", "add", f"{HOSTS[way]}/24", "dev", DEVICE)
+            run_tool(("ip", "-n", name, "addr", "add", f"{HOSTS[way]}/24", "dev", DEVICE))
             for device in ("lo", DEVICE):
-                _ip("-n", name, "link", "set", device, "up")
+                run_tool(("ip", "-n", name, "link", "set", device, "up"))
         yield names
-
-
-def _ip(*words: str) -> None:
-    if (answer := run_tool(("ip", *words))).code:
-        failure = " ".join(answer.error.split()) or "no program ip (package iproute2)"
-        raise MissingPrerequisiteError(f"ip {' '.join(words)}: {failure}; use --shaper relay")
 
 
 @contextlib.contextmanager

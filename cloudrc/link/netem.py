@@ -25,7 +25,7 @@ from hashlib import blake2b
 from math import ceil, inf
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -35,7 +35,6 @@ from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, L
 from cloudrc.link.relay import Address
 
 USE_RELAY = "use the relay (link.mode=relay, or --shaper relay)"
-NOT_FOUND = 127  # exit code that stands for a program that does not exist
 ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"  # root qdisc, band of the tunnel, its netem
 PERIOD_NS = 1_000_000_000  # time between two checks of the qdiscs [ns]
 STEP_NS = 5_000_000  # shortest time between two changes by a time line; faster are skipped [ns]
@@ -56,52 +55,23 @@ _PACKETS = 1_000  # assumed packet rate without a bottleneck [1/s]; tunnel and p
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
 
 
-class Answer(NamedTuple):
-    """Exit code, standard output and standard error of a program."""
-
-    code: int
-    output: str
-    error: str
+Run: TypeAlias = Callable[[Sequence[str]], str]
+"""Function that runs a program and returns its output; if that fails, it raises `explain`'s error.
+"""
 
 
-Run: TypeAlias = Callable[[Sequence[str]], Answer]
-"""Function that runs a program and waits for its end."""
+def explain(words: Sequence[str], text: str, *, missing: bool = False) -> CloudrcError:
+    """Make an error with cause and remedy from the `text` of a failed program.
 
-
-class Iproute2:
-    """Runs `tc` and `ip`; if a call fails, raises an error with cause and remedy."""
-
-    def __init__(self, run: Run) -> None:
-        self._run = run
-
-    def tc(self, *words: str) -> str:
-        """Run tc and return its output."""
-        return self._checked("tc", words)
-
-    def show(self, *words: str) -> list[dict[str, Any]]:
-        """Run `tc -s -j` with these arguments and return the objects that it prints."""
-        return list(json.loads(self._checked("tc", ("-s", "-j", *words)) or "[]"))
-
-    def device(self, host: str) -> str:
-        """Return the interface through which packets to a host leave."""
-        return str(json.loads(self._checked("ip", ("-j", "route", "get", host)))[0]["dev"])
-
-    def _checked(self, program: str, words: Sequence[str]) -> str:
-        answer = self._run((program, *words))
-        if answer.code:
-            raise explain(program, words, answer)
-        return answer.output
-
-
-def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
-    """Convert the failed call of a program into an error with cause and remedy."""
-    text = " ".join((answer.error or answer.output).split()) or f"exit code {answer.code}"
+    `words` are the program and its arguments. `missing` tells that there is no such program.
+    """
+    text = " ".join(text.split())
     unknown = "kind is unknown", "classifier not found", "answers: No such file"
-    cause, remedy = f"'{program} {' '.join(words)}' failed: {text}", ""
-    if answer.code == NOT_FOUND:
-        cause, remedy = f"no program {program} (package iproute2)", "install it, or "
+    cause, remedy = f"'{' '.join(words)}' failed: {text}", ""
+    if missing:
+        cause, remedy = f"no program {words[0]} (package iproute2)", "install it, or "
     elif "Operation not permitted" in text:
-        cause = "tc may not change the network of this container"
+        cause = f"{words[0]} may not change the network of this container"
         remedy = "give it NET_ADMIN and uid 0, or "
     elif "add" in words and any(sign in text for sign in unknown):
         cause = "this kernel lacks sch_netem, sch_prio or cls_u32"
@@ -110,6 +80,34 @@ def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
             "a namespace for privileged pods, or "
         )
     return MissingPrerequisiteError(f"{cause}; {remedy}{USE_RELAY}, which needs no kernel module")
+
+
+def show(run: Run, *words: str) -> list[dict[str, Any]]:
+    """Run `tc -s -j` with these arguments and return the objects that it prints."""
+    return list(json.loads(run(("tc", "-s", "-j", *words)) or "[]"))
+
+
+def find_device(run: Run, host: str) -> str:
+    """Return the interface through which packets to a host leave."""
+    return str(json.loads(run(("ip", "-j", "route", "get", host)))[0]["dev"])
+
+
+def find_netems(run: Run, host: str) -> dict[str, Any]:
+    """Find the interface to a host, and all netem qdiscs of this pod; {} if the kernel refuses.
+
+    Returns:
+        `interface`, and `netems`: interface -> its netem qdiscs, if it has any, as objects of
+        `tc -s -j qdisc show`.
+    """
+    netems = dict[str, list[dict[str, Any]]]()
+    try:
+        interface = find_device(run, host)
+        for one in show(run, "qdisc", "show"):
+            if one.get("kind") == "netem":
+                netems.setdefault(str(one["dev"]), []).append(one)
+    except (CloudrcError, ValueError, LookupError):
+        return {}
+    return {"interface": interface, "netems": netems}
 
 
 _QUANTILES: dict[str, Callable[[Floats], Floats]] = {
@@ -271,7 +269,7 @@ class Netem:
         `origin_ns` is the time on `clock` at which the link came up [ns]; `wait` sleeps for a time
         [s]; `tables` is the folder for the tables of distributions.
         """
-        self._iproute2 = Iproute2(run)
+        self._run = run
         self._clock, self._wait = clock, wait
         self._tables, self._log = tables, log
         self._device, self._damage, self._damages = "", "", 0
@@ -297,7 +295,7 @@ class Netem:
         Raises:
             CloudrcError: If netem cannot realise the profile, or the kernel refuses.
         """
-        device = self._iproute2.device(peer[0])
+        device = find_device(self._run, peer[0])
         if device != self._device:
             self.close()
             self._device = device
@@ -369,7 +367,7 @@ class Netem:
     def close(self) -> None:
         """Remove the qdiscs of `Netem`; queued datagrams are lost."""
         if self._device and _is_ours(_root_of(self._qdiscs())):
-            self._iproute2.tc("qdisc", "del", "dev", self._device, "root")
+            self._run(("tc", "qdisc", "del", "dev", self._device, "root"))
         self._device, self._applied = "", []
 
     def _look(self) -> dict[str, int]:
@@ -401,7 +399,7 @@ class Netem:
                 f"cloudrc's; remove it ('tc qdisc del {' '.join(place)}'), or {USE_RELAY}"
             )
         if not _is_ours(root):
-            self._iproute2.tc("qdisc", "add", *place, "handle", ROOT, *_PRIO)
+            self._run(("tc", "qdisc", "add", *place, "handle", ROOT, *_PRIO))
         self._apply("add" if leaf_of(qdiscs) is None else "change")
 
     def _step(self) -> None:
@@ -420,7 +418,7 @@ class Netem:
         wanted = options(self._profile, self._timeline.pieces[self._piece], self._room)
         if wanted != self._applied:
             place = ("dev", self._device, "parent", BAND, "handle", LEAF)
-            self._iproute2.tc("qdisc", verb, *place, "netem", *wanted)
+            self._run(("tc", "qdisc", verb, *place, "netem", *wanted))
             self._applied, self._listed = wanted, None
         if 0 <= before < self._piece:  # the first piece of a time line is no change
             self._stepped_ns = self._clock()
@@ -437,16 +435,16 @@ class Netem:
 
     def _select(self, peer: Address) -> None:
         """Direct the tunnel's datagrams to netem: add the new filter, then remove old filters."""
-        listed = self._iproute2.show("filter", "show", "dev", self._device, "parent", ROOT)
+        listed = show(self._run, "filter", "show", "dev", self._device, "parent", ROOT)
         old = sorted({int(one["pref"]) for one in listed})
         new = next(number for number in range(1, len(old) + 2) if number not in old)
         host, port = peer
         match = f"ip protocol 17 0xff match ip dst {host}/32 match ip dport {port} 0xffff"
         place = ("dev", self._device, "parent", ROOT, "pref")
         words = ("protocol", "ip", "u32", "match", *match.split(), "flowid", BAND)
-        self._iproute2.tc("filter", "add", *place, str(new), *words)
+        self._run(("tc", "filter", "add", *place, str(new), *words))
         for number in old:
-            self._iproute2.tc("filter", "del", *place, str(number))
+            self._run(("tc", "filter", "del", *place, str(number)))
 
     def _qdiscs(self) -> list[dict[str, Any]]:
-        return self._iproute2.show("qdisc", "show", "dev", self._device)
+        return show(self._run, "qdisc", "show", "dev", self._device)

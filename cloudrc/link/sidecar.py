@@ -10,11 +10,11 @@ import json
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 from cloudrc.errors import CloudrcError
 from cloudrc.link.follow import Loaded
-from cloudrc.link.netem import Iproute2, Netem, Run
+from cloudrc.link.netem import Netem
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.relay import Address, RelayShaper
 from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, StateFile, publish
@@ -28,24 +28,6 @@ Shaper: TypeAlias = RelayShaper | Netem
 """Shapes the datagrams that this pod's end of the tunnel sends."""
 Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
 """Function that makes a shaper from a profile and the monotonic start of its time line [ns]."""
-
-
-def find_netems(run: Run, host: str) -> dict[str, Any]:
-    """Find the interface to a host, and all netem qdiscs of this pod; {} if the kernel refuses.
-
-    Returns:
-        `interface`, and `netems`: interface -> its netem qdiscs, if it has any, as objects of
-        `tc -s -j qdisc show`.
-    """
-    iproute2, netems = Iproute2(run), dict[str, list[dict[str, Any]]]()
-    try:
-        interface = iproute2.device(host)
-        for one in iproute2.show("qdisc", "show"):
-            if one.get("kind") == "netem":
-                netems.setdefault(str(one["dev"]), []).append(one)
-    except (CloudrcError, ValueError, LookupError):
-        return {}
-    return {"interface": interface, "netems": netems}
 
 
 class Machine(NamedTuple):
