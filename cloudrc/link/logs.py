@@ -19,7 +19,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import datetime
 from itertools import pairwise
-from math import isfinite, isnan
 from operator import itemgetter
 from statistics import median
 from typing import Any, Literal, TypeAlias
@@ -284,12 +283,16 @@ FINER = {"s": "ms", "ms": "us", "us": "ns", "ns": "ns"}
 TIMES, DELAYS, LOSSES = ("time", "timestamp", "sent"), ("delay", "rtt"), ("loss", "lost")
 COLUMNS = "time_s and delay_ms, or with _s, _ms, _us or _ns; rtt_ for round trips; and loss"
 _LOST_WORDS = {
-    *("", "-", "*", "nan", "inf", "none", "null", "na", "n/a"),
+    *("", "-", "*", "nan", "-nan", "inf", "none", "null", "na", "n/a"),
     *("lost", "loss", "timeout", "timed out", "request timed out", "no answer yet"),
 }
 """Words in the delay column that mark a lost packet."""
 _LOST_NUMBERS = (-1.0, -999.0, -9999.0)  # mark a lost packet if no other delay is negative
-_FLAGS = {"0": False, "1": True, "false": False, "true": True, "no": False, "yes": True}
+_FLAGS = {
+    **dict.fromkeys(("0", "0.0", "false", "no"), False),
+    **dict.fromkeys(("1", "1.0", "true", "yes"), True),
+}
+"""Word in the loss column -> whether the packet was lost."""
 
 
 def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool) -> Packets:
@@ -376,8 +379,6 @@ def _csv_time(row: Row, column: str, unit: str) -> float:
         except ValueError:
             raise BadInputError(f"{row.where}: {_no_unit(column)}") from None
     value = row.number(column)
-    if value is None or not isfinite(value):
-        raise row.no_number(column)
     if value * SCALES[unit] > LATEST:
         raise BadInputError(f"{row.where}: {column} is {text}, a finer unit than {unit}; rename it")
     return value
@@ -386,18 +387,13 @@ def _csv_time(row: Row, column: str, unit: str) -> float:
 def _csv_delay(row: Row, column: str, loss: str | None) -> float | None:
     """Read a delay in the column's unit; return None for a lost packet."""
     if loss is not None:
-        flag = _FLAGS.get(row.text(loss).lower(), row.number(loss))
-        if flag not in (0.0, 1.0):
+        flag = _FLAGS.get(row.text(loss).lower())
+        if flag is None:
             remedy = "0 or 1 for a packet; a profile can use a trace with other shares directly"
-            raise row.no_number(loss, remedy)
+            raise BadInputError(f"{row.where}: {loss} is {row.text(loss)[:40]!r}; give {remedy}")
         if flag:
             return None
-    value = row.number(column)
-    if row.text(column).lower() in _LOST_WORDS or (value is not None and isnan(value)):
-        return None
-    if value is None or not isfinite(value):
-        raise row.no_number(column)
-    return value
+    return None if row.text(column).lower() in _LOST_WORDS else row.number(column)
 
 
 def _without_marks(raw: list[Entry], column: str, log: Log, *, has_losses: bool) -> list[Entry]:
@@ -489,7 +485,6 @@ class _Ping:
         self._summaries: list[tuple[int, int]] = []  # packets sent and received
         self._headers, self._base = 0, 1  # lines that begin a log; first number of this ping
         self._newest = 0
-        self._midnight = self._clock = 0.0
         for line in lines:
             if (number := _NUMBER.search(line)) is not None:
                 self._read_packet(line, number)
@@ -526,11 +521,7 @@ class _Ping:
         if stamp["unix"]:
             return float(stamp["unix"])
         hours, minutes, seconds = map(float, stamp["clock"].split(":"))
-        clock = hours * 3600 + minutes * 60 + seconds
-        if self._clock - clock > 43_200:  # midnight
-            self._midnight += 86_400.0
-        self._clock = clock
-        return self._midnight + clock
+        return hours * 3600 + minutes * 60 + seconds
 
     def _read_other(self, line: str) -> None:
         if line.startswith(("PING ", "PING6(")):

@@ -143,15 +143,16 @@ class Row(NamedTuple):
             raise BadInputError(f"{self.where}: {column} is nothing; give a number")
         return self.cells[column]
 
-    def number(self, column: str) -> float | None:
-        """Parse a cell as a number; None if it is not a number."""
-        return _parse(self.text(column).replace(self.decimal, "."))
-
-    def no_number(self, column: str, wanted: str = "a number") -> BadInputError:
-        """Make the error for a cell that does not contain what is `wanted`."""
+    def number(
+        self, column: str, low: float = -inf, high: float = inf, wanted: str = "a finite number"
+    ) -> float:
+        """Parse a cell as a number from `low` to `high`; else raise an error that says `wanted`."""
         text = self.text(column)
-        shown = repr(text[:40]) if text else "nothing"
-        return BadInputError(f"{self.where}: {column} is {shown}; give {wanted}")
+        value = _parse(text.replace(self.decimal, "."))
+        if value is None or not low <= value <= high or abs(value) == inf:
+            shown = repr(text[:40]) if text else "nothing"
+            raise BadInputError(f"{self.where}: {column} is {shown}; give {wanted}")
+        return value
 
 
 def read_rows(lines: Iterable[str], name: str) -> tuple[list[str], Iterator[Row]]:
@@ -223,12 +224,10 @@ def _column(text: str) -> str:
 
 def _number(row: Row, column: str) -> float:
     """Parse a number of a trace; reject negative and infinite numbers, and a loss above 1."""
-    value = row.number(column)
-    if value is None or not 0.0 <= value < inf or (column == "loss" and value > 1.0):
-        bounds = "from 0 to 1" if column == "loss" else "that is finite and not negative"
-        mark = "; a lost packet has loss 1" if column in _SCALES else ""
-        raise row.no_number(column, f"a number {bounds}{mark}")
-    return value
+    if column == "loss":
+        return row.number(column, 0.0, 1.0, "a number from 0 to 1")
+    mark = "; a lost packet has loss 1" if column in _SCALES else ""
+    return row.number(column, 0.0, inf, f"a number that is finite and not negative{mark}")
 
 
 def _check_delays(delays: Sequence[float], column: str, place: str, *, may_be_lost: bool) -> None:

@@ -88,8 +88,8 @@ def test_round_trips_are_halved_only_on_request():
         ("time_s,latency\n0,45", "no column delay, found time_s,latency; name them time_s"),
         ("", "no column time, found nothing"),
         ("time_s,delay_ms,rtt_ms\n0,45,90", "has delay_ms and rtt_ms; keep only one"),
-        ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms is 'fast'; give a number"),
-        ("time_s,delay_ms\n,45", "line 2: time_s is nothing; give a number"),
+        ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms is 'fast'; give a finite number"),
+        ("time_s,delay_ms\n,45", "line 2: time_s is nothing; give a finite number"),
         ("time_s,delay_ms,loss\n0,45,0.5", "line 2: loss is '0.5'; give 0 or 1"),
         ("time_s,delay_ms\n0,45\n1,-3", "arrived 3 ms before it was sent: the two clocks differ;"),
         ("time_s,rtt_ms\n0,45\n1,-3\n2,-1", "rtt_ms is -3, which is no round trip"),
@@ -278,9 +278,9 @@ STAMPED = "[1700000000.5] "
         (
             [
                 "PING h (192.0.2.7): 56 data bytes",
-                "23:59:59.123456 64 bytes from 192.0.2.7: icmp_seq=0 ttl=53 time=20.5 ms",
+                "23:59:57.123456 64 bytes from 192.0.2.7: icmp_seq=0 ttl=53 time=20.5 ms",
                 "Request timeout for icmp_seq 1",
-                "00:00:01.123456 64 bytes from 192.0.2.7: icmp_seq=2 ttl=53 time=20.5 ms",
+                "23:59:59.123456 64 bytes from 192.0.2.7: icmp_seq=2 ttl=53 time=20.5 ms",
                 "3 packets transmitted, 2 packets received, 33.3% packet loss",
             ],
             (10.25, None, 10.25),
