@@ -74,12 +74,6 @@ WAYS = {
 """Direction -> sender, receiver, and the kind of datagram that the sender sends."""
 KEYS = ("asked", "measured", "low", "high")  # values of a row, in the order of the table's columns
 NOT_JUDGED = "NOT JUDGED"  # in a note about a quantity that could not be verified
-TOLD = {
-    "correlation": f"correlation {NOT_JUDGED}: netem realises almost none of it",
-    "rate": f"rate {NOT_JUDGED}: only trains of probes measure it, up to 100 Mbit/s",
-    "time_line": f"its time line {NOT_JUDGED} in flight, only what follows it",
-}
-"""Quantity that cannot be judged -> the note that says so."""
 VERDICTS = {
     "off": ("not believed", "red", "does not match its profile"),
     "open": ("undecided", "yellow", "was not measured for long enough: give more --seconds"),
@@ -391,7 +385,7 @@ def _notes(way: str, rows: Sequence[Row]) -> Iterator[str]:
         yield f"{way}: one-way delays {NOT_JUDGED}: the ends do not share a clock"
     for row in rows:
         if row.verdict == "told":
-            yield f"{way}: {TOLD.get(row.name, NOT_JUDGED)}"
+            yield f"{way}: {row.name} {NOT_JUDGED}; docs/link.md says why"
 
 
 def make_report(title: str, findings: Mapping[str, Findings], probes: Mapping[str, str]) -> Report:

@@ -418,28 +418,30 @@ def open_relay(
 
     Raise a BadInputError if an address cannot be used.
     """
-    from cloudrc.link.relay import Relay
+    from cloudrc.link.relay import Lane, Relay
     from cloudrc.tunnel.codec import peek
 
-    peers = {
-        "world_peer": resolve_address("--world", options.world),
-        "cloud_peer": resolve_address("--cloud", options.cloud),
-    }
     with ExitStack() as opened:
-        sides = {}
-        for side in ("world_side", "cloud_side"):
-            address = getattr(options, side)
-            with _listening(f"--{side.replace('_', '-')}", address):
-                sides[side] = opened.enter_context(bind(address))
-        try:
-            relay = Relay(uplink, downlink, peek, **sides, **peers)  # type: ignore[arg-type]
-        except OSError as error:
-            raise BadInputError(
-                "the relay cannot reach --world from --world-side, or --cloud from --cloud-side "
-                f"({error.strerror or error}); give each side an address that reaches its end"
-            ) from error
+        sides = []
+        for end in ("world", "cloud"):
+            peer = resolve_address(f"--{end}", getattr(options, end))
+            listen = getattr(options, f"{end}_side")
+            with _listening(f"--{end}-side", listen):
+                sides.append(opened.enter_context(bind(listen)))
+            try:
+                sides[-1].connect(peer)  # takes datagrams from this address alone
+            except OSError as error:
+                raise BadInputError(
+                    f"the relay cannot reach --{end} from --{end}-side ({error.strerror or error});"
+                    " give it an address that reaches its end"
+                ) from error
         opened.pop_all()  # they stay open until this process ends
-        return relay
+    world, cloud = sides
+    lanes = {
+        "uplink": Lane(world, cloud.send, uplink, peek),
+        "downlink": Lane(cloud, world.send, downlink, peek),
+    }
+    return Relay(lanes, origin_ns=None)
 
 
 class RelayControl:
@@ -495,7 +497,7 @@ class RelayControl:
         if time.monotonic() - self._released_at >= RELEASED_PERIOD:
             self._released_at = time.monotonic()
             for way in self._links:
-                if released := self._relay.released(way):
+                if released := self._relay.lanes[way].released():
                     with suppress(OSError):
                         publish(self._folder / f"{way}{RELEASED_SUFFIX}", json.dumps(released))
 

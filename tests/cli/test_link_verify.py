@@ -108,13 +108,13 @@ def test_what_is_not_judged_is_noted(release):
     release.tells("time_line", 1.0)
     said = release.ask(0.0)
     assert said["verdict"] == "undecided"
-    assert "uplink: its time line NOT JUDGED in flight" in as_text(said)
+    assert "uplink: time_line NOT JUDGED; docs/link.md says why" in as_text(said)
     release.hears(cloud="ok")
     release.tells("correlation", 0.9)
     release.tells("rate", 3e6)
     said = as_text(release.ask())
-    assert "uplink: correlation NOT JUDGED: netem realises" in said
-    assert "uplink: rate NOT JUDGED: only trains of probes measure it" in said
+    assert "uplink: correlation NOT JUDGED" in said
+    assert "uplink: rate NOT JUDGED" in said
     assert said.endswith("except what is NOT JUDGED (above)")
 
 

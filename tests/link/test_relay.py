@@ -23,6 +23,7 @@ from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.relay import (
     AGE_MAX_NS,
     QUANTILES,
+    Lane,
     Relay,
     RelayShaper,
     ReleaseErrors,
@@ -73,15 +74,14 @@ class Bench:
         self.ends = self.world, self.cloud, self.world_side, self.cloud_side = [
             bind_loopback() for _ in range(4)
         ]
-        self.relay = Relay(
-            LinkDirection(up, 1, True),
-            LinkDirection(down, 1, False),
-            peek,
-            world_side=self.world_side,
-            cloud_side=self.cloud_side,
-            world_peer=self.world.getsockname(),
-            cloud_peer=self.cloud.getsockname(),
-        )
+        self.world_side.connect(self.world.getsockname())
+        self.cloud_side.connect(self.cloud.getsockname())
+        uplink, downlink = LinkDirection(up, 1, True), LinkDirection(down, 1, False)
+        lanes = {
+            "uplink": Lane(self.world_side, self.cloud_side.send, uplink, peek),
+            "downlink": Lane(self.cloud_side, self.world_side.send, downlink, peek),
+        }
+        self.relay = Relay(lanes, origin_ns=None)
         self._stop = Event()
         self._thread = Thread(target=self.relay.run, args=(self._stop.is_set,))
         self._thread.start()
@@ -119,7 +119,7 @@ def test_a_packet_leaves_when_the_model_says_never_earlier(bench):
         errors.append(time.monotonic_ns() - sent - wanted)
     assert min(errors) >= 0
     assert sorted(errors)[10] < 50 * MS
-    until(lambda: pair.relay.released("uplink").get("released") == 20)
+    until(lambda: pair.relay.lanes["uplink"].released().get("released") == 20)
     assert 0 <= pair.relay.counts()["release_error_p99_ns"] < 100 * MS
 
 
