@@ -258,22 +258,17 @@ _IRTT_NAMES = {
 def _irtt_entries(trips: list[dict[str, Any]], what: str) -> list[Entry]:
     """Read the time of sending and the delay of each packet [s]; time 0 is the first packet.
 
-    Packets lost in the other direction are left out. A downlink packet is sent when the uplink
-    packet arrives. If the downlink packet is lost, irtt does not report this time; it is estimated
-    with the median uplink delay.
+    Packets lost in the other direction are left out. In both directions the time is that at which
+    the client sent, because irtt does not report when the server sends a packet that is lost.
     """
     other, key = _IRTT_NAMES[what]
-    part, usual = 0.5e-9 if what == "halves" else 1e-9, 0
-    if what == "downlink":
-        usual = round(median([int(t["delay"]["send"]) for t in trips if _arrived(t)] or [0]))
+    part = 0.5e-9 if what == "halves" else 1e-9
     entries: list[tuple[int, float | None]] = []
     for trip in trips:
         if str(trip["lost"]).lower() != other:
-            stamp, delays = trip["timestamps"]["client"]["send"], trip.get("delay", {})
-            arrived, sent = _arrived(trip), int(stamp.get("monotonic", stamp.get("wall")))
-            if what == "downlink":
-                sent += int(delays["send"]) if arrived else usual
-            entries.append((sent, int(delays[key]) * part if arrived else None))
+            stamp = trip["timestamps"]["client"]["send"]
+            sent = int(stamp.get("monotonic", stamp.get("wall")))
+            entries.append((sent, int(trip["delay"][key]) * part if _arrived(trip) else None))
     start = min((sent for sent, _ in entries), default=0)
     return [((sent - start) * 1e-9, delay) for sent, delay in entries]
 

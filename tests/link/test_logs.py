@@ -164,7 +164,7 @@ TRIPS = [trip(0), trip(1, "true_up"), trip(2, "true_down"), trip(3, True), trip(
     ("direction", "sent", "delays"),
     [
         ("uplink", (0.0, 0.010, 0.030, 0.040), (0.030, None, None, 0.035)),
-        ("downlink", (0.0, 0.0225, 0.0325, 0.045), (0.020, None, None, 0.020)),
+        ("downlink", (0.0, 0.020, 0.030, 0.040), (0.020, None, None, 0.020)),
         (None, (0.0, 0.010, 0.020, 0.030, 0.040), (0.025, None, None, None, 0.0275)),
     ],
 )
