@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from math import isnan
+from math import isnan, nan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -70,19 +70,18 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _write(packets: Packets, path: Path, direction: str) -> None:
-    from statistics import fmean, pstdev
-
     from cloudrc.link.logs import trace_of
+    from cloudrc.link.model import numbers
     from cloudrc.link.traces import write_trace
 
     path.write_text(write_trace(trace_of(packets)), encoding="utf-8")
-    arrived = [delay * 1e3 for delay in packets.arrived]
-    mean, deviation = fmean(arrived), pstdev(arrived)
-    count = len(packets.delays)
+    found, count = numbers(packets), len(packets.delays)
+    mean, deviation = found.mean * 1e3, found.deviation * 1e3
+    seconds = packets.sent[-1] - packets.sent[0]
     what = "half of each round trip" if packets.halved else "one way"
     print(
-        f"{path}: {count} packets in {packets.duration:.1f} s, {what} {mean:.4g} ± "
-        f"{deviation:.3g} ms (mean, standard deviation), {packets.lost / count:.3g} lost"
+        f"{path}: {count} packets in {seconds:.1f} s, {what} {mean:.4g} ± "
+        f"{deviation:.3g} ms (mean, standard deviation), {found.loss:.3g} lost"
         + "".join(f"; {note}" for note in packets.notes)
     )
     print(f"  replay:   --set link.profile=ideal --set link.{direction}.trace={path}")
@@ -154,7 +153,7 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     opened_ns = {epoch: stamp_ns for epoch, stamp_ns in latest_first}  # the first arrival remains
     last_ns = {epoch: stamp_ns for stamp_ns, epoch, _ in rows}
     log.entries = [
-        ((stamp_ns - rows[0][0]) * 1e-9, delays.get((epoch, counter)))
+        ((stamp_ns - rows[0][0]) * 1e-9, delays.get((epoch, counter), nan))
         for stamp_ns, epoch, counter in rows
         if (epoch, counter) in delays
         or opened_ns.get(epoch, stamp_ns) < stamp_ns <= last_ns[epoch] - SETTLING_NS

@@ -19,19 +19,20 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import datetime
 from itertools import pairwise
-from operator import itemgetter
+from math import isnan, nan
 from statistics import median
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from cloudrc.errors import BadInputError
+from cloudrc.link.model import Stream
 from cloudrc.link.profile import Trace
 from cloudrc.link.traces import LATEST, Row, looks_lost, read_rows
 
 Direction: TypeAlias = Literal["uplink", "downlink"]
-Entry: TypeAlias = tuple[float, float | None]
-"""Time of sending [s] and delay [s]; the delay is None if the packet was lost."""
+Entry: TypeAlias = tuple[float, float]
+"""Time of sending [s] and delay [s]; the delay is NaN if the packet was lost."""
 LONGEST = 5.0  # largest plausible median delay [s]; a larger median suggests that the unit is wrong
 UNUSABLE_MAX = 0.01  # largest share of rows that may be left out, in [0, 1]
 GAP, GAP_MIN = 5, 1.0
@@ -46,28 +47,11 @@ HALVE = (
 
 
 @dataclass(frozen=True, slots=True)
-class Packets:
-    """The packets of a log in the order of sending."""
+class Packets(Stream):
+    """The packets of a log in the order of sending; the times of sending are on any clock."""
 
-    sent: tuple[float, ...]  # times of sending on any clock, strictly rising [s], shape (n,)
-    delays: tuple[float | None, ...]  # one-way delays [s], None for lost packets, shape (n,)
     notes: tuple[str, ...] = ()  # texts such as "3 out of order, sorted", for the user
     halved: bool = False  # whether the delays are halves of round trips
-
-    @property
-    def arrived(self) -> list[float]:
-        """Delays of the packets that arrived [s]."""
-        return [delay for delay in self.delays if delay is not None]
-
-    @property
-    def lost(self) -> int:
-        """Number of lost packets."""
-        return self.delays.count(None)
-
-    @property
-    def duration(self) -> float:
-        """Time from the first to the last packet sent [s]."""
-        return self.sent[-1] - self.sent[0]
 
 
 @dataclass(slots=True)
@@ -87,11 +71,10 @@ class Log:
         or if more than 1 % of the rows are unusable or repeat the time of an earlier row.
         """
         self._refuse_beyond_limit(len(self.unusable), *self.unusable[:1])
-        arrived = [delay for _, delay in self.entries if delay is not None]
-        if not arrived:
+        times, delays = np.array(self.entries or [(nan, nan)]).T
+        if np.isnan(delays).all():
             raise self.error("no packet arrived; give a log with at least one reply")
-        self.refuse_early(min(arrived))
-        times = np.array([sent for sent, _ in self.entries])
+        self.refuse_early(float(np.nanmin(delays)))
         steps = np.diff(times)
         far = max(GAP_MIN, GAP * float(np.median(np.abs(steps)))) if len(steps) else GAP_MIN
         back = np.flatnonzero(steps < -far)
@@ -108,14 +91,15 @@ class Log:
         self.counts["left out, at the time of another one"] += repeated
         self.counts["left out, unreadable"] += len(self.unusable)
         notes = [f"{count} {what}" for what, count in self.counts.items() if count]
-        sent, delays = zip(*sorted(unique.items(), key=itemgetter(0)), strict=True)
+        sent, delays = np.array(sorted(unique.items())).T
         gaps = np.diff(sent)
         if gaps.max(initial=0.0) > far:
             notes.append(
                 f"nothing sent for {gaps.max():.4g} s after packet {gaps.argmax() + 1}: a pause, "
                 "two sessions in one log, or a step of the clock"
             )
-        return Packets(sent, delays, tuple(notes), self.halved)
+        copies = np.isfinite(delays).astype(int)
+        return Packets(sent, delays, copies, tuple(notes), self.halved)
 
     def error(self, text: str) -> BadInputError:
         """Make an error that begins with the name of the log."""
@@ -141,15 +125,14 @@ def trace_of(packets: Packets) -> Trace:
 
     Each row applies from half a period before its packet was sent until half a period after. So in
     a flight a packet that is a little early or late gets the right row. Time 0 is the first packet.
+    A lost packet has the delay of the packet before it.
     """
-    sent = packets.sent
-    halfway = [(before + after) / 2 - sent[0] for before, after in pairwise(sent)]
-    delays, delay = [], packets.arrived[0]
-    for given in packets.delays:
-        delay = delay if given is None else given
-        delays.append(delay)
-    losses = tuple(1.0 if given is None else 0.0 for given in packets.delays)
-    return Trace((0.0, *halfway), tuple(delays), losses if packets.lost else None)
+    sent, lost = packets.sent, np.isnan(packets.delays)
+    halfway = (sent[1:] + sent[:-1]) / 2 - sent[0]
+    newest = np.maximum.accumulate(np.where(lost, 0, np.arange(len(lost))))
+    delays = packets.delays[np.maximum(newest, np.argmin(lost))]
+    losses = tuple(lost.astype(float).tolist()) if lost.any() else None
+    return Trace((0.0, *halfway.tolist()), tuple(delays.tolist()), losses)
 
 
 _OTHERS = {
@@ -263,12 +246,12 @@ def _irtt_entries(trips: list[dict[str, Any]], what: str) -> list[Entry]:
     """
     other, key = _IRTT_NAMES[what]
     part = 0.5e-9 if what == "halves" else 1e-9
-    entries: list[tuple[int, float | None]] = []
+    entries: list[tuple[int, float]] = []
     for trip in trips:
         if str(trip["lost"]).lower() != other:
             stamp = trip["timestamps"]["client"]["send"]
             sent = int(stamp.get("monotonic", stamp.get("wall")))
-            entries.append((sent, int(trip["delay"][key]) * part if _arrived(trip) else None))
+            entries.append((sent, int(trip["delay"][key]) * part if _arrived(trip) else nan))
     start = min((sent for sent, _ in entries), default=0)
     return [((sent - start) * 1e-9, delay) for sent, delay in entries]
 
@@ -325,10 +308,7 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     # For nanoseconds since 1970 a float has a resolution of 256 ns, which is enough here.
     start = min((sent for sent, _ in raw), default=0.0)
     scales = SCALES[time_unit or "s"], SCALES[unit] * (0.5 if log.halved else 1.0)
-    log.entries = [
-        ((sent - start) * scales[0], None if value is None else value * scales[1])
-        for sent, value in raw
-    ]
+    log.entries = [((sent - start) * scales[0], value * scales[1]) for sent, value in raw]
     packets = log.packets()
     if not trust_units:
         _check_unit(packets, unit, f"{name}: {delay}")
@@ -338,7 +318,7 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
 def _check_unit(packets: Packets, unit: str, name: str) -> None:
     """Raise an error if the delays are probably in another unit than the column says."""
     factor, found = 1 / SCALES[unit], ""
-    top, middle = max(packets.arrived), median(packets.arrived)
+    top, middle = np.nanmax(packets.delays), np.nanmedian(packets.delays)
     if unit != "s" and 0.0 < top * factor < 1.0:
         found = f"is at most {top * factor:.4g} {unit}, which looks like seconds"
     elif middle > LONGEST:
@@ -379,24 +359,24 @@ def _csv_time(row: Row, column: str, unit: str) -> float:
     return value
 
 
-def _csv_delay(row: Row, column: str, loss: str | None) -> float | None:
-    """Read a delay in the column's unit; return None for a lost packet."""
+def _csv_delay(row: Row, column: str, loss: str | None) -> float:
+    """Read a delay in the column's unit; return NaN for a lost packet."""
     if loss is not None:
         flag = _FLAGS.get(row.text(loss).lower())
         if flag is None:
             remedy = "0 or 1 for a packet; a profile can use a trace with other shares directly"
             raise BadInputError(f"{row.where}: {loss} is {row.text(loss)[:40]!r}; give {remedy}")
         if flag:
-            return None
-    return None if row.text(column).lower() in _LOST_WORDS else row.number(column)
+            return nan
+    return nan if row.text(column).lower() in _LOST_WORDS else row.number(column)
 
 
 def _without_marks(raw: list[Entry], column: str, log: Log, *, has_losses: bool) -> list[Entry]:
-    """Replace each number that marks a lost packet, such as -1, by None; count these packets.
+    """Replace each number that marks a lost packet, such as -1, by NaN; count these packets.
 
     If the log has a column `loss`, 0 is no mark.
     """
-    values = {value for _, value in raw if value is not None}
+    values = {value for _, value in raw if not isnan(value)}
     below = {value for value in values if value < 0.0}
     marks = {value for value in below if len(below) == 1 and value in _LOST_NUMBERS}
     if below and not marks and log.halved:
@@ -408,7 +388,7 @@ def _without_marks(raw: list[Entry], column: str, log: Log, *, has_losses: bool)
     for mark in marks:
         what = f"with {column} {mark:g} taken as lost"
         log.counts[what] = sum(value == mark for _, value in raw)
-    return [(sent, None if value in marks else value) for sent, value in raw]
+    return [(sent, nan if value in marks else value) for sent, value in raw]
 
 
 _WRAP = 1 << 16
@@ -462,7 +442,7 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
     times = np.interp(numbers, known, sent) + outside * ping.period()
     for number, at in zip(numbers.tolist(), times.tolist(), strict=True):
         reply = ping.replies.get(number)
-        log.entries.append((at, reply[1] / 2 if reply else None))
+        log.entries.append((at, reply[1] / 2 if reply else nan))
     return log.packets()
 
 
