@@ -146,7 +146,10 @@ class Row(NamedTuple):
     def number(
         self, column: str, low: float = -inf, high: float = inf, wanted: str = "a finite number"
     ) -> float:
-        """Parse a cell as a number from `low` to `high`; else raise an error that says `wanted`."""
+        """Parse a cell as a number from `low` to `high` [any unit].
+
+        Raise a BadInputError that asks for what is `wanted` if the cell contains no such number.
+        """
         text = self.text(column)
         value = _parse(text.replace(self.decimal, "."))
         if value is None or not low <= value <= high or abs(value) == inf:
