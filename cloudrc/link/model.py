@@ -7,7 +7,7 @@ relay use the same model, so both get the same delays and losses.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -201,11 +201,13 @@ def sample(
     *,
     epoch: int = 1,
     first: int = 0,
+    pause: Callable[[], None] = lambda: None,
 ) -> Stream:
     """Send packets of `size` bytes through the model of a link; return their delays.
 
     `sent_ns` are the times of sending since the link came up, rising [ns]. `first` is the counter
-    of the first packet. Damaged packets count as lost, because the receiver rejects them.
+    of the first packet. Damaged packets count as lost, because the receiver rejects them. `pause`
+    is called every few hundred microseconds, so that other threads can run.
     """
     delays, copies = np.full(len(sent_ns), np.nan), np.zeros(len(sent_ns), dtype=np.int64)
     whole = bytes(size)
@@ -215,6 +217,8 @@ def sample(
             continue
         if releases:
             delays[n], copies[n] = (min(releases) - now_ns) * 1e-9, len(releases)
+        if n % 128 == 0:
+            pause()
     return Stream(np.array(sent_ns) * 1e-9, delays, copies)
 
 

@@ -11,7 +11,7 @@ requested property is only reported, not judged.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import isnan, nan, sqrt
@@ -104,13 +104,14 @@ class Plan:
     """A measurement of one direction: the requested profile, and the datagrams to send.
 
     A train of datagrams is sent back to back. Before each train, the same number of datagrams is
-    sent one by one.
+    sent one by one. `pause` is called every few hundred microseconds: other threads can run then.
     """
 
     profile: DirectionProfile  # requested conditions
     flow: Flow
     sent: Floats  # time of sending of each datagram, since the link came up [s], shape (n,)
     train: int = 0  # number of datagrams in a train; 0 if there are no trains
+    pause: Callable[[], None] = lambda: None
 
     def draw(self, sent: Floats, epoch: int = 1, first: int = 0) -> Stream:
         """Simulate the link for datagrams sent at the times `sent` [s] since the link came up.
@@ -120,7 +121,7 @@ class Plan:
         seed, uplink, kind, size = self.flow
         link = LinkDirection(self.profile, seed, uplink)
         sent_ns = np.rint(sent * 1e9).astype(np.int64).tolist()
-        stream = sample(link, kind, sent_ns, size, epoch=epoch, first=first)
+        stream = sample(link, kind, sent_ns, size, epoch=epoch, first=first, pause=self.pause)
         return replace(stream, sent=sent)
 
     @cached_property

@@ -7,8 +7,8 @@ trips. A separate thread does the work, so that the control loop is not delayed.
 from __future__ import annotations
 
 import queue
-import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from math import inf, isnan, nan
@@ -42,7 +42,6 @@ SETTLE_NS = 2_000_000_000  # time after a change in which nothing is judged [ns]
 KEPT = 6000  # largest number of datagrams that one verdict uses
 FINAL = 128  # a missing datagram counts as lost if the newest counter is higher by this number
 ENDS = 2e-3  # largest delay that world and cloud add to a round trip if they wake on time [s]
-SWITCH_INTERVAL = 0.0002  # longest time for which this thread can block the control loop [s]
 FOLLOW_PERIOD = 0.1  # period at which the thread reads new records and the link's state file [s]
 UNJUDGED = {"distribution"}  # not judged in flight: late wakes of world and cloud change it
 DELAYS = {"mean", "deviation"}  # measurable only if world and cloud share a clock
@@ -73,14 +72,14 @@ class LinkMonitor:
         self._epoch, self._fresh, self._seen = -1, True, ""
         self._since_ns, self._due_ns = 0.0, 0
         self._suspects, self._complained = set[str](), False
+        self._pause: Callable[[], None] = lambda: None
         self._inbox: queue.SimpleQueue[tuple[Sequence[Record], int]] | None = None
         self._outbox = queue.SimpleQueue[Record]()
 
     def begin(self, asked: Asked, path: Path | None, load: Load) -> None:
         """Start the thread; the profiles `asked` apply until the state file reports others."""
-        self._inbox = queue.SimpleQueue()
+        self._inbox, self._pause = queue.SimpleQueue(), lambda: time.sleep(1e-4)
         self.follow(asked)
-        sys.setswitchinterval(SWITCH_INTERVAL)
         threading.Thread(target=self._run, args=(path, load), name="link", daemon=True).start()
 
     def follow(self, asked: Asked | None) -> None:
@@ -89,7 +88,9 @@ class LinkMonitor:
             self._asked, self._fresh = asked, True
             sent = np.arange(float(RUN_LENGTH)) * self._period
             ways = () if asked is None else asked if self._uplink else asked[::-1]
-            self._plans = [Plan(settled(profile), self._flow, sent) for profile in ways]
+            self._plans = [
+                Plan(settled(profile), self._flow, sent, pause=self._pause) for profile in ways
+            ]
 
     def after(self, records: Sequence[Record], now_ns: int) -> list[Record]:
         """Process this end's newest records at `now_ns` [ns]; return verdicts and faults."""
