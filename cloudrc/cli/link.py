@@ -54,7 +54,7 @@ examples:
 
 The delays come from the same link model as in a flight, packet by packet: a
 flight with the same seed has exactly these delays. All delays are one way.
-In the statistics of a trace, each row counts once, whatever its duration."""
+A trace has one packet per row, whatever the duration of the row."""
 VERIFY_EPILOG = """\
 examples:
   cloudrc link verify                       the link of the paper's experiment
@@ -82,7 +82,6 @@ RANGES: dict[str, tuple[float, float]] = {
     "packets": (1, PACKETS_MAX),
 }
 """Option of `show` -> its least and largest value."""
-ROWS = 1000  # least number of packets in the figure of a trace; a short trace gets several per row
 SECONDS = 30.0  # time that a figure shows by default [s]; a longer time line is shown in full
 KINDS = ("png", "svg", "pdf")
 
@@ -221,7 +220,7 @@ def _way(
     timeline, send = Timeline(profile), partial(_send, profile, name == "uplink", options.seed)
     period_ns = round(1e9 / options.rate)
     if profile.trace is not None and options.seconds is None:
-        shown = send(_row_times(profile.trace.times))
+        shown = send([round(time * 1e9) for time in profile.trace.times])
     else:
         seconds = options.seconds or max(SECONDS, 1.1e-9 * timeline.last_ns)
         if seconds * options.rate > PACKETS_MAX:
@@ -234,16 +233,6 @@ def _way(
     if timeline.only() is not None:
         many = send(range(0, options.packets * period_ns, period_ns))
     return DirectionSample(asked, shown.sent, shown.delays, many.delays), numbers(many)
-
-
-def _row_times(times: Sequence[float]) -> list[int]:
-    """Return times [ns] to send packets: one per row of a trace, several if the trace is short."""
-    rows = [round(time * 1e9) for time in times]
-    share = -(-ROWS // len(rows))
-    if len(rows) == 1 or share == 1:
-        return rows
-    ends = [*rows[1:], 2 * rows[-1] - rows[-2]]
-    return [a + n * (b - a) // share for a, b in zip(rows, ends, strict=True) for n in range(share)]
 
 
 def _send(profile: DirectionProfile, uplink: bool, seed: int, sent_ns: Sequence[int]) -> Stream:

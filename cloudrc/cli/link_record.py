@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from math import isnan
+from math import isnan, nan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,14 +37,6 @@ examples:
 A trace describes one direction. A run has two: without --direction the command
 writes both, and adds the direction to each file name."""
 DIRECTIONS: tuple[Direction, ...] = ("uplink", "downlink")
-SETTLING_NS = 2_000_000_000
-"""Length of the last part of a session [ns]. A datagram sent in this part never counts as lost: it
-may have been on its way when the session ended."""
-TOPICS = {
-    "uplink": ("/telemetry", "/uplink_delay"),
-    "downlink": ("/delay_estimate", "/downlink_delay"),
-}
-"""Direction -> topic with one row per sent datagram, topic with one row per arrived datagram."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -69,11 +61,8 @@ def execute(options: argparse.Namespace) -> int:
     else:
         require("a trace of a run", ("record",))
         recording = _recording(source)
-        if options.halve_rtt:
-            found = {only or "uplink": _halves(recording, source)}
-        else:
-            ways = (only,) if only else DIRECTIONS
-            found = {way: one_way(recording, source, way) for way in ways}
+        ways = (only,) if only else DIRECTIONS
+        found = {way: one_way(recording, source, way) for way in ways}
     for way, packets in found.items():
         own = output.with_stem(f"{output.stem}-{way}") if len(found) > 1 else output
         _write(packets, own, way)
@@ -81,19 +70,18 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _write(packets: Packets, path: Path, direction: str) -> None:
-    from statistics import fmean, pstdev
-
     from cloudrc.link.logs import trace_of
+    from cloudrc.link.model import numbers
     from cloudrc.link.traces import write_trace
 
     path.write_text(write_trace(trace_of(packets)), encoding="utf-8")
-    arrived = [delay * 1e3 for delay in packets.arrived]
-    mean, deviation = fmean(arrived), pstdev(arrived)
-    count = len(packets.delays)
+    found, count = numbers(packets), len(packets.delays)
+    mean, deviation = found.mean * 1e3, found.deviation * 1e3
+    seconds = packets.sent[-1] - packets.sent[0]
     what = "half of each round trip" if packets.halved else "one way"
     print(
-        f"{path}: {count} packets in {packets.duration:.1f} s, {what} {mean:.4g} ± "
-        f"{deviation:.3g} ms (mean, standard deviation), {packets.lost / count:.3g} lost"
+        f"{path}: {count} packets in {seconds:.1f} s, {what} {mean:.4g} ± "
+        f"{deviation:.3g} ms (mean, standard deviation), {found.loss:.3g} lost"
         + "".join(f"; {note}" for note in packets.notes)
     )
     print(f"  replay:   --set link.profile=ideal --set link.{direction}.trace={path}")
@@ -140,8 +128,9 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     if the recording has no one-way delays.
     """
     from cloudrc.link.logs import Log
+    from cloudrc.metrics.link import SENT, SETTLING_NS
 
-    log, (sent_topic, topic) = Log(str(path)), TOPICS[direction]
+    log, sent_topic, topic = Log(str(path)), SENT[direction], f"/{direction}_delay"
     sent, arrivals = recording[sent_topic], recording[topic]
     if not len(sent) or not len(arrivals):
         missing = sent_topic if not len(sent) else topic
@@ -152,8 +141,8 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     for epoch, counter, delay in _columns(arrivals, "epoch", "counter", "delay"):
         if isnan(delay):
             raise log.error(
-                "its ends did not share a clock, so one-way delays are not known; take half of "
-                "each round trip with --halve-rtt"
+                "its ends did not share a clock, so one-way delays are not known; record a run in "
+                "local mode, or measure with irtt"
             )
         log.counts["duplicates left out"] += (epoch, counter) in delays
         delays[epoch, counter] = min(delay, delays.get((epoch, counter), delay))
@@ -164,36 +153,13 @@ def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
     opened_ns = {epoch: stamp_ns for epoch, stamp_ns in latest_first}  # the first arrival remains
     last_ns = {epoch: stamp_ns for stamp_ns, epoch, _ in rows}
     log.entries = [
-        ((stamp_ns - rows[0][0]) * 1e-9, delays.get((epoch, counter)))
+        ((stamp_ns - rows[0][0]) * 1e-9, delays.get((epoch, counter), nan))
         for stamp_ns, epoch, counter in rows
         if (epoch, counter) in delays
         or opened_ns.get(epoch, stamp_ns) < stamp_ns <= last_ns[epoch] - SETTLING_NS
     ]
     unknown = len(rows) - len(log.entries)
     log.counts["left out, sent before the session was open or in its last 2 s"] += unknown
-    return log.packets()
-
-
-def _halves(recording: Recording, path: Path) -> Packets:
-    """Estimate each one-way delay as half of a round trip, at the time when the round trip began.
-
-    The result contains no losses: round trips do not show which datagrams were lost.
-    """
-    from cloudrc.link.logs import Log
-
-    log, previous = Log(str(path), halved=True), None
-    for stamp_ns, rtt, loop in _columns(
-        recording["/delay_estimate"], "stamp_ns", "rtt", "loop_delay"
-    ):
-        if isnan(rtt):
-            continue
-        if (rtt, loop) == previous:
-            log.counts["periods without a new round trip left out"] += 1
-            continue
-        previous = rtt, loop
-        log.entries.append((stamp_ns * 1e-9 - rtt, rtt / 2))
-    if not log.entries:
-        raise log.error("holds no round trip; give the folder of a run that flew")
     return log.packets()
 
 

@@ -15,7 +15,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from dataclasses import asdict
+from functools import lru_cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -29,11 +30,13 @@ from cloudrc.cli.processes import (
     warn_if_exposed,
 )
 from cloudrc.drivers.process import StopSignal
+from cloudrc.records import Counted
 
 if TYPE_CHECKING:
+    from cloudrc.drivers.exporter import Exporter
     from cloudrc.link.follow import Load
-    from cloudrc.link.netem import Answer
     from cloudrc.link.sidecar import Machine, Sidecar
+    from cloudrc.link.state import LinkState
 
 EPILOG = ""
 TOOL_TIMEOUT = 5.0  # time limit of one call of tc or ip [s]
@@ -87,7 +90,8 @@ def execute(options: argparse.Namespace) -> int:
             mode=options.mode,
             direction=options.direction,
             route=options.route,
-            metrics=exporter,
+            tell=partial(export_state, exporter),
+            count=partial(export_counts, exporter),
         )
 
         def poll_profile() -> None:
@@ -130,7 +134,7 @@ def make_profile_loader(direction: str) -> Load:
 
 def _machine(options: argparse.Namespace, seed: int, programs: Programs, tables: Path) -> Machine:
     from cloudrc.link.model import LinkDirection
-    from cloudrc.link.netem import Netem, may_shape
+    from cloudrc.link.netem import Netem
     from cloudrc.link.profile import DirectionProfile
     from cloudrc.link.relay import RelayShaper, ask_for_fifo, settle
     from cloudrc.link.sidecar import Machine
@@ -150,8 +154,7 @@ def _machine(options: argparse.Namespace, seed: int, programs: Programs, tables:
             programs, profile, origin_ns=origin_ns, clock=clock, wait=wait, tables=tables, log=log
         )
 
-    allowed = may_shape(Path("/proc/self/status").read_text(encoding="ascii"))
-    return Machine(relay, netem, allowed, clock, wait, log)
+    return Machine(relay, netem, clock, wait, log)
 
 
 def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None:
@@ -163,34 +166,48 @@ def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None
     threading.Thread(target=work, daemon=True).start()
 
 
+def export_state(exporter: Exporter | None, state: LinkState) -> None:
+    """Export the state of one direction as metrics."""
+    if exporter:
+        exporter.shaped(state.shaper, state.direction, state.mode)
+        exporter.asked(state.direction, state.asked["delay"] or 0.0)
+        exporter.ready(True)
+
+
+def export_counts(exporter: Exporter | None, counts: dict[str, int]) -> None:
+    """Export the numbers of a shaper's datagrams by outcome as metrics."""
+    if exporter:
+        exporter.see([Counted(0, "link", name, number) for name, number in counts.items()])
+
+
 def status_page(sidecar: Sidecar) -> str:
     """Return the state of a sidecar as JSON. Any thread may call this function."""
-    peer = sidecar.peer
+    peer, state = sidecar.peer, sidecar.states.state
     netems = _find_netems(peer[0], int(time.monotonic())) if peer else {}
-    return json.dumps(sidecar.status() | netems) + "\n"
+    return json.dumps((asdict(state) if state else {}) | netems) + "\n"
 
 
 @lru_cache(maxsize=1)
 def _find_netems(host: str, second: int) -> dict[str, Any]:
     """Find the netem qdiscs of this pod; the cache keeps them for one `second`."""
-    from cloudrc.link.sidecar import find_netems
+    from cloudrc.link.netem import find_netems
 
     return find_netems(run_tool, host)
 
 
-def run_tool(words: Sequence[str], environment: dict[str, str] | None = None) -> Answer:
-    """Run a program in a new process, wait until it ends, and return its output."""
-    from cloudrc.link.netem import NOT_FOUND, Answer
+def run_tool(words: Sequence[str], environment: dict[str, str] | None = None) -> str:
+    """Run a program in a new process and return its output; raise the error of `netem.explain`."""
+    from cloudrc.link.netem import explain
 
     try:
         done = subprocess.run(
             words, capture_output=True, text=True, env=environment, timeout=TOOL_TIMEOUT
         )
-    except FileNotFoundError:
-        return Answer(NOT_FOUND, "", "")
     except (OSError, subprocess.TimeoutExpired) as error:
-        return Answer(1, "", str(error))
-    return Answer(done.returncode, done.stdout, done.stderr)
+        raise explain(words, str(error), missing=isinstance(error, FileNotFoundError)) from None
+    if done.returncode:
+        raise explain(words, done.stderr or done.stdout or f"exit code {done.returncode}")
+    return done.stdout
 
 
 class Programs:
@@ -205,14 +222,14 @@ class Programs:
         self._environment = {**os.environ, "TC_LIB_DIR": tables, "LC_ALL": "C"}
         self._tc: subprocess.Popen[str] | None = None
 
-    def __call__(self, words: Sequence[str]) -> Answer:
-        """Run a command of tc or ip, and return its answer."""
+    def __call__(self, words: Sequence[str]) -> str:
+        """Run a command of tc or ip and return its output; errors as of `run_tool`."""
         try:
             match list(words):
                 case ["tc", "qdisc", "change", *_]:
-                    return self._ask(" ".join(words[1:]), lists=False)
+                    return self._ask(words[1:], lists=False)
                 case ["tc", "-s", "-j", "qdisc", "show", *_]:
-                    return self._ask(" ".join(words[3:]), lists=True)
+                    return self._ask(words[3:], lists=True)
         except OSError:  # tc was killed or is too old for -batch: start it for this command alone
             self.close()
         return run_tool(words, self._environment)
@@ -224,12 +241,12 @@ class Programs:
             self._tc.communicate()
             self._tc = None
 
-    def _ask(self, line: str, *, lists: bool) -> Answer:
+    def _ask(self, words: Sequence[str], *, lists: bool) -> str:
         """Send a command to the open tc process; `lists` tells whether the command lists qdiscs.
 
         Raise an OSError if tc has ended.
         """
-        from cloudrc.link.netem import Answer
+        from cloudrc.link.netem import explain
 
         if self._tc is None:
             pipe, merged = subprocess.PIPE, subprocess.STDOUT
@@ -238,7 +255,7 @@ class Programs:
             )
         assert self._tc.stdin is not None
         assert self._tc.stdout is not None
-        self._tc.stdin.write(f"{line}\n{_END}\n")
+        self._tc.stdin.write(f"{' '.join(words)}\n{_END}\n")
         self._tc.stdin.flush()
         said, listings, failed = list[str](), list[str](), False
         while len(listings) < 1 + (lists and not failed):
@@ -248,5 +265,5 @@ class Programs:
             (listings if answer.startswith("[") else said).append(answer.strip())
         if failed:
             errors = [one for one in said if not one.startswith("Command failed")]
-            return Answer(2, "", "\n".join(errors))
-        return Answer(0, listings[0] if lists else "", "")
+            raise explain(("tc", *words), " ".join(errors))
+        return listings[0] if lists else ""

@@ -24,8 +24,6 @@ from math import inf, nan
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import numpy as np
-
 from cloudrc.assembly import link_profile
 from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.link import VERIFY_DEFAULT
@@ -48,8 +46,8 @@ from cloudrc.errors import (
     MissingPrerequisiteError,
     TimedOutError,
 )
-from cloudrc.link.netem import check
-from cloudrc.link.sidecar import find_netems
+from cloudrc.link.model import Stream
+from cloudrc.link.netem import check, find_netems
 from cloudrc.link.state import STATE_FILE, from_text
 from cloudrc.link.verify.causes import (
     Findings,
@@ -58,7 +56,7 @@ from cloudrc.link.verify.causes import (
     read_evidence,
     read_metrics,
 )
-from cloudrc.link.verify.judge import UNITS, Expected, Flow, Plan, Row, look_twice, verdict_of
+from cloudrc.link.verify.judge import UNITS, Flow, Plan, Row, look_twice, verdict_of
 from cloudrc.link.verify.probe import PROBE, ProbeEnd, plan_probes, send_probes
 from cloudrc.tunnel.codec import SIZES, Kind
 
@@ -76,13 +74,6 @@ WAYS = {
 """Direction -> sender, receiver, and the kind of datagram that the sender sends."""
 KEYS = ("asked", "measured", "low", "high")  # values of a row, in the order of the table's columns
 NOT_JUDGED = "NOT JUDGED"  # in a note about a quantity that could not be verified
-TOLD = {
-    "correlation": f"correlation {NOT_JUDGED}: netem realises almost none of it",
-    "rate": f"rate {NOT_JUDGED}: only trains of probes measure it, up to 100 Mbit/s",
-    "time_line": f"its time line {NOT_JUDGED} in flight, only what follows it",
-}
-"""Quantity that cannot be judged -> the note that says so."""
-LOOPS = f"{NOT_JUDGED} in flight: a time line loops; probe it without --mode cluster"
 VERDICTS = {
     "off": ("not believed", "red", "does not match its profile"),
     "open": ("undecided", "yellow", "was not measured for long enough: give more --seconds"),
@@ -178,28 +169,34 @@ def make_plans(
             if netem:
                 check(profile)
         except BadInputError as error:
-            raise BadInputError(_advise(f"{way}: {error}")) from None
+            raise BadInputError(f"{way}: {error}") from None
         plans[way] = plan_probes(profile, flow, seconds, drawn=netem)
     return plans
 
 
-def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Findings]:
-    """Send all probes over a running link; return the findings on each direction."""
-    since_wall_ns, found, ends = time.time_ns() - time.monotonic_ns(), {}, []
-    states = {name: from_text((way.folder / STATE_FILE).read_text()) for name, way in ways.items()}
+def measure(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Stream]:
+    """Send all probes over a running link; return the measured stream of each direction."""
+    since_wall_ns, ends = time.time_ns() - time.monotonic_ns(), []
     for name, way in ways.items():
         route = split_address((way.folder / "route").read_text())
-        origin_ns = (states[name].origin_ns or 0) + since_wall_ns
+        origin_ns = (
+            from_text((way.folder / STATE_FILE).read_text()).origin_ns or 0
+        ) + since_wall_ns
         ends.append(ProbeEnd(way.own, route, plans[name], origin_ns))
-    streams = send_probes(ends)
+    return dict(zip(ways, send_probes(ends), strict=True))
+
+
+def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Findings]:
+    """Send all probes over a running link; return the findings on each direction."""
+    streams, found = measure(ways, plans), {}
     time.sleep(COUNTS_WAIT)
-    for (name, way), stream in zip(ways.items(), streams, strict=True):
-        with inside(way.namespace):
-            page = {"shaper": states[name].shaper, "reason": states[name].reason}
+    for name, way in ways.items():
+        page = json.loads((way.folder / STATE_FILE).read_text())
+        with inside(way.namespace):  # the process of the link may be stopped: ask the kernel
             page |= find_netems(run_tool, way.peer[0])
             metrics = read_metrics(fetch(f"http://{LOOPBACK}:{way.ports[1]}/metrics"))
-        known = read_evidence(page, metrics, len(stream.sent))
-        found[name] = Findings(plans[name].judge(stream), known)
+        known = read_evidence(page, metrics, len(streams[name].sent))
+        found[name] = Findings(plans[name].judge(streams[name]), known)
     return found
 
 
@@ -263,13 +260,9 @@ def _start(name: str, way: Way, shaper: str) -> subprocess.Popen[bytes]:
         )
 
 
-def _advise(text: str) -> str:
-    return text.replace("set link.mode=", "use --shaper ")
-
-
 def _ended(name: str, code: int, log: str) -> CloudrcError:
     last = (log.strip().splitlines() or ["it left no message"])[-1]
-    text = f"the {name} is not shaped: {_advise(last.removeprefix('cloudrc: error: '))}"
+    text = f"the {name} is not shaped: {last.removeprefix('cloudrc: error: ')}"
     known = {one.exit_code: one for one in (BadInputError, MissingPrerequisiteError, TimedOutError)}
     if code in known:
         return known[code](text)
@@ -288,20 +281,16 @@ def _namespaces() -> Iterator[dict[str, str]]:
     near, far = names.values()
     with contextlib.ExitStack() as stack:
         for name in names.values():
-            _ip("netns", "add", name)
-            stack.callback(_ip, "netns", "del", name)
-        _ip("-n", near, "link", "add", DEVICE, "type", "veth", "peer", DEVICE, "netns", far)
+            run_tool(("ip", "netns", "add", name))
+            stack.callback(run_tool, ("ip", "netns", "del", name))
+        run_tool(
+            ("ip", "-n", near, "link", "add", DEVICE, "type", "veth", "peer", DEVICE, "netns", far)
+        )
         for way, name in names.items():
-            _ip("-n", name, "addr", "add", f"{HOSTS[way]}/24", "dev", DEVICE)
+            run_tool(("ip", "-n", name, "addr", "add", f"{HOSTS[way]}/24", "dev", DEVICE))
             for device in ("lo", DEVICE):
-                _ip("-n", name, "link", "set", device, "up")
+                run_tool(("ip", "-n", name, "link", "set", device, "up"))
         yield names
-
-
-def _ip(*words: str) -> None:
-    if (answer := run_tool(("ip", *words))).code:
-        failure = " ".join(answer.error.split()) or "no program ip (package iproute2)"
-        raise MissingPrerequisiteError(f"ip {' '.join(words)}: {failure}; use --shaper relay")
 
 
 @contextlib.contextmanager
@@ -356,8 +345,8 @@ def verify_release(title: str, pods: Pods, limit: float) -> Report:
         for way, (_, receiver, _) in WAYS.items():
             if page := fetch(f"{pods[receiver][0]}/link.json"):
                 seen[way] = json.loads(page)
-        decided = len(seen) == len(WAYS) and not any(map(_may_change, seen.values()))
-        if decided or time.monotonic() >= deadline:
+        decided = {found["verdict"] for found in seen.values()} <= {"ok", "off"}
+        if (decided and len(seen) == len(WAYS)) or time.monotonic() >= deadline:
             break
     if silent := [receiver for way, (_, receiver, _) in WAYS.items() if way not in seen]:
         text = f"{' and '.join(silent)} did not answer within {limit:g} s: are the pods ready?"
@@ -377,24 +366,14 @@ def fetch(url: str) -> str:
         return ""
 
 
-def _may_change(found: Mapping[str, Any]) -> bool:
-    """Return whether an "open" verdict may change; with a looping time line it stays "open"."""
-    loops = any(row["quantity"] == "time_line" and row.get("measured") for row in found["rows"])
-    return bool(found["verdict"] == "open") and not loops
-
-
 def _findings(found: Mapping[str, Any], link: str) -> Findings:
     """Combine the receiver's verdict with the report of the link container at the URL `link`."""
     page, rows = json.loads(fetch(f"{link}/link.json") or "{}"), []
     for one in found["rows"]:
         name, values = one["quantity"], (one.get(key, nan) for key in KEYS)
         asked, measured, low, high = map(float, values)
-        row = Row(name, UNITS.get(name, "1"), asked, measured, low, high, one["verdict"])
-        # The datagrams of a flight do not show the rate. Take the rate that the shaper reports.
-        if name == "rate" and "rate" in page:
-            expected = Expected({name: (asked, asked, asked)}, np.zeros(0), known=True)
-            row = expected.judge(name, page["rate"] or inf)
-        rows.append(row)
+        unit = UNITS.get(name, "1")
+        rows.append(Row(name, unit, asked, measured, low, high, one["verdict"]))
     return Findings(rows, read_evidence(page, read_metrics(fetch(f"{link}/metrics"))))
 
 
@@ -406,8 +385,7 @@ def _notes(way: str, rows: Sequence[Row]) -> Iterator[str]:
         yield f"{way}: one-way delays {NOT_JUDGED}: the ends do not share a clock"
     for row in rows:
         if row.verdict == "told":
-            loops = row.name == "time_line" and row.measured == 1.0
-            yield f"{way}: {LOOPS if loops else TOLD.get(row.name, NOT_JUDGED)}"
+            yield f"{way}: {row.name} {NOT_JUDGED}; docs/link.md says why"
 
 
 def make_report(title: str, findings: Mapping[str, Findings], probes: Mapping[str, str]) -> Report:

@@ -18,10 +18,8 @@ import socket
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -32,7 +30,7 @@ from cloudrc.drivers.realtime import Address, Peer, bind, split_address
 from cloudrc.errors import BadInputError
 from cloudrc.files import warn_if_readable
 from cloudrc.link.follow import PROFILE_PERIOD, Loaded, ProfileFile
-from cloudrc.link.state import PROFILE_FILE, RELEASED_SUFFIX, LinkState, publish, summary, to_text
+from cloudrc.link.state import PROFILE_FILE, RELEASED_SUFFIX, StateFile, publish, summary
 from cloudrc.records import Counted
 
 if TYPE_CHECKING:
@@ -415,34 +413,36 @@ def open_relay(
 
     Raise a BadInputError if an address cannot be used.
     """
-    from cloudrc.link.relay import Relay
+    from cloudrc.link.relay import Lane, Relay
     from cloudrc.tunnel.codec import peek
 
-    peers = {
-        "world_peer": resolve_address("--world", options.world),
-        "cloud_peer": resolve_address("--cloud", options.cloud),
-    }
     with ExitStack() as opened:
-        sides = {}
-        for side in ("world_side", "cloud_side"):
-            address = getattr(options, side)
-            with _listening(f"--{side.replace('_', '-')}", address):
-                sides[side] = opened.enter_context(bind(address))
-        try:
-            relay = Relay(uplink, downlink, peek, **sides, **peers)  # type: ignore[arg-type]
-        except OSError as error:
-            raise BadInputError(
-                "the relay cannot reach --world from --world-side, or --cloud from --cloud-side "
-                f"({error.strerror or error}); give each side an address that reaches its end"
-            ) from error
+        sides = []
+        for end in ("world", "cloud"):
+            peer = resolve_address(f"--{end}", getattr(options, end))
+            listen = getattr(options, f"{end}_side")
+            with _listening(f"--{end}-side", listen):
+                sides.append(opened.enter_context(bind(listen)))
+            try:
+                sides[-1].connect(peer)  # takes datagrams from this address alone
+            except OSError as error:
+                raise BadInputError(
+                    f"the relay cannot reach --{end} from --{end}-side ({error.strerror or error});"
+                    " give it an address that reaches its end"
+                ) from error
         opened.pop_all()  # they stay open until this process ends
-        return relay
+    world, cloud = sides
+    lanes = {
+        "uplink": Lane(world, cloud.send, uplink, peek),
+        "downlink": Lane(cloud, world.send, downlink, peek),
+    }
+    return Relay(lanes, origin_ns=None)
 
 
 class RelayControl:
     """Applies the changes of `cloudrc link set` to a relay, and publishes the relay's state.
 
-    A separate thread reads and writes the files. The relay's loop replaces the profiles.
+    A separate thread reads the files. The relay's loop replaces the profiles.
     """
 
     def __init__(
@@ -464,62 +464,45 @@ class RelayControl:
         folder.mkdir(exist_ok=True)
         file, self._released_at = folder / PROFILE_FILE, 0.0
         self._files = {way: ProfileFile(file, make_profile_loader(way), _log) for way in links}
-        self._pending: deque[tuple[str, Loaded]] = deque()
-        self._applied: deque[tuple[str, Loaded, int]] = deque()
-        self._changes = dict.fromkeys(links, -1)
+        self._states = {way: StateFile(folder / f"{way}.json", "relay", way) for way in links}
+        self._requested, self._applied = dict(first), dict(first)
         for way, loaded in first.items():
-            self._publish(way, loaded, time.monotonic_ns())
+            self._publish(way, loaded)
 
     def swap(self) -> None:
-        """Apply the pending profiles, between two datagrams, in the thread of the relay's loop."""
-        if self._pending:
-            self._relay.take_in()
-        while self._pending:
-            way, loaded = self._pending.popleft()
-            self._links[way].replace_profile(loaded.direction, restart=loaded.change.restart)
-            self._applied.append((way, loaded, time.monotonic_ns()))
+        """Apply the requested profiles between two datagrams, in the thread of the relay's loop."""
+        for way, loaded in self._requested.items():
+            if loaded is not self._applied[way]:
+                self._relay.take_in()
+                self._links[way].replace_profile(loaded.direction, restart=loaded.change.restart)
+                self._applied[way] = loaded
+                with suppress(OSError):  # the relay goes on even if the disk is full
+                    self._publish(way, loaded)
 
     def follow(self) -> None:
         """Call `look` periodically, in a thread that never ends."""
         while True:
             self.look()
-            time.sleep(PROFILE_PERIOD / 2 if self._pending else PROFILE_PERIOD)
+            time.sleep(PROFILE_PERIOD)
 
     def look(self) -> None:
-        """Read requested changes from the folder; publish applied changes and the lateness."""
+        """Read requested changes from the folder; publish the lateness of the datagrams."""
         for way, file in self._files.items():
-            if (loaded := file.poll()) is not None:
-                self._pending.append((way, loaded))
-        with suppress(OSError):  # such as a full disk: the next time tries again
-            while self._applied:  # written here, because the relay's loop must not wait for a disk
-                self._publish(*self._applied[0])
-                self._applied.popleft()
-            if time.monotonic() - self._released_at >= RELEASED_PERIOD:
-                self._released_at = time.monotonic()
-                for way in self._links:
-                    if released := self._relay.released(way):
+            self._requested[way] = file.poll() or self._requested[way]
+        if time.monotonic() - self._released_at >= RELEASED_PERIOD:
+            self._released_at = time.monotonic()
+            for way in self._links:
+                if released := self._relay.lanes[way].released():
+                    with suppress(OSError):
                         publish(self._folder / f"{way}{RELEASED_SUFFIX}", json.dumps(released))
 
-    def _publish(self, way: str, loaded: Loaded, since_ns: int) -> None:
-        changes, requested = self._changes[way] + 1, summary(loaded.direction)
-        state = LinkState(
-            shaper="relay",
-            reason="local mode",
-            mode="relay",
-            direction=way,
-            profile=loaded.values,
-            since=datetime.now(UTC).isoformat(timespec="seconds"),
-            since_ns=since_ns,
-            changes=changes,
-            change=loaded.change.number,
-            cause=loaded.change.cause if changes else "",
-            asked=requested,
-            # None: the time line of the first profile starts with the first datagram.
-            origin_ns=since_ns if changes and loaded.change.restart else None,
-        )
-        self._asked(way, requested["delay"] or 0.0)
-        publish(self._folder / f"{way}.json", to_text(state))
-        self._changes[way] = changes
+    def _publish(self, way: str, loaded: Loaded) -> None:
+        now_ns, states = time.monotonic_ns(), self._states[way]
+        # None: the time line of the first profile starts with the first datagram.
+        origin_ns = now_ns if states.state and loaded.change.restart else None
+        state = states.next(loaded, "relay", "local mode", now_ns, origin_ns)
+        self._asked(way, state.asked["delay"] or 0.0)
+        states.publish(state)
 
 
 def _log(line: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from math import isfinite
 from pathlib import Path
 from typing import TypeAlias
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.fence import INNER_HIGH, INNER_LOW
-from cloudrc.link.traces import Row, read_lines, read_rows
+from cloudrc.link.traces import read_lines, read_rows
 from cloudrc.messages import Vector
 
 COLUMNS = ["time_s", "x_m", "y_m", "z_m"]
@@ -35,7 +34,7 @@ def read_setpoints(path: Path) -> tuple[TimedPosition, ...]:
         given = ",".join(columns)[:80] or "missing"
         raise BadInputError(f"{name}, line 1: the columns are {given}; give {','.join(COLUMNS)}")
     for row in rows:
-        time, x, y, z = (_number(row, column) for column in COLUMNS)
+        time, x, y, z = map(row.number, COLUMNS)
         if found and time <= found[-1][0]:
             raise BadInputError(
                 f"{row.where}: time_s {time:g} does not rise; sort the rows by time"
@@ -61,10 +60,3 @@ def write_setpoints(setpoints: Iterable[tuple[float, Sequence[float]]]) -> str:
     inside = {f"{time:.6f}": np.clip(at, INNER_LOW, INNER_HIGH) for time, at in setpoints}
     lines = (f"{time},{x:.6g},{y:.6g},{z:.6g}" for time, (x, y, z) in inside.items())
     return "\n".join([",".join(COLUMNS), *lines, ""])
-
-
-def _number(row: Row, column: str) -> float:
-    value = row.number(column)
-    if value is None or not isfinite(value):
-        raise row.no_number(column, "a finite number")
-    return value

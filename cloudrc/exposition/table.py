@@ -43,7 +43,7 @@ MISSION_OUTCOMES = ("done", "cancelled", *FAILURES, "other")
 BODIES = ("pipe", "board", "floor", "other")
 """Kinds of bodies that the robot can touch, such as "pipe" for the body `pipe_2`."""
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
-"""Outcomes of a datagram at the relay; `cloudrc.link.relay.Lanes.outcomes` explains them."""
+"""Outcomes of a datagram at the relay; `cloudrc.link.relay.Relay.counts` explains them."""
 RELEASE_PERCENTILES = ("50", "99", "99.9")
 """Percentiles of the relay's release error; the count for "99.9" is `release_error_p999_ns`."""
 

@@ -68,23 +68,16 @@ class ProfileFile:
     def poll(self) -> Loaded | None:
         """Return the new profile if the file has changed and the profile is valid, otherwise None.
 
-        If the profile is invalid, log why. If the file changes while it is being read, return None,
-        so that the next call reads the file again.
+        If the profile is invalid, log why.
         """
-        seen = version(self._path)
-        if seen == self._seen:
+        before, self._seen = self._seen, version(self._path)
+        if self._seen == before:
             return None
-        loaded, refusal = None, ""
         try:
-            loaded = self._read()
+            return self._read()
         except (BadInputError, OSError, ValueError) as error:
-            refusal = f"the new profile is refused, the old one stays: {error}"
-        if version(self._path) != seen:
+            self._log(f"the new profile is refused, the old one stays: {error}")
             return None
-        self._seen = seen
-        if refusal:
-            self._log(refusal)
-        return loaded
 
     def _read(self) -> Loaded:
         loaded = self._load(self._path)
@@ -160,28 +153,23 @@ class Profiles:
     def first(self) -> Loaded:
         """Read the profile at the start; raise a BadInputError if the profile is invalid."""
         loaded = self._file.first()
-        self._is_known(loaded)
+        self._known[loaded.change.number] = loaded.values
         return loaded
 
     def poll(self) -> Loaded | None:
         """Return the profile of a change that has arrived; None if no change has arrived."""
         for source in self._sources:
             loaded = source.poll()
-            if loaded is not None and not self._is_known(loaded):
+            if loaded is None:
+                continue
+            number = loaded.change.number
+            before = self._known.get(number) if number else None
+            self._known[number] = loaded.values
+            if before is None:
                 return loaded
+            if before != loaded.values:  # `helm upgrade` keeps the number of the previous change
+                return loaded._replace(change=Change())
         return None
-
-    def _is_known(self, loaded: Loaded) -> bool:
-        """Return whether the same change has arrived before; remember a new change.
-
-        Two changes are the same only if their numbers and their profiles are equal, because
-        `helm upgrade` changes the profile but keeps the number of the previous change.
-        """
-        number = loaded.change.number
-        if not number:
-            return False
-        before, self._known[number] = self._known.get(number), loaded.values
-        return before == loaded.values
 
 
 class PeerName:
@@ -210,19 +198,16 @@ class PeerName:
 
         If the resolution fails, return the last known address; None before the first success.
         """
-        before = self._known[-1:]
         try:
             addresses = sorted(self._resolve(self._name))
         except OSError as error:
             self.failures += 1
-            keeps = f"the link keeps {before[0]}" if before else "the link waits"
-            said, was = f"cannot be resolved ({error.strerror or error}); {keeps}", ""
+            said = f"cannot be resolved ({error.strerror or error}); its last address stays"
         else:
             kept = [address for address in self._known if address in addresses]
             self._known = kept + [address for address in addresses if address not in kept]
             said = f"is {self._known[-1]}"
-            was = f", was {before[0]}" if before and before != self._known[-1:] else ""
         if said != self._said:
             self._said = said
-            self._log(f"{self._name} {said}{was}")
+            self._log(f"{self._name} {said}")
         return (self._known[-1], self._port) if self._known else None

@@ -19,20 +19,20 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import datetime
 from itertools import pairwise
-from math import isfinite, isnan
-from operator import itemgetter
+from math import isnan, nan
 from statistics import median
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from cloudrc.errors import BadInputError
+from cloudrc.link.model import Stream
 from cloudrc.link.profile import Trace
-from cloudrc.link.traces import Row, looks_lost, read_rows
+from cloudrc.link.traces import LATEST, Row, looks_lost, read_rows
 
 Direction: TypeAlias = Literal["uplink", "downlink"]
-Entry: TypeAlias = tuple[float, float | None]
-"""Time of sending [s] and delay [s]; the delay is None if the packet was lost."""
+Entry: TypeAlias = tuple[float, float]
+"""Time of sending [s] and delay [s]; the delay is NaN if the packet was lost."""
 LONGEST = 5.0  # largest plausible median delay [s]; a larger median suggests that the unit is wrong
 UNUSABLE_MAX = 0.01  # largest share of rows that may be left out, in [0, 1]
 GAP, GAP_MIN = 5, 1.0
@@ -47,28 +47,11 @@ HALVE = (
 
 
 @dataclass(frozen=True, slots=True)
-class Packets:
-    """The packets of a log in the order of sending."""
+class Packets(Stream):
+    """The packets of a log in the order of sending; the times of sending are on any clock."""
 
-    sent: tuple[float, ...]  # times of sending on any clock, strictly rising [s], shape (n,)
-    delays: tuple[float | None, ...]  # one-way delays [s], None for lost packets, shape (n,)
     notes: tuple[str, ...] = ()  # texts such as "3 out of order, sorted", for the user
     halved: bool = False  # whether the delays are halves of round trips
-
-    @property
-    def arrived(self) -> list[float]:
-        """Delays of the packets that arrived [s]."""
-        return [delay for delay in self.delays if delay is not None]
-
-    @property
-    def lost(self) -> int:
-        """Number of lost packets."""
-        return self.delays.count(None)
-
-    @property
-    def duration(self) -> float:
-        """Time from the first to the last packet sent [s]."""
-        return self.sent[-1] - self.sent[0]
 
 
 @dataclass(slots=True)
@@ -88,11 +71,10 @@ class Log:
         or if more than 1 % of the rows are unusable or repeat the time of an earlier row.
         """
         self._refuse_beyond_limit(len(self.unusable), *self.unusable[:1])
-        arrived = [delay for _, delay in self.entries if delay is not None]
-        if not arrived:
+        times, delays = np.array(self.entries or [(nan, nan)]).T
+        if np.isnan(delays).all():
             raise self.error("no packet arrived; give a log with at least one reply")
-        self.refuse_early(min(arrived))
-        times = np.array([sent for sent, _ in self.entries])
+        self.refuse_early(float(np.nanmin(delays)))
         steps = np.diff(times)
         far = max(GAP_MIN, GAP * float(np.median(np.abs(steps)))) if len(steps) else GAP_MIN
         back = np.flatnonzero(steps < -far)
@@ -109,14 +91,15 @@ class Log:
         self.counts["left out, at the time of another one"] += repeated
         self.counts["left out, unreadable"] += len(self.unusable)
         notes = [f"{count} {what}" for what, count in self.counts.items() if count]
-        sent, delays = zip(*sorted(unique.items(), key=itemgetter(0)), strict=True)
+        sent, delays = np.array(sorted(unique.items())).T
         gaps = np.diff(sent)
         if gaps.max(initial=0.0) > far:
             notes.append(
                 f"nothing sent for {gaps.max():.4g} s after packet {gaps.argmax() + 1}: a pause, "
                 "two sessions in one log, or a step of the clock"
             )
-        return Packets(sent, delays, tuple(notes), self.halved)
+        copies = np.isfinite(delays).astype(int)
+        return Packets(sent, delays, copies, tuple(notes), self.halved)
 
     def error(self, text: str) -> BadInputError:
         """Make an error that begins with the name of the log."""
@@ -142,15 +125,14 @@ def trace_of(packets: Packets) -> Trace:
 
     Each row applies from half a period before its packet was sent until half a period after. So in
     a flight a packet that is a little early or late gets the right row. Time 0 is the first packet.
+    A lost packet has the delay of the packet before it.
     """
-    sent = packets.sent
-    halfway = [(before + after) / 2 - sent[0] for before, after in pairwise(sent)]
-    delays, delay = [], packets.arrived[0]
-    for given in packets.delays:
-        delay = delay if given is None else given
-        delays.append(delay)
-    losses = tuple(1.0 if given is None else 0.0 for given in packets.delays)
-    return Trace((0.0, *halfway), tuple(delays), losses if packets.lost else None)
+    sent, lost = packets.sent, np.isnan(packets.delays)
+    halfway = (sent[1:] + sent[:-1]) / 2 - sent[0]
+    newest = np.maximum.accumulate(np.where(lost, 0, np.arange(len(lost))))
+    delays = packets.delays[np.maximum(newest, np.argmin(lost))]
+    losses = tuple(lost.astype(float).tolist()) if lost.any() else None
+    return Trace((0.0, *halfway.tolist()), tuple(delays.tolist()), losses)
 
 
 _OTHERS = {
@@ -259,22 +241,17 @@ _IRTT_NAMES = {
 def _irtt_entries(trips: list[dict[str, Any]], what: str) -> list[Entry]:
     """Read the time of sending and the delay of each packet [s]; time 0 is the first packet.
 
-    Packets lost in the other direction are left out. A downlink packet is sent when the uplink
-    packet arrives. If the downlink packet is lost, irtt does not report this time; it is estimated
-    with the median uplink delay.
+    Packets lost in the other direction are left out. In both directions the time is that at which
+    the client sent, because irtt does not report when the server sends a packet that is lost.
     """
     other, key = _IRTT_NAMES[what]
-    part, usual = 0.5e-9 if what == "halves" else 1e-9, 0
-    if what == "downlink":
-        usual = round(median([int(t["delay"]["send"]) for t in trips if _arrived(t)] or [0]))
-    entries: list[tuple[int, float | None]] = []
+    part = 0.5e-9 if what == "halves" else 1e-9
+    entries: list[tuple[int, float]] = []
     for trip in trips:
         if str(trip["lost"]).lower() != other:
-            stamp, delays = trip["timestamps"]["client"]["send"], trip.get("delay", {})
-            arrived, sent = _arrived(trip), int(stamp.get("monotonic", stamp.get("wall")))
-            if what == "downlink":
-                sent += int(delays["send"]) if arrived else usual
-            entries.append((sent, int(delays[key]) * part if arrived else None))
+            stamp = trip["timestamps"]["client"]["send"]
+            sent = int(stamp.get("monotonic", stamp.get("wall")))
+            entries.append((sent, int(trip["delay"][key]) * part if _arrived(trip) else nan))
     start = min((sent for sent, _ in entries), default=0)
     return [((sent - start) * 1e-9, delay) for sent, delay in entries]
 
@@ -284,13 +261,16 @@ FINER = {"s": "ms", "ms": "us", "us": "ns", "ns": "ns"}
 TIMES, DELAYS, LOSSES = ("time", "timestamp", "sent"), ("delay", "rtt"), ("loss", "lost")
 COLUMNS = "time_s and delay_ms, or with _s, _ms, _us or _ns; rtt_ for round trips; and loss"
 _LOST_WORDS = {
-    *("", "-", "*", "nan", "inf", "none", "null", "na", "n/a"),
+    *("", "-", "*", "nan", "-nan", "inf", "none", "null", "na", "n/a"),
     *("lost", "loss", "timeout", "timed out", "request timed out", "no answer yet"),
 }
 """Words in the delay column that mark a lost packet."""
 _LOST_NUMBERS = (-1.0, -999.0, -9999.0)  # mark a lost packet if no other delay is negative
-_FLAGS = {"0": False, "1": True, "false": False, "true": True, "no": False, "yes": True}
-LATEST = 1e11  # largest plausible time since 1970 [s]; a larger time has another unit
+_FLAGS = {
+    **dict.fromkeys(("0", "0.0", "false", "no"), False),
+    **dict.fromkeys(("1", "1.0", "true", "yes"), True),
+}
+"""Word in the loss column -> whether the packet was lost."""
 
 
 def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool) -> Packets:
@@ -328,10 +308,7 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     # For nanoseconds since 1970 a float has a resolution of 256 ns, which is enough here.
     start = min((sent for sent, _ in raw), default=0.0)
     scales = SCALES[time_unit or "s"], SCALES[unit] * (0.5 if log.halved else 1.0)
-    log.entries = [
-        ((sent - start) * scales[0], None if value is None else value * scales[1])
-        for sent, value in raw
-    ]
+    log.entries = [((sent - start) * scales[0], value * scales[1]) for sent, value in raw]
     packets = log.packets()
     if not trust_units:
         _check_unit(packets, unit, f"{name}: {delay}")
@@ -341,7 +318,7 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
 def _check_unit(packets: Packets, unit: str, name: str) -> None:
     """Raise an error if the delays are probably in another unit than the column says."""
     factor, found = 1 / SCALES[unit], ""
-    top, middle = max(packets.arrived), median(packets.arrived)
+    top, middle = np.nanmax(packets.delays), np.nanmedian(packets.delays)
     if unit != "s" and 0.0 < top * factor < 1.0:
         found = f"is at most {top * factor:.4g} {unit}, which looks like seconds"
     elif middle > LONGEST:
@@ -377,36 +354,29 @@ def _csv_time(row: Row, column: str, unit: str) -> float:
         except ValueError:
             raise BadInputError(f"{row.where}: {_no_unit(column)}") from None
     value = row.number(column)
-    if value is None or not isfinite(value):
-        raise row.no_number(column)
     if value * SCALES[unit] > LATEST:
         raise BadInputError(f"{row.where}: {column} is {text}, a finer unit than {unit}; rename it")
     return value
 
 
-def _csv_delay(row: Row, column: str, loss: str | None) -> float | None:
-    """Read a delay in the column's unit; return None for a lost packet."""
+def _csv_delay(row: Row, column: str, loss: str | None) -> float:
+    """Read a delay in the column's unit; return NaN for a lost packet."""
     if loss is not None:
-        flag = _FLAGS.get(row.text(loss).lower(), row.number(loss))
-        if flag not in (0.0, 1.0):
+        flag = _FLAGS.get(row.text(loss).lower())
+        if flag is None:
             remedy = "0 or 1 for a packet; a profile can use a trace with other shares directly"
-            raise row.no_number(loss, remedy)
+            raise BadInputError(f"{row.where}: {loss} is {row.text(loss)[:40]!r}; give {remedy}")
         if flag:
-            return None
-    value = row.number(column)
-    if row.text(column).lower() in _LOST_WORDS or (value is not None and isnan(value)):
-        return None
-    if value is None or not isfinite(value):
-        raise row.no_number(column)
-    return value
+            return nan
+    return nan if row.text(column).lower() in _LOST_WORDS else row.number(column)
 
 
 def _without_marks(raw: list[Entry], column: str, log: Log, *, has_losses: bool) -> list[Entry]:
-    """Replace each number that marks a lost packet, such as -1, by None; count these packets.
+    """Replace each number that marks a lost packet, such as -1, by NaN; count these packets.
 
     If the log has a column `loss`, 0 is no mark.
     """
-    values = {value for _, value in raw if value is not None}
+    values = {value for _, value in raw if not isnan(value)}
     below = {value for value in values if value < 0.0}
     marks = {value for value in below if len(below) == 1 and value in _LOST_NUMBERS}
     if below and not marks and log.halved:
@@ -418,13 +388,13 @@ def _without_marks(raw: list[Entry], column: str, log: Log, *, has_losses: bool)
     for mark in marks:
         what = f"with {column} {mark:g} taken as lost"
         log.counts[what] = sum(value == mark for _, value in raw)
-    return [(sent, None if value in marks else value) for sent, value in raw]
+    return [(sent, nan if value in marks else value) for sent, value in raw]
 
 
 _WRAP = 1 << 16
 _STAMP = re.compile(
     r"\[?(?P<unix>(?<=\[)\d+(?:\.\d+)?|\d{9,10}\.\d+)\]? +"
-    r"|(?P<date>\d{4}-\d\d-\d\d)?[T ]?(?P<clock>\d\d:\d\d:\d\d\.\d+)\S* +"
+    r"|(?P<clock>\d\d:\d\d:\d\d\.\d+)\S* +"
 )
 """Time stamp at the start of a line, from `ping -D`, `ts '[%.s]'` or `ping --apple-time`."""
 _NUMBER = re.compile(r"\b(?:icmp6?_)?(?:seq|req)[= ](\d{1,12})\b|(?<= : )\[(\d{1,12})\], ")
@@ -432,15 +402,11 @@ _ROUND_TRIP = re.compile(r"(?:[=<] ?|, )(\d+(?:[.,]\d+)?) ?(?:ms|msec|msek|мс|
 _REPLY = re.compile(r"ttl=|hlim=|bytes from", re.IGNORECASE)
 _SUMMARY = re.compile(r"xmt/rcv/%loss = (\d+)/(\d+)/|^(?!.*xmt/)\D*(\d+)\D+(\d+)\D.*%")
 """Summary at the end: packets sent, packets received."""
-_NO_STAMPS = {
-    r"(?<!_)\bseq=\d": "BusyBox's ping gives no times: ping HOST | ts '[%.s]', or use irtt",
-    r"\d data bytes|Request timeout": (
-        "on macOS -D forbids fragments: use ping --apple-time there; BSD: ping HOST | ts '[%.s]'"
-    ),
-    r"\], \d+ bytes": "run fping with -D",
-    "": "run ping with -D",
-}
-"""Pattern of a kind of ping -> how to get time stamps from it; the first match is used."""
+_STAMPS_BY = (
+    "Linux: ping -D; macOS: ping --apple-time (-D does not print times there); fping: -D; "
+    "BusyBox, BSD: ping HOST | ts '[%.s]'"
+)
+"""How to get time stamps from each kind of ping."""
 
 
 def is_ping(lines: list[str]) -> bool:
@@ -476,7 +442,7 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
     times = np.interp(numbers, known, sent) + outside * ping.period()
     for number, at in zip(numbers.tolist(), times.tolist(), strict=True):
         reply = ping.replies.get(number)
-        log.entries.append((at, reply[1] / 2 if reply else None))
+        log.entries.append((at, reply[1] / 2 if reply else nan))
     return log.packets()
 
 
@@ -489,12 +455,11 @@ class _Ping:
 
     def __init__(self, lines: list[str], log: Log) -> None:
         self.replies: dict[int, tuple[float, float]] = {}
-        self._log, self._text = log, "\n".join(lines[:1000])
+        self._log = log
         self._told: dict[int, float] = {}  # number -> time stamp of its line, or 0 [s]
         self._summaries: list[tuple[int, int]] = []  # packets sent and received
         self._headers, self._base = 0, 1  # lines that begin a log; first number of this ping
         self._newest = 0
-        self._midnight = self._clock = 0.0
         for line in lines:
             if (number := _NUMBER.search(line)) is not None:
                 self._read_packet(line, number)
@@ -508,9 +473,7 @@ class _Ping:
             log.unusable.append(f"{log.name}: {reason}; run: LC_ALL=C ping -D -O HOST")
             return
         if trip and stamp is None:
-            kinds = _NO_STAMPS.items()
-            remedy = next(words for kind, words in kinds if re.search(kind, self._text))
-            raise log.error(f"its lines have no [time]; {remedy}")
+            raise log.error(f"its lines have no time stamps; {_STAMPS_BY}")
         if "DUP!" in line:
             log.counts["duplicates left out"] += 1
             return
@@ -533,13 +496,7 @@ class _Ping:
         if stamp["unix"]:
             return float(stamp["unix"])
         hours, minutes, seconds = map(float, stamp["clock"].split(":"))
-        clock = hours * 3600 + minutes * 60 + seconds
-        if stamp["date"]:
-            return datetime.fromisoformat(stamp["date"] + "T00:00+00:00").timestamp() + clock
-        if self._clock - clock > 43_200:  # midnight
-            self._midnight += 86_400.0
-        self._clock = clock
-        return self._midnight + clock
+        return hours * 3600 + minutes * 60 + seconds
 
     def _read_other(self, line: str) -> None:
         if line.startswith(("PING ", "PING6(")):

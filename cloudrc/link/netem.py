@@ -18,16 +18,14 @@ net/sched/sch_netem.c (tabledist).
 from __future__ import annotations
 
 import json
-import re
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Sequence
 from hashlib import blake2b
-from itertools import pairwise
 from math import ceil, inf
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -36,7 +34,7 @@ from cloudrc.link.draws import PARETO_CUT, Floats
 from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Loss, Timeline
 from cloudrc.link.relay import Address
 
-NOT_FOUND = 127  # exit code that stands for a program that does not exist
+USE_RELAY = "use the relay (link.mode=relay, or --shaper relay)"
 ROOT, BAND, LEAF = "7400:", "7400:4", "7401:"  # root qdisc, band of the tunnel, its netem
 PERIOD_NS = 1_000_000_000  # time between two checks of the qdiscs [ns]
 STEP_NS = 5_000_000  # shortest time between two changes by a time line; faster are skipped [ns]
@@ -57,52 +55,23 @@ _PACKETS = 1_000  # assumed packet rate without a bottleneck [1/s]; tunnel and p
 _PRIO = "prio bands 4 priomap 1 2 2 2 1 2 0 0 1 1 1 1 1 1 1 1".split()
 
 
-class Answer(NamedTuple):
-    """Exit code, standard output and standard error of a program."""
-
-    code: int
-    output: str
-    error: str
+Run: TypeAlias = Callable[[Sequence[str]], str]
+"""Function that runs a program and returns its output; if that fails, it raises `explain`'s error.
+"""
 
 
-Run: TypeAlias = Callable[[Sequence[str]], Answer]
-"""Function that runs a program and waits for its end."""
+def explain(words: Sequence[str], text: str, *, missing: bool = False) -> CloudrcError:
+    """Make an error with cause and remedy from the `text` of a failed program.
 
-
-class Iproute2:
-    """Runs `tc` and `ip`; if a call fails, raises an error with cause and remedy."""
-
-    def __init__(self, run: Run) -> None:
-        self._run = run
-
-    def tc(self, *words: str) -> str:
-        """Run tc and return its output."""
-        return self._checked("tc", words)
-
-    def show(self, *words: str) -> list[dict[str, Any]]:
-        """Run `tc -s -j` with these arguments and return the objects that it prints."""
-        return list(json.loads(self._checked("tc", ("-s", "-j", *words)) or "[]"))
-
-    def device(self, host: str) -> str:
-        """Return the interface through which packets to a host leave."""
-        return str(json.loads(self._checked("ip", ("-j", "route", "get", host)))[0]["dev"])
-
-    def _checked(self, program: str, words: Sequence[str]) -> str:
-        answer = self._run((program, *words))
-        if answer.code:
-            raise explain(program, words, answer)
-        return answer.output
-
-
-def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
-    """Convert the failed call of a program into an error with cause and remedy."""
-    text = " ".join((answer.error or answer.output).split()) or f"exit code {answer.code}"
+    `words` are the program and its arguments. `missing` tells that there is no such program.
+    """
+    text = " ".join(text.split())
     unknown = "kind is unknown", "classifier not found", "answers: No such file"
-    cause, remedy = f"'{program} {' '.join(words)}' failed: {text}", ""
-    if answer.code == NOT_FOUND:
-        cause, remedy = f"no program {program} (package iproute2)", "install it, or "
+    cause, remedy = f"'{' '.join(words)}' failed: {text}", ""
+    if missing:
+        cause, remedy = f"no program {words[0]} (package iproute2)", "install it, or "
     elif "Operation not permitted" in text:
-        cause = "tc may not change the network of this container"
+        cause = f"{words[0]} may not change the network of this container"
         remedy = "give it NET_ADMIN and uid 0, or "
     elif "add" in words and any(sign in text for sign in unknown):
         cause = "this kernel lacks sch_netem, sch_prio or cls_u32"
@@ -110,19 +79,35 @@ def explain(program: str, words: Sequence[str], answer: Answer) -> CloudrcError:
             "use nodes whose kernel has them ('modprobe -a sch_netem sch_prio cls_u32' there) and "
             "a namespace for privileged pods, or "
         )
-    return MissingPrerequisiteError(
-        f"{cause}; {remedy}set link.mode=relay, which needs no kernel module"
-    )
+    return MissingPrerequisiteError(f"{cause}; {remedy}{USE_RELAY}, which needs no kernel module")
 
 
-def may_shape(status: str) -> bool:
-    """Return whether a process is root with NET_ADMIN; `status` is the text of /proc/PID/status.
+def show(run: Run, *words: str) -> list[dict[str, Any]]:
+    """Run `tc -s -j` with these arguments and return the objects that it prints."""
+    return list(json.loads(run(("tc", "-s", "-j", *words)) or "[]"))
 
-    Source: Linux, include/uapi/linux/capability.h: CAP_NET_ADMIN is bit 12.
+
+def find_device(run: Run, host: str) -> str:
+    """Return the interface through which packets to a host leave."""
+    return str(json.loads(run(("ip", "-j", "route", "get", host)))[0]["dev"])
+
+
+def find_netems(run: Run, host: str) -> dict[str, Any]:
+    """Find the interface to a host, and all netem qdiscs of this pod; {} if the kernel refuses.
+
+    Returns:
+        `interface`, and `netems`: interface -> its netem qdiscs, if it has any, as objects of
+        `tc -s -j qdisc show`.
     """
-    uid = re.search(r"^Uid:\s+\d+\s+0\s", status, re.MULTILINE)
-    effective = re.search(r"^CapEff:\s+([0-9a-fA-F]+)", status, re.MULTILINE)
-    return bool(uid and effective and int(effective[1], 16) >> 12 & 1)
+    netems = dict[str, list[dict[str, Any]]]()
+    try:
+        interface = find_device(run, host)
+        for one in show(run, "qdisc", "show"):
+            if one.get("kind") == "netem":
+                netems.setdefault(str(one["dev"]), []).append(one)
+    except (CloudrcError, ValueError, LookupError):
+        return {}
+    return {"interface": interface, "netems": netems}
 
 
 _QUANTILES: dict[str, Callable[[Floats], Floats]] = {
@@ -192,25 +177,7 @@ def check(profile: DirectionProfile) -> None:
     }
     for what, holds in refused.items():
         if holds:
-            raise BadInputError(
-                f"netem cannot do {what}; set link.mode=relay, which can, or leave it out"
-            )
-
-
-def notes(profile: DirectionProfile) -> list[str]:
-    """Describe the parts of a profile that netem realises differently than the relay."""
-    starts = Timeline(profile).pass_ns
-    passed_over = sum(after - before < STEP_NS for before, after in pairwise(starts))
-    differences = {
-        f"netem hardly applies correlation {profile.correlation:g}": (
-            profile.jitter and profile.correlation
-        ),
-        "netem corrupts frames, not datagrams: the receiving kernel drops most of them by their "
-        f"checksums, so that corrupt {profile.corrupt:g} is seen as loss": profile.corrupt,
-        f"netem changes at most every {STEP_NS * 1e-6:g} ms: {passed_over} of {len(starts)} steps "
-        "of the time line come sooner, and some are skipped": passed_over,
-    }
-    return [text for text, holds in differences.items() if holds]
+            raise BadInputError(f"netem cannot do {what}; {USE_RELAY}, which can, or leave it out")
 
 
 def options(profile: DirectionProfile, conditions: Conditions, room: int) -> list[str]:
@@ -281,31 +248,6 @@ def _is_ours(root: dict[str, Any]) -> bool:
     return root["handle"] == ROOT and root.get("kind") == "prio"
 
 
-class Steps:
-    """Counts the changes that a time line makes to a qdisc, and how late each change is.
-
-    `applied` counts changes that were made. `passed_over` counts changes that were skipped because
-    the next change was already due.
-    """
-
-    def __init__(self) -> None:
-        self.applied = self.passed_over = 0
-        self._lateness_ns: deque[int] = deque(maxlen=_KEPT)
-
-    def note(self, lateness_ns: int, passed_over: int) -> None:
-        """Count a change made `lateness_ns` [ns] late, and `passed_over` skipped changes."""
-        self.applied += 1
-        self.passed_over += passed_over
-        self._lateness_ns.append(lateness_ns)
-
-    def counts(self) -> dict[str, int]:
-        """Return median and 99th percentile of the lateness [ns]; {} if there was no change."""
-        if not self._lateness_ns:
-            return {}
-        found = np.quantile(self._lateness_ns, (0.5, 0.99), method="inverted_cdf").tolist()
-        return {"step_lateness_p50_ns": found[0], "step_lateness_p99_ns": found[1]}
-
-
 class Netem:
     """Shapes one direction of the link with the kernel's netem."""
 
@@ -327,14 +269,14 @@ class Netem:
         `origin_ns` is the time on `clock` at which the link came up [ns]; `wait` sleeps for a time
         [s]; `tables` is the folder for the tables of distributions.
         """
-        self._iproute2 = Iproute2(run)
+        self._run = run
         self._clock, self._wait = clock, wait
         self._tables, self._log = tables, log
         self._device, self._damage, self._damages = "", "", 0
         self._looked_ns, self._stepped_ns = -PERIOD_NS, origin_ns
         self._applied: list[str] = []
         self._listed: object = None
-        self.steps = Steps()
+        self._lateness_ns: deque[int] = deque(maxlen=_KEPT)
         self._take(profile, origin_ns)
 
     def _take(self, profile: DirectionProfile, origin_ns: int) -> None:
@@ -353,7 +295,7 @@ class Netem:
         Raises:
             CloudrcError: If netem cannot realise the profile, or the kernel refuses.
         """
-        device = self._iproute2.device(peer[0])
+        device = find_device(self._run, peer[0])
         if device != self._device:
             self.close()
             self._device = device
@@ -404,14 +346,19 @@ class Netem:
                 return
 
     def counts(self) -> dict[str, int]:
-        """Return numbers of datagrams, the values of `Steps.counts`, and the count `restored`.
+        """Return numbers of datagrams, the lateness of the time line, and the count `restored`.
 
         The datagrams are `forwarded` (including copies), `lost` (dropped at random or because the
-        queue was full) and `held` (in the queue now); absent if the qdisc is missing. `restored` is
-        the number of times that another program removed or changed the qdiscs. The name is
-        historical: `Netem` does not restore them.
+        queue was full) and `held` (in the queue now); absent if the qdisc is missing.
+        `step_lateness_p50_ns` and `_p99_ns` are percentiles of the lateness with which the time
+        line changed the qdisc [ns]. `restored` is the number of times that another program removed
+        or changed the qdiscs. The name is historical: `Netem` does not restore them.
         """
-        return self._look() | self.steps.counts() | {"restored": self._damages}
+        found = self._look() | {"restored": self._damages}
+        if self._lateness_ns:
+            late_ns = np.quantile(self._lateness_ns, (0.5, 0.99), method="inverted_cdf").tolist()
+            found |= {"step_lateness_p50_ns": late_ns[0], "step_lateness_p99_ns": late_ns[1]}
+        return found
 
     def released(self) -> dict[str, int]:
         """Return an empty dict: the kernel does not report when datagrams leave the queue."""
@@ -420,7 +367,7 @@ class Netem:
     def close(self) -> None:
         """Remove the qdiscs of `Netem`; queued datagrams are lost."""
         if self._device and _is_ours(_root_of(self._qdiscs())):
-            self._iproute2.tc("qdisc", "del", "dev", self._device, "root")
+            self._run(("tc", "qdisc", "del", "dev", self._device, "root"))
         self._device, self._applied = "", []
 
     def _look(self) -> dict[str, int]:
@@ -449,10 +396,10 @@ class Netem:
         if root["handle"] != "0:" and not _is_ours(root):
             raise MissingPrerequisiteError(
                 f"{self._device} has a qdisc already ({root['kind']} {root['handle']}) that is not "
-                f"cloudrc's; remove it ('tc qdisc del {' '.join(place)}'), or set link.mode=relay"
+                f"cloudrc's; remove it ('tc qdisc del {' '.join(place)}'), or {USE_RELAY}"
             )
         if not _is_ours(root):
-            self._iproute2.tc("qdisc", "add", *place, "handle", ROOT, *_PRIO)
+            self._run(("tc", "qdisc", "add", *place, "handle", ROOT, *_PRIO))
         self._apply("add" if leaf_of(qdiscs) is None else "change")
 
     def _step(self) -> None:
@@ -471,12 +418,12 @@ class Netem:
         wanted = options(self._profile, self._timeline.pieces[self._piece], self._room)
         if wanted != self._applied:
             place = ("dev", self._device, "parent", BAND, "handle", LEAF)
-            self._iproute2.tc("qdisc", verb, *place, "netem", *wanted)
+            self._run(("tc", "qdisc", verb, *place, "netem", *wanted))
             self._applied, self._listed = wanted, None
         if 0 <= before < self._piece:  # the first piece of a time line is no change
             self._stepped_ns = self._clock()
             due_ns = self._origin_ns + starts_ns[self._piece]
-            self.steps.note(self._stepped_ns - due_ns, self._piece - before - 1)
+            self._lateness_ns.append(self._stepped_ns - due_ns)
 
     def _next_ns(self) -> float:
         """Return the time of the next change on `clock` [ns]; infinite after the last change."""
@@ -488,16 +435,16 @@ class Netem:
 
     def _select(self, peer: Address) -> None:
         """Direct the tunnel's datagrams to netem: add the new filter, then remove old filters."""
-        listed = self._iproute2.show("filter", "show", "dev", self._device, "parent", ROOT)
+        listed = show(self._run, "filter", "show", "dev", self._device, "parent", ROOT)
         old = sorted({int(one["pref"]) for one in listed})
         new = next(number for number in range(1, len(old) + 2) if number not in old)
         host, port = peer
         match = f"ip protocol 17 0xff match ip dst {host}/32 match ip dport {port} 0xffff"
         place = ("dev", self._device, "parent", ROOT, "pref")
         words = ("protocol", "ip", "u32", "match", *match.split(), "flowid", BAND)
-        self._iproute2.tc("filter", "add", *place, str(new), *words)
+        self._run(("tc", "filter", "add", *place, str(new), *words))
         for number in old:
-            self._iproute2.tc("filter", "del", *place, str(number))
+            self._run(("tc", "filter", "del", *place, str(number)))
 
     def _qdiscs(self) -> list[dict[str, Any]]:
-        return self._iproute2.show("qdisc", "show", "dev", self._device)
+        return show(self._run, "qdisc", "show", "dev", self._device)

@@ -1,6 +1,6 @@
 """Forward datagrams in real time, and delay, lose or copy each one as the link's model computes.
 
-In local mode one process runs `Relay`, with both directions. In a pod, `RelayShaper` shapes the
+In local mode one process runs a `Relay` with both directions. In a pod, `RelayShaper` shapes the
 datagrams that the pod sends:
 
     world <-> [world side]  Relay  [cloud side] <-> cloud
@@ -21,7 +21,7 @@ import select
 import socket
 import sys
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from itertools import count
 from time import monotonic_ns, time_ns
@@ -47,7 +47,7 @@ QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}  # name -> quantile of the 
 
 _BITS = 7  # number of significant bits of a lateness that select its bucket: buckets are 1.6 % wide
 _EARLY = -1  # bucket of the datagrams that left before they were due
-_RECENT = 10  # number of calls of `Lanes.counts` over which its percentiles are computed
+_RECENT = 10  # number of calls of `Relay.counts` over which its percentiles are computed
 _FIFO_PRIORITY = 10  # above ordinary processes, below the kernel's threads (50)
 _SWITCH_INTERVAL = 0.0002  # longest time for which another thread can block the relay's thread [s]
 _COLLECT_AFTER = 50_000  # new objects before a garbage collection; most are datagrams in flight
@@ -189,7 +189,7 @@ class Lane:
                 self._counts["unsent"] += 1
 
     def counts(self) -> dict[str, int]:
-        """Return the number of datagrams by outcome; `Lanes.counts` explains the outcomes."""
+        """Return the number of datagrams by outcome; `Relay.counts` explains the outcomes."""
         return {**self._counts, "unread": self._stamps.dropped}
 
     def released(self) -> dict[str, int]:
@@ -235,18 +235,25 @@ class Lane:
         return False
 
 
-class Lanes:
-    """Runs several `Lane` objects in one thread.
+class Relay:
+    """Runs one or two `Lane` objects in one thread.
 
-    The models' time starts at `origin_ns` [ns], monotonic clock. If `origin_ns` is None, it starts
-    when the first datagram arrives on any lane, as in virtual time.
+    `lanes` maps the name of each direction to its lane. The models' time starts at `origin_ns`
+    [ns], monotonic clock. If `origin_ns` is None, it starts when the first datagram arrives on any
+    lane, as in virtual time; then the models must have the origin 0.
     """
 
-    def __init__(self, lanes: Sequence[Lane], origin_ns: int | None) -> None:
-        self._lanes = tuple(lanes)
+    def __init__(self, lanes: Mapping[str, Lane], origin_ns: int | None) -> None:
+        self.lanes, self._lanes = lanes, tuple(lanes.values())
         self._past: deque[ReleaseErrors] = deque([ReleaseErrors()], maxlen=_RECENT)
         for lane in self._lanes:
             lane.origin_ns = origin_ns
+
+    def run(self, stop: Callable[[], bool]) -> None:
+        """Forward datagrams until `stop` returns True; `stop` is called at least every 0.1 s."""
+        tighten_slack()
+        while not stop():
+            self.step(STOP_PERIOD)
 
     def step(self, timeout: float) -> None:
         """Forward datagrams for `timeout` [s] or slightly longer."""
@@ -303,45 +310,7 @@ class Lanes:
         return {**outcomes, **recent, "released_early": errors[_EARLY]}
 
 
-class Relay(Lanes):
-    """Forwards datagrams between world and cloud through the two directions of a link."""
-
-    def __init__(
-        self,
-        uplink: LinkDirection,
-        downlink: LinkDirection,
-        peek: Peek,
-        *,
-        world_side: socket.socket,
-        cloud_side: socket.socket,
-        world_peer: Address,
-        cloud_peer: Address,
-    ) -> None:
-        """Connect both sockets; raise an OSError if one cannot reach world or cloud.
-
-        The caller has bound the sockets and closes them. Both models must have the origin 0. World
-        and cloud must send from the address at which they receive.
-        """
-        world_side.connect(world_peer)
-        cloud_side.connect(cloud_peer)
-        self._ways = {
-            "uplink": Lane(world_side, cloud_side.send, uplink, peek),
-            "downlink": Lane(cloud_side, world_side.send, downlink, peek),
-        }
-        super().__init__(tuple(self._ways.values()), origin_ns=None)
-
-    def run(self, stop: Callable[[], bool]) -> None:
-        """Forward datagrams until `stop` returns True; `stop` is called at least every 0.1 s."""
-        tighten_slack()
-        while not stop():
-            self.step(STOP_PERIOD)
-
-    def released(self, way: str) -> dict[str, int]:
-        """Return `Lane.released` of one direction, "uplink" or "downlink"."""
-        return self._ways[way].released()
-
-
-class RelayShaper(Lanes):
+class RelayShaper(Relay):
     """Shapes one direction of the link without the kernel's netem; same methods as `Netem`."""
 
     name = "relay"
@@ -363,7 +332,7 @@ class RelayShaper(Lanes):
         self._outside.setblocking(False)
         self._peer: Address | None = None
         self._lane = Lane(self._inside, self._send, direction, peek)
-        super().__init__((self._lane,), origin_ns=0)
+        super().__init__({"this": self._lane}, origin_ns=0)
         tighten_slack()
 
     def follow_peer(self, peer: Address) -> Address:

@@ -8,12 +8,8 @@ the logs of other tools to traces.
 from __future__ import annotations
 
 import csv
-import gzip
 import re
-import zlib
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from io import BytesIO
-from itertools import pairwise
 from math import fsum, inf, sqrt
 from pathlib import Path
 from typing import NamedTuple
@@ -23,8 +19,8 @@ from cloudrc.files import read
 from cloudrc.link.profile import Trace
 
 SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a second
-START_MAX = 600.0  # latest time of the first row; until then a flight uses this row alone [s]
-UNIX_TIME = 1e8  # from here on, times are Unix times (1e8 is in March 1973) [s]
+START_MAX = 600.0  # if the first row is later, times count from the first row [s]
+LATEST = 1e11  # largest plausible time since 1970 [s]; a larger time has another unit
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
 _ROWS_TO_JUDGE = 10  # with fewer rows, delays of 0 are accepted, as a user may have typed them
 
@@ -43,17 +39,12 @@ def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
 def read_lines(path: Path, name: str, remedy: str, size_max: int = SIZE_MAX) -> list[str]:
     """Read the lines of a text file; if that fails, raise a BadInputError with `remedy`.
 
-    A file whose name ends in .gz is unpacked. Accepted encodings are UTF-8, UTF-16 with a byte
-    order mark (Windows writes it if output is redirected), and one byte per character.
+    Accepted encodings are UTF-8, UTF-16 with a byte order mark (Windows writes it if output is
+    redirected), and one byte per character.
     """
     try:
-        data = read(path, size_max)
-        if path.suffix == ".gz":
-            data = gzip.GzipFile(fileobj=BytesIO(data)).read(size_max + 1)
-        if len(data) > size_max:
-            raise ValueError(f"longer than {size_max} bytes when unpacked")
-        return _decode(data)
-    except (OSError, EOFError, ValueError, zlib.error) as error:
+        return _decode(read(path, size_max))
+    except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error).removeprefix(f"{path}: ")
     raise BadInputError(f"{name}: {reason}; {remedy}")
 
@@ -91,7 +82,7 @@ def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
 def parse_trace(lines: Iterable[str], name: str) -> Trace:
     """Parse the lines of the trace file `name`; raise the errors of `read_trace`.
 
-    If the times are Unix times, time 0 is the first row.
+    If the first row is later than `START_MAX`, time 0 is the first row.
     """
     place = f"trace {name}"
     columns, rows = read_rows(lines, place)
@@ -113,8 +104,11 @@ def parse_trace(lines: Iterable[str], name: str) -> Trace:
         raise BadInputError(f"{place}: no rows; give at least one, for example: 0,45")
     times, delays, *losses = zip(*found, strict=True)
     _check_delays(delays, delay, place, may_be_lost=not losses)
+    if times[0] > LATEST:
+        raise BadInputError(f"{place}: time_s begins at {times[0]:.15g}, which is not in seconds")
+    start = times[0] if times[0] > START_MAX else 0.0
     scaled = tuple(one * _SCALES[delay] for one in delays)
-    return Trace(_from_start(times, name), scaled, losses[0] if losses else None)
+    return Trace(tuple(time - start for time in times), scaled, losses[0] if losses else None)
 
 
 def write_trace(trace: Trace) -> str:
@@ -149,15 +143,19 @@ class Row(NamedTuple):
             raise BadInputError(f"{self.where}: {column} is nothing; give a number")
         return self.cells[column]
 
-    def number(self, column: str) -> float | None:
-        """Parse a cell as a number; None if it is not a number."""
-        return _parse(self.text(column).replace(self.decimal, "."))
+    def number(
+        self, column: str, low: float = -inf, high: float = inf, wanted: str = "a finite number"
+    ) -> float:
+        """Parse a cell as a number from `low` to `high` [any unit].
 
-    def no_number(self, column: str, wanted: str = "a number") -> BadInputError:
-        """Make the error for a cell that does not contain what is `wanted`."""
+        Raise a BadInputError that asks for what is `wanted` if the cell contains no such number.
+        """
         text = self.text(column)
-        shown = repr(text[:40]) if text else "nothing"
-        return BadInputError(f"{self.where}: {column} is {shown}; give {wanted}")
+        value = _parse(text.replace(self.decimal, "."))
+        if value is None or not low <= value <= high or abs(value) == inf:
+            shown = repr(text[:40]) if text else "nothing"
+            raise BadInputError(f"{self.where}: {column} is {shown}; give {wanted}")
+        return value
 
 
 def read_rows(lines: Iterable[str], name: str) -> tuple[list[str], Iterator[Row]]:
@@ -175,7 +173,11 @@ def read_rows(lines: Iterable[str], name: str) -> tuple[list[str], Iterator[Row]
     separator = next((mark for mark in ";\t" if mark in header), ",")
     columns = [_column(cell) for cell in _cells(header, separator, f"{name}, line 1")]
     if len(columns) == 1 and _parse(header) is not None:
-        raise _bare_numbers([header, *(line for _, line in kept)], name)
+        raise BadInputError(
+            f"{name}: has numbers without a header; a rate trace of mahimahi has no delays, use "
+            "rate_kbit; of delays [ms], one every 0.1 s, make a trace: "
+            'awk \'BEGIN {print "time_s,delay_ms"} {print (NR-1)*0.1 "," $1}\' FILE'
+        )
 
     def rows() -> Iterator[Row]:
         for number, line in kept:
@@ -199,22 +201,6 @@ def _cells(line: str, separator: str, where: str) -> list[str]:
         return next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
     except csv.Error as error:
         raise BadInputError(f"{where}: {error}; give a CSV file") from None
-
-
-def _bare_numbers(lines: list[str], name: str) -> BadInputError:
-    """Make the error for a file with one number per line, such as a rate trace of mahimahi."""
-    values = [value for value in map(_parse, lines) if value is not None]
-    rising = all(before <= after for before, after in pairwise(values))
-    if len(values) > 1 and rising and all(value.is_integer() for value in values):
-        rate = len(values) * 1500 * 8 / max(values[-1], 1.0)
-        return BadInputError(
-            f"{name}: looks like a rate trace of mahimahi, times at which a packet may "
-            f"leave [ms]: it has no delays; its mean is rate_kbit: {rate:.4g}"
-        )
-    return BadInputError(
-        f"{name}: has numbers without a header; of delays [ms], one every 0.1 s, make a "
-        'trace: awk \'BEGIN {print "time_s,delay_ms"} {print (NR-1)*0.1 "," $1}\' FILE'
-    )
 
 
 def looks_lost(values: Collection[float]) -> bool:
@@ -241,27 +227,10 @@ def _column(text: str) -> str:
 
 def _number(row: Row, column: str) -> float:
     """Parse a number of a trace; reject negative and infinite numbers, and a loss above 1."""
-    value = row.number(column)
-    if value is None or not 0.0 <= value < inf or (column == "loss" and value > 1.0):
-        bounds = "from 0 to 1" if column == "loss" else "that is finite and not negative"
-        mark = "; a lost packet has loss 1" if column in _SCALES else ""
-        raise row.no_number(column, f"a number {bounds}{mark}")
-    return value
-
-
-def _from_start(times: tuple[float, ...], name: str) -> tuple[float, ...]:
-    """Convert Unix times to times since the first row; reject other times that start too late."""
-    start = times[0]
-    if start > START_MAX * 1e9:
-        raise BadInputError(f"trace {name}: time_s begins at {start:.15g}, which is not in seconds")
-    if start >= UNIX_TIME:
-        return tuple(time - start for time in times)
-    if start > START_MAX:
-        raise BadInputError(
-            f"trace {name}: time_s begins at {start:.15g} s, and until then its first row would "
-            f"hold; to begin at 0: cloudrc link record {name} -o NEW.csv"
-        )
-    return times
+    if column == "loss":
+        return row.number(column, 0.0, 1.0, "a number from 0 to 1")
+    mark = "; a lost packet has loss 1" if column in _SCALES else ""
+    return row.number(column, 0.0, inf, f"a number that is finite and not negative{mark}")
 
 
 def _check_delays(delays: Sequence[float], column: str, place: str, *, may_be_lost: bool) -> None:

@@ -5,6 +5,7 @@ import sys
 import pytest
 
 from cloudrc.cli.link_run import Programs
+from cloudrc.errors import MissingPrerequisiteError
 
 TC = f"""#!{sys.executable}
 import sys
@@ -43,17 +44,20 @@ def programs(tmp_path, monkeypatch):
 
 def test_changes_and_lists_go_through_one_process(programs, tmp_path):
     for _ in range(2):
-        assert programs((*CHANGE, "delay", "1us")) == (0, "", "")
-        assert programs(SHOW) == (0, '[{"kind":"netem"}]', "")
-        code, _, error = programs((*CHANGE, "lacks"))
-        assert code
-        assert error == "Cannot find device eth0"
-        assert programs((*SHOW, "lacks")).code
+        assert programs((*CHANGE, "delay", "1us")) == ""
+        assert programs(SHOW) == '[{"kind":"netem"}]'
+        for words in (CHANGE, SHOW):
+            with pytest.raises(MissingPrerequisiteError, match="failed: Cannot find device eth0;"):
+                programs((*words, "lacks"))
     lines = (tmp_path / "log").read_text().splitlines()
     assert lines[:2] == ["qdisc change dev eth0 netem delay 1us", "qdisc show dev lo"]
     assert lines[2] == "qdisc show dev eth0", "by the same process"
-    assert programs((*CHANGE, "dies")).code == 0  # repeated in its own process
-    assert programs(SHOW).output == '[{"kind":"netem"}]'
+    assert programs((*CHANGE, "dies")) == ""  # repeated in its own process
+    assert programs(SHOW) == '[{"kind":"netem"}]'
     programs.close()
-    assert programs(("tc", "qdisc", "add", "lacks")).code == 2, "not a change"
-    assert programs(("no-such-program",)).code == 127
+    for words, said in (
+        ("tc qdisc add lacks", "failed: Cannot"),
+        ("no-such", "no program no-such"),
+    ):
+        with pytest.raises(MissingPrerequisiteError, match=said):
+            programs(words.split())

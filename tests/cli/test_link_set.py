@@ -89,7 +89,8 @@ class Flight:
         first = {way: Loaded(direction, {way: {"delay_ms": 45.0} for way in ways}) for way in ways}
         folder.mkdir(parents=True)
         self.delays, self.folder = [], folder / "link"
-        relay = SimpleNamespace(take_in=lambda: None, released=lambda way: {})
+        lanes = dict.fromkeys(ways, SimpleNamespace(released=dict))
+        relay = SimpleNamespace(take_in=lambda: None, lanes=lanes)
         note = lambda *noted: self.delays.append(noted)  # noqa: E731
         self.control = RelayControl(self.folder, self.links, first, note, relay)
 

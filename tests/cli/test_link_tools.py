@@ -1,6 +1,5 @@
 """`cloudrc link`: its actions, traces of runs and logs, pictures of profiles."""
 
-import gzip
 import os
 
 import pytest
@@ -33,22 +32,12 @@ def test_a_run_gives_a_trace_per_direction(run, folder, call):
         assert read_table(folder / f"trace-{way}.csv")
     call("link record -o t.csv --direction downlink", run / "mission.mcap")
     assert (folder / "t.csv").read_bytes() == (folder / "trace-downlink.csv").read_bytes()
-    # Only fast datagrams are applied: below the 30 ms of the profile.
-    call("link record -o t.csv --halve-rtt", run)
-    delays = read_trace(folder / "t.csv").delays
-    assert 0.020 < sum(delays) / len(delays) < 0.035
 
 
-@pytest.mark.parametrize(
-    ("more", "said"),
-    [
-        ("", "no rows on /uplink_delay, so no uplink; give the run's folder"),
-        ("--halve-rtt", "holds no round trip; give the folder of a run that flew"),
-    ],
-)
-def test_a_recording_of_the_world_alone_gives_no_trace(more, said, folder, refused):
+def test_a_recording_of_the_world_alone_gives_no_trace(folder, refused):
     write(folder / "world.mcap", world_records(5))
-    assert f"world.mcap: {said}" in refused(f"link record world.mcap -o t.csv {more}")
+    said = "no rows on /uplink_delay, so no uplink; give the run's folder"
+    assert f"world.mcap: {said}" in refused("link record world.mcap -o t.csv")
 
 
 @pytest.mark.parametrize(
@@ -56,9 +45,8 @@ def test_a_recording_of_the_world_alone_gives_no_trace(more, said, folder, refus
     [
         ("a.csv", b"time_s,delay_ms\n0,0.045\n", "looks like seconds"),
         ("a.json", b'{"round_trips": []}', "choose --direction uplink"),
-        ("a.json.gz", b"not packed", "a.json.gz: Not a gzipped file"),
+        ("a.json.gz", b"\x1f\x8b\0", "a.json.gz: it is not a text file; give a run, a log of ping"),
         ("a.mcap", b"\x89MCAP0\r\n", "a.mcap"),
-        ("a.json.gz", gzip.compress(bytes(65 << 20)), "longer than 67108864 bytes when unpacked"),
         ("pipe", None, "pipe: no such file or folder"),
         (".", None, "has no mission.mcap"),
     ],
@@ -83,7 +71,7 @@ def test_an_unusable_source_is_refused_in_one_line(name, data, says, folder, ref
         ("verify nonsense", "no profile or experiment named 'nonsense'"),
         ("verify no/such.yaml", "no such file"),
         ("verify --ends world,", "--ends world,: give two hosts, WORLD,CLOUD"),
-        ("verify lossy --shaper netem", "lasts); use --shaper relay, which can, or leave it out"),
+        ("verify lossy --shaper netem", "lasts); use the relay"),
     ],
 )
 def test_a_wrong_line_is_refused(line, says, refused):

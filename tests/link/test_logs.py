@@ -1,7 +1,9 @@
 """Logs of ping, irtt and CSV: units, losses, directions; unused rows are counted."""
 
 import json
+from math import isnan, nan
 
+import numpy as np
 import pytest
 
 from cloudrc.errors import BadInputError
@@ -20,12 +22,21 @@ def read(text, *, halve=False, trust_units=False):
     return read_csv(text.splitlines(), "x.csv", halve=halve, trust_units=trust_units)
 
 
+def delays_of(packets):
+    """Return the delays [s], None for a lost packet."""
+    return [None if isnan(delay) else delay for delay in packets.delays.tolist()]
+
+
 def test_a_row_of_a_trace_begins_halfway_between_two_packets():
-    trace = trace_of(Packets((5.0, 5.01, 5.02, 5.03), (0.040, None, 0.060, 0.045)))
+    def trace_of_log(sent, delays):
+        return trace_of(Packets(np.array(sent), np.array(delays), np.ones(len(sent))))
+
+    trace = trace_of_log((5.0, 5.01, 5.02, 5.03), (0.040, nan, 0.060, 0.045))
     assert trace.times == pytest.approx((0.0, 0.005, 0.015, 0.025))
     assert trace.delays == (0.040, 0.040, 0.060, 0.045)
     assert trace.losses == (0.0, 1.0, 0.0, 0.0)
-    assert trace_of(Packets((0.0, 1.0), (0.040, 0.050))).losses is None
+    assert trace_of_log((0.0, 1.0), (0.040, 0.050)).losses is None
+    assert trace_of_log((0.0, 1.0), (nan, 0.050)).delays == (0.050, 0.050)
 
 
 @pytest.mark.parametrize(
@@ -41,7 +52,7 @@ def test_a_row_of_a_trace_begins_halfway_between_two_packets():
 def test_units_and_separators_are_those_of_the_header(text, delays):
     packets = read(text)
     assert packets.sent == pytest.approx((0.0, 0.5))
-    assert packets.delays == pytest.approx(delays)
+    assert delays_of(packets) == pytest.approx(delays)
     assert packets.notes == ()
 
 
@@ -58,24 +69,28 @@ def test_units_and_separators_are_those_of_the_header(text, delays):
 def test_marks_of_lost_packets_are_recognised(header, row, note):
     end = ",0" if "loss" in header else ""
     packets = read(f"{header}\n0,45{end}\n{row}\n2,46{end}")
-    assert packets.delays == pytest.approx((0.045, None, 0.046))
+    assert delays_of(packets) == pytest.approx((0.045, None, 0.046))
     assert packets.notes == ((note,) if note else ())
 
 
 def test_zero_is_a_delay_if_rounded_or_marked_as_arrived():
-    assert read("time_s,delay_ms\n0,0\n1,1\n2,2").lost == 0
-    assert read("time_s,delay_ms,loss\n0,0,0\n1,90,0").lost == 0
+    assert delays_of(read("time_s,delay_ms\n0,0\n1,1\n2,2"))[0] == 0
+    assert delays_of(read("time_s,delay_ms,loss\n0,0,0\n1,90,0"))[0] == 0
 
 
 def test_round_trips_are_halved_only_on_request():
-    assert read("time_s,rtt_ms\n0,90\n1,80", halve=True).delays == pytest.approx((0.045, 0.040))
-    assert read("time_s,delay_ms\n0,90\n1,80", halve=True).delays == pytest.approx((0.090, 0.080))
+    assert read("time_s,rtt_ms\n0,90\n1,80", halve=True).delays.tolist() == pytest.approx(
+        (0.045, 0.040)
+    )
+    assert read("time_s,delay_ms\n0,90\n1,80", halve=True).delays.tolist() == pytest.approx(
+        (0.090, 0.080)
+    )
     with pytest.raises(BadInputError, match=r"column rtt_ms: has round trips; .*--halve-rtt"):
         read("time_s,rtt_ms\n0,90")
     with pytest.raises(BadInputError, match=r"ping measures round trips; .*--halve-rtt"):
         read_ping(list(PING), "x", halve=False)
     trusted = read("time_s,delay_ms\n0,0.045\n1,0.07", trust_units=True)
-    assert trusted.delays == pytest.approx((45e-6, 70e-6))
+    assert trusted.delays.tolist() == pytest.approx((45e-6, 70e-6))
 
 
 @pytest.mark.parametrize(
@@ -88,8 +103,8 @@ def test_round_trips_are_halved_only_on_request():
         ("time_s,latency\n0,45", "no column delay, found time_s,latency; name them time_s"),
         ("", "no column time, found nothing"),
         ("time_s,delay_ms,rtt_ms\n0,45,90", "has delay_ms and rtt_ms; keep only one"),
-        ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms is 'fast'; give a number"),
-        ("time_s,delay_ms\n,45", "line 2: time_s is nothing; give a number"),
+        ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms is 'fast'; give a finite number"),
+        ("time_s,delay_ms\n,45", "line 2: time_s is nothing; give a finite number"),
         ("time_s,delay_ms,loss\n0,45,0.5", "line 2: loss is '0.5'; give 0 or 1"),
         ("time_s,delay_ms\n0,45\n1,-3", "arrived 3 ms before it was sent: the two clocks differ;"),
         ("time_s,rtt_ms\n0,45\n1,-3\n2,-1", "rtt_ms is -3, which is no round trip"),
@@ -121,7 +136,7 @@ def test_up_to_1_percent_may_be_unusable_and_all_is_counted():
     )
     assert packets.notes[3:] == (f"{pause} the clock",)
     assert len(packets.sent) == 199
-    assert packets.sent == tuple(sorted(packets.sent))
+    assert packets.sent.tolist() == sorted(packets.sent)
     rows[70] = rows[80] = "7"
     with pytest.raises(BadInputError, match=r"line 52: .* \(3 of 200 rows cannot be used\)"):
         read("\n".join(["time_s,delay_ms", *rows]))
@@ -164,7 +179,7 @@ TRIPS = [trip(0), trip(1, "true_up"), trip(2, "true_down"), trip(3, True), trip(
     ("direction", "sent", "delays"),
     [
         ("uplink", (0.0, 0.010, 0.030, 0.040), (0.030, None, None, 0.035)),
-        ("downlink", (0.0, 0.0225, 0.0325, 0.045), (0.020, None, None, 0.020)),
+        ("downlink", (0.0, 0.020, 0.030, 0.040), (0.020, None, None, 0.020)),
         (None, (0.0, 0.010, 0.020, 0.030, 0.040), (0.025, None, None, None, 0.0275)),
     ],
 )
@@ -172,7 +187,7 @@ def test_irtt_gives_the_delays_of_each_direction(direction, sent, delays):
     """A packet that is lost in one direction does not count in the other direction."""
     packets = irtt(TRIPS, direction, packets_sent=5, packets_received=3, duplicates=1)
     assert packets.sent == pytest.approx(sent)
-    assert packets.delays == pytest.approx(delays)
+    assert delays_of(packets) == pytest.approx(delays)
     assert packets.notes == ("1 duplicates left out",)
 
 
@@ -252,8 +267,8 @@ def test_ping_gives_half_round_trips_at_the_time_of_sending(end, lost):
     """Only the summary counts a packet after the last line."""
     packets = ping(*PING, *end)
     assert packets.sent == pytest.approx((100.0, 100.2, 100.4, 100.6, 100.8, 101.0)[: 3 + lost])
-    assert packets.delays[:5] == pytest.approx((0.020, 0.015, None, 0.050, None))
-    assert packets.lost == lost
+    assert delays_of(packets)[:5] == pytest.approx((0.020, 0.015, None, 0.050, None))
+    assert delays_of(packets).count(None) == lost
     assert packets.notes == ("1 duplicates left out",)
 
 
@@ -261,7 +276,7 @@ def test_losses_before_the_first_reply_count_if_reported():
     told = [f"no answer yet for icmp_seq={number}" for number in (1, 2)]
     for lines in ([*told, reply(3, 10.02)], [reply(3, 10.02), summary(3, 1)]):
         packets = ping(HEAD, *lines)
-        assert packets.delays == (None, None, 0.010)
+        assert delays_of(packets) == [None, None, 0.010]
         assert packets.sent == pytest.approx((8.0, 9.0, 10.0))
     assert len(ping(HEAD, reply(75, 10.02), reply(76, 11.02)).sent) == 2
 
@@ -278,9 +293,9 @@ STAMPED = "[1700000000.5] "
         (
             [
                 "PING h (192.0.2.7): 56 data bytes",
-                "23:59:59.123456 64 bytes from 192.0.2.7: icmp_seq=0 ttl=53 time=20.5 ms",
+                "23:59:57.123456 64 bytes from 192.0.2.7: icmp_seq=0 ttl=53 time=20.5 ms",
                 "Request timeout for icmp_seq 1",
-                "00:00:01.123456 64 bytes from 192.0.2.7: icmp_seq=2 ttl=53 time=20.5 ms",
+                "23:59:59.123456 64 bytes from 192.0.2.7: icmp_seq=2 ttl=53 time=20.5 ms",
                 "3 packets transmitted, 2 packets received, 33.3% packet loss",
             ],
             (10.25, None, 10.25),
@@ -304,8 +319,8 @@ STAMPED = "[1700000000.5] "
 )
 def test_other_pings_and_languages_are_read(lines, delays):
     packets = ping(*lines)
-    assert packets.duration == pytest.approx(len(delays) - 1)
-    found = [delay and delay * 1e3 for delay in packets.delays]
+    assert packets.sent[-1] - packets.sent[0] == pytest.approx(len(delays) - 1)
+    found = [delay and delay * 1e3 for delay in delays_of(packets)]
     assert found == pytest.approx(list(delays))
 
 
@@ -313,7 +328,7 @@ def test_ping_counts_on_after_65535():
     """A late reply from before the wrap keeps its place."""
     packets = ping(reply(65534, 1.0), reply(0, 3.0), reply(65535, 2.0), reply(1, 4.0))
     assert packets.sent == pytest.approx((0.98, 1.98, 2.98, 3.98))
-    assert packets.lost == 0
+    assert None not in delays_of(packets)
     assert packets.notes == ("1 out of order, sorted",)
 
 
@@ -323,10 +338,9 @@ FIVE = [reply(number, number / 5) for number in range(1, 6)]
 @pytest.mark.parametrize(
     ("lines", "says"),
     [
-        ([reply(1, 1.0)[11:]], "its lines have no .time.; run ping with -D"),
-        (["64 bytes from 192.0.2.1: seq=0 ttl=57 time=40 ms"], "BusyBox's ping gives no times"),
-        (["PING h (1.2.3.4): 56 data bytes", reply(0, 1.0)[11:]], "on macOS -D forbids .*apple-t"),
-        (["192.0.2.7 : [0], 64 bytes, 20.1 ms (20.1 avg, 0% loss)"], "run fping with -D"),
+        ([reply(1, 1.0)[11:]], "its lines have no time stamps; Linux: ping -D; macOS: .*apple-t"),
+        (["64 bytes from 192.0.2.1: seq=0 ttl=57 time=40 ms"], "no time stamps; .*BusyBox"),
+        (["192.0.2.7 : [0], 64 bytes, 20.1 ms (20.1 avg, 0% loss)"], "no time stamps; .*fping"),
         ([HEAD], "has no replies"),
         (["[1.0] 64 bytes from h: icmp_seq=1 ttl=57 tid=1 xx"], "cannot? ?be read|LC_ALL=C"),
         ([*FIVE, summary(5, 4)], "summary counts 5 sent and 4 received, but it has 5 replies"),

@@ -306,7 +306,6 @@ def test_a_time_line_is_followed(make):
             netem.step(0.1)
         flow.settle()
         netem.close()
-        assert netem.steps.applied + netem.steps.passed_over == len(times) + 1
         sent = (np.array(flow.sent_ns) - begun_ns) * 1e-9
         lost, arrived = np.delete(sent, flow.numbers()), sent[flow.numbers()]
         assert (lost.min(), lost.max()) == pytest.approx((3.51, 3.81), abs=LATE)

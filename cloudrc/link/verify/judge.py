@@ -263,9 +263,9 @@ def netem_makes(profile: DirectionProfile) -> DirectionProfile:
     return replace(profile, correlation=0.0, loss=loss, duplicate=twice)
 
 
-def told(name: str, asked: float, measured: float = nan) -> Row:
-    """Make the row of an unjudged quantity from its values `asked` and `measured` [any unit]."""
-    return Row(name, UNITS.get(name, "1"), asked, measured, nan, nan, "told")
+def told(name: str, asked: float) -> Row:
+    """Make the row of an unjudged quantity with the requested value `asked` [any unit]."""
+    return Row(name, UNITS.get(name, "1"), asked, nan, nan, nan, "told")
 
 
 def tolerance(name: str, asked: float) -> float:

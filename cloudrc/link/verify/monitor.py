@@ -11,7 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from math import inf, isinf, isnan, nan
+from math import inf, isnan, nan
 from pathlib import Path
 from typing import TypeAlias
 
@@ -191,9 +191,8 @@ class LinkMonitor:
         if not timed and not self._computes and len(self._trips) >= FEWEST:
             rows.append(self._round_trip())
         rows = [self._excuse(row) for row in rows]
-        timelines = [Timeline(one) for one in self._asked or ()]
-        if any(one.only() is None for one in timelines):  # measured 1: it loops
-            rows.append(told("time_line", 1, float(any(isinf(one.last_ns) for one in timelines))))
+        if any(Timeline(one).only() is None for one in self._asked or ()):
+            rows.append(told("time_line", 1))
         return rows
 
     def _round_trip(self) -> Row:

@@ -58,7 +58,6 @@ def test_netem_without_root_is_a_missing_prerequisite(monkeypatch, capsys):
     ("code", "words", "exit_code", "says"),
     [
         (2, "cloudrc: error: no such profile", 2, "the uplink is not shaped: no such profile"),
-        (2, "cannot; set link.mode=relay, which can", 2, "cannot; use --shaper relay, which can"),
         (70, "internal error: X", 6, "not shaped: internal error: X (exit code 70)"),
         (0, "", 6, "it left no message (exit code 0)"),
     ],
