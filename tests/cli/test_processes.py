@@ -136,7 +136,7 @@ def write_down(recorder, records):
     recorder.put(records)
     while recorder.drain():
         pass
-    recorder.flush(sync=False)
+    recorder.flush()
 
 
 def test_both_recordings_together_stay_within_the_limit(tmp_path):
