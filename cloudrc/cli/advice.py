@@ -1,7 +1,7 @@
 """Warn about settings that do not fit together, and suggest a value that fits.
 
-The delays come from a simulation of the link alone, with the random numbers of the flight. A
-warning never prevents the flight.
+The delays come from a simulation of the link alone, with the same random numbers as in the flight.
+A warning never prevents the flight.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def warn(experiment: ResolvedExperiment) -> None:
 
 
 def advise(experiment: ResolvedExperiment) -> Iterator[str]:
-    """Yield a text for each problem: settings of the experiment that do not fit together."""
+    """Yield a warning for each group of settings that do not fit together."""
     yield from _hover(experiment)
     carrot, cap = experiment.mission.carrot, experiment.guard.speed_max_mps
     if carrot is not None and carrot.speed_mps > cap:
@@ -52,8 +52,8 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
 def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]:
     """Simulate telemetry and commands over the experiment's link, without its blackouts.
 
-    Return two lists of ages [s], sampled before each datagram is sent: the age of the odometry used
-    for world's present command, and of the newest command that telemetry has confirmed to cloud.
+    Return two lists of ages [s], sampled just before each datagram is sent. In world: the age of
+    the odometry behind the present command. In cloud: the age of the newest confirmed command.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection
@@ -128,7 +128,7 @@ def _hover(experiment: ResolvedExperiment) -> Iterator[str]:
 def _long_link(
     experiment: ResolvedExperiment, ages: list[float], echoes: list[float]
 ) -> Iterator[str]:
-    """Compare the two lists of `simulate_ages` [s] with the limits of guard and cloud."""
+    """Compare the ages of `simulate_ages` [s], in world and cloud, with the limits of both."""
     age_max, cloud = experiment.guard.command_age_max_ms * 1e-3, experiment.cloud
     mean, longest = sum(ages) / len(ages), max(ages)
     lasts = max(age_max, min(ages) + min(cloud.plan_s, experiment.guard.plan_max_s))

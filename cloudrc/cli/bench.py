@@ -1,8 +1,8 @@
 """`cloudrc bench`: measure how much processor time the closed loop needs on this machine.
 
 The command flies the experiment `paper`. For comparison, it also replays only the physics of this
-flight, in C (`mujoco.rollout`, one thread). The result of each part is the shortest processor time
-of all repeats.
+flight, in C (`mujoco.rollout`, one thread), and flies as in a sweep. It repeats each measurement
+and prints the shortest processor time.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Measure the closed loop and the raw physics; print the processor time of both."""
+    """Run all measurements; print the processor time of each per physics step [us]."""
     require("the bench", ("world",))
     from cloudrc.config.load import load_experiment
     from cloudrc.sweep.flight import fly_point
@@ -74,10 +74,10 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def measure(parts: dict[str, Callable[[], Callable[[], int]]], repeats: int) -> dict[str, float]:
-    """Measure each part `repeats` times; return its shortest processor time per step [s].
+    """Repeat measurements; return name -> shortest processor time per physics step [s].
 
-    A part is a function that prepares a measurement and returns the work, another function. The
-    work returns the number of its physics steps.
+    `parts` maps the name to a function that prepares one measurement and returns a second function.
+    Only the second function is timed; it returns the number of physics steps.
     """
     shortest: dict[str, float] = {}
     for _ in range(repeats):
@@ -92,10 +92,7 @@ def measure(parts: dict[str, Callable[[], Callable[[], int]]], repeats: int) -> 
 
 
 def _replay(experiment: ResolvedExperiment) -> Callable[[], int]:
-    """Fly once and record the inputs of the physics; return a function that replays these inputs.
-
-    The returned function returns the number of replayed steps.
-    """
+    """Fly once; return a function that replays the physics and returns the number of steps."""
     import numpy as np
 
     from cloudrc.assembly import assemble
@@ -116,7 +113,7 @@ def _replay(experiment: ResolvedExperiment) -> Callable[[], int]:
 
 
 def flight(experiment: ResolvedExperiment) -> Callable[[], int]:
-    """Prepare a flight that keeps its records; return a function that flies and counts steps."""
+    """Prepare a flight; return a function that flies and returns the number of physics steps."""
     from cloudrc.assembly import assemble
 
     _, cloud, run = assemble(experiment)

@@ -51,7 +51,7 @@ class Api:
         """Check and store the address, "http://HOST:PORT" or "unix:PATH".
 
         `token` is called for each request; it returns the current token, or "" for none. `place`
-        names the run or the release in answers and refusals; "" if the user gave the address.
+        is the name of the run or release in printed texts; "" if the user gave the address.
         """
         self.url, self._token, self.place = url.rstrip("/"), token, place
         try:

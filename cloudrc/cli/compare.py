@@ -1,4 +1,4 @@
-"""`cloudrc compare A B`: say whether B differs from A, by how much, and how sure that is."""
+"""`cloudrc compare A B`: compare flights with the settings A and B; print p values."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def flight_arguments(parser: argparse.ArgumentParser, seeds: int) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Compare and print; return 0 whatever the answer, or the exit code of an early end."""
+    """Compare A and B, and print the result; return 0 unless the flights end early."""
     from cloudrc.sweep.compare import compare, of_sweep
 
     stopped, code = "", 0
@@ -92,7 +92,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
-    """Fly A and B with each seed; return the pairs, and reason and exit code of an early end."""
+    """Fly A and B with each seed; return the pairs of flights, and the result of `take_each`."""
     from cloudrc.cli.advice import warn
     from cloudrc.cli.progress import SweepView
     from cloudrc.cli.run import load
@@ -180,7 +180,7 @@ def _needed(entry: Mapping[str, Any]) -> str:
 
 
 def _answer(document: Mapping[str, Any]) -> str:
-    """Say how the first number of the table differs; before it, say whether success differs."""
+    """Say which setting succeeds more often, if decided, and how B changes the first metric."""
     success, text = document["success"], ""
     if success["decided"]:
         more, less = "ba" if success["b"] > success["a"] else "ab"

@@ -105,7 +105,7 @@ def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
 
 
 def _candidates(name: str, words: Sequence[str], *, files: bool = False) -> dict[str, Any]:
-    """Return what shtab needs to complete `words`, in the syntax of each shell.
+    """Return shell -> code that completes `words`, for the package shtab.
 
     `name` becomes part of the name of a shell function. With `files`, also complete paths.
     """

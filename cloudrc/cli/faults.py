@@ -114,7 +114,7 @@ def print_faults(options: argparse.Namespace) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run one fault, all faults, or the faults in the file of a schedule; return the exit code."""
+    """Run one fault, all faults, or the schedule of faults in a file; return the exit code."""
     from cloudrc.faults.scenarios import SCENARIOS, find
 
     if isinstance(options.name, Path):

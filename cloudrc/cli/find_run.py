@@ -54,7 +54,7 @@ def find_local_run(
 
     Raises:
         BadInputError: If `--run` names no run in flight; if several runs are in flight; or if the
-            command would steer another flight after ./runs/latest has ended.
+            command changes a flight, but the user's own run, ./runs/latest, cannot be used.
     """
     from cloudrc.drivers.local import under_way
 
@@ -77,10 +77,10 @@ def find_local_run(
 
 
 def ask_if_unclear(candidates: Collection[Path], *, steers: bool, flag: str = "--run ") -> None:
-    """Raise a BadInputError unless it is clear which flight the user means.
+    """Raise a BadInputError if it is unclear which flight the user means, as in `find_local_run`.
 
-    `candidates` are the folders of the runs here that the command could use. Without candidates,
-    the command would use a release in a cluster. For the other arguments see `find_local_run`.
+    `candidates` are the folders of the local runs that the command can use; if there are none, the
+    command uses a release in a cluster. `steers` and `flag` are those of `find_local_run`.
     """
     from cloudrc.drivers.local import RELAY_LOG, under_way
 
@@ -102,10 +102,10 @@ def ask_if_unclear(candidates: Collection[Path], *, steers: bool, flag: str = "-
 def no_run_error(
     options: argparse.Namespace, error: MissingPrerequisiteError, flags: str
 ) -> MissingPrerequisiteError:
-    """Add to `error` (no cluster was found) that no run is in flight on this machine either.
+    """Extend `error` (no cluster was found): no run is in flight on this machine either.
 
-    If the flags name a cluster, return `error` unchanged. `flags` lists the flags that name a
-    local run, for the error text.
+    Return `error` unchanged if the user gave --context or --namespace. `flags` lists the flags that
+    name a local run, for the error text.
     """
     if options.context or options.namespace:
         return error

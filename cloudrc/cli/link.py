@@ -1,4 +1,4 @@
-"""Run `cloudrc link ACTION`. Here are the action `show` and the arguments of `verify`.
+"""Run `cloudrc link ACTION`. This module has the action `show` and the arguments of `verify`.
 
 The modules `cli/link_<action>.py` contain the other actions. The module of `verify` imports large
 packages, which would slow down `cloudrc link --help`.

@@ -175,7 +175,7 @@ def export_state(exporter: Exporter | None, state: LinkState) -> None:
 
 
 def export_counts(exporter: Exporter | None, counts: dict[str, int]) -> None:
-    """Export the numbers of a shaper's datagrams by outcome as metrics."""
+    """Export the counters of a shaper as metrics: name of the counter -> value."""
     if exporter:
         exporter.see([Counted(0, "link", name, number) for name, number in counts.items()])
 
@@ -189,14 +189,14 @@ def status_page(sidecar: Sidecar) -> str:
 
 @lru_cache(maxsize=1)
 def _find_netems(host: str, second: int) -> dict[str, Any]:
-    """Find the netem qdiscs of this pod; the cache keeps them for one `second`."""
+    """Find the netem qdiscs of this pod; the cache keeps the result while `second` is the same."""
     from cloudrc.link.netem import find_netems
 
     return find_netems(run_tool, host)
 
 
 def run_tool(words: Sequence[str], environment: dict[str, str] | None = None) -> str:
-    """Run a program in a new process and return its output; raise the error of `netem.explain`."""
+    """Run a program and return its output; if it fails, raise the error of `netem.explain`."""
     from cloudrc.link.netem import explain
 
     try:

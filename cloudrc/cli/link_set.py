@@ -106,10 +106,10 @@ def read_states(folder: Path) -> list[LinkState]:
 def set_here(
     folder: Path, profile: str | None, settings: Sequence[str], number: str
 ) -> tuple[Edit, list[LinkState]]:
-    """Hand a new profile to the relay, and wait until it applies; return edit and new states.
+    """Pass a profile to the relay, and wait until it applies; return the `Edit` and new states.
 
     `profile` is the name or file of a profile that replaces the present one; None keeps it.
-    `settings` are changed values, each "uplink.KEY=VALUE". `number` identifies the change.
+    `settings` are texts such as "uplink.delay_ms=120". `number` identifies the change.
 
     Raises:
         BadInputError: If there is no link yet, or if a value cannot be used.
@@ -155,7 +155,7 @@ def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
 
 
 def note_of(edit: Edit, number: str) -> str:
-    """Return the content of change.json: the change's number, its cause and whether to restart."""
+    """Return the content of change.json: number and cause; whether the time line restarts."""
     return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
 
 

@@ -314,7 +314,7 @@ def inside(namespace: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _pods(options: argparse.Namespace) -> Iterator[Pods]:
-    """Yield the URLs of a release: on the hosts of `--ends`, or on ports that kubectl forwards."""
+    """Yield the URLs of both pods' metrics: on the hosts in `--ends`, or on forwarded ports."""
     hosts = options.ends.split(",") if options.ends else []
     if hosts and (len(hosts) != 2 or not all(hosts)):
         raise BadInputError(f"--ends {options.ends}: give two hosts, WORLD,CLOUD")

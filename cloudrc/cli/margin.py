@@ -1,4 +1,4 @@
-"""`cloudrc margin KEY`: find the largest value of a key with which every flight succeeds."""
+"""`cloudrc margin KEY`: find the largest value of KEY at which all flights succeed."""
 
 from __future__ import annotations
 
@@ -96,9 +96,9 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def largest_stable(works: Callable[[int], bool], start: int, top: int) -> tuple[int, int]:
-    """Find the largest step from 1 to `top` that works: double it from `start`, then bisect.
+    """Find the largest n from 1 to `top` for which `works(n)`: double `start`, then bisect.
 
-    Return this step, or 0 if no step works, and the next step, or 0 if `top` works.
+    Return n (0 if none works), and n + 1, which does not work (0 if `top` works).
     """
     low, high = 0, start
     while works(high):

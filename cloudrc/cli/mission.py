@@ -121,7 +121,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Run the chosen verb."""
+    """Run the chosen action."""
     verb: str = options.verb
     _, carry_out = VERBS[verb]
     if options.api:
@@ -213,7 +213,7 @@ def describe_verdict(verdict: Mapping[str, Any]) -> str:
 def _fly(options: argparse.Namespace, api: Api) -> int:
     """Post a mission, follow it to its verdict, and return the exit code of the verdict.
 
-    After Ctrl-C the mission of `run` goes on; the mission of a Job (`fly`) is cancelled.
+    After Ctrl-C, the mission of `mission run` goes on; that of `mission fly` is cancelled.
     """
     is_job = options.verb == "fly"
     if is_job:
@@ -374,7 +374,7 @@ def describe_mission(mission: Json) -> str:
 
 
 def describe_point(position: Sequence[float | None]) -> str:
-    """Format a position [m]; None is unknown."""
+    """Format a position [m]; an unknown coordinate, None, becomes a question mark."""
     return f"({', '.join('?' if value is None else f'{value:.2f}' for value in position)})"
 
 
@@ -428,7 +428,7 @@ def _forwarded_api(options: argparse.Namespace) -> Iterator[Api]:
 
 
 def _run_job(options: argparse.Namespace) -> int:
-    """Create the Job of a mission and follow its log; the API checks the mission for the Job."""
+    """Create the Job of a mission, follow its log, and return the exit code of the Job."""
     mission, release = read_mission(options.mission, options.name), _release(options)
     from cloudrc.cluster.flight import wait_ready
     from cloudrc.cluster.jobs import follow, run_job

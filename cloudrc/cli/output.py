@@ -55,7 +55,7 @@ def discard_output(stream: TextIO) -> None:
 
 
 def open_page(url: str) -> bool:
-    """Open a page in the user's browser; return False if there is none that has a window.
+    """Open a page in the user's browser; return False if there is no browser with a window.
 
     Without a window, `webbrowser` could start a text browser in the terminal of the command.
     """

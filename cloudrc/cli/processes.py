@@ -50,7 +50,7 @@ RELEASED_PERIOD = 2.0
 
 
 class Command(NamedTuple):
-    """One of several commands in a module; attributes as in the module of a single command."""
+    """One of several commands in a module; has the attributes of a module with one command."""
 
     arguments: Callable[[argparse.ArgumentParser], None]
     execute: Callable[[argparse.Namespace], int]

@@ -273,7 +273,7 @@ def fly(
 
 
 def _physics_steps(experiment: ResolvedExperiment, usual: str) -> str:
-    """Return where the physics steps run: `usual`, unless the C code does not cover the world."""
+    """Describe the code that runs the physics: `usual`, or Python with wind or a changed plant."""
     from cloudrc.config.schema import Plant
 
     is_usual = experiment.world.plant == Plant() and not experiment.world.wind.blows
@@ -286,7 +286,7 @@ def _record_virtual(
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
     """Fly in virtual time, and yield the recording, the experiment and facts about the run.
 
-    The caller writes the report in the block; afterwards, the recording contains the report.
+    The caller writes the report in the `with` block; then the recording gets a copy of the report.
     """
     from cloudrc import assembly
     from cloudrc.record.columns import RecordStore, merged
@@ -326,7 +326,7 @@ def _record_virtual(
 
 
 def _prepare(experiment: ResolvedExperiment) -> bool:
-    """Check the user's robot and scene before the flight; return whether the run has an API."""
+    """Check the user's robot and scene; return whether the packages of the API are installed."""
     if absent := missing("api"):
         text = f"no operator's API in this run: {', '.join(absent)} not installed"
         print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)

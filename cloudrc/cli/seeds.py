@@ -98,5 +98,5 @@ def fly_seeds(options: argparse.Namespace) -> int:
 
 
 def fly_one(flight: Flight) -> Row:
-    """Fly, and return the row of the flight; an exception ends the command."""
+    """Fly once and return the row of numbers; an exception ends the command."""
     return store.make_row(flight, measure(flight.experiment))

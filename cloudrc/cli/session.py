@@ -126,7 +126,7 @@ def _last_mission(folder: Path) -> Mission | None:
 
 
 def read_last_mission(folder: Path) -> tuple[Contents, ResolvedExperiment, bool]:
-    """Read the last mission of a session that has ended, and write it to config.yaml.
+    """Read the last mission of a session that has ended; write its experiment to config.yaml.
 
     Returns:
         The recording of this mission, the experiment that flies it, and whether the session ended

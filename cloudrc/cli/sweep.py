@@ -1,4 +1,4 @@
-"""`cloudrc sweep`: fly a grid of settings with several seeds; one row of numbers per flight."""
+"""`cloudrc sweep`: fly a grid of settings with several seeds; write a row of numbers per flight."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _shard(text: str) -> tuple[int, int]:
-    """Parse I/N, auto or auto/N: number of the shard, from 1 on, and number of shards."""
+    """Parse "I/N" to (I, N), shard I of N, from 1 on; "auto" reads the variables of a job array."""
     index, _, count = text.partition("/")
     first = "1"
     if index == "auto":
@@ -232,7 +232,7 @@ def _fly_into(folder: Path, flight: Flight, *, page: bool) -> dict[str, Any]:
 
 
 def fly_again(options: argparse.Namespace) -> int:
-    """Fly a row again with recording and report; exit with 6 if the records differ."""
+    """Repeat a flight of a sweep with recording and report; exit with 6 if its records changed."""
     from cloudrc.cli.report import print_traceback, summary
     from cloudrc.sweep import store
     from cloudrc.sweep.plan import read_plan
@@ -258,7 +258,7 @@ def fly_again(options: argparse.Namespace) -> int:
 
 
 def print_status(options: argparse.Namespace) -> int:
-    """Print how many flights of a sweep are done, and the success of each value of each axis."""
+    """Print how many flights of a sweep are done, and the successful ones per value of an axis."""
     from cloudrc.sweep import store
 
     summary = store.read_summary(options.folder)

@@ -40,10 +40,10 @@ def rows_from_pods(
     """Fly flights of a plan on a cluster, and yield each row once.
 
     If a pod is deleted just after its last flight, its log is lost, but Kubernetes counts its shard
-    as complete. Therefore another Job flies the missing flights, as long as rows arrive.
+    as complete. Therefore further Jobs fly the flights without a row.
 
     Raises:
-        ClusterError: If the Job fails, or if a pod will never run.
+        ClusterError: If a Job fails or yields no row, or if a pod will never run.
     """
     from cloudrc.cluster import batch
     from cloudrc.cluster.client import ClusterError

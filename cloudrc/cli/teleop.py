@@ -141,8 +141,8 @@ def ending(
 ) -> Callable[[], bool]:
     """Return a function that tells whether teleop's process may end.
 
-    Once `asked()` is true, the function pauses the mission. The process may end when the robot
-    holds its position, or after `PAUSE_LIMIT_NS`; with `single`, also after the mission.
+    Once `asked()` is true, the function pauses the mission, and returns True when the robot holds
+    its position, or after `PAUSE_LIMIT_NS`. With `single`, it also returns True after the mission.
     """
     until_ns = 0
 
