@@ -208,7 +208,7 @@ def fingerprint(experiment: ResolvedExperiment) -> str:
 
 
 def local_files(value: Any, key: str = "") -> dict[str, str]:
-    """Return dotted key -> path of each existing file in a resolved experiment, below `key`."""
+    """Return dotted key -> path of the files that exist; `value` is the experiment below `key`."""
     if isinstance(value, str):
         return {key: value} if value.startswith("/") and Path(value).is_file() else {}
     listed = dict(enumerate(value)) if isinstance(value, list) else value
@@ -218,7 +218,7 @@ def local_files(value: Any, key: str = "") -> dict[str, str]:
 
 
 def _is_inside_name(path: KeyPath) -> bool:
-    """Whether a key is below one whose value can come from another file: mission, direction."""
+    """Whether a key is inside the mission or a direction, which may come from another file."""
     is_direction = path[0] == "link" and len(path) > 2 and path[1] in DIRECTIONS
     return is_direction or (path[0] == "mission" and len(path) > 1)
 
@@ -226,7 +226,7 @@ def _is_inside_name(path: KeyPath) -> bool:
 def validate(
     document: Document, model: type[_Model], name: str, found: Sequence[Problem] = ()
 ) -> _Model:
-    """Convert a document to `model`; raise one BadInputError about `found` and its own problems."""
+    """Convert a document to `model`; raise one BadInputError about `found` and new problems."""
     known = {problem.path for problem in found}
     # The user wrote a file: describe what is valid there, for example the name of a mission.
     file_model = Experiment if model is ResolvedExperiment else model
@@ -266,7 +266,7 @@ def _inline_mission(document: Document) -> None:
 
 
 def _inline_profile(document: Document) -> None:
-    """Fill in the keys that the experiment omits in uplink and downlink from its profile."""
+    """Fill in uplink and downlink: the profile has the values that the experiment omits."""
     _default(document, ("link", "profile"), Experiment().link.profile)
     name = document.get("link", "profile")
     if not isinstance(name, str) or _has_all_values(document):
@@ -316,8 +316,8 @@ def _plan_max(document: Document) -> float:
 def _remove_derived(document: Document, *, new_profile: bool) -> None:
     """Remove computed values from a resolved file; they are computed again after the settings.
 
-    With `new_profile`, also remove the values of the file's link profile. A value that differs from
-    the computed one is the experiment's own, and stays.
+    With `new_profile`, also remove the values that come from the file's link profile. Keep each
+    value that differs from the computed value, because the user has set it.
     """
     derived: dict[KeyPath, float] = {("guard", "plan_max_s"): _plan_max(document)}
     limits: Any = (document.get("guard", key) for key in ("command_age_max_ms", "plan_max_s"))

@@ -47,7 +47,7 @@ Settings: TypeAlias = dict[KeyPath, Setting]
 
 
 def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
-    """Collect settings from their keys, such as `link.both.delay_ms`, values and sources.
+    """Make settings from triples (key, value, source); a key is such as `link.both.delay_ms`.
 
     Raise a BadInputError if a key has an empty part or is set twice.
     """

@@ -1,7 +1,7 @@
 """Store what a console shows of a flight: the newest pose, the charts of the last 25 s, the trail.
 
-The input is the records that cloud sends through the tap. If world and cloud share a clock, the
-delay of the downlink is the newest round trip minus the delay of the uplink.
+The input is the records that cloud sends to the tap, a UNIX socket. If world and cloud share a
+clock, the delay of the downlink is the newest round trip minus the delay of the uplink.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class FlightFeed:
         telemetry: The newest telemetry; None before the first.
         control: The newest control period; None while cloud does not control the robot.
         samples: Points of the charts, oldest first.
-        flown: Number of points that the trail has had so far.
+        flown: Number of points that were added to the trail so far.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -105,7 +105,7 @@ class FlightFeed:
         return rows[:, :3], rows[:, 3]
 
     def columns(self, step: int = 3) -> Array:
-        """Return every `step`-th sample, time relative to the newest [s], shape (fields, n).
+        """Return every `step`-th sample, shape (fields, n), with times relative to the newest [s].
 
         Unknown values are NaN.
         """

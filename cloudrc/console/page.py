@@ -300,7 +300,7 @@ class Page:
         self._steering.fly({**order, "name": experiment.name})
 
     def _add_target(self, client: viser.ClientHandle) -> None:
-        """Add the gizmo and the number fields of the target; each follows the other."""
+        """Add the gizmo and the number fields of the target; a change of one updates the other."""
         low, high, start = fence.INNER_LOW, fence.INNER_HIGH, self._place_target(time.monotonic())
         limits = tuple(zip(low, high, strict=True))
         gizmo = client.scene.add_transform_controls(
@@ -379,7 +379,7 @@ class Page:
 
 
 def _clamp(slider: Any) -> float:
-    """Limit a slider's value to its range, which the number field does not; return the value."""
+    """Limit the value of a slider, whose number field accepts any number; return the value."""
     value = float(np.clip(slider.value, slider.min, slider.max))
     if value != slider.value:
         slider.value = value
@@ -387,7 +387,7 @@ def _clamp(slider: Any) -> float:
 
 
 def _with_gaps(curve: Array) -> list[float | None]:
-    """Replace NaN by None, a gap in the chart; if no number is left, add one: it keeps the axis."""
+    """Replace NaN by None, a gap in the chart; if all values are NaN, keep one number: -1."""
     values = [None if value != value else value for value in curve.tolist()]
     return [-1.0, *values[1:]] if not any(value is not None for value in values) else values
 

@@ -89,7 +89,7 @@ class Steering:
             threading.Thread(target=loop, daemon=True).start()
 
     def end_drive(self) -> None:
-        """Release all keys, and wait until teleop has the velocity zero."""
+        """Release all keys, and wait until the velocity zero has been sent to teleop."""
         self._drives = False
         self.release_keys()
         self._drive.join()
@@ -146,7 +146,7 @@ class Steering:
             self._moved.set()
 
     def release_keys(self, *keys: str) -> None:
-        """Release some keys, or all."""
+        """Release the given keys; without arguments, release all keys."""
         held = self._held
         self._held = {key: held[key] for key in held.keys() - keys} if keys else {}
         self._moved.set()

@@ -37,7 +37,10 @@ STATE = Odometry(10**9, (1.0, -2.0, 0.7), (0.6, 0.0, 0.0, 0.8), (0.5, 0.3, -0.2)
 
 
 def _horizons(build: Callable[[], Any], *delays: float, hold: float = 0.0) -> Any:
-    """Return the horizons [s] before and after each loop delay [s], which contains `hold` [s]."""
+    """Return the horizons [s] of an estimator, first without any delay, then after each delay [s].
+
+    `delays` are loop delays; each includes the hold time `hold` [s].
+    """
     estimator = build()
     seen = [estimator.horizon(7.0)]
     for delay in delays:
@@ -53,9 +56,9 @@ def _predict(build: Callable[[], Any], select: Callable[[Odometry], Any]) -> Any
 def _command(
     build: Callable[..., Any], n: int = 1, speed: float = 0.0, sign: bool = False, **gains: Any
 ) -> Any:
-    """Return the command after `n` updates, 2 ms apart, at a speed [m/s], and one after a reset.
+    """Return two commands: after `n` updates, 2 ms apart, at `speed` [m/s], and after a reset.
 
-    Without `sign`, return absolute values, so that a wrong sign costs only the points of P.
+    Without `sign`, return absolute values: only the check of P tests the sign.
     """
     controller, (x, y, z), seen = build(**gains), STATE.position, ZERO
     setpoint = Setpoint((2.0, -1.0, 0.2))
@@ -76,7 +79,7 @@ class Formula(NamedTuple):
     measure: Callable[[Callable[..., Any]], Any]
 
     def score(self, files: Mapping[str, str]) -> tuple[float, str]:
-        """Return 1 and a text, or raise a BadInputError; `files` maps the part to its file."""
+        """Return 1.0 and "right", or raise a BadInputError; `files` maps the part to its path."""
         ((part, path),) = files.items()
         builds = (partial(plugins.load, f"{part}s", name) for name in (path, PARTS[part][2]))
         seen, wanted = (np.asarray(self.measure(build), dtype=float) for build in builds)
@@ -90,7 +93,7 @@ class Formula(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """A flight; the value `full` of its metric gives all points, the value `none` gives none."""
+    """A flight, scored by a metric: the value `full` earns all points, the value `none` earns 0."""
 
     test: str
     points: int
@@ -101,7 +104,7 @@ class Flight(NamedTuple):
     none: float  # any unit
 
     def score(self, files: Mapping[str, str]) -> tuple[float, str]:
-        """Return a share of the points in [0, 1], and a text; `files` maps parts to their files."""
+        """Fly; return the share of the points, in [0, 1], and a text; `files`: part -> path."""
         chosen = {f"cloud.{part}": path for part, path in files.items()}
         result = fly(self.experiment, {**chosen, "link.profile": self.link})
         value = result.numbers.get(self.metric, self.none)
@@ -142,7 +145,7 @@ CHECKS: dict[str, tuple[Formula | Flight, ...]] = {
 
 
 def rows(part: str, scored: Sequence[tuple[float, str]]) -> list[dict[str, Any]]:
-    """Return a row per check of a part; `scored` has shares of the points, in [0, 1], and texts."""
+    """Return a dictionary per check of a part; `scored` has its share of points [0, 1] and text."""
     keys = ("part", "test", "points", "max_points", "seen")
     cells = (
         (part, check.test, round(check.points * share, 1), check.points, seen)
@@ -152,7 +155,7 @@ def rows(part: str, scored: Sequence[tuple[float, str]]) -> list[dict[str, Any]]
 
 
 def run(part: str, folder: Path) -> list[dict[str, Any]]:
-    """Run the checks of a part on the files in `folder`; return a row per check."""
+    """Run the checks of a part on the files in `folder`; return a dictionary per check."""
     names, scored = PARTS if part == "together" else (part,), list[tuple[float, str]]()
     files = {name: str(folder / PARTS[name][0]) for name in names}
     for check in CHECKS[part]:
@@ -168,7 +171,7 @@ def run(part: str, folder: Path) -> list[dict[str, Any]]:
 
 
 def _explain(error: BaseException, part: str, files: Mapping[str, str]) -> str:
-    """Describe an error; begin with the failed line of a student's file, or with its method."""
+    """Describe an error after FILE:LINE: the student's failed line, else that of the method."""
     while isinstance(error, CloudrcError) and error.__cause__ is not None:
         error = error.__cause__
     places = [(each.filename, each.lineno) for each in traceback.extract_tb(error.__traceback__)]
