@@ -36,7 +36,7 @@ def outside_fence(positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]
 
 
 def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.int64]:
-    """Return the index of the nearest pipe if it is within `CLEARANCE_MIN`, else -1, shape (n,).
+    """Return the index of the nearest pipe, or -1 if it is beyond `CLEARANCE_MIN`, shape (n,).
 
     `positions` are those of the base [m], world frame, shape (n, 3); `yaws` are the headings of the
     level robot [rad], shape (n,). The board does not count.
