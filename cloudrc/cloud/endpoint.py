@@ -89,7 +89,7 @@ class ComputeTime:
         self._cpu_clock, self._began_ns = cpu_clock, 0
 
     def begin(self) -> None:
-        """Note that the computation of a command begins."""
+        """Start to measure the time to compute a command, if there is a `cpu_clock`."""
         if self._cpu_clock is not None:
             self._began_ns = self._cpu_clock()
 
@@ -167,7 +167,7 @@ class CloudEndpoint(TunnelEnd):
 
     @property
     def mission_over(self) -> bool:
-        """Whether the mission has ended, and the robot confirms it or GIVE_UP_NS have passed."""
+        """Whether the mission has ended, and the robot confirmed the end or GIVE_UP_NS passed."""
         done = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
         return done and self.teleop.outcome is not None
 

@@ -4,11 +4,11 @@ If a plug-in raises an exception, or returns values that are not finite numbers,
 safe value: the last good horizon, the last sample, or zero velocity. The loop counts every failure,
 reports the first failure of each plug-in, and continues.
 
-Telemetry echoes the stamp of the newest command that world has applied, and contains the hold time:
-from this application to the telemetry. If no new echo arrives for some time, the robot does not fly
-the commands, and the loop freezes: it commands zero velocity and does not call the controller. So
-no integral winds up, and no predictor assumes a motion that the robot did not fly. The loop works
-normally again after the echo of a new command.
+Telemetry echoes the stamp of the newest command that world has applied. It also contains the hold
+time: from the application of the command to the sending of the telemetry. If no new echo arrives
+for some time, the commands do not reach the robot, and the loop freezes: it commands zero velocity
+and does not call the controller. So no integral winds up, and no predictor assumes a motion that
+the robot did not fly. The loop works normally again after the echo of a new command.
 
 The loop measures ages on cloud's clock, and subtracts stamps of world's clock only from each other.
 It needs no clock synchronisation.
@@ -102,8 +102,8 @@ class ControlLoop:
         """Connect three plug-ins; every session gets a new estimator.
 
         `horizon_max` is the longest horizon [s]. The loop freezes if no new echo arrives for the
-        horizon and `freeze_after` [s]. `period_ns` is the time between two commands [ns]. `plan` is
-        the length of the plan in each command [s].
+        horizon and `freeze_after` [s]. `period_ns` is the time between two commands [ns]. Each
+        command contains a plan, the velocities of the next `plan` [s]; 0 means no plan.
 
         An exception of a plug-in is not caught here, because nothing flies yet.
         """
@@ -304,7 +304,7 @@ class ControlLoop:
             return STAND_STILL
 
     def _plan(self, setpoint: Setpoint, velocity: Vector, now_ns: int) -> tuple[Vector, ...]:
-        """Plan the velocities [m/s] after a command, one per PLAN_STEP: roll the model forward.
+        """Plan the velocities [m/s] after a command, one per PLAN_STEP, by simulating the flight.
 
         Args:
             setpoint: Setpoint, with its motion.
@@ -346,7 +346,7 @@ class ControlLoop:
         return now_ns - self._echoed_ns > horizon * 1e9 + self._freeze_after_ns
 
     def _call(self, kind: str, call: Callable[..., None], *arguments: Any) -> None:
-        """Call a method of a plug-in that returns nothing; note its exception."""
+        """Call a method of a plug-in that returns nothing; count and report an exception."""
         try:
             call(*arguments)
         except PLUGIN_ERRORS as error:
@@ -366,7 +366,6 @@ class ControlLoop:
 
 
 def _locate(error: BaseException) -> str:
-    """Return where a plug-in raised an exception, without folders."""
     frame = traceback.extract_tb(error.__traceback__)[-1]
     return f"{Path(frame.filename).name}:{frame.lineno} in {frame.name}"
 

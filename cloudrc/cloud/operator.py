@@ -97,7 +97,7 @@ class EmergencyStopRepeater:
         self._number = self._acted_on = self._due_ns = 0
 
     def see(self, guard: GuardState, acted_on: int) -> None:
-        """Note the guard's state and the number of the last request that world has carried out."""
+        """Process the guard's state and the number of the last request that world carried out."""
         self._acted_on, self._stopped = acted_on, guard is ESTOP
         if self._stopped and 0 < self._number <= acted_on:
             self.sounds = False

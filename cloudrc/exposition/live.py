@@ -50,7 +50,7 @@ ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total"
 
 
 class LinkVerdict:
-    """Newest judgement of world or cloud: does the link towards it match its profile?"""
+    """Newest verdict on the direction that world or cloud receives: does it match its profile?"""
 
     def __init__(self, direction: str) -> None:
         """Set the direction, "uplink" or "downlink"; the first verdict is "open"."""
@@ -64,7 +64,7 @@ class LinkVerdict:
 
     @property
     def verdict(self) -> str:
-        """Verdict on the link: "ok", "off" (not as its profile), "open" (too few datagrams)."""
+        """Verdict on the link: "ok", "off" (not as its profile), "open" (not decided yet)."""
         verdicts = {record.verdict for record in self._newest} - {"told"}
         return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"
 
@@ -113,7 +113,7 @@ class End:
 
     @property
     def has_peer(self) -> bool:
-        """Whether a new datagram of the peer has arrived in the last 2 s."""
+        """Whether a session began or a new datagram of the peer arrived in the last 2 s."""
         return self._opened_ns != NEVER_NS and self._woke_ns - self._arrival_ns < SILENCE_NS
 
     def _observe(self, name: str, seconds: float) -> None:
@@ -202,10 +202,7 @@ class WorldEnd(End):
 
     @property
     def has_peer(self) -> bool:
-        """Whether cloud is connected: a session is open, and commands arrive.
-
-        In a new session, before the first command, cloud counts as connected.
-        """
+        """Whether a session is open, and commands arrive or none has arrived yet."""
         return super().has_peer or (self._opened_ns != NEVER_NS and self._silent)
 
     def _on_sessionopened(self, record: SessionOpened) -> None:

@@ -20,5 +20,5 @@ world frame."""
 
 
 def inside(position: Vector) -> bool:
-    """Tell whether a base at `position` [m], world frame, shape (3,), is inside the fence."""
+    """Return whether a base at `position` [m], world frame, shape (3,), is inside the fence."""
     return all(low <= value <= high for low, value, high in zip(LOW, position, HIGH, strict=True))

@@ -22,7 +22,7 @@ _FAR = 1e3  # [m] limit of coordinates, so that no square overflows
 
 
 def outside_fence(positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]:
-    """Tell which positions are outside the box in which the guard lets the robot fly.
+    """Return which positions are outside the box in which the guard lets the robot fly.
 
     `positions` are in [m], world frame, shape (n, 3). A position counts as inside if its distance
     from the box is at most `slack` [m], shape () or (n,).
@@ -36,7 +36,7 @@ def outside_fence(positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]
 
 
 def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.int64]:
-    """Return the index of the nearest pipe if it is within `CLEARANCE_MIN`, else -1, shape (n,).
+    """Return the index of the nearest pipe, or -1 if it is beyond `CLEARANCE_MIN`, shape (n,).
 
     `positions` are those of the base [m], world frame, shape (n, 3); `yaws` are the headings of the
     level robot [rad], shape (n,). The board does not count.
@@ -48,14 +48,13 @@ def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray
 
 
 def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.int64]:
-    """Find the first pipe that the robot, level and with yaw 0, would touch on a straight way.
+    """Find the first pipe within `CLEARANCE_MIN` of the robot on each of n straight ways.
 
-    The check moves along each way in steps as long as the robot's distance from the nearest wall. A
-    way may begin nearer to a wall than `CLEARANCE_MIN` if it leads away from this wall. The board
-    does not count.
+    The robot is level with yaw 0. A way may begin nearer to a wall than `CLEARANCE_MIN` if it leads
+    away from this wall. The board does not count.
 
     `starts` and `ends` are in [m], world frame, not far outside the fence, shape (n, 3). Return the
-    index of the pipe of each way, or -1, shape (n,).
+    index of the pipe for each way, or -1, shape (n,).
     """
     result = np.full(len(starts), -1, dtype=np.int64)
     length = np.linalg.norm(ends - starts, axis=1)
@@ -81,13 +80,14 @@ def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.in
 def find_nearest_legal(
     scene: Scene, position: Vector, yaw: float, before: Vector | None = None
 ) -> Vector | None:
-    """Find a point within 1.5 m that the guard lets the robot reach, clear of pipes; else None.
+    """Find a point that the guard allows and that is clear of pipes; None if none is near.
 
-    The search goes along x, y and z, and towards and away from the axes of the pipes. Candidates
-    are whole centimetres, so that a message shows the checked point without rounding.
+    The search begins at `position` (of the base, [m], world frame), moved into the guard's limits.
+    It goes up to 1.5 m along x, y and z, and towards and away from the axes of the pipes.
+    Candidates are whole centimetres, so that a message shows the checked point without rounding.
 
-    `position` is that of the base [m], world frame; `yaw` is the heading of the level robot [rad].
-    The straight way to the point starts at `before` [m]; None if the start is unknown.
+    `yaw` is the heading of the level robot [rad]. If `before` [m] is given, the straight way from
+    there to the point is also clear of pipes.
     """
     start = np.clip(position, fence.INNER_LOW, fence.INNER_HIGH)
     directions = [*np.eye(3), *-np.eye(3)]

@@ -9,8 +9,8 @@ Loss bursts and correlated jitter depend on the previous packet. To limit the re
 restart from their stationary distribution every 64 blocks of 256 packets.
 
 The impairment of a packet is a tuple with one entry for each copy that arrives: no entry for a lost
-packet, two entries for a duplicated packet. An entry is the constant OVERTAKES, or the extra delay
-from jitter and loss bursts [ns], which may be negative.
+packet, two entries for a duplicated packet. An entry is the extra delay from jitter and loss bursts
+[ns], which may be negative, or OVERTAKES for a reordered packet, which skips queue and delay.
 """
 
 from __future__ import annotations
@@ -217,7 +217,7 @@ def _packets_hit(key: StreamKey, purpose: Purpose, block: int, chance: float) ->
 
 
 def _lose_in_bursts(table: list[Fate], key: StreamKey, block: int, loss: GilbertElliott) -> None:
-    """Change a table of impairments: lose packets, and delay packets in the bad state."""
+    """Add loss bursts to the impairments of a block: lose packets, delay those in the bad state."""
     extra = round(loss.delay_bad * 1e9)
     draws = uniforms(key, Purpose.LOSS, block).tolist()
     for n, bad in enumerate(bad_states(key, block, loss.bad_start, loss.bad_end)):

@@ -66,10 +66,7 @@ class ProfileFile:
         return self._read()
 
     def poll(self) -> Loaded | None:
-        """Return the new profile if the file has changed and the profile is valid, otherwise None.
-
-        If the profile is invalid, log why.
-        """
+        """Return the new profile; None if the file is unchanged, or invalid (which is logged)."""
         before, self._seen = self._seen, version(self._path)
         if self._seen == before:
             return None

@@ -165,11 +165,12 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
     direction a packet was lost, the packet counts as lost in both directions. The times of sending
     are on the client's monotonic clock, so steps of the client's wall clock have no effect.
 
-    `direction` may be None only with `halve`. `name` is the file name for messages.
+    `halve`: use half of each round trip as one-way delay, and ignore `direction`. Without `halve`,
+    `direction` selects the one-way delays to read. `name` is the file name for messages.
 
     Raises:
         BadInputError: If the file is no output of irtt, if its packets contradict its own
-            statistics, or if `halve` is false and the file has no usable one-way delays.
+            statistics, or if it has no usable one-way delays and `halve` is false.
     """
     log = Log(name, halved=halve)
     try:
@@ -241,8 +242,8 @@ _IRTT_NAMES = {
 def _irtt_entries(trips: list[dict[str, Any]], what: str) -> list[Entry]:
     """Read the time of sending and the delay of each packet [s]; time 0 is the first packet.
 
-    Packets lost in the other direction are left out. In both directions the time is that at which
-    the client sent, because irtt does not report when the server sends a packet that is lost.
+    `what` is a key of `_IRTT_NAMES`. Packets lost in the other direction are left out. For the
+    downlink, too, the client's time of sending is used: irtt has no server's time of a lost packet.
     """
     other, key = _IRTT_NAMES[what]
     part = 0.5e-9 if what == "halves" else 1e-9
@@ -283,8 +284,8 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     - The delay is -1, -999 or -9999, and the column has no other negative number.
     - The delay is 0, all other delays are far from 0, and the log has no column `loss`.
 
-    `trust_units` accepts values that seem to be in another unit. Round trips are rejected if
-    `halve` is false. `name` is the file name for messages.
+    `halve` allows round trips, half of which then count as one-way delays. `trust_units` accepts
+    values that seem to be in another unit. `name` is the file name for messages.
 
     Raises:
         BadInputError: If the log cannot be used; the text names line, value and remedy.
@@ -328,7 +329,7 @@ def _check_unit(packets: Packets, unit: str, name: str) -> None:
 
 
 def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, str]:
-    """Find the only column of these kinds; return its name and unit ("" if it names no unit)."""
+    """Find the only column of times or delays (`kinds`); return its name, and its unit or ""."""
     known = {f"{kind}_{unit}": unit for kind in kinds for unit in SCALES}
     found = [column for column in columns if column in known]
     found = found or [column for column in columns if column in kinds]
@@ -360,7 +361,7 @@ def _csv_time(row: Row, column: str, unit: str) -> float:
 
 
 def _csv_delay(row: Row, column: str, loss: str | None) -> float:
-    """Read a delay in the column's unit; return NaN for a lost packet."""
+    """Read a delay in the column's unit; NaN if the delay or the column `loss` marks a loss."""
     if loss is not None:
         flag = _FLAGS.get(row.text(loss).lower())
         if flag is None:
@@ -417,9 +418,9 @@ def is_ping(lines: list[str]) -> bool:
 def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
     """Read the output of `ping -D` or of a similar program, in any language.
 
-    Packets count as lost if their sequence number is missing between replies, if a line such as "no
-    answer yet" reports them, or if only the summary counts them. Without a summary, packets after
-    the last line are unknown, because their replies may have been under way.
+    Half of each round trip is the one-way delay. Packets count as lost if their sequence number is
+    missing between replies, if a line such as "no answer yet" reports them, or if only the summary
+    counts them. Without a summary, packets after the last line are ignored.
 
     Raises:
         BadInputError: If `halve` is false; if the log `name` has no replies, no time stamps, too

@@ -126,7 +126,7 @@ class LinkDirection:
         return dict(self._counts)
 
     def _arrival(self, entry: int, conditions: Conditions, size: int, now_ns: int) -> int | None:
-        """Compute when a copy arrives [ns]; None if the queue of the bottleneck is full."""
+        """Compute when a copy with impairment `entry` arrives [ns]; None if the queue is full."""
         arrival = now_ns
         if entry != OVERTAKES:
             if conditions.rate is not None:

@@ -9,7 +9,7 @@ change`, which keeps queued packets. An option that is missing in this command k
 so every call contains all options.
 
 netem draws jitter from a table of 16-bit integers, in which 8192 stands for one times the jitter.
-The tables of tc differ from the distributions of the link's model, so `write_table` makes others.
+The tables of tc differ from the distributions of the link's model, so `write_table` writes its own.
 
 Source: tc-prio(8), tc-netem(8), tc-u32(8); iproute2 netem/README.distribution; Linux,
 net/sched/sch_netem.c (tabledist).
@@ -61,9 +61,9 @@ Run: TypeAlias = Callable[[Sequence[str]], str]
 
 
 def explain(words: Sequence[str], text: str, *, missing: bool = False) -> CloudrcError:
-    """Make an error with cause and remedy from the `text` of a failed program.
+    """Make an error with cause and remedy from the error output `text` of a program.
 
-    `words` are the program and its arguments. `missing` tells that there is no such program.
+    `words` are the program and its arguments; `missing` means that the program is not installed.
     """
     text = " ".join(text.split())
     unknown = "kind is unknown", "classifier not found", "answers: No such file"
@@ -93,7 +93,7 @@ def find_device(run: Run, host: str) -> str:
 
 
 def find_netems(run: Run, host: str) -> dict[str, Any]:
-    """Find the interface to a host, and all netem qdiscs of this pod; {} if the kernel refuses.
+    """Find the interface to a host, and all netem qdiscs of this pod; {} if `ip` or `tc` fails.
 
     Returns:
         `interface`, and `netems`: interface -> its netem qdiscs, if it has any, as objects of
@@ -118,7 +118,7 @@ _QUANTILES: dict[str, Callable[[Floats], Floats]] = {
 
 
 def stretch(profile: DirectionProfile) -> int:
-    """Return the factor by which tc's jitter is larger than the profile's, as in `STRETCH`."""
+    """Return the factor of `STRETCH`: it divides the table's entries and multiplies tc's jitter."""
     if profile.distribution != "table":
         return STRETCH[profile.distribution]
     return ceil(max(map(abs, profile.table)) / _END_OF_TABLE) or 1
@@ -128,8 +128,8 @@ def table(profile: DirectionProfile) -> list[int]:
     """Compute netem's table for the distribution of a profile.
 
     Returns:
-        Rounded quantiles at the probabilities (n + 0.5) / 4096, rising, shape (4096,). A value of
-        8192 / `stretch` stands for one times the jitter.
+        Quantiles at the probabilities (n + 0.5) / 4096, rising, rounded, shape (4096,). Their unit
+        is the profile's jitter times `stretch` / 8192.
     """
     if profile.distribution == "table":
         places = (2 * np.arange(ENTRIES) + 1) * len(profile.table) // (2 * ENTRIES)

@@ -321,7 +321,8 @@ class RelayShaper(Relay):
         """Open the two sockets; raise an OSError if `listen` is in use or cannot reach `end`.
 
         This pod's end of the tunnel sends from `end` (None: any address) to `listen` (port 0: the
-        kernel chooses). The origin of the model `direction` is a time on the monotonic clock.
+        kernel chooses). The model `direction` has its origin on the monotonic clock. `peek` reads
+        kind, epoch and counter of a datagram.
         """
         self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._inside.bind(listen)
@@ -366,7 +367,7 @@ class RelayShaper(Relay):
 
 
 def settle() -> None:
-    """Let this thread wake on time: rare garbage collections, short turns of other threads."""
+    """Reduce late wakes: collect garbage rarely, and shorten the turns of other threads."""
     sys.setswitchinterval(_SWITCH_INTERVAL)
     gc.collect()
     gc.freeze()

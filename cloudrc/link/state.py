@@ -76,7 +76,7 @@ class StateFile:
     """
 
     def __init__(self, path: Path, mode: str, direction: str) -> None:
-        """Set the path, and the requested shaper `mode` and the `direction` of all states."""
+        """Set the path of the file, and `mode` and `direction` as in `LinkState`."""
         self.path, self._mode, self._direction = path, mode, direction
         self.state: LinkState | None = None
 
@@ -105,7 +105,7 @@ class StateFile:
         self.state = state
 
     def refuse(self, number: str, refusal: str) -> None:
-        """Add a refused change, by its number and the reason in words, to the state."""
+        """Write the number of a refused change to the file, and why (`refusal`), in words."""
         if self.state is not None:
             self.publish(replace(self.state, refused=number, refusal=refusal))
 

@@ -36,7 +36,7 @@ class Pair(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Finished flights in pairs."""
+    """Pairs of finished flights to compare."""
 
     pairs: list[Pair]
     units: dict[str, str]  # metric -> unit
@@ -52,7 +52,7 @@ def compare(
     flight of a pair lacks a metric, the pair is left out for this metric. `units`: metric -> unit.
 
     Raises:
-        BadInputError: If no pair counts, or if no pair has a metric of `names`.
+        BadInputError: If all pairs are left out, or if no pair has a metric of `names`.
     """
     flown = [pair for pair in pairs if counts(pair.a) and counts(pair.b)]
     if not flown:
@@ -120,7 +120,7 @@ def of_sweep(folder: Path, a: str, b: str) -> Found:
     `a` and `b` are texts: VALUE or AXIS=VALUE.
 
     Raises:
-        BadInputError: If not exactly one axis has both values, or if they are the same.
+        BadInputError: If not exactly one axis has both values, or if `a` and `b` are equal.
     """
     rows, units, missing = store.read_flights(folder)
     axes = store.values_of(rows)

@@ -40,8 +40,8 @@ def draw_sweep(
         rows: All flights of the sweep.
         units: Metric -> unit.
         names: Metrics to show; by default the first three of `compare.NUMBERS`.
-        x: Axis of the sweep along x; by default the first one with numbers, else the first.
-        by: Axis with one line per value; by default another one with names, else with numbers.
+        x: Axis of the sweep along x; by default the first numeric axis, else the first axis.
+        by: Axis with one line per value; by default another axis, preferably not numeric.
         look: Size of the figure.
 
     Returns:

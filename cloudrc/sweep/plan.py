@@ -38,7 +38,7 @@ _Entry: TypeAlias = tuple[str, Any, Source]
 
 
 class SweepFile(Section):
-    """The keys of the file."""
+    """The keys of the file of a sweep."""
 
     experiment: str = "paper"
     """Name or path of the experiment"""
@@ -126,7 +126,7 @@ def _everything(point: ResolvedExperiment) -> dict[str, Any]:
 
 @cache
 def _code(kind: str, name: str) -> str:
-    """Return the SHA-256 of the source file of a plug-in selected by its name, otherwise ""."""
+    """Return the SHA-256 of a plug-in's source file; "" if `name` is a path or has no file."""
     with suppress(TypeError, OSError):
         if not plugins.is_path(name):
             file = inspect.getfile(plugins.find(kind, name))
@@ -151,7 +151,7 @@ def _seeds(given: Any) -> tuple[int, ...]:
 def _entries(
     document: Document, file: SweepFile, folder: Path, found: list[Problem]
 ) -> tuple[list[_Entry], dict[str, list[tuple[Any, list[_Entry]]]]]:
-    """Return the common settings, and axis -> label and settings of each of its choices.
+    """Return the common settings, and for each axis the label and settings of each choice.
 
     Problems of the axes are added to `found`.
     """

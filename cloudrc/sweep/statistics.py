@@ -93,9 +93,9 @@ def signed_rank_test(differences: Sequence[float]) -> float:
 
 
 def _chance_at_most(total: int, doubled: NDArray[Any]) -> float:
-    """Return the probability that the sum of the positive ranks, times 2, is at most `total`.
+    """Return the probability that twice the sum of the positive ranks is at most `total`.
 
-    Each rank is positive with probability 1/2. `doubled` has the ranks times 2, shape (n,).
+    Each rank is positive with probability 1/2. `doubled` has twice each rank, shape (n,).
     """
     if len(doubled) > EXACT_MAX:
         spread = math.sqrt(float((doubled.astype(float) ** 2).sum()) / 4)
@@ -104,7 +104,7 @@ def _chance_at_most(total: int, doubled: NDArray[Any]) -> float:
 
 
 def _sums(doubled: NDArray[Any]) -> NDArray[Any]:
-    """Return the probability of each sum of positive ranks, times 2; shape (sum of all + 1,)."""
+    """Return the probability that twice the sum of the positive ranks is 0, 1, 2 and so on."""
     chances = np.zeros(int(doubled.sum()) + 1)
     chances[0] = 1.0
     for rank in doubled:
@@ -151,7 +151,7 @@ def paired(differences: Sequence[float]) -> Paired:
 
 
 def _cut(n: int) -> int:
-    """Return the largest sum of ranks with which `n` pairs reject a shift; -1 if none does."""
+    """Return the largest sum of ranks with which `n` pairs reject a shift; -1 if no sum does."""
     if n > EXACT_MAX:
         mean, spread = n * (n + 1) / 4, math.sqrt(n * (n + 1) * (2 * n + 1) / 24)
         return math.floor(mean - 0.5 - Z * spread)
@@ -162,6 +162,7 @@ def _cut(n: int) -> int:
 def _pairs_needed(values: NDArray[Any], means: NDArray[Any], least: int) -> int | None:
     """Return the number of pairs, at least `least`, for a power of 80 %; None without an effect.
 
+    `values` are the differences, `means` the means of each two of them (and of each with itself).
     Source: G. E. Noether, "Sample size determination for some common nonparametric tests", 1987.
     """
     n = len(values)

@@ -56,10 +56,10 @@ class Pid(Controller):
     def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
         """Compute one command: u = P · e + I · (integral of e) + D · (v_s - v) + v_s, limited.
 
-        Here v is the robot's velocity and v_s the setpoint's, in [m/s].
-
-        The returned terms are not limited. The integral has the errors of earlier updates only; the
-        present error is integrated over `dt` [s] for the next update. Source: the paper, eq. (5).
+        Here v is the robot's velocity and v_s the setpoint's, in [m/s]. The returned terms are
+        those before the limits of velocity and speed. The integral has the errors of earlier
+        updates only; the present error is integrated over `dt` [s] for the next update.
+        Source: the paper, eq. (5).
         """
         px, py, pz = estimate.position
         sx, sy, sz = setpoint.position
@@ -99,7 +99,10 @@ class Pid(Controller):
         return (x * scale, y * scale, z * scale)
 
     def _integrate(self, error: Vector, wanted: Vector, velocity: Vector, dt: float) -> None:
-        """Integrate `error` [m] over `dt` [s], on each axis where this causes no windup."""
+        """Integrate `error` [m] over `dt` [s], with anti-windup on each axis.
+
+        `wanted` and `velocity` are the output before and after the limits [m/s].
+        """
         terms = zip(self._integral, self._gain_i, self._integral_limit, strict=True)
         x, y, z = (
             max(min(term + gain * e * dt, limit), -limit) if v == u or e * u < 0 else term

@@ -21,7 +21,7 @@ class Earliest(Estimator):
         self._offsets: deque[float] = deque(maxlen=count)
 
     def add_applied(self, applied_minus_stamp: float) -> None:
-        """Note one `applied_minus_stamp` [s]: a delay and the offset between the clocks."""
+        """Store `applied_minus_stamp` [s]: downlink delay plus the offset between the clocks."""
         self._offsets.append(applied_minus_stamp)
 
     def horizon(self, age: float) -> float:
@@ -36,6 +36,6 @@ def build(count: Count = 200) -> Earliest:
     """Make the estimator.
 
     Args:
-        count: Number of newest commands of which the smallest delay counts [1]; at least 1.
+        count: Number of recent commands whose smallest delay is used [1]; at least 1.
     """
     return Earliest(count)

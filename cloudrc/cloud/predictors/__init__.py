@@ -19,7 +19,7 @@ from cloudrc.messages import Command, Odometry, Quaternion, Vector
 
 
 class Model:
-    """A simulated robot that follows velocity commands; `make_plan` plans with it."""
+    """A simulated robot that follows velocity commands; the control loop plans with it."""
 
     def step(self, velocity: Vector, dt: float) -> Odometry:
         """Advance the state by `dt` [s], > 0, under a velocity command [m/s]; return the state."""
@@ -30,13 +30,13 @@ class Predictor:
     """Extrapolates odometry; a plug-in has to define `predict` only."""
 
     def observe(self, odometry: Odometry) -> None:
-        """Note a new odometry sample; called once per sample, with rising stamps."""
+        """Process a new odometry sample; called once per sample, with rising stamps."""
 
     def commanded(self, command: Command) -> None:
-        """Note a command that cloud has just sent."""
+        """Process a command that cloud has just sent."""
 
     def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
-        """Note that world applied a command; called once per command whose echo arrives.
+        """Process the application of a command; called once per command whose echo arrives.
 
         Args:
             command_stamp_ns: Stamp of the command [ns], cloud's clock. A command may be older than

@@ -55,7 +55,7 @@ class History:
         return self.stamps[-1] - self.stamps[-2] if len(self.stamps) > 1 else PERIOD_NS
 
     def note_applied(self, stamp_ns: int, began_ns: int) -> None:
-        """Note that the command stamped `stamp_ns` began at `began_ns`, world's clock [ns]."""
+        """Update the shift: the command of `stamp_ns` began at `began_ns`, world's clock [ns]."""
         last_began_ns, last_stamp_ns = self._applied[-1] if self._applied else (NEVER_NS, 0)
         lasted_ns = began_ns - last_began_ns
         if lasted_ns <= 0:
@@ -87,9 +87,10 @@ class History:
         return odometry.stamp_ns + round(horizon * 1e9) - self.stamps[-1] - self._period_ns
 
     def past(self, start_ns: int, end_ns: int) -> Iterator[tuple[Vector, float]]:
-        """Yield velocity [m/s] and duration [s] of each command that world followed, by the echoes.
+        """Yield velocity [m/s] and duration [s] of each command that world has followed.
 
-        The interval from `start_ns` to `end_ns` is on world's clock [ns].
+        The echoes show when each command began. The interval from `start_ns` to `end_ns` is on
+        world's clock [ns].
         """
         parts = list[tuple[Vector, float]]()
         for began_ns, stamp_ns in reversed(self._applied):
@@ -115,7 +116,10 @@ class History:
             start_ns, index = until_ns, index + 1
 
     def followed(self, count: int, start_ns: int, end_ns: int) -> list[tuple[Vector, float]]:
-        """List velocity [m/s] and duration [s] of command number `count`, or of its plan."""
+        """List velocity [m/s] and duration [s] of command `count`, or of each step of its plan.
+
+        The first command has the number 1; 0 means zero velocity. The interval is in [ns].
+        """
         command = self.commands[count - 1] if count else NO_COMMAND
         if not command.plan:
             return [(command.velocity, (end_ns - start_ns) * 1e-9)]
@@ -150,7 +154,7 @@ class Body(Model):
         return self.odometry()
 
     def odometry(self) -> Odometry:
-        """Return the state; the orientation turns at the measured rate."""
+        """Return the state as odometry; the orientation turns at the measured rate."""
         _, _, orientation, _, rate = self.basis
         return Odometry(
             self.basis.stamp_ns + round(self.horizon * 1e9),

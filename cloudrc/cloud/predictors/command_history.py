@@ -25,7 +25,7 @@ STEPS_MAX = 200
 
 
 class FirstOrder(Body):
-    """Model per axis: the guard's acceleration limit, then two lags; the first is the dead time."""
+    """Model per axis: acceleration limit of the guard, lag for the dead time, velocity lag."""
 
     def __init__(self, axes: Axes, acceleration_max: float) -> None:
         """Begin at rest, with `acceleration_max` [m/s^2], the guard's cap."""
@@ -76,7 +76,7 @@ class CommandHistory(Replay):
         self._bodies: list[FirstOrder] = []  # at the stamp of each command
 
     def commanded(self, command: Command) -> None:
-        """Replay the earlier commands until the stamp of this command; store both."""
+        """Replay the earlier commands until the stamp of this command; store body and command."""
         body = self._at(command.stamp_ns)
         if self.history.add(command):
             if len(self._bodies) >= len(self.history.stamps):

@@ -1,4 +1,4 @@
-"""Predictor: a Kalman filter against noise of the odometry, then a replay of the sent commands.
+"""Predictor: filter the odometry with a Kalman filter, then replay the sent commands.
 
 The filter's model is that of `model_based` or of `command_history`. All axes have the same noise,
 so one covariance of position and velocity is enough.
@@ -68,7 +68,8 @@ class Kalman(Predictor):
     def _update(self, dt: float) -> Array:
         """Advance the covariance by `dt` [s] and one sample; return the gains K, shape (2, 2).
 
-        With F = (1 dt; 0 1) and an acceleration error that is constant during `dt`:
+        With the covariances P of the state and R of a sample, F = (1 dt; 0 1), and an acceleration
+        error of variance q that is constant during `dt`:
             P = F P F' + q · (dt^2/2, dt)' (dt^2/2, dt);  K = P (P + R)^-1;  P = (1 - K) P.
         Source: R. E. Kalman, "A New Approach to Linear Filtering and Prediction Problems", 1960.
         """
@@ -114,7 +115,7 @@ def build(
             trusts the odometry more.
 
     Raises:
-        ValueError: If a file or a parameter is given in the wrong place.
+        ValueError: If `white_box` has a `model_file`, or `parameters` contain name or model.
         BadInputError: If the predictor refuses a parameter.
     """
     given = dict(parameters or {})

@@ -60,7 +60,7 @@ class WhiteBox(Body):
         """Begin at a measured state, in a steady flight.
 
         Args:
-            gains: P, I and D gains and integral limits of the velocity loop, x, y, z of each.
+            gains: P, I, D gains and integral limits of the velocity loop, for x, y, z: shape (12,).
             acceleration_max: The guard's cap on the acceleration [m/s^2].
             basis: The measured state.
         """
@@ -72,7 +72,7 @@ class WhiteBox(Body):
         self._take(basis)
 
     def correct(self, odometry: Odometry) -> None:
-        """Replace the states by the measured ones, and learn from the differences."""
+        """Adopt measured pose and twist; correct the estimates of acceleration and torque."""
         (ax, ay, az), (vx, vy, vz) = odometry.velocity, self.velocity
         bx, by, bz = self._missed
         k = GAIN_ACCELERATION
@@ -137,9 +137,9 @@ class WhiteBox(Body):
     def _force(
         self, last: Vector, reference: Vector, velocity: Vector, acceleration: Vector, h: float
     ) -> Vector:
-        """Compute the force that the onboard PID asks for [N], and advance its integral by `h`.
+        """Compute the force that the onboard PID requests [N]; advance its integral by `h` [s].
 
-        Source: docs/reference/plant.md, "Low-level controller".
+        `last` is the previous reference. Source: docs/reference/plant.md, "Low-level controller".
         """
         px, py, pz, ix, iy, iz, dx, dy, dz, limit_x, limit_y, limit_z = self._gains
         (rx, ry, rz), (vx, vy, vz), (ax, ay, az) = reference, velocity, acceleration

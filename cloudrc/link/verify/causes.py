@@ -131,7 +131,7 @@ measured to requested value, and text."""
 
 
 def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
-    """Yield the most certain cause; after a lack of CPU time, also a cause from the rows."""
+    """Yield the most certain cause; if CPU time is lacking, also a cause from measured values."""
     off = {row.name: row for row in one.rows if row.verdict == "off"}
     lost = next((row.measured for row in one.rows if row.name == "loss"), 0.0)
     if off and (read := next(_of_machine(one.evidence, off, lost), None)):

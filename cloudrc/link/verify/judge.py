@@ -62,7 +62,7 @@ class Flow(NamedTuple):
 class Row(NamedTuple):
     """Verdict on one quantity of one direction; an unknown value is NaN.
 
-    `asked`, `measured`, `low` and `high` have the unit in `unit` (any unit).
+    `asked` (the requested value), `measured`, `low` and `high` have the unit `unit` (any unit).
     """
 
     name: str  # as in `Plan.quantities`, or "round_trip"
@@ -114,10 +114,7 @@ class Plan:
     pause: Callable[[], None] = lambda: None
 
     def draw(self, sent: Floats, epoch: int = 1, first: int = 0) -> Stream:
-        """Simulate the link for datagrams sent at the times `sent` [s] since the link came up.
-
-        `first` is the counter of the first datagram.
-        """
+        """Simulate datagrams sent at `sent` [s] since the link came up, numbered from `first`."""
         seed, uplink, kind, size = self.flow
         link = LinkDirection(self.profile, seed, uplink)
         sent_ns = np.rint(sent * 1e9).astype(np.int64).tolist()
@@ -155,7 +152,7 @@ class Plan:
         return self.chance._replace(bands=bands)
 
     def judge(self, measured: Stream, epoch: int = 1, first: int = 0) -> list[Row]:
-        """Judge a measured stream; properties that it cannot show get the verdict "told"."""
+        """Judge a measured stream; a property that it cannot show gets the verdict "told"."""
         expected = self.expected(measured, epoch, first)
         found = self.quantities(measured, expected.pooled)
         rows = [expected.judge(name, found[name]) for name in found if name in expected.bands]
@@ -240,7 +237,6 @@ class Plan:
 
 
 def _requested_delay(profile: DirectionProfile, sent: Floats) -> Floats:
-    """Return the delay that a profile requests at each time since the link came up [s]."""
     timeline = Timeline(profile)
     if len(timeline.pieces) == 1:
         return np.full(len(sent), timeline.pieces[0].delay_ns * 1e-9)

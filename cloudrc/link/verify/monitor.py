@@ -77,7 +77,7 @@ class LinkMonitor:
         self._outbox = queue.SimpleQueue[Record]()
 
     def begin(self, asked: Asked, path: Path | None, load: Load) -> None:
-        """Start the thread; the profiles `asked` apply until the state file reports others."""
+        """Start the thread; profiles `asked` apply until the state file `path` reports others."""
         self._inbox, self._pause = queue.SimpleQueue(), lambda: time.sleep(1e-4)
         self.follow(asked)
         threading.Thread(target=self._run, args=(path, load), name="link", daemon=True).start()
@@ -100,7 +100,7 @@ class LinkMonitor:
         return [self._outbox.get_nowait() for _ in range(self._outbox.qsize())]
 
     def look(self, path: Path, load: Load) -> None:
-        """Read the link's state file once, and adopt the profiles in it."""
+        """Read the link's state file once, and adopt its profiles, which `load` converts."""
         try:
             text = read(path, STATE_MAX).decode()
             if text != self._seen:
@@ -160,7 +160,7 @@ class LinkMonitor:
             kept.clear()
 
     def _report(self, rows: list[Row], now_ns: int) -> list[Record]:
-        """Make the records; report a quantity as "off" only after two measurements in a row."""
+        """Make records of verdicts; a quantity is "off" only after two measurements in a row."""
         count, off = len(self._arrivals), {row.name for row in rows if row.verdict == "off"}
         if off - self._suspects:
             rows = [row._replace(verdict="open") if row.name in off else row for row in rows]
