@@ -23,7 +23,7 @@ from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
 from cloudrc.geometry import fence
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Loss
-from cloudrc.link.traces import read_table, read_trace
+from cloudrc.link.traces import SIZE_MAX, read_table, read_trace
 from cloudrc.messages import Start
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.wire import Leg, Plan
@@ -253,12 +253,12 @@ def with_order(
     return experiment.model_copy(update=changed)
 
 
-def link_profile(direction: schema.Direction) -> DirectionProfile:
+def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> DirectionProfile:
     """Convert one direction of a link profile to SI units, and read its trace and its table.
 
-    Raise a BadInputError if a file cannot be read or is too long.
+    Raise a BadInputError if a file cannot be read or is longer than `file_max` bytes.
     """
-    trace = read_trace(Path(direction.trace)) if direction.trace else None
+    trace = read_trace(Path(direction.trace), file_max) if direction.trace else None
     table = direction.distribution == "table" and direction.table
     same = direction.model_dump(include=SAME_KEYS)
     return DirectionProfile(
@@ -270,7 +270,7 @@ def link_profile(direction: schema.Direction) -> DirectionProfile:
         changes=tuple(_change(change) for change in direction.changes),
         trace=None if trace is None else replace(trace, loop=direction.loop),
         blackouts=tuple(Blackout(b.start_s, b.duration_s) for b in direction.blackouts),
-        table=read_table(Path(table)) if table else (),
+        table=read_table(Path(table), file_max) if table else (),
     )
 
 

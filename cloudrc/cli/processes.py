@@ -43,6 +43,9 @@ if TYPE_CHECKING:
     from cloudrc.record.recorder import Recorder
     from cloudrc.tunnel.end import Identity
 
+TRACE_MAX = 2 << 20
+"""Maximum size of a trace file whose name comes from the link container [bytes]. World and cloud do
+not trust this container. Real traces come from a ConfigMap, which holds at most 1 MiB."""
 PERIOD = 1.0
 """Time between two updates of the relay's counts in the metrics [s]."""
 RELEASED_PERIOD = 2.0
@@ -287,7 +290,7 @@ def open_end(
         exporter=exporter,
         flights_only=options.record_flights,
         link=link,
-        check=link_monitor(experiment, link, uplink=name == "cloud"),
+        check=link_monitor(experiment, link, uplink=name == "cloud", trusted=bool(options.link)),
     )
     return experiment, Identity(clock, os.urandom(16), keys.ring), end
 
@@ -333,23 +336,26 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
 
 
 def link_monitor(
-    experiment: ResolvedExperiment, state: Path | None, *, uplink: bool
+    experiment: ResolvedExperiment, state: Path | None, *, uplink: bool, trusted: bool
 ) -> LinkMonitor:
     """Make the monitor that compares the received datagrams with the link profile.
 
     `uplink` is True in cloud, False in world. In flight, the monitor reads changes of the profile
-    from the link's file `state`.
+    from the link's file `state`. Unless the link is `trusted`, its traces have the limit TRACE_MAX.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile
+    from cloudrc.link.traces import SIZE_MAX
     from cloudrc.link.verify.judge import Flow
     from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.messages import plan_length
     from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
 
+    file_max = SIZE_MAX if trusted else TRACE_MAX
+
     def load(values: object) -> tuple[DirectionProfile, DirectionProfile]:
         profile = Profile.model_validate_json(json.dumps(values))
-        return link_profile(profile.uplink), link_profile(profile.downlink)
+        return link_profile(profile.uplink, file_max), link_profile(profile.downlink, file_max)
 
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
     rate = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz

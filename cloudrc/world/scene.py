@@ -176,7 +176,7 @@ def _refuse_differences(path: Path, found: Facts, wanted: Facts) -> None:
         f"{name} is {_words(have)}, not {_words(right)}"
         + (f" +- {_words(slack)}" if np.any(slack) else "")
         for (name, (have, _)), (right, slack) in zip(found.items(), wanted.values(), strict=True)
-        if not np.all(np.abs(np.subtract(have, right)) <= slack)
+        if not np.all(np.abs(np.subtract(have, right)) <= np.add(slack, 1e-9))
     ]
     if differs:
         raise BadInputError(

@@ -174,14 +174,14 @@ def test_the_link_is_expected_to_carry_the_plans(plan_s, size, monkeypatch):
     monitor = Mock()
     monkeypatch.setattr("cloudrc.link.verify.monitor.LinkMonitor", monitor)
     experiment = load_experiment("fast", [f"cloud.plan_s={plan_s}"])
-    processes.link_monitor(experiment, None, uplink=False)
+    processes.link_monitor(experiment, None, uplink=False, trusted=False)
     assert monitor.call_args.kwargs["flow"].size == size
 
 
-def test_a_file_named_by_the_link_must_be_a_regular_file(tmp_path, monkeypatch):
+def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch):
     loads, path = [], tmp_path / "trace.csv"
     monkeypatch.setattr(LinkMonitor, "begin", lambda self, asked, path, load: loads.append(load))
-    processes.link_monitor(load_experiment("paper"), None, uplink=False)
+    processes.link_monitor(load_experiment("paper"), None, uplink=False, trusted=False)
 
     def load(**uplink):
         return loads[0]({"uplink": uplink})[0]
@@ -189,6 +189,9 @@ def test_a_file_named_by_the_link_must_be_a_regular_file(tmp_path, monkeypatch):
     path.write_text("time_s,delay_ms\n0,45\n1,50\n")
     assert load(trace=str(path)).trace
     assert load(table=str(path), distribution="table").table
+    path.write_text(path.read_text() + "\n" * processes.TRACE_MAX)
+    with pytest.raises(BadInputError, match="longer than 2097152 bytes; give a CSV file"):
+        load(trace=str(path))
     with pytest.raises(BadInputError, match="not a file; give a CSV file"):
         load(trace="/dev/null")  # an endless device would fill the memory
 

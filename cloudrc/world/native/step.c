@@ -27,7 +27,7 @@ typedef struct { /* a box with rounded edges that contains a geom of the scene *
 } Obstacle;
 
 typedef struct {
-  /* MuJoCo: mj_step, its arguments, arrays and numbers of mjData, and the model's flags. */
+  /* MuJoCo: mj_step, its arguments, and arrays and numbers of mjData. */
   void (*mj_step)(const void *model, void *data);
   const void *model, *free_model; /* free_model: without what a robot in free air does not need */
   void *data;

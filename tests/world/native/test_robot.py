@@ -183,7 +183,7 @@ def test_a_tether_holds_the_robot_in_c_too(tmp_path):
 
 
 @pytest.mark.parametrize("setting", [{"density": 1.2}, {"viscosity": 1e-5}])
-def test_geoms_that_air_acts_on_are_always_placed(setting):
+def test_in_air_that_acts_on_geoms_c_uses_the_whole_model(setting):
     parts = Simulator("pelican", "empty"), LowLevel(), Guard(LIMITS)
     for name, value in setting.items():
         setattr(parts[0].model.opt, name, value)
