@@ -54,8 +54,8 @@ def usable_cores() -> int:
 def interpreter(*words: str) -> list[str]:
     """Build a command line for this Python interpreter, for example with `-m cloudrc relay`.
 
-    The working folder may contain files from somebody else. The new process therefore imports
-    nothing from there, unless this process does so, too.
+    The new process imports modules from the working folder only if this process does: the folder
+    may contain files from somebody else.
     """
     here = os.getcwd() in sys.path or "" in sys.path
     return [sys.executable, *(() if here else ("-P",)), *words]

@@ -99,7 +99,7 @@ class Table:
 class Recording:
     """The tables of a flight by topic.
 
-    A recording from a file also has the metadata, attachments, note and remarks of its `Contents`.
+    A recording from a file also has metadata, attachments, note and remarks, as in `Contents`.
     """
 
     def __init__(

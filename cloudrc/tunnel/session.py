@@ -1,8 +1,8 @@
 """Encrypt outgoing datagrams and verify incoming datagrams with the keys of a session.
 
 A datagram changes no state before its tag is verified. Counters restart with every session, except
-those of HELLO, CHALLENGE and BUSY: the link draws losses by epoch and counter, and with a restarted
-counter it would lose the same handshake datagrams in every attempt.
+those of HELLO, CHALLENGE and BUSY: the emulated link decides by epoch and counter which
+datagrams it loses, and with restarted counters it would lose every attempt of a handshake.
 
 Two ends in one process need no keys: their datagrams reach no network, and encryption would take
 5 % of the run time. Drivers with a socket refuse a session without keys (`Endpoint.sealed`).

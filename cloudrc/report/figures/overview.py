@@ -141,7 +141,7 @@ def _draw_floor(axes: Axes, view: _View, points: Array, height: float) -> None:
 
 
 def _instants(subject: Subject) -> list[int]:
-    """Choose rows of the true states at equal distances flown."""
+    """Choose rows of the true states at equal distances flown, up to the touch of the board."""
     truth, touch = subject.flight.truth, first_touch(subject.flight)
     stamps = truth["stamp_ns"]
     if touch is not None:
