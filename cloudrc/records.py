@@ -132,7 +132,7 @@ class Contact(NamedTuple):
 
 
 class SessionOpened(NamedTuple):
-    """World or cloud: a session began; a new epoch numbers it. Topic /session."""
+    """World or cloud: a session began; its number is a new epoch. Topic /session."""
 
     stamp_ns: int
     end: str  # "world" or "cloud"

@@ -37,7 +37,7 @@ def clock_id() -> bytes:
 def usable_cores() -> int:
     """Return how many cores this process may use: by its affinity and by its CPU limit.
 
-    The CPU limit is the lowest of its control group (version 2) and of the groups above.
+    The CPU limit is the lowest limit of the process's control group (version 2) and its parents.
     """
     affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1

@@ -218,9 +218,8 @@ class LinkNotes:
     def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
         """Return records about the link that are due at `now_ns` [ns, machine's monotonic clock].
 
-        `records` are new records of world or cloud. After a record of a type in `BEGINNINGS`, the
-        link's state is due at once.
-        `slip_ns` is the lag of the records' clock behind the machine's clock [ns].
+        `records` are new records of world or cloud; if one has a type in `BEGINNINGS`, the link's
+        state is due at once. `slip_ns` is the lag of their clock behind the machine's clock [ns].
         """
         noted: list[Record] = []
         begins = not BEGINNINGS.isdisjoint(map(type, records))

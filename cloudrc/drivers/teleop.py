@@ -75,7 +75,7 @@ class UnixPeer:
             raise BadInputError(f"--socket: cannot make {own}: {error.strerror}") from error
 
     def receive(self) -> list[Any]:
-        """Return the messages that have arrived; None for an empty datagram."""
+        """Return the messages that have arrived; an empty datagram gives None in the list."""
         messages: list[Any] = []
         with suppress(BlockingIOError):
             while len(messages) < DRAIN_MAX:
@@ -169,7 +169,7 @@ class LastWord:
         flies: Callable[[], bool],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Set functions: `asked` (must cloud end?), `flies` (the robot?) and `clock` (time [ns])."""
+        """Set functions: `asked` (must cloud end?), `flies` (the robot?), `clock` (time [ns])."""
         self._asked, self._flies, self._clock = asked, flies, clock
         self._until_ns: int | None = None
 

@@ -82,7 +82,7 @@ def _thin(columns: Columns) -> Columns:
 
 
 def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:
-    """Yield a /tf message per row; `frames`: frame -> position and orientation column (or "")."""
+    """Yield a /tf message per row. `frames`: frame -> columns of position and orientation or ""."""
     for row, stamp_ns in enumerate(columns["stamp_ns"].tolist()):
         parts = [
             part(

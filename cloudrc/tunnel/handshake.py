@@ -200,10 +200,10 @@ class ClientHandshake:
     def receive_accept(self, epoch: int, accept: Accept, *, asks: bool) -> bytes | None:
         """Process an ACCEPT; return cloud's and world's nonce if a new epoch begins, else None.
 
-        `asks` is True while cloud asks for a session. If it is False, cloud ignores ACCEPTs from a
-        new world process. If it is True, cloud may accept a late ACCEPT of an ended world process,
-        and then believes that the running process has ended. When the running process answers
-        again, cloud changes its own nonce, so that late ACCEPTs are no longer valid.
+        `asks` is True while cloud asks for a session. Otherwise, cloud ignores the ACCEPTs of a new
+        world process. While cloud asks, a late ACCEPT of an ended world process may mislead cloud.
+        When the running world process answers again, cloud changes its own nonce, which makes late
+        ACCEPTs invalid.
         """
         known = accept.world_nonce == self._world
         if accept.nonce != self._nonce or (self._world and not known and not asks):

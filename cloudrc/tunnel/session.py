@@ -91,7 +91,7 @@ class Session:
         return header + self._sealing.encrypt(header[4:], body, header)
 
     def pass_on(self, kind: int, message: Telemetry | Command) -> Passed:
-        """Return `message` instead of the next datagram of this kind, with the same counter.
+        """Return `message` in place of the next datagram of this kind, with that datagram's counter.
 
         Only an end in the same process can `open` the result.
         """
