@@ -40,7 +40,7 @@ class LinkChecked(NamedTuple):
     is not judged: "time_line", "rate", "correlation".
 
     The verdict is "ok", "off", "told" (not judged) or "open". It is "open" if the datagrams are too
-    few, if the next check must confirm "off", or if late wakes of an end may have caused "off".
+    few, if the next check must confirm "off", or if late wakes of a process may have caused "off".
     """
 
     stamp_ns: int

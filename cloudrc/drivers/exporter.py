@@ -232,7 +232,7 @@ class Exporter:
         return generate_latest(self._registry).decode()
 
     def _page(self) -> Answer:
-        """Return the page of metrics, at most 0.25 s old; one thread at a time makes a new page."""
+        """Return the metrics as text, at most 0.25 s old; one thread at a time makes a new text."""
         with self._page_lock:
             now = time.monotonic()
             if now - self._made_at >= KEPT:

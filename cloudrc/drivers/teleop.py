@@ -174,7 +174,7 @@ class LastWord:
         self._until_ns: int | None = None
 
     def __call__(self) -> bool:
-        """Return whether cloud's process has to end now; cloud's loop calls this in every turn."""
+        """Return whether cloud's process has to end now; cloud's loop calls this repeatedly."""
         if not self._asked():
             return False
         if self._until_ns is None:
