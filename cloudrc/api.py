@@ -53,7 +53,7 @@ class Result:
 
     @property
     def applied(self) -> Columns:
-        """One row per command that world applied, with the columns of cloud's record of it."""
+        """Commands that world applied, one per row, with the values of their control periods."""
         return self.flight.applied
 
     @property
@@ -76,10 +76,10 @@ def fly(
         experiment: Name of a shipped experiment, or path of a YAML file.
         settings: Changes, as with `--set`: key -> value, such as `{"link.profile": "paper-p3"}`.
             A value may be a list or a mapping.
-        seed: Random seed; None: the experiment's.
+        seed: Random seed; with None, the seed in the experiment.
 
     Returns:
-        The result; a failed mission is a result, too.
+        The result, also if the mission failed.
 
     Raises:
         cloudrc.errors.BadInputError: If a name, key or value is invalid; the text says where.

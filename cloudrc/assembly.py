@@ -77,7 +77,7 @@ def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoi
 
 
 def virtual_notes(experiment: ResolvedExperiment) -> tuple[str, ...]:
-    """Return the notes for the report of a flight in virtual time."""
+    """Return warnings for the report of a flight in virtual time; () without a warning."""
     return (MEASURED,) if experiment.cloud.compute_measured else ()
 
 
@@ -156,8 +156,8 @@ def build_cloud(
     """Build cloud: plug-ins, teleoperation, and cloud's end of the tunnel.
 
     `clock` returns cloud's monotonic time [ns]. `teleop` provides the setpoints; without it, a new
-    `Teleop` flies the mission at once. `cpu_clock` returns the processor time of this thread [ns],
-    for `cloud.compute_measured`; it is None in real time, which includes the computing time anyway.
+    `Teleop` flies the mission at once. In virtual time, `cpu_clock` returns the processor
+    time of this thread [ns], which delays commands if `cloud.compute_measured` is set.
     `make_loop` makes the control loop from the arguments of `ControlLoop`.
     """
     cloud = experiment.cloud
@@ -223,9 +223,9 @@ def mission_plan(
 def with_order(
     experiment: ResolvedExperiment, order: Order, description: str
 ) -> ResolvedExperiment:
-    """Return the experiment with the mission of an operator's order; inverse of `mission_plan`.
+    """Replace the experiment's mission with an operator's order; the inverse of `mission_plan`.
 
-    A drive by hand becomes a mission with the setpoints of `DRIVE_FILE` beside the experiment.
+    If the order is a drive by hand, the mission reads its setpoints from the file `DRIVE_FILE`.
     """
     legs, carrot = order.plan.legs, None
     if speed := max(leg.speed for leg in legs):
@@ -328,5 +328,5 @@ def _scaled(value: float | None, factor: float) -> float | None:
 
 
 def _generator(seed: int, stream: str) -> np.random.Generator:
-    """Make a random number generator; each name of a `stream` gives other numbers."""
+    """Make a random number generator; different names `stream` give independent numbers."""
     return np.random.Generator(np.random.PCG64([seed, int.from_bytes(stream.encode(), "little")]))

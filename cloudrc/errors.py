@@ -40,7 +40,6 @@ class DiskFullError(MissingPrerequisiteError):
         super().__init__(where)  # pickle passes these arguments to the parent process
 
     def __str__(self) -> str:
-        """Return the message."""
         return f"disk_full: {self.args[0]}: free some space, or choose another folder with --out"
 
 

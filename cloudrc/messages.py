@@ -151,7 +151,7 @@ class Command(NamedTuple):
     def velocity_at(self, now_ns: int) -> Vector:
         """Return the commanded velocity [m/s] at `now_ns` [ns], world's clock.
 
-        Before the plan begins it is `velocity`, after the plan its last velocity.
+        Before the plan begins, return `velocity`; after its end, the last velocity of the plan.
         """
         step = (now_ns - self.planned_ns) // PLAN_STEP_NS
         if step <= 0 or not self.plan:
@@ -211,7 +211,7 @@ class Setpoint(NamedTuple):
 
 
 class Passed(NamedTuple):
-    """A message for an endpoint in the same process, which replaces the bytes of a datagram."""
+    """A message that replaces a datagram if both endpoints are in the same process."""
 
     kind: int  # a `tunnel.codec.Kind`
     epoch: int

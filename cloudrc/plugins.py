@@ -135,7 +135,7 @@ def _one(kind: str) -> str:
 
 @contextmanager
 def _explained(kind: str, name: str, what: str) -> Iterator[None]:
-    """Convert an exception of a plug-in, which may raise anything, to one line for the user."""
+    """Convert any exception of a plug-in to a BadInputError with a message of one line."""
     try:
         yield
     except Exception as error:

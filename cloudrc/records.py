@@ -16,7 +16,7 @@ class LinkChanged(NamedTuple):
     """Driver, in real time only: requested conditions of one link direction. Topic /link.
 
     World records the uplink, and cloud records the downlink: at the start, after every change, and
-    when a session or a mission begins. The values are those at the start of the time line.
+    when a session or a mission begins. The values are those with which the profile starts.
     """
 
     stamp_ns: int
@@ -40,7 +40,7 @@ class LinkChecked(NamedTuple):
     is not judged: "time_line", "rate", "correlation".
 
     The verdict is "ok", "off", "told" (not judged) or "open". It is "open" if the datagrams are too
-    few, if the next check must confirm "off", or if late wakes of an end may have caused "off".
+    few, if the next check must confirm "off", or if late wakes of a process may have caused "off".
     """
 
     stamp_ns: int
@@ -132,7 +132,7 @@ class Contact(NamedTuple):
 
 
 class SessionOpened(NamedTuple):
-    """World or cloud: a session began; a new epoch numbers it. Topic /session."""
+    """World or cloud: a session began; its number is a new epoch. Topic /session."""
 
     stamp_ns: int
     end: str  # "world" or "cloud"
@@ -182,8 +182,8 @@ FAILURES = (
 class MissionEvent(NamedTuple):
     """Cloud: an event of the mission. Topic /mission.
 
-    The event is a word of `UNDER_WAY`. At the end of the mission it is "done", "cancelled" or a
-    word of `FAILURES`.
+    During the mission, `event` is in `UNDER_WAY`. At its end, `event` is "done", "cancelled" or in
+    `FAILURES`.
     """
 
     stamp_ns: int

@@ -1,4 +1,4 @@
-"""Fly the flights of a sweep as an Indexed Job; each pod writes the rows of its flights to its log.
+"""Fly the flights of a sweep as an Indexed Job; each pod prints the results of its flights as rows.
 
 If a pod is lost, Kubernetes starts another pod, and the same flights give the same rows. Therefore
 the sweep needs only the Job and a ConfigMap, and no volume.
@@ -41,10 +41,11 @@ def start(
     cpu: str,
     queue: str | None,
 ) -> None:
-    """Create the Job `name` with `shards` pods for `flights`; keep a Job that has not failed.
+    """Create the Job `name` with `shards` pods that fly `flights`.
 
-    `flights` is a file made by `sweep.plan.pack`, `image` an image with the simulator, `cpu`
-    the CPU request of a pod, and `queue` a queue of Kueue. The Job belongs to no Helm release.
+    A failed Job of this name is replaced; a Job that runs or is complete stays as it is. `flights`
+    is a file made by `sweep.plan.pack`, `image` an image with the simulator, `cpu` the CPU request
+    of a pod, and `queue` a queue of Kueue. The Job belongs to no Helm release.
 
     Raises:
         ClusterError: If the cluster refuses the Job, for example because the sweep is too large.
@@ -109,9 +110,9 @@ def _job_spec(name: str, shards: int, image: str, cpu: str, labels: dict[str, st
 
 
 def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iterator[str]:
-    """Yield each line of the logs of a Job until it ends, some lines twice; then delete the Job.
+    """Yield the lines of a Job's logs, some twice, until the Job is complete; then delete the Job.
 
-    `tell` receives sentences for the user. A Job that has failed is kept.
+    `tell` receives sentences for the user. A failed Job is not deleted.
 
     Raises:
         ClusterError: If the Job fails, or if a pod will never run.

@@ -119,7 +119,7 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
 def refuse_second_flight(release: Release, ask: Ask) -> None:
     """Raise a ClusterError if a mission is under way: installing would replace the pods.
 
-    If the API does not answer, nothing is raised: to install again can repair the release.
+    `ask` queries the API. If the API does not answer, return: installing may repair the release.
     """
     mission = None
     with suppress(CloudrcError), pods.api_url(release) as url:
@@ -162,7 +162,7 @@ def fly_in_cluster(
 
 
 def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Put an experiment and its link into a release's values; other values stay as in `before`."""
+    """Return `before`, a release's values, with the experiment and without the chart's mission."""
     link = {**before.get("link", {}), "profile": ""}
     # With a mission, the chart would start a second Job.
     mission = {**before.get("mission", {}), "enabled": False}

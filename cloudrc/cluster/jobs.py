@@ -106,7 +106,7 @@ def run_job(
 def create_job(
     release: Release, job: Any, files: Any, labels: Mapping[str, str], component: str
 ) -> Any:
-    """Create a Job, and the ConfigMap `files` with its name; return the Job as created."""
+    """Create a Job, and `files` as a ConfigMap of the same name; return the created Job."""
     name, created = job["metadata"]["name"], release.request("create", "jobs", body=job)
     owner = owner_of("batch/v1", "Job", created)
     files["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}

@@ -2,8 +2,8 @@
 
 First, `send` writes the new profile into the link containers of both pods, which apply it within a
 second. Then `keep` writes it into the ConfigMap, which restarted containers read. If a container
-refuses the profile, the ConfigMap stays unchanged. After a failure, the message lists where the
-change is in force. Each trace of the profile is a further file.
+refuses the profile, the ConfigMap stays unchanged. If a step fails, the error message lists
+the places where the change is in force. The files of traces are sent and stored with the profile.
 
 This module uses kubectl, which starts in 0.1 s; the Python client takes 0.5 s. For the same reason
 it runs `sh` in the containers, not Python.
@@ -159,7 +159,7 @@ def send(
 
 
 def keep(release: Release, link: LinkParts, sent: Sent) -> None:
-    """Write a sent change into the ConfigMap; raise an error if this or a container fails."""
+    """Write a change into the ConfigMap; raise an error if this or a container has failed."""
     said = list(map(str, sent.failed))
     words = ["patch", "configmap", link.name, "--type=merge", "--patch-file=/dev/stdin"]
     try:

@@ -120,7 +120,7 @@ def pod_failure(pod: Any) -> str:
 
 
 def refuse_local_files(values: Mapping[str, Any], remedy: str) -> None:
-    """Raise a BadInputError if values of an experiment name a file that the pods do not have."""
+    """Raise a BadInputError, which ends with `remedy`, if `values` name a file that pods lack."""
     from cloudrc.config.load import local_files
 
     for key, path in local_files(values).items():
@@ -172,9 +172,9 @@ def api_url(release: Release) -> Iterator[str]:
 def forwarded(
     release: Release, pod: str, ports: Sequence[int], local: int = 0
 ) -> Iterator[dict[int, int]]:
-    """Forward ports of a pod, also loopback ports of the pod, during the `with` block.
+    """Forward ports of a pod, loopback ports included, during the `with` block.
 
-    `local` is the port on this machine for a single port of the pod; 0: any free port.
+    If `ports` has one port, `local` is its port on this machine; 0 selects a free port.
 
     Yields:
         Port in the pod -> port on 127.0.0.1 of this machine.
@@ -208,9 +208,9 @@ def _forwarded_ports(output: IO[bytes]) -> dict[int, int]:
 
 
 def follow_page(release: Release, port: int, tell: Callable[[str], None]) -> Iterator[str]:
-    """Forward the page to `port` of 127.0.0.1 (0: any), and yield the lines of the console's log.
+    """Forward the console's web page to `port` of 127.0.0.1; yield the lines of the console's log.
 
-    `tell` is called with the page's address on this machine.
+    Port 0 selects a free port. `tell` is called with the page's URL on this machine.
 
     Raises:
         ClusterError: If the release has no console, or if the port cannot be forwarded.

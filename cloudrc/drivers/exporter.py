@@ -95,7 +95,6 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = CLIENT_WAIT_MAX
 
     def do_GET(self) -> None:
-        """Answer with the page of the requested path, or with 404."""
         page = self.server.pages.get(self.path.partition("?")[0])
         answer = page() if page else Answer(404, f"there are {', '.join(self.server.pages)}\n")
         content = answer.content.encode()
@@ -159,7 +158,7 @@ class Exporter:
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Set whether teleop or a link is ready; for world and cloud, the records show it."""
+        """Set whether teleop or the link is ready; the records show if world or cloud is ready."""
         self._seen_at = time.monotonic()
         self._said_ready = ready
 
@@ -170,7 +169,7 @@ class Exporter:
         return self._live.link
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set the shaper that acts on a direction, "relay" or "netem", and the requested mode."""
+        """Set the shaper of a direction, "relay" or "netem", and the mode in the configuration."""
         self.link.shaped(shaper, direction, mode)
 
     def asked(self, direction: str, delay: float) -> None:
@@ -233,7 +232,7 @@ class Exporter:
         return generate_latest(self._registry).decode()
 
     def _page(self) -> Answer:
-        """Return the page of metrics, at most 0.25 s old; one thread at a time makes a new page."""
+        """Return the metrics as text, at most 0.25 s old; one thread at a time makes a new text."""
         with self._page_lock:
             now = time.monotonic()
             if now - self._made_at >= KEPT:

@@ -49,9 +49,10 @@ class KeyFile:
 
 
 def read_keys(path: Path, named: str = "--key ") -> KeySet:
-    """Read a key file, without blocking on a pipe; `named` is the flag that gave `path`.
+    """Read a key file; never block, even if the file is a pipe.
 
-    Raise a BadInputError if the file contains no key; the text contains no part of the file.
+    If the file contains no valid key, raise a BadInputError whose text begins with `named` (the
+    command-line flag of `path`) and contains no part of the file.
     """
     try:
         return parse(read(path, SIZE_MAX))

@@ -1,7 +1,7 @@
 """Run relay, world, teleop and cloud as processes on this machine and supervise them.
 
-The supervisor (this process) reads the records that the others print. It ends all processes when
-teleop ends after the mission, when a process dies or hangs, or when the user interrupts.
+The supervisor (this process) reads the records that these processes print. It ends them when
+teleop ends after the mission, when one of them dies or hangs, or when the user interrupts.
 
 During a flight, the flight file names the folder of the run and the address of the operator's API.
 It is a locked file in a private folder of this user. Commands trust the flight file, but not the
@@ -69,7 +69,7 @@ def flights_folder() -> Path:
 
 
 class FlightFile(NamedTuple):
-    """Content of a flight file, besides the folder of the run."""
+    """Content of a flight file, except the folder of the run."""
 
     api: str  # address of the operator's API; "" for none
     kind: str  # RUN or SESSION
@@ -78,7 +78,7 @@ class FlightFile(NamedTuple):
 
 @contextlib.contextmanager
 def announced(run: Path, api: str = "", kind: str = RUN) -> Iterator[None]:
-    """Keep a flight file while the block runs, if its folder can be written.
+    """Keep a flight file during the `with` block, if the folder of flight files is writable.
 
     `run` is the folder of the run, `api` the address of the operator's API ("" without an API).
     """
@@ -161,8 +161,8 @@ class LocalRun:
 
     Attributes:
         notes: Sentences for the report of the flight.
-        announcement: Holds the file that tells other commands of this session; the caller
-            closes it.
+        announcement: Removes the flight file when it is closed. `fly` closes it after a flight, the
+            caller after a session.
     """
 
     def __init__(
@@ -175,12 +175,12 @@ class LocalRun:
     ) -> None:
         """Prepare a run in `folder`, which contains config.yaml; start no process yet.
 
-        The run adds world.mcap, cloud.mcap and four logs. It calls `see` with the records that the
-        processes print; `api` tells whether teleop serves the operator's API.
+        The run writes world.mcap, cloud.mcap and four logs there. It calls `see` with the records
+        that the processes print. With `api`, teleop serves the operator's API.
 
-        With `session`, teleop waits for missions and stores them in a journal. Every process serves
-        metrics, and recordings contain the flights only. When all processes are ready, the run
-        calls `session` with the API's address, and the metrics' addresses HOST:PORT by process.
+        With `session`, the run is a session: teleop waits for missions, all processes serve
+        metrics, and recordings contain only the flights. When all processes are ready, `session`
+        is called with the API's address and a mapping: process -> HOST:PORT of its metrics.
         """
         self._folder, self._see, self._api, self._session = folder, see, api, session
         self._metrics: dict[str, str] = {}

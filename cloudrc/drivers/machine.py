@@ -37,7 +37,7 @@ def clock_id() -> bytes:
 def usable_cores() -> int:
     """Return how many cores this process may use: by its affinity and by its CPU limit.
 
-    The CPU limit is the lowest of its control group (version 2) and of the groups above.
+    The CPU limit is the lowest limit of the process's control group (version 2) and its parents.
     """
     affinity = getattr(os, "sched_getaffinity", None)  # not on macOS
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1
@@ -54,8 +54,8 @@ def usable_cores() -> int:
 def interpreter(*words: str) -> list[str]:
     """Build a command line for this Python interpreter, for example with `-m cloudrc relay`.
 
-    The working folder may contain files from somebody else. The new process therefore imports
-    nothing from there, unless this process does so, too.
+    The new process imports modules from the working folder only if this process does: the folder
+    may contain files from somebody else.
     """
     here = os.getcwd() in sys.path or "" in sys.path
     return [sys.executable, *(() if here else ("-P",)), *words]
@@ -80,7 +80,7 @@ class Deadline:
         self.pause = 0.0
 
     def passed(self) -> bool:
-        """Return whether the limit has passed. The caller's loop calls this in every turn."""
+        """Return whether the limit has passed. The caller's loop calls this in every iteration."""
         now = self._clock()
         turn, self._before = now - self._before, now
         if turn > self._turn_max:

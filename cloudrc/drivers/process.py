@@ -95,9 +95,10 @@ class Feed:
     """Writes selected records to a pipe, without blocking: lines are lost if the pipe is full."""
 
     def __init__(self, descriptor: int, *, watched: bool = True) -> None:
-        """Make the pipe `descriptor` non-blocking; `watched` tells if a supervisor reads the pipe.
+        """Make the pipe `descriptor` non-blocking.
 
-        Without a supervisor, as in a container, the pipe is a log and gets only events, in words.
+        If a supervisor reads the pipe, `watched` is True. Otherwise, as in a container, the pipe
+        is a log: the feed writes only events, as text for humans.
         """
         self._descriptor, self._watched = descriptor, watched
         self._told_ns: dict[type, int] = {}
@@ -117,7 +118,7 @@ class Feed:
         self._write(READY)
 
     def alive_while(self, stop: Callable[[], bool]) -> Callable[[], bool]:
-        """Return a function for a loop that prints `READY` periodically, and then calls `stop`."""
+        """Wrap `stop`: each call of the result prints `READY` if due, and returns `stop()`."""
         due = 0.0
 
         def ask() -> bool:
@@ -203,7 +204,7 @@ def _from_json(kind: Any, value: Any) -> Any:
 class LinkNotes:
     """Makes records of the state of the link, for the direction in which this process sends.
 
-    The process of the link writes its state to a file, and the lateness of its datagrams to a
+    The link process writes the link's state to a file, and the lateness of its datagrams to a
     second file. World and cloud do not trust the content of these files.
     """
 
@@ -217,8 +218,8 @@ class LinkNotes:
     def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
         """Return records about the link that are due at `now_ns` [ns, machine's monotonic clock].
 
-        `records` are new records of world or cloud; one of `BEGINNINGS` makes a record due at once.
-        `slip_ns` is the lag of the records' clock behind the machine's clock [ns].
+        `records` are new records of world or cloud; if one has a type in `BEGINNINGS`, the link's
+        state is due at once. `slip_ns` is the lag of their clock behind the machine's clock [ns].
         """
         noted: list[Record] = []
         begins = not BEGINNINGS.isdisjoint(map(type, records))
@@ -344,7 +345,7 @@ class EndProcess:
         return noted
 
     def _clock_step(self) -> float:
-        """Return by how much the wall clock was set since the last call [s]; 0 if it was not."""
+        """Return the step of the wall clock since the last call [s]; 0 without a step."""
         offset = time.time() - time.clock_gettime(SINCE_BOOT)
         step, self._clock_offset = offset - self._clock_offset, offset
         return step if abs(step) > CLOCK_STEP else 0.0

@@ -65,7 +65,7 @@ class Peer:
     Attributes:
         socket: The socket, bound and not blocking.
         address: Address of the peer: world, cloud or the relay; None while it is unknown.
-        route: File of the link with `address`, as HOST:PORT; None if the address is fixed.
+        route: File from which `follow` reads `address` as HOST:PORT; None for a fixed address.
     """
 
     socket: socket.socket
@@ -149,7 +149,7 @@ def bind(listen: Address) -> socket.socket:
 def free_ports(count: int) -> list[int]:
     """Choose random ports on 127.0.0.1 that are unused for both UDP and TCP.
 
-    The kernel does not use ports of this range for outgoing connections in the meantime.
+    The kernel uses another range for outgoing connections, so the ports stay free.
     """
     found: list[int] = []
     for port in random.SystemRandom().sample(PORTS, len(PORTS)):
@@ -175,11 +175,11 @@ def serve(
     stop: Callable[[], bool],
     slip_ns: Callable[[], int] = lambda: 0,
 ) -> None:
-    """Run an endpoint, the `end` "world" or "cloud", in real time until `stop()` is true.
+    """Run world or cloud in real time until `stop()` is true.
 
     Args:
-        endpoint: World or cloud; without a key, raise a ValueError.
-        peer: Socket of the endpoint, and address of its peer.
+        endpoint: World or cloud. Raise a ValueError if it has no key.
+        peer: Socket of the endpoint, and address of the other endpoint.
         end: "world" or "cloud", for the records.
         sink: Called with new records, at least every 20 ms if there are any. It must not block.
         stop: Called at every wake, at least every 100 ms.

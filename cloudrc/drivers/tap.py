@@ -1,7 +1,7 @@
-"""Send the records that a console shows from cloud to a Unix socket, and receive them there.
+"""Send cloud's newest records to a console through a Unix socket, and receive them there.
 
-A datagram has the newest record of each type, one per line in the form of `to_line`, a new session
-first. Cloud never waits: a datagram is lost if no listener runs, or if the listener is too slow.
+A datagram contains the newest record of each type that a console shows, one per line as made by
+`to_line`. Cloud never waits: a datagram is lost if no listener runs or the listener is too slow.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class Tap:
     def __init__(self, path: Path, telemetry: Callable[[], Telemetry | None]) -> None:
         """Prepare to send to the socket at `path`, which may appear later.
 
-        `telemetry` returns cloud's newest telemetry. It is sent as a `TelemetrySent` record without
-        epoch and counter, because cloud makes no record with its content.
+        `telemetry` returns cloud's newest telemetry, which is in no record of cloud. The tap sends
+        it as a `TelemetrySent` record with epoch and counter 0.
         """
         self._path, self._telemetry = os.fspath(path), telemetry
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)

@@ -75,7 +75,7 @@ class UnixPeer:
             raise BadInputError(f"--socket: cannot make {own}: {error.strerror}") from error
 
     def receive(self) -> list[Any]:
-        """Return the messages that have arrived; None for an empty datagram."""
+        """Return the messages that have arrived; an empty datagram gives None in the list."""
         messages: list[Any] = []
         with suppress(BlockingIOError):
             while len(messages) < DRAIN_MAX:
@@ -161,7 +161,7 @@ def _moves_robot(output: Any) -> bool:
 
 
 class LastWord:
-    """Delays the end of cloud in flight, so that cloud forwards teleop's request to hold."""
+    """Delays the end of cloud's process in flight, so that cloud forwards teleop's END request."""
 
     def __init__(
         self,
@@ -169,12 +169,12 @@ class LastWord:
         flies: Callable[[], bool],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Set functions that tell if cloud has to end, if the robot flies, and the time [ns]."""
+        """Set functions: `asked` (must cloud end?), `flies` (the robot?), `clock` (time [ns])."""
         self._asked, self._flies, self._clock = asked, flies, clock
         self._until_ns: int | None = None
 
     def __call__(self) -> bool:
-        """Return whether cloud's process has to end now; cloud's loop calls this in every turn."""
+        """Return whether cloud's process has to end now; cloud's loop calls this repeatedly."""
         if not self._asked():
             return False
         if self._until_ns is None:
@@ -183,7 +183,7 @@ class LastWord:
 
 
 class TeleopLoop:
-    """Loop of teleop's process: receives the robot's state, makes queued calls, sends outputs."""
+    """Loop of teleop's process: receives the robot's state, executes API calls, sends outputs."""
 
     def __init__(
         self,
@@ -194,12 +194,10 @@ class TeleopLoop:
         calls: Make = lambda now_ns: None,
         stops: Make = lambda now_ns: None,
     ) -> None:
-        """Store what the loop connects.
+        """Connect `machine`, a `MissionService` or an object with the same methods, to `peer`.
 
-        `machine` is a `MissionService`, or has its methods hear, see, handle_deadline and
-        take_outputs. `tell` is called with the events and faults of each period, and must not
-        block. `stops` makes the queued emergency stops and holds, `calls` all other calls of the
-        API.
+        `tell` is called with the events and faults of each period, and must not block. `stops`
+        executes the queued API calls for an emergency stop or a hold, `calls` all others.
         """
         self._machine, self._peer, self._tell = machine, peer, tell
         self._calls, self._stops = calls, stops
@@ -242,7 +240,7 @@ class TeleopLoop:
         self._send(machine.take_outputs())
 
     def _send(self, outputs: Sequence[Any]) -> None:
-        """Send the events that cloud has not accepted yet, then the new outputs; tell the news."""
+        """Send the unsent events, then new outputs; pass new events and faults to `tell`."""
         unsent, peer = self._unsent, self._peer
         while unsent and peer.send(unsent[0]):
             unsent.popleft()

@@ -73,7 +73,7 @@ def check(own: Iterable[str]) -> None:
 
 
 def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
-    """Return a note for each metric file in `named` (by the experiment) that is not in `own`."""
+    """Return a note per file in `named` (experiment's metrics) that is not in `own` (user's)."""
     names = set(map(name_of, own))
     return [
         f"{METRIC_NOTE}{name_of(choice)} is not measured: name its file with --metric"

@@ -20,14 +20,14 @@ def round_trips(flight: Flight) -> Columns:
 
 
 def _age_of_information(flight: Flight) -> float | None:
-    """Average the age of the odometry that cloud used [s]; None if cloud's clock may differ."""
+    """Average the age of the odometry that cloud used [s]; None if the two clocks may differ."""
     if not np.isfinite(flight.during("/uplink_delay")["delay"]).any():
         return None
     return mean((flight.control["stamp_ns"] - flight.control["basis_stamp_ns"]) * 1e-9)
 
 
 def _prediction_error(flight: Flight) -> float | None:
-    """Compare prediction and truth when a command is applied; the delay estimate matters, too.
+    """Compute the RMS prediction error [m] when commands are applied; delay errors contribute.
 
     Source: docs/reference/control.md, "Predictors".
     """
@@ -36,21 +36,21 @@ def _prediction_error(flight: Flight) -> float | None:
 
 
 def _estimate_error(flight: Flight) -> float | None:
-    """Compare prediction and truth at the predicted time; only the predictor matters."""
+    """Compute the RMS prediction error [m] at the predicted times; delay errors do not matter."""
     control = flight.control
     target_ns = control["basis_stamp_ns"] + np.rint(control["horizon"] * 1e9).astype(np.int64)
     return rms(control["position"] - flight.true_position(target_ns))
 
 
 def _delay_error(flight: Flight) -> float | None:
-    """Compare the horizon with the true delay, from the first echo on."""
+    """Compute the RMS error of the horizon [s], from the first measured round trip on."""
     applied = flight.applied
     errors = applied["horizon"] - (applied["stamp_ns"] - applied["basis_stamp_ns"]) * 1e-9
     return rms(errors[np.isfinite(applied["rtt"])])
 
 
 def wakes(flight: Flight, end: str) -> Columns:
-    """Select the wakes that `end` ("world" or "cloud") recorded; virtual time has none."""
+    """Select the rows of /lateness from `end`, "world" or "cloud"; none in virtual time."""
     columns = flight.during("/lateness")
     rows = columns["end"] == end
     return {name: column[rows] for name, column in columns.items()}

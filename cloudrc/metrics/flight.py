@@ -190,7 +190,7 @@ SHIPPED: dict[str, Metric] = {}
 
 
 def add_metrics(group: str, *rows: tuple[str, str, str, Measure]) -> None:
-    """Add metrics of cloudrc to a group; each row has the other attributes of a `Metric`."""
+    """Add metrics of cloudrc to a group; each row has name, unit, meaning and `measure`."""
     SHIPPED.update({row[0]: Metric(*row, group) for row in rows})
 
 
@@ -201,7 +201,7 @@ def mean(values: Array) -> float | None:
 
 
 def percentile(values: Array, percent: float) -> float | None:
-    """Compute a percentile (`percent` [%]) of the finite `values`, shape (n,); None without any."""
+    """Return a percentile (`percent` [%]) of the finite `values`, shape (n,); None if none is."""
     finite = values[np.isfinite(values)]
     return float(np.percentile(finite, percent)) if len(finite) else None
 
@@ -209,7 +209,7 @@ def percentile(values: Array, percent: float) -> float | None:
 def rms(errors: Array) -> float | None:
     """Compute the root mean square length of the vectors `errors`, shape (n,) or (n, 3), any unit.
 
-    Rows with NaN or infinity are left out; without other rows, return None.
+    Rows with NaN or infinity are left out; return None if no row is left.
     """
     squares = np.square(errors) if errors.ndim == 1 else np.square(errors).sum(axis=1)
     square = mean(squares)

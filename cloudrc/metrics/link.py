@@ -52,7 +52,7 @@ def loss(flight: Flight, way: str) -> float | None:
 
 
 def _add_direction(way: str, words: str) -> None:
-    """Add the metrics of one direction; without a relay, the relay's counters are unknown."""
+    """Add the metrics of the direction `way`; `words` name the direction in descriptions."""
 
     def seconds(name: str, flight: Flight) -> float | None:
         total = flight.last_total(f"{way}_release_error_{name}_ns")

@@ -68,9 +68,9 @@ def _waypoints_reached(flight: Flight) -> float | None:
 
 
 def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
-    """Return whether the robot truly stayed at a waypoint for its dwell time before an instant.
+    """Return whether the robot truly stayed near a waypoint for its dwell time before `until_ns`.
 
-    With a carrot, the setpoint waits for the dwell time; the robot only has to come near.
+    With a carrot, a stay of any length is enough, because the setpoint waits for the dwell time.
     """
     truth, dwell = flight.truth, 0.0 if flight.mission.carrot else waypoint.dwell_s
     rows = truth["stamp_ns"] <= until_ns
@@ -84,7 +84,7 @@ def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
 
 
 def _of_touch(measure: Callable[[Flight, dict[str, Array]], float | None]) -> Measure:
-    """Make a metric from a function of the first touch of the board; None without a touch."""
+    """Make a metric that applies `measure` to the first touch of the board; None without one."""
 
     def measured(flight: Flight) -> float | None:
         touch = first_touch(flight)
@@ -153,7 +153,7 @@ def _steady_error(flight: Flight, axis: int) -> float | None:
 
 
 def _fault_count(flight: Flight) -> float | None:
-    """Count the faults; a fault that repeats is recorded once, and a counter has its number."""
+    """Count each code of a fault once, but a code in `FAILURES` as often as its counter says."""
     totals, count = dict.fromkeys(flight.recording["/fault"]["code"], 1), flight.recording["/count"]
     for name, total in zip(count["name"], count["total"], strict=True):
         if name in FAILURES:  # the largest total: a cloud that restarts counts from 0

@@ -27,7 +27,7 @@ GROWTH_MIN = 0.15
 
 
 class Step(NamedTuple):
-    """The response to one step; a value is None if the step does not show it."""
+    """The response to one step; a time is None if the robot did not get that far."""
 
     waypoint: int  # index of the waypoint or step
     start: float  # time of the step since the start of the mission [s]
@@ -94,7 +94,7 @@ def _measure(flight: Flight, row: int, end_ns: int) -> Step | None:
 def _integral(values: Array, times: Array) -> float:
     """Integrate values over time [s] by the trapezoidal rule; `numpy.trapezoid` needs numpy 2.
 
-    Not by the product `@` of vectors: its last bit depends on the place of the arrays in memory.
+    This function avoids `@`, whose last bit depends on the place of the arrays in memory.
     """
     return float(((values[1:] + values[:-1]) / 2 * np.diff(times)).sum())
 
@@ -114,9 +114,9 @@ def _settling_time(times: Array, sizes: Array, band: float) -> float | None:
 def _grows(error: Array) -> bool:
     """Return whether an error along one axis [m] oscillates without decay, shape (n,).
 
-    A half-wave lies between two changes of sign; the part before the first change is the step
-    itself. The error does not decay if a half-wave is as large as the half-wave of the same sign
-    before it, and larger than `GROWTH_MIN`.
+    A half-wave is the error between two changes of sign; the first change of sign ends the step
+    itself. The error does not decay if a half-wave is larger than `GROWTH_MIN`, and at least as
+    large as the previous half-wave of the same sign.
     """
     crossings = np.flatnonzero(np.signbit(error[1:]) != np.signbit(error[:-1])) + 1
     waves = np.split(np.abs(error), crossings)[1:]

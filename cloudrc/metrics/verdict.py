@@ -332,7 +332,7 @@ class Observations:
             yield "board_touched", text
 
     def evidence(self, ending: Ending, elapsed: float, **known: Any) -> Evidence:
-        """Return the evidence of a mission that ended at mission time `elapsed` [s]."""
+        """Return the evidence of a mission that ended at `elapsed` [s]; `known`: more fields."""
         return Evidence(
             ending=ending,
             end=Moment(elapsed),

@@ -17,7 +17,7 @@ WALL_OFFSET = "wall_clock_offset_ns"
 def wall_time(metadata: Mapping[str, str], stamp_ns: int) -> datetime | None:
     """Convert a stamp [ns] to wall time in UTC; None if the recording does not know the wall time.
 
-    It is wrong by the lag of world's clock (`slip_ns`) and by later steps of the wall clock.
+    The result ignores the lag of world's clock (`slip_ns`) and later steps of the wall clock.
     """
     with suppress(ValueError, OverflowError):
         micros = (int(metadata.get(WALL_OFFSET, "")) + stamp_ns) // 1000

@@ -99,7 +99,7 @@ class Table:
 class Recording:
     """The tables of a flight by topic.
 
-    A recording from a file also has the metadata, attachments, note and remarks of its `Contents`.
+    A recording from a file also has metadata, attachments, note and remarks, as in `Contents`.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Recording:
 
     @staticmethod
     def from_records(world: Iterable[Record], cloud: Iterable[Record] = ()) -> Recording:
-        """Make a recording from the records of each end, oldest first and all on one clock."""
+        """Make a recording from records of world and cloud, each oldest first, all on one clock."""
         store = RecordStore()
         store.add(world, cloud)
         return store.recording()

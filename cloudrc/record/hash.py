@@ -30,7 +30,7 @@ _CODES = {int: "<i8", float: "<f8", bool: "?", str: "s"}
 
 
 class RecordHash:
-    """Keeps records as columns, and hashes them; the sizes of the updates have no effect."""
+    """Keeps records as columns, and hashes them; how updates divide the records has no effect."""
 
     def __init__(self) -> None:
         self._waiting: defaultdict[type, list[Record]] = defaultdict(list)
@@ -47,7 +47,7 @@ class RecordHash:
                 del block[:BLOCK]
 
     def blocks(self) -> dict[type, list[Columns]]:
-        """Return the columns of each block; the last block may be empty."""
+        """Return, by type of record, the columns of each block; the last block may be empty."""
         kinds = sorted(self._waiting, key=lambda kind: kind.__name__)
         return {kind: [*self._blocks[kind], to_columns(kind, self._waiting[kind])]
                 for kind in kinds}  # fmt: skip

@@ -77,7 +77,7 @@ def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
 
 
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
-    """Return the smallest (arrival - departure) of a datagram [ns], each on its end's clock."""
+    """Return the smallest (arrival - departure) [ns], on two clocks; None without a datagram."""
 
     def packets(table: Table) -> Iterator[tuple[tuple[int, int], int]]:
         numbers = zip(table["epoch"].tolist(), table["counter"].tolist(), strict=True)
@@ -162,8 +162,8 @@ def _join(world: Contents, cloud: Contents) -> Contents:
 def cut_to_last_mission(mission: Contents) -> bool:
     """Reduce a pod's recording of several missions to the mission that was started last.
 
-    Return whether the recording contains the end of that mission. If so, remove the words about a
-    missing end of the file from the note: the pod was still writing the file when it was copied.
+    Return whether the recording contains the end of that mission. If so, `mission.note` no longer
+    mentions that the file has no end: the pod was still writing the file when it was copied.
     """
     began, ended, earlier = _last_mission(mission)
     until = mission.messages[-1][1] if mission.messages else 0
@@ -177,9 +177,9 @@ def cut_to_last_mission(mission: Contents) -> bool:
 
 
 def _last_mission(contents: Contents) -> tuple[int | None, int | None, int]:
-    """Find the times [ns] of the last mission's start and end, and of the end of the one before.
+    """Return start and end [ns] of the last mission, and end [ns] of the mission before.
 
-    None: the event is missing; -1: the recording has no earlier mission.
+    Start or end is None if its event is missing; the last value is -1 without an earlier mission.
     """
     began, ended, earlier = None, None, -1
     for time_ns, event in _mission_events(contents):

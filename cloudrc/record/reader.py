@@ -81,8 +81,8 @@ used, because they allocate whatever size the file claims."""
 class Contents:
     """The contents of a file.
 
-    `lacking` is the part of `note` about damaged, removed or added messages. It does not mention
-    messages that are missing because the recording process was killed.
+    `lacking` is `note` without the messages that a killed process did not write: it describes only
+    damaged, removed or added messages.
     """
 
     # Topic, log time [ns] and CDR bytes of each message, in the order of log times.

@@ -81,7 +81,7 @@ class Recorder:
         return taken
 
     def flush(self) -> None:
-        """Pass the written data to the operating system; end the file after a failed `sync`."""
+        """Pass data to the operating system; end the file at `size_max` or after a failed sync."""
         if self._sink and not self._ended:
             try:
                 self._sink.flush()

@@ -111,7 +111,7 @@ def encode_view(topic: str, *values: Any) -> bytes:
 
 
 def part(name: str, *values: Any) -> Any:
-    """Make a part of a message, such as "geometry_msgs/msg/Point", from its fields' values."""
+    """Make an object of the ROS type `name`, such as "geometry_msgs/msg/Point", from its fields."""
     return _type[name](*values)
 
 

@@ -130,7 +130,8 @@ def _earlier_report(source: Path | bytes | None) -> _EarlierReport | None:
 def _describe(recording: Recording, earlier: _EarlierReport | None, contents: Contents) -> Run:
     """Describe a run, with values from its earlier report.
 
-    Without an earlier report, infer mode and shaper: only recordings of real time contain lateness.
+    Without an earlier report, assume a local run if the recording has rows on /lateness, else a
+    virtual run.
     """
     if earlier is None:
         real_time = len(recording["/lateness"]) > 0

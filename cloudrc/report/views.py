@@ -40,7 +40,7 @@ GOAL, GHOST, GLASS = (0.84, 0.37, 0.0), (0.34, 0.71, 0.91), (0.70, 0.74, 0.78)
 
 
 def add_views(mission: Contents, experiment: ResolvedExperiment) -> Recording:
-    """Replace the views of a mission; return the mission's tables. Errors are those of `views`."""
+    """Replace `mission.views`; return the mission's tables. Raise the same errors as `views`."""
     recording = mission.recording()
     mission.views = views(recording, experiment)
     return recording
@@ -82,7 +82,7 @@ def _thin(columns: Columns) -> Columns:
 
 
 def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:
-    """Yield a message per row. `frames`: frame -> names of the position and orientation column."""
+    """Yield a /tf message per row. `frames`: frame -> columns of position and orientation or ""."""
     for row, stamp_ns in enumerate(columns["stamp_ns"].tolist()):
         parts = [
             part(
@@ -143,7 +143,7 @@ def _marker(
 
 
 def _solid(name: str, frame: str, faces: list[Face]) -> _Shape:
-    """Make a shape of triangles; each has the colour of its face, unless all are equal."""
+    """Make a shape of triangles; each triangle has the colour and opacity of its face."""
     points: list[Any] = []
     colours: list[_Colour] = []
     for corners, colour, opacity in faces:

@@ -33,8 +33,8 @@ def assess(
 ) -> Assessment:
     """Measure and judge a run without writing files or drawing figures.
 
-    `own` are names or paths of the user's metrics; cloudrc executes these files, but no
-    metric files that only the experiment names: somebody else may have written them.
+    `own` are names or paths of the user's metrics, whose files are executed. Metric files that only
+    the experiment names are not executed, because somebody else may have written them.
     """
     scene = load_scene(experiment.world.scene)
     flight = Flight(recording, experiment.criteria, experiment.mission, scene)

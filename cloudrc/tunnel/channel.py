@@ -18,7 +18,7 @@ class Channel:
         """Set the rule for a datagram that arrives after a newer datagram.
 
         If `newest_wins` is True, the datagram is late and not used. Otherwise it is used, as in the
-        published code. A repeated datagram is never used.
+        authors' published code. A repeated datagram is never used.
         """
         self._newest_wins = newest_wins
         self.reset()

@@ -230,7 +230,7 @@ def decode_operator(body: bytes) -> OperatorRequest:
 def encode(kind: Kind, *fields: Any) -> bytes:
     """Encode the body of a handshake datagram: the fields of a `Hello` or `Accept`.
 
-    A CHALLENGE has one field, a cookie. A BUSY has one, the nonce of the hello that it answers.
+    A CHALLENGE has only a cookie. A BUSY has only the nonce of the hello that it answers.
     """
     return _BODIES[kind].pack(*fields)
 

@@ -18,7 +18,7 @@ from cloudrc.tunnel.session import Session
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """The identity of one end, fixed when the end's process starts."""
+    """The identity of world or cloud, fixed when its process starts."""
 
     clock_id: bytes  # 16 bytes that identify the monotonic clock of this machine
     nonce: bytes  # 16 random bytes that identify this process
@@ -61,7 +61,7 @@ class TunnelEnd:
         return records
 
     def _tell(self, code: str, text: str, now_ns: int) -> None:
-        """Record a fault at `now_ns` [ns], unless this session has one with the same text.
+        """Record a fault at `now_ns` [ns], unless this session has a fault with the same text.
 
         Faults with the same `code` and different texts are all recorded. A forged datagram with a
         wrong version therefore does not hide the version of the true peer.
@@ -71,7 +71,7 @@ class TunnelEnd:
             self._records.append(Fault(now_ns, code, text))
 
     def _tell_refusal(self, outcome: str, data: bytes, now_ns: int) -> None:
-        """Record at `now_ns` [ns] why `data` opens no session; `outcome` is its DecodeError."""
+        """Record at `now_ns` [ns] why `data` opens no session; `outcome`: text of a DecodeError."""
         if outcome == "version":
             self._tell("version", VERSION_TEXT.format(data[0], codec.VERSION), now_ns)
         elif outcome == "tag" and codec.peek(data)[0] <= codec.LAST_GREETING:

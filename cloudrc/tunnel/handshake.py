@@ -54,7 +54,7 @@ class ServerHandshake:
     """World's side of the handshake: decide which cloud gets a session, and number sessions."""
 
     def __init__(self, session: Session, nonce: bytes, clock: bytes, age_max_ns: int) -> None:
-        """Begin without a session; the handshake begins each session in `session`.
+        """Start without a session; each handshake then sets the epoch and keys of `session`.
 
         `nonce` and `clock` have 16 bytes each, which identify this process and the monotonic clock
         of this machine. After a silence of `age_max_ns` [ns] another cloud can get a session.
@@ -128,9 +128,9 @@ class ServerHandshake:
     def _keeps_epoch(self, now_ns: int) -> bool:
         """Return whether a hello of the cloud that has the session keeps the present epoch.
 
-        A new epoch is needed if the present epoch has ended, or if the key of the hello is newer.
-        After REPEATS_MAX hellos without an encrypted datagram between them, a new epoch is also
-        needed if the session has become free for another cloud, or if the hello has another key.
+        The hello begins a new epoch if the present epoch has ended, or if its key is newer than the
+        epoch's key. After REPEATS_MAX hellos without an encrypted datagram, it also begins one if
+        the session has timed out, or if its key is not the epoch's key.
         """
         session, key = self._session, self._session.greeting_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current
@@ -164,7 +164,7 @@ class ClientHandshake:
     """Cloud's side of the handshake: make hellos, and decide which answers are valid."""
 
     def __init__(self, nonce: bytes, clock: bytes) -> None:
-        """Begin without a session; `nonce` and `clock` are as in `ServerHandshake`."""
+        """Start without a session; `nonce` and `clock` are as in `ServerHandshake`."""
         self._seed, self._clock = nonce, clock
         self._nonce, self._nonces = nonce, 0
         self._epoch = NO_EPOCH  # the newest known epoch
@@ -200,10 +200,10 @@ class ClientHandshake:
     def receive_accept(self, epoch: int, accept: Accept, *, asks: bool) -> bytes | None:
         """Process an ACCEPT; return cloud's and world's nonce if a new epoch begins, else None.
 
-        `asks` tells whether cloud asks for a session. If it does not, cloud ignores an ACCEPT from
-        another world process, because that process may have ended and the ACCEPT may be late.
-        While cloud asks, it can accept such a late ACCEPT and take the running process for an ended
-        one. When the running process answers again, cloud makes a new nonce: late ACCEPTs lack it.
+        `asks` is True while cloud asks for a session. Otherwise, cloud ignores the ACCEPTs of a new
+        world process. While cloud asks, a late ACCEPT of an ended world process may mislead cloud.
+        When the running world process answers again, cloud changes its own nonce, which makes late
+        ACCEPTs invalid.
         """
         known = accept.world_nonce == self._world
         if accept.nonce != self._nonce or (self._world and not known and not asks):

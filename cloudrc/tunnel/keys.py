@@ -64,13 +64,13 @@ class KeySet(NamedTuple):
 
     @property
     def accepted(self) -> tuple[Key, ...]:
-        """The keys that an end accepts in a handshake; the first is the current key."""
+        """The keys that an endpoint accepts in a handshake; the first is the current key."""
         return (self.current,) if self.previous is None else (self.current, self.previous)
 
 
 @dataclass
 class KeyRing:
-    """The keys of one end. If the key file changes, even in flight, the driver replaces `keys`."""
+    """The keys of world or cloud; the driver replaces `keys` if the key file changes."""
 
     keys: KeySet
 

@@ -1,10 +1,10 @@
 """Encrypt outgoing datagrams and verify incoming datagrams with the keys of a session.
 
 A datagram changes no state before its tag is verified. Counters restart with every session, except
-those of HELLO, CHALLENGE and BUSY: the link draws losses by epoch and counter, and with a restarted
-counter it would lose the same handshake datagrams in every attempt.
+those of HELLO, CHALLENGE and BUSY: the emulated link decides by epoch and counter which datagrams
+it loses. With restarted counters, it would lose the same handshake datagrams in every attempt.
 
-Two ends in one process need no keys: their datagrams reach no network, and encryption would take
+World and cloud in one process need no keys: no datagram reaches a network. Encryption would take
 5 % of the run time. Drivers with a socket refuse a session without keys (`Endpoint.sealed`).
 """
 
@@ -36,7 +36,7 @@ _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class NoCipher:
-    """Replaces the cipher if both ends are in one process: no encryption, and a tag of zeros."""
+    """Replaces the cipher if world and cloud are in one process: no encryption, a tag of zeros."""
 
     def encrypt(self, nonce: bytes, body: bytes, header: bytes) -> bytes:
         """Return the body with a tag of zeros, not encrypted."""
@@ -48,7 +48,7 @@ class NoCipher:
 
 
 class Session:
-    """Keys and counters of one end in the present session.
+    """Keys and counters of world or cloud in the present session.
 
     `epoch` is the number of the session, or `NO_EPOCH`. `epoch_key` is the pre-shared key of the
     session; `is_outdated` tells whether the key file has a newer key. `greeting_key` is the
@@ -56,9 +56,9 @@ class Session:
     """
 
     def __init__(self, sends: Direction, ring: KeyRing | None) -> None:
-        """Set the direction in which this end sends, and the pre-shared keys.
+        """Set the direction in which this endpoint sends, and the pre-shared keys.
 
-        `ring` is None if both ends are in one process.
+        `ring` is None if world and cloud are in one process.
         """
         self.epoch, self.sealed = NO_EPOCH, ring is not None
         self.ring = ring or KeyRing(KeySet(Key(_PUBLIC_KEY)))
@@ -91,9 +91,9 @@ class Session:
         return header + self._sealing.encrypt(header[4:], body, header)
 
     def pass_on(self, kind: int, message: Telemetry | Command) -> Passed:
-        """Return `message` instead of the next datagram of this kind, with the same counter.
+        """Return `message` in place of the next datagram of this kind, with its counter.
 
-        Only an end in the same process can `open` the result.
+        Only an endpoint in the same process can `open` the result.
         """
         counters = self._counters
         counter = counters[kind]
@@ -114,8 +114,8 @@ class Session:
         The body of a `Passed` message is the message itself.
 
         Raises:
-            DecodeError: "malformed", "version", "direction" (this end itself sends in the direction
-                of the datagram), "old_epoch" (another session), or "tag" (a wrong tag).
+            DecodeError: "malformed", "version", "direction" (that in which this endpoint itself
+                sends), "old_epoch" (another session), or "tag" (a wrong tag).
         """
         if type(data) is Passed:
             if data[1] != self.epoch or not data[1]:

@@ -45,8 +45,8 @@ def draw(
 ) -> dict[str, bytes]:
     """Draw panels below each other; return the contents of a PDF, a PNG and an SVG file by suffix.
 
-    `x` and `by` are the keys that change along x and between lines. With `x_names` the x axis has
-    names instead of numbers, and no line joins the points.
+    `x` is the key that varies along the x axis, `by` the key that varies between lines (None: one
+    line). With `x_names`, the x axis has names instead of numbers, and no line joins the points.
     """
     with own_settings(look):
         figure = new_figure(0.7 + 1.3 * len(panels), look.width)

@@ -1,7 +1,7 @@
 """Mark HOLD and changes of the link in figures; compute the delays of the link profile.
 
-`cloudrc link set` replaces the link profile of a direction. Until then, the link follows the time
-line of the profile.
+A link profile describes the conditions of a direction over time; `cloudrc link set` replaces the
+profile in flight.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def band(delays: Timeline, time: Array) -> tuple[Array, Array]:
 
 
 class Part(NamedTuple):
-    """A link profile that one direction had from some instant on.
+    """A link profile of one direction, in force from `begin` until the next `Part` begins.
 
     Times are in seconds since the start of the flight.
     """
@@ -80,10 +80,10 @@ def parts(subject: Subject, *, uplink: bool) -> list[Part]:
 
 
 def bounds(subject: Subject, time: Array, *, uplink: bool) -> tuple[Array, Array] | None:
-    """Compute the band of delays of the link profile at each `time` [s] since the flight's start.
+    """Compute the band of delays of the profile [s] at each `time` [s] since the flight's start.
 
-    Return its lower and upper end [s], NaN in blackouts and where the file of a trace is missing;
-    None if all are NaN.
+    Return its lower and its upper limit, NaN in blackouts and without a trace's file; None if all
+    are NaN.
     """
     low, high = np.full((2, len(time)), nan)
     for begin, origin, direction, _ in parts(subject, uplink=uplink):

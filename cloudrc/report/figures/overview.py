@@ -60,7 +60,7 @@ def _pipe(pipe: Pipe, view: _View) -> list[Face]:
 
 
 class _View:
-    """A parallel projection of the scene, with its longer side along the page."""
+    """A parallel projection of the scene, whose longer side is horizontal."""
 
     def __init__(self, points: Array, front: Array) -> None:
         """Look at `points` [m], world frame, shape (n, 3), from the side of the vector `front`."""
@@ -73,7 +73,7 @@ class _View:
         self._sides = np.stack([right, np.cross(self.towards, right)], axis=1)
 
     def project(self, points: Array) -> Array:
-        """Project points [m], world frame, shape (..., 3), to the page [m], shape (..., 2)."""
+        """Project points [m], world frame, shape (..., 3), to the figure [m], shape (..., 2)."""
         return np.asarray(points @ self._sides)
 
     def draw_faces(self, axes: Axes, faces: list[Face]) -> None:
@@ -141,7 +141,7 @@ def _draw_floor(axes: Axes, view: _View, points: Array, height: float) -> None:
 
 
 def _instants(subject: Subject) -> list[int]:
-    """Choose rows of the true states at equal distances flown."""
+    """Choose rows of the true states at equal distances flown, up to the touch of the board."""
     truth, touch = subject.flight.truth, first_touch(subject.flight)
     stamps = truth["stamp_ns"]
     if touch is not None:
