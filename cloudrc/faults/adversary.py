@@ -49,7 +49,7 @@ class DishonestLoop(ControlLoop):
     """Computes honest commands, and changes them before they are sent."""
 
     def __init__(self, lies: Sequence[Lie], *plugins: Any, **limits: Any) -> None:
-        """Set functions that change each command, in turn; the rest is for `ControlLoop`."""
+        """Set the functions that change each command in turn; `ControlLoop` takes the rest."""
         super().__init__(*plugins, **limits)
         self._lies = lies
 

@@ -468,7 +468,7 @@ class Teleop:
     def _select_early(self, now_ns: int) -> None:
         """Select the first waypoint before telemetry shows the start, to save a round trip.
 
-        Before a reset to the spawn, wait until the robot ignores commands: it would fly there.
+        Before a reset to the spawn, wait until the robot ignores commands, or it would fly there.
         """
         if not self._is_pending or self.seen is None or self._may_move:
             return

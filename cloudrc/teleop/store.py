@@ -120,7 +120,7 @@ class StoreLockedError(CloudrcError):
 
 
 class ConflictError(CloudrcError):
-    """Report that the state forbids a request because of the mission with id `mission`, or ""."""
+    """Report a forbidden request; `mission` is the id of the mission in the way, "" if none is."""
 
     exit_code = 5
 

@@ -231,7 +231,7 @@ class WorldEndpoint(TunnelEnd):
         self._sample_ns += self._sample_period_ns
 
     def _record_counts(self, now_ns: int) -> None:
-        """Record the counters; report once per session if world's clock is too slow."""
+        """Record the counters; report once per session if the simulation is too slow."""
         guard, before_ns = self.robot.guard, self._counted_slip_ns
         self._count_ns, self._counted_slip_ns = self._count_ns + COUNT_PERIOD_NS, self._slip_ns
         self._counts["held_seconds"] += guard.armed and guard.state is HOLD

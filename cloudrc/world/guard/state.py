@@ -278,7 +278,7 @@ class Guard:
         return self.reference
 
     def plain_track(self, now_ns: int) -> tuple[int, Vector, Vector, int] | None:
-        """Return the input of `native/step.c` for steps from `now_ns` [ns] on; None to use `step`.
+        """Return the input of `native/step.c` from `now_ns` [ns] on; None if only `step` can run.
 
         The input: time of the plan's next velocity [ns]; velocity reference and commanded velocity
         [m/s]; end of the time in which the command is fresh [ns].
