@@ -1,9 +1,9 @@
 """Model dishonest clouds, which have valid keys and can send any command.
 
-A policy knows what an honest cloud knows: the newest odometry and its own estimate of the delay. It
-can send any command with a valid signature. Some policies also state a wrong odometry stamp, pause
-their commands, or make requests of the operator. World cannot distinguish such requests from the
-operator's own requests, because cloud forwards both.
+Each kind of dishonest cloud is a policy. A policy knows what an honest cloud knows: the newest
+odometry, and cloud's estimate of the delay. Some policies also state a wrong odometry stamp, pause
+their commands, or forge requests of the operator. World cannot detect forged requests, because
+cloud also forwards the operator's own requests.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class DishonestLoop(ControlLoop):
     """Computes honest commands, and changes them before they are sent."""
 
     def __init__(self, lies: Sequence[Lie], *plugins: Any, **limits: Any) -> None:
-        """Apply all `lies` in turn to each command; the other arguments are for `ControlLoop`."""
+        """Set the functions that change each command in turn; `ControlLoop` takes the rest."""
         super().__init__(*plugins, **limits)
         self._lies = lies
 
@@ -66,7 +66,7 @@ class DishonestLoop(ControlLoop):
 class HostileOperator:
     """An `Operator` that forwards teleop's setpoints, but replaces teleop's requests.
 
-    Before the first setpoint it also forwards requests, so that a mission begins.
+    Until teleop's first setpoint it forwards teleop's requests, too, so that a mission begins.
     """
 
     outcome, settled = None, True
@@ -131,7 +131,7 @@ REACHED = (0, 1, 7, MISSION_OVER)
 
 
 def at_bad_moments(rng: Generator) -> Words:
-    """Make requests after random pauses; half of the requests wait for a robot near the fence."""
+    """Return a function that forges requests after random pauses, half of them near the fence."""
     pause, near = float(rng.choice([0.05, 0.3, 1.0])), float(rng.uniform(0.2, 1.5))
     due_ns, waits = 0, False
 
@@ -151,16 +151,16 @@ def at_bad_moments(rng: Generator) -> Words:
 
 
 def _faces(position: Vector) -> list[tuple[float, int, float]]:
-    """List walls and ceiling: distance [m], axis, and direction along the axis (1 or -1)."""
+    """Return for each wall and the ceiling: distance [m], axis, direction on the axis (1 or -1)."""
     walls = [(p - LOW[n], n, -1.0) for n, p in enumerate(position) if n < 2]
     return [(HIGH[n] - p, n, 1.0) for n, p in enumerate(position)] + walls
 
 
 def dishonesty(schedule: Schedule) -> tuple[Lie, Words | None]:
-    """Make the functions that change commands and make requests, for a schedule's policy.
+    """Return a schedule's policy as functions that change commands and forge requests (or None).
 
     Raises:
-        BadInputError: If the policy does not exist; the text lists all policies.
+        BadInputError: If the policy does not exist; the message lists all policies.
     """
     if schedule.policy not in POLICIES:
         names = ", ".join(POLICIES)
@@ -171,7 +171,7 @@ def dishonesty(schedule: Schedule) -> tuple[Lie, Words | None]:
 
 
 def choose(seed: int) -> Schedule:
-    """Make the schedule of a seed: a dishonest cloud, with or without random faults."""
+    """Return the schedule for a seed: a dishonest cloud, with or without random faults."""
     rng, names = generator(seed, 665), sorted(POLICIES)
     profile = ("ideal", *PAPER)[int(rng.integers(4))]
     calm = Schedule(seed, profile, duration=DURATION)
@@ -199,7 +199,7 @@ def _towards_a_face(rng: Generator) -> Lie:
 
 
 def _face_after_face(rng: Generator) -> Lie:
-    """Fly at full speed between opposite sides of the fence, sometimes along another axis."""
+    """Fly at full speed between opposite sides of the fence; sometimes change the axis."""
     axis, way = int(rng.integers(3)), 1.0
     near = float(rng.uniform(0.1, 2.0))
 
@@ -216,7 +216,7 @@ def _face_after_face(rng: Generator) -> Lie:
 
 
 def _greedy(rng: Generator) -> Lie:
-    """Fly towards the nearest wall or the ceiling, sometimes elsewhere."""
+    """Fly towards the nearest wall or the ceiling, sometimes with a random velocity along it."""
     decoy = float(rng.uniform(0.0, 0.2))
 
     def lie(command: Command, control: Control) -> Command:
@@ -312,7 +312,7 @@ def _stop_and_go(rng: Generator) -> Lie:
 
 
 def _hostile_plans(rng: Generator) -> Lie:
-    """Send plans of random lengths, for now or much later, with jumps and sometimes NaN.
+    """Send plans of random lengths that begin now or later, with jumps and sometimes NaN.
 
     Some of these clouds alternate plans with plain commands. Others send stale commands for some
     time, so that the robot flies a plan to its end.
@@ -341,12 +341,12 @@ def _hostile_plans(rng: Generator) -> Lie:
 
 
 def _operators_voice(rng: Generator) -> Lie:
-    """Fly as one of the policies in `FASTEST`, while `at_bad_moments` makes requests."""
+    """Fly as a random policy in `FASTEST`, while `at_bad_moments` forges requests."""
     return FASTEST[int(rng.integers(len(FASTEST)))](rng)
 
 
 def _refused_and_released(rng: Generator) -> Lie:
-    """Fly fast, sometimes cause a landing, and acknowledge it while the robot is in the air."""
+    """Fly fast, and send NaN to cause landings; `at_bad_moments` acknowledges the landings."""
     fly, pause_ns = _operators_voice(rng), int(rng.uniform(0.5e9, 4e9))
 
     def lie(command: Command, control: Control) -> Command:

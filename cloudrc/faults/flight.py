@@ -41,12 +41,12 @@ SHARED, OTHER = b"one clock for all".ljust(16)[:16], b"another clock..."
 
 
 def conditions(**changes: object) -> Shape:
-    """Return a `Shape` that makes these `changes` to the fields of a direction's profile."""
+    """Return a `Shape` that replaces fields of a direction's profile by `changes`."""
     return lambda profile: replace(profile, **changes)  # type: ignore[arg-type]
 
 
 def silent(start: float, duration: float, **changes: object) -> Shape:
-    """Return a `Shape` that loses all datagrams from `start` [s] for `duration` [s]."""
+    """Return a `Shape` with `changes`, and a blackout from `start` [s] for `duration` [s]."""
     return conditions(blackouts=(Blackout(start, duration),), **changes)
 
 
@@ -73,7 +73,7 @@ class Flight:
         words: Words | None = None,  # makes requests in place of the operator
         second: float | None = None,  # when a second cloud connects [s]
     ) -> None:
-        """Prepare a flight; a second cloud connects at `second` [s], if that is not None."""
+        """Prepare a flight; comments explain the arguments. `second` [s] is for a second cloud."""
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         self._honest, self._keep = honest, keep
         self._life, self._second, self._lies, self._words = life, second, lies, words
@@ -119,12 +119,12 @@ class Flight:
         return Order(plan, contact=bool(self.experiment.criteria.contact))
 
     def order_if_possible(self, now_ns: int) -> None:
-        """Order the experiment's mission; a refusal, and the time `now_ns`, are ignored."""
+        """Order the experiment's mission; ignore a refusal and `now_ns`."""
         order = self.make_order()
         self.teleop.ask(lambda service, now_ns: service.create(order, now_ns))
 
     def fly(self, until: float, is_over: Callable[[], bool] = lambda: False) -> Flight:
-        """Continue the flight until the virtual time `until` [s] or until `is_over` is True."""
+        """Continue until the virtual time `until` [s] or `is_over()`; return this flight."""
         self.run.fly(is_over, round(until * 1e9), self._sink)
         return self
 
@@ -140,7 +140,7 @@ class Flight:
         self.cloud.at(now_ns * 1e-9 + down, self.teleop.start)
 
     def replace_key(self, end: str, keys: KeySet) -> None:
-        """Write the key file of `end`; a process that is not running reads it when it starts."""
+        """Replace the keys of `end` (world or cloud), in its key file and its running process."""
         self.secrets[end] = self.rings[end].keys = keys
 
     def end_rival(self) -> None:
@@ -169,7 +169,7 @@ class Flight:
     def guard_now(self) -> tuple[GuardState, str]:
         """Return the guard's present state and its cause; GROUND while world is not running.
 
-        The records are not enough: after a restart of world, they end with the old guard's state.
+        The records do not suffice: a restarted world begins in GROUND without a record.
         """
         if self.world.inner is None:
             return GuardState.GROUND, "the world is down"
@@ -196,7 +196,7 @@ class Flight:
         return EndpointGroup([cloud, self._build_rival(joins_ns)])
 
     def _build_rival(self, start_ns: int) -> CloudEndpoint:
-        """Build a second cloud with the same key, which starts the same mission itself."""
+        """Build a second cloud with the same key; it has its own teleop and the same mission."""
         teleop = Teleop()
         teleop.start(start_ns, assembly.build_plan(self.experiment))
         identity = Identity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
@@ -207,7 +207,7 @@ class Flight:
         return LinkDirection(shape(profile), self.experiment.seed, uplink=up)
 
     def _begin(self, end: str, clock_id: bytes) -> Identity:
-        """Make the identity of a new process of `end`: a new nonce, and keys from its key file."""
+        """Make the identity of a new process of `end` (world or cloud): its nonce and its keys."""
         self.generations[end] += 1
         self.rings[end] = KeyRing(self.secrets[end])
         nonce = f"{end}-{self._life}-{self.generations[end]}".encode().ljust(16)

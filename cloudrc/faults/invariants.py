@@ -1,9 +1,9 @@
 """Safety invariants, checked after every 2 ms step, independently of the guard.
 
-fence      The base stays inside the fence while the rotors turn. After a collision or an
+fence      The robot's base stays inside the fence while the rotors turn. After a collision or an
            emergency stop the robot may leave the fence by at most `FALL_MAX`. Stopped rotors
            start again only if the robot is at rest inside the fence.
-cap, stop  The reference velocity stays within its limits, and the robot can always stop before the
+cap, stop  The velocity reference stays within its limits, and the robot can always stop before the
            fence. During LAND the robot may fly down to the floor. After a HOLD the reference
            velocity grows slowly at first.
 stale      World rejects a command that is based on too old odometry. TRACK ends with the session,
@@ -74,7 +74,7 @@ GROUND_NS = 10_000_000_000
 """Shortest time that a robot on the ground waits for a mission's first command [ns]."""
 RAMP = 3.0  # largest growth of the reference after a HOLD [m/s^2]
 RAMP_MIN = 1.0
-"""Time of slow growth of the reference velocity after a HOLD [s], if the limit is below 3 m/s."""
+"""Time of slow growth of the velocity reference after a HOLD [s], if the limit is below 3 m/s."""
 
 
 class Breach(NamedTuple):
@@ -98,7 +98,7 @@ class Watch:
         self._newest = (0, 0, -1)  # newest command: process of world, epoch and counter
 
     def attach(self, robot: Robot, start_ns: int, *, honest: bool) -> None:
-        """Check a robot from `start_ns` [ns] on; if cloud is `honest`, check its contacts, too."""
+        """Check a robot from `start_ns` [ns] on; check its contacts only if cloud is `honest`."""
         robot.observers.append(RobotInvariants(robot, self, start_ns, honest))
         self.starts_ns.append(start_ns)
 
@@ -118,7 +118,7 @@ class Watch:
                 self._newest = max(self._newest, this)
 
     def note(self, now_ns: int, kind: str, text: str) -> None:
-        """Record a breach at `now_ns` [ns]."""
+        """Record a breach of the invariant `kind` at `now_ns` [ns]; `text` describes it."""
         self.counts[kind] += 1
         if self.counts[kind] <= REPORTED:
             self.breaches.append(Breach(now_ns * 1e-9, kind, text))
@@ -218,7 +218,7 @@ class RobotInvariants:
         self._state = self._guard.state
 
     def see_request(self, request: OperatorRequest, now_ns: int) -> None:
-        """Implement `Observer.see_request`: note what the operator allows."""
+        """Implement `Observer.see_request`: store what the request allows the robot to do."""
         match request.request:
             case Request.START:
                 if request.start is Start.SPAWN:
@@ -245,7 +245,7 @@ class RobotInvariants:
         self._fresh_ns.clear()
         self._invalid_ns.clear()
 
-    # Position and reference velocity.
+    # Position and velocity reference.
 
     def _check_fence(
         self, state: GuardState, position: Vector, velocity: Vector, now_ns: int
@@ -333,8 +333,8 @@ class RobotInvariants:
     ) -> None:
         """Check that the rotors stop only on a request, after a collision, or without motion.
 
-        A rotor speed of 0 does not prove that the rotors were stopped: hard braking also commands
-        it. Therefore the check looks for the constant `STOPPED`, which only a stop uses.
+        Hard braking also commands a rotor speed of 0. Therefore the check looks for the constant
+        `STOPPED`, which is commanded only if the rotors are to stop.
         """
         turns, asked = rotor_speeds is not STOPPED, self._is_asked
         is_hit = state is ESTOP and self._was is not ESTOP and not asked
@@ -408,8 +408,8 @@ class RobotInvariants:
 def can_stop(speed: float, below: float, above: float) -> bool:
     """Return whether the robot can stop before the side of the fence that it flies towards.
 
-    Along one axis, the robot has the velocity `speed` [m/s], and the distances `below` and `above`
-    to the two sides of the fence [m].
+    `speed` is the velocity along one axis [m/s]. `below` and `above` are the robot's distances to
+    the two sides of the fence on this axis [m].
     Source: docs/reference/plant.md, "Stop rule": 0.2 v + v^2/6 <= distance - 0.1.
     """
     if speed > 0.0:
@@ -418,7 +418,7 @@ def can_stop(speed: float, below: float, above: float) -> bool:
 
 
 def growth(before: Vector, after: Vector) -> float:
-    """Compute how much the reference velocity grows from `before` to `after` [m/s]."""
+    """Compute how much the velocity reference grows from `before` to `after` [m/s]."""
     (ux, uy, uz), (vx, vy, vz) = before, after
     return sqrt(_grown(ux, vx) ** 2 + _grown(uy, vy) ** 2 + _grown(uz, vz) ** 2)
 

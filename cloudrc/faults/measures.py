@@ -25,12 +25,12 @@ ENDED = Cause.ENDED.words  # cause of a HOLD that the operator has requested
 
 
 def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
-    """Choose a random time from `first` to `last` [s]; by default, a time among the pipes."""
+    """Choose a random time [s]; from the default `first` to `last`, the robot is among pipes."""
     return float(generator(seed, 77).uniform(first, last))
 
 
 def refused(outcome: Outcome, flight: Flight, *reasons: str) -> None:
-    """Check that world has refused datagrams, or commands, for each reason."""
+    """Check that world has refused at least one datagram or command for each reason."""
     for reason in reasons:
         outcome.least(f"refused as {reason}", flight.count(reason), 1)
 
@@ -59,7 +59,7 @@ def held_in_time(outcome: Outcome, flight: Flight, text: str = "HOLD after") -> 
 
 
 def basis_age_at_hold(flight: Flight) -> float:
-    """Return the largest age that the last command's odometry had when a HOLD began [s]."""
+    """Return the largest age of the last command's odometry at the beginning of a HOLD [s]."""
     applied = [(r.stamp_ns, r.basis_stamp_ns) for r in flight.of_world if type(r) is CommandApplied]
     ages = []
     for change in held(flight):
@@ -85,7 +85,7 @@ def busiest_second(changes: Sequence[GuardChange]) -> int:
 
 
 def told(records: Iterable[Record], code: str) -> list[Fault]:
-    """Return the faults with this code."""
+    """Return the `Fault` records with this code."""
     return [each for each in records if isinstance(each, Fault) and each.code == code]
 
 
@@ -113,7 +113,7 @@ def drift(flight: Flight, start: float, end: float) -> float:
 
 
 def number(flight: Flight, name: str) -> float:
-    """Return a metric of the flight's report [any unit]; NaN if it is unknown."""
+    """Return a metric of the flight's report, in the metric's unit; NaN if there is none."""
     recording = Recording.from_records(flight.of_world, flight.of_cloud)
     numbers = assess(recording, flight.experiment, Run("virtual", "virtual")).numbers
     return numbers[name].value if name in numbers else nan
@@ -144,7 +144,7 @@ def fly_safely(outcome: Outcome, flight: Flight, limit: float = 120.0) -> Flight
 
 
 def safe(outcome: Outcome, flight: Flight) -> None:
-    """Check that there was no breach, and add the hash of the flight's records."""
+    """Check that no invariant was broken; add the hash of the flight's records to `outcome`."""
     outcome.same("breaches of an invariant", flight.watch.counts.total(), 0)
     for breach in flight.watch.breaches:
         outcome.true(f"{breach.kind} at {breach.time:.3f} s: {breach.text}", False)

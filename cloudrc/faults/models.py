@@ -41,12 +41,12 @@ Call: TypeAlias = Callable[[MissionService, int], object]
 
 
 class RestartableEndpoint:
-    """World or cloud in a process that a scenario can kill, freeze and start; an `Endpoint`."""
+    """An `Endpoint`: world or cloud in a process that a scenario can kill, freeze and start."""
 
     sealed = True  # world and cloud have keys
 
     def __init__(self, build: Callable[[int], Endpoint], clock: Clock) -> None:
-        """Start the first process; `build` makes world or cloud at a time on its clock [ns]."""
+        """Start a process; `build` makes world or cloud from the start time on `clock` [ns]."""
         self._build, self.clock = build, clock
         self.tamper: Tamper | None = None  # changes the datagrams that arrive
         self._scheduled, self._frozen_until_ns = 0, -1
@@ -93,7 +93,7 @@ class RestartableEndpoint:
             self.at(start + n * CFS_PERIOD, lambda now_ns: self.freeze(now_ns, stall))
 
     def receive_now(self, data: bytes, now_ns: int) -> None:
-        """Pass a datagram to the process without a call of `tamper`."""
+        """Pass a datagram to the process unchanged; `receive_datagram` lets `tamper` change it."""
         if self.inner is None:
             return
         if self._frozen_until_ns <= now_ns:
@@ -278,7 +278,7 @@ class TeleopModel:
         self._calls.append(call)
 
     def stop_rotors(self, now_ns: int) -> None:
-        """Make an emergency stop: send an alarm to cloud at once; `now_ns` is ignored.
+        """Make an emergency stop: send `ALARM` to cloud at once; `now_ns` is ignored.
 
         Teleop stores the stop when it wakes next.
         """

@@ -95,10 +95,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """All faults of one flight.
-
-    `seed` determines the random numbers of the link and of the faults.
-    """
+    """All faults of one flight; `seed` determines the random numbers of link and faults."""
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
     seed: Annotated[int, Field(ge=0, le=2**63)]
@@ -124,7 +121,7 @@ class Schedule:
 
 
 def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> DirectionProfile:
-    """Add the link faults of a schedule to the conditions of one direction.
+    """Return the profile of one direction ("up" or "down") with the link faults of a schedule.
 
     Raises:
         BadInputError: If both the profile and a fault change the conditions over time.
@@ -199,9 +196,9 @@ ONCE = ("second_cloud", "key_rotated")  # kinds of fault that a flight has at mo
 
 
 def compose(seed: int) -> Schedule:
-    """Make the schedule of a seed: up to 12 faults in 45 s, then 15 s without faults.
+    """Return the schedule for a seed: up to 12 faults in 45 s, then 15 s without faults.
 
-    A schedule without faults uses a profile of the paper, with which no HOLD should happen.
+    A schedule without faults uses a link profile in `PAPER`, with which no HOLD should happen.
     """
     rng, kinds, events = generator(seed, 40), sorted(KINDS), list[Event]()
     for _ in range(int(rng.integers(13))):

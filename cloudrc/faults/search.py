@@ -26,7 +26,7 @@ Map: TypeAlias = Callable[[Callable[[Job], Finding], Sequence[Job], int], Iterat
 
 
 def fly_seed(job: Job) -> Finding:
-    """Fly the schedule that belongs to a kind of search and a seed."""
+    """Fly one schedule of a search; `job` has the kind of the search and the seed."""
     kind, seed = job
     return fly(KINDS[kind](seed))
 
@@ -45,7 +45,7 @@ class Search:
     def run(
         self, minutes: float, call: Map, jobs: int = 1
     ) -> Generator[dict[str, Any] | None, None, None]:
-        """Fly one seed after another for `minutes` [min], at least one seed.
+        """Fly one seed after another for `minutes` [min]; `call` uses `jobs` processes.
 
         Yields:
             After each flight: the stored failure, or None if no invariant was broken.

@@ -156,7 +156,7 @@ class Operator:
         flight.listeners.append(self._look)
 
     def check_stuck(self) -> None:
-        """Check that the robot has flown during the last part of the flight, without faults."""
+        """Check that the guard was in TRACK at some time in the last `BACK` [s], without faults."""
         flight, now_ns = self._flight, self._flight.run.now_ns
         if now_ns - self._tracked_ns > BACK * 1e9:
             state, cause = flight.guard_now()
@@ -165,7 +165,7 @@ class Operator:
             flight.watch.note(now_ns, "stuck", f"{text} {mission}")
 
     def check_stops(self) -> None:
-        """Check that each emergency stop had an effect."""
+        """Check that each emergency stop of the operator led to ESTOP."""
         for at_ns in self._unmet_ns:
             text = f"the operator's stop at {at_ns * 1e-9:.2f} s has stopped nothing"
             self._flight.watch.note(self._flight.run.now_ns, "obeyed", text)
@@ -231,7 +231,7 @@ def inject(flight: Flight, schedule: Schedule) -> None:
 def _actions(
     flight: Flight, process: RestartableEndpoint, event: Event
 ) -> dict[str, tuple[tuple[float, Action], ...]]:
-    """Return kind of fault -> times [s] and actions; some actions apply to `process`."""
+    """Return kind of fault -> times [s] and actions for `event`; `process` is world or cloud."""
     at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
     gone = at + event.value * lasts  # end of teleop after it was asked to end
 
@@ -291,7 +291,7 @@ def flipped(data: bytes, rng: np.random.Generator, flips: int) -> bytes:
 
 
 def _bugs(schedule: Schedule, clock: Clock) -> Lie:
-    """Make a function that replaces commands by impossible ones, `Event.value` per second."""
+    """Return a function that replaces `Event.value` commands per second by impossible ones."""
     rng, events = generator(schedule.seed, 43), schedule.of(*BUGS)
     due = [event.at for event in events]
 

@@ -103,7 +103,7 @@ class Bridge:
             self._urgent.popleft()[1].set_exception(UnavailableError(why))
 
     def submit(self, call: Call, urgent: Urgent = "") -> Future[Any]:
-        """Queue a call for teleop's loop; the loop makes stops and holds first.
+        """Queue a call for teleop's loop; the loop makes urgent calls (stops and holds) first.
 
         Raise an UnavailableError if the bridge is closed. While teleop starts, the bridge accepts
         emergency stops only.
@@ -116,7 +116,7 @@ class Bridge:
         return future
 
     async def ask(self, call: Call, urgent: Urgent = "") -> Any:
-        """Queue a call and return its result; for a stop, also call `alarm` at once.
+        """Queue a call and return its result; also send a stop to cloud at once, by `alarm`.
 
         Raise an UnavailableError if the bridge is closed, or if the loop does not answer within
         `ANSWER_LIMIT`. An urgent call then stays queued; any other call is withdrawn.
@@ -284,7 +284,7 @@ async def hold(bridge: Bridged) -> Any:
 
 @router.post("/resume", response_model=models.MissionView)
 async def resume(bridge: Bridged) -> Any:
-    """Fly straight to the next waypoint; 409 if the wall of a pipe is in the way."""
+    """Fly straight to the next waypoint; the answer is 409 if a pipe's wall is in the way."""
     return await bridge.move(MissionService.resume)
 
 
@@ -303,8 +303,8 @@ async def drive(body: Body, bridge: Bridged) -> Any:
 
     The setpoint accelerates to the velocity with at most 2 m/s^2 and stays inside the fence. Repeat
     this request, for example 10 times a second: 0.5 s after the last request the setpoint brakes to
-    rest, and the robot holds there. After a hold, a stop or the end of a mission, let go: send the
-    velocity zero, or nothing for 0.5 s. 409 while a mission flies.
+    rest, and the robot holds there. After a hold, a stop or the end of a mission, let go first:
+    send the velocity zero, or nothing for 0.5 s. The answer is 409 while a mission flies.
     """
     velocity = models.read_drive(body)
     return await bridge.move(lambda service, now_ns: service.drive(velocity, now_ns).summary())

@@ -98,7 +98,7 @@ class LegWatch:
         return self._flown_ns * 1e-9
 
     def is_reached(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
-        """Tell whether the robot has stayed at the waypoint for the dwell time by `now_ns` [ns]."""
+        """Return whether at `now_ns` [ns] the robot has been at the waypoint for the dwell time."""
         before_ns, self._seen_ns = self._seen_ns, now_ns
         if seen.guard is HOLD:
             self._near_since_ns = NEVER_NS
@@ -202,7 +202,7 @@ class Teleop:
         """Move the setpoint with `velocity` [m/s], world frame, for at most `HEARTBEAT_NS`.
 
         The setpoint moves only while telemetry shows that the robot follows commands. Raise
-        BadInputError unless the mission is held or begins held.
+        BadInputError unless the mission is held, or is a drive that is still starting.
         """
         if self._plan.by_hand and self.state == STARTING:
             return
@@ -232,7 +232,7 @@ class Teleop:
     def stop(self, now_ns: int) -> None:
         """Stop the rotors at once in any state, and drop all earlier requests to the robot.
 
-        Teleop sends `ALARM` to cloud until telemetry shows ESTOP; cloud repeats it to the robot.
+        Teleop sends `ALARM` to cloud until telemetry shows ESTOP; cloud sends stops to the robot.
         """
         if self.state in UNDER_WAY:
             self._end("emergency_stopped", "emergency stop", now_ns, where=True)
@@ -306,7 +306,7 @@ class Teleop:
             raise BadInputError(f"{verb}: the mission is {self.state}; it must be {needed}")
 
     def _find_failure(self, seen: RobotStatus) -> tuple[str, str] | None:
-        """Find in telemetry a reason why the mission fails; return the event's code and text."""
+        """Return an event's code and text if telemetry shows that the mission fails, else None."""
         if self._world not in ("", seen.world):
             return "world_restarted", "world restarted"
         if self._expected and seen.mission_id not in self._expected:
@@ -330,7 +330,7 @@ class Teleop:
         return None
 
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
-        """Keep the robot at its position, because its mission is not one of this teleop.
+        """Keep the robot at its position if another teleop has started its mission.
 
         If the robot stands on the ground, or if its mission has ended, teleop also requests the end
         of that mission.
@@ -348,7 +348,7 @@ class Teleop:
         self._knot = -1
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
-        """Begin the mission and its time, once telemetry shows the start."""
+        """Begin the mission and count its time, once telemetry shows the start."""
         self._world, self._expected = seen.world, (self._mission_id,)
         self._watch = LegWatch()
         if not self._continued:
@@ -383,9 +383,9 @@ class Teleop:
             self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
 
     def _lead(self, seen: RobotStatus, now_ns: int) -> None:
-        """Keep the carrot at the robot while the guard ignores commands; then start it again there.
+        """Keep the carrot at the robot while the guard ignores commands; then let it move again.
 
-        The carrot does not wait for the take-off, because this would take a round trip.
+        At the first take-off the carrot does not wait for telemetry: this saves a round trip.
         """
         self._followed = self._followed or seen.guard is TRACK
         if seen.guard is not TRACK and (self._followed or seen.guard is not GROUND):
@@ -396,7 +396,7 @@ class Teleop:
             self._select_leg(self.leg, now_ns)
 
     def _follow_track(self, now_ns: int) -> None:
-        """Move the setpoint from each point of the track to the next, at the time of the point."""
+        """Move the setpoint from point to point of the track, at the times in the track."""
         track = self._plan.track
         knot = bisect_right(track, self.elapsed(now_ns), key=lambda each: each[0]) - 1
         if not self._knot < knot < len(track) - 1:
@@ -462,13 +462,13 @@ class Teleop:
 
     @property
     def _may_move(self) -> bool:
-        """Whether the robot may still fly an earlier mission while this mission has not begun."""
+        """Whether the robot may still follow commands before its reset to the spawn."""
         return self._from_spawn and not self.requests.waits
 
     def _select_early(self, now_ns: int) -> None:
         """Select the first waypoint before telemetry shows the start, to save a round trip.
 
-        While the robot may move, select nothing, because the robot would fly there at once.
+        Before a reset to the spawn, wait until the robot ignores commands, or it would fly there.
         """
         if not self._is_pending or self.seen is None or self._may_move:
             return
@@ -478,7 +478,7 @@ class Teleop:
             self._select_leg(leg, now_ns)
 
     def _repeat_setpoint(self, now_ns: int) -> None:
-        """Send the setpoint again in a new session; before the start, the robot's position."""
+        """Send the setpoint again in a new session; in a drive or before a reset, hold still."""
         if self.state == STARTING and self._may_move:
             self._is_pending = True
             self._select_here()
@@ -516,7 +516,7 @@ class Teleop:
 
     @property
     def where(self) -> str:
-        """The place in the mission for texts of events: "on the way to waypoint 1 of 7"."""
+        """Place in the mission, for an event's text, such as "on the way to waypoint 1 of 7"."""
         return f"on the way to {self._leg_name}"
 
     @property

@@ -70,7 +70,7 @@ class RequestSender:
             self._next = asked
 
     def forget(self) -> None:
-        """Drop all requests, because somebody else controls the robot or an emergency stops it."""
+        """Drop all requests, because another teleop or an emergency stop controls the robot."""
         self._is_started = False
         self._pending = self._next = None
 

@@ -67,7 +67,7 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
     """Describe what the robot does next, or what the operator has to do.
 
     `age` is the age of the telemetry [s], `cloud_age` the age of the last message from cloud [s],
-    and `mission` the state of the mission under way (`DRIVEN` in a drive), or None.
+    and `mission` the state of the mission under way: `DRIVEN` in a drive, None without a mission.
     """
     if age > SILENCE:
         return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
@@ -89,7 +89,7 @@ class MissionService:
     def __init__(
         self, contact_speed_max: float, book: MissionStore, scene: Scene | None = None
     ) -> None:
-        """Begin with the missions of a store, the `book`.
+        """Begin with the missions in the store `book`.
 
         `contact_speed_max` limits the speed of the arm's tip when it touches the board [m/s]. With
         a `scene`, the service refuses straight ways through the walls of pipes.
@@ -190,7 +190,7 @@ class MissionService:
         """Drive the setpoint with `velocity` [m/s], in a held mission or in a new one.
 
         The setpoint brakes and rests if the next request does not come within `HEARTBEAT_NS`. After
-        a hold or the end of a mission, the operator has to let go first.
+        a hold or a mission's end, the operator first has to send zero, or nothing for that time.
         """
         pause_ns, self._driven_ns = now_ns - self._driven_ns, now_ns
         x, y, z = velocity
@@ -317,7 +317,7 @@ class MissionService:
 
     @property
     def _inherits_stop(self) -> Mission | None:
-        """Mission that an earlier process has stopped; always None after the first telemetry."""
+        """Mission that a stop ended in an earlier process; None after the first telemetry."""
         unknown = self.seen is None and not self._teleop.stopping
         return self.book.stopped() if unknown else None
 
@@ -366,10 +366,10 @@ class MissionService:
         return mission
 
     def _start_next(self, now_ns: int, *, queued: bool = False) -> Mission | None:
-        """Fly the first mission that has not ended; return the mission under way, if any.
+        """Start or continue the first mission that has not ended; return the mission under way.
 
-        A mission that has begun continues. A mission in the queue starts only if `queued` is
-        true, and only after the disk has stored that this mission starts.
+        A mission in the queue starts only with `queued`, and only after the disk has stored that
+        the mission starts. Return None if no mission is under way.
         """
         waiting = self.book.open()
         if self._current is not None or not waiting:

@@ -71,7 +71,7 @@ class Mission:
     ) -> None:
         """Update the mission with an event; `changed` has new values of the mission's attributes.
 
-        `number` counts the events of all missions. The default of `waypoint` is the current one.
+        `number` is the event's number. By default, `waypoint` is the mission's current waypoint.
         """
         waypoint = self.waypoint if waypoint is None else waypoint
         for name, value in changed.items():
@@ -120,7 +120,7 @@ class StoreLockedError(CloudrcError):
 
 
 class ConflictError(CloudrcError):
-    """Report that the present state forbids a request; `mission` is the id in the way, or ""."""
+    """Report a forbidden request; `mission` is the id of the mission in the way, "" if none is."""
 
     exit_code = 5
 

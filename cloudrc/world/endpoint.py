@@ -145,7 +145,7 @@ class WorldEndpoint(TunnelEnd):
     def _follow(self, now_ns: int) -> int:
         """Return world's time at `now_ns` [ns]; extend the slip if world lags by too much.
 
-        Store the end of a stall: datagrams that arrive then may have waited in the socket.
+        After a stall, store `now_ns`: datagrams of this time may have waited in the socket.
         """
         world_ns = now_ns - self._slip_ns
         behind_ns = world_ns - self._tick_ns
@@ -160,8 +160,8 @@ class WorldEndpoint(TunnelEnd):
     def _advance(self, until_ns: int, *, samples: bool = False) -> None:
         """Simulate all steps that begin before `until_ns` [ns], world's clock.
 
-        With `samples`, take the sample that is due at `until_ns`, too. If this sample was taken
-        earlier, also simulate the step that begins at `until_ns`, before the next datagram acts.
+        With `samples`, also take the sample that is due at `until_ns`. If this sample exists
+        already, also simulate the step from `until_ns` on: a datagram then acts on the next step.
         """
         tick_ns = self._tick_ns
         if until_ns == tick_ns == self._sample_ns - self._sample_period_ns:
@@ -231,7 +231,7 @@ class WorldEndpoint(TunnelEnd):
         self._sample_ns += self._sample_period_ns
 
     def _record_counts(self, now_ns: int) -> None:
-        """Record the counters; report once per session that simulated time is too slow."""
+        """Record the counters; report once per session if the simulation is too slow."""
         guard, before_ns = self.robot.guard, self._counted_slip_ns
         self._count_ns, self._counted_slip_ns = self._count_ns + COUNT_PERIOD_NS, self._slip_ns
         self._counts["held_seconds"] += guard.armed and guard.state is HOLD
@@ -270,10 +270,10 @@ class WorldEndpoint(TunnelEnd):
             self._touch_speed = hypot(*touch.tip_velocity)
 
     def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
-        """Carry out the operator's requests in the order of their numbers.
+        """Carry out an operator request; ignore repeated and old requests.
 
         Raise the DecodeError "stale" for a start that is too old or may have waited in the socket
-        during a stall, and "future" if its odometry has a stamp later than world's clock.
+        during a stall, and "future" for a start whose odometry is later than world's clock.
         """
         kind, guard, tick_ns = request.request, self.robot.guard, self._tick_ns
         starts = kind is Request.START

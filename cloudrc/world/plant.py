@@ -20,7 +20,7 @@ of a robot in its body frame."""
 
 
 def point_inertia(mass: float, place: Array) -> Array:
-    """Return the inertia m (d · d 1 - d d') of a point [kg m^2], shape (3, 3).
+    """Return the inertia m (|d|^2 I - d d') of a point mass [kg m^2], shape (3, 3).
 
     `mass` is m [kg]; `place` is d [m], shape (3,).
     """

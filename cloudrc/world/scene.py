@@ -100,7 +100,7 @@ def _compile_nominal(robot_path: Path, scene_path: Path) -> Any:
 def _compile(
     robot_path: Path, scene_path: Path, inertia: Inertia | None = None, *, fuse: bool = True
 ) -> Any:
-    """Compile the robot in the scene, with another `inertia` of the robot if it is given."""
+    """Compile the robot in the scene; `inertia`, if not None, replaces that of the robot."""
     try:
         spec = mujoco.MjSpec.from_file(str(scene_path))
         for number, geom in enumerate(spec.geoms):
@@ -189,9 +189,9 @@ def _words(numbers: ArrayLike) -> str:
 
 
 def _facts(model: Any) -> Facts:
-    """Return what the onboard controller and the rotors assume of a robot, by name.
+    """Return the quantities on which controller and rotors depend: name -> value, tolerance.
 
-    The controller can handle the accepted differences: the velocity loop compensates for a weight
+    The controller can handle these tolerances: the velocity loop compensates for a weight
     that differs by 1 N, and the attitude gains work for an inertia that differs by 50 %.
     """
     base = model.jnt_bodyid[0]

@@ -1,7 +1,7 @@
 """Simulate the physics: turn commanded rotor speeds into readings and contacts.
 
-The module writes to MuJoCo's arrays with `struct` and memory views: four elements take a quarter of
-the time that a numpy slice assignment takes.
+The module writes to MuJoCo's arrays with `struct` and memory views. For four elements, this takes a
+quarter of the time of a numpy slice assignment.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ class Simulator:
 
         `rotor_speeds` are the actual speeds [rad/s], shape (4,). `tip_force_peak` [N],
         `tip_impulse` [N s], `contacts` and `steps` are the new values of the attributes. `before`
-        has the readings at the beginning of the last step; None: its contacts need no check.
+        has the readings before the last step; None if the contacts of this step need no check.
         """
         self._rotors.speeds, self._readings = rotor_speeds, None
         self.tip_force_peak, self.tip_impulse = tip_force_peak, tip_impulse

@@ -16,7 +16,7 @@ def find(name: str) -> Scenario:
     """Return a scenario by its name (cloud-killed) or number (F13).
 
     Raises:
-        BadInputError: If there is no such scenario; the text lists all.
+        BadInputError: If there is no such scenario; the message lists all scenarios.
     """
     for each in SCENARIOS:
         if name.lower() in (each.id.lower(), each.name):

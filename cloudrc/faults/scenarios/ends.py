@@ -118,7 +118,7 @@ def _two_clouds(outcome: Outcome, seed: int) -> None:
     expects="always a safe state; the mission continues",
 )
 def _swizzle(outcome: Outcome, seed: int) -> None:
-    """Stop each direction of the link before its sender stops, so that datagrams are lost.
+    """Block both directions of the link, then stop the processes; resume all in random order.
 
     Source: FoundationDB, "Simulation and Testing", swizzle-clogging.
     """

@@ -80,7 +80,7 @@ def _corruption(outcome: Outcome, seed: int) -> None:
     expects="no effect: the same path, bit by bit",
 )
 def _flood(outcome: Outcome, seed: int) -> None:
-    """Send random bytes, and valid headers with too few and with enough random bytes."""
+    """Send random bytes alone, and valid headers followed by too few or enough random bytes."""
     rng = generator(seed, 20)
 
     def garbage(data: bytes) -> Iterable[bytes]:

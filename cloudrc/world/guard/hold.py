@@ -110,8 +110,8 @@ def brake_start(reference: Vector, velocity: Vector) -> Vector:
     """Return the velocity reference when braking begins [m/s]: slower than the robot.
 
     With a reference at the robot's speed, the robot would first speed up, because it follows with a
-    delay. `reference`, of the last step, is finite. `velocity` is that of the robot. Both are in
-    [m/s], world frame, shape (3,).
+    delay. `reference` is the reference of the last step and finite; `velocity` is the robot's
+    velocity. Both are in [m/s], world frame, shape (3,).
     """
     start = velocity if hypot(*velocity) < hypot(*reference) else reference
     speed = hypot(*start)
@@ -150,12 +150,12 @@ class Descent:
         self._moved_ns, self.acknowledged = now_ns, False
 
     def may_stop(self, readings: Readings) -> bool:
-        """Tell whether the robot may stop above the ground; the class describes the conditions."""
+        """Return whether the robot may end its descent in the air; the class describes when."""
         free = readings.velocity[2] < -0.5 * self.speed and readings.position[2] > self._floor
         return self.acknowledged and free
 
     def is_over(self, now_ns: int, reference: Vector, readings: Readings) -> bool:
-        """Tell whether the robot has touched down; call in every step of a descent.
+        """Return whether the robot has touched down; call in every step of a descent.
 
         `now_ns` is world's clock [ns]. `reference` is the velocity reference of the last step
         [m/s], world frame, shape (3,).
@@ -201,7 +201,7 @@ class TakeOff:
             self._stopped, self._still_ticks, self._height = True, 0, nan
 
     def look(self, readings: Readings, flies: bool) -> None:
-        """Process one step: update `over` in flight, height and time at rest on the ground."""
+        """Process a step: if the robot `flies`, update `over`, else its height and time at rest."""
         height = readings.position[2]
         if flies:
             self.over, self._stopped = not abs(height - self._height) < LIFT_OFF_HEIGHT, False
@@ -214,5 +214,5 @@ class TakeOff:
                 self._still_ticks = self._still_ticks + 1 if at_rest else 0
 
     def may_end(self, readings: Readings) -> bool:
-        """Tell whether the robot has not left the ground, and is slow enough to stop its rotors."""
+        """Return whether the robot may stop its rotors: it is slow, and has not left the ground."""
         return not self.over and hypot(*readings.velocity) < GROUND_SPEED_MAX

@@ -110,7 +110,7 @@ def limit_length(a: Vector, length_max: float) -> Vector:
 
 
 def within(velocities: Iterable[Vector], most: float) -> bool:
-    """Tell whether no component of any velocity is above `most` [m/s], infinite or NaN."""
+    """Return whether each component of each velocity is a number from -`most` to `most` [m/s]."""
     return all(abs(x) <= most and abs(y) <= most and abs(z) <= most for x, y, z in velocities)
 
 
@@ -152,7 +152,7 @@ def growth(before: float, after: float) -> float:
 
 
 def limit_sink(reference: Vector, before: Vector, climb: float, speed_max: float) -> Vector:
-    """Limit how fast the velocity `reference` [m/s] sinks, so that the robot does not turn over.
+    """Limit the downward speed of the velocity `reference`, so that the robot does not turn over.
 
     `before` is the velocity reference of the last step. `climb` is the vertical velocity of the
     robot, upwards. `speed_max` is the largest speed of `before` and of the result. All in [m/s].
@@ -226,10 +226,10 @@ class Limits:
 
     @property
     def ramp_ns(self) -> int:
-        """Time after a HOLD in which the acceleration of the velocity reference is limited [ns].
+        """Time after a HOLD in which the velocity reference accelerates with at most BRAKE [ns].
 
-        The limit is BRAKE, and the time is long enough to reach the speed cap. The time does not
-        end at the commanded velocity, because the first commands after a silence may be zero.
+        The time is long enough to reach the speed cap. It does not end early at the commanded
+        velocity, because the first commands after a silence may be zero.
         Source: docs/reference/plant.md, "Leaving HOLD".
         """
         return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)
@@ -242,7 +242,7 @@ class Limits:
         return self.hold_max_ns if flies else max(self.hold_max_ns, GROUND_WAIT_MIN_NS)
 
     def inner_corners(self) -> tuple[Vector, Vector]:
-        """Return the lower and upper corner of the fence without its margins [m]."""
+        """Return the fence's lower and upper corner, moved inwards by the margins [m]."""
         (ax, ay, az), (bx, by, bz) = self.fence_low, self.fence_high
         low = (ax + FENCE_MARGIN, ay + FENCE_MARGIN, az + FLOOR_MARGIN)
         return low, (bx - FENCE_MARGIN, by - FENCE_MARGIN, bz - FENCE_MARGIN)

@@ -218,7 +218,7 @@ class Guard:
         return min(end_ns, now_ns + self._limits.plan_max_ns)
 
     def _play(self, command: Command, now_ns: int) -> None:
-        """Use a command's velocity for `now_ns` [ns]; store when its plan changes the velocity."""
+        """Set the wanted velocity to that of a command, or of its plan at `now_ns` [ns]."""
         velocity, self._played, self._next_ns = command.velocity, command, FOREVER_NS
         if command.plan:
             velocity = command.velocity_at(now_ns)
@@ -239,7 +239,10 @@ class Guard:
             self._ramp_until_ns = now_ns + self._limits.ramp_ns
 
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
-        """Tell whether TRACK may begin: take-off is allowed, and SETTLE_NS have passed."""
+        """Return whether TRACK may begin: take-off is allowed, and SETTLE_NS have passed.
+
+        The time counts from the last TRACK to now, and from the last HOLD to `fresh_until_ns`.
+        """
         apart_ns = min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns)
         return self._take_off.allowed and apart_ns >= SETTLE_NS
 
@@ -275,11 +278,10 @@ class Guard:
         return self.reference
 
     def plain_track(self, now_ns: int) -> tuple[int, Vector, Vector, int] | None:
-        """Return the input of `native/step.c` for steps from `now_ns` [ns] on, or None.
+        """Return the input of `native/step.c` from `now_ns` [ns] on; None if only `step` can run.
 
         The input: time of the plan's next velocity [ns]; velocity reference and commanded velocity
-        [m/s]; end of the time in which the command is fresh [ns]. With None, only `step` can run
-        the step.
+        [m/s]; end of the time in which the command is fresh [ns].
         """
         if not (self._take_off.over and self._ramp_until_ns <= now_ns <= self._track_until_ns):
             return None

