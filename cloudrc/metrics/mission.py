@@ -149,7 +149,7 @@ def _steady_error(flight: Flight, axis: int) -> float | None:
     if too_short or touched or not len(still) or (still != still[-1]).any():
         return None
     rows = flight.truth["stamp_ns"] >= begin_ns
-    return float(np.abs(flight.truth["position"][rows, axis] - still[-1, axis]).mean())
+    return mean(np.abs(flight.truth["position"][rows, axis] - still[-1, axis]))
 
 
 def _fault_count(flight: Flight) -> float | None:

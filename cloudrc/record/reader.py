@@ -112,7 +112,11 @@ class Contents:
 
     def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
         """Write the contents and further `attachments` to a file, atomically; may raise OSError."""
-        with atomic_file(target) as file, McapWriter(file, clock="") as writer:
+        clock, machine = self.metadata.get(CLOCK, ""), self.metadata.get("clock_id", "")
+        with (
+            atomic_file(target) as file,
+            McapWriter(file, clock=clock, clock_id=machine) as writer,
+        ):
             writer.note(self.metadata)
             if self.messages and (began := wall_time(self.metadata, self.messages[0][1])):
                 writer.note({STARTED: began.isoformat(timespec="milliseconds")})

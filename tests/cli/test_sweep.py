@@ -85,6 +85,20 @@ def test_a_row_flies_again_to_the_same_hash(write_sweep, call):
         call("sweep fly", folder, key, code=code)
 
 
+@pytest.mark.usefixtures("no_page")
+def test_a_failed_plugin_is_flown_again_with_its_traceback(write_sweep, call):
+    Path("mine.py").write_text(
+        "from cloudrc.cloud.predictors import Predictor\n\n\nclass Mine(Predictor):\n"
+        "    def predict(self, odometry, horizon):\n        return 1 / 0\n\n\nbuild = Mine\n"
+    )
+    grid = {"cloud.predictor": [str(Path("mine.py").resolve())]}
+    call("sweep run --out grid", write_sweep(grid), code=1)
+    (row,) = rows("grid")
+    assert row["failures"] == ["plugin_failed"]
+    error = call("--debug sweep fly grid", row["key"]).err
+    assert "ZeroDivisionError: division by zero" in error
+
+
 def test_failed_flights_are_recorded_if_asked_for(write_sweep, call):
     file = write_sweep({"criteria.contact": [False, True]})
     call("sweep run --out grid --record=failed", file, code=1)

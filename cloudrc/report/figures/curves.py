@@ -20,8 +20,8 @@ from cloudrc.report.figures.style import Subject, dots, legend_above, new_figure
 DELAY_ALT = "Two scatter plots over time: one-way delays, and the loop delay with its estimate."
 DELAY = (
     "Delays. (a) Each dot is the one-way delay of a datagram that arrived, late ones included; the "
-    "band is the link profile. (b) Each dot is the loop delay of one echo: the time from a "
-    "command's stamp to its echo (the paper's τₙ). The solid line is the delay estimate, over "
+    "band is the link profile, with gaps in blackouts. (b) Each dot is the loop delay of one echo: "
+    "the time from a command's stamp to its echo (the paper's τₙ). The solid line is the delay estimate, over "
     "which the controller predicts. The band is the sum of both directions of the link profile, "
     "the dashed line its mean. Only applied commands have echoes; if the newest command wins, "
     "these are the fast ones, so the loop delay lies below the mean of the profile."
