@@ -82,6 +82,8 @@ def read_token(path: Path) -> str:
         token = read(path).strip()
     except OSError as error:
         raise ValueError(error.strerror) from None
+    except ValueError as error:  # the caller names the file
+        raise ValueError(str(error).removeprefix(f"{path}: ")) from None
     if not _TOKEN.fullmatch(token):
         raise ValueError("a token is 16 to 512 visible ASCII characters")
     return token.decode("ascii")

@@ -15,6 +15,7 @@ import platform
 import subprocess
 import sys
 from pathlib import Path
+from shutil import which
 from statistics import median
 from tempfile import TemporaryDirectory
 from typing import NamedTuple, TypeAlias
@@ -90,7 +91,7 @@ def releases(rounds: int, duration: float) -> list[Line]:
     """
     experiment = find_experiment("ideal", [f"link.{way}.delay_ms=20" for way in WAYS])
     wakes, found, chrt = list[float](), list[dict[str, int]](), ["chrt", "-f", "10"]
-    fifo = not subprocess.run([*chrt, "true"], capture_output=True).returncode
+    fifo = which("chrt") and not subprocess.run([*chrt, "true"], capture_output=True).returncode
     with TemporaryDirectory(prefix="bench-link-") as folder:
         program, source = f"{folder}/wake", Path(__file__).with_name("wake_lateness.c")
         subprocess.run(["cc", "-O2", "-o", program, source], check=True)

@@ -52,13 +52,13 @@ _STAMPS = {
     ("first physics step that follows the command", "once per command applied"): "/command_applied",
     ("physics step in which the state changes", "once per event"): "/guard",
     ("first odometry after the contact, at most 10 ms later", "once per event"): "/contact",
-    ("when the session begins at this end", "once per event"): "/session",
+    ("when the session begins at the process that writes the row", "once per event"): "/session",
     ("departure of the command", _PERIOD):
         "/estimated_odometry /setpoint_position /cmd_vel /delay_estimate /pid",
     ("instant of the event", "once per event"): "/mission",
-    ("when this end notices the fault", "once per fault; repetitions are only counted"): "/fault",
+    ("when world or cloud notices the fault", "once per fault; repetitions are only counted"): "/fault",
     ("when the counters are read", "1 Hz per counter; counters of a relay 0.5 Hz"): "/count",
-    ("when this end notices the change", _LINK): "/link",
+    ("when world or cloud notices the change", _LINK): "/link",
     ("end of the interval that is judged", "every 5 s per quantity"): "/link_check",
     ("when the loop handles the deadline", "once per wake, 100 Hz per end by default"): "/lateness",
 }  # fmt: skip
@@ -249,7 +249,7 @@ def _topics() -> str:
         stamp, _ = SAMPLING[name]
         clock = f"{topic.end}'s clock"
         if topic.end == "either":
-            clock = "the clock of the end that wrote the row"
+            clock = "the clock of the process that writes the row"
         blocks += [
             f"## `{name}`\n",
             f"{text}.\n",

@@ -23,7 +23,7 @@ from cloudrc.errors import BadInputError
 if TYPE_CHECKING:
     from cloudrc.config.schema import Direction, Profile
     from cloudrc.link.model import Numbers, Stream
-    from cloudrc.link.profile import DirectionProfile
+    from cloudrc.link.profile import DirectionProfile, Trace
     from cloudrc.report.figures.link import DirectionSample
 
 EPILOG = """\
@@ -54,7 +54,8 @@ examples:
 
 The delays come from the same link model as in a flight, packet by packet: a
 flight with the same seed has exactly these delays. All delays are one way.
-A trace has one packet per row, whatever the duration of the row."""
+A trace has one packet per row, whatever the duration of the row; a short trace
+with losses between 0 and 1 has several."""
 VERIFY_EPILOG = """\
 examples:
   cloudrc link verify                       the link of the paper's experiment
@@ -82,6 +83,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "packets": (1, PACKETS_MAX),
 }
 """Option of `show` -> its least and largest value."""
+ROWS = 1000  # least number of packets for a trace that has shares of losses
 SECONDS = 30.0  # time that a figure shows by default [s]; a longer time line is shown in full
 KINDS = ("png", "svg", "pdf")
 
@@ -220,7 +222,7 @@ def _way(
     timeline, send = Timeline(profile), partial(_send, profile, name == "uplink", options.seed)
     period_ns = round(1e9 / options.rate)
     if profile.trace is not None and options.seconds is None:
-        shown = send([round(time * 1e9) for time in profile.trace.times])
+        shown = send(_row_times(profile.trace))
     else:
         seconds = options.seconds or max(SECONDS, 1.1e-9 * timeline.last_ns)
         if seconds * options.rate > PACKETS_MAX:
@@ -233,6 +235,15 @@ def _way(
     if timeline.only() is not None:
         many = send(range(0, options.packets * period_ns, period_ns))
     return DirectionSample(asked, shown.sent, shown.delays, many.delays), numbers(many)
+
+
+def _row_times(trace: Trace) -> list[int]:
+    """Return times to send packets [ns]: one per row, or several if rows have shares of losses."""
+    rows = [round(time * 1e9) for time in trace.times]
+    has_shares = any(0.0 < loss < 1.0 for loss in trace.losses or ())
+    many = -(-ROWS // len(rows)) if has_shares and len(rows) > 1 else 1
+    ends = [*rows[1:], 2 * rows[-1] - rows[-1 - (len(rows) > 1)]]
+    return [a + n * (b - a) // many for a, b in zip(rows, ends, strict=True) for n in range(many)]
 
 
 def _send(profile: DirectionProfile, uplink: bool, seed: int, sent_ns: Sequence[int]) -> Stream:

@@ -45,7 +45,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("source", type=Path, metavar="SOURCE", help="a run, a log or a CSV file")
     add("-o", "--output", type=Path, required=True, metavar="FILE", help="the trace to write")
     add("--direction", choices=DIRECTIONS, help="take this direction only")
-    halve = "take half of each round trip; correct only if both directions are equal"
+    halve = "take half of each round trip of a log; correct only if both directions are equal"
     add("--halve-rtt", action="store_true", help=halve)
     trust = "accept values that look as if they had another unit"
     add("--trust-units", action="store_true", help=trust)
@@ -59,6 +59,8 @@ def execute(options: argparse.Namespace) -> int:
     if not _is_run(source):
         found = {only or "uplink": _from_log(source, options)}
     else:
+        if options.halve_rtt:
+            raise BadInputError(f"{source}: a run has one-way delays; leave out --halve-rtt")
         require("a trace of a run", ("record",))
         recording = _recording(source)
         ways = (only,) if only else DIRECTIONS

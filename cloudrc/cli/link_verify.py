@@ -76,7 +76,7 @@ KEYS = ("asked", "measured", "low", "high")  # values of a row, in the order of 
 NOT_JUDGED = "NOT JUDGED"  # in a note about a quantity that could not be verified
 VERDICTS = {
     "off": ("not believed", "red", "does not match its profile"),
-    "open": ("undecided", "yellow", "was not measured for long enough: give more --seconds"),
+    "open": ("undecided", "yellow", "needs more --seconds, or cannot be judged: see the notes"),
     "ok": ("believed", "green", "matches its profile"),
 }
 """Worst verdict on any quantity of the link -> verdict on the whole link, with colour and text."""

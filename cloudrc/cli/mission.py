@@ -17,7 +17,7 @@ from cloudrc.cli import client
 from cloudrc.cli.client import Api, UnreachableError, mission_path, token_file, token_reader
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
-from cloudrc.cli.output import format_document, output_argument, print_line, table
+from cloudrc.cli.output import escape, format_document, output_argument, print_line, table
 from cloudrc.cli.parser import number
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.drivers.machine import Deadline
@@ -66,6 +66,8 @@ The second limit is longer, because the pod of the API may still have to load it
 TURN_MAX = 30.0
 """Longest time that a request and the pause after the request take [s]. If more time has passed,
 this process was suspended; the suspension does not count towards a time limit."""
+TERMINATION_LOG = Path("/dev/termination-log")
+"""File in a pod for the pod's last message, which `kubectl describe` shows after the pod's end."""
 LIMIT_MAX = 86_400.0
 """Time limit of a Job if the mission file gives no valid time limit [s]. Teleop ends the mission
 earlier, by the time limit of the release's experiment."""
@@ -234,7 +236,11 @@ def _fly(options: argparse.Namespace, api: Api) -> int:
             command = f"cloudrc mission cancel {mission_id}"
             print_line(f"mission {mission_id} goes on; cancel it: {command}", sys.stderr)
         raise
-    print_line(describe_verdict(verdict))
+    text = describe_verdict(verdict)
+    print_line(text)
+    if is_job and TERMINATION_LOG.exists():
+        with suppress(OSError):
+            TERMINATION_LOG.write_text(f"{escape(text)}\n", encoding="utf-8")
     return int(verdict["exit_code"])
 
 

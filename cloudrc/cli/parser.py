@@ -7,6 +7,7 @@ import difflib
 import importlib
 import os
 from collections.abc import Callable, Iterable
+from math import nan
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -110,7 +111,7 @@ def number(low: float, high: float, unit: str) -> Callable[[str], float]:
         try:
             value = float(text.removesuffix(unit[0]))
         except ValueError:
-            value = -1.0
+            value = nan
         if not low <= value <= high:  # or it is NaN
             raise argparse.ArgumentTypeError(f"'{text}' is not a number of {unit}, {low} to {high}")
         return value

@@ -471,7 +471,8 @@ class RelayControl:
         file, self._released_at = folder / PROFILE_FILE, 0.0
         self._files = {way: ProfileFile(file, make_profile_loader(way), _log) for way in links}
         self._states = {way: StateFile(folder / f"{way}.json", "relay", way) for way in links}
-        self._requested, self._applied = dict(first), dict(first)
+        self._requested, self._applied, self._published = dict(first), dict(first), dict(first)
+        self._applied_ns = dict.fromkeys(first, time.monotonic_ns())
         for way, loaded in first.items():
             self._publish(way, loaded)
 
@@ -481,9 +482,7 @@ class RelayControl:
             if loaded is not self._applied[way]:
                 self._relay.take_in()
                 self._links[way].replace_profile(loaded.direction, restart=loaded.change.restart)
-                self._applied[way] = loaded
-                with suppress(OSError):  # the relay goes on even if the disk is full
-                    self._publish(way, loaded)
+                self._applied_ns[way], self._applied[way] = time.monotonic_ns(), loaded
 
     def follow(self) -> None:
         """Call `look` periodically, in a thread that never ends."""
@@ -492,9 +491,16 @@ class RelayControl:
             time.sleep(PROFILE_PERIOD)
 
     def look(self) -> None:
-        """Read requested changes from the folder; publish the lateness of the datagrams."""
+        """Read requested changes; publish applied ones and the lateness of the datagrams.
+
+        This thread writes the files, because the relay's loop must not wait for a disk.
+        """
         for way, file in self._files.items():
             self._requested[way] = file.poll() or self._requested[way]
+            if (loaded := self._applied[way]) is not self._published[way]:
+                with suppress(OSError):  # such as a full disk: the next call tries again
+                    self._publish(way, loaded)
+                    self._published[way] = loaded
         if time.monotonic() - self._released_at >= RELEASED_PERIOD:
             self._released_at = time.monotonic()
             for way in self._links:
@@ -503,7 +509,7 @@ class RelayControl:
                         publish(self._folder / f"{way}{RELEASED_SUFFIX}", json.dumps(released))
 
     def _publish(self, way: str, loaded: Loaded) -> None:
-        now_ns, states = time.monotonic_ns(), self._states[way]
+        now_ns, states = self._applied_ns[way], self._states[way]
         # None: the time line of the first profile starts with the first datagram.
         origin_ns = now_ns if states.state and loaded.change.restart else None
         state = states.next(loaded, "relay", "local mode", now_ns, origin_ns)

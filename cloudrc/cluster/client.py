@@ -23,10 +23,13 @@ COMPONENTS = ("world", "cloud")
 """Components of a release that have a pod of their own."""
 REQUEST_TIMEOUT = 15.0
 """Time limit for one request to the API server [s]."""
-RETRIES: dict[str, Any] = {"total": 6, "connect": 4, "read": 1, "backoff_factor": 0.5}
-"""How often urllib3 repeats a request: for 31 s while the API server is overloaded, for 7 s while
-it refuses connections, and once if it does not answer. A request to create an object is repeated
-only after a refused connection."""
+RETRIES: dict[str, Any] = {
+    **{"total": 6, "connect": 4, "read": 1, "other": 4},
+    **{"backoff_factor": 0.5, "respect_retry_after_header": False},
+}
+"""How often urllib3 repeats a request: for 31 s while the API server is overloaded, for 7 s after
+a refused connection or a TLS error, and once if the server does not answer. A request to create an
+object is repeated only after a refused connection or a TLS error."""
 BUSY = (429, 500, 502, 503, 504)
 """HTTP status codes after which the same request may succeed later."""
 PROGRAM_LIMIT = 120.0
@@ -186,8 +189,11 @@ def _refusal(error: Any, doing: str) -> str:
         message = json.loads(error.body)["message"]
     except (ValueError, KeyError, TypeError):
         message = error.reason or f"the API server answered {error.status}"
+    message = " ".join(str(message).split())
+    if error.status == 401 or "system:anonymous" in message:
+        return "the API server does not know you; log in to the cluster again"
     remedy = f"; check your permission: kubectl auth can-i {doing}"
-    return " ".join(str(message).split()) + remedy * (error.status in (401, 403))
+    return message + remedy * (error.status == 403 and "exceeded quota" not in message)
 
 
 def _root(error: BaseException) -> str:

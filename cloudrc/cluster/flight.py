@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cluster import pods
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, chart_folder, run
-from cloudrc.cluster.jobs import delete_job, follow, run_job
+from cloudrc.cluster.jobs import delete_job, failure_of, follow, run_job
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 
 if TYPE_CHECKING:
@@ -117,10 +117,17 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
 
 
 def refuse_second_flight(release: Release, ask: Ask) -> None:
-    """Raise a ClusterError if a mission is under way: installing would replace the pods.
+    """Raise a ClusterError if a Job or mission is under way: installing would replace the pods.
 
     `ask` queries the API. If the API does not answer, return: installing may repair the release.
     """
+    for job in release.find("jobs", "mission"):
+        if failure_of(job) is None:
+            name, end = job.metadata.name, f"kubectl {' '.join(release.flags)} delete job"
+            raise ClusterError(
+                f"Job '{name}' is under way on release '{release.name}' {release.where}; wait for "
+                f"it, end it: {end} {name}, or fly on a release of your own: --release NAME"
+            )
     mission = None
     with suppress(CloudrcError), pods.api_url(release) as url:
         mission = ask(url, pods.operator_token(release))["mission"]

@@ -64,7 +64,9 @@ def read_link(release: Release) -> LinkParts:
         and each["status"].get("phase") == "Running"
         and "deletionTimestamp" not in each["metadata"]
     }
-    if not maps or not pods.keys() >= set(COMPONENTS):
+    if maps and not pods.keys() >= set(COMPONENTS):
+        raise ClusterError(f"a pod of release '{release.name}' {release.where} does not run")
+    if not maps:
         raise ClusterError(
             f"release '{release.name}' has no link to change; is it a release of cloudrc? see: "
             "helm list --all-namespaces"

@@ -314,10 +314,11 @@ def _plan_max(document: Document) -> float:
 
 
 def _remove_derived(document: Document, *, new_profile: bool) -> None:
-    """Remove computed values from a resolved file; they are computed again after the settings.
+    """Remove computed values from a resolved file.
 
-    With `new_profile`, also remove the values that come from the file's link profile. Keep each
-    value that differs from the computed value, because the user has set it.
+    They are computed again after the user's settings have been applied. With `new_profile`, also
+    remove the values that come from the file's link profile. Keep each value that differs from the
+    computed value, because the user has set it.
     """
     derived: dict[KeyPath, float] = {("guard", "plan_max_s"): _plan_max(document)}
     limits: Any = (document.get("guard", key) for key in ("command_age_max_ms", "plan_max_s"))

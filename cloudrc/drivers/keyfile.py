@@ -27,7 +27,8 @@ class KeyFile:
     def follow(self, now_ns: int) -> list[Fault]:
         """Reload the file if it has changed and a check is due at `now_ns` [ns, monotonic clock].
 
-        Return a record of the new key, or of the error that keeps the old keys in use.
+        Return a record of the new key, or of the error that keeps the old keys in use until the
+        file changes again.
         """
         if now_ns < self._due_ns:
             return []

@@ -60,12 +60,13 @@ RUN, SESSION = "run", "session"
 
 
 def flights_folder() -> Path:
-    """Return the folder for flight files: in XDG_RUNTIME_DIR or, if that is not set, in the home.
+    """Return the folder for flight files: in XDG_RUNTIME_DIR if this user owns it, or in the home.
 
     Source: XDG Base Directory Specification.
     """
-    root = os.environ.get("XDG_RUNTIME_DIR") or os.path.expanduser("~/.local/state")
-    return Path(root, "cloudrc", "flights")
+    root = os.environ.get("XDG_RUNTIME_DIR", "")
+    is_own = os.access(root, os.W_OK) and os.stat(root).st_uid == os.getuid()
+    return Path(root if is_own else os.path.expanduser("~/.local/state"), "cloudrc", "flights")
 
 
 class FlightFile(NamedTuple):

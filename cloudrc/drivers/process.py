@@ -346,8 +346,11 @@ class EndProcess:
 
     def _clock_step(self) -> float:
         """Return the step of the wall clock since the last call [s]; 0 without a step."""
-        offset = time.time() - time.clock_gettime(SINCE_BOOT)
-        step, self._clock_offset = offset - self._clock_offset, offset
+        before, wall = time.clock_gettime(SINCE_BOOT), time.time()
+        boot = time.clock_gettime(SINCE_BOOT)
+        if boot - before > CLOCK_STEP / 2.0:
+            return 0.0  # the process was paused while it read the clocks: the next call compares
+        step, self._clock_offset = wall - boot - self._clock_offset, wall - boot
         return step if abs(step) > CLOCK_STEP else 0.0
 
     def _count_losses(self, stamp_ns: int) -> Counted:

@@ -37,8 +37,7 @@ IDLE = 0.1
 BUSY = 0.001
 """Sleep of the thread while more records wait [s]."""
 FLUSH = 0.25
-"""Shortest time between two flushes, and between two syncs to the disk [s]. A killed process loses
-records of less than 0.5 s."""
+"""Shortest time between two flushes [s]. A killed process loses records of less than 0.5 s."""
 
 
 class FlightsOnly:
@@ -68,7 +67,7 @@ class RecordingThread:
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder
-        self._stopping = threading.Event()
+        self._stopping, self._flushed, self._over = threading.Event(), threading.Event(), False
         # Daemon threads: the process can end even if the disk hangs.
         self._writing = threading.Thread(target=self._write, name="recording", daemon=True)
         self._syncing = threading.Thread(target=self._sync, name="recording-sync", daemon=True)
@@ -95,11 +94,18 @@ class RecordingThread:
             rest = BUSY if recorder.drain(BATCH) == BATCH else IDLE
             if time.monotonic() - flushed >= FLUSH:
                 recorder.flush()
+                self._flushed.set()
                 flushed = time.monotonic()
         recorder.close()
+        self._over = True
+        self._flushed.set()
 
     def _sync(self) -> None:
-        while not self._stopping.wait(FLUSH):
+        while True:
+            self._flushed.wait()
+            self._flushed.clear()
+            if self._over:
+                return
             began = time.monotonic()
             if self._recorder.sync():
                 self._safe_since = began

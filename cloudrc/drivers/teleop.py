@@ -138,7 +138,7 @@ class RemoteTeleop:
             self._peer.send(None)
         self._stalled = not self._stalled and now_ns - self._looked_ns > STALL_NS
         self._looked_ns = now_ns
-        for output in self._peer.receive():
+        for output in filter(None, self._peer.receive()):
             self._heard_ns, self._silent = now_ns, False
             if not (self._stalled and _moves_robot(output)):
                 self.outputs.append(output)
@@ -169,7 +169,11 @@ class LastWord:
         flies: Callable[[], bool],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Set functions: `asked` (must cloud end?), `flies` (the robot?), `clock` (time [ns])."""
+        """Set the functions.
+
+        `asked` returns whether cloud must end, `flies` whether the robot flies, `clock` the time
+        [ns].
+        """
         self._asked, self._flies, self._clock = asked, flies, clock
         self._until_ns: int | None = None
 

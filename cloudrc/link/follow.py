@@ -199,7 +199,8 @@ class PeerName:
             addresses = sorted(self._resolve(self._name))
         except OSError as error:
             self.failures += 1
-            said = f"cannot be resolved ({error.strerror or error}); its last address stays"
+            keeps = "its last address stays" if self._known else "the link waits"
+            said = f"cannot be resolved ({error.strerror or error}); {keeps}"
         else:
             kept = [address for address in self._known if address in addresses]
             self._known = kept + [address for address in addresses if address not in kept]

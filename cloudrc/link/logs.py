@@ -81,7 +81,8 @@ class Log:
         if 1 <= len(back) <= STEPS_MAX:  # sorting would mix two sessions
             raise self.error(
                 f"after row {back[0] + 1} the times go back by {-steps[back[0]]:.4g} s: a step of "
-                "the clock, or two sessions in one log; give the rows before or after it"
+                "the clock, midnight in times without a date, or two sessions in one log; give the "
+                "rows before or after it"
             )
         unique = dict(reversed(self.entries))  # of packets with the same time, the first is kept
         repeated = len(times) - len(unique)
@@ -267,11 +268,8 @@ _LOST_WORDS = {
 }
 """Words in the delay column that mark a lost packet."""
 _LOST_NUMBERS = (-1.0, -999.0, -9999.0)  # mark a lost packet if no other delay is negative
-_FLAGS = {
-    **dict.fromkeys(("0", "0.0", "false", "no"), False),
-    **dict.fromkeys(("1", "1.0", "true", "yes"), True),
-}
-"""Word in the loss column -> whether the packet was lost."""
+_FLAGS = {"false": 0.0, "no": 0.0, "true": 1.0, "yes": 1.0}
+"""Word in the loss column -> 1 if the packet was lost."""
 
 
 def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool) -> Packets:
@@ -363,9 +361,11 @@ def _csv_time(row: Row, column: str, unit: str) -> float:
 def _csv_delay(row: Row, column: str, loss: str | None) -> float:
     """Read a delay in the column's unit; NaN if the delay or the column `loss` marks a loss."""
     if loss is not None:
+        remedy = "0 or 1 for a packet; a profile can use a trace with other shares directly"
         flag = _FLAGS.get(row.text(loss).lower())
         if flag is None:
-            remedy = "0 or 1 for a packet; a profile can use a trace with other shares directly"
+            flag = row.number(loss)
+        if flag not in (0.0, 1.0):
             raise BadInputError(f"{row.where}: {loss} is {row.text(loss)[:40]!r}; give {remedy}")
         if flag:
             return nan

@@ -68,13 +68,16 @@ def test_run_follows_to_the_verdict(api, mission):
     assert lines[-1] == "SUCCESS: every waypoint reached, every criterion met"
 
 
-def test_fly_under_one_key_flies_once(api, mission):
+def test_fly_under_one_key_flies_once_and_leaves_its_verdict(api, mission, folder, monkeypatch):
+    log = folder / "termination-log"
+    log.touch()
+    monkeypatch.setattr(command, "TERMINATION_LOG", log)
     thread = pilot(api, A)
     end = threading.Thread(target=lambda: (thread.join(), api.post("/v1/missions/m1/cancel")))
     end.start()
     for _ in range(2):
-        lines = mission("fly --mission two.yaml --key uid", 130).out.splitlines()
-        assert lines[-1] == "INTERRUPTED: cancelled: mission cancelled"
+        assert "INTERRUPTED" in mission("fly --mission two.yaml --key uid", 130).out
+        assert log.read_text() == "INTERRUPTED: cancelled: mission cancelled\n"
     end.join()
     assert len(api.get("/v1/missions")["missions"]) == 1
 
@@ -135,6 +138,7 @@ def test_a_verb_needs_a_mission_in_the_right_state(api, mission):
     assert "no mission is under way" in mission("cancel", 2).err
     api.fly(FAR)
     mission("goto 0.5 0 1", 5)  # the mission is flying
+    assert "'1,5' is not a number of metres" in mission("goto 1,5 0 1", 2).err
 
 
 def test_list_status_and_logs(api, mission):

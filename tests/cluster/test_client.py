@@ -34,8 +34,9 @@ def test_a_missing_or_broken_kubeconfig_is_named_with_a_remedy(tmp_path, monkeyp
 @pytest.mark.parametrize(
     ("code", "said", "expected"),
     [
-        (401, "Unauthorized", "Unauthorized; check your permission: kubectl auth can-i list pods"),
+        (401, "Unauthorized", "log in to the cluster again"),
         (403, 'User "me" cannot list', "can-i list pods"),
+        (403, "exceeded quota: compute", "exceeded quota: compute$"),
         (500, "etcd\nis gone", "etcd is gone"),
     ],
 )

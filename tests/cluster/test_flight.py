@@ -9,7 +9,8 @@ import pytest
 
 from cloudrc.cli.main import main
 from cloudrc.cluster import flight, pods
-from cloudrc.cluster.client import ClusterError
+from cloudrc.cluster.client import ClusterError, connect
+from cloudrc.cluster.jobs import run_job
 from cloudrc.config.load import load_experiment
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import LinkChanged
@@ -180,6 +181,9 @@ def test_a_run_does_not_end_a_flight_in_progress(ready, teleop, tmp_path, capsys
     said = capsys.readouterr().err
     assert "mission m7 is under way on release 'cloudrc'" in said
     assert "end it: cloudrc mission cancel m7 --namespace=demo --release=cloudrc, or" in said
+    run_job(connect(), {}, name="first")
+    assert main([*LINE, "--out", "out"]) == 5
+    assert "Job 'first' is under way" in capsys.readouterr().err
     assert not (tmp_path / "helm").exists()
     assert not (tmp_path / "out").exists()
 

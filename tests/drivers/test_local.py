@@ -39,6 +39,19 @@ def test_a_flight_is_found_while_it_lasts_and_leaves_nothing(tmp_path, flights, 
     assert list(flights.iterdir()) == []
 
 
+@pytest.mark.parametrize("runtime", ["", "of_others", "missing"])
+def test_without_a_runtime_folder_of_its_own_a_flight_is_in_the_home(
+    tmp_path, runtime, monkeypatch
+):
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", runtime and str(tmp_path / runtime))
+    (tmp_path / "of_others").mkdir()
+    monkeypatch.setattr(os, "getuid", lambda: os.stat(tmp_path).st_uid + 1)
+    with local.announced(tmp_path):
+        assert list(local.under_way()) == [tmp_path]
+        assert (tmp_path / "home/.local/state/cloudrc/flights").is_dir()
+
+
 def test_a_flight_without_a_writable_folder_is_not_found(tmp_path):
     (tmp_path / "cloudrc").write_text("in the way")
     with local.announced(tmp_path):

@@ -214,3 +214,20 @@ def test_an_end_tells_of_its_clock_key_link_and_recorder(end, path, pipe, monkey
     said = os.read(pipe[0], 4096).decode()
     assert said.count("wall clock stepped by +60.0 s: ") == 1
     assert said.count(end.recorder.error) == 1
+
+
+@pytest.mark.parametrize("pause", ["never", "before", "after"])
+def test_a_process_that_was_paused_sees_no_step_of_the_clock(end, pause, monkeypatch):
+    """A pause of a second before or after the read of the wall clock, by SIGSTOP or a quota."""
+    boot, pauses = [0.0], [pause]
+
+    def read():
+        here = pauses.pop() if pauses else ""
+        boot[0] += here == "before"
+        shown = end._clock_offset + boot[0]
+        boot[0] += here == "after"
+        return shown
+
+    monkeypatch.setattr(time, "clock_gettime", lambda clock: boot[0])
+    monkeypatch.setattr(time, "time", read)
+    assert [end._clock_step(), end._clock_step()] == [0.0, 0.0]

@@ -54,7 +54,7 @@ def test_cloud_reports_each_silence_of_teleop_once(peers):
         teleop.handle_deadline(now_ns)
     (fault,) = teleop.take_outputs()
     assert (type(fault), fault.code) == (Fault, "teleop_silent")
-    for data in (b"rubbish", b'["Nobody", []]', POINT):  # what is no message is ignored
+    for data in (b"rubbish", b"", b'["Nobody", []]', POINT):  # what is no message is ignored
         other.send(data)
     for now_ns in range(6 * SECOND, 9 * SECOND, PERIOD_NS):
         teleop.handle_deadline(now_ns)

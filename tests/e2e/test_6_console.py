@@ -16,7 +16,7 @@ def console(installed):
     upgrade = ("upgrade", NAME, str(CHART), "--reuse-values", "--set")
     helm(*upgrade, "console.enabled=true")
     wait_ready(place(), timeout=120.0)
-    words = ["console", "--cluster", "-n", NAMESPACE, "--release", NAME]
+    words = ["console", "--cluster", "--no-open", "-n", NAMESPACE, "--release", NAME]
     command = [sys.executable, "-m", "cloudrc", *words]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
         yield process

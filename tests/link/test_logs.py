@@ -60,6 +60,7 @@ def test_units_and_separators_are_those_of_the_header(text, delays):
     ("header", "row", "note"),
     [
         ("time_s,delay_ms,loss", "1,0,yes", ""),
+        ("time_s,delay_ms,loss", "1,0,1.000", ""),
         ("time_s,delay_ms", "1,nan", ""),
         ("time_s,delay_ms", "1,no answer yet", ""),
         ("time_s,delay_ms", "1,-1", "1 with delay_ms -1 taken as lost"),
@@ -106,6 +107,7 @@ def test_round_trips_are_halved_only_on_request():
         ("time_s,delay_ms\n0,45\n1,fast", "line 3: delay_ms is 'fast'; give a finite number"),
         ("time_s,delay_ms\n,45", "line 2: time_s is nothing; give a finite number"),
         ("time_s,delay_ms,loss\n0,45,0.5", "line 2: loss is '0.5'; give 0 or 1"),
+        ("time_s,delay_ms,loss\n0,45,maybe", "line 2: loss is 'maybe'"),
         ("time_s,delay_ms\n0,45\n1,-3", "arrived 3 ms before it was sent: the two clocks differ;"),
         ("time_s,rtt_ms\n0,45\n1,-3\n2,-1", "rtt_ms is -3, which is no round trip"),
         ("time_s,delay_ms", "no packet arrived"),

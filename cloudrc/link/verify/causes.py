@@ -145,7 +145,11 @@ def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
 
 
 def _of_machine(known: Evidence, off: Mapping[str, Row], lost: float) -> Iterator[tuple[str, str]]:
-    """Yield causes that the machine reports, the most certain first; `lost` is the share lost."""
+    """Yield causes of a failed check for which this machine's counters are evidence.
+
+    The most certain cause comes first. `off` has the rows that failed; `lost` is the share of lost
+    packets.
+    """
     where, elsewhere = known.interface or "the way out", " and ".join(known.elsewhere)
     sent, unshaped = known.sent or 0, known.shaper == "none"
     passed = sent if known.passed is None else known.passed

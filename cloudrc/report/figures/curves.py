@@ -21,10 +21,10 @@ DELAY_ALT = "Two scatter plots over time: one-way delays, and the loop delay wit
 DELAY = (
     "Delays. (a) Each dot is the one-way delay of a datagram that arrived, late ones included; the "
     "band is the link profile, with gaps in blackouts. (b) Each dot is the loop delay of one echo: "
-    "the time from a command's stamp to its echo (the paper's τₙ). The solid line is the delay estimate, over "
-    "which the controller predicts. The band is the sum of both directions of the link profile, "
-    "the dashed line its mean. Only applied commands have echoes; if the newest command wins, "
-    "these are the fast ones, so the loop delay lies below the mean of the profile."
+    "the time from a command's stamp to its echo (the paper's τₙ). The solid line is the delay "
+    "estimate, over which the controller predicts. The band is the sum of both directions of the "
+    "link profile, the dashed line its mean. Only applied commands have echoes; if the newest "
+    "command wins, these are the fast ones, so the loop delay lies below the mean of the profile."
 )
 TIME = "time since start (s)"
 """Label of the time axis; the report page finds panels over time by this label."""

@@ -235,7 +235,7 @@ class NativeRobot(Robot):
         super().put_on_ground(now_ns, cause)
 
     def run(self, tick_ns: int, until_ns: int) -> int:
-        """Run steps, as `Robot` does: the first ones in C, if they are usual steps."""
+        """Run steps, as `Robot` does: in C up to the first unusual step, the rest in Python."""
         simulator, guard = self.simulator, self.guard
         in_c = not self.observers and simulator.tape is None
         while in_c and (track := guard.plain_track(tick_ns)):
