@@ -128,8 +128,8 @@ def step_towards(start: Vector, end: Vector, step: float) -> Vector:
 def limit_growth(before: Vector, after: Vector, step: float) -> Vector:
     """Return the velocity `after`, slowed so that the speed grows by at most `step` [m/s].
 
-    `before` and `after` are the velocities at the start and at the end of a physics step [m/s], both
-    finite. The limit applies to all axes together: the fence may reverse the velocity of one axis
+    `before` and `after` are the velocities at the start and at the end of a physics step [m/s].
+    Both are finite. The limit applies to all axes together: the fence may reverse the velocity of one axis
     while another axis gains speed.
     """
     (ax, ay, az), (bx, by, bz) = before, after
