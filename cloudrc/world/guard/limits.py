@@ -129,8 +129,8 @@ def limit_growth(before: Vector, after: Vector, step: float) -> Vector:
     """Return the velocity `after`, slowed so that the speed grows by at most `step` [m/s].
 
     `before` and `after` are the velocities at the start and at the end of a physics step [m/s].
-    Both are finite. The limit applies to all axes together: the fence may reverse the velocity of one axis
-    while another axis gains speed.
+    Both are finite. The limit applies to all axes together: the fence may reverse the velocity of
+    one axis while another axis gains speed.
     """
     (ax, ay, az), (bx, by, bz) = before, after
     x, y, z = growth(ax, bx), growth(ay, by), growth(az, bz)
