@@ -56,7 +56,7 @@ _STAMPS = {
     ("departure of the command", _PERIOD):
         "/estimated_odometry /setpoint_position /cmd_vel /delay_estimate /pid",
     ("instant of the event", "once per event"): "/mission",
-    ("when world or cloud notices the fault", "once per fault; repetitions are only counted"): "/fault",
+    ("when world or cloud notices the fault", "once per fault; repetitions are counted"): "/fault",
     ("when the counters are read", "1 Hz per counter; counters of a relay 0.5 Hz"): "/count",
     ("when world or cloud notices the change", _LINK): "/link",
     ("end of the interval that is judged", "every 5 s per quantity"): "/link_check",
