@@ -6,7 +6,7 @@ import errno
 
 DISK_FULL = {errno.ENOSPC: "disk full", errno.EDQUOT: "disk quota used up"}
 """Error number (errno) of a full disk -> text for the user."""
-TEXT_MAX = 4096
+TEXT_MAX = 2000
 """Largest length of another program's text in a message [characters]; the rest is cut off."""
 
 
