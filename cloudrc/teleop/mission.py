@@ -466,7 +466,7 @@ class Teleop:
         return self._from_spawn and not self.requests.waits
 
     def _select_early(self, now_ns: int) -> None:
-        """Select the first waypoint before telemetry confirms the start of the mission, to save time.
+        """Select the first waypoint before telemetry shows that the mission began, to save time.
 
         If the mission begins with a reset to the spawn, wait until the robot ignores commands;
         otherwise it would fly to the waypoint before the reset.
