@@ -122,8 +122,8 @@ def load(name: str, overrides: Iterable[str], seed: int | None = None) -> Resolv
 def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None) -> int:
     """Fly as `options` say, print the summary, and return the exit code.
 
-    With `ready`, fly a session, which may have many missions; it calls `ready` when it waits for
-    missions.
+    With `ready`, fly a session of any number of missions; `ready` is called when the session waits
+    for missions.
     """
     from cloudrc.metrics.verdict import exit_code
 

@@ -114,9 +114,9 @@ def _settling_time(times: Array, sizes: Array, band: float) -> float | None:
 def _grows(error: Array) -> bool:
     """Return whether `error`, along one axis [m], shape (n,), oscillates without decay.
 
-    A half-wave is the error between two changes of sign; the error before the first change is
-    none. The error does not decay if a half-wave is larger than `GROWTH_MIN`, and at least as
-    large as the previous half-wave of the same sign.
+    A half-wave is the error between two changes of sign; the first half-wave begins
+    at the first change. The error does not decay if a half-wave is larger than `GROWTH_MIN`, and at
+    least as large as the previous half-wave of the same sign.
     """
     crossings = np.flatnonzero(np.signbit(error[1:]) != np.signbit(error[:-1])) + 1
     waves = np.split(np.abs(error), crossings)[1:]

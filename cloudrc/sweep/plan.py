@@ -205,7 +205,7 @@ def pack(flights: Iterable[Flight]) -> bytes:
 
 
 def unpack(path: Path) -> list[Flight]:
-    """Read the flights of a file; raise a BadInputError if this version cannot fly them."""
+    """Read the flights in a file from `pack`; raise a BadInputError if the file is unusable."""
     try:
         content = json.loads(gzip.decompress(path.read_bytes()))
         points = [

@@ -226,7 +226,7 @@ class Plan:
         return there - np.median(there) if len(there) else there
 
     def _rate(self, stream: Stream) -> float:
-        """Compute the rate of the bottleneck [bit/s] from the spacing of datagrams sent as a train.
+        """Compute the bottleneck's rate [bit/s] from the arrivals of trains, sent back to back.
 
         Source: M. Jain, C. Dovrolis, IEEE/ACM Trans. Networking 12, 2004: packet dispersion.
         """
