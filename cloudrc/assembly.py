@@ -254,7 +254,7 @@ def with_order(
 
 
 def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> DirectionProfile:
-    """Convert one direction of a link profile to SI units, and read its trace and its table.
+    """Convert one direction of a link profile to SI units; read the files that it names.
 
     Raise a BadInputError if a file cannot be read or is longer than `file_max` bytes.
     """

@@ -46,7 +46,7 @@ class Cause(IntEnum):
     words: str
 
     def __new__(cls, number: int, words: str) -> Cause:
-        """Make a cause from its number and its words."""
+        """Make a cause from its number and the words that describe it."""
         cause = int.__new__(cls, number)
         cause._value_, cause.words = number, words
         return cause

@@ -13,10 +13,11 @@ from cloudrc.messages import NEVER_NS, GuardState, Odometry, Quaternion, Telemet
 
 
 class LinkChanged(NamedTuple):
-    """Driver, in real time only: requested conditions of one link direction. Topic /link.
+    """Made by the driver, in real time only: a link direction's requested conditions. Topic /link.
 
     World records the uplink, and cloud records the downlink: at the start, after every change, and
-    when a session or a mission begins. The values are those with which the profile starts.
+    when a session or a mission begins. The values are those at the start of the profile's time
+    line.
     """
 
     stamp_ns: int
@@ -118,7 +119,7 @@ class GuardChange(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """World: the robot began to touch something. Topic /contact.
+    """Made by world: the robot began to touch something. Topic /contact.
 
     Position and velocities are those just before the contact, in the world frame.
     """
@@ -215,7 +216,7 @@ class Counted(NamedTuple):
 
 
 class Lateness(NamedTuple):
-    """Driver, in real time only: how late a deadline was handled. Topic /lateness."""
+    """Made by the driver, in real time only: lateness of a handled deadline. Topic /lateness."""
 
     stamp_ns: int
     end: str  # "world" or "cloud"

@@ -389,9 +389,10 @@ def _notes(way: str, rows: Sequence[Row]) -> Iterator[str]:
 
 
 def make_report(title: str, findings: Mapping[str, Findings], probes: Mapping[str, str]) -> Report:
-    """Make the report as plain values for JSON, in SI units; leave out unknown values.
+    """Make the report as values for JSON, in SI units; leave out unknown values.
 
-    Losses and other shares are in [0, 1]. `probes` describes the measured datagrams per direction.
+    Losses and other shares are in [0, 1]. `title` names the link. `findings` and `probes` have an
+    entry per direction; `probes` says which datagrams were measured.
     """
     shapers = {one.evidence.shaper or "an unknown shaper" for one in findings.values()}
     verdicts = {verdict_of(one.rows) for one in findings.values()}

@@ -171,10 +171,10 @@ def _addresses(name: str, family: int) -> list[str]:
 
 
 def resolve_address(flag: str, where: Address, listen: Address = ("0.0.0.0", 0)) -> Address:
-    """Look up the host of an address before the control loop starts, which must not wait for DNS.
+    """Resolve the host of an address before a control loop starts: the loop must not wait for DNS.
 
-    The result is IPv4 or IPv6, like the address `listen` of this process; if `listen` is [::], both
-    are possible. Raise a BadInputError, which names `flag`, if the host cannot be resolved.
+    The result is IPv4 or IPv6, like the address `listen` of this process. If `listen` is [::], the
+    result may be either. Raise a BadInputError, which names `flag`, if the host cannot be resolved.
     """
     host, port = where
     family = socket.AF_INET6 if ":" in listen[0] else socket.AF_INET

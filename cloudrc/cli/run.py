@@ -122,7 +122,8 @@ def load(name: str, overrides: Iterable[str], seed: int | None = None) -> Resolv
 def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None) -> int:
     """Fly as `options` say, print the summary, and return the exit code.
 
-    With `ready`, fly a session, which calls `ready` once it waits for missions.
+    With `ready`, fly a session of any number of missions; `ready` is called when the session waits
+    for missions.
     """
     from cloudrc.metrics.verdict import exit_code
 
@@ -199,7 +200,7 @@ def new_folder(out: Path | None, name: str, link: str = "latest") -> Path:
 
 
 def point_to(folder: Path, link: str) -> None:
-    """Point the link beside `folder` to `folder`, if the file system supports symbolic links."""
+    """Let the symbolic link `link`, beside `folder`, point to `folder`; ignore a failure."""
     latest = folder.parent / link
     with contextlib.suppress(OSError):
         if latest.is_symlink():
@@ -326,7 +327,7 @@ def _record_virtual(
 
 
 def _prepare(experiment: ResolvedExperiment) -> bool:
-    """Check the user's robot and scene; return whether the packages of the API are installed."""
+    """Check the user's robot and scene; return whether the operator's API is installed."""
     if absent := missing("api"):
         text = f"no operator's API in this run: {', '.join(absent)} not installed"
         print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)

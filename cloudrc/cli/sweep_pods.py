@@ -39,8 +39,9 @@ def rows_from_pods(
 ) -> Generator[Row]:
     """Fly flights of a plan on a cluster, and yield each row once.
 
-    If a pod is deleted just after its last flight, its log is lost, but Kubernetes counts its shard
-    as complete. Therefore further Jobs fly the flights without a row.
+    Each pod of a Job flies a share (shard) of the flights and logs their rows. If a pod is deleted
+    just after its last flight, its log is lost, but Kubernetes counts its shard as complete.
+    Therefore further Jobs fly the flights without a row.
 
     Raises:
         ClusterError: If a Job fails or yields no row, or if a pod will never run.

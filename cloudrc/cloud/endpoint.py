@@ -94,7 +94,7 @@ class ComputeTime:
             self._began_ns = self._cpu_clock()
 
     def end(self) -> int:
-        """Return the time that the computation since `begin` takes in the simulation [ns]."""
+        """Return the simulated duration of the computation that started with `begin` [ns]."""
         time_ns = self._mean_ns
         if self._deviation_ns:
             shape = (self._mean_ns / self._deviation_ns) ** 2

@@ -207,7 +207,7 @@ class ControlLoop:
         self._estimator.add_applied((applied_ns - echo_ns) * 1e-9)
 
     def _estimate_horizon(self, age: float) -> float:
-        """Return the horizon [s], within the limits; `age` is as in `Estimator.horizon`.
+        """Return the horizon [s], limited to its allowed range; `age` is as in `Estimator.horizon`.
 
         Raises:
             InvalidResultError: If the estimator's horizon is not finite.

@@ -88,12 +88,12 @@ class EmergencyStopRepeater:
         self._number = self._acted_on = self._due_ns = 0
 
     def sound(self) -> None:
-        """Begin to send and repeat the stop."""
+        """Begin to send the emergency stop repeatedly."""
         if not self.sounds:
             self.sounds, self._number, self._due_ns = True, 0, 0
 
     def restart_numbers(self) -> None:
-        """Forget all numbers, because the numbers of requests begin again in each session."""
+        """Forget the numbers of requests, because each session numbers its requests anew."""
         self._number = self._acted_on = self._due_ns = 0
 
     def see(self, guard: GuardState, acted_on: int) -> None:

@@ -110,9 +110,9 @@ def _job_spec(name: str, shards: int, image: str, cpu: str, labels: dict[str, st
 
 
 def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iterator[str]:
-    """Yield the lines of a Job's logs, some twice, until the Job is complete; then delete the Job.
+    """Yield the lines of a Job's logs until the Job is complete; then delete the Job.
 
-    `tell` receives sentences for the user. A failed Job is not deleted.
+    A line may come twice. `tell` receives sentences for the user. A failed Job is not deleted.
 
     Raises:
         ClusterError: If the Job fails, or if a pod will never run.

@@ -120,7 +120,7 @@ class Steering:
             self.say("cancel: no mission is under way", is_refusal=True)
 
     def fly(self, order: Mapping[str, Any]) -> None:
-        """Fly a mission; a drive that waits for keys ends first."""
+        """Fly a mission; if the user drives the robot by keys, first end this drive."""
         if is_drive(self.state.get("mission")):
             if not self.ask("ending the drive", "/v1/resume"):
                 return
@@ -130,7 +130,7 @@ class Steering:
         self.ask(words, "/v1/missions", order)
 
     def go_to(self, position: Vector) -> bool:
-        """Hold a mission that flies, and fly to a position [m]; return whether teleop agrees."""
+        """Hold the present mission, if any; fly to a position [m]. Return whether teleop agrees."""
         x, y, z = (round(float(value), 3) for value in position)
         mission = self.state.get("mission") or {"state": ""}
         if mission["state"] in ("starting", "flying") and not self.ask("hold", "/v1/hold"):

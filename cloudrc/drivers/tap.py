@@ -78,7 +78,7 @@ class TapListener:
     """Receives the datagrams of one tap; a tap has at most one listener."""
 
     def __init__(self, path: Path) -> None:
-        """Bind the socket at `path`.
+        """Become the listener of the tap that sends to the socket `path`.
 
         Raises:
             BadInputError: If another process listens at `path`.

@@ -161,7 +161,7 @@ def _moves_robot(output: Any) -> bool:
 
 
 class LastWord:
-    """Delays the end of cloud's process in flight, so that cloud forwards teleop's END request."""
+    """Lets cloud's process forward teleop's END request before the process ends in flight."""
 
     def __init__(
         self,

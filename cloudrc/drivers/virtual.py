@@ -30,7 +30,7 @@ PERIOD_NS = 100_000_000
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """Monotonic clock of a machine, which may differ from virtual time."""
+    """Monotonic clock of a simulated machine; it may differ from virtual time."""
 
     offset_ns: int = 0  # what the clock shows at virtual time 0 [ns]
     drift_ppm: int = 0  # how much faster than virtual time the clock is [ppm]

@@ -12,7 +12,7 @@ class DelayEstimator(Estimator):
     """Mean of the loop delays since the session began."""
 
     def update(self, sample: DelaySample) -> None:
-        """Add a loop delay: `sample.loop_delay` [s] is tau_n."""
+        """Add a loop delay to the mean: `sample.loop_delay` [s], the tau_n of eq. (1)."""
         # Your code: eq. (1).
 
     def horizon(self, age: float) -> float:

@@ -1,6 +1,6 @@
-"""Predictor, part 2 of the exercise: the state of the robot when the next command acts, tau later.
+"""Part 2 of the exercise: predict the state of the robot when the next command acts, tau later.
 
-    position = p + v tau      velocity = v + a tau, with a = 0: the robot does not measure it
+    position = p + v tau      velocity = v + a tau, with a = 0, because a is not measured
     orientation: "similarly", with the angular velocity; use `rotate_ahead`
 
 Source: the paper, eqs. (2) and (3).

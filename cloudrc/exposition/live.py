@@ -202,7 +202,7 @@ class WorldEnd(End):
 
     @property
     def has_peer(self) -> bool:
-        """Whether a session is open, and commands arrive or none has arrived yet."""
+        """Whether commands arrive, or the open session still waits for its first command."""
         return super().has_peer or (self._opened_ns != NEVER_NS and self._silent)
 
     def _on_sessionopened(self, record: SessionOpened) -> None:

@@ -49,7 +49,7 @@ def unlabelled(value: float) -> dict[Labels, float]:
 
 
 def per_axis(vector: Vector) -> dict[Labels, float]:
-    """Make the reading per axis of a `vector` [unit of the metric]; NaN is left out."""
+    """Map each axis to its value in `vector` [unit of the metric]; leave out NaN."""
     values = zip(AXES, vector, strict=True)
     return {(axis,): value for axis, value in values if not isnan(value)}
 

@@ -341,7 +341,7 @@ def _hostile_plans(rng: Generator) -> Lie:
 
 
 def _operators_voice(rng: Generator) -> Lie:
-    """Fly as a random policy in `FASTEST`, while `at_bad_moments` forges requests."""
+    """Fly with a random policy of `FASTEST`; `at_bad_moments` forges the operator's requests."""
     return FASTEST[int(rng.integers(len(FASTEST)))](rng)
 
 

@@ -73,7 +73,7 @@ class Flight:
         words: Words | None = None,  # makes requests in place of the operator
         second: float | None = None,  # when a second cloud connects [s]
     ) -> None:
-        """Prepare a flight; comments explain the arguments. `second` [s] is for a second cloud."""
+        """Prepare a flight (see the comments). At `second` [s], if any, a second cloud connects."""
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         self._honest, self._keep = honest, keep
         self._life, self._second, self._lies, self._words = life, second, lies, words

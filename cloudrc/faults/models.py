@@ -46,7 +46,7 @@ class RestartableEndpoint:
     sealed = True  # world and cloud have keys
 
     def __init__(self, build: Callable[[int], Endpoint], clock: Clock) -> None:
-        """Start a process; `build` makes world or cloud from the start time on `clock` [ns]."""
+        """Start a process; `build` makes world or cloud, given the time on `clock` [ns]."""
         self._build, self.clock = build, clock
         self.tamper: Tamper | None = None  # changes the datagrams that arrive
         self._scheduled, self._frozen_until_ns = 0, -1
@@ -93,7 +93,7 @@ class RestartableEndpoint:
             self.at(start + n * CFS_PERIOD, lambda now_ns: self.freeze(now_ns, stall))
 
     def receive_now(self, data: bytes, now_ns: int) -> None:
-        """Pass a datagram to the process unchanged; `receive_datagram` lets `tamper` change it."""
+        """Pass a datagram to the process as it is; `receive_datagram` applies `tamper` first."""
         if self.inner is None:
             return
         if self._frozen_until_ns <= now_ns:
@@ -193,7 +193,7 @@ class _Peer(UnixPeer):
         return _take_all(self.waiting)
 
     def send(self, message: Message | None) -> bool:
-        """Implement `UnixPeer.send`: put a message into the other socket if it has room."""
+        """Implement `UnixPeer.send`; return False if the other socket is closed or full."""
         sent = self.other._is_open() and len(self.other.waiting) < UNIX_SOCKET_MAX
         if sent:
             self.other.waiting.append(message)
@@ -259,7 +259,7 @@ class TeleopModel:
         host.at(self._phase_ns * 1e-9, self._wake)
 
     def join(self, start_ns: int) -> RemoteTeleop:
-        """Return the `Operator` for a cloud that starts at `start_ns` on its clock [ns]."""
+        """Connect a cloud that starts at `start_ns` on its clock [ns]; return its `Operator`."""
         self._clouds.waiting.clear()  # lost with the previous cloud
         return RemoteTeleop(self._clouds, start_ns)
 

@@ -52,10 +52,11 @@ def robot_points() -> Spheres:
 
 
 def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) -> Array:
-    """Return the robot's points in the world frame [m], for n poses, shape (n, k, 3).
+    """Return the centres of the robot's spheres at n poses [m], world frame, shape (n, k, 3).
 
-    `positions` are those of the base [m], world frame, shape (n, 3). Each row of
-    `orientations_wxyz` is a unit quaternion, body to world, shape (n, 4).
+    `points` are the k spheres in the body frame. `positions` are those of the base [m], world
+    frame, shape (n, 3). Each row of `orientations_wxyz` is a unit quaternion, body to world, shape
+    (n, 4).
     """
     w, x, y, z = np.moveaxis(orientations_wxyz, -1, 0)
     rows = (

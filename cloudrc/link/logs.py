@@ -282,8 +282,9 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     - The delay is -1, -999 or -9999, and the column has no other negative number.
     - The delay is 0, all other delays are far from 0, and the log has no column `loss`.
 
-    `halve` allows round trips, half of which then count as one-way delays. `trust_units` accepts
-    values that seem to be in another unit. `name` is the file name for messages.
+    With `halve`, the log may have round-trip times; half of each counts as one-way delay. With
+    `trust_units`, values that seem to be in another unit are accepted. `name` is the file name for
+    messages.
 
     Raises:
         BadInputError: If the log cannot be used; the text names line, value and remedy.

@@ -238,9 +238,9 @@ class Lane:
 class Relay:
     """Runs one or two `Lane` objects in one thread.
 
-    `lanes` maps the name of each direction to its lane. The models' time starts at `origin_ns`
-    [ns], monotonic clock. If `origin_ns` is None, it starts when the first datagram arrives on any
-    lane, as in virtual time; then the models must have the origin 0.
+    `lanes` maps the name of each direction to its lane. The time of the link models starts at
+    `origin_ns` [ns], monotonic clock. If `origin_ns` is None, it starts when the first datagram
+    arrives on any lane; in this case, make the models with `origin_ns` 0.
     """
 
     def __init__(self, lanes: Mapping[str, Lane], origin_ns: int | None) -> None:
@@ -298,7 +298,8 @@ class Relay:
         socket's buffer was full); `unsent` (the receiver is unknown or the kernel refused).
 
         Call this method once a second; the percentiles of the lateness [ns] then cover the last
-        10 s. `released_early` counts since the start.
+        10 s. `released_early` is the number of datagrams that left before they were due, since the
+        start.
         """
         outcomes, errors = Counter[str](), ReleaseErrors()
         for lane in self._lanes:
@@ -340,7 +341,7 @@ class RelayShaper(Relay):
         """Send all datagrams to this peer from now on, including those in flight.
 
         Returns:
-            The route: the address to which this pod's end of the tunnel has to send.
+            The relay's own address, to which this pod's end of the tunnel has to send.
         """
         self._peer = peer
         host, port = self._inside.getsockname()

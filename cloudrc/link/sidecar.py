@@ -31,7 +31,7 @@ Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
 
 
 class Machine(NamedTuple):
-    """Functions of the machine on which a sidecar runs."""
+    """Functions that a sidecar calls on its machine: shapers, clock, sleep and log."""
 
     relay: Make  # makes a `RelayShaper`
     netem: Make  # makes a `Netem`, without changing the network yet

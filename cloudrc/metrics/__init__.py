@@ -73,7 +73,10 @@ def check(own: Iterable[str]) -> None:
 
 
 def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
-    """Return a note per file in `named` (experiment's metrics) that is not in `own` (user's)."""
+    """Return a note for each metric file that the experiment names but the user does not.
+
+    `named` are the metrics that the experiment names, `own` those that the user names.
+    """
     names = set(map(name_of, own))
     return [
         f"{METRIC_NOTE}{name_of(choice)} is not measured: name its file with --metric"

@@ -130,7 +130,7 @@ class Flight:
         return pipe_index(self.scene, self.truth["position"]) >= 0
 
     def count(self, number: float) -> float | None:
-        """Return `number` [any unit] as a metric; None if the robot never flew."""
+        """Return `number` [any unit] as the value of a metric; None if the robot never flew."""
         return None if self.start_ns is None else float(number)
 
     def last_total(self, name: str) -> float | None:

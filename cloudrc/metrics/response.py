@@ -112,11 +112,11 @@ def _settling_time(times: Array, sizes: Array, band: float) -> float | None:
 
 
 def _grows(error: Array) -> bool:
-    """Return whether an error along one axis [m] oscillates without decay, shape (n,).
+    """Return whether `error`, along one axis [m], shape (n,), oscillates without decay.
 
-    A half-wave is the error between two changes of sign; the first change of sign ends the step
-    itself. The error does not decay if a half-wave is larger than `GROWTH_MIN`, and at least as
-    large as the previous half-wave of the same sign.
+    A half-wave is the error between two changes of sign; the first half-wave begins
+    at the first change. The error does not decay if a half-wave is larger than `GROWTH_MIN`, and at
+    least as large as the previous half-wave of the same sign.
     """
     crossings = np.flatnonzero(np.signbit(error[1:]) != np.signbit(error[:-1])) + 1
     waves = np.split(np.abs(error), crossings)[1:]

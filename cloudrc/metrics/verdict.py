@@ -112,7 +112,7 @@ class Evidence:
 
 
 def judge(evidence: Evidence) -> Verdict:
-    """Apply the rules to the evidence of a mission."""
+    """Judge a mission by its evidence; the verdict lists all violations and unmet goals."""
     violations, limit = evidence.violations, evidence.contact_speed_max
     if evidence.contact and evidence.touch is not None and evidence.touch[0] >= limit:
         speed, moment = evidence.touch

@@ -77,7 +77,7 @@ def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
 
 
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
-    """Return the smallest (arrival - departure) [ns], on two clocks; None without a datagram."""
+    """Return the smallest arrival minus departure [ns], on two clocks; None if none arrived."""
 
     def packets(table: Table) -> Iterator[tuple[tuple[int, int], int]]:
         numbers = zip(table["epoch"].tolist(), table["counter"].tolist(), strict=True)
@@ -162,8 +162,8 @@ def _join(world: Contents, cloud: Contents) -> Contents:
 def cut_to_last_mission(mission: Contents) -> bool:
     """Reduce a pod's recording of several missions to the mission that was started last.
 
-    Return whether the recording contains the end of that mission. If so, `mission.note` no longer
-    mentions that the file has no end: the pod was still writing the file when it was copied.
+    Return whether the recording contains the end of that mission. If so, delete the remark that the
+    file has no end from `mission.note`: the pod still wrote to the file during the copy.
     """
     began, ended, earlier = _last_mission(mission)
     until = mission.messages[-1][1] if mission.messages else 0

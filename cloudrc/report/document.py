@@ -99,7 +99,8 @@ def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
 def environment_document(physics_steps: str = "") -> dict[str, Any]:
     """Describe the software and hardware of this machine, without names of users and hosts.
 
-    `physics_steps` is as in `Run`.
+    `physics_steps` names the code of the physics steps, such as "C (compiled by cc)"; "" if this is
+    unknown.
     """
     packages = {}
     for name in PACKAGES:

@@ -125,7 +125,7 @@ def _marker(
     points: Iterable[Any] = (),
     colours: Iterable[_Colour] = (),
 ) -> Any:
-    """Make a marker at the origin of a frame; `size` and `points`, shape (n, 3), in [m]."""
+    """Make a ROS marker at the origin of `frame`; `size` and `points`, shape (n, 3), in [m]."""
     point, none = "geometry_msgs/msg/Point", np.zeros(0, np.uint8)
     pose = part("geometry_msgs/msg/Pose", part(point, 0.0, 0.0, 0.0), _quaternion(LEVEL))
     forever = part("builtin_interfaces/msg/Duration", 0, 0)

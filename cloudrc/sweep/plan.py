@@ -53,7 +53,7 @@ class SweepFile(Section):
 
 
 class Flight(NamedTuple):
-    """One point with one seed."""
+    """One flight of a sweep: a point (one value per axis), flown with one seed."""
 
     key: str  # 16 hexadecimal digits; equal keys mean equal flights
     point: dict[str, Any]  # axis -> value or name
@@ -190,8 +190,8 @@ def _resolve(experiment: str, entries: Iterable[_Entry]) -> ResolvedExperiment:
 def pack(flights: Iterable[Flight]) -> bytes:
     """Pack flights into a file for pods, which have none of the user's files.
 
-    The file has each resolved point once, and the point and seed of each flight. Equal flights give
-    equal bytes.
+    The file contains each point once, with its resolved experiment. For each flight, it contains
+    the index of the point and the seed. Equal flights give equal bytes.
     """
     points: dict[int, int] = {}  # identity of a resolved point -> its index
     shown, chosen = [], []
@@ -205,7 +205,7 @@ def pack(flights: Iterable[Flight]) -> bytes:
 
 
 def unpack(path: Path) -> list[Flight]:
-    """Read the flights of a file; raise a BadInputError if this version cannot fly them."""
+    """Read the flights in a file from `pack`; raise a BadInputError if the file is unusable."""
     try:
         content = json.loads(gzip.decompress(path.read_bytes()))
         points = [

@@ -95,7 +95,7 @@ def begin(folder: Path, plan: Plan) -> dict[str, Row]:
 
 
 def finish(folder: Path, plan: Plan) -> dict[str, Row]:
-    """Update the description; if all flights are done, write the tables. Return the rows."""
+    """Update the sweep's description; write the tables after the last flight; return the rows."""
     rows = read_rows(folder)
     unit_of = _write_summary(folder, plan, rows)
     if len(rows) == len(plan.flights):

@@ -144,7 +144,7 @@ class Bridge:
         return await self.ask(checked)
 
     def make_stops(self, now_ns: int) -> None:
-        """Make the queued stops and holds; the loop does this before it reads telemetry."""
+        """Execute the queued stops and holds; the loop does this before it reads telemetry."""
         self._make(self._urgent, now_ns)
 
     def make_calls(self, now_ns: int) -> None:

@@ -121,7 +121,7 @@ class Audit(RotatingFileHandler):
         self._listener.start()
 
     def note(self, caller: Caller, scope: Mapping[str, Any], answer: Mapping[str, Any]) -> None:
-        """Queue a log line about a command and the answer to the command."""
+        """Queue a log line: who sent a command, the request (`scope`), and the `answer` to it."""
         said = json.loads(answer.get("body") or b"{}")
         line = {
             "time": datetime.now(UTC).isoformat(timespec="milliseconds"),

@@ -383,9 +383,9 @@ class Teleop:
             self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
 
     def _lead(self, seen: RobotStatus, now_ns: int) -> None:
-        """Keep the carrot at the robot while the guard ignores commands; then let it move again.
+        """Keep the carrot at the robot while the guard ignores commands; then move the carrot on.
 
-        At the first take-off the carrot does not wait for telemetry: this saves a round trip.
+        At the first take-off the carrot moves before telemetry arrives: this saves a round trip.
         """
         self._followed = self._followed or seen.guard is TRACK
         if seen.guard is not TRACK and (self._followed or seen.guard is not GROUND):
@@ -420,7 +420,7 @@ class Teleop:
         return near and leaves_ns is not None and now_ns >= leaves_ns
 
     def _leaves_ns(self, leg: int) -> int | None:
-        """Return when the dwell time of a carrot at a waypoint ends [ns]; None without a carrot."""
+        """Return when the dwell time at a waypoint ends [ns]; None if no carrot moves to it."""
         setpoint = self._setpoint
         if setpoint is None or type(setpoint.motion) is not Motion or setpoint.waypoint != leg:
             return None
@@ -466,9 +466,10 @@ class Teleop:
         return self._from_spawn and not self.requests.waits
 
     def _select_early(self, now_ns: int) -> None:
-        """Select the first waypoint before telemetry shows the start, to save a round trip.
+        """Select the first waypoint before telemetry shows that the mission began, to save time.
 
-        Before a reset to the spawn, wait until the robot ignores commands, or it would fly there.
+        If the mission begins with a reset to the spawn, wait until the robot ignores commands;
+        otherwise it would fly to the waypoint before the reset.
         """
         if not self._is_pending or self.seen is None or self._may_move:
             return

@@ -189,8 +189,9 @@ class MissionService:
     def drive(self, velocity: Vector, now_ns: int) -> Mission:
         """Drive the setpoint with `velocity` [m/s], in a held mission or in a new one.
 
-        The setpoint brakes and rests if the next request does not come within `HEARTBEAT_NS`. After
-        a hold or a mission's end, the operator first has to send zero, or nothing for that time.
+        The setpoint brakes and rests if the next request comes later than `HEARTBEAT_NS`. After a
+        hold, a stop or the end of a mission, the operator can drive on only after a request for
+        zero velocity, or after a pause of `HEARTBEAT_NS`.
         """
         pause_ns, self._driven_ns = now_ns - self._driven_ns, now_ns
         x, y, z = velocity

@@ -200,10 +200,10 @@ class ClientHandshake:
     def receive_accept(self, epoch: int, accept: Accept, *, asks: bool) -> bytes | None:
         """Process an ACCEPT; return cloud's and world's nonce if a new epoch begins, else None.
 
-        `asks` is True while cloud asks for a session. Otherwise, cloud ignores the ACCEPTs of a new
-        world process. While cloud asks, a late ACCEPT of an ended world process may mislead cloud.
-        When the running world process answers again, cloud changes its own nonce, which makes late
-        ACCEPTs invalid.
+        `asks` is True while cloud asks for a session; only then does cloud accept a new world
+        process. It may then accept an ended world process, whose ACCEPT arrives late. As soon as
+        the running world process answers again, cloud changes its own nonce: all late ACCEPTs
+        become invalid.
         """
         known = accept.world_nonce == self._world
         if accept.nonce != self._nonce or (self._world and not known and not asks):

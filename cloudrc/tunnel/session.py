@@ -91,9 +91,10 @@ class Session:
         return header + self._sealing.encrypt(header[4:], body, header)
 
     def pass_on(self, kind: int, message: Telemetry | Command) -> Passed:
-        """Return `message` in place of the next datagram of this kind, with its counter.
+        """Give `message` the counter of the next datagram of this kind, without encryption.
 
-        Only an endpoint in the same process can `open` the result.
+        Use this method in place of `seal` if the receiver is in the same process: only there can
+        `open` read the result.
         """
         counters = self._counters
         counter = counters[kind]
@@ -111,11 +112,11 @@ class Session:
     def open(self, data: Datagram) -> tuple[int, int, int, Any]:
         """Verify a datagram; return its kind, epoch, counter and decrypted body.
 
-        The body of a `Passed` message is the message itself.
+        For a datagram from `pass_on`, the body is the message itself.
 
         Raises:
-            DecodeError: "malformed", "version", "direction" (that in which this endpoint itself
-                sends), "old_epoch" (another session), or "tag" (a wrong tag).
+            DecodeError: "malformed"; "version"; "direction" if this endpoint itself sends in the
+                datagram's direction; "old_epoch" for another session; "tag" for a wrong tag.
         """
         if type(data) is Passed:
             if data[1] != self.epoch or not data[1]:

@@ -205,7 +205,7 @@ class Simulator:
         self.contacts = contacts
 
     def _note_contacts(self, before: Readings) -> None:
-        """Store the new contacts with the state of the robot before the step, `before`."""
+        """Store the new contacts, with the robot's motion `before` the step of the simulation."""
         contact = self.data.contact
         tip = self.data.site_xpos[self._tip].tolist()
         pairs, places = contact.geom.tolist(), contact.pos.tolist()

@@ -56,8 +56,8 @@ class Pid(Controller):
     def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
         """Compute one command: u = P · e + I · (integral of e) + D · (v_s - v) + v_s, limited.
 
-        Here v is the robot's velocity and v_s the setpoint's, in [m/s]. The returned terms are
-        those before the limits of velocity and speed. The integral has the errors of earlier
+        Here v is the robot's velocity and v_s the setpoint's, in [m/s]. The limits of velocity
+        and speed apply to u, but not to the returned terms. The integral has the errors of earlier
         updates only; the present error is integrated over `dt` [s] for the next update.
         Source: the paper, eq. (5).
         """

@@ -12,9 +12,9 @@ from cloudrc.config.schema import Count
 
 
 def build(count_max: Count = 500) -> RunningMean:
-    """Make the authors' estimator.
+    """Make the estimator in the published code of the paper's authors.
 
     Args:
-        count_max: Number of samples after which the gain stays at 1/count_max.
+        count_max: Number of samples; after them, each new sample has the weight 1/count_max.
     """
     return RunningMean(count_max)

@@ -72,7 +72,7 @@ class History:
         self._applied.append((began_ns, stamp_ns))
 
     def is_silent(self, now_ns: int) -> bool:
-        """Whether the robot has followed no new command for FOLLOWED_NS at `now_ns` [ns]."""
+        """Whether the last applied command began more than FOLLOWED_NS before `now_ns` [ns]."""
         return bool(self._applied) and now_ns - self._applied[-1][0] > FOLLOWED_NS
 
     def shift_ns(self, odometry: Odometry, horizon: float) -> int:
@@ -133,7 +133,7 @@ class History:
 
 
 class Body(Model):
-    """A model whose state is `horizon` [s] later than the odometry `basis`.
+    """A model that starts from the odometry `basis`; its state is that `horizon` [s] later.
 
     `position` [m] and `velocity` [m/s] are those of the base, world frame.
     """

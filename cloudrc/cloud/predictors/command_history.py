@@ -28,7 +28,7 @@ class FirstOrder(Body):
     """Model per axis: acceleration limit of the guard, lag for the dead time, velocity lag."""
 
     def __init__(self, axes: Axes, acceleration_max: float) -> None:
-        """Begin at rest, with `acceleration_max` [m/s^2], the guard's cap."""
+        """Begin at rest; `acceleration_max` [m/s^2] is the guard's acceleration limit."""
         self._axes, self._acceleration_max = axes, acceleration_max
         self._reference = self._delayed = self.velocity = self.position = ZERO
 
@@ -76,7 +76,7 @@ class CommandHistory(Replay):
         self._bodies: list[FirstOrder] = []  # at the stamp of each command
 
     def commanded(self, command: Command) -> None:
-        """Replay the earlier commands until the stamp of this command; store body and command."""
+        """Store a command, and the body that the earlier commands have moved until its stamp."""
         body = self._at(command.stamp_ns)
         if self.history.add(command):
             if len(self._bodies) >= len(self.history.stamps):

@@ -17,7 +17,7 @@ class ConstantAcceleration(Predictor):
     """Predicts with the measured velocity and the mean acceleration in a short time window."""
 
     def __init__(self, window: float) -> None:
-        """Set `window`, the longest time between the two compared velocities [s]."""
+        """Set `window`, the longest time over which the mean acceleration is computed [s]."""
         self._window_ns = round(window * 1e9)
         self._recent: deque[Odometry] = deque()
         self._acceleration = ZERO

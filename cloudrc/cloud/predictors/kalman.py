@@ -27,10 +27,10 @@ class Kalman(Predictor):
     """Filters position and velocity, and gives the filtered samples to another predictor."""
 
     def __init__(self, replay: Replay, position: float, velocity: float, model: float) -> None:
-        """Set the predictor that replays the commands, and three standard deviations.
+        """Set `replay`, the predictor that replays the commands, and three standard deviations.
 
-        `position` [m] and `velocity` [m/s] belong to the measurement; `model` belongs to the
-        acceleration of the model [m/s^2].
+        `position` [m] and `velocity` [m/s] are those of the measured values per axis. `model`
+        [m/s^2] is that of the acceleration of the filter's model.
         """
         self._replay, self._error = replay, model * model
         self._noise = np.diag([position * position, velocity * velocity])

@@ -177,7 +177,7 @@ def _limit(reference: Vector, last: Vector, height: float, climb: float) -> Vect
 
 
 class ModelBased(Replay):
-    """Moves the white box from the newest odometry by the commands of the horizon."""
+    """Moves a `WhiteBox` from the newest odometry by the commands that act in the horizon."""
 
     def __init__(self, gains: tuple[float, ...], acceleration_max: float) -> None:
         """Set the gains of the onboard velocity loop, and `acceleration_max` [m/s^2]."""
@@ -201,7 +201,7 @@ class ModelBased(Replay):
         return body
 
     def observe(self, odometry: Odometry) -> None:
-        """Correct the model with a new sample."""
+        """Correct the white box with a new odometry sample."""
         super().observe(odometry)
         self._body = self.forecast(odometry.stamp_ns) or WhiteBox(*self._loop, odometry)
         self._body.correct(odometry)

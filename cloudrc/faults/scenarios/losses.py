@@ -19,7 +19,7 @@ from cloudrc.messages import Cause, GuardState
     expects="stays in TRACK, no step above the acceleration cap",
 )
 def _short_silence(outcome: Outcome, seed: int) -> None:
-    """Interrupt a link without jitter, so that datagrams have no other gaps."""
+    """Interrupt both directions; then each alone, without jitter, which makes other gaps."""
     at = measures.instant(seed)
     both, steady = silent(at, 0.1), conditions(jitter=0.0)
     cut = silent(at, 0.1, jitter=0.0)

@@ -170,10 +170,11 @@ class Plan:
         return round(len(self.links[0].sent) * max(1.0, most**2))
 
     def quantities(self, stream: Stream, pooled: Floats) -> dict[str, float]:
-        """Compute the quantities of a stream that are judged; an unknown quantity is NaN.
+        """Compute the judged quantities of a stream by name; an unknown quantity is NaN.
 
-        "deviation" is the standard deviation from the delay requested at each time [s], so it shows
-        the jitter alone. "distribution" is the Kolmogorov-Smirnov distance to `pooled`, in [0, 1].
+        "deviation" is the standard deviation of (delay - requested delay) [s], so it shows the
+        jitter alone. "distribution" is the Kolmogorov-Smirnov distance, in [0, 1], of these
+        differences from `pooled`, the differences in simulated streams.
         """
         singles = self._singles(stream)
         found, shape = numbers(singles), self._shape(singles)
@@ -225,7 +226,7 @@ class Plan:
         return there - np.median(there) if len(there) else there
 
     def _rate(self, stream: Stream) -> float:
-        """Compute the rate at which trains leave a bottleneck [bit/s].
+        """Compute the bottleneck's rate [bit/s] from the arrivals of trains, sent back to back.
 
         Source: M. Jain, C. Dovrolis, IEEE/ACM Trans. Networking 12, 2004: packet dispersion.
         """

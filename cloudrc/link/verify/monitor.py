@@ -160,7 +160,7 @@ class LinkMonitor:
             kept.clear()
 
     def _report(self, rows: list[Row], now_ns: int) -> list[Record]:
-        """Make records of verdicts; a quantity is "off" only after two measurements in a row."""
+        """Make records of the verdicts; an "off" stays "open" until the next check confirms it."""
         count, off = len(self._arrivals), {row.name for row in rows if row.verdict == "off"}
         if off - self._suspects:
             rows = [row._replace(verdict="open") if row.name in off else row for row in rows]

@@ -80,10 +80,10 @@ def parts(subject: Subject, *, uplink: bool) -> list[Part]:
 
 
 def bounds(subject: Subject, time: Array, *, uplink: bool) -> tuple[Array, Array] | None:
-    """Compute the band of delays of the profile [s] at each `time` [s] since the flight's start.
+    """Compute the profile's `band` of delays [s] at each `time` [s] since the flight's start.
 
-    Return its lower and its upper limit, NaN in blackouts and without a trace's file; None if all
-    are NaN.
+    Return the lower and the upper limit of the band. They are NaN in blackouts, and if the file of
+    a trace is missing. Return None if all are NaN.
     """
     low, high = np.full((2, len(time)), nan)
     for begin, origin, direction, _ in parts(subject, uplink=uplink):

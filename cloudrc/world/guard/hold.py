@@ -123,7 +123,7 @@ def brake_start(reference: Vector, velocity: Vector) -> Vector:
 
 
 def brake_rate(speed: float) -> float:
-    """Return the deceleration of a velocity reference of `speed` [m/s]: large at high speed."""
+    """Return the deceleration [m/s^2] for braking from `speed` [m/s]: large at high speed."""
     return min(BRAKE_MAX, max(BRAKE_MIN, speed / BRAKE_TIME_CONSTANT))
 
 
@@ -146,11 +146,11 @@ class Descent:
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
-        """Begin a descent at `now_ns` [ns], not acknowledged by the operator."""
+        """Begin a descent at `now_ns` [ns]; the operator has yet to acknowledge it."""
         self._moved_ns, self.acknowledged = now_ns, False
 
     def may_stop(self, readings: Readings) -> bool:
-        """Return whether the robot may end its descent in the air; the class describes when."""
+        """Return whether the robot may end its descent in the air, as the class describes."""
         free = readings.velocity[2] < -0.5 * self.speed and readings.position[2] > self._floor
         return self.acknowledged and free
 
@@ -166,11 +166,12 @@ class Descent:
 
 
 class TakeOff:
-    """Detect when the robot has left the ground (`over`), and decide whether it may take off.
+    """Detect the end of the take-off, and decide whether the robot may take off.
 
-    If the rotors stopped in the air, the robot may still fall, or be outside the fence, when the
-    operator acknowledges the stop. It may then take off only after it has come to rest on the
-    ground, at least TAKE_OFF_MARGIN inside the fence.
+    `over` becomes True when the robot has left the ground. If the rotors stopped in the air, the
+    robot may still fall, or be outside the fence, when the operator acknowledges the stop. It may
+    then take off only after it has come to rest on the ground, at least TAKE_OFF_MARGIN inside the
+    fence.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
