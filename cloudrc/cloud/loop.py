@@ -353,7 +353,7 @@ class ControlLoop:
             self._note(kind, error, "cloud goes on using it")
 
     def _note(self, kind: str, error: BaseException, instead: str = "") -> None:
-        """Count a failure of a plug-in; report the first failure of each kind of plug-in."""
+        """Count a plug-in's failure; report the first of a `kind`, and what cloud does `instead`."""
         code = f"{kind}_failed"
         self.counts[code] += 1
         if self.counts[code] == 1:

@@ -393,5 +393,5 @@ def _with_gaps(curve: Array) -> list[float | None]:
 
 
 def _visible(position: Vector, orientation_wxyz: Quaternion) -> tuple[Any, Any]:
-    """Round a pose to what is visible, so that a robot at rest costs the browser no drawing."""
+    """Round a pose to steps too small to see, so that the browser redraws only a moving robot."""
     return np.round(position, 3), np.round(orientation_wxyz, 3)
