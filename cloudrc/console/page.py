@@ -234,7 +234,7 @@ class Page:
                     slider.value = shown
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        """Give the controls to a new browser if no other has them."""
+        """Give the controls to a new browser if no other browser has them."""
         with self._lock:
             is_pilot = self._pilot is None
             if is_pilot:

@@ -10,7 +10,7 @@ from cloudrc.metrics.flight import Columns, Flight, add_metrics, mean, percentil
 def round_trips(flight: Flight) -> Columns:
     """Select the control periods in which cloud measured a new round trip.
 
-    All other periods repeat the last measured values; if the link is silent, for seconds.
+    All other periods repeat the last measured values, for seconds on end if the link is silent.
     """
     control = flight.control
     pair = np.stack([control["rtt"], control["loop_delay"]], axis=1)

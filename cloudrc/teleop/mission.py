@@ -201,9 +201,9 @@ class Teleop:
     def drive(self, now_ns: int, velocity: Vector) -> None:
         """Move the setpoint with `velocity` [m/s], world frame, for at most `HEARTBEAT_NS`.
 
-        The setpoint moves only while telemetry shows that the robot follows commands. Ignore the
-        call while a mission by hand is starting. In all other states except HELD, raise
-        BadInputError.
+        The setpoint moves only while telemetry shows that the robot follows commands. While
+        a hand-driven mission is starting, the call has no effect. Otherwise, raise BadInputError if
+        no mission is held.
         """
         if self._plan.by_hand and self.state == STARTING:
             return

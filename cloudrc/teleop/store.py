@@ -120,7 +120,7 @@ class StoreLockedError(CloudrcError):
 
 
 class ConflictError(CloudrcError):
-    """Report a forbidden request; `mission` is the id of the mission that forbids it, or "" (none)."""
+    """Report a forbidden request; `mission` is the id of the blocking mission, "" without one."""
 
     exit_code = 5
 
@@ -292,7 +292,7 @@ class MissionStore:
         self._db.close()
 
     def _commit(self, new: Mission | None = None, old: Sequence[str] = ()) -> None:
-        """Write unsaved events and the mission `new` to the disk; delete the missions `old` there."""
+        """Write unsaved events and the mission `new` to the disk; delete missions `old` there."""
         db = self._db
         try:
             db.execute("BEGIN")

@@ -138,7 +138,7 @@ class Session:
         return kind, epoch, counter, body
 
     def next_counter(self, kind: int) -> int:
-        """Return the counter of the next datagram of this kind."""
+        """Return the counter that the next datagram of a kind will have."""
         return self._counters[kind]
 
     def follow_keys(self) -> None:
