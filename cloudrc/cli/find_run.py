@@ -77,10 +77,10 @@ def find_local_run(
 
 
 def ask_if_unclear(candidates: Collection[Path], *, steers: bool, flag: str = "--run ") -> None:
-    """Raise a BadInputError if it is unclear which flight the user means, as in `find_local_run`.
+    """Raise a BadInputError if it is unclear which flight the user means.
 
     `candidates` are the folders of the local runs that the command can use; if there are none, the
-    command uses a release in a cluster. `steers` and `flag` are those of `find_local_run`.
+    command uses a release in a cluster. `find_local_run` explains `steers`, `flag` and the errors.
     """
     from cloudrc.drivers.local import RELAY_LOG, under_way
 

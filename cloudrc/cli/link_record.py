@@ -52,7 +52,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Read the source, write the traces, and print a summary of each."""
+    """Read the delays from SOURCE, write a trace per direction, and print a summary of each."""
     source, output, only = options.source, options.output, options.direction
     if not (source.is_dir() or source.is_file()):
         raise BadInputError(f"{source}: no such file or folder; name a run, a log or a CSV file")

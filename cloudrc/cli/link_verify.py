@@ -175,7 +175,7 @@ def make_plans(
 
 
 def measure(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Stream]:
-    """Send all probes over a running link; return the measured stream of each direction."""
+    """Send all probes over a running link; return what the probes measured in each direction."""
     since_wall_ns, ends = time.time_ns() - time.monotonic_ns(), []
     for name, way in ways.items():
         route = split_address((way.folder / "route").read_text())

@@ -155,7 +155,7 @@ def _try(options: argparse.Namespace, value: float, *, first: bool) -> Trial:
 
 
 def _limits(experiment: ResolvedExperiment) -> list[str]:
-    """Return settings KEY=VALUE that raise limits of cloud and guard to the delays of the link."""
+    """Return settings KEY=VALUE: time limits of cloud and guard, raised if the link needs it."""
     from cloudrc.config.load import COMMAND_AGE_MAX_MS, FREEZE_AFTER_S, HORIZON_MAX_S
     from cloudrc.config.schema import COMMAND_AGE_MS
 

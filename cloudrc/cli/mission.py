@@ -191,7 +191,7 @@ class MissionFollower:
             time.sleep(POLL_PERIOD)
 
     def _retry(self, request: Callable[[], _Answer]) -> _Answer:
-        """Repeat a request until the API answers."""
+        """Repeat a request until the API answers; raise a TimedOutError if this takes too long."""
         deadline, reported = Deadline(self._patience, TURN_MAX), False
         while True:
             try:

@@ -109,7 +109,7 @@ def take_each(
 ) -> tuple[str, int]:
     """Call `take` with each result until the work ends or is interrupted.
 
-    Return "" and 0 or, if the work ended early, the reason and the exit code.
+    Return "" and 0; if the work ended early, return the reason and the exit code instead.
     """
     try:
         with closing(results):

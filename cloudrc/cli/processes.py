@@ -5,7 +5,7 @@ the first line of this list, the relay writes the others.
 
     DIR/profile.json, change.json            requested profile; missing before the first change
     DIR/uplink.json, downlink.json           applied state of the link (`cloudrc/link/state.py`)
-    DIR/uplink.released, downlink.released   lateness of the datagrams so far, written every 2 s
+    DIR/uplink.released, downlink.released   how late datagrams left the relay, written every 2 s
 """
 
 from __future__ import annotations

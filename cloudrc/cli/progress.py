@@ -135,7 +135,7 @@ class SweepView:
             self._status.start()
 
     def see(self, row: Row) -> None:
-        """Count a finished flight; print its text if it is the first flight with its verdict."""
+        """Count a finished flight; print its text if no earlier flight had the same verdict."""
         self._done += 1
         self._failed += row["verdict"] != "success"
         if row["text"] and row["verdict"] not in self._told:

@@ -205,7 +205,7 @@ def _rows(
 
 
 def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
-    """Fly and return the row; if the job asks for a recording, fly again with a recording."""
+    """Fly a job's flight and return its row; if the job asks for a recording, fly again for it."""
     from cloudrc.sweep.flight import fly_point
     from cloudrc.sweep.store import make_row
 

@@ -167,7 +167,7 @@ class CloudEndpoint(TunnelEnd):
 
     @property
     def mission_over(self) -> bool:
-        """Whether the mission has ended, and the robot confirmed the end or GIVE_UP_NS passed."""
+        """Whether the mission has ended, and the robot knows it or cloud gave up telling it."""
         done = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
         return done and self.teleop.outcome is not None
 

@@ -166,7 +166,7 @@ class ControlLoop:
         self._call("predictor", self._predictor.observe, telemetry.odometry)
 
     def expect(self, round_trip: float) -> None:
-        """Use a round trip [s] as the horizon until a command has been echoed."""
+        """Use `round_trip` [s] as the horizon until telemetry has echoed a command."""
         self._expected = round_trip
 
     def observe_late(self, telemetry: Telemetry, now_ns: int) -> None:
@@ -353,7 +353,7 @@ class ControlLoop:
             self._note(kind, error, "cloud goes on using it")
 
     def _note(self, kind: str, error: BaseException, instead: str = "") -> None:
-        """Count a failure of a plug-in; report the first failure of each kind of plug-in."""
+        """Count a plug-in's failure; report the first of a kind, and what cloud does instead."""
         code = f"{kind}_failed"
         self.counts[code] += 1
         if self.counts[code] == 1:

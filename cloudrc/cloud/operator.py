@@ -75,7 +75,7 @@ def make_robot_status(
 
 
 class EmergencyStopRepeater:
-    """Number an emergency stop, and repeat it until telemetry shows that the robot has obeyed.
+    """Give an emergency stop a number; repeat it until telemetry shows that the robot has obeyed.
 
     Teleop may request the stop any number of times. The stop waits while there is no session.
 
@@ -103,7 +103,7 @@ class EmergencyStopRepeater:
             self.sounds = False
 
     def acknowledge(self) -> None:
-        """End the repetition if the robot is stopped: the operator acknowledges the stop."""
+        """Process the operator's acknowledgement: if the robot has stopped, end the repetition."""
         self.sounds = self.sounds and not self._stopped
 
     def due(self, asked: int, now_ns: int) -> OperatorRequest | None:

@@ -81,7 +81,7 @@ def speed_cap(command_age_max_ms: float, plan_max_s: float = 0.0) -> float:
 
 
 class ResolvedGuard(Guard):
-    """The section `guard` with a value for each limit."""
+    """The section `guard`, in which every limit has a value."""
 
     command_age_max_ms: CommandAge = COMMAND_AGE_MAX_MS
     plan_max_s: PlanMax = 0.0
@@ -218,7 +218,7 @@ def local_files(value: Any, key: str = "") -> dict[str, str]:
 
 
 def _is_inside_name(path: KeyPath) -> bool:
-    """Whether a key is inside the mission or a direction, which may come from another file."""
+    """Return whether a key is inside `mission` or a direction: sections that a name can replace."""
     is_direction = path[0] == "link" and len(path) > 2 and path[1] in DIRECTIONS
     return is_direction or (path[0] == "mission" and len(path) > 1)
 

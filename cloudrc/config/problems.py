@@ -32,7 +32,7 @@ _LISTED = 50
 
 
 def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPath, FieldInfo]]:
-    """Yield path and field of each key that is no section; "0" stands for any list index."""
+    """Yield path and field of each key below `above` with a plain value; a list index is "0"."""
     for key, info in model.model_fields.items():
         inner = list(_models(info.annotation))
         many = ("0",) if _is_list(info.annotation) else ()

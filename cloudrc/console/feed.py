@@ -44,13 +44,13 @@ class Sample(NamedTuple):
 
 
 class FlightFeed:
-    """The present state of a flight, from the records of the tap.
+    """The present state of a flight, from the records that cloud sends to the tap.
 
     Attributes:
         telemetry: The newest telemetry; None before the first.
         control: The newest control period; None while cloud does not control the robot.
         samples: Points of the charts, oldest first.
-        flown: Number of points that were added to the trail so far.
+        flown: Number of points added so far to the trail, the line that shows the robot's path.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -95,7 +95,7 @@ class FlightFeed:
         return told.echo_hold_ns * 1e-9 + self.silence(now)
 
     def controls(self, now: float) -> bool:
-        """Return whether cloud controls the robot at `now` [s]; never on the ground."""
+        """Return whether cloud controls the robot at `now` [s]; False for a robot on the ground."""
         grounded = self.telemetry is not None and self.telemetry.guard == GuardState.GROUND
         return now - self._controlled < STALE and not grounded
 

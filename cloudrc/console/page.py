@@ -234,7 +234,7 @@ class Page:
                     slider.value = shown
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        """Give the controls to a new browser if no other has them."""
+        """Give the controls to a new browser if no other browser has them."""
         with self._lock:
             is_pilot = self._pilot is None
             if is_pilot:
@@ -393,5 +393,5 @@ def _with_gaps(curve: Array) -> list[float | None]:
 
 
 def _visible(position: Vector, orientation_wxyz: Quaternion) -> tuple[Any, Any]:
-    """Round a pose to what is visible, so that a robot at rest costs the browser no drawing."""
+    """Round a pose to steps too small to see, so that the browser redraws only a moving robot."""
     return np.round(position, 3), np.round(orientation_wxyz, 3)

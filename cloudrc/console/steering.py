@@ -109,7 +109,7 @@ class Steering:
         return True
 
     def say(self, text: str, *, is_refusal: bool = False) -> None:
-        """Show a text as the newest answer."""
+        """Make `text` the newest answer on the page; `is_refusal` marks it as a refused request."""
         self.answer = text, is_refusal, time.monotonic()
 
     def cancel(self) -> None:
@@ -138,7 +138,7 @@ class Steering:
         return self.ask(f"flying to ({x:g}, {y:g}, {z:g})", "/v1/goto", {"position_m": (x, y, z)})
 
     def hold_key(self, key: str, velocity: Vector, lasts: float) -> None:
-        """Add `velocity` [m/s] to the drive for `lasts` [s] from now on, because `key` is held."""
+        """Add `velocity` [m/s] to the driving velocity for `lasts` [s], because `key` is held."""
         now = time.monotonic()
         before = self.velocity(now)
         self._held = {**self._held, key: (velocity, now + lasts)}

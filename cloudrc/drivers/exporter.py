@@ -158,7 +158,7 @@ class Exporter:
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Set whether teleop or the link is ready; the records show if world or cloud is ready."""
+        """Set whether teleop or the link is ready; for world and cloud, the records show this."""
         self._seen_at = time.monotonic()
         self._said_ready = ready
 

@@ -80,7 +80,7 @@ class Deadline:
         self.pause = 0.0
 
     def passed(self) -> bool:
-        """Return whether the limit has passed. The caller's loop calls this in every iteration."""
+        """Return whether the time limit has passed; the caller's loop calls this in every turn."""
         now = self._clock()
         turn, self._before = now - self._before, now
         if turn > self._turn_max:

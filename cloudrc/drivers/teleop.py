@@ -85,9 +85,9 @@ class UnixPeer:
         return messages
 
     def send(self, message: Any) -> bool:
-        """Send a message, or an empty datagram for None; return whether it was accepted.
+        """Send a message; None sends an empty datagram. Return whether the datagram was accepted.
 
-        The socket of the other process accepts a message unless its queue is full.
+        False means that the other process does not run, or that the queue of its socket is full.
         """
         data = b"" if message is None else self._encode(message)
         try:
@@ -244,7 +244,7 @@ class TeleopLoop:
         self._send(machine.take_outputs())
 
     def _send(self, outputs: Sequence[Any]) -> None:
-        """Send the unsent events, then new outputs; pass new events and faults to `tell`."""
+        """Send all unsent events, then `outputs`; call `tell` with the new events and faults."""
         unsent, peer = self._unsent, self._peer
         while unsent and peer.send(unsent[0]):
             unsent.popleft()

@@ -23,7 +23,7 @@ class StudentController(Controller):
         """Forget the integral and everything else: a new mission begins."""
 
     def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
-        """Return u [m/s], `dt` [s] after the last call; both inputs have a `position` [m]."""
+        """Return the velocity u [m/s] from two positions [m]; the last call was `dt` [s] ago."""
         return ControlOutput(velocity=ZERO, yaw_rate=0.0)  # Your code: eqs. (4) and (5).
 
 

@@ -329,7 +329,7 @@ class Link:
         self._delays: dict[str, float] = {}
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set the shaper of a direction, "relay" or "netem", and the mode in the configuration."""
+        """Set a direction's present shaper, "relay" or "netem", and the setting `link.mode`."""
         self._shapers[direction] = (shaper, direction, mode)
 
     def asked(self, direction: str, delay: float) -> None:

@@ -59,7 +59,7 @@ def held_in_time(outcome: Outcome, flight: Flight, text: str = "HOLD after") -> 
 
 
 def basis_age_at_hold(flight: Flight) -> float:
-    """Return the largest age of the last command's odometry at the beginning of a HOLD [s]."""
+    """Return how old the last command's odometry was when a HOLD began: the largest age [s]."""
     applied = [(r.stamp_ns, r.basis_stamp_ns) for r in flight.of_world if type(r) is CommandApplied]
     ages = []
     for change in held(flight):
@@ -90,7 +90,7 @@ def told(records: Iterable[Record], code: str) -> list[Fault]:
 
 
 def events_of_missions(flight: Flight, name: str) -> list[dict[str, Any]]:
-    """Return the events with this name in teleop's log; none while teleop is not running."""
+    """Return the events called `name` in teleop's log; an empty list while teleop does not run."""
     service = flight.teleop.service
     events = service.book.events_after(0) if service is not None else []
     return [event for event in events if event["event"] == name]

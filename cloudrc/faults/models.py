@@ -69,7 +69,7 @@ class RestartableEndpoint:
         self._set_deadline()
 
     def start(self, now_ns: int) -> None:
-        """Start a new process at `now_ns` [ns]."""
+        """Start a new process of world or cloud at `now_ns` [ns, virtual time]."""
         self.inner = self._build(self.clock.at(now_ns))
         self._set_deadline()
 
@@ -215,7 +215,7 @@ class TeleopModel:
 
         Args:
             contact_speed_max: Limit of the speed of the arm's tip at the board [m/s].
-            phase_ns: First wake of teleop's process [ns, virtual time].
+            phase_ns: Time at which teleop's process wakes for the first time [ns, virtual time].
         """
         self._contact_speed_max, self._phase_ns, self._starts = contact_speed_max, phase_ns, 0
         self._disk = b""  # the bytes of its database

@@ -146,7 +146,7 @@ def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> Direction
 
 
 def _change(profile: DirectionProfile, active: list[Event], at: float) -> Change:
-    """Return the conditions at the time `at` [s] with all faults that are active then."""
+    """Return the link's conditions from `at` [s] on: the profile with the `active` faults."""
     delay, jitter, loss = profile.delay, profile.jitter, profile.loss
     for event in active:
         if event.kind == "delay":
@@ -164,7 +164,7 @@ _SCHEDULE = TypeAdapter(Schedule)
 
 
 def dump(schedule: Schedule, note: str = "") -> str:
-    """Format a schedule as YAML, with a note at the top."""
+    """Format a schedule as YAML, with `note` as a comment at the top."""
     document = _SCHEDULE.dump_python(schedule, mode="json", exclude_defaults=True)
     head = "".join(f"# {line}\n" for line in note.splitlines())
     text: str = yaml.safe_dump(document, sort_keys=False, width=100)

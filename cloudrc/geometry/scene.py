@@ -60,8 +60,8 @@ class Scene:
 def load_scene(name: str) -> Scene:
     """Read a scene by the path of an .xml file, or a shipped scene by its file name without .xml.
 
-    Raise a BadInputError if the file does not exist, or if its numbers have another form than in
-    the table above.
+    Raise a BadInputError if the file does not exist, or if its numbers do not have the form in the
+    table at the top of this module.
     """
     path = Path(name) if name.endswith(".xml") else SCENES / f"{name}.xml"
     try:

@@ -61,7 +61,7 @@ class ProfileFile:
         self._seen: object = None
 
     def first(self) -> Loaded:
-        """Read the file at the start; raise a BadInputError if the profile is invalid."""
+        """Read the file for the first time; raise a BadInputError if the profile is invalid."""
         self._seen = version(self._path)
         return self._read()
 
@@ -154,7 +154,7 @@ class Profiles:
         return loaded
 
     def poll(self) -> Loaded | None:
-        """Return the profile of a change that has arrived; None if no change has arrived."""
+        """Return the next changed profile; None if the requested profile has not changed."""
         for source in self._sources:
             loaded = source.poll()
             if loaded is None:

@@ -96,8 +96,8 @@ def find_netems(run: Run, host: str) -> dict[str, Any]:
     """Find the interface to a host, and all netem qdiscs of this pod; {} if `ip` or `tc` fails.
 
     Returns:
-        `interface`, and `netems`: interface -> its netem qdiscs, if it has any, as objects of
-        `tc -s -j qdisc show`.
+        `interface`, and `netems`: interface -> its netem qdiscs, as `tc -s -j qdisc show` lists
+        them; interfaces without a netem qdisc are left out.
     """
     netems = dict[str, list[dict[str, Any]]]()
     try:
@@ -128,8 +128,8 @@ def table(profile: DirectionProfile) -> list[int]:
     """Compute netem's table for the distribution of a profile.
 
     Returns:
-        Quantiles at the probabilities (n + 0.5) / 4096, rising, rounded, shape (4096,). Their unit
-        is the profile's jitter times `stretch` / 8192.
+        Quantiles at the probabilities (n + 0.5) / 4096, in rising order, shape (4096,). They are
+        whole multiples of jitter · `stretch(profile)` / 8192.
     """
     if profile.distribution == "table":
         places = (2 * np.arange(ENTRIES) + 1) * len(profile.table) // (2 * ENTRIES)

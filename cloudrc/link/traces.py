@@ -82,7 +82,7 @@ def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
 def parse_trace(lines: Iterable[str], name: str) -> Trace:
     """Parse the lines of the trace file `name`; raise the errors of `read_trace`.
 
-    If the first row is later than `START_MAX`, time 0 is the first row.
+    If the time of the first row is above `START_MAX`, the first row becomes time 0.
     """
     place = f"trace {name}"
     columns, rows = read_rows(lines, place)

@@ -57,7 +57,7 @@ def find(choice: str) -> Metric:
 
 
 def name_of(choice: str) -> str:
-    """Return a metric's name in report.json; for a file, the file name without `.py`."""
+    """Return a metric's name in report.json; if `choice` is a path, the file name without `.py`."""
     return Path(choice).stem if plugins.is_path(choice) else choice
 
 

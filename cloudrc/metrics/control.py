@@ -10,7 +10,7 @@ from cloudrc.metrics.flight import Columns, Flight, add_metrics, mean, percentil
 def round_trips(flight: Flight) -> Columns:
     """Select the control periods in which cloud measured a new round trip.
 
-    All other periods repeat the values of the last round trip, for seconds if the link is silent.
+    All other periods repeat the last measured values, for seconds on end if the link is silent.
     """
     control = flight.control
     pair = np.stack([control["rtt"], control["loop_delay"]], axis=1)
@@ -50,7 +50,7 @@ def _delay_error(flight: Flight) -> float | None:
 
 
 def wakes(flight: Flight, end: str) -> Columns:
-    """Select the rows of /lateness from `end`, "world" or "cloud"; none in virtual time."""
+    """Select the rows of /lateness that `end` ("world", "cloud") recorded; none in virtual time."""
     columns = flight.during("/lateness")
     rows = columns["end"] == end
     return {name: column[rows] for name, column in columns.items()}

@@ -92,9 +92,10 @@ def _measure(flight: Flight, row: int, end_ns: int) -> Step | None:
 
 
 def _integral(values: Array, times: Array) -> float:
-    """Integrate values over time [s] by the trapezoidal rule; `numpy.trapezoid` needs numpy 2.
+    """Integrate `values` over `times` [s] by the trapezoidal rule.
 
-    This function avoids `@`, whose last bit depends on the place of the arrays in memory.
+    `numpy.trapezoid` would need numpy 2. The last bit of `@` would depend on the arrays' place in
+    memory.
     """
     return float(((values[1:] + values[:-1]) / 2 * np.diff(times)).sum())
 

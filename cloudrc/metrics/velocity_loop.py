@@ -43,9 +43,9 @@ class Fit(NamedTuple):
 
 
 def series(recording: Recording, name: str) -> tuple[Array, Array]:
-    """Return the velocities of INPUT and OUTPUT [m/s], shape (n, 3), at steps of DT.
+    """Return the commanded and the measured velocity [m/s], one sample per `DT`, shape (n, 3) each.
 
-    The samples are from the longest time in TRACK, without the take-off. `name` is the recording's
+    The samples are from the longest phase in TRACK, without its take-off. `name` is the recording's
     name in error messages.
     """
     for topic in (INPUT, OUTPUT, "/guard"):

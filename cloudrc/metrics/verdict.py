@@ -161,7 +161,7 @@ def _too_slow(factor: float) -> str:
 def flight_evidence(
     flight: Flight, numbers: Mapping[str, Number], *, real_time: bool, interrupted: bool
 ) -> Evidence:
-    """Collect the evidence from the recorded truth and from the metrics of a flight.
+    """Collect the evidence for the verdict from the records and from the metrics of a flight.
 
     `real_time` is True if the run had to keep real time: in all modes except virtual. `interrupted`
     is True if the run was stopped, or if its recording has no end.

@@ -105,7 +105,7 @@ class Recording:
     def __init__(
         self, make_table: Callable[[Topic], Table], contents: Contents | None = None
     ) -> None:
-        """Set the function that makes a table; most callers use `read` or `from_records`."""
+        """Set the function that makes a topic's table; `read` and `from_records` call this."""
         self._make_table = make_table
         self._tables: dict[str, Table] = {}
         self.metadata: Mapping[str, str] = contents.metadata if contents else {}

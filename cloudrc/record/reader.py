@@ -288,7 +288,7 @@ def read_contents(path: Path) -> Contents:
 
 
 def _note(file: _File) -> None:
-    """Write into the contents of a file what is missing from them, in words."""
+    """Describe in words what a file lacks; store the texts in the file's `contents`."""
     contents, fault = file.contents, file.fault
     changed, metadata = list[str](), contents.metadata
     if file.data_ended and file.cut:

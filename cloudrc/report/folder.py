@@ -87,10 +87,10 @@ def _read_merged(folder: Path) -> Contents | None:
 
 
 def _lacking(recording: Recording, config: Path, *, whole: bool) -> Iterator[str]:
-    """Yield the reasons why a recording is not sufficient for a report, the clearest reason first.
+    """Yield the reasons why a recording is not sufficient for a report, the best explanation first.
 
-    `config` is the path of config.yaml. `whole` tells whether the earlier report was made from a
-    complete recording.
+    `config` is the path of the run's config.yaml. `whole` tells whether the run already has a
+    report, made from a complete recording.
     """
     if not any(len(recording[topic]) for topic in TOPICS):
         yield "; ".join(["holds no message of cloudrc", *recording.remarks])

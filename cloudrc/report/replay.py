@@ -29,7 +29,7 @@ STALE = 0.5
 
 
 def write_section(flight: Flight, experiment: ResolvedExperiment) -> str:
-    """Return the replay as a section of a page.
+    """Return the replay of a flight as a section of an HTML page.
 
     Raises:
         BadInputError: If the robot never flew, or if its model or scene cannot be read.

@@ -1,4 +1,4 @@
-"""Build robot, pipes and board from flat convex polygons, for the overview and for viewers."""
+"""Build robot, pipes and board from flat convex polygons, for the overview figure and viewers."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ _Entry: TypeAlias = tuple[str, Any, Source]
 
 
 class SweepFile(Section):
-    """The keys of the file of a sweep."""
+    """The content of a sweep file, as YAML keys."""
 
     experiment: str = "paper"
     """Name or path of the experiment"""

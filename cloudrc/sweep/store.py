@@ -35,7 +35,7 @@ def make_row(flight: Flight, flown: Row) -> Row:
 
 
 def read_rows(folder: Path) -> dict[str, Row]:
-    """Read the rows of all shards: key -> row; the unfinished last line of a file is ignored.
+    """Read the rows of all files: a flight's key -> row; ignore an unfinished last line.
 
     Raises:
         BadInputError: If a line is not a row.

@@ -201,8 +201,9 @@ class Teleop:
     def drive(self, now_ns: int, velocity: Vector) -> None:
         """Move the setpoint with `velocity` [m/s], world frame, for at most `HEARTBEAT_NS`.
 
-        The setpoint moves only while telemetry shows that the robot follows commands. Raise
-        BadInputError unless the mission is held, or is a drive that is still starting.
+        The setpoint moves only while telemetry shows that the robot follows commands. While
+        a hand-driven mission is starting, the call has no effect. Otherwise, raise BadInputError if
+        no mission is held.
         """
         if self._plan.by_hand and self.state == STARTING:
             return
@@ -330,10 +331,10 @@ class Teleop:
         return None
 
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
-        """Keep the robot at its position if another teleop has started its mission.
+        """Keep the robot at its position, because another teleop may have started its mission.
 
-        If the robot stands on the ground, or if its mission has ended, teleop also requests the end
-        of that mission.
+        Also request the end of that mission, if the robot stands on the ground, or if this teleop
+        knows that the mission has ended.
         """
         mission_id = seen.mission_id
         over = self._is_ended(mission_id) or (seen.guard is GROUND and mission_id != 0)

@@ -75,7 +75,7 @@ class RequestSender:
         self._pending = self._next = None
 
     def report(self, mission_id: int, reached: int) -> None:
-        """Set the mission and the number of reached waypoints that every request contains."""
+        """Set the progress that every request contains: mission and number of reached waypoints."""
         self._progress = self._progress._replace(mission_id=mission_id, reached=reached)
         if self._pending is None:
             self._due_ns = 0

@@ -67,7 +67,7 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
     """Describe what the robot does next, or what the operator has to do.
 
     `age` is the age of the telemetry [s], `cloud_age` the age of the last message from cloud [s],
-    and `mission` the state of the mission under way: `DRIVEN` in a drive, None without a mission.
+    and `mission` the state of the mission under way: `DRIVEN` if driven by hand, None without one.
     """
     if age > SILENCE:
         return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD

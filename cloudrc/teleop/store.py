@@ -120,7 +120,7 @@ class StoreLockedError(CloudrcError):
 
 
 class ConflictError(CloudrcError):
-    """Report a forbidden request; `mission` is the id of the mission in the way, "" if none is."""
+    """Report a forbidden request; `mission` is the id of the blocking mission, "" without one."""
 
     exit_code = 5
 
@@ -198,6 +198,7 @@ class MissionStore:
 
         The ids of every new file begin with "m1". The robot stores progress by mission number;
         the random bytes `salt` make these numbers differ from those of an earlier file.
+        `notice` tells what happened to a damaged earlier file; "" means that there is none.
         """
         self._db, self._salt = db, salt
         self.notice = notice  # what happened to a damaged earlier file; "" without such a file
@@ -291,7 +292,7 @@ class MissionStore:
         self._db.close()
 
     def _commit(self, new: Mission | None = None, old: Sequence[str] = ()) -> None:
-        """Write all events that are not on the disk, and a new mission; delete old missions."""
+        """Write unsaved events and the mission `new` to the disk; delete missions `old` there."""
         db = self._db
         try:
             db.execute("BEGIN")

@@ -43,7 +43,7 @@ def is_newer(epoch: int, than: int) -> bool:
 
 
 class HelloAnswer(NamedTuple):
-    """World's answer to a hello: name of the outcome, datagrams, whether a session has begun."""
+    """World's answer to a hello: its outcome, datagrams to send, whether a session has begun."""
 
     outcome: str
     datagrams: list[bytes]

@@ -43,7 +43,7 @@ class NoCipher:
         return body + _NO_TAG
 
     def decrypt(self, nonce: bytes, data: bytes, header: bytes) -> bytes:
-        """Return the body without the tag."""
+        """Return the body: `data` without the tag; nothing is encrypted."""
         return data[:-TAG_SIZE]
 
 
@@ -139,7 +139,7 @@ class Session:
         return kind, epoch, counter, body
 
     def next_counter(self, kind: int) -> int:
-        """Return the counter of the next datagram of this kind."""
+        """Return the counter that the next datagram of a kind will have."""
         return self._counters[kind]
 
     def follow_keys(self) -> None:

@@ -38,7 +38,7 @@ class Estimator:
         """
 
     def horizon(self, age: float) -> float:
-        """Return the horizon for a command that leaves now [s]; 0 before the first sample.
+        """Return the horizon [s] for a command that leaves now; 0 before the first sample.
 
         Args:
             age: Now on cloud's clock minus the newest odometry's stamp on world's clock [s]: the

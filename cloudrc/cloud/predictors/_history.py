@@ -154,7 +154,7 @@ class Body(Model):
         return self.odometry()
 
     def odometry(self) -> Odometry:
-        """Return the state as odometry; the orientation turns at the measured rate."""
+        """Return the predicted state as odometry; the orientation turns at the measured rate."""
         _, _, orientation, _, rate = self.basis
         return Odometry(
             self.basis.stamp_ns + round(self.horizon * 1e9),

@@ -24,11 +24,11 @@ SETTLED = 2.0
 def _check_no_effect(
     outcome: Outcome, seed: int, makes: Sequence[Make], *refusals: str, since: float = 0.0
 ) -> None:
-    """Fly with and without hostile datagrams; both flights must be equal.
+    """Fly with and without hostile datagrams; check that both flights are equal.
 
     Hostile datagrams are sent from `since` [s] on. The first function in `makes` makes datagrams
-    for world, an optional second function makes datagrams for cloud. World's counters `refusals`
-    must rise.
+    for world, an optional second function makes datagrams for cloud. `refusals` are names of
+    world's counters that must rise.
     """
     clean, flight, sent = Flight(seed=seed).fly_mission(), Flight(seed=seed), list[int]()
 

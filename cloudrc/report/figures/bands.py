@@ -1,4 +1,4 @@
-"""Draw the figure of a sweep: one panel per quantity; in it, one line with a band per setting."""
+"""Draw the figure of a sweep: a panel per quantity, a line per setting, an interval per point."""
 
 from __future__ import annotations
 

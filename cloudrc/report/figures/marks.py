@@ -28,7 +28,7 @@ HELD = " Red: the guard was in HOLD."
 
 
 def delays_of(direction: Direction) -> Timeline | None:
-    """Return the conditions of a link profile over time; None if its files cannot be read."""
+    """Return a direction's conditions over time; None if a file of its profile cannot be read."""
     try:
         return Timeline(link_profile(direction))
     except BadInputError:

@@ -52,7 +52,7 @@ RC: dict[Any, Any] = {
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Size of figures in print."""
+    """Width and font size of figures in print."""
 
     width: float = PAGE  # of the figure [in]
     font_size: float = 9.0  # of titles and labels; numbers at axes are 1 point smaller [points]
@@ -64,7 +64,7 @@ class Look:
         return {**RC, "font.size": self.font_size, **dict.fromkeys(small, self.font_size - 1.0)}
 
     def two_panels(self) -> tuple[Figure, list[Axes]]:
-        """Make a figure with two panels, below each other if it is narrow."""
+        """Make a figure with two panels, one below the other if the figure is narrow."""
         narrow = self.width < NARROW
         figure = new_figure(4.16 if narrow else 2.6, self.width)
         return figure, [*(figure.subplots(2, 1) if narrow else figure.subplots(1, 2))]

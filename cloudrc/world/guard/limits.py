@@ -206,8 +206,9 @@ class Limits:
     def __post_init__(self) -> None:
         """Check the limits; raise a ValueError that names the first invalid limit.
 
-        Each limit has to be finite and above 0, `plan_max_ns` may be 0. The robot has to stop in
-        time from `speed_max` with a command as old as `command_age_max_ns` and the rest of a plan.
+        Each limit has to be finite and above 0; only `plan_max_ns` may be 0. From `speed_max` the
+        robot has to stop within `STOPPING_DISTANCE`. It starts to brake after the largest age of a
+        command, the longest plan and the reaction time.
         """
         for name in self.__slots__[2:-1]:
             value = getattr(self, name)
