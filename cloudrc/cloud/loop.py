@@ -270,7 +270,7 @@ class ControlLoop:
         return command, control
 
     def take_faults(self) -> list[Fault]:
-        """Return the faults since the last call."""
+        """Return the faults that happened since the last call."""
         faults, self.faults = self.faults, []
         return faults
 

@@ -248,7 +248,7 @@ class _File:
 
     @property
     def lost(self) -> int:
-        """Number of messages that are not in `contents`."""
+        """Number of messages in the file that are not in `contents`."""
         return self.total - len(self.contents.messages) - len(self.contents.views)
 
     def _take_room(self, size: int) -> None:

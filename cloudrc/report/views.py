@@ -82,7 +82,10 @@ def _thin(columns: Columns) -> Columns:
 
 
 def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:
-    """Yield a /tf message per row. `frames`: frame -> columns of position and orientation or ""."""
+    """Yield a /tf message with all `frames` for each row of `columns`.
+
+    `frames`: frame -> name of its position column, name of its orientation column ("": level).
+    """
     for row, stamp_ns in enumerate(columns["stamp_ns"].tolist()):
         parts = [
             part(
