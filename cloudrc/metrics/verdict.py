@@ -217,7 +217,7 @@ def _moment(flight: Flight, stamp_ns: int) -> Moment:
 
 
 def _pipes(flight: Flight, until_ns: float = inf) -> Iterator[Failure]:
-    """Yield a failure for each pipe that the robot touched, up to a stamp [ns]."""
+    """Yield a failure for each pipe that the robot touched at or before `until_ns`."""
     contact = flight.during("/contact")
     for body in sorted({str(body) for body in contact["body"] if str(body).startswith("pipe")}):
         stamps = contact["stamp_ns"][contact["body"] == body]

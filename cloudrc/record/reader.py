@@ -243,7 +243,7 @@ class _File:
 
     @property
     def unread(self) -> int:
-        """Size of the part that was not read [bytes]; 0 if only the index is damaged."""
+        """Size of the part of the file that was not read [bytes]; 0 if only its index is bad."""
         return 0 if self.data_ended and not self.ended else self.size - self.position
 
     @property

@@ -76,7 +76,7 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[View]:
 
 
 def _thin(columns: Columns) -> Columns:
-    """Keep the first row of each `PERIOD_NS`."""
+    """Keep the first row of `columns` in each period of length `PERIOD_NS`."""
     rows = np.flatnonzero(np.diff(columns["stamp_ns"] // PERIOD_NS, prepend=-1))
     return {name: column[rows] for name, column in columns.items()}
 

@@ -110,7 +110,7 @@ def read_plan(path: Path) -> Plan:
 
 
 def flight_key(point: ResolvedExperiment, seed: int) -> str:
-    """Return the key of the flight of a resolved point with a seed."""
+    """Return the key that identifies the flight of a point with a seed."""
     return _key(_everything(point), seed)
 
 
