@@ -181,7 +181,7 @@ class LocalRun:
 
         If `session` is given, the run is a session: teleop waits for missions, all processes serve
         metrics, and the recordings contain only the flights. When all processes are ready,
-        `session` is called with the API's address and a mapping: process -> HOST:PORT of its metrics.
+        `session` gets the API's address and a mapping: process -> HOST:PORT of its metrics.
         """
         self._folder, self._see, self._api, self._session = folder, see, api, session
         self._metrics: dict[str, str] = {}
