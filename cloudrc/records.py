@@ -34,7 +34,7 @@ class LinkChanged(NamedTuple):
 
 
 class LinkChecked(NamedTuple):
-    """Driver, in real time only: verdict on one quantity of the link. Topic /link_check.
+    """Driver: verdict on one quantity of the link, recorded in real time only. Topic /link_check.
 
     Cloud judges the uplink, and world judges the downlink, from the datagrams of the last 60 s. The
     quantity is "mean", "deviation", "round_trip", "loss", "reordered" or "duplicated", or one that
@@ -70,7 +70,7 @@ class TelemetrySent(NamedTuple):
 
 
 class GroundTruth(NamedTuple):
-    """World: the true state, once per odometry. Topics /ground_truth and /reference."""
+    """World: the true robot state at each odometry sample. Topics /ground_truth and /reference."""
 
     stamp_ns: int
     odometry: Odometry  # true pose and twist
@@ -183,8 +183,8 @@ FAILURES = (
 class MissionEvent(NamedTuple):
     """Cloud: an event of the mission. Topic /mission.
 
-    During the mission, `event` is in `UNDER_WAY`. At its end, `event` is "done", "cancelled" or in
-    `FAILURES`.
+    During the mission, `event` is one of `UNDER_WAY`. At the end of the mission, `event` is "done",
+    "cancelled" or one of `FAILURES`.
     """
 
     stamp_ns: int

@@ -133,7 +133,7 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
 
 
 def as_text(document: Mapping[str, Any]) -> str:
-    """Format the result of a comparison: a table and, in the last lines, the answer."""
+    """Format the result of a comparison: a table and, in the last lines, the conclusion."""
     from cloudrc.sweep.compare import LEFT_OUT
 
     body = [_row(name, entry) for name, entry in document["numbers"].items()]

@@ -91,7 +91,7 @@ def native_steps() -> Check:
 
 
 def _last_line(program: str) -> str:
-    """Run a Python program; return the last line of its output or, without output, of its error.
+    """Run a Python program; return the last line of its output or, without output, of stderr.
 
     The program runs in a new process, because a broken library may abort the process.
     """

@@ -116,7 +116,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Run the chosen action."""
+    """Run the action that the user has chosen, such as `set`; return the exit code."""
     if options.action is None:
         raise BadInputError("an action is missing; see 'cloudrc link --help'")
     code: int = options.act(options)

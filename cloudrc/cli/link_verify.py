@@ -105,7 +105,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
-    """Read the experiment `target`, or the default experiment with the link profile `target`."""
+    """Read the experiment `target`; if `target` is a profile, the default experiment with it."""
     experiments, profiles = shipped.names("experiment"), shipped.names("profile")
     is_profile = target not in experiments
     if shipped.is_path(target):
@@ -204,7 +204,7 @@ def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, 
 def run_link(
     experiment: ResolvedExperiment, shaper: str, applied: Profile | None = None
 ) -> Iterator[dict[str, Way]]:
-    """Run both directions of a link while the `with` block runs.
+    """Run both directions of a link during a `with` block; yield a mapping: direction -> `Way`.
 
     The relay runs on loopback; netem runs in two network namespaces.
 

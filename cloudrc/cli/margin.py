@@ -124,7 +124,10 @@ def _present(experiment: ResolvedExperiment, key: str) -> float:
 
 
 def _try(options: argparse.Namespace, value: float, *, first: bool) -> Trial:
-    """Fly all seeds with one value of the key, until a flight fails."""
+    """Fly one seed after the other with the key set to `value`, until a flight fails.
+
+    If `first`, an invalid `value` raises a BadInputError; otherwise it is not stable.
+    """
     from cloudrc.cli.run import load
     from cloudrc.sweep.flight import fly_point
 

@@ -173,7 +173,7 @@ def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Pars
 
 
 def _find_command(name: str) -> Any:
-    """Return the module or `Command` that has a command's functions `arguments` and `execute`."""
+    """Return the module or `Command` with the functions `arguments` and `execute` of a command."""
     if name in SHARED:
         return getattr(importlib.import_module(f"cloudrc.cli.{SHARED[name]}"), name)
     module = "class_" if name == "class" else name  # a keyword of Python

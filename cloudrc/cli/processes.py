@@ -477,7 +477,7 @@ class RelayControl:
             self._publish(way, loaded)
 
     def swap(self) -> None:
-        """Apply the requested profiles between two datagrams, in the thread of the relay's loop."""
+        """Apply the requested profiles; the relay's loop calls this between two datagrams."""
         for way, loaded in self._requested.items():
             if loaded is not self._applied[way]:
                 self._relay.take_in()

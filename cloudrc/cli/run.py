@@ -287,7 +287,8 @@ def _record_virtual(
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
     """Fly in virtual time, and yield the recording, the experiment and facts about the run.
 
-    The caller writes the report in the `with` block; then the recording gets a copy of the report.
+    The caller writes the report in the `with` block. After the block, this function attaches a copy
+    of the report to mission.mcap.
     """
     from cloudrc import assembly
     from cloudrc.record.columns import RecordStore, merged

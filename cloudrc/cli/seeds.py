@@ -26,10 +26,10 @@ METHOD = "95 % interval of the median, by order statistics"
 
 
 def summarise(rows: Sequence[Row], units: Mapping[str, str]) -> dict[str, Any]:
-    """Count all runs and successful runs; compute median and interval of each measurement.
+    """Count all runs and successful runs; compute the median of each measurement.
 
-    A run whose plug-in failed is counted, but its measurements are left out.
-    `units`: metric -> unit.
+    Each median has a confidence interval. A run whose plug-in failed is counted, but its
+    measurements are left out. `units`: metric -> unit.
     """
     numbers, measured = {}, [row["numbers"] for row in rows if counts(row)]
     for name in dict.fromkeys(name for each in measured for name in each):

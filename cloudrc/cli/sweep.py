@@ -195,7 +195,7 @@ def _plan(options: argparse.Namespace) -> Plan:
 def _rows(
     options: argparse.Namespace, plan: Plan, jobs: list[tuple[Flight, str | None, Path]]
 ) -> Generator[Row]:
-    """Fly here or in pods, and yield each row as soon as it is there."""
+    """Fly the jobs on this machine or in pods; yield the row of each flight when it ends."""
     if options.on:
         yield from rows_from_pods(options, plan, [flight for flight, _, _ in jobs])
         return
@@ -258,7 +258,7 @@ def fly_again(options: argparse.Namespace) -> int:
 
 
 def print_status(options: argparse.Namespace) -> int:
-    """Print how many flights of a sweep are done, and the successful ones per value of an axis."""
+    """Print how many flights of a sweep are done, and how many succeeded per value of an axis."""
     from cloudrc.sweep import store
 
     summary = store.read_summary(options.folder)

@@ -141,8 +141,9 @@ def ending(
 ) -> Callable[[], bool]:
     """Return a function that tells whether teleop's process may end.
 
-    Once `asked()` is true, the function pauses the mission, and returns True when the robot holds
-    its position, or after `PAUSE_LIMIT_NS`. With `single`, it also returns True after the mission.
+    Once `asked()` is true, that function pauses the mission; it returns True when the robot holds
+    its position, or after `PAUSE_LIMIT_NS`. Before, it returns True only with `single`, when the
+    mission is over.
     """
     until_ns = 0
 

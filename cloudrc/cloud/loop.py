@@ -170,7 +170,7 @@ class ControlLoop:
         self._expected = round_trip
 
     def observe_late(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Process telemetry that arrived after newer telemetry; only its echo is used."""
+        """Process telemetry that arrived after newer telemetry: use only its echo of a command."""
         self._now_ns = now_ns
         self._call("estimator", self._observe_echo, telemetry)
 
@@ -270,7 +270,7 @@ class ControlLoop:
         return command, control
 
     def take_faults(self) -> list[Fault]:
-        """Return the faults since the last call."""
+        """Return the faults that happened since the last call."""
         faults, self.faults = self.faults, []
         return faults
 

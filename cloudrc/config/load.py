@@ -226,7 +226,7 @@ def _is_inside_name(path: KeyPath) -> bool:
 def validate(
     document: Document, model: type[_Model], name: str, found: Sequence[Problem] = ()
 ) -> _Model:
-    """Convert a document to `model`; raise one BadInputError about `found` and new problems."""
+    """Convert a document to `model`; raise one BadInputError for all problems, also `found`."""
     known = {problem.path for problem in found}
     # The user wrote a file: describe what is valid there, for example the name of a mission.
     file_model = Experiment if model is ResolvedExperiment else model

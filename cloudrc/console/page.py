@@ -119,7 +119,7 @@ class Page:
         self._drawn = 0  # number of drawn points of the trail
 
     def fill(self, experiment: ResolvedExperiment, feed: FlightFeed, steering: Steering) -> None:
-        """Build the scene and the panels, and give the controls to the first browser."""
+        """Build the scene and the panels; only the first browser to connect gets the controls."""
         self._experiment, self._feed, self._steering = experiment, feed, steering
         from cloudrc.console.scene import LEGEND, FlightScene  # needs MuJoCo, which takes a second
 
@@ -300,7 +300,7 @@ class Page:
         self._steering.fly({**order, "name": experiment.name})
 
     def _add_target(self, client: viser.ClientHandle) -> None:
-        """Add the gizmo and the number fields of the target; a change of one updates the other."""
+        """Add a gizmo and number fields for the target position; a change of one updates both."""
         low, high, start = fence.INNER_LOW, fence.INNER_HIGH, self._place_target(time.monotonic())
         limits = tuple(zip(low, high, strict=True))
         gizmo = client.scene.add_transform_controls(

@@ -144,7 +144,7 @@ class FlightScene:
             self._scene.add_line_segments("/plan", lines, PLAN, thickness=0.03)
 
     def _add_surroundings(self, model: Any, geometry: Scene) -> None:
-        """Add all static shapes: planes as grids, pipes as smooth tubes, others unchanged."""
+        """Add all static shapes: planes as grids, pipes as smooth tubes, others as in the model."""
         pipes = {pipe.name for pipe in geometry.pipes}
         bodies = defaultdict(list)
         for geom in map(int, np.flatnonzero(model.body_weldid[model.geom_bodyid] == 0)):

@@ -206,7 +206,7 @@ class Steering:
             self._moved.clear()
 
     def _link_loop(self) -> None:
-        """Apply the newest settings; collect later settings while a change is under way."""
+        """Apply new settings of the link; collect further settings while a change is under way."""
         while self._changed.wait():
             self._changed.clear()
             settings = []

@@ -179,9 +179,9 @@ class LocalRun:
         The run writes world.mcap, cloud.mcap and four logs there. It calls `see` with the records
         that the processes print. With `api`, teleop serves the operator's API.
 
-        With `session`, the run is a session: teleop waits for missions, all processes serve
-        metrics, and recordings contain only the flights. When all processes are ready, `session`
-        is called with the API's address and a mapping: process -> HOST:PORT of its metrics.
+        If `session` is given, the run is a session: teleop waits for missions, all processes serve
+        metrics, and the recordings contain only the flights. When all processes are ready,
+        `session` gets the API's address and a mapping: process -> HOST:PORT of its metrics.
         """
         self._folder, self._see, self._api, self._session = folder, see, api, session
         self._metrics: dict[str, str] = {}

@@ -1,7 +1,7 @@
 """Run world or cloud as a process: record its data, report to the supervisor, stop on signals.
 
-The process ends on SIGTERM or SIGINT, or when its parent process has ended. It prints its feed to
-standard output: a line of JSON per record. Prints of plug-ins go to standard error.
+The process ends on SIGTERM or SIGINT, or when its parent process has ended. Its standard output is
+a feed: a line of JSON for each event and for some samples. Prints of plug-ins go to standard error.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class StopSignal:
 
 
 class Feed:
-    """Writes selected records to a pipe, without blocking: lines are lost if the pipe is full."""
+    """Writes events and some samples to a pipe, without blocking: a full pipe loses lines."""
 
     def __init__(self, descriptor: int, *, watched: bool = True) -> None:
         """Make the pipe `descriptor` non-blocking.
@@ -141,7 +141,7 @@ class Feed:
                 self._write(to_line(record))
 
     def _is_news(self, record: LinkChanged) -> bool:
-        """Return whether a record shows a change of the link and is not a repetition."""
+        """Return whether a record is the first one about a change of the link."""
         last, self._links[record.uplink] = self._links.get(record.uplink), record.conditions
         return last != record.conditions and bool(record.cause)
 

@@ -76,7 +76,7 @@ class Peer:
 
     @classmethod
     def bind(cls, listen: Address, where: Address | Path) -> Peer:
-        """Bind a socket at `listen`; `where` is the peer's address or a route file."""
+        """Bind a socket at `listen`; `where` is the peer's address or a file that contains it."""
         bound = bind(listen)
         if isinstance(where, Path):
             return cls(bound, None, where)

@@ -34,8 +34,8 @@ class Tap:
     def __init__(self, path: Path, telemetry: Callable[[], Telemetry | None]) -> None:
         """Prepare to send to the socket at `path`, which may appear later.
 
-        `telemetry` returns cloud's newest telemetry, which is in no record of cloud. The tap sends
-        it as a `TelemetrySent` record with epoch and counter 0.
+        `telemetry` returns cloud's newest telemetry, or None. No record of cloud contains it, so
+        the tap sends it as a `TelemetrySent` record, whose epoch and counter are 0.
         """
         self._path, self._telemetry = os.fspath(path), telemetry
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)

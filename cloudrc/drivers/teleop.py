@@ -120,7 +120,7 @@ class RemoteTeleop:
         self.outputs: list[Any] = []
 
     def see(self, seen: Any, now_ns: int) -> None:
-        """Send the robot's state to teleop, at most every `TELL_NS`."""
+        """Send `seen`, the status of the robot, to teleop; at most once per `TELL_NS`."""
         if now_ns >= self._tell_ns:
             self._tell_ns, self._alive_ns = now_ns + TELL_NS, now_ns + ALIVE_NS
             self._peer.send(seen)
@@ -130,8 +130,8 @@ class RemoteTeleop:
     def handle_deadline(self, now_ns: int) -> None:
         """Receive teleop's outputs; report a fault if teleop does not answer telemetry for 1 s.
 
-        After a stall of cloud, ignore outputs that start a mission or lead to a waypoint: teleop
-        may have cancelled them, and the cancellation may be lost. Teleop repeats valid outputs.
+        If cloud has stalled, ignore outputs that start a mission or lead to a waypoint: teleop may
+        have cancelled them, and the cancellation may be lost. Teleop repeats all valid outputs.
         """
         if now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_NS

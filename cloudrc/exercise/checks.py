@@ -37,9 +37,9 @@ STATE = Odometry(10**9, (1.0, -2.0, 0.7), (0.6, 0.0, 0.0, 0.8), (0.5, 0.3, -0.2)
 
 
 def _horizons(build: Callable[[], Any], *delays: float, hold: float = 0.0) -> Any:
-    """Return the horizons [s] of an estimator, first without any delay, then after each delay [s].
+    """Return the horizons [s] of an estimator: before the first delay, and after each delay.
 
-    `delays` are loop delays; each includes the hold time `hold` [s].
+    `delays` are loop delays [s]; each includes the hold time `hold` [s].
     """
     estimator = build()
     seen = [estimator.horizon(7.0)]
@@ -79,7 +79,10 @@ class Formula(NamedTuple):
     measure: Callable[[Callable[..., Any]], Any]
 
     def score(self, files: Mapping[str, str]) -> tuple[float, str]:
-        """Return 1.0 and "right", or raise a BadInputError; `files` maps the part to its path."""
+        """Return 1.0 and "right" if the results agree; otherwise raise a BadInputError.
+
+        `files` has one entry: part of the exercise -> path of the student's file.
+        """
         ((part, path),) = files.items()
         builds = (partial(plugins.load, f"{part}s", name) for name in (path, PARTS[part][2]))
         seen, wanted = (np.asarray(self.measure(build), dtype=float) for build in builds)
@@ -93,7 +96,7 @@ class Formula(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """A flight, scored by a metric: the value `full` earns all points, the value `none` earns 0."""
+    """A flight with a score: the metric's value `full` earns all points, its value `none` none."""
 
     test: str
     points: int

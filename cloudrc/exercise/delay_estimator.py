@@ -16,7 +16,7 @@ class DelayEstimator(Estimator):
         # Your code: eq. (1).
 
     def horizon(self, age: float) -> float:
-        """Return tau [s], which is 0 before the first delay; this estimator ignores `age` [s]."""
+        """Return the horizon tau [s], 0 before the first delay; this estimator ignores `age`."""
         return 0.0  # Your code.
 
 

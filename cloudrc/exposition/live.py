@@ -382,7 +382,7 @@ class Mission:
 
 
 def _read_count(metric: Metric, counts: Mapping[str, int]) -> dict[Labels, float]:
-    """Return the values of a metric that is a count, in s if the count is in ns."""
+    """Return the values of a metric that is a count; convert a count of ns to s."""
     begins_at_0 = metric.kind is Kind.COUNTER and metric.name not in ONE_SHAPER
     found: dict[Labels, float] = {}
     for labels in product(*metric.labels.values()):  # of one label or none

@@ -49,14 +49,14 @@ class DishonestLoop(ControlLoop):
     """Computes honest commands, and changes them before they are sent."""
 
     def __init__(self, lies: Sequence[Lie], *plugins: Any, **limits: Any) -> None:
-        """Set the functions that change each command in turn; `ControlLoop` takes the rest."""
+        """Set `lies`, which change each command in turn; other arguments as for `ControlLoop`."""
         super().__init__(*plugins, **limits)
         self._lies = lies
 
     def command(
         self, setpoint: Setpoint, now_ns: int, dt: float, epoch: int, counter: int
     ) -> tuple[Command, Control]:
-        """Implement `ControlLoop.command`; `dt` is the time since the last command [s]."""
+        """Compute an honest command, and change it; `dt` is the time since the last command [s]."""
         command, control = super().command(setpoint, now_ns, dt, epoch, counter)
         for lie in self._lies:
             command = lie(command, control)
@@ -191,7 +191,7 @@ def _fly(command: Command, velocity: Sequence[float], **others: Any) -> Command:
 
 
 def _towards_a_face(rng: Generator) -> Lie:
-    """Fly towards a wall, an edge or a corner of the fence."""
+    """Command a flight towards a wall, an edge or a corner of the fence."""
     way: list[int] = rng.choice([-1, 0, 1], 3).tolist()
     way = way if any(way) else [0, 0, 1]
     speed = float(rng.choice([2.0, FAST, 40.0, 1e3]))
@@ -314,8 +314,8 @@ def _stop_and_go(rng: Generator) -> Lie:
 def _hostile_plans(rng: Generator) -> Lie:
     """Send plans of random lengths that begin now or later, with jumps and sometimes NaN.
 
-    Some of these clouds alternate plans with plain commands. Others send stale commands for some
-    time, so that the robot flies a plan to its end.
+    Some clouds of this policy mix plans with commands that have no plan. Others send stale
+    commands for some time, so that the robot flies a plan to its end.
     """
     ahead, share = float(rng.choice([0.05, 0.5, 9.9])), float(rng.choice([0.0, 0.5]))
     absurd, old_ns = float(rng.choice([0.0, 0.003])), int(rng.choice([0, 150_000_000, 300_000_000]))

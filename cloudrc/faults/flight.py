@@ -169,7 +169,7 @@ class Flight:
     def guard_now(self) -> tuple[GuardState, str]:
         """Return the guard's present state and its cause; GROUND while world is not running.
 
-        The records do not suffice: a restarted world begins in GROUND without a record.
+        The records do not always show it: a restarted world begins in GROUND without a record.
         """
         if self.world.inner is None:
             return GuardState.GROUND, "the world is down"

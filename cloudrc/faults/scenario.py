@@ -18,7 +18,7 @@ YES = "yes"  # unit of a check that is a statement: its value is 1 if the statem
 
 
 def generator(seed: int, use: int) -> np.random.Generator:
-    """Make a random generator; with the same seed, each `use` gets different random numbers."""
+    """Make a random generator; each number `use` gives an independent sequence for the seed."""
     return np.random.Generator(np.random.PCG64([seed, use]))
 
 
@@ -34,7 +34,7 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether the measured value keeps the limit; False for NaN, which means "not measured"."""
+        """Whether `measured` complies with `limit`; False if `measured` is NaN (not measured)."""
         known = isfinite(self.measured)
         return known and bool(_COMPARE[self.relation](self.measured, self.limit))
 
@@ -94,7 +94,7 @@ Inject: TypeAlias = Callable[[Outcome, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """A fault and the required reaction, in words and as checks."""
+    """A fault, how to inject it, and the reaction that the robot has to show."""
 
     number: int  # in docs/reference/faults.md: 13 for F13
     name: str  # on the command line: cloud-killed
@@ -108,7 +108,7 @@ class Scenario:
         return f"F{self.number}"
 
     def run(self, seed: int) -> Outcome:
-        """Inject the fault with a seed, and check the reaction; store an exception as `error`."""
+        """Inject the fault, and check the reaction; the outcome has the checks or an error."""
         outcome = Outcome()
         try:
             self.inject(outcome, seed)

@@ -35,7 +35,10 @@ class Search:
     """A search and its result so far; `next` is the next seed."""
 
     def __init__(self, kind: str, first: int, store: Path) -> None:
-        """Prepare a search of a kind in `KINDS`; `store` is the folder for failing schedules."""
+        """Prepare a search from the seed `first` on; `kind` is a key of `KINDS`.
+
+        The search writes schedules that break an invariant to the folder `store`.
+        """
         self.kind, self.first, self.next, self._store = kind, first, first, store
         self.failures: list[dict[str, Any]] = []  # schedules that broke an invariant
         self._checked: Counter[str] = Counter()
@@ -119,7 +122,7 @@ def search_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def search_summary(document: dict[str, Any]) -> str:
-    """Describe in one sentence the number of flights and the extreme values."""
+    """Describe a search in one sentence: flights, failures, least distance to fence, top speed."""
     return (
         f"{document['count']} {document['kind']} schedules in {document['seconds']:.0f} s, seeds "
         f"{document['first']} to {document['next'] - 1}: {len(document['failures'])} broken, "

@@ -72,7 +72,7 @@ class Finding:
 
     @property
     def kinds(self) -> set[str]:
-        """Names of the broken invariants."""
+        """Names of the broken invariants, such as "fence"."""
         return {breach.kind for breach in self.breaches}
 
 

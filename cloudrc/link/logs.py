@@ -56,7 +56,7 @@ class Packets(Stream):
 
 @dataclass(slots=True)
 class Log:
-    """The rows that a reader finds in a log."""
+    """The packets that a reader finds in a log, and the number of rows that it left out."""
 
     name: str
     entries: list[Entry] = field(default_factory=list)  # the packets in the order of the log
@@ -212,7 +212,10 @@ def _compare_counts(stats: dict[str, Any], packets: int, replies: int, log: Log)
 
 
 def _check_clocks(arrived: list[dict[str, Any]], log: Log) -> None:
-    """Raise an error if one-way delays are missing, if the clocks differ, or if a clock steps."""
+    """Raise an error if irtt's one-way delays are missing or wrong.
+
+    They are wrong if the clocks of client and server differ, or if one of the clocks steps.
+    """
     if any(not {"send", "receive"} <= trip["delay"].keys() for trip in arrived):
         raise BadInputError(f"{log.name} (irtt's server sent no stamps): has round trips; {HALVE}")
     both = [int(trip["delay"][key]) for trip in arrived for key in ("send", "receive")]
@@ -374,9 +377,9 @@ def _csv_delay(row: Row, column: str, loss: str | None) -> float:
 
 
 def _without_marks(raw: list[Entry], column: str, log: Log, *, has_losses: bool) -> list[Entry]:
-    """Replace each number that marks a lost packet, such as -1, by NaN; count these packets.
+    """Replace by NaN each number that stands for a lost packet, such as -1; count these packets.
 
-    If the log has a column `loss`, 0 is no mark.
+    With `has_losses`, the log has a column `loss`; then 0 never stands for a lost packet.
     """
     values = {value for _, value in raw if not isnan(value)}
     below = {value for value in values if value < 0.0}

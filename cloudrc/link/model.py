@@ -126,7 +126,10 @@ class LinkDirection:
         return dict(self._counts)
 
     def _arrival(self, entry: int, conditions: Conditions, size: int, now_ns: int) -> int | None:
-        """Compute when a copy with impairment `entry` arrives [ns]; None if the queue is full."""
+        """Compute when one copy of a packet arrives [ns]; None if the queue is full.
+
+        `entry` is the extra delay of the copy [ns], or OVERTAKES.
+        """
         arrival = now_ns
         if entry != OVERTAKES:
             if conditions.rate is not None:
@@ -223,7 +226,7 @@ def sample(
 
 
 def numbers(stream: Stream) -> Numbers:
-    """Compute the statistics of a stream."""
+    """Compute the statistics of a stream of packets, such as mean delay and loss."""
     arrived = np.isfinite(stream.delays)
     delays = stream.delays[arrived]
     if not len(delays):

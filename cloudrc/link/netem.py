@@ -371,7 +371,7 @@ class Netem:
         self._device, self._applied = "", []
 
     def _look(self) -> dict[str, int]:
-        """Read the counts of the qdisc; log and count changes by other programs."""
+        """Return the qdisc's packet counts; log and count other programs' changes of the qdisc."""
         self._looked_ns, leaf = self._clock(), leaf_of(self._qdiscs())
         found = leaf and leaf.get("options")
         self._listed = found if self._listed is None and found else self._listed
@@ -390,7 +390,7 @@ class Netem:
         return {name: leaf[key] for name, key in names.items()} if leaf else {}
 
     def _set_up(self) -> None:
-        """Add the qdiscs, or take over the qdiscs of an earlier process."""
+        """Add cloudrc's qdiscs, or take over those that an earlier process has left."""
         qdiscs, place = self._qdiscs(), ("dev", self._device, "root")
         root = _root_of(qdiscs)
         if root["handle"] != "0:" and not _is_ours(root):

@@ -321,9 +321,9 @@ class RelayShaper(Relay):
     ) -> None:
         """Open the two sockets; raise an OSError if `listen` is in use or cannot reach `end`.
 
-        This pod's end of the tunnel sends from `end` (None: any address) to `listen` (port 0: the
-        kernel chooses). The model `direction` has its origin on the monotonic clock. `peek` reads
-        kind, epoch and counter of a datagram.
+        This pod's end of the tunnel sends to the address `listen`; with port 0 the kernel chooses a
+        port. It sends from the address `end`; None allows any address. The times of the model
+        `direction` are on the monotonic clock. `peek` reads kind, epoch and counter of a datagram.
         """
         self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._inside.bind(listen)
@@ -368,7 +368,7 @@ class RelayShaper(Relay):
 
 
 def settle() -> None:
-    """Reduce late wakes: collect garbage rarely, and shorten the turns of other threads."""
+    """Make this process wake up in time: collect garbage rarely, and switch threads sooner."""
     sys.setswitchinterval(_SWITCH_INTERVAL)
     gc.collect()
     gc.freeze()

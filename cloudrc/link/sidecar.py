@@ -134,7 +134,7 @@ class Sidecar:
         return relay, relay.follow_peer(peer)
 
     def _replace(self, shaper: Shaper, profile: Loaded) -> bool:
-        """Apply a new profile; return False if the profile needs the other shaper."""
+        """Apply or refuse a new profile; return False if only the other shaper can apply it."""
         restart = profile.change.restart
         try:
             shaper.follow_profile(profile.direction, restart=restart)

@@ -105,7 +105,7 @@ class StateFile:
         self.state = state
 
     def refuse(self, number: str, refusal: str) -> None:
-        """Write the number of a refused change to the file, and why (`refusal`), in words."""
+        """Write to the file that change `number` was refused; `refusal` is the reason, in words."""
         if self.state is not None:
             self.publish(replace(self.state, refused=number, refusal=refusal))
 

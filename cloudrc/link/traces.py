@@ -131,7 +131,7 @@ def _short(value: float, digits: int) -> str:
 
 
 class Row(NamedTuple):
-    """One row of a CSV file."""
+    """One row of a trace or log in a CSV file."""
 
     where: str  # file and line, for messages
     cells: dict[str, str]  # column -> text without blanks at its ends

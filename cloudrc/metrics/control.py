@@ -27,8 +27,9 @@ def _age_of_information(flight: Flight) -> float | None:
 
 
 def _prediction_error(flight: Flight) -> float | None:
-    """Compute the RMS prediction error [m] when commands are applied; delay errors contribute.
+    """Compute the RMS distance from the predicted to the true position of the robot [m].
 
+    The true position is taken when the robot applies the command: delay errors contribute.
     Source: docs/reference/control.md, "Predictors".
     """
     applied = flight.applied

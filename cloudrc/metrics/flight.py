@@ -201,7 +201,10 @@ def mean(values: Array) -> float | None:
 
 
 def percentile(values: Array, percent: float) -> float | None:
-    """Return a percentile (`percent` [%]) of the finite `values`, shape (n,); None if none is."""
+    """Return the percentile `percent` [%] of the finite `values`, shape (n,).
+
+    Return None if no value is finite.
+    """
     finite = values[np.isfinite(values)]
     return float(np.percentile(finite, percent)) if len(finite) else None
 

@@ -68,9 +68,10 @@ def _waypoints_reached(flight: Flight) -> float | None:
 
 
 def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
-    """Return whether the robot truly stayed near a waypoint for its dwell time before `until_ns`.
+    """Return whether the robot stayed near a waypoint for its dwell time before `until_ns`.
 
-    With a carrot, a stay of any length is enough, because the setpoint waits for the dwell time.
+    The true position counts. If the mission has a `carrot` (a moving setpoint), a stay of any
+    length is enough, because the setpoint waits at the waypoint for the dwell time.
     """
     truth, dwell = flight.truth, 0.0 if flight.mission.carrot else waypoint.dwell_s
     rows = truth["stamp_ns"] <= until_ns
@@ -115,7 +116,10 @@ def _impulse(flight: Flight, touch: dict[str, Array]) -> float:
 
 @_of_touch
 def _steady_force(flight: Flight, touch: dict[str, Array]) -> float | None:
-    """Average the final contact force [N]; the simulator's contact parameters do not matter."""
+    """Average the contact force before the mission's end [N].
+
+    It does not depend on the simulator's contact parameters.
+    """
     if flight.ending is None or flight.ending[1] != "done":
         return None
     begin_ns = flight.ending[0] - PRESSING_NS

@@ -217,7 +217,7 @@ def _moment(flight: Flight, stamp_ns: int) -> Moment:
 
 
 def _pipes(flight: Flight, until_ns: float = inf) -> Iterator[Failure]:
-    """Yield a failure for each pipe that the robot touched, up to a stamp [ns]."""
+    """Yield a failure for each pipe that the robot touched at or before `until_ns`."""
     contact = flight.during("/contact")
     for body in sorted({str(body) for body in contact["body"] if str(body).startswith("pipe")}):
         stamps = contact["stamp_ns"][contact["body"] == body]
@@ -263,7 +263,7 @@ def _plugins(flight: Flight) -> Iterator[Failure]:
 
 
 def _responses(flight: Flight, settle: float) -> Iterator[Failure]:
-    """Yield failures for steps that did not settle within `settle` [m], and for instability."""
+    """Yield a failure if a step did not settle within `settle` [m], and one for instability."""
     found, unit = steps(flight), "step" if flight.mission.steps else "waypoint"
     far = [step for step in found if step.last_error > settle]
     if far and flight.mission.steps:

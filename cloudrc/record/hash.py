@@ -47,7 +47,10 @@ class RecordHash:
                 del block[:BLOCK]
 
     def blocks(self) -> dict[type, list[Columns]]:
-        """Return, by type of record, the columns of each block; the last block may be empty."""
+        """Return a mapping: type of record -> columns of each block of `BLOCK` records.
+
+        The last block contains the remaining records, possibly none.
+        """
         kinds = sorted(self._waiting, key=lambda kind: kind.__name__)
         return {kind: [*self._blocks[kind], to_columns(kind, self._waiting[kind])]
                 for kind in kinds}  # fmt: skip

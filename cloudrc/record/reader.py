@@ -243,12 +243,12 @@ class _File:
 
     @property
     def unread(self) -> int:
-        """Size of the part that was not read [bytes]; 0 if only the index is damaged."""
+        """Size of the part of the file that was not read [bytes]; 0 if only its index is bad."""
         return 0 if self.data_ended and not self.ended else self.size - self.position
 
     @property
     def lost(self) -> int:
-        """Number of messages that are not in `contents`."""
+        """Number of messages in the file that are not in `contents`."""
         return self.total - len(self.contents.messages) - len(self.contents.views)
 
     def _take_room(self, size: int) -> None:

@@ -65,8 +65,8 @@ class McapWriter:
 
         `clock` is "world" or "cloud", the clock of the stamps. `clock_id` identifies the machine's
         clock ("" if unknown); files with the same `clock_id` need no clock offset.
-        `wall_offset_ns` is the wall time minus that clock [ns]; None in virtual time. Without an
-        `index` of its chunks, a file of any length takes constant memory.
+        `wall_offset_ns` is the wall time minus that clock [ns]; None in virtual time. Without
+        `index`, the file gets no index of its chunks, and writing it takes constant memory.
         """
         self._owned = isinstance(target, Path)
         # Unbuffered: mcap's writer has its own buffer, and `abandon` writes past it.
@@ -97,7 +97,7 @@ class McapWriter:
             self.note({WALL_OFFSET: str(wall_offset_ns)})
 
     def write(self, records: Iterable[Record]) -> None:
-        """Write all rows of records from world or from cloud, oldest first."""
+        """Write all rows of `records`, oldest first; all are from world, or all from cloud."""
         for record in records:
             for row in rows(record):
                 self.write_row(row, row[1])

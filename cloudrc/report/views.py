@@ -76,13 +76,16 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[View]:
 
 
 def _thin(columns: Columns) -> Columns:
-    """Keep the first row of each `PERIOD_NS`."""
+    """Keep the first row of `columns` in each period of length `PERIOD_NS`."""
     rows = np.flatnonzero(np.diff(columns["stamp_ns"] // PERIOD_NS, prepend=-1))
     return {name: column[rows] for name, column in columns.items()}
 
 
 def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:
-    """Yield a /tf message per row. `frames`: frame -> columns of position and orientation or ""."""
+    """Yield a /tf message with all `frames` for each row of `columns`.
+
+    `frames`: frame -> name of its position column, name of its orientation column ("": level).
+    """
     for row, stamp_ns in enumerate(columns["stamp_ns"].tolist()):
         parts = [
             part(

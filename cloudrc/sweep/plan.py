@@ -62,7 +62,7 @@ class Flight(NamedTuple):
 
     @property
     def experiment(self) -> ResolvedExperiment:
-        """The experiment with the seed."""
+        """The experiment of the point, with the seed of this flight."""
         return self.resolved.model_copy(update={"seed": self.seed})
 
 
@@ -110,7 +110,7 @@ def read_plan(path: Path) -> Plan:
 
 
 def flight_key(point: ResolvedExperiment, seed: int) -> str:
-    """Return the key of the flight of a resolved point with a seed."""
+    """Return the key that identifies the flight of a point with a seed."""
     return _key(_everything(point), seed)
 
 
@@ -151,7 +151,7 @@ def _seeds(given: Any) -> tuple[int, ...]:
 def _entries(
     document: Document, file: SweepFile, folder: Path, found: list[Problem]
 ) -> tuple[list[_Entry], dict[str, list[tuple[Any, list[_Entry]]]]]:
-    """Return the common settings, and for each axis the label and settings of each choice.
+    """Return the settings of all points, and a mapping: axis -> label and settings per choice.
 
     Problems of the axes are added to `found`.
     """

@@ -169,7 +169,7 @@ def read_flights(folder: Path) -> tuple[list[Row], dict[str, str], str]:
 
 
 def values_of(rows: Sequence[Row]) -> dict[str, list[Any]]:
-    """Return the values of each axis in the order of the grid."""
+    """Return a mapping: axis -> its different values in `rows`, in the order of `rows`."""
     return {axis: list(dict.fromkeys(row["point"][axis] for row in rows))
             for axis in rows[0]["point"]}  # fmt: skip
 

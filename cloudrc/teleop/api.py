@@ -82,7 +82,7 @@ Address: TypeAlias = tuple[str, int] | Path
 
 
 class Bridge:
-    """Pass calls of the mission service from the API's thread to teleop's loop, by queues."""
+    """Passes calls from the API's thread, by queues, to the mission service in teleop's loop."""
 
     def __init__(self) -> None:
         self.closed = STARTING  # why the bridge refuses calls, in words; "" while it accepts calls
@@ -97,7 +97,7 @@ class Bridge:
         self._service, self.closed = service, ""
 
     def close(self, why: str) -> None:
-        """Refuse all calls from now on; answer the waiting stops and holds with an error."""
+        """Refuse all new calls; answer queued stops and holds with an error that says `why`."""
         self.closed = why
         while self._urgent:
             self._urgent.popleft()[1].set_exception(UnavailableError(why))

@@ -164,7 +164,7 @@ class Gate:
         self.counts: Counter[str] = Counter()  # requests by outcome; "served": answered by `app`
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse a request, or pass it to the application without the slash at its path's end."""
+        """Refuse a request, or pass it on to the application; remove a slash at the path's end."""
         path = scope["path"] = scope["path"].rstrip("/") or "/"
         # An event stream calls `caller` again, because the stream can outlast its token.
         caller, scope["caller"] = await self.caller(scope), lambda: self.caller(scope)

@@ -70,9 +70,10 @@ def _profile(setpoint: Setpoint) -> tuple[float, float, float]:
 
 
 def steer(setpoint: Setpoint, velocity: Vector, now_ns: int) -> Setpoint:
-    """Return the setpoint driven with a `velocity` [m/s], world frame, from `now_ns` [ns] on.
+    """Return a setpoint that moves with `velocity` [m/s], world frame, from `now_ns` [ns] on.
 
-    It stays in the box in which the guard lets the robot fly, and slows down before a wall.
+    It begins where `setpoint` is at `now_ns`. It stays in the box in which the guard lets the robot
+    fly, and slows down before a wall.
     """
     start, yaw, _, _, before, _ = setpoint_at(setpoint, now_ns)
     x, y, z = (

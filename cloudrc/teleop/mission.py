@@ -186,7 +186,7 @@ class Teleop:
             self.see(self.seen, now_ns)  # the mission may be over, or world restarted
 
     def go_to(self, now_ns: int, leg: Leg) -> None:
-        """Fly to a point; raise BadInputError unless the mission is held."""
+        """Fly to a point; raise BadInputError if the mission is not in the state `HELD`."""
         self._check("goto", HELD)
         x, y, z = leg.position
         self._report("goto", NO_WAYPOINT, f"go to ({x:.2f}, {y:.2f}, {z:.2f}) m", now_ns)
@@ -432,7 +432,7 @@ class Teleop:
         self._report("held", self.leg, f"held {self.where}", now_ns)
 
     def _end(self, code: str, text: str, now_ns: int, *, where: bool = False) -> None:
-        """End the mission, and ask the robot to hold; with `where`, the text names the waypoint."""
+        """End the mission, and ask the robot to hold; `where` adds the place to the text."""
         text = f"{text} {self.where}" if where else text
         waypoint = min(self.leg, len(self._plan.legs) - 1)
         if code != "done" and self._mission_id:

@@ -96,7 +96,7 @@ class _Answer(BaseModel):
 
 
 class Reached(_Answer):
-    """Waypoint that was reached."""
+    """A waypoint that the robot has reached, and when."""
 
     waypoint: int = _field("Index of the waypoint, from 0")
     time_s: float = _field("Time since the mission began [s]")

@@ -31,9 +31,9 @@ class Channel:
 
     @property
     def is_flooded(self) -> bool:
-        """Whether more repeated datagrams have arrived than the sender has sent new datagrams.
+        """Whether more repeated datagrams have arrived than the sender has sent in this session.
 
-        Only an attacker repeats so many datagrams. Then the receiver no longer records repeats.
+        Only an attacker repeats so many datagrams. The receiver then no longer records repeats.
         """
         return self._repeats > self._newest + 1
 

@@ -18,7 +18,7 @@ from cloudrc.tunnel.session import Session
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """The identity of world or cloud, fixed when its process starts."""
+    """Clock, process and keys of one end of the tunnel, fixed when its process starts."""
 
     clock_id: bytes  # 16 bytes that identify the monotonic clock of this machine
     nonce: bytes  # 16 random bytes that identify this process

@@ -120,7 +120,7 @@ class ServerHandshake:
         return HelloAnswer("hello", [self._accept()], opened=True)
 
     def begin_next_epoch(self, now_ns: int) -> bytes:
-        """Begin a new session with the same cloud at `now_ns` [ns]; return the ACCEPT for it."""
+        """Begin a new session with the same cloud at `now_ns` [ns]; return its ACCEPT datagram."""
         self._begin(now_ns)
         self._session.begin(self._epoch)
         return self._accept()

@@ -28,7 +28,7 @@ def point_inertia(mass: float, place: Array) -> Array:
 
 
 def true_inertia(plant: Plant, model: Inertia) -> Inertia:
-    """Return the inertia of the true robot: that of the `model`, scaled, with the payload.
+    """Return the inertia of the true robot: `model`, scaled by factors of `plant`, plus payload.
 
     By the parallel-axis theorem, the payload adds the inertia of a point mass m1 m2/(m1 + m2) at
     the distance between the robot's centre of mass and the payload.

@@ -40,8 +40,8 @@ frame [N] and a torque in the body frame [N m], as MuJoCo's free joint requires.
 class Rotors:
     """Four rotors with lag, thrust and drag; `speeds` are front, left, back, right [rad/s].
 
-    In one step, a rotor speeds up by the share `up` of the missing speed, or slows down by the
-    share `down` of the excess speed [1].
+    In one step, the speed of a rotor changes by a share of its difference from the commanded speed:
+    by the share `up` if the rotor speeds up, by the share `down` if it slows down [1].
     """
 
     def __init__(self, dt: float) -> None:
@@ -51,7 +51,7 @@ class Rotors:
         self.speeds = STOPPED
 
     def step(self, commands: RotorSpeeds, readings: Readings) -> Controls:
-        """Advance the rotor speeds by `dt` towards `commands`; return thrusts and drag.
+        """Advance the rotor speeds by one step towards `commands`; return thrusts and drag.
 
         Lag: w(t + dt) = w + (command - w) · (1 - exp(-dt/T)), with T = 12.5 ms for a rotor that
         speeds up, 25 ms for a rotor that slows down. Thrust: kf · w^2.

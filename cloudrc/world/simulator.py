@@ -178,7 +178,7 @@ class Simulator:
         return found
 
     def take_contacts(self) -> list[Contact]:
-        """Return the contacts that began since the last call, oldest first; each stamp is 0."""
+        """Return the contacts that began since the last call, oldest first; their stamps are 0."""
         touches, self.touches = self.touches, []
         return touches
 
@@ -236,7 +236,7 @@ def _velocity_at(readings: Readings, offset: Vector) -> Vector:
 def replay(
     model: Any, physics: npt.ArrayLike, warmstart: npt.ArrayLike, tape: npt.ArrayLike
 ) -> npt.NDArray[np.float64]:
-    """Repeat the steps of a `Simulator.tape` with MuJoCo alone, to measure its speed.
+    """Repeat the steps recorded in a `Simulator.tape` with MuJoCo alone, to measure its speed.
 
     `physics` and `warmstart` are the result of `Simulator.state()` before the first step. Return
     the state of the physics after the last step; it equals the simulator's state bit by bit.

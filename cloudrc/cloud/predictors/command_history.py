@@ -35,7 +35,8 @@ class FirstOrder(Body):
     def advance(self, command: Vector, dt: float) -> None:
         """Advance the state by `dt` [s] under a velocity command [m/s].
 
-        In each step of about one period, the reference is constant and the lags are exact.
+        The time is divided into steps of about one control period. In each step the reference is
+        constant, and the response of the lags to it is exact.
         """
         steps = min(ceil(dt * 1e9 / PERIOD_NS - 0.5), STEPS_MAX) or 1
         for _ in range(steps):

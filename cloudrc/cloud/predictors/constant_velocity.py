@@ -31,5 +31,5 @@ class ConstantVelocity(Predictor):
 
 
 def build() -> ConstantVelocity:
-    """Make the predictor of eq. (3); it has no parameters."""
+    """Make the predictor of the paper's eq. (3); it has no parameters."""
     return ConstantVelocity()

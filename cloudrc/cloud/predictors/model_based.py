@@ -57,7 +57,7 @@ class WhiteBox(Body):
     """
 
     def __init__(self, gains: tuple[float, ...], acceleration_max: float, basis: Odometry) -> None:
-        """Begin at a measured state, in a steady flight.
+        """Begin at a measured state, and assume that the flight is steady.
 
         Args:
             gains: P, I, D gains and integral limits of the velocity loop, for x, y, z: shape (12,).

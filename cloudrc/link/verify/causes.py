@@ -88,7 +88,7 @@ class Cause(NamedTuple):
 
 
 class Findings(NamedTuple):
-    """Judged measurements of one direction, and the facts that its machine reports."""
+    """Judged measurements of one direction of the link, and facts about its shaper."""
 
     rows: Sequence[Row]
     evidence: Evidence

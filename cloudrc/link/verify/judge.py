@@ -82,7 +82,7 @@ class Expected(NamedTuple):
     known: bool  # whether the random numbers are known, so that a band has no width
 
     def hidden(self, name: str) -> float:
-        """Return half the width of a quantity's band, as a multiple of its tolerance."""
+        """Return (high - low) / 2 of a quantity's entry in `bands`, divided by its tolerance."""
         mean, low, high = self.bands[name]
         return 0.5 * (high - low) / tolerance(name, mean)
 
@@ -165,7 +165,7 @@ class Plan:
         return rows
 
     def needed(self) -> int:
-        """Return the number of datagrams that makes every band narrow enough for a verdict."""
+        """Return the number of datagrams that a verdict on every quantity needs."""
         most = max(map(self.chance.hidden, self.chance.bands))
         return round(len(self.links[0].sent) * max(1.0, most**2))
 

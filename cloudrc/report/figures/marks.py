@@ -60,7 +60,7 @@ class Part(NamedTuple):
 
 
 def parts(subject: Subject, *, uplink: bool) -> list[Part]:
-    """List the profiles of one direction of the link, the earliest first."""
+    """List the profiles that were in force in one direction of the link, the earliest first."""
     recording, seconds = subject.flight.recording, subject.flight.seconds
     sent, table = recording["/telemetry"]["stamp_ns"], recording["/link"]
     start = float(seconds(sent[0])) if len(sent) else 0.0

@@ -189,7 +189,7 @@ class TakeOff:
 
     @property
     def condition(self) -> Cause:
-        """Cause to record for GROUND: ACKNOWLEDGED, or STILL_FIRST if take-off is not allowed."""
+        """Cause of a change to GROUND: ACKNOWLEDGED if take-off is allowed, else STILL_FIRST."""
         return Cause.ACKNOWLEDGED if self.allowed else Cause.STILL_FIRST
 
     def forget(self, *, stopped: bool = False) -> None:
@@ -202,7 +202,10 @@ class TakeOff:
             self._stopped, self._still_ticks, self._height = True, 0, nan
 
     def look(self, readings: Readings, flies: bool) -> None:
-        """Process a step: if the robot `flies`, update `over`, else its height and time at rest."""
+        """Process the sensor readings of a step.
+
+        If the robot `flies`, update `over`; otherwise update its height and its time at rest.
+        """
         height = readings.position[2]
         if flies:
             self.over, self._stopped = not abs(height - self._height) < LIFT_OFF_HEIGHT, False

@@ -189,9 +189,10 @@ class Limits:
         speed_max: Largest speed of the velocity reference [m/s].
         acceleration_max: Largest rate of change of the velocity reference [m/s^2].
         yaw_rate_max: Largest yaw rate [rad/s].
-        hold_max_ns: Longest HOLD in a mission before LAND begins [ns]; see `alone_max_ns`.
+        hold_max_ns: Longest HOLD in a mission before LAND begins [ns]; on the ground,
+            `alone_max_ns` applies.
         plan_max_ns: Longest time for which the robot flies a command's plan after its arrival [ns];
-            with 0, a plan does not keep a command fresh for longer.
+            0: a command with a plan is fresh for as long as a command without a plan.
     """
 
     fence_low: Vector

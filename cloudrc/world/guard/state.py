@@ -85,8 +85,8 @@ class Guard:
         reference: Velocity reference of the last step [m/s], world frame, shape (3,).
         yaw_rate: Limited yaw rate [rad/s]; the published low-level controller ignores it.
         changes: Changes of the state since the last `take_changes`.
-        counts: How often the guard applied a limit: "limited_speed" counts commands and flown
-            velocities of plans, "limited_yaw_rate" commands, "limited_fence" steps.
+        counts: How often each limit was applied: "limited_speed" to a command or to a velocity of a
+            plan, "limited_yaw_rate" to a command, "limited_fence" in a step.
     """
 
     def __init__(self, limits: Limits) -> None:

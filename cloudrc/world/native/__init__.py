@@ -1,1 +1,4 @@
-"""The usual step in C: `step.c`, the code that loads it, and the robot that flies with it."""
+"""Run usual steps of the robot in C: `step.c`, the code that loads it, and a robot that uses it.
+
+In a usual step the robot follows a fresh command that the guard need not limit.
+"""
