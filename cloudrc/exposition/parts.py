@@ -55,7 +55,7 @@ def per_axis(vector: Vector) -> dict[Labels, float]:
 
 
 def by_label(counts: Mapping[str, float]) -> dict[Labels, float]:
-    """Make the reading of a metric with one label from its count for each label value."""
+    """Convert label value -> count to the reading of a metric that has one label."""
     return {(name,): count for name, count in counts.items()}
 
 

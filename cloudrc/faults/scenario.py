@@ -39,7 +39,7 @@ class Check:
         return known and bool(_COMPARE[self.relation](self.measured, self.limit))
 
     def show(self) -> str:
-        """Format text, measured value and limit on one line."""
+        """Format the check on one line: its text, the measured value and the limit."""
         if self.unit == YES:
             return f"{self.text}: {'yes' if self.measured else 'NO'}"
         unit = f" {self.unit}" if self.unit else ""

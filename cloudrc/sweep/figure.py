@@ -80,7 +80,11 @@ def draw_sweep(
 def _choose(
     rows: Sequence[Row], x: str | None, by: str | None
 ) -> tuple[dict[str, list[Any]], str, str | None, list[str]]:
-    """Return the values of each axis, the axes for x and for the lines, and the other axes."""
+    """Choose which axes of the sweep the figure shows.
+
+    Return axis -> values; the axis along x; the axis with one line per value, or None; and the
+    remaining axes.
+    """
     values = values_of(rows)
     for axis in (x, by, *([] if values else ["of any name"])):
         if axis is not None and axis not in values:

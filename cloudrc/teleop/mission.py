@@ -158,7 +158,7 @@ class Teleop:
         return (now_ns - self._began_ns) * 1e-9
 
     def take_outputs(self) -> list[Output]:
-        """Return the messages since the last call, oldest first."""
+        """Return and remove the messages for cloud since the last call, oldest first."""
         outputs, self.outputs = self.outputs, []
         return outputs
 

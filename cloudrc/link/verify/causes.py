@@ -131,7 +131,11 @@ measured to requested value, and text."""
 
 
 def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
-    """Yield the most certain cause; if CPU time is lacking, also a cause from measured values."""
+    """Yield code and text of the probable causes of a failed direction: none, one or two.
+
+    The first is the most certain cause that the machine's counters show. A cause derived from the
+    measured values follows if that cause is "throttled", a lack of CPU time, or if there is none.
+    """
     off = {row.name: row for row in one.rows if row.verdict == "off"}
     lost = next((row.measured for row in one.rows if row.name == "loss"), 0.0)
     if off and (read := next(_of_machine(one.evidence, off, lost), None)):

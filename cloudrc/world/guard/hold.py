@@ -59,7 +59,7 @@ class PositionHold:
     """
 
     def __init__(self, low: Vector, high: Vector, speed_max: float) -> None:
-        """Set the box for hold points, `low` and `high` [m], world frame, and `speed_max` [m/s]."""
+        """Set the corners of the box for hold points [m], world frame, and the top speed [m/s]."""
         self._low, self._high = low, high
         self._speed_max = min(HOLD_SPEED_MAX, speed_max)
         self._hold_point: Vector | None = None
