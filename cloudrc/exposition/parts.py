@@ -156,8 +156,8 @@ class PredictionJudge:
 class DelayJudge:
     """Compares delay estimates with true delays.
 
-    The delay is the time from the stamp of the odometry for which cloud computed a command until
-    world applies the command. Telemetry contains an echo of the newest command that world has
+    The delay is the time from the stamp of the odometry from which cloud computed a command until
+    world applies this command. Telemetry contains an echo of the newest command that world has
     applied: the stamp of the command on cloud's clock, and the time since world applied it.
     """
 

@@ -66,7 +66,7 @@ class Outcome:
         self.checks.append(Check(text, measured, "<=", limit, unit))
 
     def least(self, text: str, measured: float, limit: float, unit: str = "") -> None:
-        """Check that `measured` is at least `limit`, both in `unit` [any unit]."""
+        """Check that `measured` is at least `limit`; both have the unit `unit` [any unit]."""
         self.checks.append(Check(text, measured, ">=", limit, unit))
 
     def same(self, text: str, measured: float, limit: float) -> None:

@@ -186,7 +186,7 @@ def flight_evidence(
 
 
 def _violations(flight: Flight) -> Iterator[Failure]:
-    """Yield all events in the recording that must not happen."""
+    """Yield a failure for each recorded event that a successful flight must not have."""
     yield from _pipes(flight)
     yield from _interventions(flight)
     yield from _restarts(flight)

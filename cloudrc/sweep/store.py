@@ -80,7 +80,7 @@ def append_rows(folder: Path, shard: int | None) -> Iterator[Callable[[Row], Non
 
 
 def begin(folder: Path, plan: Plan) -> dict[str, Row]:
-    """Write the description of a sweep into its folder; return the rows that the folder has.
+    """Write the description of a sweep into `folder`; return its earlier rows, key -> row.
 
     Raises:
         BadInputError: If the folder has rows of another sweep.

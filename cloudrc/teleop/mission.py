@@ -490,7 +490,11 @@ class Teleop:
             self._select(self._setpoint)
 
     def _select_leg(self, leg: int, begin_ns: int, start: Vector | None = None) -> None:
-        """Make a waypoint the setpoint; a carrot moves there from `start`, or from the robot."""
+        """Make waypoint number `leg` the setpoint.
+
+        If the waypoint has a speed, the setpoint is a carrot: from `begin_ns` [ns] it moves to the
+        waypoint, starting at `start` [m] or, by default, at the robot.
+        """
         to, motion = self._plan.legs[leg], None
         if to.speed and self.seen is not None:
             motion = Motion(start or self.seen.position, begin_ns, to.speed, to.acceleration)

@@ -40,8 +40,8 @@ class Channel:
     def take(self, counter: int, newest_wins: bool = False) -> str:
         """Classify the datagram with this counter as USED, LATE or REPEATED.
 
-        If `newest_wins` is True, this datagram is not USED if a newer datagram has arrived, whatever
-        the rule of the channel is.
+        If `newest_wins` is True, a datagram that arrives after a newer datagram is never USED, even
+        if the rule of the channel allows it.
         """
         ahead = counter - self._newest
         if ahead > 0:

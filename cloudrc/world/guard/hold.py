@@ -59,7 +59,11 @@ class PositionHold:
     """
 
     def __init__(self, low: Vector, high: Vector, speed_max: float) -> None:
-        """Set the corners of the box for hold points [m], world frame, and the top speed [m/s]."""
+        """Set the box for hold points and the speed limit.
+
+        `low` and `high` are the corners of the box [m], world frame. `speed_max` is the robot's
+        largest speed [m/s].
+        """
         self._low, self._high = low, high
         self._speed_max = min(HOLD_SPEED_MAX, speed_max)
         self._hold_point: Vector | None = None
