@@ -66,7 +66,7 @@ class CommandHistory(Replay):
     """
 
     def __init__(self, axes: Axes, acceleration_max: float) -> None:
-        """Set the model of the velocity loop; `acceleration_max` limits its acceleration [m/s^2]."""
+        """Set the model of the velocity loop; `acceleration_max` is its limit [m/s^2]."""
         self._axes, self._loop = axes, (axes, acceleration_max)
         super().__init__()
 

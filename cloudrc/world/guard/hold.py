@@ -61,8 +61,8 @@ class PositionHold:
     def __init__(self, low: Vector, high: Vector, speed_max: float) -> None:
         """Set the box for hold points and the speed limit.
 
-        `low` and `high` are the corners of the box [m], world frame. `speed_max` is the robot's
-        largest speed [m/s].
+        `low` and `high` are the corners of the box [m], world frame. `speed_max` limits
+        the velocity reference [m/s].
         """
         self._low, self._high = low, high
         self._speed_max = min(HOLD_SPEED_MAX, speed_max)
