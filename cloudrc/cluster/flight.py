@@ -169,10 +169,9 @@ def fly_in_cluster(
 
 
 def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a release's Helm values for a flight of `experiment`.
+    """Return Helm values for a flight: the release's present values `before`, with `experiment`.
 
-    `before` contains the present values. The chart's own mission is disabled, because it would fly
-    in addition.
+    The chart's own mission is disabled, because it would fly in addition.
     """
     link = {**before.get("link", {}), "profile": ""}
     # With a mission, the chart would start a second Job.

@@ -120,8 +120,7 @@ class Feed:
     def alive_while(self, stop: Callable[[], bool]) -> Callable[[], bool]:
         """Return a function that returns `stop()` and, every `ALIVE_PERIOD`, prints `READY`.
 
-        The line shows the supervisor that this process is alive. It is not printed if there is no
-        supervisor.
+        The line, printed only for a supervisor, shows that this process is alive.
         """
         due = 0.0
 

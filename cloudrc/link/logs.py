@@ -327,10 +327,9 @@ def _check_unit(packets: Packets, unit: str, name: str) -> None:
 
 
 def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, str]:
-    """Find the column with one of the names `kinds`, with or without a unit, such as `delay_ms`.
+    """Find the only column of a kind in `kinds`, such as `delay_ms`; return its name and unit.
 
-    Return the column's name and its unit, "" if the name has none. `name` is the log's name. Raise
-    a BadInputError if there is no such column, or more than one.
+    The unit is "" if the column's name has none. `name` is the log's name, for error messages.
     """
     known = {f"{kind}_{unit}": unit for kind in kinds for unit in SCALES}
     found = [column for column in columns if column in known]

@@ -80,10 +80,9 @@ def draw_sweep(
 def _choose(
     rows: Sequence[Row], x: str | None, by: str | None
 ) -> tuple[dict[str, list[Any]], str, str | None, list[str]]:
-    """Choose which axes of the sweep the figure shows.
+    """Choose the axes of the figure; return axis -> values, axis along x, axis of lines, others.
 
-    Return axis -> values; the axis along x; the axis with one line per value, or None; and the
-    remaining axes.
+    The figure has a line per value of the axis of lines, which is None if no axis is left.
     """
     values = values_of(rows)
     for axis in (x, by, *([] if values else ["of any name"])):

@@ -490,10 +490,9 @@ class Teleop:
             self._select(self._setpoint)
 
     def _select_leg(self, leg: int, begin_ns: int, start: Vector | None = None) -> None:
-        """Make waypoint number `leg` the setpoint.
+        """Make waypoint `leg` the setpoint; for a waypoint with a speed, begin a carrot to it.
 
-        If the waypoint has a speed, the setpoint is a carrot: from `begin_ns` [ns] it moves to the
-        waypoint, starting at `start` [m] or, by default, at the robot.
+        The carrot begins at `begin_ns` [ns], at `start` [m] or, by default, at the robot.
         """
         to, motion = self._plan.legs[leg], None
         if to.speed and self.seen is not None:

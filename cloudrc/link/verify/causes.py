@@ -131,10 +131,9 @@ measured to requested value, and text."""
 
 
 def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
-    """Yield code and text of the probable causes of a failed direction: none, one or two.
+    """Yield code and text of the cause for which the machine's counters are the best evidence.
 
-    The first is the most certain cause that the machine's counters show. A cause derived from the
-    measured values follows if that cause is "throttled", a lack of CPU time, or if there is none.
+    If there is none, or if it is "throttled", also yield a cause that the measured values suggest.
     """
     off = {row.name: row for row in one.rows if row.verdict == "off"}
     lost = next((row.measured for row in one.rows if row.name == "loss"), 0.0)

@@ -196,8 +196,7 @@ class Plan:
     def _fits(self, measured: Stream, drawn: Stream) -> bool:
         """Return whether a measured link has the predicted random numbers of a relay.
 
-        Compare the delays of the packets with the predicted delays. If the delay hardly varies,
-        compare the losses instead.
+        Compare the delays with the predicted delays or, if they hardly vary, compare the losses.
         """
         lost = np.isnan(measured.delays), np.isnan(drawn.delays)
         both, requested = ~lost[0] & ~lost[1], _requested_delay(self.profile, drawn.sent)

@@ -59,10 +59,9 @@ class PositionHold:
     """
 
     def __init__(self, low: Vector, high: Vector, speed_max: float) -> None:
-        """Set the box for hold points and the speed limit.
+        """Set the box for hold points, and the limit `speed_max` of the reference [m/s].
 
-        `low` and `high` are the corners of the box [m], world frame. `speed_max` limits
-        the velocity reference [m/s].
+        `low` and `high` are the corners of the box [m], world frame.
         """
         self._low, self._high = low, high
         self._speed_max = min(HOLD_SPEED_MAX, speed_max)
