@@ -53,7 +53,10 @@ class Result:
 
     @property
     def applied(self) -> Columns:
-        """Commands that world applied, one per row, with the values of their control periods."""
+        """Commands that world applied, one per row.
+
+        A row also has the values with which cloud computed the command, such as the horizon.
+        """
         return self.flight.applied
 
     @property

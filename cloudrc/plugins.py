@@ -135,7 +135,7 @@ def _one(kind: str) -> str:
 
 @contextmanager
 def _explained(kind: str, name: str, what: str) -> Iterator[None]:
-    """Convert any exception of a plug-in to a BadInputError with a message of one line."""
+    """Convert any exception of a plug-in to a BadInputError; `what` says in words what failed."""
     try:
         yield
     except Exception as error:

@@ -111,7 +111,7 @@ class CommandApplied(NamedTuple):
 
 
 class GuardChange(NamedTuple):
-    """World: the guard changed its state. Topic /guard."""
+    """Made by world: the guard changed its state. Topic /guard."""
 
     stamp_ns: int
     state: GuardState  # the new state
@@ -133,7 +133,7 @@ class Contact(NamedTuple):
 
 
 class SessionOpened(NamedTuple):
-    """World or cloud: a session began; its number is a new epoch. Topic /session."""
+    """Made by world or cloud: a session began, and `epoch` is its number. Topic /session."""
 
     stamp_ns: int
     end: str  # "world" or "cloud"

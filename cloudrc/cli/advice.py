@@ -128,7 +128,10 @@ def _hover(experiment: ResolvedExperiment) -> Iterator[str]:
 def _long_link(
     experiment: ResolvedExperiment, ages: list[float], echoes: list[float]
 ) -> Iterator[str]:
-    """Compare the ages of `simulate_ages` [s], in world and cloud, with the limits of both."""
+    """Yield warnings about limits of guard and cloud that are too short for the link's delays.
+
+    `ages` and `echoes` are the two lists that `simulate_ages` returns [s].
+    """
     age_max, cloud = experiment.guard.command_age_max_ms * 1e-3, experiment.cloud
     mean, longest = sum(ages) / len(ages), max(ages)
     lasts = max(age_max, min(ages) + min(cloud.plan_s, experiment.guard.plan_max_s))

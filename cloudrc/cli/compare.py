@@ -92,7 +92,10 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
-    """Fly A and B with each seed; return the pairs of flights, and the result of `take_each`."""
+    """Fly A and B with each seed.
+
+    Return the pairs of flights; and, from `take_each`, why the work ended early and the exit code.
+    """
     from cloudrc.cli.advice import warn
     from cloudrc.cli.progress import SweepView
     from cloudrc.cli.run import load

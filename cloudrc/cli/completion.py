@@ -105,9 +105,10 @@ def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
 
 
 def _candidates(name: str, words: Sequence[str], *, files: bool = False) -> dict[str, Any]:
-    """Return shell -> code that completes `words`, for the package shtab.
+    """Make the code that completes `words` in each shell, in the form that package shtab needs.
 
-    `name` becomes part of the name of a shell function. With `files`, also complete paths.
+    `name` becomes part of the name of a shell function. If `files` is True, the code also completes
+    paths of files.
     """
     function, joined = f"_cloudrc_{name}", " ".join(words)
     bash = zsh = fish = ""

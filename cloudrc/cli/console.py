@@ -173,7 +173,7 @@ def _in_pod(options: argparse.Namespace) -> Flight:
 
 
 def _show_release(options: argparse.Namespace) -> int:
-    """Forward the page of a release to this machine; apply link changes made on the page."""
+    """Forward a release's console page to this machine; apply link changes made on the page."""
     if options.run:
         raise BadInputError("RUN names a run here, the other flags a cluster; give one")
     release = release_from_flags(options)

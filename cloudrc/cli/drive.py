@@ -41,7 +41,7 @@ HELP = (
 
 
 def drive(api: Api) -> int:
-    """Let the user drive until q; raise BadInputError without a terminal."""
+    """Let the user steer the robot until the key q; raise a BadInputError without a terminal."""
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise BadInputError("mission drive needs a terminal; from a program use POST /v1/drive")
     steering = Steering(api)
@@ -100,7 +100,7 @@ def _lines(steering: Steering, api: Api) -> list[str]:
 
 
 def _is_gone() -> bool:
-    """Return whether the terminal was closed; not every process gets a signal for that."""
+    """Return whether the terminal was closed; the process may get no signal in this case."""
     terminal = select.poll()
     terminal.register(sys.stdin)
     return any(events & select.POLLHUP for _, events in terminal.poll(0))

@@ -122,7 +122,7 @@ def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
 
 @dataclass(slots=True)
 class Way:
-    """One direction of a link under test: socket of the probes, process and files of the shaper."""
+    """One direction of a link under test, with the socket of its probes and its shaper process."""
 
     own: socket.socket  # sends the probes of this direction, receives those of the other
     ports: tuple[int, int]  # port at which a relay receives, and metrics port
@@ -334,7 +334,9 @@ def _pods(options: argparse.Namespace) -> Iterator[Pods]:
 
 
 def verify_release(title: str, pods: Pods, limit: float) -> Report:
-    """Report the verdicts of world and cloud on the directions they receive; wait `limit` [s].
+    """Report the verdict on each direction of a release's link, from the process that receives it.
+
+    World receives the downlink, cloud the uplink. Wait at most `limit` [s] for both verdicts.
 
     Raises:
         TimedOutError: If world or cloud does not answer in time.

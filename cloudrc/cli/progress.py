@@ -154,6 +154,6 @@ class SweepView:
             print_or_drop(line, self._stream)
 
     def close(self) -> None:
-        """Erase the line on a terminal."""
+        """Erase the status line on a terminal."""
         if self._status:
             self._status.stop()

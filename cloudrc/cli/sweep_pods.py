@@ -77,7 +77,7 @@ def rows_from_pods(
 
 
 def print_rows(options: argparse.Namespace) -> int:
-    """Fly one shard of the flights in a file, and print the row of each flight."""
+    """Fly one shard (part) of the flights in a file; print the result of each flight as a row."""
     from cloudrc.sweep.flight import fly_point
     from cloudrc.sweep.plan import unpack
     from cloudrc.sweep.store import make_row

@@ -329,9 +329,9 @@ class CloudEndpoint(TunnelEnd):
     def _relay(self, request: OperatorRequest) -> None:
         """Relay an operator's request to world, or drop it; teleop repeats a dropped request.
 
-        Cloud drops every request while there is no session. Cloud also drops a start before the
-        first telemetry, and a start while cloud repeats an emergency stop. Cloud itself numbers and
-        repeats an emergency stop that has no number.
+        Cloud keeps an emergency stop with the number 0: it gives the stop a number and repeats it.
+        Cloud drops all other requests while there is no session. Cloud also drops a START request
+        before the first telemetry, and while it repeats an emergency stop.
         """
         if request.number > codec.NUMBER_MAX:  # somebody with the keys has used up the numbers
             self._counts["words_dropped"] += 1

@@ -22,7 +22,7 @@ class Operator(Protocol):
 
     @property
     def outputs(self) -> Sequence[Output | Fault]:
-        """Messages since the last call of `take_outputs`."""
+        """Messages from teleop since the last call of `take_outputs`."""
 
     @property
     def outcome(self) -> MissionEvent | None:
@@ -39,7 +39,7 @@ class Operator(Protocol):
         """Let teleop do what is due at `now_ns` [ns], cloud's clock."""
 
     def take_outputs(self) -> Sequence[Output | Fault]:
-        """Return the messages since the last call."""
+        """Return and remove the messages from teleop since the last call."""
 
 
 def is_for_session(epoch: int, output: Output | Fault) -> bool:

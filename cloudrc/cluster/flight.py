@@ -169,7 +169,10 @@ def fly_in_cluster(
 
 
 def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `before`, a release's values, with the experiment and without the chart's mission."""
+    """Return Helm values for a flight: the release's present values `before`, with `experiment`.
+
+    The chart's own mission is disabled, because it would fly in addition.
+    """
     link = {**before.get("link", {}), "profile": ""}
     # With a mission, the chart would start a second Job.
     mission = {**before.get("mission", {}), "enabled": False}

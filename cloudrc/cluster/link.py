@@ -39,7 +39,7 @@ _LOOK_PERIOD = 0.02
 
 @dataclass(frozen=True)
 class LinkParts:
-    """ConfigMap and pods of a release's link."""
+    """The parts of a release's emulated link: its ConfigMap and the pods with link containers."""
 
     name: str  # of the ConfigMap that the link containers follow
     files: dict[str, str]  # of the ConfigMap: profile, traces, record of the last change

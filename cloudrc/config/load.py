@@ -379,8 +379,8 @@ class Edit(NamedTuple):
 def edit_profile(before: Document, profile: str | None, settings: Sequence[str]) -> Edit:
     """Set values in the link profile `before`, or in the profile named `profile` if it is given.
 
-    A key that the user sets is removed from the time line (changes, trace), so that it keeps the
-    user's value. Raise a BadInputError if the request is empty or invalid.
+    The changes and the trace of the profile no longer affect a key that the user sets, so that it
+    keeps the user's value. Raise a BadInputError if the request is empty or invalid.
     """
     if profile is None and not settings:
         raise BadInputError(f"nothing to set; name a value, {_EXAMPLE}")

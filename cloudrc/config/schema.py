@@ -515,7 +515,7 @@ class Criteria(Section):
 
 
 class Report(Section):
-    """Additions to the report of a run."""
+    """The user's additions to the report of a run."""
 
     metrics: tuple[str, ...] = ()
     """Your own metrics for `cloudrc run`: paths of Python files, or names of installed metrics"""

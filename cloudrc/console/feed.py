@@ -54,7 +54,7 @@ class FlightFeed:
     """
 
     def __init__(self, scene: Scene) -> None:
-        """Begin without records; `scene` has the pipes for the clearance."""
+        """Begin without records; measure the clearance from the pipes of `scene`."""
         self._scene, self._judge = scene, PredictionJudge()
         self.telemetry: Telemetry | None = None
         self.control: Control | None = None
@@ -105,9 +105,9 @@ class FlightFeed:
         return rows[:, :3], rows[:, 3]
 
     def columns(self, step: int = 3) -> Array:
-        """Return every `step`-th sample, shape (fields, n), with times relative to the newest [s].
+        """Return every `step`-th sample of the charts, shape (fields of `Sample`, n).
 
-        Unknown values are NaN.
+        The times are relative to the newest returned sample [s]. Unknown values are NaN.
         """
         rows = np.array([*self.samples][::step] or [Sample(0.0)], dtype=np.float64)
         rows[:, 0] -= rows[-1, 0]

@@ -226,5 +226,5 @@ class Steering:
 
 
 def is_drive(mission: Mapping[str, Any] | None) -> bool:
-    """Return whether a mission is a drive by hand, which waits for keys."""
+    """Return whether the user steers the robot by keys in this mission, which is held."""
     return mission is not None and mission["by_hand"] and mission["state"] == "held"

@@ -27,8 +27,8 @@ class KeyFile:
     def follow(self, now_ns: int) -> list[Fault]:
         """Reload the file if it has changed and a check is due at `now_ns` [ns, monotonic clock].
 
-        Return a record of the new key, or of the error that keeps the old keys in use until the
-        file changes again.
+        If the keys have changed, return a record that names the new key. If the file is invalid,
+        keep the old keys until it changes again, and return a record of the error.
         """
         if now_ns < self._due_ns:
             return []

@@ -146,7 +146,7 @@ class Child:
     ready: bool = False  # whether the process can receive datagrams
 
     def take(self, data: bytes) -> list[Record]:
-        """Process the next piece of the process's output; return the records in complete lines."""
+        """Parse the next bytes of the process's output; return the records in complete lines."""
         records: list[Record] = []
         *lines, self.unread = (self.unread + data).split(b"\n")
         for line in lines:

@@ -118,7 +118,10 @@ class Feed:
         self._write(READY)
 
     def alive_while(self, stop: Callable[[], bool]) -> Callable[[], bool]:
-        """Wrap `stop`: each call of the result prints `READY` if due, and returns `stop()`."""
+        """Return a function that returns `stop()` and, every `ALIVE_PERIOD`, prints `READY`.
+
+        The line, printed only for a supervisor, shows that this process is alive.
+        """
         due = 0.0
 
         def ask() -> bool:
@@ -328,7 +331,7 @@ class EndProcess:
             self.exporter.see(records)
 
     def look_around(self, records: list[Record], slip_ns: int) -> list[Record]:
-        """Return records about steps of the wall clock, new keys, and the state of the link.
+        """Return new records about wall-clock steps, changed keys and the state of the link.
 
         `records` are the newest records of the endpoint. `slip_ns` is the lag of the endpoint's
         clock behind the machine's monotonic clock [ns].

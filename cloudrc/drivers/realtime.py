@@ -178,7 +178,7 @@ def serve(
     """Run world or cloud in real time until `stop()` is true.
 
     Args:
-        endpoint: World or cloud. Raise a ValueError if it has no key.
+        endpoint: World or cloud, with a key; without a key, a ValueError is raised.
         peer: Socket of the endpoint, and address of the other endpoint.
         end: "world" or "cloud", for the records.
         sink: Called with new records, at least every 20 ms if there are any. It must not block.

@@ -169,10 +169,10 @@ class LastWord:
         flies: Callable[[], bool],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Set the functions.
+        """Set the functions that give the state of cloud and robot.
 
-        `asked` returns whether cloud must end, `flies` whether the robot flies, `clock` the time
-        [ns].
+        `asked` returns True after cloud has been asked to end, `flies` while the robot flies.
+        `clock` returns the time [ns].
         """
         self._asked, self._flies, self._clock = asked, flies, clock
         self._until_ns: int | None = None
@@ -220,10 +220,11 @@ class TeleopLoop:
             self.wake(now_ns, late_ns)
 
     def wake(self, now_ns: int, late_ns: int) -> None:
-        """Run one period, which begins at `now_ns`, later than planned by `late_ns` [ns].
+        """Run one period at `now_ns` [ns]; `late_ns` is its delay after the planned time [ns].
 
-        After a stall, the socket contains old states. Calls may depend on the robot's position; so
-        teleop discards the old states and waits for a new one, for at most `BLIND_WAKES` periods.
+        After a long delay, the socket contains old states of the robot, but API calls may depend on
+        the present position. Therefore teleop discards the old states, and does nothing until a new
+        state arrives, for at most `BLIND_WAKES` periods.
         """
         machine, arrived = self._machine, self._peer.receive()
         states = [state for state in arrived if state is not None]

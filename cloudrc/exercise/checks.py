@@ -56,9 +56,10 @@ def _predict(build: Callable[[], Any], select: Callable[[Odometry], Any]) -> Any
 def _command(
     build: Callable[..., Any], n: int = 1, speed: float = 0.0, sign: bool = False, **gains: Any
 ) -> Any:
-    """Return two commands: after `n` updates, 2 ms apart, at `speed` [m/s], and after a reset.
+    """Build a controller; return the velocity that it commands before and after a reset.
 
-    Without `sign`, return absolute values: only the check of P tests the sign.
+    Before the reset, the controller gets `n` updates, 2 ms apart, at `speed` [m/s]. After the reset
+    it gets one update. If `sign` is False, return absolute values: only the check of P tests signs.
     """
     controller, (x, y, z), seen = build(**gains), STATE.position, ZERO
     setpoint = Setpoint((2.0, -1.0, 0.2))

@@ -55,7 +55,7 @@ def per_axis(vector: Vector) -> dict[Labels, float]:
 
 
 def by_label(counts: Mapping[str, float]) -> dict[Labels, float]:
-    """Make the reading of a metric with one label from its count for each label value."""
+    """Convert label value -> count to the reading of a metric that has one label."""
     return {(name,): count for name, count in counts.items()}
 
 
@@ -156,8 +156,8 @@ class PredictionJudge:
 class DelayJudge:
     """Compares delay estimates with true delays.
 
-    The delay is the time from the stamp of the odometry for which cloud computed a command until
-    world applies the command. Telemetry contains an echo of the newest command that world has
+    The delay is the time from the stamp of the odometry from which cloud computed a command until
+    world applies this command. Telemetry contains an echo of the newest command that world has
     applied: the stamp of the command on cloud's clock, and the time since world applied it.
     """
 

@@ -131,7 +131,10 @@ REACHED = (0, 1, 7, MISSION_OVER)
 
 
 def at_bad_moments(rng: Generator) -> Words:
-    """Return a function that forges requests after random pauses, half of them near the fence."""
+    """Return a function that forges an operator's requests after random pauses.
+
+    Half of the requests wait until the robot is near the fence.
+    """
     pause, near = float(rng.choice([0.05, 0.3, 1.0])), float(rng.uniform(0.2, 1.5))
     due_ns, waits = 0, False
 
@@ -346,7 +349,10 @@ def _operators_voice(rng: Generator) -> Lie:
 
 
 def _refused_and_released(rng: Generator) -> Lie:
-    """Fly fast, and send NaN to cause landings; `at_bad_moments` acknowledges the landings."""
+    """Fly fast, and from time to time send NaN, so that the guard lands the robot.
+
+    Meanwhile `at_bad_moments` acknowledges the landings in the operator's name.
+    """
     fly, pause_ns = _operators_voice(rng), int(rng.uniform(0.5e9, 4e9))
 
     def lie(command: Command, control: Control) -> Command:

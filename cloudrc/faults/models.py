@@ -254,7 +254,7 @@ class TeleopModel:
         self.service = None
 
     def run_on(self, host: RestartableEndpoint) -> None:
-        """Run on the machine of `host`; the process wakes even if cloud is down."""
+        """Run teleop on the machine of the cloud `host`; teleop also runs while cloud is down."""
         self._host = host
         host.at(self._phase_ns * 1e-9, self._wake)
 

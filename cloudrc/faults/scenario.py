@@ -39,7 +39,7 @@ class Check:
         return known and bool(_COMPARE[self.relation](self.measured, self.limit))
 
     def show(self) -> str:
-        """Format text, measured value and limit on one line."""
+        """Format the check on one line: its text, the measured value and the limit."""
         if self.unit == YES:
             return f"{self.text}: {'yes' if self.measured else 'NO'}"
         unit = f" {self.unit}" if self.unit else ""
@@ -66,7 +66,7 @@ class Outcome:
         self.checks.append(Check(text, measured, "<=", limit, unit))
 
     def least(self, text: str, measured: float, limit: float, unit: str = "") -> None:
-        """Check that `measured` is at least `limit`, both in `unit` [any unit]."""
+        """Check that `measured` is at least `limit`; both have the unit `unit` [any unit]."""
         self.checks.append(Check(text, measured, ">=", limit, unit))
 
     def same(self, text: str, measured: float, limit: float) -> None:

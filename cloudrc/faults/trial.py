@@ -231,7 +231,10 @@ def inject(flight: Flight, schedule: Schedule) -> None:
 def _actions(
     flight: Flight, process: RestartableEndpoint, event: Event
 ) -> dict[str, tuple[tuple[float, Action], ...]]:
-    """Return kind of fault -> times [s] and actions for `event`; `process` is world or cloud."""
+    """Return what to do at which times for `event`: kind of fault -> pairs of time [s] and action.
+
+    `process` is the process that the event kills or freezes, world or cloud.
+    """
     at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
     gone = at + event.value * lasts  # end of teleop after it was asked to end
 
@@ -291,7 +294,10 @@ def flipped(data: bytes, rng: np.random.Generator, flips: int) -> bytes:
 
 
 def _bugs(schedule: Schedule, clock: Clock) -> Lie:
-    """Return a function that replaces `Event.value` commands per second by impossible ones."""
+    """Return a function that replaces some commands by commands with impossible values.
+
+    While an event lasts, the function replaces `Event.value` commands per second.
+    """
     rng, events = generator(schedule.seed, 43), schedule.of(*BUGS)
     due = [event.at for event in events]
 

@@ -65,10 +65,10 @@ class Log:
     halved: bool = False  # whether the delays are halves of round trips
 
     def packets(self) -> Packets:
-        """Check the packets, sort them by time of sending, and note what was changed.
+        """Check the packets, sort them by time of sending, and add a note on each correction.
 
-        Raises a BadInputError if no packet arrived, if a delay is negative, if the times jump back,
-        or if more than 1 % of the rows are unusable or repeat the time of an earlier row.
+        Raise a BadInputError if no packet arrived, if a delay is negative, if the times jump back,
+        or if more than 1 % of the rows are unusable or have the time of an earlier row.
         """
         self._refuse_beyond_limit(len(self.unusable), *self.unusable[:1])
         times, delays = np.array(self.entries or [(nan, nan)]).T
@@ -331,7 +331,10 @@ def _check_unit(packets: Packets, unit: str, name: str) -> None:
 
 
 def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, str]:
-    """Find the only column of times or delays (`kinds`); return its name, and its unit or ""."""
+    """Find the only column of a kind in `kinds`, such as `delay_ms`; return its name and unit.
+
+    The unit is "" if the column's name has none. `name` is the log's name, for error messages.
+    """
     known = {f"{kind}_{unit}": unit for kind in kinds for unit in SCALES}
     found = [column for column in columns if column in known]
     found = found or [column for column in columns if column in kinds]
@@ -363,7 +366,10 @@ def _csv_time(row: Row, column: str, unit: str) -> float:
 
 
 def _csv_delay(row: Row, column: str, loss: str | None) -> float:
-    """Read a delay in the column's unit; NaN if the delay or the column `loss` marks a loss."""
+    """Read the delay of a packet from `column`, in the column's unit; return NaN for a lost packet.
+
+    `loss` is the column that marks lost packets; None if the file has no such column.
+    """
     if loss is not None:
         remedy = "0 or 1 for a packet; a profile can use a trace with other shares directly"
         flag = _FLAGS.get(row.text(loss).lower())
@@ -514,7 +520,10 @@ class _Ping:
             self._log.counts["other lines left out"] += 1
 
     def check_range(self) -> tuple[int, int]:
-        """Return the first and last sequence number; raise an error if the summary disagrees."""
+        """Return the first and last sequence number of the log.
+
+        Raise a BadInputError if the replies do not match ping's own summary at the end of the log.
+        """
         beginnings = max(self._headers, len(self._summaries))
         if beginnings > 1:
             self._refuse_sessions(f"{beginnings} beginnings or ends")

@@ -64,12 +64,12 @@ class ReleaseErrors(Counter[int]):
         self[_EARLY if error_ns < 0 else (shift << _BITS) + (error_ns >> shift)] += 1
 
     def in_ns(self) -> dict[str, int]:
-        """Return counts and percentiles of the lateness; safe while another thread counts.
+        """Return counts and percentiles of the lateness; another thread may count meanwhile.
 
         Returns:
             `released`, the number of datagrams; `released_early`, those that left before they were
             due, which is a fault; and the percentiles `release_error_p50_ns`, `_p99_ns` and
-            `_p999_ns` [ns]. Empty before the first datagram.
+            `_p999_ns` [ns]. The dictionary is empty before the first datagram.
         """
         counts, below = sorted(self.copy().items()), 0
         whole = sum(number for _, number in counts)

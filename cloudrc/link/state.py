@@ -38,9 +38,9 @@ CHANGE_FILE = "change.json"  # last `Change` of a profile, in the profile's fold
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Number and cause of a profile's change, as `cloudrc link set` writes them to `CHANGE_FILE`.
+    """A change of a link profile, as `cloudrc link set` describes it in `CHANGE_FILE`.
 
-    With `restart`, the time line starts again when the profile takes effect.
+    If `restart` is True, the profile's time line starts again when the new profile takes effect.
     """
 
     number: str = ""  # identifies the change; "" if unknown
@@ -137,7 +137,7 @@ def parse(kind: type[T], text: bytes | str) -> T:
 
 
 def from_text(text: bytes | str) -> LinkState:
-    """Parse a state; raise a ValueError if the text is invalid."""
+    """Parse the JSON text of a link's state; raise a ValueError if the text is invalid."""
     return parse(LinkState, text)
 
 

@@ -62,7 +62,7 @@ def name_of(choice: str) -> str:
 
 
 def check(own: Iterable[str]) -> None:
-    """Check the user's metrics before the flight; `own` contains names or paths as for `find`.
+    """Check the user's metrics before the flight; `own` lists their names or file paths.
 
     Raises:
         BadInputError: If a metric is invalid, or if two metrics have the same name.

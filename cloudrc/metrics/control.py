@@ -44,7 +44,10 @@ def _estimate_error(flight: Flight) -> float | None:
 
 
 def _delay_error(flight: Flight) -> float | None:
-    """Compute the RMS error of the horizon [s], from the first measured round trip on."""
+    """Compute the RMS difference between horizon and true delay of the commands [s].
+
+    Commands before the first measured round trip are left out.
+    """
     applied = flight.applied
     errors = applied["horizon"] - (applied["stamp_ns"] - applied["basis_stamp_ns"]) * 1e-9
     return rms(errors[np.isfinite(applied["rtt"])])

@@ -51,7 +51,7 @@ def holds(flight: Flight) -> list[tuple[int, int]]:
 
 
 def reported(flight: Flight) -> dict[int, int]:
-    """Return the waypoints that the operator reported as reached: index -> stamp [ns]."""
+    """Return the waypoints that teleop reported as reached: index -> stamp of the report [ns]."""
     mission = flight.during("/mission")
     rows = mission["event"] == "reached"
     pairs = zip(mission["waypoint"][rows], mission["stamp_ns"][rows], strict=True)
@@ -59,7 +59,7 @@ def reported(flight: Flight) -> dict[int, int]:
 
 
 def _waypoints_reached(flight: Flight) -> float | None:
-    """Count the waypoints that the operator reported and that the true position confirms."""
+    """Count the waypoints that teleop reported as reached and the true position confirms."""
     stamps, points = reported(flight), flight.mission.waypoints
     if flight.mission.steps or flight.mission.setpoints:  # they end after their time, anywhere
         return flight.count(len(stamps))
@@ -85,7 +85,10 @@ def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
 
 
 def _of_touch(measure: Callable[[Flight, dict[str, Array]], float | None]) -> Measure:
-    """Make a metric that applies `measure` to the first touch of the board; None without one."""
+    """Make a metric that applies `measure` to the first touch of the board.
+
+    The metric is None if the robot never touches the board.
+    """
 
     def measured(flight: Flight) -> float | None:
         touch = first_touch(flight)

@@ -186,7 +186,7 @@ def flight_evidence(
 
 
 def _violations(flight: Flight) -> Iterator[Failure]:
-    """Yield all events in the recording that must not happen."""
+    """Yield a failure for each recorded event that a successful flight must not have."""
     yield from _pipes(flight)
     yield from _interventions(flight)
     yield from _restarts(flight)
@@ -324,7 +324,10 @@ class Observations:
     slip_ns: int = 0  # time by which world's clock fell behind while teleop ran [ns]
 
     def news(self, before: Observations, elapsed: float) -> Iterator[tuple[str, str]]:
-        """Yield event and text of each contact since `before`, at mission time `elapsed` [s]."""
+        """Compare with the earlier observations `before`; yield name and text of each new contact.
+
+        `elapsed` is the present mission time [s].
+        """
         if self.pipe_contacts > before.pipe_contacts:
             yield "pipe_touched", f"the robot touched a pipe at {elapsed:.2f} s"
         if self.touch_speed != before.touch_speed:
@@ -332,7 +335,10 @@ class Observations:
             yield "board_touched", text
 
     def evidence(self, ending: Ending, elapsed: float, **known: Any) -> Evidence:
-        """Return the evidence of a mission that ended at `elapsed` [s]; `known`: more fields."""
+        """Return the evidence on a mission that ended at mission time `elapsed` [s].
+
+        `known` contains further fields of `Evidence`.
+        """
         return Evidence(
             ending=ending,
             end=Moment(elapsed),

@@ -37,7 +37,7 @@ class RecordHash:
         self._blocks: defaultdict[type, list[Columns]] = defaultdict(list)
 
     def update(self, records: Iterable[Record]) -> None:
-        """Add records, oldest first."""
+        """Add records to the hash, oldest first."""
         waiting = self._waiting
         for record in records:
             waiting[type(record)].append(record)

@@ -59,8 +59,9 @@ SAME_CLOCK = ClockOffset(0, 0, "same clock")
 def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
     """Estimate world's clock minus cloud's clock.
 
-    The estimate is the centre of the interval that the packets allow. Without packets in both
-    directions, it is the difference of the first stamps.
+    No packet arrives before it was sent. The packets of each direction therefore bound the offset
+    on one side, and the estimate is the centre between both bounds. If a direction has no packets,
+    the estimate is the difference of the first stamps.
 
     Source: the clock filter of RFC 5905 (NTP), section 10: it uses the sample with the smallest
     round trip, and half of this round trip bounds the error.

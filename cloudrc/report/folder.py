@@ -128,7 +128,7 @@ def _earlier_report(source: Path | bytes | None) -> _EarlierReport | None:
 
 
 def _describe(recording: Recording, earlier: _EarlierReport | None, contents: Contents) -> Run:
-    """Describe a run, with values from its earlier report.
+    """Describe a run; take its mode, shaper and notes from its earlier report.
 
     Without an earlier report, assume a local run if the recording has rows on /lateness, else a
     virtual run.

@@ -104,7 +104,10 @@ def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:
 
 
 def _errors(topic: str, flight: Flight, columns: Columns, name: str) -> Iterator[View]:
-    """Yield, per row, the distance [m] from the position in column `name` to the true position."""
+    """Yield one view per row: the distance from a position to the robot's true position [m].
+
+    `name` is the column of `columns` with the positions.
+    """
     columns = _thin(columns)
     away = columns[name] - flight.true_position(columns["stamp_ns"])
     errors = np.linalg.norm(away, axis=1).astype(np.float32).tolist()

@@ -80,7 +80,10 @@ def draw_sweep(
 def _choose(
     rows: Sequence[Row], x: str | None, by: str | None
 ) -> tuple[dict[str, list[Any]], str, str | None, list[str]]:
-    """Return the values of each axis, the axes for x and for the lines, and the other axes."""
+    """Choose the axes of the figure; return axis -> values, axis along x, axis of lines, others.
+
+    The figure has a line per value of the axis of lines, which is None if no axis is left.
+    """
     values = values_of(rows)
     for axis in (x, by, *([] if values else ["of any name"])):
         if axis is not None and axis not in values:

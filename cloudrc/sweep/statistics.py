@@ -160,9 +160,10 @@ def _cut(n: int) -> int:
 
 
 def _pairs_needed(values: NDArray[Any], means: NDArray[Any], least: int) -> int | None:
-    """Return the number of pairs, at least `least`, for a power of 80 %; None without an effect.
+    """Return how many pairs (A, B) a test with a power of 80 % needs; the result is >= `least`.
 
-    `values` are the differences, `means` the means of each two of them (and of each with itself).
+    Return None if the data show no effect. `values` contains the n differences B - A, and `means`
+    the mean of every two differences, each difference also paired with itself.
     Source: G. E. Noether, "Sample size determination for some common nonparametric tests", 1987.
     """
     n = len(values)

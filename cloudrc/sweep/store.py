@@ -30,7 +30,7 @@ TABLE, PARQUET = "table.csv", "table.parquet"
 
 
 def make_row(flight: Flight, flown: Row) -> Row:
-    """Make the row of a flight of a sweep."""
+    """Make the row of a sweep's flight; `flown` has the results of the flight, such as verdict."""
     return {"key": flight.key, "point": flight.point, "seed": flight.seed, **flown}
 
 
@@ -63,7 +63,10 @@ def parse_row(line: bytes | str) -> Row | None:
 
 @contextmanager
 def append_rows(folder: Path, shard: int | None) -> Iterator[Callable[[Row], None]]:
-    """Yield a function that appends a row to the file of a shard; None means the whole sweep."""
+    """Yield a function that appends a row to the file of shard number `shard`.
+
+    If `shard` is None, the sweep is not divided, and the function appends to its only file.
+    """
     path = folder / ("rows.jsonl" if shard is None else f"rows-{shard}.jsonl")
     with path.open("ab+") as file:
         file.seek(0)
@@ -77,7 +80,7 @@ def append_rows(folder: Path, shard: int | None) -> Iterator[Callable[[Row], Non
 
 
 def begin(folder: Path, plan: Plan) -> dict[str, Row]:
-    """Write the description of a sweep into its folder; return the rows that the folder has.
+    """Write the description of a sweep into `folder`; return its earlier rows, key -> row.
 
     Raises:
         BadInputError: If the folder has rows of another sweep.

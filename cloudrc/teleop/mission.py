@@ -158,7 +158,7 @@ class Teleop:
         return (now_ns - self._began_ns) * 1e-9
 
     def take_outputs(self) -> list[Output]:
-        """Return the messages since the last call, oldest first."""
+        """Return and remove the messages for cloud since the last call, oldest first."""
         outputs, self.outputs = self.outputs, []
         return outputs
 
@@ -492,7 +492,10 @@ class Teleop:
             self._select(self._setpoint)
 
     def _select_leg(self, leg: int, begin_ns: int, start: Vector | None = None) -> None:
-        """Make a waypoint the setpoint; a carrot moves there from `start`, or from the robot."""
+        """Make waypoint `leg` the setpoint; for a waypoint with a speed, begin a carrot to it.
+
+        The carrot begins at `begin_ns` [ns], at `start` [m] or, by default, at the robot.
+        """
         to, motion = self._plan.legs[leg], None
         if to.speed and self.seen is not None:
             motion = Motion(start or self.seen.position, begin_ns, to.speed, to.acceleration)

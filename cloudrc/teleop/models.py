@@ -203,7 +203,7 @@ class Acknowledged(_Answer):
 
 
 class Problem(_Answer):
-    """One value that cannot be used."""
+    """One invalid value in a request."""
 
     path: str = _field("Keys down to the value, joined by dots")
     index: int | None = _field("Index of the waypoint with the problem; null without a waypoint")

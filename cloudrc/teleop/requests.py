@@ -52,7 +52,7 @@ class RequestSender:
 
     @property
     def waits(self) -> bool:
-        """Whether the robot ignores commands: on the ground, or after the end of its mission."""
+        """Whether the robot ignores commands: its guard is in GROUND, or its mission has ended."""
         seen = self._seen
         if seen is None or self._next is not None:
             return False
@@ -61,7 +61,8 @@ class RequestSender:
     def ask(self, request: Request, start: Start = Start.SPAWN, *, after: bool = False) -> None:
         """Begin to repeat a request; it replaces the pending request.
 
-        With `after`, the new request waits until the robot has carried out the pending request.
+        If `after` is True, the new request replaces nothing, but waits until the robot has carried
+        out the pending request.
         """
         asked = self._progress._replace(request=request, start=start)
         if self._pending is None or not after:

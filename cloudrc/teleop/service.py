@@ -367,10 +367,10 @@ class MissionService:
         return mission
 
     def _start_next(self, now_ns: int, *, queued: bool = False) -> Mission | None:
-        """Start or continue the first mission that has not ended; return the mission under way.
+        """Start or continue the oldest mission that has not ended, unless a mission is under way.
 
-        A mission in the queue starts only with `queued`, and only after the disk has stored that
-        the mission starts. Return None if no mission is under way.
+        Take a mission out of the queue only if `queued` is True; such a mission starts after its
+        new state is on the disk. Return the mission under way, or None.
         """
         waiting = self.book.open()
         if self._current is not None or not waiting:

@@ -29,9 +29,9 @@ from cloudrc.records import FAILURES, MissionEvent
 class Leg:
     """A waypoint, and the conditions under which it counts as reached.
 
-    With an infinite `tolerance` (for random steps), the waypoint is reached after the time `dwell`.
-    With a `speed`, it is reached when the setpoint has rested there for the time `dwell` and the
-    robot is within `tolerance`.
+    A random step has an infinite `tolerance`; it counts as reached after the time `dwell`. If
+    `speed` is above 0, the waypoint counts as reached when the setpoint has rested there for the
+    time `dwell` and the robot is within `tolerance`.
     """
 
     position: Vector  # [m], world frame, shape (3,)

@@ -40,7 +40,8 @@ class Channel:
     def take(self, counter: int, newest_wins: bool = False) -> str:
         """Classify the datagram with this counter as USED, LATE or REPEATED.
 
-        With `newest_wins`, a late datagram counts as LATE even if the channel would use it.
+        If `newest_wins` is True, a datagram that arrives after a newer datagram is never USED, even
+        if the rule of the channel allows it.
         """
         ahead = counter - self._newest
         if ahead > 0:

@@ -58,7 +58,8 @@ class Session:
     def __init__(self, sends: Direction, ring: KeyRing | None) -> None:
         """Set the direction in which this endpoint sends, and the pre-shared keys.
 
-        `ring` is None if world and cloud are in one process.
+        `ring` contains these keys. It is None if world and cloud run in one process: then no
+        secret is needed.
         """
         self.epoch, self.sealed = NO_EPOCH, ring is not None
         self.ring = ring or KeyRing(KeySet(Key(_PUBLIC_KEY)))

@@ -192,7 +192,7 @@ class WorldEndpoint(TunnelEnd):
         self._records.append(_new(CommandApplied, applied))
 
     def _sample(self, now_ns: int) -> None:
-        """Record the true state and the events before it; send telemetry if it is due."""
+        """Record the true state and new guard changes and contacts; send telemetry if it is due."""
         simulator, guard, records = self.robot.simulator, self.robot.guard, self._records
         tip_force = simulator.tip_force()
         truth = simulator.truth(now_ns)
@@ -232,7 +232,7 @@ class WorldEndpoint(TunnelEnd):
         self._sample_ns += self._sample_period_ns
 
     def _record_counts(self, now_ns: int) -> None:
-        """Record the counters; report once per session if the simulation is too slow."""
+        """Record the counters of world and guard; report a slow simulation once per session."""
         guard, before_ns = self.robot.guard, self._counted_slip_ns
         self._count_ns, self._counted_slip_ns = self._count_ns + COUNT_PERIOD_NS, self._slip_ns
         self._counts["held_seconds"] += guard.armed and guard.state is HOLD

@@ -137,7 +137,10 @@ def _inertia(model: Any) -> Inertia:
 
 
 def _set_inertia(base: Any, mass: float, centre: Array, inertia: Array) -> None:
-    """Give the base of an `MjSpec` the inertia of the whole robot, and its other bodies none."""
+    """Set the mass and inertia of the whole robot on its base body, and zero on all other bodies.
+
+    `base` is the base body in an `MjSpec`.
+    """
     for geom in base.find_all("geom"):
         geom.mass = 0.0
     for body in base.find_all("body"):

@@ -18,7 +18,10 @@ class RunningMean(Estimator):
     """
 
     def __init__(self, count_max: float = inf) -> None:
-        """Limit the count to `count_max` [samples]: the gain is at least 1/count_max."""
+        """Set the number of samples after which the weight of a new sample stays constant.
+
+        This weight is 1/`count_max` [1]. By default all samples have the same weight in the mean.
+        """
         self._count_max, self._count, self._mean = count_max, 0, 0.0
 
     def update(self, sample: DelaySample) -> None:

@@ -18,7 +18,10 @@ from cloudrc.config.schema import Gain
 
 
 class Split(Estimator):
-    """Adds the age of the newest odometry and the average of `applied_minus_stamp`."""
+    """Adds the age of the newest odometry and the average of `applied_minus_stamp`.
+
+    `applied_minus_stamp` is the measured downlink delay minus the offset between the clocks.
+    """
 
     def __init__(self, gain: float) -> None:
         """Set `gain`, the weight of a new sample in the average, in [0, 1]."""
@@ -26,7 +29,7 @@ class Split(Estimator):
         self._applied_minus_stamp: float | None = None
 
     def add_applied(self, applied_minus_stamp: float) -> None:
-        """Add one `applied_minus_stamp` [s] to the average of the downlink."""
+        """Update the average with a new value of `applied_minus_stamp` [s]."""
         if self._applied_minus_stamp is None:
             self._applied_minus_stamp = applied_minus_stamp
         else:

@@ -1,7 +1,8 @@
 """Base class of the predictors that replay the sent commands through a model of the robot.
 
 World follows the newest command that has arrived. On world's clock, a command begins at its stamp
-plus a shift: the downlink delay plus the clock offset. The echoes show the sum of both.
+plus a shift. The shift is the downlink delay plus the clock offset; the echoes in telemetry show
+this sum.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class History:
         self._shift_ns = 0.0
 
     def add(self, command: Command) -> bool:
-        """Store a command that cloud has just sent; return False if it is not the newest."""
+        """Store a command that cloud has sent. Ignore an old command, and return False for it."""
         if self.stamps and command.stamp_ns <= self.stamps[-1]:
             return False
         self.stamps.append(command.stamp_ns)
@@ -104,9 +105,10 @@ class History:
         return reversed(parts)
 
     def ahead(self, start_ns: int, end_ns: int, shift_ns: int) -> Iterator[tuple[Vector, float]]:
-        """Yield velocity [m/s] and duration [s] of each command that world will probably follow.
+        """Predict which sent commands world follows; yield velocity [m/s] and duration [s] of each.
 
-        The interval from `start_ns` to `end_ns` is on world's clock [ns].
+        The interval begins at `start_ns` and ends at `end_ns` [ns], world's clock. A command begins
+        at its stamp plus `shift_ns` [ns].
         """
         index = bisect_right(self.stamps, start_ns - shift_ns)
         while start_ns < end_ns:
@@ -116,9 +118,11 @@ class History:
             start_ns, index = until_ns, index + 1
 
     def followed(self, count: int, start_ns: int, end_ns: int) -> list[tuple[Vector, float]]:
-        """List velocity [m/s] and duration [s] of command `count`, or of each step of its plan.
+        """List the velocities [m/s] of one command and the duration of each [s].
 
-        The first command has the number 1; 0 means zero velocity. The interval is in [ns].
+        A command with a plan has one velocity per step of the plan. `count` is the number of the
+        command in `commands`, from 1; 0 means a command with zero velocity. World follows the
+        command from `start_ns` to `end_ns` [ns], world's clock.
         """
         command = self.commands[count - 1] if count else NO_COMMAND
         if not command.plan:

@@ -43,11 +43,11 @@ class Kalman(Predictor):
         self._replay.reset()
 
     def commanded(self, command: Command) -> None:
-        """Pass the command on to the replay."""
+        """Pass the command on to the predictor that replays the commands."""
         self._replay.commanded(command)
 
     def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
-        """Pass the echo on to the replay."""
+        """Pass the echo on to the predictor that replays the commands."""
         self._replay.applied(command_stamp_ns, applied_ns)
 
     def observe(self, odometry: Odometry) -> None:

@@ -71,7 +71,10 @@ def _long_silence(outcome: Outcome, seed: int) -> None:
 
 
 def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
-    """Interrupt the link at `at` [s] for 75 s: the robot must land and stop its rotors."""
+    """Interrupt the link at `at` [s] for 75 s; check that the robot lands and stops its rotors.
+
+    `where` is the place of the robot, for the texts of the checks.
+    """
     limit = "criteria.time_limit_s=200"
     flight = Flight(limit, seed=seed, link=silent(at, 75.0))
     flight.fly(at + 80.0)

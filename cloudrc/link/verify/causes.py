@@ -131,7 +131,10 @@ measured to requested value, and text."""
 
 
 def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
-    """Yield the most certain cause; if CPU time is lacking, also a cause from measured values."""
+    """Yield code and text of the cause for which the machine's counters are the best evidence.
+
+    If there is none, or if it is "throttled", also yield a cause that the measured values suggest.
+    """
     off = {row.name: row for row in one.rows if row.verdict == "off"}
     lost = next((row.measured for row in one.rows if row.name == "loss"), 0.0)
     if off and (read := next(_of_machine(one.evidence, off, lost), None)):

@@ -195,7 +195,10 @@ class Plan:
         return measured
 
     def _fits(self, measured: Stream, drawn: Stream) -> bool:
-        """Return whether delays match the prediction; without jitter, whether losses match it."""
+        """Return whether a measured link has the predicted random numbers of a relay.
+
+        Compare the delays with the predicted delays or, if they hardly vary, compare the losses.
+        """
         lost = np.isnan(measured.delays), np.isnan(drawn.delays)
         both, requested = ~lost[0] & ~lost[1], _requested_delay(self.profile, drawn.sent)
         pair = [(one.delays - requested)[both] for one in (measured, drawn)]
@@ -266,7 +269,7 @@ def told(name: str, asked: float) -> Row:
 
 
 def tolerance(name: str, asked: float) -> float:
-    """Return the tolerance of a quantity whose requested value is `asked` [any unit]."""
+    """Return the tolerance of the quantity `name`; `asked` is its requested value [its unit]."""
     floor, share = TOLERANCES.get(name, SHARE_TOLERANCE)
     return max(floor, share * asked)
 

@@ -93,7 +93,7 @@ class LinkMonitor:
             ]
 
     def after(self, records: Sequence[Record], now_ns: int) -> list[Record]:
-        """Process this end's newest records at `now_ns` [ns]; return verdicts and faults."""
+        """Process this end's new records at `now_ns` [ns]; return link verdicts and faults."""
         if self._inbox is None:
             return self._see(records, now_ns)
         self._inbox.put((records, now_ns))
@@ -204,10 +204,11 @@ class LinkMonitor:
         return expected.judge("round_trip", float(np.mean(self._trips)))
 
     def _excuse(self, row: Row) -> Row:
-        """Change "off" to "open" if late wakes of this machine may have caused the long delay.
+        """Change a verdict "off" to "open" if late wakes of this machine may explain a long delay.
 
-        If a loop wakes late by t, the datagrams that arrive meanwhile wait for up to t. So the mean
-        square of the added delay grows with the third power of t.
+        If a loop wakes late by t, each datagram that arrives meanwhile waits for up to t. The
+        number of these datagrams grows with t, and the square of their wait with t^2. Therefore the
+        mean square of the added delay grows with t^3.
         """
         late = np.array(self._lates or [0.0])
         added = 2.0 * max((late**2).mean(), (late**3).mean() / (3.0 * self._period)) ** 0.5

@@ -108,7 +108,7 @@ class ProbeEnd:
                 self._copies[number] += 1
 
     def stream(self) -> Stream:
-        """Return the measured delays and copies of all probes."""
+        """Return time of sending, measured delay and number of copies of each probe."""
         delays = np.where(self._copies, self._delays, np.nan)
         return Stream((self._sent_ns - self.origin_ns) * 1e-9, delays, self._copies)
 

@@ -91,7 +91,7 @@ def _draw_delay(axes: Axes, way: DirectionSample, colour: str, top: float) -> No
 
 
 def _draw_tail(axes: Axes, letter: str, ways: list[_LabelledWay]) -> None:
-    """Draw the share of packets whose delay exceeds x, over x; a log scale shows the tail."""
+    """Plot, for each delay, the share of packets with a longer delay, on a logarithmic axis."""
     panel(axes, letter, "distribution")
     least = 1e-2
     for (way, name, colour), dashes in zip(ways, ("-", "--"), strict=False):

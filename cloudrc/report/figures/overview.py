@@ -63,7 +63,10 @@ class _View:
     """A parallel projection of the scene; the longer side of the scene is horizontal in it."""
 
     def __init__(self, points: Array, front: Array) -> None:
-        """Look at `points` [m], world frame, shape (n, 3), from the side of the vector `front`."""
+        """Look at `points` [m], world frame, shape (n, 3), from the side to which `front` points.
+
+        `front` is a vector in the world frame, shape (3,).
+        """
         level = points[:, :2] - points[:, :2].mean(axis=0)
         x, y = np.linalg.svd(level, full_matrices=False)[2][0]
         if front[:2] @ (y, -x) < 0:

@@ -103,7 +103,7 @@ def dots(axes: Axes, x: Array, y: Array, colour: str, name: str, size: float = 1
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """A flight, the link profile of each direction at its start, and the look of its figures."""
+    """A flight, the two link profiles at its start, and the look of the flight's figures."""
 
     flight: Flight
     uplink: Direction

@@ -59,7 +59,10 @@ class PositionHold:
     """
 
     def __init__(self, low: Vector, high: Vector, speed_max: float) -> None:
-        """Set the box for hold points, `low` and `high` [m], world frame, and `speed_max` [m/s]."""
+        """Set the box for hold points, and the limit `speed_max` of the reference [m/s].
+
+        `low` and `high` are the corners of the box [m], world frame.
+        """
         self._low, self._high = low, high
         self._speed_max = min(HOLD_SPEED_MAX, speed_max)
         self._hold_point: Vector | None = None

@@ -229,10 +229,10 @@ class Limits:
 
     @property
     def ramp_ns(self) -> int:
-        """Time after a HOLD in which the velocity reference accelerates with at most BRAKE [ns].
+        """Time after a HOLD for which BRAKE limits the reference's acceleration [ns].
 
-        The time is long enough to reach the speed cap. It does not end early at the commanded
-        velocity, because the first commands after a silence may be zero.
+        In this time the robot can reach its highest speed. The limit also applies after the
+        reference has reached the command, because the first commands after a silence may be zero.
         Source: docs/reference/plant.md, "Leaving HOLD".
         """
         return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)

@@ -126,7 +126,7 @@ class Guard:
         return changes
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
-        """Reset to GROUND; the robot stands at its spawn with stopped rotors."""
+        """Enter GROUND because of `cause`; the robot was reset to its spawn with stopped rotors."""
         self.forget_commands()
         self._tracked_ns = self._held_ns = -SETTLE_NS
         self._enter(GROUND, now_ns, Cause.SPAWN, cause)

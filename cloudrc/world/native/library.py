@@ -44,7 +44,7 @@ class Library(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Summary in one line, such as "C (compiled by cc)"."""
+        """Language that runs the steps, and origin of the code, such as "C (compiled by cc)"."""
         return f"{'Python' if self.run is None else 'C'} ({self.origin})"
 
 
