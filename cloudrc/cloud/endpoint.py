@@ -81,9 +81,10 @@ class ComputeTime:
         rng: np.random.Generator,
         cpu_clock: Callable[[], int] | None = None,
     ) -> None:
-        """Set the mean `mean_ns` [ns] and the standard deviation `deviation_ns` [ns].
+        """Set the mean and the standard deviation of the simulated time [ns].
 
-        If `cpu_clock` is given, its time [ns] between `begin` and `end` is added.
+        `cpu_clock` returns the CPU time used so far [ns]. If it is given, the CPU time between
+        `begin` and `end` is added.
         """
         self._mean_ns, self._deviation_ns, self._rng = mean_ns, deviation_ns, rng
         self._cpu_clock, self._began_ns = cpu_clock, 0
