@@ -173,7 +173,7 @@ class CloudEndpoint(TunnelEnd):
         return done and self.teleop.outcome is not None
 
     def next_deadline_ns(self) -> int:
-        """Return when the next command leaves or begins to be computed [ns]."""
+        """Return when the unsent command leaves; without one, when the next is computed [ns]."""
         return self._tick_ns if self._unsent is None else self._unsent[0]
 
     def handle_deadline(self, now_ns: int) -> None:

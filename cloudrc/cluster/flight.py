@@ -143,12 +143,12 @@ def refuse_second_flight(release: Release, ask: Ask) -> None:
 def fly_in_cluster(
     experiment: ResolvedExperiment, folder: Path, release: Release, timeout: float, tell: Tell
 ) -> dict[str, Any]:
-    """Fly one experiment with a release, fill its run folder, and return the report.
+    """Fly one experiment in a cluster, fill its run folder, and return the report.
 
     Args:
         experiment: A complete and checked experiment.
         folder: Folder of the run, which gets configuration, recordings, logs and report.
-        release: The release that flies; it is installed if it is missing, and stays afterwards.
+        release: The Helm release to use; it is installed if it is missing, and stays afterwards.
         timeout: Time limit for the release to become ready [s].
         tell: Receives the progress, one line per call.
     """
