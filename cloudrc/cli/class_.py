@@ -84,7 +84,7 @@ def _new(folder: Path) -> int:
 
 
 def check(folder: Path, limit: float = TIME_LIMIT) -> list[dict[str, Any]]:
-    """Score a folder, all parts in parallel, within `limit` [s]; return a dictionary per test."""
+    """Score the student's files in a folder within `limit` [s]; return a dictionary per test."""
     from cloudrc.drivers.machine import interpreter
     from cloudrc.exercise import checks
 

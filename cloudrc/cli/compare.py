@@ -67,7 +67,7 @@ def flight_arguments(parser: argparse.ArgumentParser, seeds: int) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Compare A and B, and print the result; return 0 unless the flights end early."""
+    """Compare A and B, print the result, and return the exit code: 0 if all flights were flown."""
     from cloudrc.sweep.compare import compare, of_sweep
 
     stopped, code = "", 0

@@ -102,10 +102,10 @@ def ask_if_unclear(candidates: Collection[Path], *, steers: bool, flag: str = "-
 def no_run_error(
     options: argparse.Namespace, error: MissingPrerequisiteError, flags: str
 ) -> MissingPrerequisiteError:
-    """Extend `error` (no cluster was found): no run is in flight on this machine either.
+    """Return an error which says that neither this machine nor a cluster has a run in flight.
 
-    Return `error` unchanged if the user gave --context or --namespace. `flags` lists the flags that
-    name a local run, for the error text.
+    `error` is the reason why no cluster was found. It is returned unchanged if the user gave
+    --context or --namespace. The text suggests `flags`, the flags that name a local run.
     """
     if options.context or options.namespace:
         return error

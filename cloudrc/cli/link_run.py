@@ -223,7 +223,7 @@ class Programs:
         self._tc: subprocess.Popen[str] | None = None
 
     def __call__(self, words: Sequence[str]) -> str:
-        """Run a command of tc or ip and return its output; errors as of `run_tool`."""
+        """Run a command of tc or ip and return its output; raise the same errors as `run_tool`."""
         try:
             match list(words):
                 case ["tc", "qdisc", "change", *_]:

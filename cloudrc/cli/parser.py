@@ -120,7 +120,7 @@ def number(low: float, high: float, unit: str) -> Callable[[str], float]:
 
 
 def figure_arguments(parser: argparse.ArgumentParser, width: float) -> None:
-    """Declare the arguments for the size of figures, by default of `width` [in]."""
+    """Declare the arguments for the size of figures; `width` is the default width [in]."""
     add = parser.add_argument
     about = f"width of figures in inches: one column of a paper has 3.5 (default: {width})"
     add("--width", type=number(2, 20, "inches"), default=width, metavar="IN", help=about)

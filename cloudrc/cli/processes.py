@@ -63,7 +63,7 @@ class Command(NamedTuple):
 def _add(
     parser: argparse._ActionsContainer, flag: str, kind: str, text: str, *, required: bool = False
 ) -> None:
-    """Declare a flag; `kind` is the metavar and tells the type of its value ("": no value)."""
+    """Declare a flag; `kind`, such as "FILE", is the name and type of its value ("": no value)."""
     if not kind:
         parser.add_argument(flag, action="store_true", help=text)
         return
@@ -196,7 +196,7 @@ def warn_if_exposed(listen: Address) -> None:
 
 @contextmanager
 def _listening(flag: str, listen: Address) -> Iterator[None]:
-    """Warn if `listen` is exposed; if the block cannot bind it, name `flag` in the error."""
+    """Warn if other machines can reach `listen`; name `flag` in the error if binding it fails."""
     warn_if_exposed(listen)
     try:
         yield
@@ -341,7 +341,8 @@ def link_monitor(
     """Make the monitor that compares the received datagrams with the link profile.
 
     `uplink` is True in cloud, False in world. In flight, the monitor reads changes of the profile
-    from the link's file `state`. Unless the link is `trusted`, its traces have the limit TRACE_MAX.
+    from the link's file `state`. If the link is not `trusted`, the monitor refuses files that are
+    larger than TRACE_MAX.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile

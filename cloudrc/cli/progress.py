@@ -125,7 +125,7 @@ class SweepView:
     """Shows how many flights are done: on a terminal in a status line, else in a line per 30 s."""
 
     def __init__(self, stream: TextIO, head: str, total: int) -> None:
-        """Print `head`; set the number of flights to fly."""
+        """Print the headline `head`; set `total`, the number of flights to fly."""
         self._stream, self._total = stream, total
         self._done, self._failed, self._told = 0, 0, set[str]()
         self._began = self._printed = monotonic()

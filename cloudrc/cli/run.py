@@ -347,7 +347,7 @@ def _record_local(
     see: See,
     session: Callable[[str, dict[str, str]], None] | None = None,
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
-    """Do as `_record_virtual`, but in real time; merge the recordings of world and cloud."""
+    """Fly in real time, merge the recordings, and yield the same as `_record_virtual`."""
     from cloudrc.assembly import flight_limit
     from cloudrc.cli.session import read_last_mission
     from cloudrc.drivers.local import LocalRun

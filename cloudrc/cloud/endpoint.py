@@ -81,9 +81,10 @@ class ComputeTime:
         rng: np.random.Generator,
         cpu_clock: Callable[[], int] | None = None,
     ) -> None:
-        """Set the mean `mean_ns` [ns] and the standard deviation `deviation_ns` [ns].
+        """Set the mean and the standard deviation of the simulated time [ns].
 
-        If `cpu_clock` is given, its time [ns] between `begin` and `end` is added.
+        `cpu_clock` returns the CPU time used so far [ns]. If it is given, the CPU time between
+        `begin` and `end` is added.
         """
         self._mean_ns, self._deviation_ns, self._rng = mean_ns, deviation_ns, rng
         self._cpu_clock, self._began_ns = cpu_clock, 0
@@ -172,7 +173,7 @@ class CloudEndpoint(TunnelEnd):
         return done and self.teleop.outcome is not None
 
     def next_deadline_ns(self) -> int:
-        """Return when the next command leaves or begins to be computed [ns]."""
+        """Return when the unsent command leaves; without one, when the next is computed [ns]."""
         return self._tick_ns if self._unsent is None else self._unsent[0]
 
     def handle_deadline(self, now_ns: int) -> None:

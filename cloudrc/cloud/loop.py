@@ -338,7 +338,7 @@ class ControlLoop:
         return tuple(plan)
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
-        """Whether the last new echo is older than the `horizon` [s] plus `freeze_after`."""
+        """Whether echoes have confirmed no new command for `horizon` plus `freeze_after` [s]."""
         if self._echoed_ns < self._newest_echo_ns:
             self._echoed_ns = self._newest_echo_ns
         elif self._echoed_ns == NEVER_NS:

@@ -45,9 +45,9 @@ class Operator(Protocol):
 def is_for_session(epoch: int, output: Output | Fault) -> bool:
     """Return whether a message from teleop is valid in the session with this epoch.
 
-    Setpoints and starts, which make the robot fly, are valid only in the session for which teleop
-    made them: before the next session another cloud may have moved the robot. Teleop sends both
-    again. All other messages are valid in every session.
+    Setpoints and START requests make the robot fly. They are valid only in the session for which
+    teleop made them: before the next session another cloud may have moved the robot. Teleop sends
+    both again. All other messages are valid in every session.
     """
     if isinstance(output, Setpoint) or (
         isinstance(output, OperatorRequest) and output.request is Request.START

@@ -143,12 +143,12 @@ def refuse_second_flight(release: Release, ask: Ask) -> None:
 def fly_in_cluster(
     experiment: ResolvedExperiment, folder: Path, release: Release, timeout: float, tell: Tell
 ) -> dict[str, Any]:
-    """Fly one experiment with a release, fill its run folder, and return the report.
+    """Fly one experiment in a cluster, fill its run folder, and return the report.
 
     Args:
         experiment: A complete and checked experiment.
         folder: Folder of the run, which gets configuration, recordings, logs and report.
-        release: The release that flies; it is installed if it is missing, and stays afterwards.
+        release: The Helm release to use; it is installed if it is missing, and stays afterwards.
         timeout: Time limit for the release to become ready [s].
         tell: Receives the progress, one line per call.
     """
@@ -181,10 +181,11 @@ def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> d
 
 
 def refuse_local_files(experiment: ResolvedExperiment) -> None:
-    """Raise a BadInputError if an experiment names local files, or if its mission has steps.
+    """Raise a BadInputError if an experiment needs files that the cluster does not have.
 
-    The API accepts only missions with waypoints. Files of the user's metrics and link profile are
-    allowed: this machine evaluates the metrics, and the experiment contains the profile.
+    Also raise it if the mission has random steps, because the API accepts only waypoints. Files of
+    the user's metrics are allowed, because this machine evaluates the metrics. The file of the link
+    profile is allowed, because the experiment contains its values.
     """
     flown = experiment.model_dump(mode="json", exclude={"report": True, "link": {"profile"}})
     pods.refuse_local_files(flown, "or fly with --mode local")

@@ -291,7 +291,7 @@ def _inline_profile(document: Document) -> None:
 
 
 def _implied(profile: Profile) -> dict[KeyPath, float]:
-    """Return the defaults that a profile gives for keys of `guard` and `cloud`, by path."""
+    """Return path -> default of those keys of `guard` and `cloud` that depend on the profile."""
     return {
         ("guard", "command_age_max_ms"): profile.command_age_max_ms or COMMAND_AGE_MAX_MS,
         ("cloud", "horizon_max_s"): profile.horizon_max_s or HORIZON_MAX_S,
@@ -300,7 +300,7 @@ def _implied(profile: Profile) -> dict[KeyPath, float]:
 
 
 def _has_all_values(document: Document) -> bool:
-    """Whether both directions have all keys, as in the file of a resolved experiment."""
+    """Whether the file sets all keys of both link directions, as a resolved experiment does."""
     given = [document.get("link", way) for way in DIRECTIONS]
     return all(
         isinstance(one, dict) and one.keys() >= Direction.model_fields.keys() for one in given

@@ -104,7 +104,7 @@ class Blackout(Section):
 
 
 class Change(Section):
-    """A change of the conditions; a key that is not given keeps its value."""
+    """A change of one direction of the link; a key that is not given keeps its value."""
 
     at_s: NotNegative
     """Start, in time since the link came up [s]"""
@@ -298,7 +298,7 @@ class LowLevel(Section):
 
 
 class Sensors(Section):
-    """Errors of the odometry for cloud."""
+    """Errors that world adds to the true state to make the odometry for cloud."""
 
     position_noise_m: NotNegative = 0.0
     """Standard deviation of the position noise per axis [m]"""

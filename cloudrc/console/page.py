@@ -336,7 +336,7 @@ class Page:
                 self._target = free
 
     def _place_target(self, now: float) -> Vector:
-        """Return the position of an unmoved target [m]: the setpoint, or 0.6 m above the robot."""
+        """Place the target until a user moves it [m]: at the setpoint, or 0.6 m above the robot."""
         feed = self._feed
         if feed.control is not None and feed.controls(now):
             at: Any = feed.control.setpoint

@@ -168,7 +168,7 @@ class FlightScene:
                 self._scene.add_mesh_simple(name, *rim, side="double", **look)
 
     def _add_robot(self, model: Any) -> None:
-        """Add the robot and its ghost; draw struts to the rotors, which the physics model lacks."""
+        """Add the robot, its ghost (the predicted robot), and struts that only the page shows."""
         base = model.jnt_bodyid[0]
         geoms = list(map(int, np.flatnonzero(model.body_rootid[model.geom_bodyid] == base)))
         self._add_geoms("/robot", model, geoms)

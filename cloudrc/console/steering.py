@@ -60,11 +60,11 @@ class Steering:
 
     Attributes:
         api: Teleop's API; it keeps no connection open, so that several threads may use it.
-        link: Functions for the emulated link.
-        answer: Newest result in words, whether it is a refusal, and its time [s].
+        link: Functions that read and change the emulated link.
+        answer: Result of the newest request in words, whether it is a refusal, and its time [s].
         state: Newest answer of the API's `GET /v1/state`; {} before the first.
         route: Waypoints of the mission under way [m], shape (n, 3); empty if none.
-        conditions: "uplink.delay_ms" and the like -> present value, in the unit of the key.
+        conditions: Key of the link, such as "uplink.delay_ms" -> present value, in the key's unit.
     """
 
     api: Api
@@ -99,7 +99,10 @@ class Steering:
         self._stops.set()
 
     def ask(self, words: str, path: str, body: Mapping[str, Any] | None = None) -> bool:
-        """Post a request, and store the result in `answer`; return whether teleop accepted it."""
+        """Post a request to `path` of the API; return whether teleop accepted it.
+
+        Store `words` in `answer`, or the error if teleop refused the request.
+        """
         try:
             self.api.post(path, body)
         except CloudrcError as error:

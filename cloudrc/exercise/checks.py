@@ -175,7 +175,7 @@ def run(part: str, folder: Path) -> list[dict[str, Any]]:
 
 
 def _explain(error: BaseException, part: str, files: Mapping[str, str]) -> str:
-    """Describe an error after FILE:LINE: the student's failed line, else that of the method."""
+    """Describe an error; begin with FILE:LINE of the student's failed line, else of the method."""
     while isinstance(error, CloudrcError) and error.__cause__ is not None:
         error = error.__cause__
     places = [(each.filename, each.lineno) for each in traceback.extract_tb(error.__traceback__)]

@@ -262,7 +262,7 @@ class WorldEnd(End):
 
 
 class CloudEnd(End):
-    """Metrics of cloud: those of `End`, and delays in the loop, prediction, control."""
+    """Metrics of cloud: those of `End`, and those of loop delay, prediction and control."""
 
     def __init__(self, counts: Mapping[str, int]) -> None:
         super().__init__(table.CLOUD, counts)
@@ -329,7 +329,7 @@ class Link:
         self._delays: dict[str, float] = {}
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set a direction's present shaper, "relay" or "netem", and the setting `link.mode`."""
+        """Set the `shaper` of a direction, "relay" or "netem", and the configured `link.mode`."""
         self._shapers[direction] = (shaper, direction, mode)
 
     def asked(self, direction: str, delay: float) -> None:

@@ -124,7 +124,7 @@ class Flight:
         self.teleop.ask(lambda service, now_ns: service.create(order, now_ns))
 
     def fly(self, until: float, is_over: Callable[[], bool] = lambda: False) -> Flight:
-        """Continue until the virtual time `until` [s] or `is_over()`; return this flight."""
+        """Fly on until the virtual time `until` [s], or until `is_over()` is True; return self."""
         self.run.fly(is_over, round(until * 1e9), self._sink)
         return self
 
@@ -207,7 +207,7 @@ class Flight:
         return LinkDirection(shape(profile), self.experiment.seed, uplink=up)
 
     def _begin(self, end: str, clock_id: bytes) -> Identity:
-        """Make the identity of a new process of `end` (world or cloud): its nonce and its keys."""
+        """Make the identity of a new process; `end` is "world" or "cloud"."""
         self.generations[end] += 1
         self.rings[end] = KeyRing(self.secrets[end])
         nonce = f"{end}-{self._life}-{self.generations[end]}".encode().ljust(16)

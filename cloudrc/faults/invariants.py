@@ -103,7 +103,7 @@ class Watch:
         self.starts_ns.append(start_ns)
 
     def see(self, records: list[Record], now_ns: int) -> None:
-        """Check that new records of world show commands that are applied once and in order.
+        """Check in the new `records` of world that each command was applied once and in order.
 
         A restarted world continues from the last epoch that cloud knows. If cloud knows no epoch,
         world starts with the first epoch again, which is allowed.
@@ -194,7 +194,7 @@ class RobotInvariants:
         self._was, self._state, self._before = state, state, reference
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
-        """Implement `Observer.see_command`: count fresh and impossible commands."""
+        """Implement `Observer.see_command`: check accepted commands, count impossible ones."""
         if rejection is None:
             basis_ns = command.basis_stamp_ns
             if not 0 <= now_ns - basis_ns <= self._age_ns:

@@ -70,11 +70,11 @@ class Outcome:
         self.checks.append(Check(text, measured, ">=", limit, unit))
 
     def same(self, text: str, measured: float, limit: float) -> None:
-        """Check that the count `measured` equals `limit` [1]."""
+        """Check that `measured` equals `limit`, both counts [1]; `text` says what is counted."""
         self.checks.append(Check(text, measured, "==", limit))
 
     def true(self, text: str, holds: bool) -> None:
-        """Check that the statement `text` is true."""
+        """Check that the statement `text` is true; `holds` tells whether it is."""
         self.checks.append(Check(text, float(holds), "==", 1.0, YES))
 
     @property

@@ -312,9 +312,9 @@ class Netem:
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
         """Use this profile from now on; with `restart`, its time line starts now.
 
-        Without `restart`, the new time line has the start of the old time line. Datagrams in flight
-        are not lost. If netem cannot realise the profile, the method raises a CloudrcError and the
-        old profile stays in force.
+        Without `restart`, the new time line counts as started when the old one started. Datagrams
+        in flight are not lost. If netem cannot realise the profile, the method raises a
+        CloudrcError and the old profile stays in force.
         """
         check(profile)
         held = self._look().get("held", 0)

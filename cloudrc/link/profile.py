@@ -122,9 +122,10 @@ class Timeline:
     """The conditions of one direction over time, from its changes, trace and blackouts.
 
     Attributes:
-        pieces: The conditions in each piece of the time line, or of one pass if it loops.
-        pass_ns: Start of each piece, as time since the link came up, rising [ns].
-        period_ns: Duration of one pass of a looping time line [ns]; None if there is no loop.
+        pieces: The constant conditions in each piece of the time line. If the time line loops, the
+            pieces are those of one period.
+        pass_ns: Start of each piece [ns], rising; 0 is the time at which the link came up.
+        period_ns: Period of a looping time line [ns]; None if the time line does not loop.
     """
 
     def __init__(self, profile: DirectionProfile) -> None:

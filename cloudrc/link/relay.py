@@ -348,12 +348,12 @@ class RelayShaper(Relay):
         return host, port
 
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Use this profile from now on; `restart` as in `LinkDirection.replace_profile`."""
+        """Use this profile from now on; with `restart`, its time line starts at the next packet."""
         self.take_in()  # datagrams that have arrived belong to the old profile
         self._lane.direction.replace_profile(profile, restart=restart)
 
     def released(self) -> dict[str, int]:
-        """Return `Lane.released` of this direction."""
+        """Return how late datagrams of this direction left; see `Lane.released`."""
         return self._lane.released()
 
     def close(self) -> None:

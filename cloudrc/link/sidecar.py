@@ -72,10 +72,11 @@ class Sidecar:
         self._reason, self._origin_ns = "", 0
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Wait until the peer is known, then shape until `stop` returns True.
+        """Wait until the peer is known, then shape datagrams until `stop` returns True.
 
         Raises:
-            CloudrcError: If the mode is not "auto" and its shaper cannot realise the profile.
+            CloudrcError: If the mode names a shaper (relay or netem), and this shaper cannot
+                realise the profile.
         """
         self._route.unlink(missing_ok=True)  # an earlier process may have left one
         while self.peer is None:
@@ -160,7 +161,7 @@ class Sidecar:
         return state
 
     def _publish_released(self, shaper: Shaper) -> None:
-        """Update the file from which world or cloud reads the lateness."""
+        """Write to a file how late datagrams left; the pod's world or cloud reads this file."""
         if released := shaper.released():
             with suppress(OSError):
                 publish(self._released_file, json.dumps(released))

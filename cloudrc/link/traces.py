@@ -234,7 +234,7 @@ def _number(row: Row, column: str) -> float:
 
 
 def _check_delays(delays: Sequence[float], column: str, place: str, *, may_be_lost: bool) -> None:
-    """Reject delays that are probably in seconds, and delays of 0 that mark lost packets."""
+    """Reject delays in [ms] that are probably seconds, and delays of 0 that mean lost packets."""
     longest = max(delays)
     if column == "delay_ms" and 0.0 < longest < 1.0:
         raise BadInputError(

@@ -103,7 +103,7 @@ class Flight:
 
     @cached_property
     def control(self) -> Columns:
-        """Control periods during the flight; one row has the values of all `CONTROL_TOPICS`."""
+        """One row per control period of the flight, with the columns of all `CONTROL_TOPICS`."""
         return self._within(self._control)
 
     @cached_property

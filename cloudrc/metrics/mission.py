@@ -31,7 +31,7 @@ FAILURES = ("estimator_failed", "predictor_failed", "controller_failed", "horizo
 
 
 def first_touch(flight: Flight) -> dict[str, Array] | None:
-    """Find the row of /contact for the arm's first touch of the board; None without a touch."""
+    """Return the first row of /contact in which the arm's tip touches the board, else None."""
     contact = flight.during("/contact")
     touches = np.flatnonzero((contact["body"] == BOARD) & contact["tip"].astype(bool))
     return {name: column[touches[0]] for name, column in contact.items()} if len(touches) else None

@@ -35,7 +35,7 @@ DURATION_MIN, DEVIATION_MIN, SHARE_MIN = 20.0, 0.1, 0.8
 
 
 class Fit(NamedTuple):
-    """The model of one axis, and how certain it is."""
+    """The fitted parameters of the velocity loop along one axis, and their uncertainty."""
 
     values: Array  # time constant [s], dead time [s] and gain [1], shape (3,)
     half_widths: Array  # half of the 95 % intervals of `values` [s], [s] and [1], shape (3,)
@@ -70,7 +70,7 @@ def series(recording: Recording, name: str) -> tuple[Array, Array]:
 
 
 def identify(given: Array, measured: Array, name: str) -> Fit:
-    """Fit the model to the velocities of one axis, one sample per DT.
+    """Fit the model of the velocity loop to the velocities along one axis, one sample per DT.
 
     Args:
         given: Input velocities [m/s], shape (n,).
@@ -119,9 +119,10 @@ def identify(given: Array, measured: Array, name: str) -> Fit:
 
 
 def simulate(given: Array, theta: Array, start: float) -> Array:
-    """Return the model's velocity [m/s], shape (n,), for `theta` with T, d [s] and K [1].
+    """Simulate the velocity loop; return its velocity at each sample [m/s], shape (n,).
 
-    `given` is the input velocity, `start` the first velocity [m/s].
+    `given` is the commanded velocity [m/s], shape (n,). `theta` is (T [s], d [s], K [1]). `start`
+    is the velocity at the first sample [m/s].
     """
     constant, dead, gain = theta
     at = np.arange(len(given)) * DT
@@ -132,7 +133,7 @@ def simulate(given: Array, theta: Array, start: float) -> Array:
 
 
 def _slopes(residuals: Any, theta: Array) -> Array:
-    """Return the derivatives of the residuals with respect to T, d and K, shape (n, 3)."""
+    """Return the derivatives of `residuals` at `theta`, which is (T, d, K), shape (n, 3)."""
     step = 0.5 * DT
     pairs = [(theta + change, theta - change) for change in np.eye(3) * step]
     return np.stack([(residuals(a) - residuals(b)) / (2.0 * step) for a, b in pairs], axis=1)

@@ -44,7 +44,7 @@ class Topic(NamedTuple):
     part: str = ""  # path, with a final dot, of a nested record with fields that `source` lacks
 
     def paths(self) -> list[str]:
-        """Return the dotted path of each field's value in the record."""
+        """Return where each field's value is in the record, as dotted paths."""
         own = self.source._fields
         return [
             field.path or (field.name if field.name in own else f"{self.part}{field.name}")

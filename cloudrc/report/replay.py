@@ -51,7 +51,7 @@ def write_section(flight: Flight, experiment: ResolvedExperiment) -> str:
 
 
 def write_page(flight: Flight, experiment: ResolvedExperiment) -> str:
-    """Return the replay as a page of its own; raise the same errors as `write_section`."""
+    """Return the replay as a complete HTML page; raise the same errors as `write_section`."""
     return (
         '<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8">\n'
         f"<title>{escape(experiment.name)}: replay</title>\n"

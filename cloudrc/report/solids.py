@@ -29,7 +29,7 @@ class Face(NamedTuple):
 
 
 def robot_faces() -> list[Face]:
-    """Build the robot, in its body frame."""
+    """Return the faces that draw the robot, in its body frame."""
     rod, arm = (body.ROD_TOP - body.ROD_BOTTOM) / 2, body.ARM_LENGTH / 2
     wide, thin = body.ROD_RADIUS, body.ARM_RADIUS
     faces = _box((0.0, 0.0, 0.0), body.BASE_HALF, BASE)

@@ -151,7 +151,10 @@ def paired(differences: Sequence[float]) -> Paired:
 
 
 def _cut(n: int) -> int:
-    """Return the largest sum of ranks with which `n` pairs reject a shift; -1 if no sum does."""
+    """Return the critical value of the signed-rank test of `n` pairs; -1 if there is none.
+
+    The test rejects a shift if the sum of ranks is at most this value.
+    """
     if n > EXACT_MAX:
         mean, spread = n * (n + 1) / 4, math.sqrt(n * (n + 1) * (2 * n + 1) / 24)
         return math.floor(mean - 0.5 - Z * spread)

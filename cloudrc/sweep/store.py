@@ -178,7 +178,7 @@ def values_of(rows: Sequence[Row]) -> dict[str, list[Any]]:
 
 
 def _write_summary(folder: Path, plan: Plan, rows: Mapping[str, Row]) -> dict[str, str]:
-    """Write the description of a sweep; return the units of all metrics."""
+    """Write the file SUMMARY of a sweep; return metric -> unit."""
     own = {choice for point in plan.points for choice in point.report.metrics}
     unit_of = units(own)
     summary = {

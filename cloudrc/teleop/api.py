@@ -377,7 +377,8 @@ class ApiServer(uvicorn.Server):
     def __init__(self, gate: Gate, bridge: Bridge, address: Address) -> None:
         """Bind the address; with port 0 the kernel chooses a port.
 
-        Raise a BadInputError if the address cannot be bound, or if a TCP address has no tokens.
+        Raise a BadInputError if the address cannot be bound, or if `gate` has no tokens and the
+        address is not that of a Unix socket.
         """
         if gate.tokens is None and not isinstance(address, Path):
             raise BadInputError(

@@ -45,9 +45,10 @@ class Leg:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Waypoints of a mission, with the place of the start and the time limit.
+    """What a mission flies: its waypoints (`legs`) or its `track`, where it starts, its time limit.
 
-    A mission with a `track` has one waypoint, which counts as reached at the end of the track.
+    A track gives setpoints at fixed times. A mission with a track has one waypoint, which counts as
+    reached at the end of the track.
     """
 
     legs: tuple[Leg, ...]  # in order; at least one

@@ -273,8 +273,8 @@ class WorldEndpoint(TunnelEnd):
     def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
         """Carry out an operator request; ignore repeated and old requests.
 
-        Raise the DecodeError "stale" for a start that is too old or may have waited in the socket
-        during a stall, and "future" for a start whose odometry is later than world's clock.
+        Raise the DecodeError "stale" for a START request that is too old or may have waited in the
+        socket during a stall, and "future" if its odometry is later than world's clock.
         """
         kind, guard, tick_ns = request.request, self.robot.guard, self._tick_ns
         starts = kind is Request.START

@@ -21,13 +21,13 @@ class Earliest(Estimator):
         self._offsets: deque[float] = deque(maxlen=count)
 
     def add_applied(self, applied_minus_stamp: float) -> None:
-        """Store `applied_minus_stamp` [s]: downlink delay plus the offset between the clocks."""
+        """Store the downlink delay of a command plus the offset between the clocks [s]."""
         self._offsets.append(applied_minus_stamp)
 
     def horizon(self, age: float) -> float:
-        """Return `age` plus the smallest `applied_minus_stamp` [s].
+        """Return `age` plus the smallest `applied_minus_stamp` [s]; 0 before the first of them.
 
-        Both contain the offset between the clocks, with opposite signs, so their sum does not.
+        Both contain the offset between the clocks, with opposite signs. It cancels in the sum.
         """
         return max(0.0, age + min(self._offsets)) if self._offsets else 0.0
 

@@ -26,7 +26,7 @@ class Ewma(Estimator):
             self._average += self._gain * (sample.loop_delay - self._average)
 
     def horizon(self, age: float) -> float:
-        """Return the average [s]. `age` has no effect."""
+        """Return the average loop delay [s]; 0 before the first sample. `age` has no effect."""
         return 0.0 if self._average is None else max(0.0, self._average)
 
 

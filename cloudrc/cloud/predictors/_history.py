@@ -56,7 +56,10 @@ class History:
         return self.stamps[-1] - self.stamps[-2] if len(self.stamps) > 1 else PERIOD_NS
 
     def note_applied(self, stamp_ns: int, began_ns: int) -> None:
-        """Update the shift: the command of `stamp_ns` began at `began_ns`, world's clock [ns]."""
+        """Update the mean shift with an echo.
+
+        World applied the command with the stamp `stamp_ns` at `began_ns`, on world's clock [ns].
+        """
         last_began_ns, last_stamp_ns = self._applied[-1] if self._applied else (NEVER_NS, 0)
         lasted_ns = began_ns - last_began_ns
         if lasted_ns <= 0:
@@ -137,7 +140,7 @@ class History:
 
 
 class Body(Model):
-    """A model that starts from the odometry `basis`; its state is that `horizon` [s] later.
+    """A model of the robot; its state is `horizon` [s] later than the odometry `basis`.
 
     `position` [m] and `velocity` [m/s] are those of the base, world frame.
     """
@@ -170,7 +173,7 @@ class Body(Model):
 
 
 class Replay(Predictor):
-    """A predictor that replays commands through a `Body`; a subclass defines `roll`."""
+    """A predictor that simulates the sent commands with a `Body`; subclasses define `roll`."""
 
     def __init__(self) -> None:
         self.reset()
@@ -194,11 +197,11 @@ class Replay(Predictor):
         self.newest, self.history.seen_ns = odometry, odometry.stamp_ns
 
     def roll(self, odometry: Odometry, horizon: float) -> Body:
-        """Return a body in the predicted state `horizon` [s] after the newest sample."""
+        """Return a model of the robot in the state `horizon` [s] after `odometry`."""
         raise NotImplementedError
 
     def forecast(self, stamp_ns: int) -> Body | None:
-        """Return a body in the predicted state at a later stamp [ns]; None without a sample."""
+        """Return a model in the state predicted for `stamp_ns` [ns]; None without older samples."""
         if self.newest is None or stamp_ns <= self.newest.stamp_ns:
             return None
         return self.roll(self.newest, (stamp_ns - self.newest.stamp_ns) * 1e-9)
@@ -209,7 +212,7 @@ class Replay(Predictor):
         return self._last.odometry() if horizon else odometry
 
     def model(self) -> Model | None:
-        """Return a copy of the body in the state of the last prediction."""
+        """Return a copy of the robot's model, in the state of the last prediction; or None."""
         return copy(self._last)
 
 

@@ -62,8 +62,9 @@ class FirstOrder(Body):
 class CommandHistory(Replay):
     """Adds the effect of the commands in the horizon to the measured position and velocity.
 
-    The loop is linear behind the acceleration limit. Therefore one replay of all commands, from
-    rest, is enough: the difference between measured and replayed velocity decays exponentially.
+    The velocity loop is linear, except for the acceleration limit at its input. Therefore it is
+    enough to simulate all commands once, from rest: the difference between measured and simulated
+    velocity decays exponentially.
     """
 
     def __init__(self, axes: Axes, acceleration_max: float) -> None:
@@ -85,7 +86,7 @@ class CommandHistory(Replay):
             self._bodies.append(body)
 
     def _at(self, time_ns: int) -> FirstOrder:
-        """Return the replayed body at a time on cloud's clock [ns]."""
+        """Return the simulated robot at `time_ns`, on cloud's clock [ns]."""
         history = self.history
         if not history.stamps:
             return FirstOrder(*self._loop)

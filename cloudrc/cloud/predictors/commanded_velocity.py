@@ -13,8 +13,9 @@ from cloudrc.messages import ZERO, Command, Odometry
 class CommandedVelocity(Predictor):
     """Adds the last commanded velocity times the horizon to the position.
 
-    With a proportional controller, u = -K · (p + u · tau) gives u = -K · p / (1 + K · tau): a
-    longer delay lowers the effective gain. This damps the motion, but the predictions are bad.
+    At the position p, with the horizon tau and a proportional controller, the command is
+    u = -K · (p + u · tau). This gives u = -K · p / (1 + K · tau): a longer delay lowers the
+    effective gain. This damps the motion, but the predictions are bad.
     """
 
     def __init__(self) -> None:

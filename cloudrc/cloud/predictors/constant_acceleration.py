@@ -17,7 +17,7 @@ class ConstantAcceleration(Predictor):
     """Predicts with the measured velocity and the mean acceleration in a short time window."""
 
     def __init__(self, window: float) -> None:
-        """Set `window`, the longest time over which the mean acceleration is computed [s]."""
+        """Set `window`, the longest time between the samples that give the acceleration [s]."""
         self._window_ns = round(window * 1e9)
         self._recent: deque[Odometry] = deque()
         self._acceleration = ZERO
@@ -78,8 +78,8 @@ def build(window: Positive = 0.05) -> ConstantAcceleration:
     """Make the predictor.
 
     Args:
-        window: Longest time between the two compared velocities [s]; at least one period of the
-            odometry. A longer window reduces the noise, but the acceleration lags by half the
-            window.
+        window: Longest time between the two samples that give the acceleration [s]; at least one
+            period of the odometry. A longer window reduces the noise, but the acceleration lags by
+            half the window.
     """
     return ConstantAcceleration(window)

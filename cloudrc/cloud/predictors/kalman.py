@@ -91,7 +91,7 @@ class Kalman(Predictor):
         return prediction if horizon else odometry
 
     def model(self) -> Model | None:
-        """Return the replay's model in the state of the last prediction."""
+        """Return the model of the robot, in the state of the last prediction; or None."""
         return self._replay.model()
 
 

@@ -1,9 +1,10 @@
 """Predictor: replay the sent commands through a model of the robot and its onboard controller.
 
-The model is a white box: guard's limits, velocity PID, attitude loop, rotors, drag. Its hidden
-states (reference, integral, thrust, torque) follow the commands that the echoes show. Each odometry
-sample replaces pose and twist. The model estimates effects that it lacks, such as wind, a payload
-or the arm's weight, as a constant acceleration and a constant torque.
+The model is a white box: guard's limits, velocity PID, attitude loop, rotors, drag. Its reference,
+integral, thrust and torque are not in the odometry; the model computes them from the commands that
+the echoes confirm. Each odometry sample replaces pose and twist. The predictor estimates effects
+that the model lacks, such as wind, a payload or the arm's weight, as a constant acceleration and a
+constant torque.
 
 Source: docs/reference/control.md, "Predictors", (e2); docs/reference/plant.md, "Robot", "Low-level
 controller".

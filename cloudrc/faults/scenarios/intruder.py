@@ -80,7 +80,7 @@ def _corruption(outcome: Outcome, seed: int) -> None:
     expects="no effect: the same path, bit by bit",
 )
 def _flood(outcome: Outcome, seed: int) -> None:
-    """Send random bytes alone, and valid headers followed by too few or enough random bytes."""
+    """Send random bytes, alone or after a valid header, too few of them or the right number."""
     rng = generator(seed, 20)
 
     def garbage(data: bytes) -> Iterable[bytes]:

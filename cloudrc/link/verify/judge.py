@@ -132,7 +132,7 @@ class Plan:
 
     @cached_property
     def chance(self) -> Expected:
-        """Bands of the values measured on the simulated `links`."""
+        """The range in which each quantity lies by chance, computed from the simulated `links`."""
         return self._expect(self.links)
 
     def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:
@@ -249,7 +249,7 @@ def _requested_delay(profile: DirectionProfile, sent: Floats) -> Floats:
 
 
 def netem_makes(profile: DirectionProfile) -> DirectionProfile:
-    """Return the profile with which the link's model behaves as netem does with `profile`.
+    """Return a profile with which the relay's link model behaves as netem does with `profile`.
 
     netem hardly correlates delays. If netem selects a packet both for loss and for duplication, one
     copy arrives. netem can also lose the second copy. Source: Linux, net/sched/sch_netem.c.
@@ -264,7 +264,7 @@ def netem_makes(profile: DirectionProfile) -> DirectionProfile:
 
 
 def told(name: str, asked: float) -> Row:
-    """Make the row of an unjudged quantity with the requested value `asked` [any unit]."""
+    """Make a row that only tells the requested value `asked` [any unit], and judges nothing."""
     return Row(name, UNITS.get(name, "1"), asked, nan, nan, nan, "told")
 
 

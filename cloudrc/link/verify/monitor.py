@@ -58,10 +58,10 @@ class LinkMonitor:
     def __init__(
         self, *, uplink: bool, flow: Flow, period: float = PERIOD, computes: bool = False
     ) -> None:
-        """Monitor the received `flow`: telemetry at cloud (`uplink`), or commands at world.
+        """Monitor a received `flow`: with `uplink` telemetry in cloud, else commands in world.
 
-        `period` is that of the flow [s]. If cloud `computes` for a simulated time, delays that
-        contain this time are not judged.
+        `period` is the time between two datagrams of the flow [s]. `computes` tells whether cloud
+        simulates a computing time; delays that contain this time are not judged.
         """
         self._uplink, self._flow = uplink, flow
         self._period, self._computes = period, computes

@@ -41,11 +41,11 @@ _BUFFER = 4_000_000
 def plan_probes(
     profile: DirectionProfile, flow: Flow, seconds: float | None = None, *, drawn: bool = False
 ) -> Plan:
-    """Plan probes for `seconds` [s], or with None for as long as a verdict needs.
+    """Plan when to send probes, for `seconds` [s].
 
-    With None, a profile with a time line is probed along the whole time line. If the profile limits
-    the rate, the probes are large, and half of them are sent in trains to measure the rate.
-    `drawn` is True for netem, whose random numbers cannot be predicted.
+    None selects a duration that is long enough for a verdict, and covers the profile's time line up
+    to a limit. If the profile limits the rate, the probes are large, and half of them are sent in
+    trains to measure the rate. `drawn` is True for netem, whose random numbers nobody can predict.
     """
     timeline, train, step = Timeline(profile), 0, (2.0 if drawn else 1.0) / RATE
     if (rate := min(piece.rate or inf for piece in timeline.pieces)) <= RATE_MAX:

@@ -33,7 +33,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A quantity with its unit, and one line per setting."""
+    """One panel of the figure: a quantity with its unit, and its points per setting."""
 
     title: str
     unit: str

@@ -181,7 +181,7 @@ def _draw_inset(rows: Any, subject: Subject) -> None:
 
 
 def _free_box(axes: Axes, time: float, width: float, height: float) -> Bbox | None:
-    """Find a box without curves, as near to `time` [s] as possible; sizes are shares of a panel."""
+    """Find a box near `time` [s] without curves; `width` and `height` are shares of the panel."""
     to_axes = axes.transData - axes.transAxes
     paths = [to_axes.transform_path(line.get_path()) for line in axes.lines]
     at = to_axes.transform((time, 0.0))[0]

@@ -50,7 +50,7 @@ def place_labels(figure: Figure) -> None:
 
 
 def curves(axes: Axes) -> tuple[list[Path], Any]:
-    """Return what labels must not cover [pixels]: lines, and dots with shape (n, 2)."""
+    """Return lines and positions of dots, shape (n, 2), that labels must not cover [pixels]."""
     lines: list[Path] = []
     dots: list[Any] = [np.zeros((0, 2))]
     for line in (line for line in axes.lines if line.get_zorder() > 0):  # 0: background

@@ -198,7 +198,8 @@ class TakeOff:
     def forget(self, *, stopped: bool = False) -> None:
         """Reset to the state before take-off, because the rotors stop.
 
-        `stopped` tells whether the robot may now be in the air or on an obstacle.
+        With `stopped`, the robot may be in the air or on an obstacle. Then it may take off only
+        after it has come to rest on the ground.
         """
         self.over = False
         if stopped:

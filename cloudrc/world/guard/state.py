@@ -239,9 +239,10 @@ class Guard:
             self._ramp_until_ns = now_ns + self._limits.ramp_ns
 
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
-        """Return whether TRACK may begin: take-off is allowed, and SETTLE_NS have passed.
+        """Return whether TRACK may begin.
 
-        The time counts from the last TRACK to now, and from the last HOLD to `fresh_until_ns`.
+        Take-off must be allowed. Since the last TRACK began, SETTLE_NS must have passed. Since the
+        last HOLD began, SETTLE_NS must have passed by `fresh_until_ns`.
         """
         apart_ns = min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns)
         return self._take_off.allowed and apart_ns >= SETTLE_NS

@@ -230,7 +230,7 @@ class NativeRobot(Robot):
         self._in_c = False  # whether C has the newest state of the controller
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
-        """Reset the robot to its spawn, as `Robot` does."""
+        """Reset the robot to its spawn; see `Robot.put_on_ground`."""
         self._in_c = False
         super().put_on_ground(now_ns, cause)
 
