@@ -223,7 +223,7 @@ def mission_plan(
 def with_order(
     experiment: ResolvedExperiment, order: Order, description: str
 ) -> ResolvedExperiment:
-    """Replace the experiment's mission with an operator's order; the inverse of `mission_plan`.
+    """Return the experiment with an operator's order as its mission; inverts `mission_plan`.
 
     If the order is a drive by hand, the mission reads its setpoints from the file `DRIVE_FILE`.
     """

@@ -120,7 +120,10 @@ def create_job(
 
 
 def owner_of(version: str, kind: str, owner: Any) -> dict[str, Any]:
-    """Build an owner reference: Kubernetes deletes an object when its owner is deleted."""
+    """Build a reference to `owner`: Kubernetes deletes an object that has it together with `owner`.
+
+    `version` and `kind` are those of the owner, such as "batch/v1" and "Job".
+    """
     metadata = owner.metadata
     return {"apiVersion": version, "kind": kind, "name": metadata.name, "uid": metadata.uid}
 

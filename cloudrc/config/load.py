@@ -208,7 +208,10 @@ def fingerprint(experiment: ResolvedExperiment) -> str:
 
 
 def local_files(value: Any, key: str = "") -> dict[str, str]:
-    """Return dotted key -> path of the files that exist; `value` is the experiment below `key`."""
+    """Return the existing files that `value` names by absolute path: dotted key -> path.
+
+    `value` is the part of the experiment below the dotted key `key`.
+    """
     if isinstance(value, str):
         return {key: value} if value.startswith("/") and Path(value).is_file() else {}
     listed = dict(enumerate(value)) if isinstance(value, list) else value

@@ -64,7 +64,7 @@ def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
 
 
 def _directions(path: KeyPath) -> list[KeyPath]:
-    """Return the paths for uplink and downlink if `path` names both, else `path`."""
+    """Return the paths of uplink and downlink if `path` contains "both", else only `path`."""
     at = int(path[0] == "link")
     if path[at : at + 1] != ("both",):
         return [path]

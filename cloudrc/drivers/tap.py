@@ -47,7 +47,10 @@ class Tap:
         self._due = 0.0
 
     def tell(self, records: Iterable[Record]) -> None:
-        """Store the newest of new `records` (oldest first); send a datagram if one is due."""
+        """Store the newest record of each type; send a datagram if one is due.
+
+        `records` are new records, oldest first.
+        """
         for record in records:
             if isinstance(record, Arrival):
                 self._arrival = record if record.used else self._arrival

@@ -60,7 +60,10 @@ def steps(flight: Flight) -> tuple[Step, ...]:
 
 
 def _measure(flight: Flight, row: int, end_ns: int) -> Step | None:
-    """Measure the step from a row of `flight.control` to `end_ns` [ns]; None if it is too small."""
+    """Measure the response to the step of the setpoint in row `row` of `flight.control`.
+
+    The response ends at `end_ns` [ns]. Return None if the step is shorter than `LENGTH_MIN`.
+    """
     control, truth = flight.control, flight.truth
     begin_ns, setpoint = int(control["stamp_ns"][row]), control["setpoint"][row]
     rows = (truth["stamp_ns"] >= begin_ns) & (truth["stamp_ns"] < end_ns)
