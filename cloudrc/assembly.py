@@ -328,5 +328,5 @@ def _scaled(value: float | None, factor: float) -> float | None:
 
 
 def _generator(seed: int, stream: str) -> np.random.Generator:
-    """Make a random number generator; different names `stream` give independent numbers."""
+    """Make a random number generator; generators with different names `stream` are independent."""
     return np.random.Generator(np.random.PCG64([seed, int.from_bytes(stream.encode(), "little")]))

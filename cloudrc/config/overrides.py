@@ -182,7 +182,7 @@ def build_plugin(kind: str, choice: PlugIn) -> Any:
 
 
 def parameter_model(kind: str, name: str) -> type[BaseModel]:
-    """Create a pydantic model of a plug-in's parameters from the signature of its `build`."""
+    """Create a pydantic model of a plug-in's parameters from the signature of its function `build`."""
     empty = inspect.Parameter.empty
     fields: dict[str, Any] = {
         name: (
