@@ -7,7 +7,7 @@
   `cloud.controller.speed_max=2` gives `{name: pid, speed_max: 2}`.
 - An index one above the last index of a list appends to it.
 
-Types and defaults of a plug-in's parameters come from the signature of its function `build`.
+Types and defaults of a plug-in's parameters come from the signature of its `build`.
 """
 
 from __future__ import annotations
@@ -182,7 +182,7 @@ def build_plugin(kind: str, choice: PlugIn) -> Any:
 
 
 def parameter_model(kind: str, name: str) -> type[BaseModel]:
-    """Create a pydantic model of a plug-in's parameters from the signature of its function `build`."""
+    """Create a pydantic model of a plug-in's parameters from the signature of its `build`."""
     empty = inspect.Parameter.empty
     fields: dict[str, Any] = {
         name: (
