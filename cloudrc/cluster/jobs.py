@@ -120,10 +120,7 @@ def create_job(
 
 
 def owner_of(version: str, kind: str, owner: Any) -> dict[str, Any]:
-    """Build a reference to `owner`: Kubernetes deletes an object that has it together with `owner`.
-
-    `version` and `kind` are those of the owner, such as "batch/v1" and "Job".
-    """
+    """Make an owner reference; Kubernetes deletes an object that has it together with `owner`."""
     metadata = owner.metadata
     return {"apiVersion": version, "kind": kind, "name": metadata.name, "uid": metadata.uid}
 

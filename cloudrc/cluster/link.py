@@ -161,10 +161,7 @@ def send(
 
 
 def keep(release: Release, link: LinkParts, sent: Sent) -> None:
-    """Write a sent change into the ConfigMap, so that it is permanent.
-
-    Raise a CloudrcError if this fails, or if a container has not answered.
-    """
+    """Write a change to the ConfigMap; raise an error if this fails or a container did not answer."""
     said = list(map(str, sent.failed))
     words = ["patch", "configmap", link.name, "--type=merge", "--patch-file=/dev/stdin"]
     try:

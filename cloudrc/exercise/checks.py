@@ -145,11 +145,7 @@ CHECKS: dict[str, tuple[Formula | Flight, ...]] = {
 
 
 def rows(part: str, scored: Sequence[tuple[float, str]]) -> list[dict[str, Any]]:
-    """Return a dictionary per check of a part, with the points that were reached.
-
-    `scored` has for each check the share of its points that was reached, in [0, 1], and a text that
-    describes what was seen.
-    """
+    """Return a row per check; `scored` has its share of the points [0, 1], and what was seen."""
     keys = ("part", "test", "points", "max_points", "seen")
     cells = (
         (part, check.test, round(check.points * share, 1), check.points, seen)

@@ -190,10 +190,7 @@ class ModelBased(Replay):
         self._body: WhiteBox | None = None  # at the newest sample
 
     def forecast(self, stamp_ns: int) -> WhiteBox | None:
-        """Return the white box in its predicted state at a later stamp [ns].
-
-        Return None without recent odometry, or if no new command has been applied for some time.
-        """
+        """Predict the white box at a later stamp [ns]; None without recent odometry or command."""
         body = copy(self._body)
         if body is None or not 0 < stamp_ns - body.basis.stamp_ns < GAP_NS:
             return None

@@ -130,10 +130,7 @@ class LinkMonitor:
             threading.Event().wait(FOLLOW_PERIOD)
 
     def _see(self, records: Sequence[Record], now_ns: int) -> list[Record]:
-        """Store records; every `CHECK_NS`, judge the records of the present session and profile.
-
-        Return the verdicts and faults as records; the list is empty between two checks.
-        """
+        """Store records; every `CHECK_NS`, return verdicts on the present session and profile."""
         for record in records:
             if isinstance(record, Arrival):
                 self._fresh |= record.epoch != self._epoch
