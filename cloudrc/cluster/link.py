@@ -161,7 +161,7 @@ def send(
 
 
 def keep(release: Release, link: LinkParts, sent: Sent) -> None:
-    """Write a change to the ConfigMap; raise an error if this fails or a container did not answer."""
+    """Write a change to the ConfigMap; raise an error if the write or a container has failed."""
     said = list(map(str, sent.failed))
     words = ["patch", "configmap", link.name, "--type=merge", "--patch-file=/dev/stdin"]
     try:
