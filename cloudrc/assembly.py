@@ -223,7 +223,7 @@ def mission_plan(
 def with_order(
     experiment: ResolvedExperiment, order: Order, description: str
 ) -> ResolvedExperiment:
-    """Replace the experiment's mission with an operator's order; the inverse of `mission_plan`.
+    """Return the experiment with an operator's order as its mission; inverts `mission_plan`.
 
     If the order is a drive by hand, the mission reads its setpoints from the file `DRIVE_FILE`.
     """
@@ -328,5 +328,5 @@ def _scaled(value: float | None, factor: float) -> float | None:
 
 
 def _generator(seed: int, stream: str) -> np.random.Generator:
-    """Make a random number generator; different names `stream` give independent numbers."""
+    """Make a random number generator; generators with different names `stream` are independent."""
     return np.random.Generator(np.random.PCG64([seed, int.from_bytes(stream.encode(), "little")]))

@@ -41,7 +41,7 @@ class GuardState(IntEnum):
 
 
 class Cause(IntEnum):
-    """Why the guard is in its state: a number in messages, and `words` for users."""
+    """Why the guard is in its state: messages carry the number, and users read the `words`."""
 
     words: str
 

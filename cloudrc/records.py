@@ -83,9 +83,9 @@ class GroundTruth(NamedTuple):
 class Arrival(NamedTuple):
     """World or cloud: a datagram with a command or telemetry arrived, even if late.
 
-    If an attacker repeats more datagrams in a session than the peer has sent, further repetitions
-    get no record, so that they cannot fill the recording. Topics /uplink_delay (made by cloud) and
-    /downlink_delay (made by world).
+    If a session has more repeated datagrams than the peer has sent, only an attacker can be the
+    cause. Further repeats then get no record, so that they cannot fill the recording. Cloud writes
+    the topic /uplink_delay, world the topic /downlink_delay.
     """
 
     stamp_ns: int

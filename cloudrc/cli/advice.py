@@ -102,7 +102,7 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
 
 
 def _hover(experiment: ResolvedExperiment) -> Iterator[str]:
-    """Check whether the integral of the velocity loop can balance wind and additional weight."""
+    """Yield advice if the integral of the velocity loop cannot balance wind or a changed weight."""
     from cloudrc.config.schema import GRAVITY_MPS2, MASS_KG
     from cloudrc.world.low_level import GRAVITY, MASS
 

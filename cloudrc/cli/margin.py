@@ -96,9 +96,9 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def largest_stable(works: Callable[[int], bool], start: int, top: int) -> tuple[int, int]:
-    """Find the largest n from 1 to `top` for which `works(n)`: double `start`, then bisect.
+    """Find the largest n from 1 to `top` for which `works(n)` is true: double `start`, then bisect.
 
-    Return n (0 if none works), and n + 1, which does not work (0 if `top` works).
+    Return n and n + 1. The first is 0 if no number works; the second is 0 if `top` works.
     """
     low, high = 0, start
     while works(high):

@@ -109,7 +109,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def load(name: str, overrides: Iterable[str], seed: int | None = None) -> ResolvedExperiment:
-    """Load an experiment by name or path with `overrides` (KEY=VALUE); check the user's metrics."""
+    """Load an experiment by name or path with `overrides` (KEY=VALUE); check its own metrics."""
     from cloudrc import metrics
     from cloudrc.config.load import load_experiment
 
@@ -274,7 +274,7 @@ def fly(
 
 
 def _physics_steps(experiment: ResolvedExperiment, usual: str) -> str:
-    """Describe the code that runs the physics: `usual`, or Python with wind or a changed plant."""
+    """Name the code that runs the physics: Python for wind or a changed plant, else `usual`."""
     from cloudrc.config.schema import Plant
 
     is_usual = experiment.world.plant == Plant() and not experiment.world.wind.blows

@@ -85,7 +85,7 @@ def _up(options: argparse.Namespace) -> int:
 
 @contextmanager
 def _console(folder: Path, say: Say) -> Iterator[None]:
-    """Run `cloudrc console` while the block runs; print its address or its error by `say`."""
+    """Run `cloudrc console` during the `with` block; pass its address or its error to `say`."""
     from cloudrc.cluster.client import end_process
     from cloudrc.drivers.machine import interpreter
 

@@ -304,16 +304,17 @@ class ControlLoop:
             return STAND_STILL
 
     def _plan(self, setpoint: Setpoint, velocity: Vector, now_ns: int) -> tuple[Vector, ...]:
-        """Plan the velocities [m/s] after a command, one per PLAN_STEP, by simulating the flight.
+        """Plan the velocities [m/s] that follow a command, by simulating the flight.
 
         Args:
-            setpoint: Setpoint, with its motion.
+            setpoint: Setpoint, which may move during the plan.
             velocity: Velocity of the command [m/s].
             now_ns: Time of the command [ns], cloud's clock.
 
         Returns:
-            The plan; it ends before a velocity that the guard would refuse. It is empty if the
-            predictor has no model, or if a plug-in fails.
+            One velocity per PLAN_STEP after the command. The plan ends before the first velocity
+            that the guard would refuse. It is empty if the predictor has no model, or if a plug-in
+            fails.
         """
         plan, plug_in = list[Vector](), "predictor"
         try:

@@ -107,10 +107,10 @@ class EmergencyStopRepeater:
         self.sounds = self.sounds and not self._stopped
 
     def due(self, asked: int, now_ns: int) -> OperatorRequest | None:
-        """Return a copy of the emergency stop if a copy is due at `now_ns` [ns], else None.
+        """Return the emergency stop if cloud has to send it at `now_ns` [ns], else None.
 
-        World carries out requests with rising numbers only. `asked` is the highest number so far in
-        this session; the stop gets a higher number.
+        World carries out a request only if its number is higher than the last number. `asked` is
+        the highest number so far in this session; the stop gets a higher number.
         """
         if not self.sounds or now_ns < self._due_ns:
             return None

@@ -120,7 +120,7 @@ def create_job(
 
 
 def owner_of(version: str, kind: str, owner: Any) -> dict[str, Any]:
-    """Build an owner reference: Kubernetes deletes an object when its owner is deleted."""
+    """Make an owner reference; Kubernetes deletes an object that has it together with `owner`."""
     metadata = owner.metadata
     return {"apiVersion": version, "kind": kind, "name": metadata.name, "uid": metadata.uid}
 

@@ -123,7 +123,7 @@ def send(
         link: The present link of the release.
         profile: New profile, as in `cloudrc.config.load.edit_profile`.
         settings: Values to set, as in `cloudrc.config.load.edit_profile`.
-        note: Makes the record of the change: who changed the profile, and why.
+        note: Makes the content of change.json: number and cause of the change.
 
     Raises:
         BadInputError: If the request is not valid, or if a container refuses the change.
@@ -161,7 +161,7 @@ def send(
 
 
 def keep(release: Release, link: LinkParts, sent: Sent) -> None:
-    """Write a change into the ConfigMap; raise an error if this or a container has failed."""
+    """Write a change to the ConfigMap; raise an error if the write or a container has failed."""
     said = list(map(str, sent.failed))
     words = ["patch", "configmap", link.name, "--type=merge", "--patch-file=/dev/stdin"]
     try:

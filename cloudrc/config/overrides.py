@@ -7,7 +7,7 @@
   `cloud.controller.speed_max=2` gives `{name: pid, speed_max: 2}`.
 - An index one above the last index of a list appends to it.
 
-Types and defaults of a plug-in's parameters come from the signature of its function `build`.
+Types and defaults of a plug-in's parameters come from the signature of its `build`.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
 
 
 def _directions(path: KeyPath) -> list[KeyPath]:
-    """Return the paths for uplink and downlink if `path` names both, else `path`."""
+    """Return the paths of uplink and downlink if `path` contains "both", else only `path`."""
     at = int(path[0] == "link")
     if path[at : at + 1] != ("both",):
         return [path]

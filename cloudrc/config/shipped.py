@@ -54,7 +54,7 @@ def check_name(kind: str, name: str) -> None:
 def model_path(kind: str, name: str, folder: Path) -> str:
     """Return the name of a shipped robot or scene, or the absolute path of an .xml file.
 
-    Raise a BadInputError if there is no such file.
+    `kind` is "robot" or "scene". Raise a BadInputError if the name or the file does not exist.
     """
     if not (is_path(name) or name.endswith(".xml")):
         check_name(kind, name)

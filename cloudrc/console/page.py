@@ -1,7 +1,7 @@
-"""Serve the console's page: scene, charts and state for all browsers, controls for the first one.
+"""Serve the console's page: all browsers show scene, charts and state, the first also controls.
 
 viser draws and serves the page. The keyboard API of viser does not report the release of a key.
-Therefore a script on the page presses the buttons of the drive while keys are held.
+Therefore, while the user holds a key, a script on the page holds the button of the same direction.
 """
 
 from __future__ import annotations
@@ -346,7 +346,7 @@ class Page:
         return x, y, z
 
     def _add_keys(self, gui: viser.GuiApi) -> None:
-        """Add the buttons that steer by hand; a held button calls back ten times a second."""
+        """Add the buttons for driving by hand; viser reports a held button ten times a second."""
         steering = self._steering
         speed = gui.add_slider("Drive [m/s]", 0.1, 1.0, 0.1, 0.4)
         for code, (label, direction) in KEYS.items():

@@ -208,7 +208,8 @@ def _surface(
 ) -> tuple[Array, Array]:
     """Make the mesh between two circles around the axis of a pipe: its wall or a rim.
 
-    Each circle has a radius [m] and a place along the axis, from -0.5 (begin) to 0.5 (end).
+    Each circle is a radius [m] and a place along the axis, as a share of the pipe's length: -0.5 is
+    the begin of the pipe, 0.5 its end.
 
     Returns:
         Vertices [m], world frame, shape (2 * sides, 3), and faces, shape (2 * sides, 3).

@@ -83,7 +83,7 @@ class Steering:
         self._mission = ""
 
     def start(self) -> None:
-        """Start the threads; they end with the process."""
+        """Start the background threads; they do not keep the process alive."""
         self._drive.start()
         for loop in (self._stop_loop, self._link_loop, self._watch_loop):
             threading.Thread(target=loop, daemon=True).start()
@@ -161,7 +161,7 @@ class Steering:
         return x, y, z
 
     def set_link(self, key: str, value: float) -> None:
-        """Begin to set `key`, such as "uplink.delay_ms", to `value` [unit of the key]."""
+        """Request a link change: set `key`, such as "uplink.delay_ms", to `value` [unit of key]."""
         self._changes[key] = value
         self._changed.set()
 

@@ -162,8 +162,8 @@ class LocalRun:
 
     Attributes:
         notes: Sentences for the report of the flight.
-        announcement: Removes the flight file when it is closed. `fly` closes it after a flight, the
-            caller after a session.
+        announcement: Its method `close` removes the flight file. `fly` calls `close` after a
+            flight; after a session the caller does so.
     """
 
     def __init__(

@@ -108,7 +108,7 @@ class Feed:
 
     @classmethod
     def on_stdout(cls, *, watched: bool = True) -> Feed:
-        """Use standard output for the feed only; redirect all other prints to standard error."""
+        """Make a feed that owns standard output; redirect other prints to standard error."""
         feed = cls(os.dup(1), watched=watched)
         os.dup2(2, 1)
         return feed
@@ -212,7 +212,7 @@ class LinkNotes:
     """
 
     def __init__(self, path: Path, *, uplink: bool) -> None:
-        """Follow the state file at `path`, which need not exist yet."""
+        """Follow the state file at `path`, which may not exist yet; `uplink` is this direction."""
         self._path, self._uplink = path, uplink
         self._seen: tuple[int, int, int] | None = None
         self._since_ns: int | None = None

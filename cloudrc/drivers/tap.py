@@ -47,7 +47,7 @@ class Tap:
         self._due = 0.0
 
     def tell(self, records: Iterable[Record]) -> None:
-        """Store the newest of new `records` (oldest first); send a datagram if one is due."""
+        """Store new `records`, in order of time; if due, send a datagram with the newest ones."""
         for record in records:
             if isinstance(record, Arrival):
                 self._arrival = record if record.used else self._arrival

@@ -149,7 +149,7 @@ CHECKS: dict[str, tuple[Formula | Flight, ...]] = {
 
 
 def rows(part: str, scored: Sequence[tuple[float, str]]) -> list[dict[str, Any]]:
-    """Return a dictionary per check of a part; `scored` has its share of points [0, 1] and text."""
+    """Return a row per check; `scored` has its share of the points [0, 1], and what was seen."""
     keys = ("part", "test", "points", "max_points", "seen")
     cells = (
         (part, check.test, round(check.points * share, 1), check.points, seen)

@@ -44,7 +44,7 @@ Readings: TypeAlias = dict[str, "dict[Labels, float] | Histogram"]
 
 
 def unlabelled(value: float) -> dict[Labels, float]:
-    """Make the reading of a metric without labels from `value` [unit of the metric]; {} for NaN."""
+    """Return `value` [unit of the metric] as the reading of a metric without labels; {} for NaN."""
     return {} if isnan(value) else {(): value}
 
 
@@ -176,7 +176,7 @@ class DelayJudge:
             del self._sent[next(iter(self._sent))]  # the oldest
 
     def echoed(self, control: Control, arrival_ns: int) -> None:
-        """Compute the error of the delay estimate of a command whose echo has arrived.
+        """Compute how wrong the estimated delay was for a command whose echo has arrived.
 
         The echo arrived at `arrival_ns` [ns], cloud's clock. `control` is the record of the first
         control period after this arrival.

@@ -46,7 +46,7 @@ def conditions(**changes: object) -> Shape:
 
 
 def silent(start: float, duration: float, **changes: object) -> Shape:
-    """Return a `Shape` with `changes`, and a blackout from `start` [s] for `duration` [s]."""
+    """Return a function that adds a blackout from `start` [s] for `duration` [s], and `changes`."""
     return conditions(blackouts=(Blackout(start, duration),), **changes)
 
 

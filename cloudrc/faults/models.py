@@ -112,7 +112,7 @@ class RestartableEndpoint:
         return self._due_ns
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Implement `Endpoint.handle_deadline`."""
+        """Implement `Endpoint.handle_deadline`: inject due faults, then run the process."""
         while self._actions and self._actions[0][0] <= now_ns:
             heappop(self._actions)[2](now_ns)
         inner = self.inner
@@ -201,7 +201,7 @@ class _Peer(UnixPeer):
 
 
 class TeleopModel:
-    """Teleop in a process of its own, with a disk that survives restarts.
+    """Models teleop in a process of its own, with a disk that survives restarts.
 
     The process wakes every 20 ms. Two Unix sockets connect it with cloud, as in production.
 
@@ -278,9 +278,9 @@ class TeleopModel:
         self._calls.append(call)
 
     def stop_rotors(self, now_ns: int) -> None:
-        """Make an emergency stop: send `ALARM` to cloud at once; `now_ns` is ignored.
+        """Make an emergency stop: teleop sends `ALARM` to cloud at once; `now_ns` is ignored.
 
-        Teleop stores the stop when it wakes next.
+        When teleop's process wakes next, it also stores the stop on the disk.
         """
         if self.service is not None:
             self._stops.append(MissionService.stop_rotors)

@@ -61,7 +61,7 @@ IMPOSSIBLE = (nan, inf, -inf)
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of flying a schedule."""
+    """Result of a flight with a schedule of faults."""
 
     schedule: Schedule
     breaches: tuple[Breach, ...]  # the first ones of each kind
@@ -77,7 +77,7 @@ class Finding:
 
 
 def fly(schedule: Schedule, *settings: str, keep: bool = False) -> Finding:
-    """Fly a schedule with further `settings` of the experiment, as for `--set`.
+    """Fly with a schedule of faults, and with further `settings` of the experiment, as for `--set`.
 
     With `keep` the records are kept and hashed, which doubles the time.
 

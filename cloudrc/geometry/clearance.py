@@ -97,9 +97,9 @@ def clearance_per_pipe(
 ) -> Array:
     """Compute the robot's distance from the wall of each pipe [m], shape (n, number of pipes).
 
-    The distance is that of the nearest point, negative in a wall. `positions` [m] and
-    `orientations_wxyz` (unit quaternions) are as for `place_points`. `points` represent the robot;
-    default: `key_points()`.
+    The distance is that of the robot's nearest point; it is negative inside a wall. `positions` [m]
+    and `orientations_wxyz` (unit quaternions) are as for `place_points`. `points` are points of the
+    robot; None: `key_points()`.
     """
     points = points or key_points()
     at = np.asarray(positions, dtype=np.float64).reshape(-1, 3)

@@ -217,7 +217,7 @@ def _packets_hit(key: StreamKey, purpose: Purpose, block: int, chance: float) ->
 
 
 def _lose_in_bursts(table: list[Fate], key: StreamKey, block: int, loss: GilbertElliott) -> None:
-    """Add loss bursts to the impairments of a block: lose packets, delay those in the bad state."""
+    """Apply loss bursts to a block: lose packets, and delay the other packets of the bad state."""
     extra = round(loss.delay_bad * 1e9)
     draws = uniforms(key, Purpose.LOSS, block).tolist()
     for n, bad in enumerate(bad_states(key, block, loss.bad_start, loss.bad_end)):

@@ -107,7 +107,7 @@ class Log:
         return BadInputError(f"{self.name}: {text}")
 
     def refuse_early(self, least: float) -> None:
-        """Raise an error if the shortest delay, `least` [s], is negative."""
+        """Raise a BadInputError if the shortest delay in the log, `least` [s], is negative."""
         if least < 0.0:
             raise self.error(
                 f"a packet arrived {-least * 1e3:.4g} ms before it was sent: the two clocks differ;"

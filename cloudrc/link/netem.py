@@ -118,7 +118,7 @@ _QUANTILES: dict[str, Callable[[Floats], Floats]] = {
 
 
 def stretch(profile: DirectionProfile) -> int:
-    """Return the factor of `STRETCH`: it divides the table's entries and multiplies tc's jitter."""
+    """Return the divisor of the table's entries for a profile, as `STRETCH` explains."""
     if profile.distribution != "table":
         return STRETCH[profile.distribution]
     return ceil(max(map(abs, profile.table)) / _END_OF_TABLE) or 1
@@ -426,7 +426,7 @@ class Netem:
             self._lateness_ns.append(self._stepped_ns - due_ns)
 
     def _next_ns(self) -> float:
-        """Return the time of the next change on `clock` [ns]; infinite after the last change."""
+        """Return when `clock` reaches the next change [ns]; infinite after the last change."""
         following = self._piece + 1
         if following >= len(self._timeline.pass_ns):
             return inf

@@ -56,7 +56,7 @@ _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SET_TIMERSLACK = 35, 40, 29
 
 
 class ReleaseErrors(Counter[int]):
-    """Histogram of how late datagrams left: bucket -> number of datagrams."""
+    """Histogram of how late datagrams left the relay: bucket -> number of datagrams."""
 
     def observe(self, error_ns: int) -> None:
         """Count one datagram that left `error_ns` [ns] after it was due."""

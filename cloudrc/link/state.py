@@ -142,7 +142,7 @@ def from_text(text: bytes | str) -> LinkState:
 
 
 def read_change(text: str) -> Change:
-    """Parse a profile's change; return a change without a number if the text is invalid."""
+    """Parse the content of change.json; return an empty `Change` if the text is invalid."""
     try:
         found = json.loads(text)
         return Change(str(found["number"]), str(found["cause"]), bool(found["restart"]))

@@ -148,7 +148,7 @@ class Row(NamedTuple):
     ) -> float:
         """Parse a cell as a number from `low` to `high` [any unit].
 
-        Raise a BadInputError that asks for what is `wanted` if the cell contains no such number.
+        If the cell contains no such number, raise a BadInputError whose message asks for `wanted`.
         """
         text = self.text(column)
         value = _parse(text.replace(self.decimal, "."))

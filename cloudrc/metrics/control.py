@@ -20,7 +20,7 @@ def round_trips(flight: Flight) -> Columns:
 
 
 def _age_of_information(flight: Flight) -> float | None:
-    """Average the age of the odometry that cloud used [s]; None if the two clocks may differ."""
+    """Compute the mean age of the odometry that cloud used [s]; None without a shared clock."""
     if not np.isfinite(flight.during("/uplink_delay")["delay"]).any():
         return None
     return mean((flight.control["stamp_ns"] - flight.control["basis_stamp_ns"]) * 1e-9)

@@ -160,7 +160,7 @@ def _steady_error(flight: Flight, axis: int) -> float | None:
 
 
 def _fault_count(flight: Flight) -> float | None:
-    """Count each code of a fault once, but a code in `FAILURES` as often as its counter says."""
+    """Count each fault code once, but for a code in `FAILURES` take the total of its counter."""
     totals, count = dict.fromkeys(flight.recording["/fault"]["code"], 1), flight.recording["/count"]
     for name, total in zip(count["name"], count["total"], strict=True):
         if name in FAILURES:  # the largest total: a cloud that restarts counts from 0

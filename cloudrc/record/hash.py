@@ -30,7 +30,7 @@ _CODES = {int: "<i8", float: "<f8", bool: "?", str: "s"}
 
 
 class RecordHash:
-    """Keeps records as columns, and hashes them; how updates divide the records has no effect."""
+    """Stores and hashes records; the hash ignores how the calls of `update` group the records."""
 
     def __init__(self) -> None:
         self._waiting: defaultdict[type, list[Record]] = defaultdict(list)

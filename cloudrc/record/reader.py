@@ -128,7 +128,7 @@ class Contents:
 
 
 class _File:
-    """Reads one MCAP file, also the records inside its chunks, up to its first damaged part."""
+    """Reads one MCAP file, including its chunks, up to the first damaged part."""
 
     def __init__(self, path: Path) -> None:
         """Read a file; raise a BadInputError if it cannot be read or is not MCAP."""

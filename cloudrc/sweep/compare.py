@@ -108,7 +108,7 @@ def _flight(row: Row, names: Sequence[str]) -> dict[str, Any]:
 
 
 def scale(unit: str, largest: float) -> tuple[float, str]:
-    """Return factor and unit in which values up to `largest` [`unit`] are readable: mm, ms."""
+    """Return a factor and a unit that make values up to `largest` [`unit`] readable, such as mm."""
     if 0 < largest < {"m": 0.1, "s": 1.0}.get(unit, 0.0):
         return 1e3, f"m{unit}"
     return 1.0, "" if unit == "1" else unit

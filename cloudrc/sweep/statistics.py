@@ -104,7 +104,7 @@ def _chance_at_most(total: int, doubled: NDArray[Any]) -> float:
 
 
 def _sums(doubled: NDArray[Any]) -> NDArray[Any]:
-    """Return the probability that twice the sum of the positive ranks is 0, 1, 2 and so on."""
+    """Return the probability that the positive ranks, `doubled`, have the sum 0, 1, 2 and so on."""
     chances = np.zeros(int(doubled.sum()) + 1)
     chances[0] = 1.0
     for rank in doubled:

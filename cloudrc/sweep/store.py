@@ -120,7 +120,7 @@ def as_csv(columns: Mapping[str, Sequence[Any]], unit_of: Mapping[str, str]) -> 
 
 
 def _columns(rows: list[Row], plan: Plan) -> dict[str, list[Any]]:
-    """Return the columns of the tables; values of an axis with several types become text."""
+    """Return the columns of a sweep's tables; an axis with values of several types becomes text."""
     columns = {"key": [row["key"] for row in rows]}
     for axis in plan.axes:
         values = [row["point"][axis] for row in rows]

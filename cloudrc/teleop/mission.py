@@ -286,7 +286,7 @@ class Teleop:
         self._seen_ns = now_ns
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Check the time limits and repeat the request that is due."""
+        """Check the time limits, move the setpoint of a track, and repeat a request that is due."""
         if self.state in UNDER_WAY and (timeout := self._find_timeout(now_ns)):
             self._end(*timeout, now_ns)
         if self.state == FLYING and self._plan.track:
@@ -463,7 +463,7 @@ class Teleop:
 
     @property
     def _may_move(self) -> bool:
-        """Whether the robot may still follow commands before its reset to the spawn."""
+        """Whether the reset to the spawn is still to come, so that commands may move the robot."""
         return self._from_spawn and not self.requests.waits
 
     def _select_early(self, now_ns: int) -> None:

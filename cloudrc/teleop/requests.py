@@ -82,7 +82,7 @@ class RequestSender:
             self._due_ns = 0
 
     def see(self, seen: RobotStatus, now_ns: int) -> Request | None:
-        """Process telemetry of `now_ns` [ns]; return the request that the telemetry confirms."""
+        """Process telemetry of `now_ns` [ns]; return the request that it confirms, else None."""
         self._seen, pending = seen, self._pending
         if pending is None:
             self._repeat_start_if_lost(seen, now_ns)

@@ -318,7 +318,7 @@ class MissionService:
 
     @property
     def _inherits_stop(self) -> Mission | None:
-        """Mission that a stop ended in an earlier process; None after the first telemetry."""
+        """Mission that an emergency stop ended before a restart; None after the first telemetry."""
         unknown = self.seen is None and not self._teleop.stopping
         return self.book.stopped() if unknown else None
 

@@ -233,7 +233,7 @@ class MissionStore:
         return self.missions[mission_id]
 
     def has_ended(self, number: int) -> bool:
-        """Return whether a mission has ended, by the number that the robot knows."""
+        """Return whether a mission has ended; `number` is the mission's number in telemetry."""
         return any(mission.number == number and mission.ended for mission in self.missions.values())
 
     def with_key(self, key: str) -> Mission | None:
@@ -269,7 +269,7 @@ class MissionStore:
             self._commit()
 
     def catch_up(self, now_ns: int) -> None:
-        """Write the events that the disk has refused, if an attempt is due at `now_ns` [ns]."""
+        """Write again the events that the disk has refused, if a retry is due at `now_ns` [ns]."""
         if self.trouble and now_ns >= self._keep_ns:
             self._keep_ns = now_ns + KEEP_PERIOD_NS
             with suppress(UnavailableError):

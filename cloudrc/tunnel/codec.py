@@ -197,7 +197,7 @@ def encode_command(command: Command) -> bytes:
 
 
 def as_planned(velocity: Vector) -> Vector:
-    """Return a velocity [m/s] as a plan carries it: in single precision, shape (3,)."""
+    """Round a velocity [m/s], shape (3,), to single precision, as the datagram of a plan does."""
     return _VELOCITY.unpack(_VELOCITY.pack(*velocity))
 
 

@@ -56,8 +56,8 @@ class ServerHandshake:
     def __init__(self, session: Session, nonce: bytes, clock: bytes, age_max_ns: int) -> None:
         """Start without a session; each handshake then sets the epoch and keys of `session`.
 
-        `nonce` and `clock` have 16 bytes each, which identify this process and the monotonic clock
-        of this machine. After a silence of `age_max_ns` [ns] another cloud can get a session.
+        `nonce` identifies this process, and `clock` the monotonic clock of this machine; both have
+        16 bytes. If cloud is silent for `age_max_ns` [ns], another cloud can get a session.
         """
         self._session = session
         self._nonce, self._clock, self._epoch = nonce, clock, NO_EPOCH

@@ -81,7 +81,7 @@ class LowLevel:
         self.reset()
 
     def reset(self) -> None:
-        """Set the integral to zero and delete the last error."""
+        """Set the integral to zero, and forget the velocity error of the last update."""
         self.integral = ZERO
         self.error: Vector | None = None
 

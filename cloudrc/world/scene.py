@@ -194,7 +194,7 @@ def _words(numbers: ArrayLike) -> str:
 def _facts(model: Any) -> Facts:
     """Return the quantities on which controller and rotors depend: name -> value, tolerance.
 
-    The controller can handle these tolerances: the velocity loop compensates for a weight
+    The controller works within these tolerances: the velocity loop compensates for a weight
     that differs by 1 N, and the attitude gains work for an inertia that differs by 50 %.
     """
     base = model.jnt_bodyid[0]

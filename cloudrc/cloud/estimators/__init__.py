@@ -24,13 +24,13 @@ class DelaySample(NamedTuple):
 
 
 class Estimator:
-    """Estimates the horizon: the time from the measurement to the application of the command."""
+    """Estimates the horizon: the time from measuring the odometry to applying the command."""
 
     def update(self, sample: DelaySample) -> None:
         """Add the delays from one telemetry datagram, even if its echo was received before."""
 
     def add_applied(self, applied_minus_stamp: float) -> None:
-        """Add a command that world has applied; called once for each command that an echo shows.
+        """Add a command that world has applied; called once per command, when its echo arrives.
 
         Args:
             applied_minus_stamp: Time of application on world's clock minus the command's stamp on

@@ -140,7 +140,7 @@ def build(
 
 
 def _read_model(path: Path, names: Iterable[str]) -> dict[str, Vector]:
-    """Return the values with these names from a file of `cloudrc identify`."""
+    """Read the values `names`, each for three axes, from a file that `cloudrc identify` wrote."""
     hint = "'cloudrc identify' writes a file that fits"
     try:
         tree = read_document(path, str(path)).tree

@@ -52,9 +52,9 @@ GAP_NS = 500_000_000
 
 
 class WhiteBox(Body):
-    """The robot and its onboard controller, which holds the yaw at 0.
+    """Model of the robot and of its onboard controller, which holds the yaw at 0.
 
-    The thrust axis is (nx, ny, nz) in the world frame; the body rates turn it.
+    The body rates turn the axis of the thrust: a unit vector (nx, ny, nz) in the world frame.
     """
 
     def __init__(self, gains: tuple[float, ...], acceleration_max: float, basis: Odometry) -> None:
@@ -191,7 +191,7 @@ class ModelBased(Replay):
         self._body: WhiteBox | None = None  # at the newest sample
 
     def forecast(self, stamp_ns: int) -> WhiteBox | None:
-        """Return a body in the predicted state at a later stamp [ns]; None without recent data."""
+        """Predict the white box at a later stamp [ns]; None without recent odometry or command."""
         body = copy(self._body)
         if body is None or not 0 < stamp_ns - body.basis.stamp_ns < GAP_NS:
             return None
@@ -208,7 +208,7 @@ class ModelBased(Replay):
         self._body.correct(odometry)
 
     def roll(self, odometry: Odometry, horizon: float) -> WhiteBox:
-        """Return a body in the predicted state `horizon` [s] after the newest sample."""
+        """Return the white box in its predicted state, `horizon` [s] after the newest sample."""
         if self._body is None or self._body.basis.stamp_ns != odometry.stamp_ns:
             self.observe(odometry)
         assert self._body is not None

@@ -21,7 +21,7 @@ PASSED = 0.9  # if the shaper counts less than this share of the arrived datagra
 
 
 class Evidence(NamedTuple):
-    """Facts about the shaper of one direction, as its machine reports; None or "" means unknown."""
+    """Facts about one direction's shaper, which its machine reports; None or "" means unknown."""
 
     shaper: str = ""  # "relay", "netem"; "none" if the interface has no netem qdisc
     why: str = ""  # why this shaper was chosen, in words

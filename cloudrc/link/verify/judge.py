@@ -75,7 +75,7 @@ class Row(NamedTuple):
 
 
 class Expected(NamedTuple):
-    """Expected measurement of a link that has the requested profile."""
+    """The values that a measurement should give if the link has the requested profile."""
 
     bands: dict[str, tuple[float, float, float]]  # quantity -> mean, low and high limit of its band
     pooled: Floats  # delays minus the requested delays, with median 0, sorted [s]
@@ -87,7 +87,7 @@ class Expected(NamedTuple):
         return 0.5 * (high - low) / tolerance(name, mean)
 
     def judge(self, name: str, value: float) -> Row:
-        """Judge one measured `value` of a quantity [any unit]."""
+        """Compare the measured `value` of the quantity `name` [any unit] with its band."""
         mean, low, high = self.bands[name]
         slack, hidden = tolerance(name, mean), self.hidden(name)
         if self.known and name == "deviation":
@@ -136,10 +136,11 @@ class Plan:
         return self._expect(self.links)
 
     def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:
-        """Return the expected measurement of a correct link with the datagrams of a stream.
+        """Return the values that a correct link should give for the datagrams of a measured stream.
 
-        If the stream matches the predicted random numbers of a relay, the values are exact.
-        Otherwise they are the bands of simulated links with different seeds.
+        The values are exact if the stream matches the predicted random numbers of a relay.
+        Otherwise they are bands over simulated links with different seeds. `first` is the counter
+        of the first datagram.
         """
         drawn = self.draw(measured.sent, epoch, first)
         if self._fits(self._singles(measured), self._singles(drawn)):
@@ -152,7 +153,7 @@ class Plan:
         return self.chance._replace(bands=bands)
 
     def judge(self, measured: Stream, epoch: int = 1, first: int = 0) -> list[Row]:
-        """Judge a measured stream; a property that it cannot show gets the verdict "told"."""
+        """Judge a measured stream; properties that it cannot show get the verdict "told"."""
         expected = self.expected(measured, epoch, first)
         found = self.quantities(measured, expected.pooled)
         rows = [expected.judge(name, found[name]) for name in found if name in expected.bands]
@@ -223,7 +224,7 @@ class Plan:
         return Stream(*(one.reshape(-1, 2 * self.train)[:, : self.train].ravel() for one in parts))
 
     def _shape(self, stream: Stream) -> Floats:
-        """Return measured minus requested delays of arrived datagrams, shifted to median 0 [s]."""
+        """Return the errors of the delays of arrived datagrams [s], shifted to median 0."""
         delays = stream.delays - _requested_delay(self.profile, stream.sent)
         there: Floats = delays[np.isfinite(delays)]
         return there - np.median(there) if len(there) else there

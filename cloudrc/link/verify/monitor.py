@@ -100,7 +100,7 @@ class LinkMonitor:
         return [self._outbox.get_nowait() for _ in range(self._outbox.qsize())]
 
     def look(self, path: Path, load: Load) -> None:
-        """Read the link's state file once, and adopt its profiles, which `load` converts."""
+        """Take the requested profiles from the link's state file; `load` converts them."""
         try:
             text = read(path, STATE_MAX).decode()
             if text != self._seen:
@@ -130,7 +130,7 @@ class LinkMonitor:
             threading.Event().wait(FOLLOW_PERIOD)
 
     def _see(self, records: Sequence[Record], now_ns: int) -> list[Record]:
-        """Store records; every `CHECK_NS`, judge the records of the present session and profile."""
+        """Store records; every `CHECK_NS`, return verdicts on the present session and profile."""
         for record in records:
             if isinstance(record, Arrival):
                 self._fresh |= record.epoch != self._epoch

@@ -1,8 +1,9 @@
 """Brake, hold a position, land and take off with the onboard sensors alone.
 
 The deceleration falls towards the end of braking. The robot follows the velocity reference with a
-delay, so a constant deceleration would make the robot overshoot. The robot always stops within the
-distance of the stop rule, which assumes the deceleration BRAKE after the time REACTION.
+delay, so a constant deceleration would make the robot overshoot. The guard's stop rule computes a
+stopping distance from the deceleration BRAKE, which begins after the time REACTION. The robot
+always stops within this distance.
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ class PositionHold:
         return step_towards(reference, (x, y, z - sink), BRAKE * dt)
 
     def _brake(self, reference: Vector, readings: Readings, sink: float, dt: float) -> Vector:
-        """Slow the velocity reference down; set the hold point once the robot is at rest."""
+        """Brake for one step of `dt` [s]; set the hold point once the robot is at rest."""
         if not self.brakes:
             reference, self.brakes = brake_start(reference, readings.velocity), True
         x, y, z = reference

@@ -218,7 +218,7 @@ class Guard:
         return min(end_ns, now_ns + self._limits.plan_max_ns)
 
     def _play(self, command: Command, now_ns: int) -> None:
-        """Set the wanted velocity to that of a command, or of its plan at `now_ns` [ns]."""
+        """Take the wanted velocity for `now_ns` [ns] from a command, or from the command's plan."""
         velocity, self._played, self._next_ns = command.velocity, command, FOREVER_NS
         if command.plan:
             velocity = command.velocity_at(now_ns)

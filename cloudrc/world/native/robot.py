@@ -1,6 +1,7 @@
 """A robot that runs its usual steps in C, and all others in Python, with the same results.
 
-Python and `step.c` share the structure `Flight`: constants, MuJoCo's addresses, present state.
+In a usual step the robot follows a fresh command that the guard need not limit. Python and `step.c`
+share the structure `Flight`: constants, MuJoCo's addresses, present state.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
 
     Each row of the array is a box: centre (3,) [m], axes (9,), half sizes (3,) [m], radius of the
     edges [m]. A ball with the robot's radius around the base's origin contains the robot. The
-    radius is infinite if forces act without a contact, for example of springs or a fluid.
+    radius is infinite if the model has forces without a contact, such as those of a spring.
     """
     option, rows, radius = model.opt, [], 0.0
     other = option.density, option.viscosity, model.nflex, model.npair, model.neq, model.ntendon
