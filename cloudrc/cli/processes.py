@@ -53,7 +53,7 @@ RELEASED_PERIOD = 2.0
 
 
 class Command(NamedTuple):
-    """A command of a module with several; has the attributes of a module with one command."""
+    """One of several commands in a module, with the attributes of a module for one command."""
 
     arguments: Callable[[argparse.ArgumentParser], None]
     execute: Callable[[argparse.Namespace], int]

@@ -119,7 +119,7 @@ class Sidecar:
             shaper.close()
 
     def _choose(self, profile: Loaded, peer: Address) -> tuple[Shaper, Address]:
-        """Choose the shaper and store the reason; "auto" uses the relay if netem fails."""
+        """Choose netem or the relay, and store the reason; "auto" uses netem if it works."""
         machine, mode = self._machine, self._mode
         self._reason = f"link.mode={mode}"
         if mode != "relay":

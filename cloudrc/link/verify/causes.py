@@ -95,7 +95,7 @@ class Findings(NamedTuple):
 
 
 def find_causes(findings: Mapping[str, Findings]) -> list[Cause]:
-    """List the causes of measurements with the verdict "off"; return [] if there are none."""
+    """List why measurements of a link have the verdict "off"; return [] if none has it."""
     found = {way: list(_causes_of(one)) for way, one in findings.items()}
     silent = [way for way, causes in found.items() if causes and causes[0][0] in _UNSHAPED]
     shaped = [way for way in findings if way not in silent]
