@@ -63,7 +63,7 @@ def load(kind: str, name: str, **parameters: Any) -> Any:
 
 
 def find(kind: str, name: str) -> Any:
-    """Import a plug-in by kind and name or path; return its module or its entry point's object."""
+    """Import the plug-in with this name or path; return its module, or its entry point's object."""
     if is_path(name):
         if not Path(name).is_file():
             raise BadInputError(f"{_one(kind)} {name!r}: there is no such file")

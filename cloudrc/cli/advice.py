@@ -52,8 +52,9 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
 def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]:
     """Simulate telemetry and commands over the experiment's link, without its blackouts.
 
-    Return two lists of ages [s], sampled just before each datagram is sent. In world: the age of
-    the odometry behind the present command. In cloud: the age of the newest confirmed command.
+    Return two lists of ages [s], sampled just before each datagram is sent. First: in world, the
+    age of the odometry from which the present command was computed. Second: in cloud, the age of
+    the newest command that telemetry has confirmed.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection

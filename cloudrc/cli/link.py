@@ -193,7 +193,7 @@ def show(options: argparse.Namespace) -> int:
 
 
 def _profile(name: str) -> tuple[Profile, bool]:
-    """Load a link profile, or make a profile from a CSV trace; return whether `name` is a trace."""
+    """Load the profile `name`, or make one from a CSV trace; return whether `name` is a trace."""
     from cloudrc.config.load import load_profile
     from cloudrc.config.schema import Direction, Profile
     from cloudrc.link.traces import read_trace

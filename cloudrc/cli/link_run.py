@@ -189,7 +189,7 @@ def status_page(sidecar: Sidecar) -> str:
 
 @lru_cache(maxsize=1)
 def _find_netems(host: str, second: int) -> dict[str, Any]:
-    """Find the netem qdiscs of this pod; the cache keeps the result while `second` is the same."""
+    """Find the netem qdiscs of this pod, at most once per second; `second` is the time [s]."""
     from cloudrc.link.netem import find_netems
 
     return find_netems(run_tool, host)

@@ -44,7 +44,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def describe_all(kind: str) -> dict[str, str]:
-    """Return name -> description of everything of one kind, such as "profiles", sorted by name."""
+    """Return name -> description, sorted by name, of all things of a kind, such as "profiles"."""
     from cloudrc import plugins
     from cloudrc.config import shipped
 

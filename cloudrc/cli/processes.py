@@ -53,7 +53,7 @@ RELEASED_PERIOD = 2.0
 
 
 class Command(NamedTuple):
-    """One of several commands in a module; has the attributes of a module with one command."""
+    """One of several commands in a module, with the attributes of a module for one command."""
 
     arguments: Callable[[argparse.ArgumentParser], None]
     execute: Callable[[argparse.Namespace], int]
@@ -492,7 +492,7 @@ class RelayControl:
             time.sleep(PROFILE_PERIOD)
 
     def look(self) -> None:
-        """Read requested changes; publish applied ones and the lateness of the datagrams.
+        """Read the requested profiles; publish applied profiles and the lateness of the datagrams.
 
         This thread writes the files, because the relay's loop must not wait for a disk.
         """

@@ -254,8 +254,8 @@ def fly(
     """Fly in mode "virtual" or "local"; write all files into `folder`, and return the report.
 
     During the flight `see` is called with new records; in local mode some are left out. An
-    interrupted flight also gets a report. Without `page`, write no report.html. With `session` (see
-    `LocalRun`), fly a session; the report is that of its last mission.
+    interrupted flight also gets a report. Without `page`, write no report.html. With `session`,
+    teleop waits for missions, as in `LocalRun`; the report is that of the last mission.
     """
     from cloudrc.config.load import dump
     from cloudrc.report.write import write_report

@@ -98,7 +98,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _shard(text: str) -> tuple[int, int]:
-    """Parse "I/N" to (I, N), shard I of N, from 1 on; "auto" reads the variables of a job array."""
+    """Parse "I/N", shard I of N (from 1 on); "auto" reads I and N from a job array's variables."""
     index, _, count = text.partition("/")
     first = "1"
     if index == "auto":

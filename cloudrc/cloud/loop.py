@@ -101,8 +101,8 @@ class ControlLoop:
     ) -> None:
         """Connect three plug-ins; every session gets a new estimator.
 
-        `horizon_max` is the longest horizon [s]. The loop freezes if no new echo arrives for the
-        horizon and `freeze_after` [s]. `period_ns` is the time between two commands [ns]. Each
+        `horizon_max` is the longest horizon [s]. The loop freezes if the newest echo is older than
+        the horizon plus `freeze_after` [s]. `period_ns` is the time between two commands [ns]. Each
         command contains a plan, the velocities of the next `plan` [s]; 0 means no plan.
 
         An exception of a plug-in is not caught here, because nothing flies yet.
@@ -347,7 +347,7 @@ class ControlLoop:
         return now_ns - self._echoed_ns > horizon * 1e9 + self._freeze_after_ns
 
     def _call(self, kind: str, call: Callable[..., None], *arguments: Any) -> None:
-        """Call a method of a plug-in that returns nothing; count and report an exception."""
+        """Call a plug-in's method that has no result; count and report an exception."""
         try:
             call(*arguments)
         except PLUGIN_ERRORS as error:

@@ -265,6 +265,6 @@ def fetch_logs(release: Release, component: str) -> dict[str, str]:
 
 
 def pod_log(release: Release, pod: str, container: str, last: int | None = None) -> str:
-    """Read the log of a container, or only that of the `last` seconds [s]."""
+    """Return the log of a container; with `last`, return only the log of the last `last` [s]."""
     since = {} if last is None else {"since_seconds": last}
     return str(release.request("get", "pods/log", name=pod, container=container, **since))

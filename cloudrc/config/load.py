@@ -266,7 +266,7 @@ def _inline_mission(document: Document) -> None:
 
 
 def _inline_profile(document: Document) -> None:
-    """Fill in uplink and downlink: the profile has the values that the experiment omits."""
+    """Fill in the values of the link that the experiment omits, from the link profile."""
     _default(document, ("link", "profile"), Experiment().link.profile)
     name = document.get("link", "profile")
     if not isinstance(name, str) or _has_all_values(document):

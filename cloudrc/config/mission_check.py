@@ -91,7 +91,7 @@ def _check_waypoints(mission: Mission, scene: Scene) -> Iterator[Problem]:
 
 
 def _check_ways(positions: Array, scene: Scene) -> Iterator[Problem]:
-    """List the straight paths between successive `positions` [m], shape (n, 3), into a wall."""
+    """Report straight ways between successive `positions` [m], shape (n, 3), that hit a pipe."""
     through = find_crossed_pipe(scene, positions[:-1], positions[1:])
     for index in np.flatnonzero(through >= 0)[:_REPORTED]:
         name = scene.pipes[through[index]].name

@@ -180,7 +180,7 @@ class FlightScene:
     def _add_geoms(
         self, parent: str, model: Any, geoms: list[int], ghost: Colour | None = None
     ) -> None:
-        """Add geoms of one body, one mesh for each colour; all in the colour `ghost` if given."""
+        """Add one mesh per colour for the geoms of one body; with `ghost`, one in this colour."""
         # mjviser imports mujoco, which cloudrc.world.scene has imported without OpenGL.
         from mjviser.conversions import merge_geoms
 
@@ -196,7 +196,7 @@ class FlightScene:
 
 
 def clearance_colours(clearances: Array) -> NDArray[np.uint8]:
-    """Return the RGB colours of clearances [m], shape (n,): shape (n, 3)."""
+    """Return the RGB colours for clearances [m], shape (n,); the result has the shape (n, 3)."""
     colours = np.array([list(bytes.fromhex(colour)) for colour in VIRIDIS.split()])
     place = np.linspace(0.0, CLEARANCE_SHOWN, len(colours))
     parts = [np.interp(clearances, place, part) for part in colours.T]

@@ -73,7 +73,8 @@ class Deadline:
     ) -> None:
         """Start a time limit of `limit` [s] by a monotonic `clock` [s].
 
-        If more than `turn_max` [s] pass between two calls of `passed`, this process was suspended.
+        If more than `turn_max` [s] pass between two calls of `passed`, this process was suspended,
+        and the limit excludes this time.
         """
         self._left, self._turn_max, self._clock = limit, turn_max, clock
         self._before = clock()

@@ -97,8 +97,8 @@ class Feed:
     def __init__(self, descriptor: int, *, watched: bool = True) -> None:
         """Make the pipe `descriptor` non-blocking.
 
-        If a supervisor reads the pipe, `watched` is True. Otherwise, as in a container, the pipe
-        is a log: the feed writes only events, as text for humans.
+        `watched` is True if a supervisor reads the pipe. Otherwise, as in a container, the pipe is
+        a log, and the feed writes only events, as text for humans.
         """
         self._descriptor, self._watched = descriptor, watched
         self._told_ns: dict[type, int] = {}
@@ -134,7 +134,7 @@ class Feed:
         return ask
 
     def tell(self, records: Iterable[Record]) -> None:
-        """Write the records that belong to the feed: all of `EVENTS`, some of `SAMPLED`."""
+        """Write all records with a type in `EVENTS` and, to a supervisor, some in `SAMPLED`."""
         for record in records:
             if isinstance(record, LinkChanged) and not self._is_news(record):
                 continue
@@ -247,7 +247,7 @@ class LinkNotes:
         return [Counted(stamp_ns, "link", f"{way}_{name}", n) for name, n in counts.items()]
 
     def _read_state(self, begins: bool, now_ns: int, slip_ns: int) -> list[LinkChanged]:
-        """Return the state of the link as a record, if the link has changed or `begins` is true."""
+        """Return the link's state as a record if it is new or `begins` is true, else []."""
         state = from_text(read(self._path, STATE_MAX).decode())
         asked = {key: nan if value is None else float(value) for key, value in state.asked.items()}
         changed = LinkChanged(

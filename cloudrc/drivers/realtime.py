@@ -124,7 +124,7 @@ class Peer:
 
 
 def _reachable(bound: socket.socket, address: Address) -> Address:
-    """Convert an IPv4 address to the form that an IPv6 socket needs."""
+    """Convert an IPv4 address to an IPv6 address if the socket `bound` uses IPv6."""
     if bound.family != socket.AF_INET6 or ":" in address[0]:
         return address
     return f"::ffff:{address[0]}", address[1]

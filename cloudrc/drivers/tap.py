@@ -75,7 +75,7 @@ class Tap:
 
 
 class TapListener:
-    """Receives the datagrams of one tap; a tap has at most one listener."""
+    """Receives the datagrams of one `Tap`, which sends to at most one listener."""
 
     def __init__(self, path: Path) -> None:
         """Become the listener of the tap that sends to the socket `path`.

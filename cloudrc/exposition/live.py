@@ -50,10 +50,10 @@ ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total"
 
 
 class LinkVerdict:
-    """Newest verdict on the direction that world or cloud receives: does it match its profile?"""
+    """Newest verdict on whether the direction that world or cloud receives matches its profile."""
 
     def __init__(self, direction: str) -> None:
-        """Set the direction, "uplink" or "downlink"; the first verdict is "open"."""
+        """Set the direction, "uplink" or "downlink"; the verdict is "open" before a check."""
         self._direction = direction
         self._newest: tuple[LinkChecked, ...] = ()
 
@@ -185,7 +185,7 @@ ADMITTED = "cloud said hello"
 
 
 class WorldEnd(End):
-    """Metrics of world: those of `End`, and robot, guard, contacts, real-time factor."""
+    """Metrics of world: those of `End`, of robot, guard and contacts, and the real-time factor."""
 
     def __init__(self, counts: Mapping[str, int]) -> None:
         super().__init__(table.WORLD, counts)

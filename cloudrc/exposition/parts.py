@@ -30,7 +30,7 @@ class Histogram:
         self._counts = [0] * (len(bounds) + 1)
 
     def observe(self, value: float) -> None:
-        """Count a `value` [unit of the bounds]."""
+        """Count `value`, which has the unit of the bounds."""
         self._counts[bisect_left(self.bounds, value)] += 1
         self.total += value
 
@@ -130,7 +130,7 @@ class PredictionJudge:
         self._measured: Vector = (nan, nan, nan)
 
     def take(self, control: Control) -> None:
-        """Compare stored predictions with the newest measurement; store the newest prediction."""
+        """Judge the predictions that are due by the new measurement; store the new prediction."""
         stamp_ns, waiting = control.basis_stamp_ns, self._waiting
         if stamp_ns > self._measured_ns:
             before_ns, before = self._measured_ns, self._measured
@@ -166,7 +166,7 @@ class DelayJudge:
         self.reset()
 
     def reset(self) -> None:
-        """Drop all stored commands, because a new session has started."""
+        """Drop the stored control periods, because a new session has started."""
         self._sent: dict[int, Control] = {}
 
     def sent(self, control: Control) -> None:

@@ -79,7 +79,7 @@ class HostileOperator:
         self._number = 0  # of the last request in this session
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
-        """Implement `Operator.see`."""
+        """Pass telemetry to teleop, and update the number of the session's last request."""
         if self._seen is None or self._seen.epoch != seen.epoch:
             self._number = 0
         self._seen, self._number = seen, max(self._number, seen.mission)
@@ -87,7 +87,7 @@ class HostileOperator:
         self._collect()
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Implement `Operator.handle_deadline`."""
+        """Forward teleop's outputs at `now_ns` [ns]; after its first setpoint, forge requests."""
         self._honest.handle_deadline(now_ns)
         self._collect()
         if self._has_setpoint and self._seen is not None:
@@ -160,7 +160,9 @@ def _faces(position: Vector) -> list[tuple[float, int, float]]:
 
 
 def dishonesty(schedule: Schedule) -> tuple[Lie, Words | None]:
-    """Return a schedule's policy as functions that change commands and forge requests (or None).
+    """Return the two functions of a schedule's policy.
+
+    The first changes commands. The second forges operator requests; it is None for some policies.
 
     Raises:
         BadInputError: If the policy does not exist; the message lists all policies.
@@ -232,7 +234,7 @@ def _greedy(rng: Generator) -> Lie:
 
 
 def _on_the_limit(rng: Generator) -> Lie:
-    """Fly slightly faster than the guard's stop rule allows."""
+    """Fly towards the fence slightly faster than the guard's stop rule allows."""
     more = float(rng.uniform(1.0, 1.5))
     way: list[int] = rng.choice([-1, 1], 3).tolist()
 

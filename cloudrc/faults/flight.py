@@ -119,7 +119,7 @@ class Flight:
         return Order(plan, contact=bool(self.experiment.criteria.contact))
 
     def order_if_possible(self, now_ns: int) -> None:
-        """Order the experiment's mission; ignore a refusal and `now_ns`."""
+        """Order the experiment's mission; teleop may refuse the order. `now_ns` is not used."""
         order = self.make_order()
         self.teleop.ask(lambda service, now_ns: service.create(order, now_ns))
 

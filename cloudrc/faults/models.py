@@ -127,7 +127,7 @@ class RestartableEndpoint:
         self._set_deadline()
 
     def take_datagrams(self) -> list[bytes]:
-        """Implement `Endpoint.take_datagrams`."""
+        """Return the datagrams of the process; none while it is frozen or does not run."""
         if self.inner is None or self._frozen_until_ns >= 0:
             return []
         return self.inner.take_datagrams()
@@ -156,7 +156,7 @@ class EndpointGroup:
         self.others: list[Record] = []  # records of all clouds but the first, oldest first
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Implement `Endpoint.receive_datagram`."""
+        """Pass a datagram on at `now_ns` [ns]; `tamper`, if set, changes it before."""
         for member in self.members:
             member.receive_datagram(data, now_ns)
 

@@ -117,7 +117,7 @@ class Scenario:
         return outcome
 
     def as_json(self, outcome: Outcome) -> dict[str, Any]:
-        """Convert one result of this scenario to plain values."""
+        """Return one result of this scenario as values for a JSON document."""
         return {
             "id": self.id,
             "name": self.name,

@@ -313,7 +313,7 @@ def _bugs(schedule: Schedule, clock: Clock) -> Lie:
 
 
 def _ruined(command: Command, event: Event, rng: np.random.Generator) -> Command:
-    """Replace a random number in a command by NaN or infinity, or the velocity by a huge one."""
+    """Return the command with one number replaced by NaN or infinity, or with a huge velocity."""
     if event.kind == "values_huge":
         x, y, z = rng.choice([1e308, -1e308], 3).tolist()
         return command._replace(velocity=(x, y, z))

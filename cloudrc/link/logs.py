@@ -428,9 +428,10 @@ def is_ping(lines: list[str]) -> bool:
 def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
     """Read the output of `ping -D` or of a similar program, in any language.
 
-    Half of each round trip is the one-way delay. Packets count as lost if their sequence number is
-    missing between replies, if a line such as "no answer yet" reports them, or if only the summary
-    counts them. Without a summary, packets after the last line are ignored.
+    The one-way delay is half of each round trip; `halve` has to permit this. Packets count as lost
+    if their sequence number is missing between replies, if a line such as "no answer yet" reports
+    them, or if only the summary counts them. Without a summary, packets after the last line are
+    ignored.
 
     Raises:
         BadInputError: If `halve` is false; if the log `name` has no replies, no time stamps, too

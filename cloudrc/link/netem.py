@@ -346,13 +346,13 @@ class Netem:
                 return
 
     def counts(self) -> dict[str, int]:
-        """Return numbers of datagrams, the lateness of the time line, and the count `restored`.
+        """Return counters of datagrams, percentiles of the lateness, and the counter `restored`.
 
         The datagrams are `forwarded` (including copies), `lost` (dropped at random or because the
-        queue was full) and `held` (in the queue now); absent if the qdisc is missing.
-        `step_lateness_p50_ns` and `_p99_ns` are percentiles of the lateness with which the time
-        line changed the qdisc [ns]. `restored` is the number of times that another program removed
-        or changed the qdiscs. The name is historical: `Netem` does not restore them.
+        queue was full) and `held` (in the queue now); without the qdisc, these counters are absent.
+        `step_lateness_p50_ns` and `_p99_ns` are percentiles of the lateness with which a change of
+        the time line changed the qdisc [ns]. `restored` is the number of times that another program
+        removed or changed the qdiscs. The name is historical: `Netem` does not restore them.
         """
         found = self._look() | {"restored": self._damages}
         if self._lateness_ns:
@@ -412,7 +412,7 @@ class Netem:
                 raise
 
     def _apply(self, verb: str) -> None:
-        """Apply the present conditions of the time line if they differ from those in force."""
+        """Run tc's `verb` ("add" or "change") if the conditions of the time line have changed."""
         elapsed_ns, starts_ns = self._clock() - self._origin_ns, self._timeline.pass_ns
         before, self._piece = self._piece, max(bisect_right(starts_ns, elapsed_ns) - 1, 0)
         wanted = options(self._profile, self._timeline.pieces[self._piece], self._room)

@@ -41,7 +41,7 @@ def mean_loss(loss: Loss) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A change of the conditions at one time; a value that is None stays unchanged."""
+    """A change of a link's conditions at one time; None leaves a value unchanged."""
 
     at: float  # time since the link came up [s]
     delay: float | None = None  # mean one-way delay [s]
@@ -76,7 +76,7 @@ class Trace:
 
     @property
     def period(self) -> float | None:
-        """Return the duration of one pass [s]; None if the trace does not loop."""
+        """Return the time after which the trace begins again [s]; None if it never begins again."""
         if not self.loop or len(self.times) < 2:
             return None
         return self.times[-1] + (self.times[-1] - self.times[0]) / (len(self.times) - 1)

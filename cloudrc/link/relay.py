@@ -84,7 +84,7 @@ class ReleaseErrors(Counter[int]):
 
 
 def ask_for_stamps(one: socket.socket) -> None:
-    """Let the kernel record arrival times and count dropped datagrams, if it supports that."""
+    """Let the kernel record arrival times and count dropped datagrams on a socket, if it can."""
     for option in (_SO_RXQ_OVFL, _SO_TIMESTAMPNS) if sys.platform == "linux" else ():
         with suppress(OSError):  # without a stamp, the time of reading counts as arrival
             one.setsockopt(socket.SOL_SOCKET, option, 1)

@@ -92,7 +92,7 @@ class Sidecar:
                 file.unlink(missing_ok=True)
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
-        """Shape with one shaper until `stop` returns True, or a profile needs the other shaper."""
+        """Use one shaper until `stop` returns True, or until a profile needs the other shaper."""
         profile, machine = self.profile, self._machine
         if self.states.state and profile.change.restart:
             self._origin_ns = machine.clock()
@@ -120,7 +120,7 @@ class Sidecar:
             shaper.close()
 
     def _choose(self, profile: Loaded, peer: Address) -> tuple[Shaper, Address]:
-        """Choose the shaper and store the reason; "auto" tries netem first, then uses the relay."""
+        """Choose netem or the relay, and store the reason; "auto" uses netem if it works."""
         machine, mode = self._machine, self._mode
         self._reason = f"link.mode={mode}"
         if mode != "relay":

@@ -204,7 +204,7 @@ def _cells(line: str, separator: str, where: str) -> list[str]:
 
 
 def looks_lost(values: Collection[float]) -> bool:
-    """Return whether delays of 0 mark lost packets: all other delays are far from 0.
+    """Return whether 0 marks lost packets in `values`, because all other delays are far from 0.
 
     `values` are delays in any unit. With few decimals, 0 may be a short delay that was rounded.
     """

@@ -141,11 +141,10 @@ class Flight:
 
     @cached_property
     def applied(self) -> Columns:
-        """Commands that world applied in the flight, with the values of their control periods.
+        """Commands that world applied in the flight, each with the record of its control period.
 
-        Commands without a recorded control period are left out. `stamp_ns` is the time of
-        application or, for a command with a plan, the start of the plan [ns]; `position` is the
-        predicted position [m].
+        Commands without such a record are left out. `stamp_ns` is the time of application or, for a
+        command with a plan, the start of the plan [ns]; `position` is the predicted position [m].
         """
         commands = self.during("/command_applied")
         keys = zip(self._control["epoch"], self._control["counter"], strict=True)

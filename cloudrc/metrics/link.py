@@ -27,7 +27,7 @@ COUNTS = {
 
 
 def _delay_mean(flight: Flight, way: str) -> float | None:
-    """Average the delay; None if world and cloud may have different clocks."""
+    """Return the mean one-way delay [s]; None if world and cloud may have different clocks."""
     return mean(flight.during(f"/{way}_delay")["delay"])
 
 

@@ -46,7 +46,7 @@ class ClockOffset(NamedTuple):
     method: Literal["same clock", "packets", "first records"]
 
     def metadata(self) -> dict[str, str]:
-        """Format the offset for a file's metadata; an unknown uncertainty is left out."""
+        """Format the clock offset for a file's metadata; leave out an unknown uncertainty."""
         noted = {"clock_offset_ns": str(self.offset_ns), "clock_offset_method": self.method}
         if self.uncertainty_ns is not None:
             noted["clock_offset_uncertainty_ns"] = str(self.uncertainty_ns)

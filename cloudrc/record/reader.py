@@ -79,10 +79,10 @@ used, because they allocate whatever size the file claims."""
 
 @dataclass(slots=True)
 class Contents:
-    """The contents of a file.
+    """The contents of a recording's file.
 
-    `lacking` is `note` without the messages that a killed process did not write: it describes only
-    damaged, removed or added messages.
+    `note` says what is missing. `lacking` says the same without the messages that a killed process
+    did not write: it mentions only damaged, removed or added messages.
     """
 
     # Topic, log time [ns] and CDR bytes of each message, in the order of log times.

@@ -87,7 +87,7 @@ class Assessment:
 
 
 def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
-    """Describe how cloud's stamps were converted to world's clock; None for a common clock."""
+    """Describe how cloud's stamps were converted to world's clock; None if both have one clock."""
     method = metadata.get("clock_offset_method", "same clock")
     if method == "same clock":
         return None

@@ -54,7 +54,7 @@ def counts(row: Row) -> bool:
 
 
 def units(own: Iterable[str]) -> dict[str, str]:
-    """Return metric -> unit of all known metrics and of the user's (`own`: names or paths)."""
+    """Return metric -> unit of all known metrics, and of the metrics `own`, by name or path."""
     names = (*metrics.SHIPPED, *plugins.names("metrics"), *own)
     return {metric.name: metric.unit for metric in map(metrics.find, names)}
 

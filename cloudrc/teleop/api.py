@@ -116,10 +116,10 @@ class Bridge:
         return future
 
     async def ask(self, call: Call, urgent: Urgent = "") -> Any:
-        """Queue a call and return its result; also send a stop to cloud at once, by `alarm`.
+        """Queue a call for teleop's loop and return its result; for a stop, call `alarm`, too.
 
         Raise an UnavailableError if the bridge is closed, or if the loop does not answer within
-        `ANSWER_LIMIT`. An urgent call then stays queued; any other call is withdrawn.
+        `ANSWER_LIMIT`. In the second case an urgent call stays queued; any other call is withdrawn.
         """
         try:  # queue the stop first: later, telemetry may show it already
             asked = asyncio.wrap_future(self.submit(call, urgent))

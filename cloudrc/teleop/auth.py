@@ -137,13 +137,13 @@ class Audit(RotatingFileHandler):
         self._queue.handle(logging.makeLogRecord({"msg": text}))
 
     def stop(self) -> None:
-        """Write the queued lines, and close the file."""
+        """Write the queued log lines, end the thread and close the file."""
         self._listener.stop()
         with suppress(OSError):
             self.close()
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802
-        """Count a line that could not be written; report the first such line."""
+        """Count a log line that could not be written; report the first such line."""
         if not self.dropped:
             reason = sys.exception()
             self._complain(f"the audit log {self.baseFilename} cannot be written: {reason}")

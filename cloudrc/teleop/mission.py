@@ -349,7 +349,7 @@ class Teleop:
         self._knot = -1
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
-        """Begin the mission and count its time, once telemetry shows the start."""
+        """Begin the mission and its time, because telemetry shows that the robot has started."""
         self._world, self._expected = seen.world, (self._mission_id,)
         self._watch = LegWatch()
         if not self._continued:
@@ -480,7 +480,10 @@ class Teleop:
             self._select_leg(leg, now_ns)
 
     def _repeat_setpoint(self, now_ns: int) -> None:
-        """Send the setpoint again in a new session; in a drive or before a reset, hold still."""
+        """Send the setpoint again in a new session.
+
+        If the operator steers by hand, or before a reset to the spawn, send the robot's position.
+        """
         if self.state == STARTING and self._may_move:
             self._is_pending = True
             self._select_here()

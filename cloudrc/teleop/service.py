@@ -114,7 +114,7 @@ class MissionService:
 
     @property
     def over(self) -> bool:
-        """Whether there are missions, all have ended, and all requests are carried out."""
+        """Whether missions exist, all have ended, and no request is left to carry out."""
         return bool(self.book.missions) and not self.book.open() and self.settled
 
     @property

@@ -69,9 +69,9 @@ class Mission:
     def apply(
         self, number: int, event: str, text: str, *, waypoint: int | None = None, **changed: Any
     ) -> None:
-        """Update the mission with an event; `changed` has new values of the mission's attributes.
+        """Add an event to the mission, and set the mission's attributes that `changed` names.
 
-        `number` is the event's number. By default, `waypoint` is the mission's current waypoint.
+        `number` is the id of the event, `waypoint` its waypoint, by default the current waypoint.
         """
         waypoint = self.waypoint if waypoint is None else waypoint
         for name, value in changed.items():

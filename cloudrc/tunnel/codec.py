@@ -236,5 +236,5 @@ def encode(kind: Kind, *fields: Any) -> bytes:
 
 
 def decode(kind: Kind, body: bytes) -> tuple[Any, ...]:
-    """Decode the fields of a handshake datagram, as in `encode`."""
+    """Decode the body of a handshake datagram to the fields that `encode` takes."""
     return _BODIES[kind].unpack(body)

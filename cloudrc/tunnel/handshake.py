@@ -126,11 +126,11 @@ class ServerHandshake:
         return self._accept()
 
     def _keeps_epoch(self, now_ns: int) -> bool:
-        """Return whether a hello of the cloud that has the session keeps the present epoch.
+        """Return whether the present epoch continues after a repeated HELLO of the session's cloud.
 
-        The hello begins a new epoch if the present epoch has ended, or if its key is newer than the
-        epoch's key. After REPEATS_MAX hellos without an encrypted datagram, it also begins one if
-        the session has timed out, or if its key is not the epoch's key.
+        It ends if the hello has a newer key than the epoch. After REPEATS_MAX hellos without an
+        encrypted datagram, it also ends if the session has timed out, or if the hello's key is not
+        the epoch's key. Return False, too, if there is no present epoch.
         """
         session, key = self._session, self._session.greeting_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current
@@ -194,7 +194,7 @@ class ClientHandshake:
         return self._hello()
 
     def is_refused(self, nonce: bytes) -> bool:
-        """Return whether a BUSY with this nonce is the answer to a hello of this process."""
+        """Return whether a BUSY datagram with this nonce answers a HELLO of this process."""
         return nonce == self._nonce
 
     def receive_accept(self, epoch: int, accept: Accept, *, asks: bool) -> bytes | None:

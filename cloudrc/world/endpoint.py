@@ -143,9 +143,10 @@ class WorldEndpoint(TunnelEnd):
                 self._tell_refusal(str(error), data, world_ns)
 
     def _follow(self, now_ns: int) -> int:
-        """Return world's time at `now_ns` [ns]; extend the slip if world lags by too much.
+        """Return world's time at `now_ns` [ns, monotonic clock].
 
-        After a stall, store `now_ns`: datagrams of this time may have waited in the socket.
+        If the simulation lags by more than CATCH_UP_NS, add the excess to the slip. After a stall,
+        store `now_ns`, because datagrams that are read at this time may have waited in the socket.
         """
         world_ns = now_ns - self._slip_ns
         behind_ns = world_ns - self._tick_ns

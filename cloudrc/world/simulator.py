@@ -183,10 +183,10 @@ class Simulator:
         return touches
 
     def state(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Return two arrays for `replay`: the state of the physics, and accelerations.
+        """Return the arguments `physics` and `warmstart` of `replay`.
 
-        The state is `mjSTATE_FULLPHYSICS`, shape (n,). The contact solver of the next step starts
-        from the accelerations, shape (nv,).
+        `physics` is the state `mjSTATE_FULLPHYSICS`, shape (n,). `warmstart` has the accelerations
+        from which the contact solver of the next step starts, shape (nv,).
         """
         spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
         physics = np.empty(mujoco.mj_stateSize(self.model, spec))
@@ -194,7 +194,10 @@ class Simulator:
         return physics, self.data.qacc_warmstart.copy()
 
     def _feel(self, contacts: int, before: Readings) -> None:
-        """Measure the tip's force after a step with `contacts` contacts, and store new contacts."""
+        """Update the tip's force and impulse after a step, and store new contacts.
+
+        `contacts` is the number of contacts in the step; `before` has the readings before the step.
+        """
         force = self._sensors[self._tip_sensor]
         self.tip_impulse += force * self.dt
         if force > self.tip_force_peak:

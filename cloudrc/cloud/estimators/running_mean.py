@@ -39,5 +39,5 @@ class RunningMean(Estimator):
 
 
 def build() -> RunningMean:
-    """Make the estimator of eq. (1); it has no parameters."""
+    """Make the estimator of the paper's eq. (1), which has no parameters."""
     return RunningMean()

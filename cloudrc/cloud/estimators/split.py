@@ -29,7 +29,7 @@ class Split(Estimator):
         self._applied_minus_stamp: float | None = None
 
     def add_applied(self, applied_minus_stamp: float) -> None:
-        """Update the average with a new value of `applied_minus_stamp` [s]."""
+        """Update the average with a sample of the downlink delay [s] plus the clock offset."""
         if self._applied_minus_stamp is None:
             self._applied_minus_stamp = applied_minus_stamp
         else:
@@ -38,9 +38,10 @@ class Split(Estimator):
             )
 
     def horizon(self, age: float) -> float:
-        """Return `age` plus the average of `applied_minus_stamp` [s].
+        """Return the horizon [s]: the sum of `age` and the average of `applied_minus_stamp`.
 
-        Both contain the offset between the clocks, with opposite signs, so their sum does not.
+        Both terms contain the offset between the clocks, with opposite signs, so the offset
+        cancels.
         """
         if self._applied_minus_stamp is None:
             return 0.0
@@ -51,6 +52,6 @@ def build(gain: Gain = 0.05) -> Split:
     """Make the estimator.
 
     Args:
-        gain: Weight of a new sample of the downlink [1].
+        gain: Weight of a new sample in the average of the downlink delay [1].
     """
     return Split(gain)

@@ -48,7 +48,7 @@ class Predictor:
         """Reset the predictor at the start of a session."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Return the newest sample extrapolated by `horizon` [s], >= 0, with a later stamp."""
+        """Extrapolate the newest sample, `odometry`, and its stamp by `horizon` [s], >= 0."""
         raise NotImplementedError
 
     def model(self) -> Model | None:

@@ -80,9 +80,10 @@ class History:
         return bool(self._applied) and now_ns - self._applied[-1][0] > FOLLOWED_NS
 
     def shift_ns(self, odometry: Odometry, horizon: float) -> int:
-        """Return the shift [ns]; before the first echo, compute it from `horizon` [s].
+        """Return the time from the stamp of a command to its beginning: the shift [ns].
 
-        With a plan, the shift is known: the command states when its plan begins.
+        A command with a plan states when it begins. Without a plan, the shift comes from the
+        echoes; before the first echo, it comes from `horizon` [s].
         """
         if self.commands and self.commands[-1].plan:
             return self.commands[-1].planned_ns - self.stamps[-1]
@@ -207,7 +208,7 @@ class Replay(Predictor):
         return self.roll(self.newest, (stamp_ns - self.newest.stamp_ns) * 1e-9)
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Return the newest sample, moved by the commands of the next `horizon` [s]."""
+        """Predict the odometry `horizon` [s] after the newest sample from the sent commands."""
         self._last = self.roll(odometry, horizon)
         return self._last.odometry() if horizon else odometry
 

@@ -95,7 +95,7 @@ class Findings(NamedTuple):
 
 
 def find_causes(findings: Mapping[str, Findings]) -> list[Cause]:
-    """Name the causes for each direction of a link; return [] if no measurement is "off"."""
+    """List why measurements of a link have the verdict "off"; return [] if none has it."""
     found = {way: list(_causes_of(one)) for way, one in findings.items()}
     silent = [way for way, causes in found.items() if causes and causes[0][0] in _UNSHAPED]
     shaped = [way for way in findings if way not in silent]
@@ -148,10 +148,10 @@ def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
 
 
 def _of_machine(known: Evidence, off: Mapping[str, Row], lost: float) -> Iterator[tuple[str, str]]:
-    """Yield causes of a failed check for which this machine's counters are evidence.
+    """Yield code and text of each cause that this machine's counters show, the most certain first.
 
-    The most certain cause comes first. `off` has the rows that failed; `lost` is the share of lost
-    packets.
+    `known` has the counters. `off` has the measurements outside their limits, by name. `lost` is
+    the share of lost packets.
     """
     where, elsewhere = known.interface or "the way out", " and ".join(known.elsewhere)
     sent, unshaped = known.sent or 0, known.shaper == "none"

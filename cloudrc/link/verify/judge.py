@@ -60,9 +60,10 @@ class Flow(NamedTuple):
 
 
 class Row(NamedTuple):
-    """Verdict on one quantity of one direction; an unknown value is NaN.
+    """Verdict on one quantity of one direction of a link; an unknown value is NaN.
 
-    `asked` (the requested value), `measured`, `low` and `high` have the unit `unit` (any unit).
+    `asked` is the requested value. A measured value from `low` to `high` is accepted. All four
+    values have the unit `unit`.
     """
 
     name: str  # as in `Plan.quantities`, or "round_trip"
@@ -114,7 +115,10 @@ class Plan:
     pause: Callable[[], None] = lambda: None
 
     def draw(self, sent: Floats, epoch: int = 1, first: int = 0) -> Stream:
-        """Simulate datagrams sent at `sent` [s] since the link came up, numbered from `first`."""
+        """Simulate the transfer of datagrams that are sent at `sent` [s] since the link came up.
+
+        The datagrams have the numbers from `first` on in the session `epoch`.
+        """
         seed, uplink, kind, size = self.flow
         link = LinkDirection(self.profile, seed, uplink)
         sent_ns = np.rint(sent * 1e9).astype(np.int64).tolist()
@@ -123,7 +127,7 @@ class Plan:
 
     @cached_property
     def links(self) -> list[Stream]:
-        """Streams over 200 simulated netem links, shortened if the profile is constant in time."""
+        """Streams through 200 simulated netem links; shorter if the conditions are constant."""
         few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
         sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
         seeds = range(-RUNS, 0)  # the seed of an experiment is not negative

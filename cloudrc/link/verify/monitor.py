@@ -77,7 +77,7 @@ class LinkMonitor:
         self._outbox = queue.SimpleQueue[Record]()
 
     def begin(self, asked: Asked, path: Path | None, load: Load) -> None:
-        """Start the thread; profiles `asked` apply until the state file `path` reports others."""
+        """Start the thread; until the state file `path` has profiles, those in `asked` apply."""
         self._inbox, self._pause = queue.SimpleQueue(), lambda: time.sleep(1e-4)
         self.follow(asked)
         threading.Thread(target=self._run, args=(path, load), name="link", daemon=True).start()

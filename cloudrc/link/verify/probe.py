@@ -85,7 +85,7 @@ class ProbeEnd:
         self._delays, self._copies = np.full(count, inf), np.zeros(count, int)
 
     def _encode(self, number: int) -> bytes:
-        """Encode a probe; copies of its header fill the probe, so that damage is visible."""
+        """Encode a probe; copies of its header fill the rest, so that damage is noticed."""
         _, uplink, kind, size = self.plan.flow
         way = Direction.UPLINK if uplink else Direction.DOWNLINK
         header = encode_header(kind, way, 1, number)

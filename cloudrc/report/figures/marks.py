@@ -48,9 +48,9 @@ def band(delays: Timeline, time: Array) -> tuple[Array, Array]:
 
 
 class Part(NamedTuple):
-    """A link profile of one direction, in force from `begin` until the next `Part` begins.
+    """Part of a flight in which one direction of the link has one profile.
 
-    Times are in seconds since the start of the flight.
+    It lasts until the next `Part` begins. Times are in seconds since the start of the flight.
     """
 
     begin: float  # [s]; -inf for the profile at the start of the flight

@@ -213,7 +213,7 @@ class Guard:
         return 0 <= ahead_ns <= AGE_MAX_NS and rules.within(command.plan, COMMAND_MAX)
 
     def _plan_end_ns(self, command: Command, now_ns: int) -> int:
-        """Return the end [ns] of a plan that arrives at `now_ns` [ns], if no command follows."""
+        """Return until when [ns] the robot may follow a plan that arrives at `now_ns` [ns]."""
         end_ns = command.planned_ns + (len(command.plan) + 1) * PLAN_STEP_NS
         return min(end_ns, now_ns + self._limits.plan_max_ns)
 
@@ -279,10 +279,10 @@ class Guard:
         return self.reference
 
     def plain_track(self, now_ns: int) -> tuple[int, Vector, Vector, int] | None:
-        """Return the input of `native/step.c` from `now_ns` [ns] on; None if only `step` can run.
+        """Return what `native/step.c` needs from `now_ns` [ns] on; None if `step` has to run.
 
-        The input: time of the plan's next velocity [ns]; velocity reference and commanded velocity
-        [m/s]; end of the time in which the command is fresh [ns].
+        The four values: time of the plan's next velocity [ns]; velocity reference and commanded
+        velocity [m/s]; end of the time in which the command is fresh [ns].
         """
         if not (self._take_off.over and self._ramp_until_ns <= now_ns <= self._track_until_ns):
             return None
@@ -291,7 +291,7 @@ class Guard:
         return self._next_ns, self.reference, self._wanted, self._track_until_ns
 
     def _follow(self, reference: Vector, now_ns: int, readings: Readings, dt: float) -> None:
-        """Set the velocity reference, limited to keep the robot upright and inside the fence."""
+        """Limit a velocity reference to keep the robot upright and inside the fence; store it."""
         climb, position = readings.velocity[2], readings.position
         if reference[2] < climb - rules.SINK_LEAD_MAX:
             reference = rules.limit_sink(reference, self.reference, climb, self._speed_max)

@@ -77,7 +77,7 @@ _FIELDS: dict[str, Any] = {
 
 
 class Flight(ctypes.Structure):
-    """The structure `Flight` of `step.c`, which explains the fields."""
+    """The C structure `Flight`; `step.c` explains its fields."""
 
     _fields_ = tuple(_FIELDS.items())
 
@@ -212,10 +212,11 @@ def usable() -> Library:
 
 
 class NativeRobot(Robot):
-    """A `Robot` whose usual steps `step.c` runs.
+    """A `Robot` whose usual steps run in C, in `step.c`.
 
     In a usual step the robot follows a fresh command that the guard need not limit. Python runs all
-    other steps, and every step while the robot has observers or the simulator has a tape.
+    other steps. It runs every step while the robot has observers, or while the simulator stores its
+    controls in a `tape`.
     """
 
     def __init__(
@@ -236,7 +237,7 @@ class NativeRobot(Robot):
         super().put_on_ground(now_ns, cause)
 
     def run(self, tick_ns: int, until_ns: int) -> int:
-        """Run steps, as `Robot` does: in C up to the first unusual step, the rest in Python."""
+        """Run steps, as `Robot` does: in C until a step is not usual, then the rest in Python."""
         simulator, guard = self.simulator, self.guard
         in_c = not self.observers and simulator.tape is None
         while in_c and (track := guard.plain_track(tick_ns)):
@@ -266,7 +267,7 @@ class NativeRobot(Robot):
         return super().run(tick_ns, until_ns)
 
     def _give(self, reference: Vector, wanted: Vector, track_ns: int) -> None:
-        """Write the state for C into the `Flight`; the arguments are from `Guard.plain_track`."""
+        """Copy the state to the C structure `Flight`; `Guard.plain_track` has the arguments."""
         simulator = self.simulator
         tip = simulator.tip_force_peak, simulator.tip_impulse
         counts = simulator.contacts, simulator.steps
