@@ -34,7 +34,7 @@ class LinkChanged(NamedTuple):
 
 
 class LinkChecked(NamedTuple):
-    """Driver: verdict on one quantity of the link, recorded in real time only. Topic /link_check.
+    """Made by the driver, in real time only: verdict on a quantity of the link. Topic /link_check.
 
     Cloud judges the uplink, and world judges the downlink, from the datagrams of the last 60 s. The
     quantity is "mean", "deviation", "round_trip", "loss", "reordered" or "duplicated", or one that
@@ -61,7 +61,7 @@ Source: docs/reference/control.md, "Real-time factor"."""
 
 
 class TelemetrySent(NamedTuple):
-    """World: telemetry was sent. Topics /odometry and /telemetry."""
+    """Made by world: telemetry was sent. Topics /odometry and /telemetry."""
 
     stamp_ns: int
     epoch: int
@@ -70,7 +70,7 @@ class TelemetrySent(NamedTuple):
 
 
 class GroundTruth(NamedTuple):
-    """World: the true robot state at each odometry sample. Topics /ground_truth and /reference."""
+    """Made by world: true state at each odometry sample. Topics /ground_truth and /reference."""
 
     stamp_ns: int
     odometry: Odometry  # true pose and twist
@@ -81,7 +81,7 @@ class GroundTruth(NamedTuple):
 
 
 class Arrival(NamedTuple):
-    """World or cloud: a datagram with a command or telemetry arrived, even if late.
+    """Made by world or cloud: a datagram with a command or telemetry arrived, even if late.
 
     If a session has more repeated datagrams than the peer has sent, only an attacker can be the
     cause. Further repeats then get no record, so that they cannot fill the recording. Cloud writes
@@ -97,7 +97,7 @@ class Arrival(NamedTuple):
 
 
 class CommandApplied(NamedTuple):
-    """World: a command was applied for the first time. Topic /command_applied.
+    """Made by world: a command was applied for the first time. Topic /command_applied.
 
     Epoch and counter identify the `Control` record of the command.
     """
@@ -142,7 +142,7 @@ class SessionOpened(NamedTuple):
 
 
 class Control(NamedTuple):
-    """Cloud: one period of the control loop.
+    """Made by cloud: one period of the control loop.
 
     Topics /estimated_odometry, /setpoint_position, /cmd_vel, /delay_estimate and /pid. Vectors are
     in the world frame; the terms of the controller are per axis.
@@ -181,7 +181,7 @@ FAILURES = (
 
 
 class MissionEvent(NamedTuple):
-    """Cloud: an event of the mission. Topic /mission.
+    """Made by cloud: an event of the mission. Topic /mission.
 
     During the mission, `event` is one of `UNDER_WAY`. At the end of the mission, `event` is "done",
     "cancelled" or one of `FAILURES`.
@@ -194,7 +194,7 @@ class MissionEvent(NamedTuple):
 
 
 class Fault(NamedTuple):
-    """World or cloud: a problem that did not stop the flight. Topic /fault.
+    """Made by world or cloud: a problem that did not stop the flight. Topic /fault.
 
     The code is one word, such as "predictor_failed", "recorder", "link_check", or "late" (cloud
     missed periods, or world is slower than real time).
@@ -207,7 +207,7 @@ class Fault(NamedTuple):
 
 
 class Counted(NamedTuple):
-    """World or cloud: the value of a counter, once a second. Topic /count."""
+    """Made by world or cloud: the value of a counter, once a second. Topic /count."""
 
     stamp_ns: int
     end: str  # "world", "cloud" or "link"

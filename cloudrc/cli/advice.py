@@ -52,9 +52,8 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
 def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]:
     """Simulate telemetry and commands over the experiment's link, without its blackouts.
 
-    Return two lists of ages [s], sampled just before each datagram is sent. First: in world, the
-    age of the odometry from which the present command was computed. Second: in cloud, the age of
-    the newest command that telemetry has confirmed.
+    Return two lists of ages [s], sampled just before each datagram is sent: of the odometry behind
+    world's present command, and of the newest command that telemetry has confirmed to cloud.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection

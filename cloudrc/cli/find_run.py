@@ -41,6 +41,9 @@ def find_local_run(
 ) -> _Found | None:
     """Find the run in flight that a command means: the folder of `--run`, else the only run.
 
+    A command that changes a flight does not take the only run if the user's newest run here,
+    ./runs/latest, has ended or cannot be used: the other flight may be that of somebody else.
+
     Args:
         options: Parsed arguments of the command.
         look: Function of a run's folder and the URL of its API ("" without an API). It returns
@@ -53,8 +56,8 @@ def find_local_run(
         The result of `look`; None if no run is in flight, or if the flags name a cluster.
 
     Raises:
-        BadInputError: If `--run` names no run in flight; if several runs are in flight; or if the
-            command changes a flight, but the user's own run, ./runs/latest, cannot be used.
+        BadInputError: If `--run` names no run in flight; if several runs are in flight; or if
+            the command changes a flight and ./runs/latest has ended or cannot be used.
     """
     from cloudrc.drivers.local import under_way
 

@@ -26,7 +26,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Print the names and descriptions of the requested kind, or of all kinds."""
+    """Print name and description of each plug-in or shipped file of one kind, or of all kinds."""
     found = {kind: describe_all(kind) for kind in ([options.what] if options.what else KINDS)}
     if options.output == "table":
         blocks = []

@@ -418,7 +418,7 @@ def can_stop(speed: float, below: float, above: float) -> bool:
 
 
 def growth(before: Vector, after: Vector) -> float:
-    """Return the growth of a velocity [m/s]: the norm of the growth in size on each axis."""
+    """Return the growth from `before` to `after` [m/s]: the norm of the growth in size per axis."""
     (ux, uy, uz), (vx, vy, vz) = before, after
     return sqrt(_grown(ux, vx) ** 2 + _grown(uy, vy) ** 2 + _grown(uz, vz) ** 2)
 

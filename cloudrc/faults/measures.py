@@ -25,7 +25,7 @@ ENDED = Cause.ENDED.words  # cause of a HOLD that the operator has requested
 
 
 def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
-    """Choose a random time [s]; with the default limits, the robot is then among the pipes."""
+    """Choose a time [s] between `first` and `last`; by default the robot is then in the pipes."""
     return float(generator(seed, 77).uniform(first, last))
 
 

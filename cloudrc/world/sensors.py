@@ -23,7 +23,7 @@ class Errors(NamedTuple):
     bias: Vector = ZERO
 
     def add(self, true: Vector, rng: np.random.Generator) -> Vector:
-        """Return the vector `true` plus these errors, shape (3,), in the same unit."""
+        """Return the vector `true` plus these errors, shape (3,), any unit."""
         if self == NONE:
             return true
         (x, y, z), (bias_x, bias_y, bias_z) = true, self.bias

@@ -21,7 +21,7 @@ class Earliest(Estimator):
         self._offsets: deque[float] = deque(maxlen=count)
 
     def add_applied(self, applied_minus_stamp: float) -> None:
-        """Store the downlink delay of a command plus the offset between the clocks [s]."""
+        """Store `applied_minus_stamp` [s]: downlink delay of a command plus the clock offset."""
         self._offsets.append(applied_minus_stamp)
 
     def horizon(self, age: float) -> float:

@@ -29,7 +29,7 @@ class Split(Estimator):
         self._applied_minus_stamp: float | None = None
 
     def add_applied(self, applied_minus_stamp: float) -> None:
-        """Update the average with a sample of the downlink delay [s] plus the clock offset."""
+        """Average `applied_minus_stamp` [s]: downlink delay of a command plus the clock offset."""
         if self._applied_minus_stamp is None:
             self._applied_minus_stamp = applied_minus_stamp
         else:

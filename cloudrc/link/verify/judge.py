@@ -62,8 +62,8 @@ class Flow(NamedTuple):
 class Row(NamedTuple):
     """Verdict on one quantity of one direction of a link; an unknown value is NaN.
 
-    `asked` is the requested value. A measured value from `low` to `high` is accepted. All four
-    values have the unit `unit`.
+    `asked` is the requested value. A `measured` value from `low` to `high` is accepted. These four
+    values have the unit `unit` (any unit).
     """
 
     name: str  # as in `Plan.quantities`, or "round_trip"
@@ -83,7 +83,7 @@ class Expected(NamedTuple):
     known: bool  # whether the random numbers are known, so that a band has no width
 
     def hidden(self, name: str) -> float:
-        """Return (high - low) / 2 of a quantity's entry in `bands`, divided by its tolerance."""
+        """Return half the width of a quantity's entry in `bands`, divided by its tolerance."""
         mean, low, high = self.bands[name]
         return 0.5 * (high - low) / tolerance(name, mean)
 
