@@ -157,7 +157,10 @@ class Plan:
         return self.chance._replace(bands=bands)
 
     def judge(self, measured: Stream, epoch: int = 1, first: int = 0) -> list[Row]:
-        """Judge a measured stream; properties that it cannot show get the verdict "told"."""
+        """Judge a measured stream.
+
+        Properties that the stream cannot show are only reported, with the verdict "told".
+        """
         expected = self.expected(measured, epoch, first)
         found = self.quantities(measured, expected.pooled)
         rows = [expected.judge(name, found[name]) for name in found if name in expected.bands]
