@@ -42,7 +42,7 @@ ENDS = {"world": "world", "cloud": "cloud", "either": "world and cloud"}
 _PERIOD = "once per command (100 Hz by default), while there is telemetry and a setpoint"
 _LINK = "once per change; again when a session, a mission or a state of the guard begins"
 _STAMPS = {
-    ("instant of the measurement, when the telemetry leaves",
+    ("instant at which the odometry was measured; the telemetry leaves world at the same instant",
      "100 Hz by default, in a session"):
         "/odometry /telemetry",
     ("instant of the physics step", "100 Hz, or the rate of the odometry if it is higher"):
@@ -52,7 +52,7 @@ _STAMPS = {
     ("first physics step that follows the command", "once per command applied"): "/command_applied",
     ("physics step in which the state changes", "once per event"): "/guard",
     ("first odometry after the contact, at most 10 ms later", "once per event"): "/contact",
-    ("when the session begins at the process that writes the row", "once per event"): "/session",
+    ("instant at which this session begins in world or in cloud", "once per event"): "/session",
     ("departure of the command", _PERIOD):
         "/estimated_odometry /setpoint_position /cmd_vel /delay_estimate /pid",
     ("instant of the event", "once per event"): "/mission",
@@ -60,7 +60,9 @@ _STAMPS = {
     ("when the counters are read", "1 Hz per counter; counters of a relay 0.5 Hz"): "/count",
     ("when world or cloud notices the change", _LINK): "/link",
     ("end of the interval that is judged", "every 5 s per quantity"): "/link_check",
-    ("when the loop handles the deadline", "once per wake, 100 Hz per end by default"): "/lateness",
+    ("instant at which the loop wakes and begins the period",
+     "once per wake, 100 Hz per end by default"):
+        "/lateness",
 }  # fmt: skip
 SAMPLING = {name: about for about, names in _STAMPS.items() for name in names.split()}
 """Topic -> meaning of a row's stamp, and when a row is written."""
@@ -253,7 +255,7 @@ def _topics() -> str:
         blocks += [
             f"## `{name}`\n",
             f"{text}.\n",
-            f"Stamp: {stamp}, on {clock}.\n",
+            f"Stamp, on {clock}: {stamp}.\n",
             table(
                 "field | type | unit | meaning",
                 ((f"`{field.name}`", field.kind, field.unit, field.text) for field in topic.fields),
