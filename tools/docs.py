@@ -53,15 +53,17 @@ _STAMPS = {
     ("physics step in which the state changes", "once per event"): "/guard",
     ("first row of `/ground_truth` after the contact, at most 10 ms later", "once per event"):
         "/contact",
-    ("when the session begins at the process that writes the row", "once per event"): "/session",
+    ("instant at which this session begins in world or in cloud", "once per event"): "/session",
     ("departure of the command", _PERIOD):
         "/estimated_odometry /setpoint_position /cmd_vel /delay_estimate /pid",
     ("instant of the event", "once per event"): "/mission",
     ("when world or cloud notices the fault", "once per fault; repetitions are counted"): "/fault",
     ("when the counters are read", "1 Hz per counter; counters of a relay 0.5 Hz"): "/count",
     ("when world or cloud notices the change", _LINK): "/link",
-    ("end of the measurement that is judged", "every 5 s per quantity"): "/link_check",
-    ("when the loop handles the deadline", "once per wake, 100 Hz per end by default"): "/lateness",
+    ("end of the interval that is judged", "every 5 s per quantity"): "/link_check",
+    ("instant at which the loop wakes and begins the period",
+     "once per wake, 100 Hz per end by default"):
+        "/lateness",
 }  # fmt: skip
 SAMPLING = {name: about for about, names in _STAMPS.items() for name in names.split()}
 """Topic -> meaning of a row's stamp, and when a row is written."""
@@ -254,7 +256,7 @@ def _topics() -> str:
         blocks += [
             f"## `{name}`\n",
             f"{text}.\n",
-            f"Stamp: {stamp}, on {clock}.\n",
+            f"Stamp, on {clock}: {stamp}.\n",
             table(
                 "field | type | unit | meaning",
                 ((f"`{field.name}`", field.kind, field.unit, field.text) for field in topic.fields),

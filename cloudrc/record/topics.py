@@ -149,8 +149,8 @@ _TABLE = (
         "A session began under a new epoch, clock of its end", (
         _END, _EPOCH, Field("cause", "string", "", "why, in words"))),
     Topic("/estimated_odometry", "nav_msgs/msg/Odometry", rec.Control, "cloud",
-        "Predicted pose and twist that the controller used, for the instant basis_stamp_ns +"
-        " horizon (columns of /delay_estimate), cloud's clock",
+        "Predicted pose and twist that the controller used, cloud's clock. The prediction is for"
+        " the instant basis_stamp_ns + horizon; /delay_estimate has these two columns",
         _POSE_AND_TWIST[:3]),
     Topic("/setpoint_position", "geometry_msgs/msg/PointStamped", rec.Control, "cloud",
         "Position that the controller tracks, cloud's clock", (
@@ -190,7 +190,8 @@ _TABLE = (
         Field("name", "string", "", _COUNTED),
         Field("total", "int", "", "count since the start"))),
     Topic("/link", "cloudrc_msgs/msg/LinkChanged", rec.LinkChanged, "either",
-        "Conditions of the emulated link towards this end, in real time only, clock of its end", (
+        "Conditions of the emulated link in the direction in which the process that writes the row"
+        " sends: the uplink in world, the downlink in cloud, clock of its end. In real time only", (
         _WAY,
         Field("shaper", "string", "", "relay or netem"),
         Field("cause", "string", "", "why it changed; empty before the first change"),
@@ -203,8 +204,8 @@ _TABLE = (
         Field("rate", "float", "bit/s", "profile's rate at the start of the time line, or NaN"),
         Field("conditions", "string", "", "the profile as JSON"))),
     Topic("/link_check", "cloudrc_msgs/msg/LinkChecked", rec.LinkChecked, "either",
-        "A measured quantity of the link towards this end, compared with its profile, in real time"
-        " only, clock of its end", (
+        "A measured quantity of the link in the direction towards the process that writes the row,"
+        " compared with its profile, clock of its end. In real time only", (
         _WAY,
         Field("quantity", "string", "", "mean, deviation, round_trip, loss, ..."),
         Field("asked", "float", "s or 1", "value expected from the profile: a delay or a share"),
