@@ -190,8 +190,8 @@ _TABLE = (
         Field("name", "string", "", _COUNTED),
         Field("total", "int", "", "count since the start"))),
     Topic("/link", "cloudrc_msgs/msg/LinkChanged", rec.LinkChanged, "either",
-        "Conditions of the emulated link in the direction of the end that writes the row, in real"
-        " time only, clock of its end", (
+        "Conditions of the emulated link towards the end that writes the row, in real time only,"
+        " clock of its end", (
         _WAY,
         Field("shaper", "string", "", "relay or netem"),
         Field("cause", "string", "", "why it changed; empty before the first change"),
@@ -204,8 +204,8 @@ _TABLE = (
         Field("rate", "float", "bit/s", "profile's rate at the start of the time line, or NaN"),
         Field("conditions", "string", "", "the profile as JSON"))),
     Topic("/link_check", "cloudrc_msgs/msg/LinkChecked", rec.LinkChecked, "either",
-        "A measured quantity of the link in the direction of the end that writes the row, compared"
-        " with the link's profile, in real time only, clock of its end", (
+        "A measured quantity of the link towards the end that writes the row, compared with its"
+        " profile, in real time only, clock of its end", (
         _WAY,
         Field("quantity", "string", "", "mean, deviation, round_trip, loss, ..."),
         Field("asked", "float", "s or 1", "value expected from the profile: a delay or a share"),
