@@ -59,7 +59,7 @@ _STAMPS = {
     ("instant of the event", "once per event"): "/mission",
     ("when world or cloud notices the fault", "once per fault; repetitions are counted"): "/fault",
     ("when the counters are read", "1 Hz per counter; counters of a relay 0.5 Hz"): "/count",
-    ("when world or cloud notices the change", _LINK): "/link",
+    ("when world or cloud notices that the link has changed", _LINK): "/link",
     ("end of the interval that is judged", "every 5 s per quantity"): "/link_check",
     ("instant at which the loop wakes and begins the period",
      "once per wake, 100 Hz per end by default"):
