@@ -156,7 +156,7 @@ class Feed:
         return True
 
     def _write(self, line: str) -> None:
-        """Complete the last line, then write a new line; drop the new line if the pipe is full."""
+        """Write the rest of the previous line, then `line`; drop `line` if the pipe is full."""
         data = line.encode(errors="backslashreplace") + b"\n"
         with suppress(OSError):  # the pipe is full or closed: continue without the feed
             self._rest = self._rest[os.write(self._descriptor, self._rest) :]

@@ -54,7 +54,7 @@ def library() -> Library:
 
 
 def built_file(folder: Path = FOLDER, compiler: str = "built") -> Path:
-    """Return the path of `step.c` as compiled by `compiler`, or as "built" with the package."""
+    """Return the path of the library that `compiler` makes; "built" is that of the package."""
     key = sha256(SOURCE.read_bytes() + " ".join(FLAGS).encode()).hexdigest()[:16]
     return folder / f"step-{key}-{compiler}-{platform.machine().lower()}.so"
 
