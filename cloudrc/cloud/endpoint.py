@@ -330,7 +330,7 @@ class CloudEndpoint(TunnelEnd):
     def _relay(self, request: OperatorRequest) -> None:
         """Relay an operator's request to world, or drop it; teleop repeats a dropped request.
 
-        Cloud keeps an emergency stop with the number 0: it gives the stop a number and repeats it.
+        An emergency stop without a number (0) is never dropped: cloud numbers it and repeats it.
         Cloud drops all other requests while there is no session. Cloud also drops a START request
         before the first telemetry, and while it repeats an emergency stop.
         """
