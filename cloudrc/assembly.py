@@ -202,7 +202,7 @@ def build_plan(experiment: ResolvedExperiment) -> Plan:
 def mission_plan(
     mission: schema.Mission, time_limit: float, seed: int = 0, *, speed_max: float = inf
 ) -> Plan:
-    """Convert a valid mission to a plan for teleop; `time_limit` is that of the mission [s].
+    """Convert a valid mission to a plan for teleop, with the `time_limit` of the mission [s].
 
     `seed` is the seed of random setpoints, `speed_max` the guard's speed limit [m/s].
     """

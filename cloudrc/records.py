@@ -216,7 +216,7 @@ class Counted(NamedTuple):
 
 
 class Lateness(NamedTuple):
-    """Made by the driver, in real time only: lateness of a handled deadline. Topic /lateness."""
+    """Made by the driver, in real time only: how late it handled a deadline. Topic /lateness."""
 
     stamp_ns: int
     end: str  # "world" or "cloud"

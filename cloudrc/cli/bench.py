@@ -41,7 +41,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Run all measurements; print the processor time of each per physics step [us]."""
+    """Run all measurements; print for each the processor time per physics step [us]."""
     require("the bench", ("world",))
     from cloudrc.config.load import load_experiment
     from cloudrc.sweep.flight import fly_point

@@ -75,7 +75,7 @@ def map_in_order(
 ) -> Generator[Result]:
     """Call a function on each piece of work, in parallel, and yield the results in order.
 
-    With `in_order` False, yield each result as soon as it is there. At most `jobs` worker processes
+    With `in_order` False, yield each result once it is ready. At most `jobs` worker processes
     run, and at most one per core. If one worker is enough, this process makes the calls itself. The
     function has to be at module level: a worker imports the function. Ctrl-C or closing the
     generator kills the workers and drops all calls that have not ended.

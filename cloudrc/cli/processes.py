@@ -63,7 +63,7 @@ class Command(NamedTuple):
 def _add(
     parser: argparse._ActionsContainer, flag: str, kind: str, text: str, *, required: bool = False
 ) -> None:
-    """Declare a flag; `kind`, such as "FILE", is the name and type of its value ("": no value)."""
+    """Declare a flag; `kind`, such as "FILE", names its value; with "" the flag has no value."""
     if not kind:
         parser.add_argument(flag, action="store_true", help=text)
         return
@@ -341,8 +341,8 @@ def link_monitor(
     """Make the monitor that compares the received datagrams with the link profile.
 
     `uplink` is True in cloud, False in world. In flight, the monitor reads changes of the profile
-    from the link's file `state`. If the link is not `trusted`, the monitor refuses files that are
-    larger than TRACE_MAX.
+    from the link's file `state`. If the link is not `trusted`, the monitor refuses trace files
+    that are larger than TRACE_MAX.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile
@@ -494,7 +494,7 @@ class RelayControl:
     def look(self) -> None:
         """Read the requested profiles; publish applied profiles and the lateness of the datagrams.
 
-        This thread writes the files, because the relay's loop must not wait for a disk.
+        `follow` calls this in its own thread, because the relay's loop must not wait for a disk.
         """
         for way, file in self._files.items():
             self._requested[way] = file.poll() or self._requested[way]

@@ -95,7 +95,7 @@ class ComputeTime:
             self._began_ns = self._cpu_clock()
 
     def end(self) -> int:
-        """Return the simulated duration of the computation that started with `begin` [ns]."""
+        """Return the simulated duration [ns] of the computation that started with `begin`."""
         time_ns = self._mean_ns
         if self._deviation_ns:
             shape = (self._mean_ns / self._deviation_ns) ** 2

@@ -249,7 +249,7 @@ def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> 
 
 
 def _fetch_previous(release: Release, component: str, path: Path, tell: Tell) -> None:
-    """Fetch the recording that a restarted container made before its last restart."""
+    """If a container was restarted, fetch the recording that it made before the last restart."""
     try:
         statuses = pods.container_statuses(pods.find_pod(release, component))
         if any(each.name == component and each.restart_count for each in statuses):

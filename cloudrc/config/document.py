@@ -169,7 +169,7 @@ class Document:
     def source(self, path: KeyPath) -> Source:
         """Find the source of the value at `path`.
 
-        If a setting gave the value or a part of the value, return the source of the setting.
+        If a setting, such as `--set`, gave the value or a part of it, return the setting's source.
         """
         for key, source in self.sources.items():
             if source.is_setting and key[: len(path)] == path:

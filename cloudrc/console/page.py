@@ -1,4 +1,4 @@
-"""Serve the console's page: all browsers show scene, charts and state, the first also controls.
+"""Serve the console's page: all browsers show the flight, one browser can control it.
 
 viser draws and serves the page. The keyboard API of viser does not report the release of a key.
 Therefore, while the user holds a key, a script on the page holds the button of the same direction.

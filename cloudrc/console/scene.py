@@ -180,7 +180,7 @@ class FlightScene:
     def _add_geoms(
         self, parent: str, model: Any, geoms: list[int], ghost: Colour | None = None
     ) -> None:
-        """Add one mesh per colour for the geoms of one body; with `ghost`, one in this colour."""
+        """Add a mesh per colour for the geoms of a body; with `ghost`, one mesh in that colour."""
         # mjviser imports mujoco, which cloudrc.world.scene has imported without OpenGL.
         from mjviser.conversions import merge_geoms
 
@@ -209,7 +209,7 @@ def _surface(
     """Make the mesh between two circles around the axis of a pipe: its wall or a rim.
 
     Each circle is a radius [m] and a place along the axis, as a share of the pipe's length: -0.5 is
-    the begin of the pipe, 0.5 its end.
+    one end of the pipe, 0.5 the other.
 
     Returns:
         Vertices [m], world frame, shape (2 * sides, 3), and faces, shape (2 * sides, 3).

@@ -1,7 +1,7 @@
 """Run world or cloud as a process: record its data, report to the supervisor, stop on signals.
 
 The process ends on SIGTERM or SIGINT, or when its parent process has ended. Its standard output is
-a feed: a line of JSON for each event and for some samples. Prints of plug-ins go to standard error.
+a feed: a line of JSON for each event and for some samples. Plug-ins print to standard error.
 """
 
 from __future__ import annotations

@@ -149,7 +149,7 @@ CHECKS: dict[str, tuple[Formula | Flight, ...]] = {
 
 
 def rows(part: str, scored: Sequence[tuple[float, str]]) -> list[dict[str, Any]]:
-    """Return a row per check; `scored` has its share of the points [0, 1], and what was seen."""
+    """Make a row per check from `scored`: share of the points [0, 1], text on what was seen."""
     keys = ("part", "test", "points", "max_points", "seen")
     cells = (
         (part, check.test, round(check.points * share, 1), check.points, seen)
@@ -175,7 +175,10 @@ def run(part: str, folder: Path) -> list[dict[str, Any]]:
 
 
 def _explain(error: BaseException, part: str, files: Mapping[str, str]) -> str:
-    """Describe an error; begin with FILE:LINE of the student's failed line, else of the method."""
+    """Describe an error; begin with FILE:LINE, the place in the student's file that failed.
+
+    If no line of this file failed, the place is the student's method.
+    """
     while isinstance(error, CloudrcError) and error.__cause__ is not None:
         error = error.__cause__
     places = [(each.filename, each.lineno) for each in traceback.extract_tb(error.__traceback__)]

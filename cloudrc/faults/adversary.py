@@ -160,9 +160,10 @@ def _faces(position: Vector) -> list[tuple[float, int, float]]:
 
 
 def dishonesty(schedule: Schedule) -> tuple[Lie, Words | None]:
-    """Return the two functions of a schedule's policy.
+    """Return the two functions by which the dishonest cloud of a schedule attacks.
 
-    The first changes commands. The second forges operator requests; it is None for some policies.
+    The first changes commands. The second forges operator requests; it is None if the policy
+    forges none.
 
     Raises:
         BadInputError: If the policy does not exist; the message lists all policies.

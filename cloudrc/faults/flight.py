@@ -46,7 +46,7 @@ def conditions(**changes: object) -> Shape:
 
 
 def silent(start: float, duration: float, **changes: object) -> Shape:
-    """Return a function that adds a blackout from `start` [s] for `duration` [s], and `changes`."""
+    """Return `conditions` with a blackout from `start` [s] for `duration` [s] and the `changes`."""
     return conditions(blackouts=(Blackout(start, duration),), **changes)
 
 

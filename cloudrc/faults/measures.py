@@ -136,7 +136,7 @@ def done(outcome: Outcome, flight: Flight) -> None:
 
 
 def fly_safely(outcome: Outcome, flight: Flight, limit: float = 120.0) -> Flight:
-    """Fly the mission, at most until `limit` [s]; then make the checks of `safe` and of `done`."""
+    """Fly the mission, at most until `limit` [s]; then check that it was `safe` and `done`."""
     flight.fly_mission(limit)
     safe(outcome, flight)
     done(outcome, flight)

@@ -1,6 +1,6 @@
 """Read the pipes, the board and the floor of a scene from its MJCF file, without MuJoCo.
 
-For this purpose the file repeats the ideal shapes as numbers: `<custom><numeric name="pipe_1"
+For this reader, the MJCF file repeats the ideal shapes as numbers: `<custom><numeric name="pipe_1"
 data="..."/>`, in metres, world frame.
 
 | name | data |

@@ -94,7 +94,7 @@ class Handed:
 
 
 def write_handed(handed: Handed) -> str:
-    """Format a change as the text of the JSON document."""
+    """Format a change as the JSON document that `cloudrc link set` writes into a pod."""
     return json.dumps(asdict(handed))
 
 
@@ -148,7 +148,7 @@ class Profiles:
         self._known: dict[str, dict[str, Any]] = {}
 
     def first(self) -> Loaded:
-        """Read the profile at the start; raise a BadInputError if the profile is invalid."""
+        """Read the profile for the first time; raise a BadInputError if it is invalid."""
         loaded = self._file.first()
         self._known[loaded.change.number] = loaded.values
         return loaded

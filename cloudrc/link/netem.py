@@ -312,7 +312,7 @@ class Netem:
     def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
         """Use this profile from now on; with `restart`, its time line starts now.
 
-        Without `restart`, the new time line counts as started when the old one started. Datagrams
+        Without `restart`, the new time line keeps the start time of the old one. Datagrams
         in flight are not lost. If netem cannot realise the profile, the method raises a
         CloudrcError and the old profile stays in force.
         """

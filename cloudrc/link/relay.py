@@ -129,7 +129,7 @@ class Lane:
     """One direction of the relay: reads datagrams, and sends them when they are due.
 
     The datagrams arrive at the bound UDP socket `source`, which the caller closes. `origin_ns` is
-    the start of the model's time on the monotonic clock [ns], or None before the first datagram.
+    time 0 of the link model, monotonic clock [ns], or None before the first datagram.
     """
 
     def __init__(

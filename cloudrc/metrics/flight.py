@@ -98,7 +98,7 @@ class Flight:
 
     @cached_property
     def truth(self) -> Columns:
-        """True states during the flight."""
+        """True states of the robot during the flight."""
         return self.during("/ground_truth")
 
     @cached_property
@@ -141,7 +141,7 @@ class Flight:
 
     @cached_property
     def applied(self) -> Columns:
-        """Commands that world applied in the flight, each with the record of its control period.
+        """Commands that world applied in the flight, each with cloud's record `Control`.
 
         Commands without such a record are left out. `stamp_ns` is the time of application or, for a
         command with a plan, the start of the plan [ns]; `position` is the predicted position [m].

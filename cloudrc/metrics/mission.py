@@ -119,9 +119,9 @@ def _impulse(flight: Flight, touch: dict[str, Array]) -> float:
 
 @_of_touch
 def _steady_force(flight: Flight, touch: dict[str, Array]) -> float | None:
-    """Average the contact force before the mission's end [N].
+    """Average the contact force in the last PRESSING_NS of the mission [N].
 
-    It does not depend on the simulator's contact parameters.
+    This average does not depend on the simulator's contact parameters.
     """
     if flight.ending is None or flight.ending[1] != "done":
         return None

@@ -317,7 +317,7 @@ def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, N
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """Contacts in a mission and slip of world's clock, as telemetry reports them."""
+    """Contacts in a mission, and lag of world's clock (slip), as telemetry reports them."""
 
     pipe_contacts: int = 0  # number of contacts with pipes
     touch_speed: float | None = None  # of the arm's tip at its first touch of the board [m/s]

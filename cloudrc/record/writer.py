@@ -120,9 +120,9 @@ class McapWriter:
         add_message(self._sha256, topic, now_ns, data)
 
     def write_views(self, views: Iterable[tuple[str, int, bytes]]) -> None:
-        """Write messages of `VIEWS`, each with its log time [ns], after all other messages.
+        """Write the messages for viewers, each with topic and log time [ns], after all others.
 
-        Views have chunks of their own; readers merge the chunks by the index. Views are neither
+        They have chunks of their own; readers sort the chunks by the file's index. They are neither
         counted nor hashed, because they repeat other messages.
         """
         self.flush()

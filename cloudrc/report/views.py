@@ -40,7 +40,7 @@ GOAL, GHOST, GLASS = (0.84, 0.37, 0.0), (0.34, 0.71, 0.91), (0.70, 0.74, 0.78)
 
 
 def add_views(mission: Contents, experiment: ResolvedExperiment) -> Recording:
-    """Fill `mission.views`; return the mission's tables. Raise the same errors as `views`."""
+    """Add messages for viewers to the recording `mission`; return its tables; raise as `views`."""
     recording = mission.recording()
     mission.views = views(recording, experiment)
     return recording

@@ -83,7 +83,7 @@ def write_report(
 
 
 def _driven(flight: Flight) -> str:
-    """Return the setpoints since the operator began to drive, as CSV; "" without a drive."""
+    """Return the setpoints of the operator's drive by hand, as CSV; "" if nobody drove."""
     mission, control = flight.during("/mission"), flight.control
     begins_ns = mission["stamp_ns"][mission["event"] == "driving"]
     if not len(begins_ns):

@@ -32,7 +32,7 @@ def arrival_ns(setpoint: Setpoint) -> int:
 
 
 def setpoint_at(setpoint: Setpoint, now_ns: int) -> Setpoint:
-    """Return the setpoint as its motion has changed it by `now_ns` [ns], cloud's clock."""
+    """Return the setpoint with its position and velocity at `now_ns` [ns], cloud's clock."""
     motion = setpoint.motion
     if motion is None:
         return setpoint
@@ -107,7 +107,10 @@ def _driven(setpoint: Setpoint, drive: Drive, now_ns: int) -> Setpoint:
 def _change(
     position: Vector, before: Vector, after: Vector, acceleration: float, time: float
 ) -> tuple[Vector, Vector]:
-    """Return position [m] and velocity [m/s] after `time` [s] of a change, `before` to `after`."""
+    """Return position [m] and velocity [m/s], `time` [s] after the velocity left `before`.
+
+    It changes at a constant acceleration [m/s^2] to `after`, and then stays constant.
+    """
     ramp = dist(before, after) / acceleration
     share = min(time / ramp, 1.0) if ramp else 1.0
     rising, steady = min(time, ramp), max(time - ramp, 0.0)

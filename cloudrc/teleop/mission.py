@@ -233,7 +233,8 @@ class Teleop:
     def stop(self, now_ns: int) -> None:
         """Stop the rotors at once in any state, and drop all earlier requests to the robot.
 
-        Teleop sends `ALARM` to cloud until telemetry shows ESTOP; cloud sends stops to the robot.
+        Teleop sends `ALARM` to cloud until telemetry shows ESTOP. Cloud then sends the request
+        ESTOP to the robot.
         """
         if self.state in UNDER_WAY:
             self._end("emergency_stopped", "emergency stop", now_ns, where=True)
@@ -331,7 +332,7 @@ class Teleop:
         return None
 
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
-        """Keep the robot at its position, because another teleop may have started its mission.
+        """Keep the robot at its position: another teleop may have started the reported mission.
 
         Also request the end of that mission, if the robot stands on the ground, or if this teleop
         knows that the mission has ended.
@@ -482,7 +483,8 @@ class Teleop:
     def _repeat_setpoint(self, now_ns: int) -> None:
         """Send the setpoint again in a new session.
 
-        If the operator steers by hand, or before a reset to the spawn, send the robot's position.
+        Send the robot's position instead if the operator steers by hand, or if the mission still
+        has to reset the robot to the spawn.
         """
         if self.state == STARTING and self._may_move:
             self._is_pending = True

@@ -196,8 +196,8 @@ class MissionStore:
     def __init__(self, db: sqlite3.Connection, salt: bytes, notice: str = "") -> None:
         """Read all missions of `db`; if that fails, close `db` and raise DatabaseError.
 
-        The ids of every new file begin with "m1". The robot stores progress by mission number;
-        the random bytes `salt` make these numbers differ from those of an earlier file.
+        The first mission in a new file has the id "m1". The robot stores progress by mission
+        number; the random bytes `salt` make these numbers differ from those of an earlier file.
         `notice` tells what happened to a damaged earlier file; "" means that there is none.
         """
         self._db, self._salt = db, salt

@@ -29,7 +29,7 @@ from cloudrc.records import FAILURES, MissionEvent
 class Leg:
     """A waypoint, and the conditions under which it counts as reached.
 
-    A random step has an infinite `tolerance`; it counts as reached after the time `dwell`. If
+    A random waypoint has an infinite `tolerance`; it counts as reached after the time `dwell`. If
     `speed` is above 0, the waypoint counts as reached when the setpoint has rested there for the
     time `dwell` and the robot is within `tolerance`.
     """

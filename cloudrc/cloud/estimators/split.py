@@ -24,7 +24,7 @@ class Split(Estimator):
     """
 
     def __init__(self, gain: float) -> None:
-        """Set `gain`, the weight of a new sample in the average, in [0, 1]."""
+        """Set `gain`, in [0, 1]: weight of a new value in the average of `applied_minus_stamp`."""
         self._gain = gain
         self._applied_minus_stamp: float | None = None
 

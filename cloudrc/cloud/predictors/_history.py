@@ -56,9 +56,10 @@ class History:
         return self.stamps[-1] - self.stamps[-2] if len(self.stamps) > 1 else PERIOD_NS
 
     def note_applied(self, stamp_ns: int, began_ns: int) -> None:
-        """Update the mean shift with an echo.
+        """Update the mean shift: the mean time from a command's stamp to its application.
 
-        World applied the command with the stamp `stamp_ns` at `began_ns`, on world's clock [ns].
+        World applied the command with the stamp `stamp_ns` (cloud's clock) at `began_ns` (world's
+        clock), both [ns].
         """
         last_began_ns, last_stamp_ns = self._applied[-1] if self._applied else (NEVER_NS, 0)
         lasted_ns = began_ns - last_began_ns
@@ -194,7 +195,7 @@ class Replay(Predictor):
         self.history.note_applied(command_stamp_ns, applied_ns)
 
     def observe(self, odometry: Odometry) -> None:
-        """Store the newest sample."""
+        """Store the newest odometry sample."""
         self.newest, self.history.seen_ns = odometry, odometry.stamp_ns
 
     def roll(self, odometry: Odometry, horizon: float) -> Body:
@@ -213,7 +214,7 @@ class Replay(Predictor):
         return self._last.odometry() if horizon else odometry
 
     def model(self) -> Model | None:
-        """Return a copy of the robot's model, in the state of the last prediction; or None."""
+        """Return a copy of the model in the state of the last prediction; None before the first."""
         return copy(self._last)
 
 

@@ -25,7 +25,7 @@ STEPS_MAX = 200
 
 
 class FirstOrder(Body):
-    """Model per axis: the guard's acceleration limit, then two lags, for dead time and velocity."""
+    """Model per axis: the guard's acceleration limit, a lag as dead time, a lag of the velocity."""
 
     def __init__(self, axes: Axes, acceleration_max: float) -> None:
         """Begin at rest; `acceleration_max` [m/s^2] is the guard's acceleration limit."""

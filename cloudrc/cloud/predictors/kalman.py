@@ -51,7 +51,7 @@ class Kalman(Predictor):
         self._replay.applied(command_stamp_ns, applied_ns)
 
     def observe(self, odometry: Odometry) -> None:
-        """Update the estimate with a new sample."""
+        """Update the estimated state with a new odometry sample."""
         before, forecast = self._estimate, self._replay.forecast(odometry.stamp_ns)
         estimate = odometry
         if before is None or forecast is None:
@@ -91,7 +91,7 @@ class Kalman(Predictor):
         return prediction if horizon else odometry
 
     def model(self) -> Model | None:
-        """Return the model of the robot, in the state of the last prediction; or None."""
+        """Return the robot's model in the state of the last prediction; None before the first."""
         return self._replay.model()
 
 

@@ -202,7 +202,7 @@ class ModelBased(Replay):
         return body
 
     def observe(self, odometry: Odometry) -> None:
-        """Correct the white box with a new odometry sample."""
+        """Correct the `WhiteBox`, the model of the robot, with a new odometry sample."""
         super().observe(odometry)
         self._body = self.forecast(odometry.stamp_ns) or WhiteBox(*self._loop, odometry)
         self._body.correct(odometry)

@@ -181,7 +181,7 @@ def _ratio(row: Row) -> float:
 
 
 def describe(row: Row) -> str:
-    """Compare a measured value with the requested one."""
+    """Return a text such as "mean 52.00 ms instead of 40.00 ms", the measured value first."""
     return f"{row.name} {in_unit(row.measured, row.unit)} instead of {in_unit(row.asked, row.unit)}"
 
 

@@ -83,7 +83,7 @@ class Expected(NamedTuple):
     known: bool  # whether the random numbers are known, so that a band has no width
 
     def hidden(self, name: str) -> float:
-        """Return half the width of a quantity's entry in `bands`, divided by its tolerance."""
+        """Return half the width of the band of the quantity `name`, divided by its tolerance."""
         mean, low, high = self.bands[name]
         return 0.5 * (high - low) / tolerance(name, mean)
 
@@ -136,7 +136,7 @@ class Plan:
 
     @cached_property
     def chance(self) -> Expected:
-        """The range in which each quantity lies by chance, computed from the simulated `links`."""
+        """Expected values and their random variation, computed from the simulated `links`."""
         return self._expect(self.links)
 
     def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:
@@ -159,7 +159,7 @@ class Plan:
     def judge(self, measured: Stream, epoch: int = 1, first: int = 0) -> list[Row]:
         """Judge a measured stream.
 
-        Properties that the stream cannot show are only reported, with the verdict "told".
+        If the stream cannot show a property, its row has the verdict "told" and no measured value.
         """
         expected = self.expected(measured, epoch, first)
         found = self.quantities(measured, expected.pooled)

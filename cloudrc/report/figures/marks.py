@@ -1,4 +1,4 @@
-"""Mark HOLD and changes of the link in figures; compute the delays of the link profile.
+"""Mark the state HOLD and link changes in figures; compute the delays of the link profile.
 
 A link profile describes the conditions of a direction over time; `cloudrc link set` replaces the
 profile in flight.

@@ -150,7 +150,7 @@ class Descent:
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
-        """Begin a descent at `now_ns` [ns]; the operator has yet to acknowledge it."""
+        """Begin a descent at `now_ns` [ns] that the operator has not acknowledged yet."""
         self._moved_ns, self.acknowledged = now_ns, False
 
     def may_stop(self, readings: Readings) -> bool:
@@ -179,7 +179,7 @@ class TakeOff:
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
-        """Set the corners of the fence, `low` and `high` [m], world frame; begin on the ground."""
+        """Set the fence from corner `low` to `high` [m], world frame; begin before the take-off."""
         (ax, ay, az), (bx, by, bz) = low, high
         self._low = (ax + TAKE_OFF_MARGIN, ay + TAKE_OFF_MARGIN, az)
         self._high = (bx - TAKE_OFF_MARGIN, by - TAKE_OFF_MARGIN, bz)
