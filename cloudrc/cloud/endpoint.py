@@ -81,7 +81,7 @@ class ComputeTime:
         rng: np.random.Generator,
         cpu_clock: Callable[[], int] | None = None,
     ) -> None:
-        """Set mean (`mean_ns`) and standard deviation (`deviation_ns`) of the simulated time [ns].
+        """Set mean `mean_ns` and standard deviation `deviation_ns` of the compute time [ns].
 
         `cpu_clock` returns the CPU time used so far [ns]. If it is given, the CPU time between
         `begin` and `end` is added.
@@ -330,7 +330,7 @@ class CloudEndpoint(TunnelEnd):
     def _relay(self, request: OperatorRequest) -> None:
         """Relay an operator's request to world, or drop it; teleop repeats a dropped request.
 
-        Cloud keeps an emergency stop with the number 0: it gives the stop a number and repeats it.
+        If an emergency stop has the number 0, cloud gives it a number and repeats it.
         Cloud drops all other requests while there is no session. Cloud also drops a START request
         before the first telemetry, and while it repeats an emergency stop.
         """
