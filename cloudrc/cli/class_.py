@@ -42,7 +42,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Write the files, or score them; return 0 whatever the score."""
+    """Write a student's files, or score the files in a folder; return 0 whatever the score."""
     if options.verb == "new":
         return _new(options.folder)
     if not options.folder.is_dir():

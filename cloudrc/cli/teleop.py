@@ -142,8 +142,8 @@ def ending(
     """Return a function that tells whether teleop's process may end.
 
     When `asked()` becomes true, that function pauses the mission; it returns True as soon as the
-    robot holds its position, or after `PAUSE_LIMIT_NS`. With `single`, it also returns True when
-    the mission is over, even if `asked()` is false.
+    robot holds its position, or after `PAUSE_LIMIT_NS`. While `asked()` is false, it returns True
+    only with `single`, as soon as the mission is over.
     """
     until_ns = 0
 

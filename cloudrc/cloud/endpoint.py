@@ -330,7 +330,7 @@ class CloudEndpoint(TunnelEnd):
     def _relay(self, request: OperatorRequest) -> None:
         """Relay an operator's request to world, or drop it; teleop repeats a dropped request.
 
-        If an emergency stop has the number 0, cloud gives it a number and repeats it.
+        An emergency stop without a number (0) is never dropped: cloud numbers it and repeats it.
         Cloud drops all other requests while there is no session. Cloud also drops a START request
         before the first telemetry, and while it repeats an emergency stop.
         """

@@ -161,7 +161,7 @@ def _moves_robot(output: Any) -> bool:
 
 
 class LastWord:
-    """Delays the end of cloud's process in flight, so that it can forward teleop's END request."""
+    """Delays the end of cloud's process in flight, to forward teleop's END request first."""
 
     def __init__(
         self,
