@@ -40,8 +40,9 @@ class LinkChecked(NamedTuple):
     quantity is "mean", "deviation", "round_trip", "loss", "reordered" or "duplicated", or one that
     is not judged: "time_line", "rate", "correlation".
 
-    The verdict is "ok", "off", "told" (not judged) or "open". It is "open" if the datagrams are too
-    few, if the next check must confirm "off", or if late wakes of a process may have caused "off".
+    The verdict is "ok", "off" or "open", or "told" for a quantity that is not judged. "open" means
+    that the datagrams are too few, that the next check must confirm "off", or that a process that
+    woke late may have caused "off".
     """
 
     stamp_ns: int

@@ -94,7 +94,7 @@ def execute(options: argparse.Namespace) -> int:
 def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
     """Fly A and B with each seed.
 
-    Return the pairs of flights; and, from `take_each`, why the work ended early and the exit code.
+    Return the pairs of flights; why the work ended early, or ""; and the exit code.
     """
     from cloudrc.cli.advice import warn
     from cloudrc.cli.progress import SweepView

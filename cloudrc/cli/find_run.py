@@ -39,10 +39,10 @@ def find_local_run(
     steers: bool = True,
     flag: str = "--run ",
 ) -> _Found | None:
-    """Find the run in flight that a command means: the folder of `--run`, else the only run.
+    """Find the run in flight that a command means: that of `--run`, else the only one.
 
-    A command that changes a flight does not take the only run if the user's newest run here,
-    ./runs/latest, has ended or cannot be used: the other flight may be that of somebody else.
+    If the user's newest run here, ./runs/latest, has ended or cannot be used, a command that
+    changes a flight rejects the only run in flight, which may belong to somebody else.
 
     Args:
         options: Parsed arguments of the command.

@@ -189,7 +189,10 @@ def status_page(sidecar: Sidecar) -> str:
 
 @lru_cache(maxsize=1)
 def _find_netems(host: str, second: int) -> dict[str, Any]:
-    """Find the netem qdiscs of this pod, at most once per second; `second` is the time [s]."""
+    """Find the netem qdiscs of this pod.
+
+    `second` is the present time in whole seconds [s]: the cache allows one search per second.
+    """
     from cloudrc.link.netem import find_netems
 
     return find_netems(run_tool, host)

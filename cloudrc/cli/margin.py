@@ -158,7 +158,7 @@ def _try(options: argparse.Namespace, value: float, *, first: bool) -> Trial:
 
 
 def _limits(experiment: ResolvedExperiment) -> list[str]:
-    """Return settings KEY=VALUE: time limits of cloud and guard, raised if the link needs it."""
+    """Return time limits of cloud and guard, as KEY=VALUE, that are long enough for the link."""
     from cloudrc.config.load import COMMAND_AGE_MAX_MS, FREEZE_AFTER_S, HORIZON_MAX_S
     from cloudrc.config.schema import COMMAND_AGE_MS
 

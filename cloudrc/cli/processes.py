@@ -296,7 +296,10 @@ def open_end(
 
 
 def open_peer(options: argparse.Namespace) -> Peer:
-    """Bind the socket of world or cloud. `--peer` or the file `--route` has the peer's address."""
+    """Bind the socket of world or cloud.
+
+    The peer's address is the value of `--peer`, or the content of the file `--route`.
+    """
     target: Address | Path | None = options.route
     if target is None:
         target = resolve_address("--peer", options.peer, options.listen)

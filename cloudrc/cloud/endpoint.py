@@ -81,7 +81,7 @@ class ComputeTime:
         rng: np.random.Generator,
         cpu_clock: Callable[[], int] | None = None,
     ) -> None:
-        """Set mean (`mean_ns`) and standard deviation (`deviation_ns`) of the simulated time [ns].
+        """Set mean `mean_ns` and standard deviation `deviation_ns` of the compute time [ns].
 
         `cpu_clock` returns the CPU time used so far [ns]. If it is given, the CPU time between
         `begin` and `end` is added.

@@ -120,7 +120,10 @@ def pod_failure(pod: Any) -> str:
 
 
 def refuse_local_files(values: Mapping[str, Any], remedy: str) -> None:
-    """Raise a BadInputError, which ends with `remedy`, if `values` name a file that pods lack."""
+    """Raise a BadInputError if one of `values` is the path of a local file, which the pods lack.
+
+    `remedy` is the end of the error's text.
+    """
     from cloudrc.config.load import local_files
 
     for key, path in local_files(values).items():

@@ -291,7 +291,7 @@ def _inline_profile(document: Document) -> None:
 
 
 def _implied(profile: Profile) -> dict[KeyPath, float]:
-    """Return path -> default of those keys of `guard` and `cloud` that depend on the profile."""
+    """Return key path -> default value, for the defaults that depend on the link's profile."""
     return {
         ("guard", "command_age_max_ms"): profile.command_age_max_ms or COMMAND_AGE_MAX_MS,
         ("cloud", "horizon_max_s"): profile.horizon_max_s or HORIZON_MAX_S,

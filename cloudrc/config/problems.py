@@ -149,7 +149,10 @@ class Problem(NamedTuple):
 def from_pydantic(
     error: ValidationError, model: type[BaseModel], prefix: KeyPath = (), limit: int | None = None
 ) -> list[Problem]:
-    """Convert the first `limit` validation errors of `model`; `prefix` is the path of the model."""
+    """Convert the first `limit` validation errors of `model`.
+
+    `prefix` is the key path of the model in the document.
+    """
     details = error.errors(include_url=False)[:limit]
     return [_problem(detail, model, prefix) for detail in details]
 

@@ -278,7 +278,7 @@ class Mission(Section):
 
     @property
     def count(self) -> int:
-        """Number of waypoints or random steps; setpoints from a file count as one waypoint."""
+        """Number of waypoints or random setpoints; a file of setpoints counts as one waypoint."""
         return self.steps.count if self.steps else 1 if self.setpoints else len(self.waypoints)
 
 

@@ -169,7 +169,7 @@ class Exporter:
         return self._live.link
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set the `shaper` of a direction, "relay" or "netem", and the configured `link.mode`."""
+        """Set a direction's `shaper`, "relay" or "netem"; `mode` is the configured `link.mode`."""
         self.link.shaped(shaper, direction, mode)
 
     def asked(self, direction: str, delay: float) -> None:

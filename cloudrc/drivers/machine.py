@@ -1,4 +1,4 @@
-"""Identify the machine's clock, count its cores, run its Python, and measure time limits."""
+"""Identify the machine's clock, count its cores, build Python commands, measure time limits."""
 
 from __future__ import annotations
 

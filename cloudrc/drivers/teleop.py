@@ -161,7 +161,7 @@ def _moves_robot(output: Any) -> bool:
 
 
 class LastWord:
-    """Lets cloud's process forward teleop's END request before the process ends in flight."""
+    """Delays the end of cloud's process in flight, to forward teleop's END request first."""
 
     def __init__(
         self,

@@ -35,6 +35,7 @@ def build(
 ) -> StudentController:
     """Make a controller of `gain_p` [1/s], `gain_i` [1/s^2], `gain_d` [1], `velocity_max` [m/s].
 
-    The defaults are the gains that the paper's authors published, and a limit hardly ever reached.
+    The default gains are those that the paper's authors published. The default of `velocity_max`
+    is so high that the robot hardly ever reaches it.
     """
     return StudentController(gain_p, gain_i, gain_d, velocity_max)

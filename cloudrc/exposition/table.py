@@ -1,7 +1,7 @@
 """Define all Prometheus metrics: name, type, meaning, labels, and the processes that expose them.
 
 Names follow the rules of Prometheus: prefix `cloudrc_`, base units, `_total` at the end of
-counters. The values of a label are known in advance: one pod has fewer than 200 series.
+counters. Each label has a fixed set of values, so one pod has fewer than 200 series.
 """
 
 from __future__ import annotations

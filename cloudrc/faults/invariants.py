@@ -297,7 +297,7 @@ class RobotInvariants:
                 self._note(now_ns, "cap", f"{text}{' after a HOLD' if after else ''}")
 
     def _leave_track(self, readings: Readings, now_ns: int) -> None:
-        """Store where the guard left TRACK, and the distance within which the robot must stop."""
+        """Store where the guard left TRACK, and how far from there the robot may come to rest."""
         speed = max(hypot(*readings.velocity), hypot(*self._before))
         self._left, self._way = readings.position, speed * (0.2 + speed / 6.0) + REST
         if now_ns - self._touched_ns < REELS_NS:

@@ -62,11 +62,11 @@ class Outcome:
         self.sha256 = hashlib.sha256(both).hexdigest() if self.sha256 else sha256
 
     def most(self, text: str, measured: float, limit: float, unit: str = "") -> None:
-        """Check that `measured` is at most `limit`, both in `unit` [any unit]."""
+        """Check `measured` <= `limit`, both in `unit` [any unit]; `text` says what is measured."""
         self.checks.append(Check(text, measured, "<=", limit, unit))
 
     def least(self, text: str, measured: float, limit: float, unit: str = "") -> None:
-        """Check that `measured` is at least `limit`; both have the unit `unit` [any unit]."""
+        """Check `measured` >= `limit`, both in `unit` [any unit]; `text` says what is measured."""
         self.checks.append(Check(text, measured, ">=", limit, unit))
 
     def same(self, text: str, measured: float, limit: float) -> None:

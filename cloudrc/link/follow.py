@@ -154,7 +154,7 @@ class Profiles:
         return loaded
 
     def poll(self) -> Loaded | None:
-        """Return the next changed profile; None if the requested profile has not changed."""
+        """Return a profile that has been changed since the last call; None if there is none."""
         for source in self._sources:
             loaded = source.poll()
             if loaded is None:

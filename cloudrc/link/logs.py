@@ -245,10 +245,10 @@ _IRTT_NAMES = {
 
 
 def _irtt_entries(trips: list[dict[str, Any]], what: str) -> list[Entry]:
-    """Read the time of sending and the delay of each packet [s]; time 0 is the first packet.
+    """Read the time of sending and the delay of each packet [s]; the first time is 0.
 
-    `what` is a key of `_IRTT_NAMES`. Packets lost in the other direction are left out. For the
-    downlink, too, the client's time of sending is used: irtt has no server's time of a lost packet.
+    `what` is a key of `_IRTT_NAMES`. Packets lost in the other direction are left out. The time is
+    always that of the client, even for the downlink: a lost packet has no time of the server.
     """
     other, key = _IRTT_NAMES[what]
     part = 0.5e-9 if what == "halves" else 1e-9

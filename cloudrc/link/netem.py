@@ -151,7 +151,7 @@ def distribution_name(profile: DirectionProfile) -> str:
 
 
 def write_table(folder: Path, profile: DirectionProfile) -> None:
-    """Write the table of a profile's distribution; TC_LIB_DIR tells tc the folder."""
+    """Write the table of a profile's delays to `folder`; TC_LIB_DIR tells tc this folder."""
     name = distribution_name(profile)
     path = folder / f"{name}.dist"
     if not path.exists():  # the name determines the content
@@ -350,9 +350,9 @@ class Netem:
 
         The datagrams are `forwarded` (including copies), `lost` (dropped at random or because the
         queue was full) and `held` (in the queue now); without the qdisc, these counters are absent.
-        `step_lateness_p50_ns` and `_p99_ns` are percentiles of the lateness with which a change of
-        the time line changed the qdisc [ns]. `restored` is the number of times that another program
-        removed or changed the qdiscs. The name is historical: `Netem` does not restore them.
+        `step_lateness_p50_ns` and `step_lateness_p99_ns` are percentiles [ns] of how late the qdisc
+        followed the changes of the time line. `restored` is the number of times that another
+        program removed or changed the qdiscs; despite the name, `Netem` does not restore them.
         """
         found = self._look() | {"restored": self._damages}
         if self._lateness_ns:

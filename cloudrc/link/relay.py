@@ -84,7 +84,7 @@ class ReleaseErrors(Counter[int]):
 
 
 def ask_for_stamps(one: socket.socket) -> None:
-    """Let the kernel record arrival times and count dropped datagrams on a socket, if it can."""
+    """Let the kernel, if it can, record arrival times on a socket and count dropped datagrams."""
     for option in (_SO_RXQ_OVFL, _SO_TIMESTAMPNS) if sys.platform == "linux" else ():
         with suppress(OSError):  # without a stamp, the time of reading counts as arrival
             one.setsockopt(socket.SOL_SOCKET, option, 1)
@@ -193,7 +193,7 @@ class Lane:
         return {**self._counts, "unread": self._stamps.dropped}
 
     def released(self) -> dict[str, int]:
-        """Return how late datagrams left; any thread may call this method.
+        """Return statistics of how late datagrams left; any thread may call this method.
 
         Returns:
             The values of `ReleaseErrors.in_ns`, and the numbers of datagrams that were dropped

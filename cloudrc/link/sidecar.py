@@ -58,7 +58,7 @@ class Sidecar:
         tell: Callable[[LinkState], object],
         count: Callable[[dict[str, int]], object],
     ) -> None:
-        """Store the arguments; `route` is the path of the route file, beside the state file.
+        """Store the arguments; `route` is the route file. The state file is in the same folder.
 
         `direction` is "uplink" or "downlink". `tell` exports each new state of the link as metrics.
         `count` exports the numbers of datagrams by outcome, once a second.
@@ -161,7 +161,7 @@ class Sidecar:
         return state
 
     def _publish_released(self, shaper: Shaper) -> None:
-        """Write to a file how late datagrams left; the pod's world or cloud reads this file."""
+        """Write the lateness of datagrams to a file, which the pod's world or cloud reads."""
         if released := shaper.released():
             with suppress(OSError):
                 publish(self._released_file, json.dumps(released))

@@ -40,7 +40,7 @@ class Flight:
 
     @property
     def waypoints(self) -> int:
-        """Number of waypoints or random steps of the mission."""
+        """Number of the mission's waypoints or random setpoints."""
         return self.mission.count
 
     @cached_property

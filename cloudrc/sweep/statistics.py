@@ -60,7 +60,7 @@ def wilson_interval(successes: int, count: int) -> tuple[float, float]:
 
 
 def sign_test(less: int, more: int) -> float:
-    """Return the exact two-sided p-value that two kinds of events are equally likely.
+    """Return the exact two-sided p-value for "two kinds of events are equally likely".
 
     `less` and `more` are the numbers of events of each kind. If B is below A in `less` pairs and
     above A in `more` pairs, this is the sign test. If only A succeeded in `less` pairs and only B

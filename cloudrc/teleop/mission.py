@@ -89,7 +89,7 @@ class LegWatch:
         self.pause()
 
     def pause(self) -> None:
-        """Interrupt the flight to the waypoint: keep the time of flight, restart the dwell time."""
+        """Interrupt the flight to the waypoint; its time is kept, and the dwell time restarts."""
         self._seen_ns = self._near_since_ns = NEVER_NS
 
     @property
@@ -350,7 +350,7 @@ class Teleop:
         self._knot = -1
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
-        """Begin the mission and its time, because telemetry shows that the robot has started."""
+        """Begin the mission, now that telemetry shows that the robot has started."""
         self._world, self._expected = seen.world, (self._mission_id,)
         self._watch = LegWatch()
         if not self._continued:
@@ -464,7 +464,7 @@ class Teleop:
 
     @property
     def _may_move(self) -> bool:
-        """Whether the reset to the spawn is still to come, so that commands may move the robot."""
+        """Whether a command could move the robot before the mission resets it to the spawn."""
         return self._from_spawn and not self.requests.waits
 
     def _select_early(self, now_ns: int) -> None:

@@ -318,7 +318,10 @@ class MissionService:
 
     @property
     def _inherits_stop(self) -> Mission | None:
-        """Mission that an emergency stop ended before a restart; None after the first telemetry."""
+        """Mission that an emergency stop ended before teleop restarted.
+
+        None after the first telemetry, or if there is no such mission.
+        """
         unknown = self.seen is None and not self._teleop.stopping
         return self.book.stopped() if unknown else None
 

@@ -201,8 +201,8 @@ class ClientHandshake:
         """Process an ACCEPT; return cloud's and world's nonce if a new epoch begins, else None.
 
         `asks` is True while cloud asks for a session; only then does cloud accept a new world
-        process. It may then accept an ended world process, whose ACCEPT arrives late. As soon as
-        the running world process answers again, cloud changes its own nonce: all late ACCEPTs
+        process. A late ACCEPT can make cloud accept a world process that has ended. As soon as the
+        running world process answers again, cloud changes its own nonce, so that all late ACCEPTs
         become invalid.
         """
         known = accept.world_nonce == self._world

@@ -94,8 +94,8 @@ class Session:
     def pass_on(self, kind: int, message: Telemetry | Command) -> Passed:
         """Give `message` the counter of the next datagram of this kind, without encryption.
 
-        Use this method in place of `seal` if the receiver is in the same process: only there can
-        `open` read the result.
+        Use this method in place of `seal` only if the receiver is in the same process: `open`
+        cannot read the result elsewhere.
         """
         counters = self._counters
         counter = counters[kind]

@@ -40,8 +40,8 @@ frame [N] and a torque in the body frame [N m], as MuJoCo's free joint requires.
 class Rotors:
     """Four rotors with lag, thrust and drag; `speeds` are front, left, back, right [rad/s].
 
-    In one step, the speed of a rotor changes by a share of its difference from the commanded speed:
-    by the share `up` if the rotor speeds up, by the share `down` if it slows down [1].
+    In one step, the speed of a rotor changes by a share [1] of its difference from the commanded
+    speed. The share is `up` for a rotor that speeds up, `down` for a rotor that slows down.
     """
 
     def __init__(self, dt: float) -> None:

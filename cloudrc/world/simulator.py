@@ -172,7 +172,7 @@ class Simulator:
         return self._sensors[self._tip_sensor]
 
     def take_tip_force(self) -> tuple[float, float]:
-        """Return `tip_force_peak` [N] and `tip_impulse` [N s], and set both to 0."""
+        """Return and reset `tip_force_peak` [N] and `tip_impulse` [N s] since the last call."""
         found = self.tip_force_peak, self.tip_impulse
         self.tip_force_peak = self.tip_impulse = 0.0
         return found

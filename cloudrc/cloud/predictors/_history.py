@@ -42,7 +42,7 @@ class History:
         self._shift_ns = 0.0
 
     def add(self, command: Command) -> bool:
-        """Store a command that cloud has sent. Ignore an old command, and return False for it."""
+        """Store a sent command and return True; ignore it and return False if it is not newer."""
         if self.stamps and command.stamp_ns <= self.stamps[-1]:
             return False
         self.stamps.append(command.stamp_ns)

@@ -99,7 +99,7 @@ class CommandHistory(Replay):
         return body
 
     def roll(self, odometry: Odometry, horizon: float) -> FirstOrder:
-        """Return a body in the predicted state `horizon` [s] after a sample."""
+        """Return the model in its predicted state, `horizon` [s] after the sample `odometry`."""
         start_ns = odometry.stamp_ns - self.history.shift_ns(odometry, horizon)
         start, body = self._at(start_ns), self._at(start_ns + round(horizon * 1e9))
         axes = []

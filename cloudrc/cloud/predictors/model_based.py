@@ -208,7 +208,7 @@ class ModelBased(Replay):
         self._body.correct(odometry)
 
     def roll(self, odometry: Odometry, horizon: float) -> WhiteBox:
-        """Return the white box in its predicted state, `horizon` [s] after the newest sample."""
+        """Return the model in its predicted state, `horizon` [s] after the sample `odometry`."""
         if self._body is None or self._body.basis.stamp_ns != odometry.stamp_ns:
             self.observe(odometry)
         assert self._body is not None

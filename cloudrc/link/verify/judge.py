@@ -142,9 +142,9 @@ class Plan:
     def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:
         """Return the values that a correct link should give for the datagrams of a measured stream.
 
-        The values are exact if the stream matches the predicted random numbers of a relay.
-        Otherwise they are bands over simulated links with different seeds. `first` is the counter
-        of the first datagram.
+        The values are exact if the stream shows the random numbers that a relay would draw.
+        Otherwise they are bands, from simulations of the link with different seeds. `first` is the
+        counter of the first datagram.
         """
         drawn = self.draw(measured.sent, epoch, first)
         if self._fits(self._singles(measured), self._singles(drawn)):

@@ -77,7 +77,10 @@ class LinkMonitor:
         self._outbox = queue.SimpleQueue[Record]()
 
     def begin(self, asked: Asked, path: Path | None, load: Load) -> None:
-        """Start the thread; until the state file `path` has profiles, those in `asked` apply."""
+        """Start the thread, which judges the link by the requested profiles `asked`.
+
+        As soon as the state file `path` contains profiles, those replace `asked`; see `look`.
+        """
         self._inbox, self._pause = queue.SimpleQueue(), lambda: time.sleep(1e-4)
         self.follow(asked)
         threading.Thread(target=self._run, args=(path, load), name="link", daemon=True).start()

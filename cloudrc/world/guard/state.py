@@ -279,10 +279,11 @@ class Guard:
         return self.reference
 
     def plain_track(self, now_ns: int) -> tuple[int, Vector, Vector, int] | None:
-        """Return what `native/step.c` needs from `now_ns` [ns] on; None if `step` has to run.
+        """Return the guard's values for steps in C (`native/step.c`) from `now_ns` [ns] on.
 
-        The four values: time of the plan's next velocity [ns]; velocity reference and commanded
-        velocity [m/s]; end of the time in which the command is fresh [ns].
+        The four values are the time of the plan's next velocity [ns], the velocity reference and
+        the commanded velocity [m/s], and the time until which the command is fresh [ns]. Return
+        None if the guard's `step` has to run instead.
         """
         if not (self._take_off.over and self._ramp_until_ns <= now_ns <= self._track_until_ns):
             return None

@@ -206,7 +206,7 @@ def make_robot(simulator: Simulator, low_level: LowLevel, guard: Guard, limits: 
 
 
 def usable() -> Library:
-    """Return the library; if the self-test fails in this process, `run` is None."""
+    """Return the library of `step.c`; `run` is None if the code is missing or fails its test."""
     found = library()
     return found if found.run is None or not (wrong := _self_test()) else Library(None, wrong)
 
