@@ -44,7 +44,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def describe_all(kind: str) -> dict[str, str]:
-    """Return name -> description, sorted by name, of all things of a kind, such as "profiles"."""
+    """Return name -> description, sorted by name, of everything that `list` shows for `kind`."""
     from cloudrc import plugins
     from cloudrc.config import shipped
 

@@ -18,7 +18,7 @@ YES = "yes"  # unit of a check that is a statement: its value is 1 if the statem
 
 
 def generator(seed: int, use: int) -> np.random.Generator:
-    """Make a random generator; each number `use` gives an independent sequence for the seed."""
+    """Make a random generator; different numbers `use` give independent sequences."""
     return np.random.Generator(np.random.PCG64([seed, use]))
 
 
@@ -66,7 +66,7 @@ class Outcome:
         self.checks.append(Check(text, measured, "<=", limit, unit))
 
     def least(self, text: str, measured: float, limit: float, unit: str = "") -> None:
-        """Check that `measured` is at least `limit`; both have the unit `unit` [any unit]."""
+        """Check that `measured` is at least `limit`, both in `unit` [any unit]."""
         self.checks.append(Check(text, measured, ">=", limit, unit))
 
     def same(self, text: str, measured: float, limit: float) -> None:

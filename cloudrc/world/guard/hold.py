@@ -193,7 +193,7 @@ class TakeOff:
 
     @property
     def condition(self) -> Cause:
-        """Cause of a change to GROUND: ACKNOWLEDGED if take-off is allowed, else STILL_FIRST."""
+        """Cause to record when the operator acknowledges a stop and the guard changes to GROUND."""
         return Cause.ACKNOWLEDGED if self.allowed else Cause.STILL_FIRST
 
     def forget(self, *, stopped: bool = False) -> None:
