@@ -108,7 +108,7 @@ class Scenario:
         return f"F{self.number}"
 
     def run(self, seed: int) -> Outcome:
-        """Inject the fault, and check the reaction; the outcome has the checks or an error."""
+        """Inject the fault, and check the reaction; an exception becomes the outcome's `error`."""
         outcome = Outcome()
         try:
             self.inject(outcome, seed)

@@ -154,7 +154,10 @@ class Descent:
         self._moved_ns, self.acknowledged = now_ns, False
 
     def may_stop(self, readings: Readings) -> bool:
-        """Return whether the robot may end its descent in the air, as the class describes."""
+        """Return whether the robot may stop its descent in the air, and hold its position there.
+
+        The operator must have acknowledged; the robot must sink freely, above the lowest height.
+        """
         free = readings.velocity[2] < -0.5 * self.speed and readings.position[2] > self._floor
         return self.acknowledged and free
 
