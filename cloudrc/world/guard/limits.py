@@ -146,9 +146,10 @@ def limit_growth(before: Vector, after: Vector, step: float) -> Vector:
 
 
 def growth(before: float, after: float) -> float:
-    """Return by how much one component of a velocity grows in the direction of `after` [m/s].
+    """Return by how much one component of a velocity grows in the direction of `after`.
 
-    A component that shrinks gives 0; one that changes its sign grows from 0.
+    `before`, `after` and the result are in [m/s]. A component that shrinks gives 0. A component
+    that changes its sign grows from 0.
     """
     if after < 0.0:
         before, after = -before, -after
