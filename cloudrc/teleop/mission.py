@@ -473,7 +473,7 @@ class Teleop:
         """Select the first waypoint before telemetry shows that the mission began, to save time.
 
         If the mission begins with a reset to the spawn, first wait until the robot ignores
-        commands; otherwise the robot would fly to the waypoint before it is reset.
+        commands; otherwise the robot would fly to the waypoint before the reset.
         """
         if not self._is_pending or self.seen is None or self._may_move:
             return

@@ -239,7 +239,7 @@ class Guard:
             self._ramp_until_ns = now_ns + self._limits.ramp_ns
 
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
-        """Return whether a command at `now_ns` may begin TRACK; it is valid to `fresh_until_ns`.
+        """Return whether a command at `now_ns` may begin TRACK; it is fresh to `fresh_until_ns`.
 
         Take-off must be allowed. At least SETTLE_NS must lie between the start of the last TRACK
         and `now_ns`, and between the start of the last HOLD and `fresh_until_ns`.
