@@ -211,7 +211,7 @@ class Setpoint(NamedTuple):
 
 
 class Passed(NamedTuple):
-    """A message that replaces a datagram if both endpoints are in the same process."""
+    """What an endpoint sends, instead of bytes, to an endpoint in the same process."""
 
     kind: int  # a `tunnel.codec.Kind`
     epoch: int

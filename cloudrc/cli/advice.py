@@ -158,7 +158,7 @@ def _round_up(value: float, step: float) -> float:
 
 
 def _control(experiment: ResolvedExperiment, delay: float) -> Iterator[str]:
-    """Check the gains of the PID; `delay` is the mean time from odometry to command [s]."""
+    """Yield advice about the PID's gains; `delay` is the mean time from odometry to command [s]."""
     controller = experiment.cloud.controller
     if controller.name != "pid":
         return

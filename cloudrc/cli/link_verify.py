@@ -137,7 +137,7 @@ def verify(
 ) -> Report:
     """Send probes over a link for `seconds` [s] (None: as long as needed), and judge the link.
 
-    If a quantity is off, repeat the measurement once.
+    If a measured quantity gets the verdict "off", repeat the measurement once.
     """
     plans, found = make_plans(experiment, seconds, shaper), dict[str, Findings]()
     longest = max(plan.sent[-1] for plan in plans.values())

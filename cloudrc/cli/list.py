@@ -44,7 +44,10 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def describe_all(kind: str) -> dict[str, str]:
-    """Return name -> description, sorted by name, of all things of a kind, such as "profiles"."""
+    """Return name -> description of what `cloudrc list KIND` shows, sorted by name.
+
+    `kind` is a word such as "profiles".
+    """
     from cloudrc import plugins
     from cloudrc.config import shipped
 

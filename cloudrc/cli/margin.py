@@ -126,7 +126,8 @@ def _present(experiment: ResolvedExperiment, key: str) -> float:
 def _try(options: argparse.Namespace, value: float, *, first: bool) -> Trial:
     """Fly one seed after the other with the key set to `value`, until a flight fails.
 
-    If `first`, an invalid `value` raises a BadInputError; otherwise it is not stable.
+    An invalid `value` gives a trial that is not stable. If `value` is the `first` one of the
+    search, raise a BadInputError instead, because then the key is wrong.
     """
     from cloudrc.cli.run import load
     from cloudrc.sweep.flight import fly_point

@@ -218,7 +218,10 @@ def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
 
 
 def _to_record(row: Row, record: str | None, folder: Path) -> bool:
-    """Return whether a flight lacks a recording that `record` ("failed", "all", None) asks for."""
+    """Return whether a flight still needs a recording.
+
+    `record` names the flights to record: "failed", "all" or None for no flights.
+    """
     wanted = record == "all" or (record == "failed" and row["verdict"] != "success")
     has = (folder / row["key"] / "report.json").is_file()
     return wanted and row["verdict"] != "error" and not has

@@ -166,7 +166,7 @@ class ControlLoop:
         self._call("predictor", self._predictor.observe, telemetry.odometry)
 
     def expect(self, round_trip: float) -> None:
-        """Use `round_trip` [s] as the horizon until telemetry has echoed a command."""
+        """Use `round_trip` [s] as the horizon until telemetry echoes the first command."""
         self._expected = round_trip
 
     def observe_late(self, telemetry: Telemetry, now_ns: int) -> None:
@@ -354,7 +354,10 @@ class ControlLoop:
             self._note(kind, error, "cloud goes on using it")
 
     def _note(self, kind: str, error: BaseException, instead: str = "") -> None:
-        """Count a plug-in's failure; report the first of a kind, and what cloud does instead."""
+        """Count a failure of the plug-in `kind`, such as "estimator"; report the first one.
+
+        `instead` tells the user what cloud does now; "" stands for the text in `INSTEAD`.
+        """
         code = f"{kind}_failed"
         self.counts[code] += 1
         if self.counts[code] == 1:

@@ -47,7 +47,7 @@ Settings: TypeAlias = dict[KeyPath, Setting]
 
 
 def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
-    """Make settings from triples of key, value and source; `link.both.delay_ms` is a key.
+    """Make settings from triples of a key, such as `link.both.delay_ms`, its value and its source.
 
     Raise a BadInputError if a key has an empty part or is set twice.
     """

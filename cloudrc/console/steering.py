@@ -141,7 +141,10 @@ class Steering:
         return self.ask(f"flying to ({x:g}, {y:g}, {z:g})", "/v1/goto", {"position_m": (x, y, z)})
 
     def hold_key(self, key: str, velocity: Vector, lasts: float) -> None:
-        """Add `velocity` [m/s] to the driving velocity for `lasts` [s], because `key` is held."""
+        """Drive the robot with `velocity` [m/s] for `lasts` [s], because the user holds `key`.
+
+        The velocities of several held keys add up.
+        """
         now = time.monotonic()
         before = self.velocity(now)
         self._held = {**self._held, key: (velocity, now + lasts)}

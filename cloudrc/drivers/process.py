@@ -134,7 +134,10 @@ class Feed:
         return ask
 
     def tell(self, records: Iterable[Record]) -> None:
-        """Write all records with a type in `EVENTS` and, to a supervisor, some in `SAMPLED`."""
+        """Write the records with a type in `EVENTS`, but only one record per change of the link.
+
+        If a supervisor reads the pipe, also write some of the records with a type in `SAMPLED`.
+        """
         for record in records:
             if isinstance(record, LinkChanged) and not self._is_news(record):
                 continue

@@ -34,8 +34,9 @@ class Tap:
     def __init__(self, path: Path, telemetry: Callable[[], Telemetry | None]) -> None:
         """Prepare to send to the socket at `path`, which may appear later.
 
-        `telemetry` returns cloud's newest telemetry, or None. No record of cloud contains it, so
-        the tap sends it as a `TelemetrySent` record, whose epoch and counter are 0.
+        `telemetry` returns the newest telemetry that cloud has received; None before the first.
+        Cloud does not record received telemetry. Therefore the tap sends it as world's record,
+        `TelemetrySent`, with epoch and counter 0.
         """
         self._path, self._telemetry = os.fspath(path), telemetry
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)

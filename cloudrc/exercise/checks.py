@@ -97,7 +97,10 @@ class Formula(NamedTuple):
 
 
 class Flight(NamedTuple):
-    """A flight with a score: the metric's value `full` earns all points, its value `none` none."""
+    """A test flight; the value of one metric decides how many of the points the student gets.
+
+    The value `full` or better gives all points, `none` or worse gives 0; linear in between.
+    """
 
     test: str
     points: int

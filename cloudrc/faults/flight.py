@@ -207,7 +207,7 @@ class Flight:
         return LinkDirection(shape(profile), self.experiment.seed, uplink=up)
 
     def _begin(self, end: str, clock_id: bytes) -> Identity:
-        """Make the identity of a new process; `end` is "world" or "cloud"."""
+        """Make key ring and identity of a new process of `end`, "world" or "cloud"."""
         self.generations[end] += 1
         self.rings[end] = KeyRing(self.secrets[end])
         nonce = f"{end}-{self._life}-{self.generations[end]}".encode().ljust(16)

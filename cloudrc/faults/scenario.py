@@ -18,7 +18,7 @@ YES = "yes"  # unit of a check that is a statement: its value is 1 if the statem
 
 
 def generator(seed: int, use: int) -> np.random.Generator:
-    """Make a random generator; each number `use` gives an independent sequence for the seed."""
+    """Make a random generator; different numbers `use` give independent sequences."""
     return np.random.Generator(np.random.PCG64([seed, use]))
 
 
@@ -108,7 +108,7 @@ class Scenario:
         return f"F{self.number}"
 
     def run(self, seed: int) -> Outcome:
-        """Inject the fault, and check the reaction; the outcome has the checks or an error."""
+        """Inject the fault, and check the reaction; an exception becomes the outcome's `error`."""
         outcome = Outcome()
         try:
             self.inject(outcome, seed)

@@ -332,9 +332,10 @@ def _check_unit(packets: Packets, unit: str, name: str) -> None:
 
 
 def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, str]:
-    """Find the only column of a kind in `kinds`, such as `delay_ms`; return its name and unit.
+    """Find the only column named after one of `kinds`, as in `delay_ms` or, without unit, `delay`.
 
-    The unit is "" if the column's name has none. `name` is the log's name, for error messages.
+    Return the column's name and its unit; "" without unit. Raise an error if there is none, or more
+    than one; `name` is the log's name, for the error.
     """
     known = {f"{kind}_{unit}": unit for kind in kinds for unit in SCALES}
     found = [column for column in columns if column in known]

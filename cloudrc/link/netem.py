@@ -118,7 +118,10 @@ _QUANTILES: dict[str, Callable[[Floats], Floats]] = {
 
 
 def stretch(profile: DirectionProfile) -> int:
-    """Return the divisor of the table's entries for a profile, as `STRETCH` explains."""
+    """Return the number by which `table` divides its entries, so that they fit in 16 bits.
+
+    To compensate, tc gets the jitter multiplied by this number.
+    """
     if profile.distribution != "table":
         return STRETCH[profile.distribution]
     return ceil(max(map(abs, profile.table)) / _END_OF_TABLE) or 1

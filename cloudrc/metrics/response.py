@@ -94,8 +94,8 @@ def _measure(flight: Flight, row: int, end_ns: int) -> Step | None:
 def _integral(values: Array, times: Array) -> float:
     """Integrate `values` over `times` [s] by the trapezoidal rule.
 
-    `numpy.trapezoid` would need numpy 2. The last bit of `@` would depend on the arrays' place in
-    memory.
+    The function avoids `numpy.trapezoid`, which needs numpy 2, and `@`, because the last bit of
+    its result depends on the addresses of the arrays.
     """
     return float(((values[1:] + values[:-1]) / 2 * np.diff(times)).sum())
 

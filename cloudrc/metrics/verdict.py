@@ -227,7 +227,7 @@ def _pipes(flight: Flight, until_ns: float = inf) -> Iterator[Failure]:
 
 
 def _interventions(flight: Flight) -> Iterator[Failure]:
-    """Yield a failure for each change of the guard to another state than TRACK or HOLD."""
+    """Yield a failure for each change of the guard to GROUND, LAND or ESTOP."""
     guard, before = flight.during("/guard"), None
     rows = zip(guard["stamp_ns"], guard["state"], guard["cause"], strict=True)
     for stamp_ns, state, cause in rows:

@@ -105,7 +105,10 @@ class Recording:
     def __init__(
         self, make_table: Callable[[Topic], Table], contents: Contents | None = None
     ) -> None:
-        """Set the function that makes a topic's table; `read` and `from_records` call this."""
+        """Store `make_table`, which makes the table of a topic, and the rest of a file's contents.
+
+        Outside this package, call `read` or `from_records` instead.
+        """
         self._make_table = make_table
         self._tables: dict[str, Table] = {}
         self.metadata: Mapping[str, str] = contents.metadata if contents else {}

@@ -433,7 +433,10 @@ class Teleop:
         self._report("held", self.leg, f"held {self.where}", now_ns)
 
     def _end(self, code: str, text: str, now_ns: int, *, where: bool = False) -> None:
-        """End the mission, and ask the robot to hold; `where` adds the place to the text."""
+        """End the mission, and ask the robot to hold; report the event `code` with its `text`.
+
+        With `where`, add to the text which waypoint the robot was flying to.
+        """
         text = f"{text} {self.where}" if where else text
         waypoint = min(self.leg, len(self._plan.legs) - 1)
         if code != "done" and self._mission_id:
@@ -470,8 +473,8 @@ class Teleop:
     def _select_early(self, now_ns: int) -> None:
         """Select the first waypoint before telemetry shows that the mission began, to save time.
 
-        If the mission begins with a reset to the spawn, wait until the robot ignores commands;
-        otherwise it would fly to the waypoint before the reset.
+        If the mission begins with a reset to the spawn, first wait until the robot ignores
+        commands; otherwise the robot would fly to the waypoint before the reset.
         """
         if not self._is_pending or self.seen is None or self._may_move:
             return

@@ -120,7 +120,10 @@ class StoreLockedError(CloudrcError):
 
 
 class ConflictError(CloudrcError):
-    """Report a forbidden request; `mission` is the id of the blocking mission, "" without one."""
+    """Report a request that the present state forbids.
+
+    `mission` is the id of the mission that blocks the request; "" if no mission blocks it.
+    """
 
     exit_code = 5
 

@@ -178,7 +178,10 @@ class Simulator:
         return found
 
     def take_contacts(self) -> list[Contact]:
-        """Return the contacts that began since the last call, oldest first; their stamps are 0."""
+        """Return the contacts that began since the last call, oldest first.
+
+        The caller has to set their stamps, which are 0.
+        """
         touches, self.touches = self.touches, []
         return touches
 

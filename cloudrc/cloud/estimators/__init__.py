@@ -27,7 +27,10 @@ class Estimator:
     """Estimates the horizon: the time from measuring the odometry to applying the command."""
 
     def update(self, sample: DelaySample) -> None:
-        """Add the delays from one telemetry datagram, even if its echo was received before."""
+        """Add the delays that one telemetry datagram shows.
+
+        Several datagrams may echo the same command; each of them gives a sample.
+        """
 
     def add_applied(self, applied_minus_stamp: float) -> None:
         """Add a command that world has applied; called once per command, when its echo arrives.

@@ -19,7 +19,11 @@ from cloudrc.messages import Cause, GuardState
     expects="stays in TRACK, no step above the acceleration cap",
 )
 def _short_silence(outcome: Outcome, seed: int) -> None:
-    """Interrupt both directions; then each alone, without jitter, which makes other gaps."""
+    """Interrupt both directions at the same time, then only one direction per flight.
+
+    In the flights with one interrupted direction, the link has no jitter: a jittered direction has
+    gaps of its own.
+    """
     at = measures.instant(seed)
     both, steady = silent(at, 0.1), conditions(jitter=0.0)
     cut = silent(at, 0.1, jitter=0.0)

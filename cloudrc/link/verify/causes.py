@@ -186,7 +186,7 @@ def describe(row: Row) -> str:
 
 
 def in_unit(value: float, unit: str) -> str:
-    """Format a value [s], [1] or [bit/s] with the unit ms, % or kbit/s."""
+    """Format a `value` in `unit`: [s] as ms, [1] as %, [bit/s] as kbit/s; NaN as "-"."""
     if isnan(value):
         return "-"
     if unit == "bit/s":

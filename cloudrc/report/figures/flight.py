@@ -145,7 +145,7 @@ def _draw_side(axes: Axes, subject: Subject, flown: Array, position: Array) -> N
 
 
 def _passages(subject: Subject, flown: Array, position: Array) -> list[tuple[Pipe, float, float]]:
-    """List the pipes that the robot flew through: pipe, distances flown at entry and exit [m]."""
+    """List each flight through a pipe: the pipe, and the distance flown to entry and exit [m]."""
     inside = pipe_index(subject.flight.scene, position)
     changes = np.flatnonzero(np.diff(inside, prepend=-1, append=-1))
     return [

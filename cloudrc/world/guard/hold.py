@@ -154,7 +154,11 @@ class Descent:
         self._moved_ns, self.acknowledged = now_ns, False
 
     def may_stop(self, readings: Readings) -> bool:
-        """Return whether the robot may end its descent in the air, as the class describes."""
+        """Return whether the robot may stop its descent in the air, and hold its position there.
+
+        The operator must have acknowledged the landing; the robot must sink freely, and be above
+        the lowest height for a position hold.
+        """
         free = readings.velocity[2] < -0.5 * self.speed and readings.position[2] > self._floor
         return self.acknowledged and free
 
@@ -193,7 +197,7 @@ class TakeOff:
 
     @property
     def condition(self) -> Cause:
-        """Cause of a change to GROUND: ACKNOWLEDGED if take-off is allowed, else STILL_FIRST."""
+        """Cause to record when the operator acknowledges LAND or ESTOP, and GROUND begins."""
         return Cause.ACKNOWLEDGED if self.allowed else Cause.STILL_FIRST
 
     def forget(self, *, stopped: bool = False) -> None:

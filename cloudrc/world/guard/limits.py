@@ -146,7 +146,11 @@ def limit_growth(before: Vector, after: Vector, step: float) -> Vector:
 
 
 def growth(before: float, after: float) -> float:
-    """Return the gain in speed on one axis from `before` to `after`, all in [m/s]; at least 0."""
+    """Return by how much one component of a velocity grows in the direction of `after`.
+
+    `before`, `after` and the result are in [m/s]. A component that shrinks gives 0. A component
+    that changes its sign grows from 0.
+    """
     if after < 0.0:
         before, after = -before, -after
     return max(after - max(before, 0.0), 0.0)
@@ -229,7 +233,7 @@ class Limits:
 
     @property
     def ramp_ns(self) -> int:
-        """Time after a HOLD for which BRAKE limits the reference's acceleration [ns].
+        """Time after a HOLD in which the reference accelerates by at most BRAKE [ns].
 
         In this time the robot can reach its highest speed. The limit also applies after the
         reference has reached the command, because the first commands after a silence may be zero.

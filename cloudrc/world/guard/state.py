@@ -239,10 +239,10 @@ class Guard:
             self._ramp_until_ns = now_ns + self._limits.ramp_ns
 
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
-        """Return whether TRACK may begin.
+        """Return whether a command at `now_ns` may begin TRACK; it is fresh to `fresh_until_ns`.
 
-        Take-off must be allowed. Since the last TRACK began, SETTLE_NS must have passed. Since the
-        last HOLD began, SETTLE_NS must have passed by `fresh_until_ns`.
+        Take-off must be allowed. At least SETTLE_NS must lie between the start of the last TRACK
+        and `now_ns`, and between the start of the last HOLD and `fresh_until_ns`.
         """
         apart_ns = min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns)
         return self._take_off.allowed and apart_ns >= SETTLE_NS

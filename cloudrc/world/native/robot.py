@@ -118,8 +118,8 @@ def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
     """Return a box with rounded edges around each geom of the scene, and the robot's radius [m].
 
     Each row of the array is a box: centre (3,) [m], axes (9,), half sizes (3,) [m], radius of the
-    edges [m]. A ball with the robot's radius around the base's origin contains the robot. The
-    radius is infinite if the model has forces without a contact, such as those of a spring.
+    edges [m]. A ball with the robot's radius around the base's origin contains the robot. If the
+    model has other forces than those of contacts, such as springs, the radius is infinite.
     """
     option, rows, radius = model.opt, [], 0.0
     other = option.density, option.viscosity, model.nflex, model.npair, model.neq, model.ntendon
