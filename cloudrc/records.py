@@ -13,11 +13,11 @@ from cloudrc.messages import NEVER_NS, GuardState, Odometry, Quaternion, Telemet
 
 
 class LinkChanged(NamedTuple):
-    """Made by the driver, in real time only: a link direction's requested conditions. Topic /link.
+    """The requested conditions of one direction of the link. Topic /link.
 
-    World records the uplink, and cloud records the downlink: at the start, after every change, and
-    when a session or a mission begins. The values are those at the start of the profile's time
-    line.
+    The driver makes this record, in real time only: the driver of world for the uplink, that of
+    cloud for the downlink. It does so at the start, after every change, and when a session or a
+    mission begins. The values are those at the start of the profile's time line.
     """
 
     stamp_ns: int

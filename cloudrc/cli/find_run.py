@@ -82,8 +82,9 @@ def find_local_run(
 def ask_if_unclear(candidates: Collection[Path], *, steers: bool, flag: str = "--run ") -> None:
     """Raise a BadInputError if it is unclear which flight the user means.
 
-    `candidates` are the folders of the local runs that the command can use; if there are none, the
-    command uses a release in a cluster. `find_local_run` explains `steers`, `flag` and the errors.
+    `candidates` are the folders of the local runs that the command can use. `steers` tells whether
+    the command changes a flight; `flag` names a run in error messages. `find_local_run` explains
+    the errors.
     """
     from cloudrc.drivers.local import RELAY_LOG, under_way
 

@@ -245,9 +245,10 @@ class Programs:
             self._tc = None
 
     def _ask(self, words: Sequence[str], *, lists: bool) -> str:
-        """Send a command to the open tc process; `lists` tells whether the command lists qdiscs.
+        """Send a command to the open tc process.
 
-        Raise an OSError if tc has ended.
+        If the command `lists` qdiscs, return the list as JSON, else "". Raise an OSError if tc has
+        ended.
         """
         from cloudrc.link.netem import explain
 

@@ -51,7 +51,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Search the largest stable value and print it; return 0, or 1 if no value is stable."""
+    """Find and print the key's largest stable value; return 0, or 1 if no value is stable."""
     from cloudrc.cli.run import load
 
     interrupt_on_signals()

@@ -168,7 +168,10 @@ class CloudEndpoint(TunnelEnd):
 
     @property
     def mission_over(self) -> bool:
-        """Whether the mission has ended, and the robot knows it or cloud gave up telling it."""
+        """Whether the mission has ended and cloud has nothing more to tell the robot.
+
+        Either telemetry shows that the robot has acted on the last request, or cloud has given up.
+        """
         done = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
         return done and self.teleop.outcome is not None
 

@@ -18,7 +18,7 @@ _new = tuple.__new__  # makes a named tuple twice as fast as its class does
 
 
 class Operator(Protocol):
-    """Teleop, in this process or in another process that is connected by a socket."""
+    """Cloud's view of teleop, which runs in this process or behind a socket in another process."""
 
     @property
     def outputs(self) -> Sequence[Output | Fault]:

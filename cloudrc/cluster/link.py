@@ -101,7 +101,7 @@ def send_change(release: Release, pod: str, handed: Handed) -> str:
 
 
 class Sent(NamedTuple):
-    """A change that was sent to both link containers, and that neither container has refused."""
+    """A change of the link profile that was sent to both link containers; neither refused it."""
 
     edit: Edit  # the edited profile
     files: dict[str, str]  # for the ConfigMap
@@ -123,7 +123,8 @@ def send(
         link: The present link of the release.
         profile: New profile, as in `cloudrc.config.load.edit_profile`.
         settings: Values to set, as in `cloudrc.config.load.edit_profile`.
-        note: Makes the content of change.json: number and cause of the change.
+        note: Function that makes the content of change.json, the number and the cause of the
+            change, from the edited profile.
 
     Raises:
         BadInputError: If the request is not valid, or if a container refuses the change.

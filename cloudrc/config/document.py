@@ -196,7 +196,7 @@ class Document:
 
 
 def child(node: Any, key: str) -> Any:
-    """Return the value at a key of a mapping or at an index of a list; None if there is none."""
+    """Return the value at a mapping's key or a list's index; None if it does not exist."""
     if isinstance(node, dict):
         return node.get(key)
     if isinstance(node, list) and key.isdecimal() and int(key) < len(node):

@@ -226,7 +226,10 @@ def _is_inside_name(path: KeyPath) -> bool:
 def validate(
     document: Document, model: type[_Model], name: str, found: Sequence[Problem] = ()
 ) -> _Model:
-    """Convert a document to `model`; raise one BadInputError for all problems, also `found`."""
+    """Convert a document to `model`; `name` names the document in error messages.
+
+    If there are problems, raise one BadInputError for all: the new ones and those in `found`.
+    """
     known = {problem.path for problem in found}
     # The user wrote a file: describe what is valid there, for example the name of a mission.
     file_model = Experiment if model is ResolvedExperiment else model
@@ -379,8 +382,9 @@ class Edit(NamedTuple):
 def edit_profile(before: Document, profile: str | None, settings: Sequence[str]) -> Edit:
     """Set values in the link profile `before`, or in the profile named `profile` if it is given.
 
-    The changes and the trace of the profile no longer affect a key that the user sets, so that it
-    keeps the user's value. Raise a BadInputError if the request is empty or invalid.
+    For each key in `settings`, remove the changes over time from the profile (for the delay also
+    the trace), so that the key keeps the user's value. Raise a BadInputError if the request is
+    empty or invalid.
     """
     if profile is None and not settings:
         raise BadInputError(f"nothing to set; name a value, {_EXAMPLE}")

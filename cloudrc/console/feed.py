@@ -32,7 +32,7 @@ JUMP = 0.5
 
 
 class Sample(NamedTuple):
-    """One point in time of the charts; unknown values are NaN."""
+    """The values of all charts at one time; unknown values are NaN."""
 
     time: float  # of arrival [s], the console's clock
     uplink: float = nan  # one-way delay [s]

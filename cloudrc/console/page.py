@@ -336,7 +336,10 @@ class Page:
                 self._target = free
 
     def _place_target(self, now: float) -> Vector:
-        """Place the target until a user moves it [m]: at the setpoint, or 0.6 m above the robot."""
+        """Return the position [m] for a target that no user has moved, inside the fence.
+
+        It is the setpoint if cloud controls the robot, else the point 0.6 m above the robot.
+        """
         feed = self._feed
         if feed.control is not None and feed.controls(now):
             at: Any = feed.control.setpoint

@@ -133,7 +133,10 @@ class Steering:
         self.ask(words, "/v1/missions", order)
 
     def go_to(self, position: Vector) -> bool:
-        """Hold the present mission, if any; fly to a position [m]. Return whether teleop agrees."""
+        """Hold the present mission, if one flies, then request a flight to a position [m].
+
+        Return whether teleop has accepted the requests.
+        """
         x, y, z = (round(float(value), 3) for value in position)
         mission = self.state.get("mission") or {"state": ""}
         if mission["state"] in ("starting", "flying") and not self.ask("hold", "/v1/hold"):

@@ -164,7 +164,7 @@ class Exporter:
 
     @property
     def link(self) -> Link:
-        """The metrics of the emulated link. Only the role "link" has them."""
+        """The metrics of the emulated link; only an exporter with the role "link" has them."""
         assert self._live.link is not None, "only a link is shaped"
         return self._live.link
 

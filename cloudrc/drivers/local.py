@@ -70,7 +70,7 @@ def flights_folder() -> Path:
 
 
 class FlightFile(NamedTuple):
-    """What a flight file says about a flight under way, besides the folder of the run."""
+    """Content of the file of a flight under way, except the folder of the run."""
 
     api: str  # address of the operator's API; "" for none
     kind: str  # RUN or SESSION

@@ -222,11 +222,11 @@ class LinkNotes:
         self._due_ns = self._released_ns = 0
 
     def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
-        """Return the link's records that are due at `now_ns` [ns, machine's monotonic clock].
+        """Return records about the link that are due at `now_ns` [ns], machine's monotonic clock.
 
         `records` are new records of world or cloud. If one of them has a type in `BEGINNINGS`, a
-        record of the link's state is due at once. `slip_ns` [ns] is how far the clock of world or
-        cloud lags behind the machine's clock.
+        mission may begin, and a record of the link's state is due at once. `slip_ns` is the lag of
+        world's or cloud's clock behind the machine's clock [ns].
         """
         noted: list[Record] = []
         begins = not BEGINNINGS.isdisjoint(map(type, records))

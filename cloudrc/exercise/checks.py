@@ -59,7 +59,7 @@ def _command(
     """Build a controller; return the velocity that it commands before and after a reset.
 
     Before the reset, the controller gets `n` updates, 2 ms apart, at `speed` [m/s]. After the reset
-    it gets one update. If `sign` is False, return absolute values: only the check of P tests signs.
+    it gets one update. If `sign` is False, return the absolute values of both velocities.
     """
     controller, (x, y, z), seen = build(**gains), STATE.position, ZERO
     setpoint = Setpoint((2.0, -1.0, 0.2))

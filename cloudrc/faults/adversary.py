@@ -79,7 +79,7 @@ class HostileOperator:
         self._number = 0  # of the last request in this session
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
-        """Pass telemetry to teleop, and update the number of the session's last request."""
+        """Pass telemetry to teleop; keep the largest request number seen in this session."""
         if self._seen is None or self._seen.epoch != seen.epoch:
             self._number = 0
         self._seen, self._number = seen, max(self._number, seen.mission)

@@ -114,7 +114,7 @@ class Flight:
         return self.run.now_ns * 1e-9
 
     def make_order(self) -> Order:
-        """Make an order for the experiment's mission."""
+        """Make the order with which teleop flies the experiment's mission."""
         plan = assembly.build_plan(self.experiment)
         return Order(plan, contact=bool(self.experiment.criteria.contact))
 

@@ -311,7 +311,7 @@ class RobotInvariants:
     # Contacts and stops of the rotors.
 
     def _check_touches(self, state: GuardState, now_ns: int) -> None:
-        """Check that new contacts are allowed; after a contact, let the robot leave the fence."""
+        """Check that new contacts are allowed; a robot that collided may then leave the fence."""
         touches = self._simulator.touches
         if touches is not self._touches:
             self._touches, self._seen = touches, 0

@@ -44,7 +44,7 @@ def changes_into(flight: Flight, state: GuardState) -> list[GuardChange]:
 
 
 def first_into(flight: Flight, state: GuardState) -> float:
-    """Return when the guard first changed to a state [s]; NaN if never."""
+    """Return when the guard first changed to `state` [s]; NaN if it never did."""
     return next((c.stamp_ns * 1e-9 for c in changes_into(flight, state)), nan)
 
 
@@ -144,7 +144,7 @@ def fly_safely(outcome: Outcome, flight: Flight, limit: float = 120.0) -> Flight
 
 
 def safe(outcome: Outcome, flight: Flight) -> None:
-    """Check that no invariant was broken; add the hash of the flight's records to `outcome`."""
+    """Add to `outcome`: whether the flight broke an invariant, and the hash of its records."""
     outcome.same("breaches of an invariant", flight.watch.counts.total(), 0)
     for breach in flight.watch.breaches:
         outcome.true(f"{breach.kind} at {breach.time:.3f} s: {breach.text}", False)

@@ -198,8 +198,8 @@ ONCE = ("second_cloud", "key_rotated")  # kinds of fault that a flight has at mo
 def compose(seed: int) -> Schedule:
     """Return the schedule for a seed: up to 12 faults in 45 s, then 15 s without faults.
 
-    A schedule without faults uses a link profile in `PAPER`, with which the guard should never
-    enter HOLD.
+    A schedule without faults uses one of the paper's link profiles, with which the guard should
+    never enter HOLD.
     """
     rng, kinds, events = generator(seed, 40), sorted(KINDS), list[Event]()
     for _ in range(int(rng.integers(13))):

@@ -138,7 +138,7 @@ class _HandedFile(ProfileFile):
 
 
 class Profiles:
-    """Watches the profile's file and the document of `link set`; returns each change once."""
+    """Watches the profile's file and the file from `link set`; returns each change once."""
 
     def __init__(
         self, profile: Path, document: Path, load: Load, log: Callable[[str], None]

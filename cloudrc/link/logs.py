@@ -320,7 +320,7 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
 
 
 def _check_unit(packets: Packets, unit: str, name: str) -> None:
-    """Raise an error if the delays are probably in another unit than the column says."""
+    """Raise a BadInputError if the delays are probably not in `unit`, the column's unit."""
     factor, found = 1 / SCALES[unit], ""
     top, middle = np.nanmax(packets.delays), np.nanmedian(packets.delays)
     if unit != "s" and 0.0 < top * factor < 1.0:

@@ -131,8 +131,8 @@ def table(profile: DirectionProfile) -> list[int]:
     """Compute netem's table for the distribution of a profile.
 
     Returns:
-        Quantiles at the probabilities (n + 0.5) / 4096, in rising order, shape (4096,). They are
-        whole multiples of jitter · `stretch(profile)` / 8192.
+        Quantiles of the delay's random part at the probabilities (n + 0.5) / 4096, in rising
+        order, shape (4096,). Their unit is jitter · `stretch(profile)` / 8192.
     """
     if profile.distribution == "table":
         places = (2 * np.arange(ENTRIES) + 1) * len(profile.table) // (2 * ENTRIES)

@@ -122,8 +122,8 @@ class Timeline:
     """The conditions of one direction over time, from its changes, trace and blackouts.
 
     Attributes:
-        pieces: The constant conditions in each piece of the time line. If the time line loops, the
-            pieces are those of one period.
+        pieces: The conditions in each piece of the time line, constant within the piece. If the
+            time line loops, the pieces are those of one period.
         pass_ns: Start of each piece [ns], rising; 0 is the time at which the link came up.
         period_ns: Period of a looping time line [ns]; None if the time line does not loop.
     """

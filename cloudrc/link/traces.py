@@ -82,7 +82,7 @@ def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
 def parse_trace(lines: Iterable[str], name: str) -> Trace:
     """Parse the lines of the trace file `name`; raise the errors of `read_trace`.
 
-    If the time of the first row is above `START_MAX`, the first row becomes time 0.
+    If the first row's time is above `START_MAX` [s], subtract this time from all times.
     """
     place = f"trace {name}"
     columns, rows = read_rows(lines, place)
@@ -234,7 +234,10 @@ def _number(row: Row, column: str) -> float:
 
 
 def _check_delays(delays: Sequence[float], column: str, place: str, *, may_be_lost: bool) -> None:
-    """Reject delays in [ms] that are probably seconds, and delays of 0 that mean lost packets."""
+    """Raise a BadInputError if delays in `delay_ms` are probably seconds.
+
+    With `may_be_lost`, also raise it if delays of 0 probably mean lost packets.
+    """
     longest = max(delays)
     if column == "delay_ms" and 0.0 < longest < 1.0:
         raise BadInputError(

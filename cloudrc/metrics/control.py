@@ -37,7 +37,7 @@ def _prediction_error(flight: Flight) -> float | None:
 
 
 def _estimate_error(flight: Flight) -> float | None:
-    """Compute the RMS error of predicted positions [m], each at the time it was predicted for."""
+    """Compute the RMS distance [m] from predicted positions to the later true positions."""
     control = flight.control
     target_ns = control["basis_stamp_ns"] + np.rint(control["horizon"] * 1e9).astype(np.int64)
     return rms(control["position"] - flight.true_position(target_ns))

@@ -30,7 +30,7 @@ _CODES = {int: "<i8", float: "<f8", bool: "?", str: "s"}
 
 
 class RecordHash:
-    """Stores and hashes records; the hash ignores how the calls of `update` group the records."""
+    """Stores and hashes records; one call of `update` or many calls give the same hash."""
 
     def __init__(self) -> None:
         self._waiting: defaultdict[type, list[Record]] = defaultdict(list)

@@ -1,11 +1,11 @@
 """Make topics for viewers: Foxglove and Lichtblick show them without settings.
 
-Each moving thing is a frame on `/tf`: `base_link` is the true robot, `estimate` the robot as cloud
-predicted it, `setpoint` the position that the controller tracks. `/scene` has one message: a marker
-for each shape. A marker moves with its frame; the pipes have the frame `world`.
+Each moving thing is a frame on `/tf`: `base_link` is the robot's true pose, `estimate` the pose
+that cloud predicted, `setpoint` the position that the controller tracks. `/scene` has one message:
+a marker for each shape. A marker moves with its frame; the pipes have the frame `world`.
 
-The stamps of `estimate` and `setpoint` are those of `/estimated_odometry`: when cloud sent the
-command.
+`estimate` and `setpoint` have the stamps of `/estimated_odometry`. Each stamp is the time at which
+cloud sent a command.
 """
 
 from __future__ import annotations

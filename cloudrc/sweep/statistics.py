@@ -95,7 +95,8 @@ def signed_rank_test(differences: Sequence[float]) -> float:
 def _chance_at_most(total: int, doubled: NDArray[Any]) -> float:
     """Return the probability that twice the sum of the positive ranks is at most `total`.
 
-    Each rank is positive with probability 1/2. `doubled` has twice each rank, shape (n,).
+    Each rank is positive or negative with probability 1/2. `doubled` has twice the size of each
+    rank, shape (n,).
     """
     if len(doubled) > EXACT_MAX:
         spread = math.sqrt(float((doubled.astype(float) ** 2).sum()) / 4)
@@ -104,7 +105,10 @@ def _chance_at_most(total: int, doubled: NDArray[Any]) -> float:
 
 
 def _sums(doubled: NDArray[Any]) -> NDArray[Any]:
-    """Return the probability that the positive ranks, `doubled`, have the sum 0, 1, 2 and so on."""
+    """Return the probability of each value 0, 1, 2 ... of twice the sum of the positive ranks.
+
+    The ranks and `doubled` are those of `_chance_at_most`.
+    """
     chances = np.zeros(int(doubled.sum()) + 1)
     chances[0] = 1.0
     for rank in doubled:
@@ -151,9 +155,10 @@ def paired(differences: Sequence[float]) -> Paired:
 
 
 def _cut(n: int) -> int:
-    """Return the critical value of the signed-rank test of `n` pairs; -1 if there is none.
+    """Return the critical value of the signed-rank test; -1 if `n` pairs are too few for one.
 
-    The test rejects a shift if the sum of ranks is at most this value.
+    The test finds a difference if the smaller of the two sums, of the positive ranks and of the
+    negative ranks, is at most this value.
     """
     if n > EXACT_MAX:
         mean, spread = n * (n + 1) / 4, math.sqrt(n * (n + 1) * (2 * n + 1) / 24)

@@ -30,7 +30,7 @@ TABLE, PARQUET = "table.csv", "table.parquet"
 
 
 def make_row(flight: Flight, flown: Row) -> Row:
-    """Make the row of a sweep's flight; `flown` has the results of the flight, such as verdict."""
+    """Make the row of a flight in a sweep; `flown` has its results, such as the verdict."""
     return {"key": flight.key, "point": flight.point, "seed": flight.seed, **flown}
 
 

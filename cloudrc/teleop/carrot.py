@@ -86,7 +86,7 @@ def steer(setpoint: Setpoint, velocity: Vector, now_ns: int) -> Setpoint:
 
 
 def _speed_within(distance: float) -> float:
-    """Return the speed [m/s] from which a setpoint without new requests stops in `distance` [m]."""
+    """Return the speed [m/s] from which a setpoint stops `distance` [m] after its last request."""
     wait = HEARTBEAT_NS * 1e-9
     return ACCELERATION * (sqrt(wait * wait + 2.0 * max(distance, 0.0) / ACCELERATION) - wait)
 

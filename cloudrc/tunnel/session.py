@@ -43,7 +43,7 @@ class NoCipher:
         return body + _NO_TAG
 
     def decrypt(self, nonce: bytes, data: bytes, header: bytes) -> bytes:
-        """Return the body: `data` without the tag; nothing is encrypted."""
+        """Return the body, which is not encrypted: `data` without the tag."""
         return data[:-TAG_SIZE]
 
 

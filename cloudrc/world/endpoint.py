@@ -161,9 +161,9 @@ class WorldEndpoint(TunnelEnd):
     def _advance(self, until_ns: int, *, samples: bool = False) -> None:
         """Simulate all steps that begin before `until_ns` [ns], world's clock.
 
-        With `samples`, also take the sample that is due at `until_ns`. If the sample of this time
-        was taken earlier, also simulate the step that begins at `until_ns`; a datagram of this time
-        then acts on the next step.
+        With `samples`, also take the odometry sample that is due at `until_ns`. If an earlier call
+        took this sample, simulate also the step that begins at `until_ns`. A datagram that arrives
+        at `until_ns` then acts on the following step.
         """
         tick_ns = self._tick_ns
         if until_ns == tick_ns == self._sample_ns - self._sample_period_ns:

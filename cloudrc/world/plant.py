@@ -59,7 +59,8 @@ class Wind:
     def seen_from(self, readings: Readings, dt: float) -> Readings:
         """Return readings with the velocity relative to the air; advance the gusts by `dt` [s].
 
-        w(t + dt) = a w(t) + s sqrt(1 - a^2) n, with a = exp(-dt/T), white noise n and deviation s.
+        Gusts w(t + dt) = a w(t) + s sqrt(1 - a^2) n, with a = exp(-dt/T); n is white noise, s the
+        standard deviation of the gusts, T their time constant.
         """
         (x, y), (vx, vy, vz) = (self._mean + self._gusts).tolist(), readings.velocity
         if self._gust:

@@ -100,7 +100,10 @@ def _compile_nominal(robot_path: Path, scene_path: Path) -> Any:
 def _compile(
     robot_path: Path, scene_path: Path, inertia: Inertia | None = None, *, fuse: bool = True
 ) -> Any:
-    """Compile the robot in the scene; `inertia`, if not None, replaces that of the robot."""
+    """Compile the robot in the scene; `fuse` tells whether MuJoCo fuses static bodies.
+
+    `inertia` replaces the robot's inertia; None keeps it.
+    """
     try:
         spec = mujoco.MjSpec.from_file(str(scene_path))
         for number, geom in enumerate(spec.geoms):

@@ -78,7 +78,7 @@ class CommandHistory(Replay):
         self._bodies: list[FirstOrder] = []  # at the stamp of each command
 
     def commanded(self, command: Command) -> None:
-        """Store a command, and the body that the earlier commands have moved until its stamp."""
+        """Store a command, and the state of the simulated robot at the command's stamp."""
         body = self._at(command.stamp_ns)
         if self.history.add(command):
             if len(self._bodies) >= len(self.history.stamps):

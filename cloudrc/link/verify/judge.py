@@ -203,9 +203,10 @@ class Plan:
         return measured
 
     def _fits(self, measured: Stream, drawn: Stream) -> bool:
-        """Return whether a measured link has the predicted random numbers of a relay.
+        """Return whether the `measured` packets match the packets `drawn`.
 
-        Compare the delays with the predicted delays or, if they hardly vary, compare the losses.
+        `drawn` is the prediction from the relay's random numbers. Compare the delays or, if the
+        delays hardly vary, the losses.
         """
         lost = np.isnan(measured.delays), np.isnan(drawn.delays)
         both, requested = ~lost[0] & ~lost[1], _requested_delay(self.profile, drawn.sent)
@@ -272,7 +273,7 @@ def netem_makes(profile: DirectionProfile) -> DirectionProfile:
 
 
 def told(name: str, asked: float) -> Row:
-    """Make a row that only tells the requested value `asked` [any unit], and judges nothing."""
+    """Make a row that shows the requested value `asked` [unit of `name`] without a judgement."""
     return Row(name, UNITS.get(name, "1"), asked, nan, nan, nan, "told")
 
 

@@ -33,7 +33,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One panel of the figure: a quantity with its unit, and its points per setting."""
+    """One panel of the figure: a quantity, its unit, and for each setting a line of points."""
 
     title: str
     unit: str

@@ -63,7 +63,10 @@ def _draw(title: str, uplink: DirectionSample, downlink: DirectionSample | None)
 
 
 def _draw_delay(axes: Axes, way: DirectionSample, colour: str, top: float) -> None:
-    """Draw the profile as a band, each packet as a dot, lost packets along the lower edge."""
+    """Draw the profile's delays as a band, packets as dots, lost packets at the lower edge.
+
+    `top` is the upper end of the delay axis [ms].
+    """
     duration = float(way.sent[-1]) if len(way.sent) else 1.0
     delays = marks.delays_of(way.asked)
     if delays is not None and (way.asked.trace is None or way.asked.jitter_ms):

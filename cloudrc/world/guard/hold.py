@@ -211,9 +211,10 @@ class TakeOff:
             self._stopped, self._still_ticks, self._height = True, 0, nan
 
     def look(self, readings: Readings, flies: bool) -> None:
-        """Process the sensor readings of a step.
+        """Process the sensor readings of a physics step.
 
-        If the robot `flies`, update `over`; otherwise update its height and its time at rest.
+        If `flies` is True, the robot flies: update `over`. Otherwise update the robot's height on
+        the ground and its time at rest.
         """
         height = readings.position[2]
         if flies:

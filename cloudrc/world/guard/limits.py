@@ -196,7 +196,7 @@ class Limits:
         hold_max_ns: Longest HOLD in a mission before LAND begins [ns]; on the ground,
             `alone_max_ns` applies.
         plan_max_ns: Longest time for which the robot flies a command's plan after its arrival [ns];
-            0: a command with a plan is fresh for as long as a command without a plan.
+            0: a plan does not extend the time for which its command is fresh.
     """
 
     fence_low: Vector
