@@ -208,7 +208,10 @@ def fingerprint(experiment: ResolvedExperiment) -> str:
 
 
 def local_files(value: Any, key: str = "") -> dict[str, str]:
-    """Return dotted key -> path of the existing files that `value`, the part at `key`, names."""
+    """Return dotted key -> path of each existing file whose absolute path is in `value`.
+
+    `key` is the dotted key of `value` itself.
+    """
     if isinstance(value, str):
         return {key: value} if value.startswith("/") and Path(value).is_file() else {}
     listed = dict(enumerate(value)) if isinstance(value, list) else value
@@ -218,7 +221,7 @@ def local_files(value: Any, key: str = "") -> dict[str, str]:
 
 
 def _is_inside_name(path: KeyPath) -> bool:
-    """Return whether a key is inside `mission` or a direction: sections that a name can replace."""
+    """Return whether a key is in a section that a name can replace: `mission` or a direction."""
     is_direction = path[0] == "link" and len(path) > 2 and path[1] in DIRECTIONS
     return is_direction or (path[0] == "mission" and len(path) > 1)
 
