@@ -82,8 +82,7 @@ def _corruption(outcome: Outcome, seed: int) -> None:
 def _flood(outcome: Outcome, seed: int) -> None:
     """Send datagrams of random bytes.
 
-    One third have no valid header. One third have a valid header, but are too short. One third
-    have a valid header and the right length.
+    Two of three begin with a valid header: one of them is too short, one has the right length.
     """
     rng = generator(seed, 20)
 
