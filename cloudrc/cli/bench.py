@@ -1,8 +1,9 @@
 """`cloudrc bench`: measure how much processor time the closed loop needs on this machine.
 
-The command flies the experiment `paper`. For comparison, it also replays only the physics of this
-flight, in C (`mujoco.rollout`, one thread), and flies as in a sweep. It repeats each measurement
-and prints the shortest processor time.
+The command flies the experiment `paper`. For comparison, it also measures two other workloads: one
+replays only the physics of this flight, in C (`mujoco.rollout`, one thread); the other flies the
+experiment as one flight of a sweep, which also computes the metrics. The command repeats each
+measurement and prints the shortest processor time.
 """
 
 from __future__ import annotations

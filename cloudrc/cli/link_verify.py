@@ -105,7 +105,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
-    """Read the experiment `target`; if `target` is a profile, the default experiment with it."""
+    """Read the experiment `target`, or the default experiment with the link profile `target`."""
     experiments, profiles = shipped.names("experiment"), shipped.names("profile")
     is_profile = target not in experiments
     if shipped.is_path(target):

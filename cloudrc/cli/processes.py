@@ -53,7 +53,10 @@ RELEASED_PERIOD = 2.0
 
 
 class Command(NamedTuple):
-    """One of several commands in a module, with the attributes of a module for one command."""
+    """One command of a module that defines several commands.
+
+    The fields have the names that the attributes of a module with only one command have.
+    """
 
     arguments: Callable[[argparse.ArgumentParser], None]
     execute: Callable[[argparse.Namespace], int]
@@ -463,10 +466,11 @@ class RelayControl:
         asked: Callable[[str, float], object],
         relay: Relay,
     ) -> None:
-        """Publish the initial state in `folder`, which is created if missing.
+        """Publish the initial state of both directions in `folder`, which is created if missing.
 
-        `links` and `first` map "uplink" and "downlink" to the direction's link and to its first
-        profile. Each change calls `asked` with the direction and its new mean delay [s].
+        `links` maps "uplink" and "downlink" to the link of this direction, `first` maps them to its
+        first profile. `asked` is called with a direction and its mean delay [s], now and after each
+        change.
         """
         from cloudrc.cli.link_run import make_profile_loader
 

@@ -347,7 +347,10 @@ def _record_local(
     see: See,
     session: Callable[[str, dict[str, str]], None] | None = None,
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
-    """Fly in real time, merge the recordings, and yield the same as `_record_virtual`."""
+    """Fly in real time; yield the merged recording, the experiment and facts about the run.
+
+    With `session`, yield those of the session's last mission.
+    """
     from cloudrc.assembly import flight_limit
     from cloudrc.cli.session import read_last_mission
     from cloudrc.drivers.local import LocalRun

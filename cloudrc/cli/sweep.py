@@ -98,7 +98,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _shard(text: str) -> tuple[int, int]:
-    """Parse "I/N", shard I of N (from 1 on); "auto" reads I and N from a job array's variables."""
+    """Parse "I/N": shard I of N shards, counted from 1.
+
+    "auto" reads I and N from the environment variables of a job array, "auto/N" only I.
+    """
     index, _, count = text.partition("/")
     first = "1"
     if index == "auto":

@@ -176,7 +176,10 @@ class CloudEndpoint(TunnelEnd):
         return done and self.teleop.outcome is not None
 
     def next_deadline_ns(self) -> int:
-        """Return when the unsent command leaves; without one, when the next is computed [ns]."""
+        """Return when cloud has to act next [ns].
+
+        If a computed command still has to leave, cloud then sends it; otherwise it computes one.
+        """
         return self._tick_ns if self._unsent is None else self._unsent[0]
 
     def handle_deadline(self, now_ns: int) -> None:

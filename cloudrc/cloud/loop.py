@@ -105,7 +105,7 @@ class ControlLoop:
         the horizon plus `freeze_after` [s]. `period_ns` is the time between two commands [ns]. Each
         command contains a plan, the velocities of the next `plan` [s]; 0 means no plan.
 
-        An exception of a plug-in is not caught here, because nothing flies yet.
+        Here the loop does not catch exceptions of plug-ins, because the robot does not fly yet.
         """
         self._build_estimator, self._predictor = build_estimator, predictor
         self._controller = controller

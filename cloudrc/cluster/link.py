@@ -162,7 +162,10 @@ def send(
 
 
 def keep(release: Release, link: LinkParts, sent: Sent) -> None:
-    """Write a change to the ConfigMap; raise an error if the write or a container has failed."""
+    """Write a change to the ConfigMap, from which restarted pods read it.
+
+    Raise an error if the write fails, or if a container failed to apply the change (`sent`).
+    """
     said = list(map(str, sent.failed))
     words = ["patch", "configmap", link.name, "--type=merge", "--patch-file=/dev/stdin"]
     try:

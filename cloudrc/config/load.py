@@ -208,7 +208,10 @@ def fingerprint(experiment: ResolvedExperiment) -> str:
 
 
 def local_files(value: Any, key: str = "") -> dict[str, str]:
-    """Return dotted key -> path of the existing files that `value`, the part at `key`, names."""
+    """Return dotted key -> path of each existing file whose absolute path is in `value`.
+
+    `key` is the dotted key of `value` itself.
+    """
     if isinstance(value, str):
         return {key: value} if value.startswith("/") and Path(value).is_file() else {}
     listed = dict(enumerate(value)) if isinstance(value, list) else value

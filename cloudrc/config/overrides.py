@@ -72,7 +72,7 @@ def _directions(path: KeyPath) -> list[KeyPath]:
 
 
 def parse_settings(texts: Iterable[str], label: str = "--set") -> Settings:
-    """Parse texts `key=value`, in which a relative path starts at the working folder.
+    """Parse texts `key=value`; a relative path in a value starts at the working folder.
 
     Raise a BadInputError for a text of another form; its message begins with `label`.
     """

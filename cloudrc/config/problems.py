@@ -32,7 +32,10 @@ _LISTED = 50
 
 
 def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPath, FieldInfo]]:
-    """Yield path and field of each key below `above` with a plain value; a list index is "0"."""
+    """Yield path and schema field of each key of `model` that has a plain value.
+
+    The paths begin with `above`. In a list of sections, the path has the index "0".
+    """
     for key, info in model.model_fields.items():
         inner = list(_models(info.annotation))
         many = ("0",) if _is_list(info.annotation) else ()

@@ -92,7 +92,10 @@ class StopSignal:
 
 
 class Feed:
-    """Writes events and some samples to a pipe, without blocking: a full pipe loses lines."""
+    """Writes all event records and some of the periodic records to a pipe, one record per line.
+
+    It never blocks: it drops a line for which the pipe has no space.
+    """
 
     def __init__(self, descriptor: int, *, watched: bool = True) -> None:
         """Make the pipe `descriptor` non-blocking.
@@ -250,7 +253,7 @@ class LinkNotes:
         return [Counted(stamp_ns, "link", f"{way}_{name}", n) for name, n in counts.items()]
 
     def _read_state(self, begins: bool, now_ns: int, slip_ns: int) -> list[LinkChanged]:
-        """Return the link's state as a record if it is new or `begins` is true, else []."""
+        """Return the link's state as a record if it is new or a mission `begins`, else []."""
         state = from_text(read(self._path, STATE_MAX).decode())
         asked = {key: nan if value is None else float(value) for key, value in state.asked.items()}
         changed = LinkChanged(

@@ -185,7 +185,7 @@ ADMITTED = "cloud said hello"
 
 
 class WorldEnd(End):
-    """Metrics of world: those of `End`, of robot, guard and contacts, and the real-time factor."""
+    """Metrics of world: all of `End`, and those of robot, guard, contacts and real-time factor."""
 
     def __init__(self, counts: Mapping[str, int]) -> None:
         super().__init__(table.WORLD, counts)

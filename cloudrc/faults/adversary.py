@@ -49,7 +49,10 @@ class DishonestLoop(ControlLoop):
     """Computes honest commands, and changes them before they are sent."""
 
     def __init__(self, lies: Sequence[Lie], *plugins: Any, **limits: Any) -> None:
-        """Set `lies`, which change each command in turn; other arguments as for `ControlLoop`."""
+        """Set `lies`; each command passes through all of them, in this order.
+
+        The other arguments are those of `ControlLoop`.
+        """
         super().__init__(*plugins, **limits)
         self._lies = lies
 
@@ -252,7 +255,7 @@ def _on_the_limit(rng: Generator) -> Lie:
 
 
 def _shaking(rng: Generator) -> Lie:
-    """Shake at a frequency at which the onboard control loops may resonate."""
+    """Command velocities that oscillate at a frequency at which the onboard loops may resonate."""
     frequency, plane = float(rng.uniform(0.2, 10.0)), rng.permutation(3).tolist()
     bias: list[float] = rng.uniform(-3.0, 3.0, 3).tolist()
 

@@ -100,7 +100,7 @@ def events_of_missions(flight: Flight, name: str) -> list[dict[str, Any]]:
 
 
 def calm_after(flight: Flight, start: float, end: float) -> float:
-    """Return how long after `start` [s] the robot last moved, before `end` [s]; 0 if never."""
+    """Return the time [s] from `start` to the last motion before `end`, both [s]; 0 if none."""
     path = [(r.stamp_ns * 1e-9, hypot(*r.odometry.velocity)) for r in flight.trajectory()]
     fast = [time for time, speed in path if start <= time < end and speed >= STANDS]
     return fast[-1] + SAMPLE - start if fast else 0.0

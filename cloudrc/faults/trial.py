@@ -1,7 +1,7 @@
-"""Fly one schedule in virtual time, and return the invariants that were broken.
+"""Fly with the faults of one schedule in virtual time, and return the broken invariants.
 
-An operator orders one mission after another, and acknowledges each landing and emergency stop.
-During the last part of the flight, without faults, the robot must fly again; otherwise it is stuck.
+An operator orders one mission after another, and acknowledges each landing and emergency stop. The
+last part of the flight has no faults: the robot must then fly again, otherwise it counts as stuck.
 `cloudrc.faults.schedule.shaped` applies the faults of the link.
 """
 

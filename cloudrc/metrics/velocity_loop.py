@@ -45,8 +45,8 @@ class Fit(NamedTuple):
 def series(recording: Recording, name: str) -> tuple[Array, Array]:
     """Return the commanded and the measured velocity [m/s], one sample per `DT`, shape (n, 3) each.
 
-    The samples are from the longest phase in TRACK, without its take-off. `name` is the recording's
-    name in error messages.
+    The samples are from the longest phase with the guard in TRACK, without its take-off. `name` is
+    the recording's name in error messages.
     """
     for topic in (INPUT, OUTPUT, "/guard"):
         if not len(recording[topic]):

@@ -324,7 +324,7 @@ class Observations:
     slip_ns: int = 0  # time by which world's clock fell behind while teleop ran [ns]
 
     def news(self, before: Observations, elapsed: float) -> Iterator[tuple[str, str]]:
-        """Compare with the earlier observations `before`; yield name and text of each new contact.
+        """Yield event name and text of each contact since the earlier observations `before`.
 
         `elapsed` is the present mission time [s].
         """

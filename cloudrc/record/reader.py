@@ -63,7 +63,7 @@ class NothingReadableError(BadInputError):
 
 
 class _StopError(Exception):
-    """Ends the reading of a file, although the file may be intact; the text says why."""
+    """The reader cannot go on, although the file may be intact; the text says why."""
 
 
 _UNPACK: dict[str, Callable[[bytes, int], bytes]] = {

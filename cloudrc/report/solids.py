@@ -47,7 +47,10 @@ def robot_faces() -> list[Face]:
 
 
 def board_faces(board: Board) -> list[Face]:
-    """Build the board, in the world frame; it is translucent, because the arm may be behind it."""
+    """Build the board, a wall that the arm can touch, in the world frame.
+
+    The board is translucent, because the arm may be behind it.
+    """
     low = np.array([board.x, board.y[0], board.z[0]])
     high = np.array([board.x + 0.05, board.y[1], board.z[1]])
     faces = _box((low + high) / 2, (high - low) / 2, BOARD)

@@ -84,7 +84,8 @@ def _thin(columns: Columns) -> Columns:
 def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:
     """Yield a /tf message with all `frames` for each row of `columns`.
 
-    `frames`: frame -> name of its position column, name of its orientation column ("": level).
+    `frames`: frame -> names of its position column and of its orientation column. If the latter is
+    "", the frame is level.
     """
     for row, stamp_ns in enumerate(columns["stamp_ns"].tolist()):
         parts = [

@@ -115,7 +115,7 @@ def scale(unit: str, largest: float) -> tuple[float, str]:
 
 
 def of_sweep(folder: Path, a: str, b: str) -> Found:
-    """Pair each row with the value `a` of an axis with the row that differs only in the value `b`.
+    """Pair the rows of a sweep that differ only in one axis: one has the value `a`, the other `b`.
 
     `a` and `b` are texts: VALUE or AXIS=VALUE.
 

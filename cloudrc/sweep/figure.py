@@ -80,9 +80,10 @@ def draw_sweep(
 def _choose(
     rows: Sequence[Row], x: str | None, by: str | None
 ) -> tuple[dict[str, list[Any]], str, str | None, list[str]]:
-    """Choose the axes of the figure; return axis -> values, axis along x, axis of lines, others.
+    """Choose which axis of the sweep is the figure's x axis, and which axis has a line per value.
 
-    The figure has a line per value of the axis of lines, which is None if no axis is left.
+    `x` and `by` are the user's choices; None: choose here. Return the values of each axis, the x
+    axis, the axis of the lines (None if no axis is left), and the other axes.
     """
     values = values_of(rows)
     for axis in (x, by, *([] if values else ["of any name"])):

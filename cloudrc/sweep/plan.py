@@ -126,7 +126,10 @@ def _everything(point: ResolvedExperiment) -> dict[str, Any]:
 
 @cache
 def _code(kind: str, name: str) -> str:
-    """Return the SHA-256 of a plug-in's source file; "" if `name` is a path or has no file."""
+    """Return the SHA-256 of the source file of plug-in `name`; "" if there is no such file.
+
+    Also return "" if `name` is a path, because the caller hashes this file with all other files.
+    """
     with suppress(TypeError, OSError):
         if not plugins.is_path(name):
             file = inspect.getfile(plugins.find(kind, name))

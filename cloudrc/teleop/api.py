@@ -148,7 +148,7 @@ class Bridge:
         self._make(self._urgent, now_ns)
 
     def make_calls(self, now_ns: int) -> None:
-        """Make all queued calls, the urgent ones first."""
+        """Execute all queued calls, the stops and holds first."""
         self._make(self._urgent, now_ns)
         self._make(self._calls, now_ns)
 

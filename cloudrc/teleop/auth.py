@@ -113,7 +113,10 @@ class Audit(RotatingFileHandler):
     """Log commands as lines of JSON, in a separate thread. Only the owner can read the files."""
 
     def __init__(self, path: Path, complain: Callable[[str], None]) -> None:
-        """Start the thread; `complain` receives one line if the file cannot be written."""
+        """Start the thread that writes the log to the file `path`.
+
+        `complain` receives one line of text if the file cannot be written.
+        """
         super().__init__(path, maxBytes=AUDIT_MAX, backupCount=1, encoding="utf-8", delay=True)
         self.dropped, self._complain = 0, complain  # `dropped`: lines that could not be written
         waiting: queue.SimpleQueue[Any] = queue.SimpleQueue()

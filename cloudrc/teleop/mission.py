@@ -201,9 +201,9 @@ class Teleop:
     def drive(self, now_ns: int, velocity: Vector) -> None:
         """Move the setpoint with `velocity` [m/s], world frame, for at most `HEARTBEAT_NS`.
 
-        The setpoint moves only while telemetry shows that the robot follows commands. While
-        a hand-driven mission is starting, the call has no effect. Otherwise, raise BadInputError if
-        no mission is held.
+        The setpoint moves only while telemetry shows that the robot follows commands. A call during
+        the start of a hand-driven mission has no effect. Every other call needs a held mission, and
+        raises BadInputError without one.
         """
         if self._plan.by_hand and self.state == STARTING:
             return
@@ -385,9 +385,10 @@ class Teleop:
             self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
 
     def _lead(self, seen: RobotStatus, now_ns: int) -> None:
-        """Keep the carrot at the robot while the guard ignores commands; then move the carrot on.
+        """Keep the carrot, a moving setpoint, at the robot while the guard ignores commands.
 
-        At the first take-off the carrot moves before telemetry arrives: this saves a round trip.
+        Then let the carrot move on. At the first take-off it does not wait until telemetry shows
+        that the guard obeys: this saves a round trip.
         """
         self._followed = self._followed or seen.guard is TRACK
         if seen.guard is not TRACK and (self._followed or seen.guard is not GROUND):
@@ -500,9 +501,10 @@ class Teleop:
             self._select(self._setpoint)
 
     def _select_leg(self, leg: int, begin_ns: int, start: Vector | None = None) -> None:
-        """Make waypoint `leg` the setpoint; for a waypoint with a speed, begin a carrot to it.
+        """Make waypoint `leg` the setpoint; if it has a speed, move a carrot, a setpoint, to it.
 
-        The carrot begins at `begin_ns` [ns], at `start` [m] or, by default, at the robot.
+        The carrot starts at the time `begin_ns` [ns], from the point `start` [m] or, by default,
+        from the robot.
         """
         to, motion = self._plan.legs[leg], None
         if to.speed and self.seen is not None:

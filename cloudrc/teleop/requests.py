@@ -61,8 +61,8 @@ class RequestSender:
     def ask(self, request: Request, start: Start = Start.SPAWN, *, after: bool = False) -> None:
         """Begin to repeat a request; it replaces the pending request.
 
-        If `after` is True, the new request replaces nothing, but waits until the robot has carried
-        out the pending request.
+        If `after` is True, the new request waits instead until the robot has carried out the
+        pending request. `start` is the place where a mission starts; only a START needs it.
         """
         asked = self._progress._replace(request=request, start=start)
         if self._pending is None or not after:

@@ -370,10 +370,11 @@ class MissionService:
         return mission
 
     def _start_next(self, now_ns: int, *, queued: bool = False) -> Mission | None:
-        """Start or continue the oldest mission that has not ended, unless a mission is under way.
+        """Start the oldest mission that has not ended, unless a mission is already under way.
 
-        Take a mission out of the queue only if `queued` is True; such a mission starts after its
-        new state is on the disk. Return the mission under way, or None.
+        If an earlier teleop process has started this mission, continue it. A mission in the queue
+        starts only if `queued` is True, and after its new state is on the disk. Return the mission
+        that is under way then, or None.
         """
         waiting = self.book.open()
         if self._current is not None or not waiting:

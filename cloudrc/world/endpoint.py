@@ -143,10 +143,11 @@ class WorldEndpoint(TunnelEnd):
                 self._tell_refusal(str(error), data, world_ns)
 
     def _follow(self, now_ns: int) -> int:
-        """Return world's time at `now_ns` [ns, monotonic clock].
+        """Return world's time at `now_ns` [ns, monotonic clock]: `now_ns` minus the slip.
 
-        If the simulation lags by more than CATCH_UP_NS, add the excess to the slip. After a stall,
-        store `now_ns`, because datagrams that are read at this time may have waited in the socket.
+        If the simulation lags by more than CATCH_UP_NS, add the excess to the slip. If it lags by
+        more than the largest age of a command, world has stalled. Then store `now_ns`, because
+        datagrams that are read at this time may have waited in the socket.
         """
         world_ns = now_ns - self._slip_ns
         behind_ns = world_ns - self._tick_ns

@@ -46,10 +46,11 @@ class Sensors:
         rate: Errors = NONE,
         turn_rng: np.random.Generator | None = None,
     ) -> None:
-        """Set standard deviations per axis, `position_noise` [m] and `velocity_noise` [m/s].
+        """Set the errors of the measured position, velocity, `attitude` and body `rate`.
 
-        The error of the `attitude` is a rotation about the body's axes. Attitude and rate have
-        their own `turn_rng`, so that their noise does not change that of position and velocity.
+        `position_noise` [m] and `velocity_noise` [m/s] are standard deviations per axis. The error
+        of the attitude is a rotation about the body's axes. The noise of attitude and rate comes
+        from `turn_rng`, so that it does not change the noise of position and velocity.
         """
         self._position, self._velocity = Errors(position_noise), Errors(velocity_noise)
         self._attitude, self._rate = attitude, rate

@@ -52,7 +52,7 @@ class Predictor:
         raise NotImplementedError
 
     def model(self) -> Model | None:
-        """Return a new model in the state of the last prediction; by default there is none."""
+        """Return a new model of the robot in the last predicted state, or None (the default)."""
         return None
 
 

@@ -81,10 +81,10 @@ class History:
         return bool(self._applied) and now_ns - self._applied[-1][0] > FOLLOWED_NS
 
     def shift_ns(self, odometry: Odometry, horizon: float) -> int:
-        """Return the time from the stamp of a command to its beginning: the shift [ns].
+        """Return the shift [ns]: the time from a command's stamp until world begins to follow it.
 
         A command with a plan states when it begins. Without a plan, the shift comes from the
-        echoes; before the first echo, it comes from `horizon` [s].
+        echoes. Before the first echo, it comes from the newest `odometry` and the `horizon` [s].
         """
         if self.commands and self.commands[-1].plan:
             return self.commands[-1].planned_ns - self.stamps[-1]

@@ -58,7 +58,7 @@ class WhiteBox(Body):
     """
 
     def __init__(self, gains: tuple[float, ...], acceleration_max: float, basis: Odometry) -> None:
-        """Begin at a measured state, and assume that the flight is steady.
+        """Start the model in a measured state; assume steady flight, in which thrust equals weight.
 
         Args:
             gains: P, I, D gains and integral limits of the velocity loop, for x, y, z: shape (12,).

@@ -80,7 +80,10 @@ def _corruption(outcome: Outcome, seed: int) -> None:
     expects="no effect: the same path, bit by bit",
 )
 def _flood(outcome: Outcome, seed: int) -> None:
-    """Send random bytes, alone or after a valid header, too few of them or the right number."""
+    """Send datagrams of random bytes.
+
+    Two of three begin with a valid header: one of them is too short, one has the right length.
+    """
     rng = generator(seed, 20)
 
     def garbage(data: bytes) -> Iterable[bytes]:

@@ -1,7 +1,7 @@
 """Name the likely cause if the measurements of a link differ from its profile.
 
-Causes that data of the machine show (qdiscs, counters, lateness of the shaper) come before causes
-that are inferred from the measurements.
+Causes that the machine itself shows (by its qdiscs, its counters, or a late shaper) come before
+causes that are only inferred from the measurements.
 """
 
 from __future__ import annotations

