@@ -150,7 +150,7 @@ class Flight:
         self._second = None
 
     def sha256(self) -> str:
-        """Return the hash of all records so far; the flight must have been made with `keep`."""
+        """Return the hash of all records so far; without `keep`, the hash of no records."""
         return self._hash.hexdigest()
 
     def trajectory(self) -> list[GroundTruth]:
