@@ -80,7 +80,7 @@ class FlightView:
                     self._event(in_words(record))
 
     def line(self) -> Text:
-        """Return the status line, with the least important part last: narrow terminals crop it."""
+        """Return the status line; it ends with the least important part, which may be cropped."""
         elapsed, flown = self._seen - self._began, (self._now_ns - self._first_ns) * 1e-9
         number = self._waypoint + 1
         cells = (
@@ -135,7 +135,7 @@ class SweepView:
             self._status.start()
 
     def see(self, row: Row) -> None:
-        """Count a finished flight; print its text if no earlier flight had the same verdict."""
+        """Count a finished flight; print why it failed, or its note, once for each verdict."""
         self._done += 1
         self._failed += row["verdict"] != "success"
         if row["text"] and row["verdict"] not in self._told:

@@ -158,7 +158,7 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
 
 
 def _check_model(predictor: Any, name: str) -> None:
-    """Raise a BadInputError if the predictor `name` has no model of the robot to plan with."""
+    """Raise a BadInputError if the predictor `name` lacks the robot model that plans need."""
     predictor.predict(Odometry(0, ZERO, UPRIGHT, ZERO, ZERO), 0.0)
     if predictor.model() is None:
         raise BadInputError(

@@ -230,8 +230,8 @@ def _surface(
 def _camera(geometry: Scene, waypoints: Sequence[Vector], aspect: float) -> tuple[Array, Array]:
     """Return the place of the viewer, and the point at which the viewer looks [m], shape (3,).
 
-    The viewer looks along +x, so that the key ↑ flies away from the viewer, and ← to the left. The
-    place is the nearest one from which spawn, pipes and waypoints are in sight.
+    The viewer looks along +x: the key ↑ moves the robot away from the viewer, the key ← to the
+    viewer's left. The place is the nearest one from which spawn, pipes and waypoints are in sight.
     """
     pipes = [(pipe.centre, 0.5 * pipe.length * np.array(pipe.axis)) for pipe in geometry.pipes]
     ends = [centre + sign * half for centre, half in pipes for sign in (-1, 1)]

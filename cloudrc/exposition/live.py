@@ -53,7 +53,7 @@ class LinkVerdict:
     """Newest verdict on the link's direction to this process: whether it matches its profile."""
 
     def __init__(self, direction: str) -> None:
-        """Set the direction, "uplink" or "downlink"; the verdict is "open" before a check."""
+        """Set the direction, "uplink" or "downlink"; the verdict is "open" until a check."""
         self._direction = direction
         self._newest: tuple[LinkChecked, ...] = ()
 

@@ -130,7 +130,7 @@ class PredictionJudge:
         self._measured: Vector = (nan, nan, nan)
 
     def take(self, control: Control) -> None:
-        """Judge the predictions that are due by the new measurement; store the new prediction."""
+        """Compare the predictions for times up to a new measurement; store the new prediction."""
         stamp_ns, waiting = control.basis_stamp_ns, self._waiting
         if stamp_ns > self._measured_ns:
             before_ns, before = self._measured_ns, self._measured
@@ -170,7 +170,7 @@ class DelayJudge:
         self._sent: dict[int, Control] = {}
 
     def sent(self, control: Control) -> None:
-        """Store a control period in which cloud sent a command."""
+        """Store the record of a control period in which cloud sent a command, for `echoed`."""
         self._sent[control.stamp_ns] = control
         if len(self._sent) > WAITING_MAX:
             del self._sent[next(iter(self._sent))]  # the oldest

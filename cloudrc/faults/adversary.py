@@ -350,14 +350,14 @@ def _hostile_plans(rng: Generator) -> Lie:
 
 
 def _operators_voice(rng: Generator) -> Lie:
-    """Fly with a random policy of `FASTEST`; `at_bad_moments` forges the operator's requests."""
+    """Follow a policy of `FASTEST`, while `at_bad_moments` forges the operator's requests."""
     return FASTEST[int(rng.integers(len(FASTEST)))](rng)
 
 
 def _refused_and_released(rng: Generator) -> Lie:
     """Fly fast, and from time to time send NaN, so that the guard lands the robot.
 
-    Meanwhile `at_bad_moments` acknowledges the landings in the operator's name.
+    Meanwhile `at_bad_moments` forges requests of the operator, which acknowledge the landings.
     """
     fly, pause_ns = _operators_voice(rng), int(rng.uniform(0.5e9, 4e9))
 

@@ -41,7 +41,7 @@ SHARED, OTHER = b"one clock for all".ljust(16)[:16], b"another clock..."
 
 
 def conditions(**changes: object) -> Shape:
-    """Return a `Shape` that replaces fields of a direction's profile by `changes`."""
+    """Return a function that replaces fields of a direction's profile by `changes`."""
     return lambda profile: replace(profile, **changes)  # type: ignore[arg-type]
 
 
@@ -150,7 +150,7 @@ class Flight:
         self._second = None
 
     def sha256(self) -> str:
-        """Return the hash of all records so far; the flight must have been made with `keep`."""
+        """Return the hash of all records so far; without `keep`, the hash of no records."""
         return self._hash.hexdigest()
 
     def trajectory(self) -> list[GroundTruth]:

@@ -418,7 +418,10 @@ def can_stop(speed: float, below: float, above: float) -> bool:
 
 
 def growth(before: Vector, after: Vector) -> float:
-    """Return the growth from `before` to `after` [m/s]: the norm of the growth in size per axis."""
+    """Return how much a velocity grows from `before` to `after` [m/s].
+
+    This is the norm of the growth in speed on each axis. A lower speed counts as no growth.
+    """
     (ux, uy, uz), (vx, vy, vz) = before, after
     return sqrt(_grown(ux, vx) ** 2 + _grown(uy, vy) ** 2 + _grown(uz, vz) ** 2)
 

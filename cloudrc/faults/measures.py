@@ -25,7 +25,7 @@ ENDED = Cause.ENDED.words  # cause of a HOLD that the operator has requested
 
 
 def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
-    """Choose a time [s] between `first` and `last`; by default the robot is then in the pipes."""
+    """Choose a time from `first` to `last` [s]; in the default range the robot is in the pipes."""
     return float(generator(seed, 77).uniform(first, last))
 
 
@@ -54,7 +54,10 @@ def held(flight: Flight) -> list[GuardChange]:
 
 
 def held_in_time(outcome: Outcome, flight: Flight, text: str = "HOLD after") -> None:
-    """Check that every HOLD began within one step after the last command became too old."""
+    """Check that every HOLD began within one step after the last command became too old.
+
+    `text` names the check in the outcome.
+    """
     outcome.most(text, basis_age_at_hold(flight), AGE_MAX, "s")
 
 

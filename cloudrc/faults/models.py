@@ -1,4 +1,4 @@
-"""Model processes, clocks and teleop in virtual time, so that faults can be injected."""
+"""Simulate processes, clocks and teleop in virtual time, so that faults can be injected."""
 
 from __future__ import annotations
 

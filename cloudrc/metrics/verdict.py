@@ -263,7 +263,7 @@ def _plugins(flight: Flight) -> Iterator[Failure]:
 
 
 def _responses(flight: Flight, settle: float) -> Iterator[Failure]:
-    """Yield a failure if a step did not settle within `settle` [m], and one for instability."""
+    """Yield a failure if a step did not settle within `settle` [m], and one for unstable steps."""
     found, unit = steps(flight), "step" if flight.mission.steps else "waypoint"
     far = [step for step in found if step.last_error > settle]
     if far and flight.mission.steps:

@@ -99,7 +99,8 @@ class Table:
 class Recording:
     """The tables of a flight by topic.
 
-    A recording from a file also has metadata, attachments, note and remarks, as in `Contents`.
+    A recording from a file also has metadata, attachments, a note and remarks; `Contents` describes
+    them.
     """
 
     def __init__(

@@ -47,7 +47,7 @@ def add_views(mission: Contents, experiment: ResolvedExperiment) -> Recording:
 
 
 def views(recording: Recording, experiment: ResolvedExperiment) -> list[View]:
-    """Make all messages for viewers.
+    """Convert a recording to messages that viewers such as Foxglove can show.
 
     Raises:
         BadInputError: If the scene of the experiment cannot be read.

@@ -54,7 +54,10 @@ def counts(row: Row) -> bool:
 
 
 def units(own: Iterable[str]) -> dict[str, str]:
-    """Return metric -> unit of all known metrics, and of the metrics `own`, by name or path."""
+    """Return name -> unit of all metrics that are shipped or installed, and of those in `own`.
+
+    `own` contains names of metrics and paths of files with a metric.
+    """
     names = (*metrics.SHIPPED, *plugins.names("metrics"), *own)
     return {metric.name: metric.unit for metric in map(metrics.find, names)}
 

@@ -110,7 +110,7 @@ def read_plan(path: Path) -> Plan:
 
 
 def flight_key(point: ResolvedExperiment, seed: int) -> str:
-    """Return the key that identifies the flight of a point with a seed."""
+    """Return the key that identifies a flight: a hash of its experiment `point` and its seed."""
     return _key(_everything(point), seed)
 
 

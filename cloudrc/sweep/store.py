@@ -98,7 +98,7 @@ def begin(folder: Path, plan: Plan) -> dict[str, Row]:
 
 
 def finish(folder: Path, plan: Plan) -> dict[str, Row]:
-    """Update the sweep's description; write the tables after the last flight; return the rows."""
+    """Write the sweep's description and, after the last flight, its tables; return key -> row."""
     rows = read_rows(folder)
     unit_of = _write_summary(folder, plan, rows)
     if len(rows) == len(plan.flights):

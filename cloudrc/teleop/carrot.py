@@ -61,7 +61,7 @@ def setpoint_at(setpoint: Setpoint, now_ns: int) -> Setpoint:
 
 
 def _profile(setpoint: Setpoint) -> tuple[float, float, float]:
-    """Return the length of a carrot's path [m], its acceleration time [s] and total time [s]."""
+    """Return distance [m], acceleration time [s] and total time [s] of a setpoint's motion."""
     motion = setpoint.motion
     assert isinstance(motion, Motion), "the setpoint rests, or is driven"
     distance, acceleration = dist(motion.start, setpoint.position), motion.acceleration

@@ -94,7 +94,7 @@ class LegWatch:
 
     @property
     def flown(self) -> float:
-        """Time of flight to the waypoint so far [s]."""
+        """Time for which the robot has flown towards the present waypoint [s]."""
         return self._flown_ns * 1e-9
 
     def is_reached(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:

@@ -66,8 +66,9 @@ IN_MISSION = {
 def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | None) -> str:
     """Describe what the robot does next, or what the operator has to do.
 
-    `age` is the age of the telemetry [s], `cloud_age` the age of the last message from cloud [s],
-    and `mission` the state of the mission under way: `DRIVEN` if driven by hand, None without one.
+    `age` is the age of the telemetry [s], `cloud_age` the age of the last message from cloud [s].
+    `mission` is the state of the mission under way: `DRIVEN` while the operator steers the robot by
+    hand, None if no mission is under way.
     """
     if age > SILENCE:
         return NO_CLOUD if cloud_age > SILENCE else NOT_HEARD
@@ -344,7 +345,7 @@ class MissionService:
             )
 
     def _check_way(self, leg: Leg) -> None:
-        """Raise ConflictError if the straight way from the robot to `leg` crosses a pipe's wall."""
+        """Raise ConflictError if a pipe's wall lies between the robot and the waypoint of `leg`."""
         seen, scene = self.seen, self._scene
         if seen is None or scene is None:
             return

@@ -262,7 +262,7 @@ class MissionStore:
         return mission
 
     def note(self, mission: Mission, event: str, text: str, **changed: Any) -> None:
-        """Apply an event as `Mission.apply`, and store it; if the disk fails, store it later."""
+        """Apply an event by `Mission.apply` and store it; if the disk fails, `catch_up` does so."""
         if event == "reached" and changed["waypoint"] < len(mission.reached):
             return  # an earlier teleop has stored it
         self._events += 1

@@ -71,7 +71,10 @@ class TunnelEnd:
             self._records.append(Fault(now_ns, code, text))
 
     def _tell_refusal(self, outcome: str, data: bytes, now_ns: int) -> None:
-        """Record at `now_ns` [ns] that `data` has another version or key, if `outcome` says so."""
+        """Record at `now_ns` [ns] that the refused datagram `data` has a wrong version or key.
+
+        `outcome` is the reason of the refusal. For another reason, record nothing.
+        """
         if outcome == "version":
             self._tell("version", VERSION_TEXT.format(data[0], codec.VERSION), now_ns)
         elif outcome == "tag" and codec.peek(data)[0] <= codec.LAST_GREETING:

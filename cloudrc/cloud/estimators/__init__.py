@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 
 class DelaySample(NamedTuple):
-    """The delays that one telemetry datagram with a short hold time shows.
+    """The delays that one telemetry datagram shows; datagrams with a long hold time give none.
 
     Attributes:
         loop_delay: Arrival of the echo minus the command's stamp [s]. The loop delay includes the

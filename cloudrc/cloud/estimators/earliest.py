@@ -25,9 +25,9 @@ class Earliest(Estimator):
         self._offsets.append(applied_minus_stamp)
 
     def horizon(self, age: float) -> float:
-        """Return `age` plus the smallest `applied_minus_stamp` [s]; 0 before the first of them.
+        """Return `age` plus the smallest stored value [s]; 0 until `add_applied` is called.
 
-        Both contain the offset between the clocks, with opposite signs. It cancels in the sum.
+        Both terms contain the offset between the clocks, with opposite signs, so that it cancels.
         """
         return max(0.0, age + min(self._offsets)) if self._offsets else 0.0
 

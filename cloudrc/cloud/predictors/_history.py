@@ -203,7 +203,10 @@ class Replay(Predictor):
         raise NotImplementedError
 
     def forecast(self, stamp_ns: int) -> Body | None:
-        """Return a model in the state predicted for `stamp_ns` [ns]; None without older samples."""
+        """Return the model predicted for `stamp_ns` [ns], which is after the newest sample.
+
+        Return None if there is no sample, or if the newest one is not older.
+        """
         if self.newest is None or stamp_ns <= self.newest.stamp_ns:
             return None
         return self.roll(self.newest, (stamp_ns - self.newest.stamp_ns) * 1e-9)

@@ -30,9 +30,10 @@ class CommandedVelocity(Predictor):
         self._commanded = ZERO
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Extrapolate a sample by `horizon`, tau [s]: p + u · tau; the velocity stays as measured.
+        """Extrapolate a sample by `horizon`, tau [s]: p + u · tau, with the commanded velocity u.
 
-        Source: the authors' published code. The orientation is extrapolated as in all predictors.
+        The velocity stays as measured. The orientation is extrapolated as in all predictors.
+        Source: the authors' published code.
         """
         px, py, pz = odometry.position
         ux, uy, uz = self._commanded

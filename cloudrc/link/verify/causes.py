@@ -131,9 +131,10 @@ measured to requested value, and text."""
 
 
 def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
-    """Yield code and text of the cause for which the machine's counters are the best evidence.
+    """Yield code and text of at most two causes of the quantities that are "off".
 
-    If there is none, or if it is "throttled", also yield a cause that the measured values suggest.
+    The first is the cause for which the machine's counters are the best evidence. If it is missing
+    or "throttled", the next is a cause that the measured values suggest.
     """
     off = {row.name: row for row in one.rows if row.verdict == "off"}
     lost = next((row.measured for row in one.rows if row.name == "loss"), 0.0)

@@ -88,7 +88,7 @@ class Expected(NamedTuple):
         return 0.5 * (high - low) / tolerance(name, mean)
 
     def judge(self, name: str, value: float) -> Row:
-        """Compare the measured `value` of the quantity `name` [any unit] with its band."""
+        """Judge whether a correct link can give the measured `value` [any unit] of `name`."""
         mean, low, high = self.bands[name]
         slack, hidden = tolerance(name, mean), self.hidden(name)
         if self.known and name == "deviation":
@@ -127,7 +127,7 @@ class Plan:
 
     @cached_property
     def links(self) -> list[Stream]:
-        """Streams through 200 simulated netem links; shorter if the conditions are constant."""
+        """One stream per simulated netem link (200 links); short if the conditions are constant."""
         few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
         sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
         seeds = range(-RUNS, 0)  # the seed of an experiment is not negative
@@ -238,7 +238,7 @@ class Plan:
         return there - np.median(there) if len(there) else there
 
     def _rate(self, stream: Stream) -> float:
-        """Compute the bottleneck's rate [bit/s] from the arrivals of trains, sent back to back.
+        """Compute the bottleneck's rate [bit/s] from the time in which a train arrives.
 
         Source: M. Jain, C. Dovrolis, IEEE/ACM Trans. Networking 12, 2004: packet dispersion.
         """

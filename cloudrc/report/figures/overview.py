@@ -76,7 +76,7 @@ class _View:
         self._sides = np.stack([right, np.cross(self.towards, right)], axis=1)
 
     def project(self, points: Array) -> Array:
-        """Project points [m], world frame, shape (..., 3), to the figure [m], shape (..., 2)."""
+        """Project points [m], world frame, shape (..., 3), to the image [m], shape (..., 2)."""
         return np.asarray(points @ self._sides)
 
     def draw_faces(self, axes: Axes, faces: list[Face]) -> None:

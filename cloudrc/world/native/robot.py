@@ -271,7 +271,7 @@ class NativeRobot(Robot):
         return super().run(tick_ns, until_ns)
 
     def _give(self, reference: Vector, wanted: Vector, track_ns: int) -> None:
-        """Copy the state to the C structure `Flight`; `Guard.plain_track` has the arguments."""
+        """Copy the state and these values of `Guard.plain_track` to the C structure `Flight`."""
         simulator = self.simulator
         tip = simulator.tip_force_peak, simulator.tip_impulse
         counts = simulator.contacts, simulator.steps
