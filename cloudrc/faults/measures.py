@@ -39,7 +39,7 @@ def refused(outcome: Outcome, flight: Flight, *reasons: str) -> None:
 
 
 def changes_into(flight: Flight, state: GuardState) -> list[GuardChange]:
-    """Return the guard's changes to a state, without the HOLD at the end of a mission."""
+    """Return the guard's changes that lead to `state`, except the HOLD at a mission's end."""
     return [c for c in flight.changes if c.state is state and c.cause != ENDED]
 
 

@@ -36,7 +36,7 @@ class Observer(Protocol):
 
 
 class Robot:
-    """Run physics, guard and low-level controller step by step, and inform the `observers`."""
+    """Runs physics, guard and low-level controller step by step, and informs `observers`."""
 
     def __init__(self, simulator: Simulator, low_level: LowLevel, guard: Guard) -> None:
         self.simulator = simulator

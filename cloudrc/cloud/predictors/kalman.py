@@ -115,7 +115,7 @@ def build(
             trusts the odometry more.
 
     Raises:
-        ValueError: If `white_box` has a `model_file`, or `parameters` contain name or model.
+        ValueError: If `white_box` has a `model_file`, or `parameters` has the key name or model.
         BadInputError: If the predictor refuses a parameter.
     """
     given = dict(parameters or {})
