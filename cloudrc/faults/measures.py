@@ -90,7 +90,7 @@ def told(records: Iterable[Record], code: str) -> list[Fault]:
 
 
 def events_of_missions(flight: Flight, name: str) -> list[dict[str, Any]]:
-    """Return the events called `name` in teleop's log; an empty list while teleop does not run."""
+    """Return the events called `name` in teleop's log; none if teleop does not run now."""
     service = flight.teleop.service
     events = service.book.events_after(0) if service is not None else []
     return [event for event in events if event["event"] == name]

@@ -29,7 +29,7 @@ class Observer(Protocol):
         """Observe a command and the guard's answer; `rejection` is None if the guard accepts it."""
 
     def see_request(self, request: OperatorRequest, now_ns: int) -> None:
-        """Note that the robot has carried out an operator request; called by the robot."""
+        """Observe that the robot has carried out an operator request at `now_ns`."""
 
     def see_session(self, now_ns: int) -> None:
         """Observe that a new session begins; the guard has forgotten all earlier commands."""
