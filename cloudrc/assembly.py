@@ -77,7 +77,7 @@ def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoi
 
 
 def virtual_notes(experiment: ResolvedExperiment) -> tuple[str, ...]:
-    """Return warnings for the report of a flight in virtual time; () without a warning."""
+    """Return warnings for the report of a flight in virtual time; () if there are none."""
     return (MEASURED,) if experiment.cloud.compute_measured else ()
 
 

@@ -81,7 +81,7 @@ def _handle_keys(screen: curses.window, steering: Steering, api: Api) -> None:
 
 
 def _lines(steering: Steering, api: Api) -> list[str]:
-    """Return the lines to show, the most important first: a small window cuts off the last."""
+    """Return the text of the screen, important lines first: a small window cuts off the last."""
     mission, seen = steering.state.get("mission"), steering.state.get("seen")
     text, is_refusal, _ = steering.answer
     asked = ", ".join(f"{speed:.1f}" for speed in steering.velocity(time.monotonic()))

@@ -209,7 +209,7 @@ def _profile(name: str) -> tuple[Profile, bool]:
 def _way(
     asked: Direction, name: str, options: argparse.Namespace
 ) -> tuple[DirectionSample, Numbers]:
-    """Simulate one direction; return the packets for the figure, and statistics.
+    """Simulate one direction of the link; return the packets for the figure, and statistics.
 
     If the conditions are constant, the statistics come from more packets than the figure shows.
     """

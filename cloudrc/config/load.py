@@ -314,7 +314,7 @@ def _has_all_values(document: Document) -> bool:
 
 
 def _plan_max(document: Document) -> float:
-    """Return the default of guard.plan_max_s [s]."""
+    """Return the default of guard.plan_max_s [s]; 0 if cloud sends no plans."""
     plan = document.get("cloud", "plan_s")
     return PLAN_MAX_S if isinstance(plan, float | int) and plan > 0 else 0.0
 

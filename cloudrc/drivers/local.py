@@ -81,7 +81,8 @@ class FlightFile(NamedTuple):
 def announced(run: Path, api: str = "", kind: str = RUN) -> Iterator[None]:
     """Keep a flight file during the `with` block, if the folder of flight files is writable.
 
-    `run` is the folder of the run, `api` the address of the operator's API ("" without an API).
+    The file tells other commands `run`, the folder of the run; `api`, the address of the operator's
+    API ("" without an API); and `kind`, RUN or SESSION.
     """
     about = FlightFile(api, kind, os.getpid())._asdict()
     flight = json.dumps({"schemaVersion": 1, "run": str(run.resolve()), **about})
@@ -162,8 +163,8 @@ class LocalRun:
 
     Attributes:
         notes: Sentences for the report of the flight.
-        announcement: Its method `close` removes the flight file. `fly` calls `close` after a
-            flight; after a session the caller does so.
+        announcement: Owns the flight file of this run; its method `close` removes the file.
+            `fly` calls `close` after a flight. After a session, the caller of `fly` does so.
     """
 
     def __init__(

@@ -51,7 +51,7 @@ class FlightsOnly:
         self._flies, self._until_ns = flies, 0
 
     def __call__(self, records: list[Record]) -> list[Record]:
-        """Return the records to keep: outside flights, those that are not periodic."""
+        """Return the records to keep: all of a flight; between flights, only events."""
         if not records:
             return records
         stamp_ns = records[-1].stamp_ns

@@ -1,7 +1,8 @@
 """Score the exercise of docs/exercise.md: formulas on given samples, then flights in virtual time.
 
-The reference is cloudrc's own plug-ins. In the flight of a part, the other two parts are those of
-the reference, so that an error in one part costs no points of another part.
+The exercise has three parts: estimator, predictor and controller. The reference is cloudrc's own
+plug-ins. A flight that scores one part uses the reference for the other two parts, so that an error
+in one part costs no points of another part.
 """
 
 from __future__ import annotations
@@ -80,9 +81,9 @@ class Formula(NamedTuple):
     measure: Callable[[Callable[..., Any]], Any]
 
     def score(self, files: Mapping[str, str]) -> tuple[float, str]:
-        """Return 1.0 and "right" if the results agree; otherwise raise a BadInputError.
+        """Return 1.0 and "right" if the student's results agree with those of the reference.
 
-        `files` has one entry: part of the exercise -> path of the student's file.
+        Otherwise raise a BadInputError. `files` has one entry: part -> path of the student's file.
         """
         ((part, path),) = files.items()
         builds = (partial(plugins.load, f"{part}s", name) for name in (path, PARTS[part][2]))

@@ -16,7 +16,7 @@ class StudentController(Controller):
     """Computes a velocity command from the predicted position."""
 
     def __init__(self, p: Vector, i: Vector, d: Vector, velocity_max: Vector) -> None:
-        """Take `p` [1/s], `i` [1/s^2], `d` [1] and `velocity_max` [m/s], each for x, y and z."""
+        """Set gains `p` [1/s], `i` [1/s^2], `d` [1] and limit `velocity_max` [m/s], per axis."""
         self.p, self.i, self.d, self.velocity_max = p, i, d, velocity_max
 
     def reset(self) -> None:

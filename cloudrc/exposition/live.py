@@ -94,7 +94,7 @@ class End:
     """Metrics that both world and cloud have: session, datagrams, one-way delay, loop timing."""
 
     def __init__(self, role: str, counts: Mapping[str, int]) -> None:
-        """Set the role, "world" or "cloud"; `counts` maps the names of counters to their values."""
+        """Make the metrics of `role`, "world" or "cloud"; `counts` maps counter names to values."""
         self._counts, self._stream = counts, DatagramTally()
         self._outgoing, self._incoming, others = "uplink", "downlink", table.ONLY_CLOUD
         if role == table.CLOUD:

@@ -30,7 +30,7 @@ class Histogram:
         self._counts = [0] * (len(bounds) + 1)
 
     def observe(self, value: float) -> None:
-        """Count a `value` [unit of the bounds]."""
+        """Add `value` [unit of the bounds] to the count of its bucket and to the total."""
         self._counts[bisect_left(self.bounds, value)] += 1
         self.total += value
 
@@ -166,7 +166,7 @@ class DelayJudge:
         self.reset()
 
     def reset(self) -> None:
-        """Drop the stored control periods, because a new session has started."""
+        """Drop the control periods that wait for an echo, because a new session has started."""
         self._sent: dict[int, Control] = {}
 
     def sent(self, control: Control) -> None:

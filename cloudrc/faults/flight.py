@@ -73,7 +73,10 @@ class Flight:
         words: Words | None = None,  # makes requests in place of the operator
         second: float | None = None,  # when a second cloud connects [s]
     ) -> None:
-        """Prepare a flight (see the comments). At `second` [s], if any, a second cloud connects."""
+        """Prepare a flight; the comments describe the arguments.
+
+        If `second` [s] is given, a second cloud connects at this time.
+        """
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         self._honest, self._keep = honest, keep
         self._life, self._second, self._lies, self._words = life, second, lies, words

@@ -250,7 +250,10 @@ class RobotInvariants:
     def _check_fence(
         self, state: GuardState, position: Vector, velocity: Vector, now_ns: int
     ) -> None:
-        """Check that the robot stays inside the fence and, after a fall, takes off only at rest."""
+        """Check that the base is inside the fence, or near it in a fall or after a collision.
+
+        After an ESTOP in the air, the next take-off must begin at rest and inside the fence.
+        """
         self._falls = self._falls or (self._was in FLOWN and state is ESTOP)
         if self._falls and state in FLOWN:
             self._falls, speed = False, hypot(*velocity)

@@ -39,7 +39,7 @@ def refused(outcome: Outcome, flight: Flight, *reasons: str) -> None:
 
 
 def changes_into(flight: Flight, state: GuardState) -> list[GuardChange]:
-    """Return the guard's changes to a state, without the HOLD at the end of a mission."""
+    """Return the guard's changes that lead to `state`, except the HOLD at a mission's end."""
     return [c for c in flight.changes if c.state is state and c.cause != ENDED]
 
 
@@ -93,7 +93,7 @@ def told(records: Iterable[Record], code: str) -> list[Fault]:
 
 
 def events_of_missions(flight: Flight, name: str) -> list[dict[str, Any]]:
-    """Return the events called `name` in teleop's log; an empty list while teleop does not run."""
+    """Return the events called `name` in teleop's log; none if teleop does not run now."""
     service = flight.teleop.service
     events = service.book.events_after(0) if service is not None else []
     return [event for event in events if event["event"] == name]

@@ -38,7 +38,7 @@ def outside_fence(positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]
 def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.int64]:
     """Return for each pose the index of the pipe that the robot is too near to, shape (n,).
 
-    The index is -1 if all pipes are at least `CLEARANCE_MIN` away. The board does not count.
+    The index is -1 if all pipes are at least `CLEARANCE_MIN` away; the scene's board is ignored.
     `positions` are those of the base [m], world frame, shape (n, 3); `yaws` are the headings of the
     level robot [rad], shape (n,).
     """

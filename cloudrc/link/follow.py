@@ -99,7 +99,7 @@ def write_handed(handed: Handed) -> str:
 
 
 def read_handed(text: bytes | str) -> Handed:
-    """Parse the JSON document that `write_handed` made.
+    """Parse a change of the link from the JSON document that `write_handed` made.
 
     Raises:
         ValueError: If the text is invalid, or if a file name could lead to another folder.

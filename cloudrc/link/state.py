@@ -105,7 +105,7 @@ class StateFile:
         self.state = state
 
     def refuse(self, number: str, refusal: str) -> None:
-        """Write to the file that change `number` was refused; `refusal` is the reason, in words."""
+        """Note in the file that change `number` was refused; `refusal` is the reason, in words."""
         if self.state is not None:
             self.publish(replace(self.state, refused=number, refusal=refusal))
 

@@ -72,7 +72,7 @@ class Verdict:
     failures: tuple[Failure, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        """Return outcome, exit code and failures for the API; times and places are left out."""
+        """Return outcome, exit code and failures for the API; of a failure only code and text."""
         failures = [{"code": each.code, "text": each.text} for each in self.failures]
         code = EXIT_CODES[self.outcome]
         return {"outcome": self.outcome, "exit_code": code, "failures": failures}

@@ -163,8 +163,8 @@ def _join(world: Contents, cloud: Contents) -> Contents:
 def cut_to_last_mission(mission: Contents) -> bool:
     """Reduce a pod's recording of several missions to the mission that was started last.
 
-    Return whether the recording contains the end of that mission. If so, delete the remark that the
-    file has no end from `mission.note`: the pod still wrote to the file during the copy.
+    Return whether the recording contains the end of that mission. If so, remove from `mission.note`
+    the remark that the file has no end: the pod was still writing to the file during the copy.
     """
     began, ended, earlier = _last_mission(mission)
     until = mission.messages[-1][1] if mission.messages else 0

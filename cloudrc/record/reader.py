@@ -81,8 +81,8 @@ used, because they allocate whatever size the file claims."""
 class Contents:
     """The contents of a recording's file.
 
-    `note` says what is missing. `lacking` says the same without the messages that a killed process
-    did not write: it mentions only damaged, removed or added messages.
+    `note` says what is missing or wrong. `lacking` mentions only damaged, removed or added
+    messages, and leaves out the messages that a killed process did not write.
     """
 
     # Topic, log time [ns] and CDR bytes of each message, in the order of log times.

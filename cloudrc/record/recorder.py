@@ -66,7 +66,7 @@ class Recorder:
                 self._overflowed += 1
 
     def drain(self, max_records: int = 64) -> int:
-        """Write up to `max_records` queued records; return their number. Many delay the loop."""
+        """Write queued records, at most `max_records` to delay the loop little; return how many."""
         if self._sink is None and not self._ended:
             try:
                 self._sink = self._open_sink(self._path)

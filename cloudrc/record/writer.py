@@ -65,8 +65,8 @@ class McapWriter:
 
         `clock` is "world" or "cloud", the clock of the stamps. `clock_id` identifies the machine's
         clock ("" if unknown); files with the same `clock_id` need no clock offset.
-        `wall_offset_ns` is the wall time minus that clock [ns]; None in virtual time. Without
-        `index`, the file gets no index of its chunks, and writing it takes constant memory.
+        `wall_offset_ns` is the wall time minus the time of `clock` [ns]; None in virtual time.
+        Without `index`, the file gets no index of its chunks, and writing takes constant memory.
         """
         self._owned = isinstance(target, Path)
         # Unbuffered: mcap's writer has its own buffer, and `abandon` writes past it.

@@ -60,8 +60,9 @@ def board_faces(board: Board) -> list[Face]:
 def bore(pipe: Pipe, towards: Array, half_angle: float, count: int, stations: int) -> Array:
     """Return points on the inner face of a pipe [m], world frame, shape (stations, count, 3).
 
-    The `count` points of each station are on an arc of twice the `half_angle` [rad]. The middle of
-    the arc is opposite to the direction `towards`, shape (3,).
+    The stations are cross-sections at equal distances along the pipe. The `count` points of each
+    are on an arc of twice the `half_angle` [rad]. The middle of the arc is opposite to the
+    direction `towards`, shape (3,).
     """
     centre, axis = np.array(pipe.centre), np.array(pipe.axis)
     up = towards - (towards @ axis) * axis

@@ -108,7 +108,10 @@ def _flight(row: Row, names: Sequence[str]) -> dict[str, Any]:
 
 
 def scale(unit: str, largest: float) -> tuple[float, str]:
-    """Return a factor and a unit that make values up to `largest` [`unit`] readable, such as mm."""
+    """Return a factor and a new unit for small values: 1000 and "mm" if the unit is "m".
+
+    `largest` [`unit`] is the largest of the values. If it is not small, the factor is 1.
+    """
     if 0 < largest < {"m": 0.1, "s": 1.0}.get(unit, 0.0):
         return 1e3, f"m{unit}"
     return 1.0, "" if unit == "1" else unit

@@ -154,9 +154,9 @@ def _seeds(given: Any) -> tuple[int, ...]:
 def _entries(
     document: Document, file: SweepFile, folder: Path, found: list[Problem]
 ) -> tuple[list[_Entry], dict[str, list[tuple[Any, list[_Entry]]]]]:
-    """Return the settings of all points, and a mapping: axis -> label and settings per choice.
+    """Return the settings that all points share, and a mapping: axis -> its choices.
 
-    Problems of the axes are added to `found`.
+    A choice is a label with its settings. Problems of the axes are added to `found`.
     """
 
     def entry(key: str, value: Any, *path: str) -> _Entry:

@@ -168,10 +168,10 @@ def _cut(n: int) -> int:
 
 
 def _pairs_needed(values: NDArray[Any], means: NDArray[Any], least: int) -> int | None:
-    """Return how many pairs (A, B) a test with a power of 80 % needs; the result is >= `least`.
+    """Return how many pairs the signed-rank test needs for a power of 80 %: `least` or more.
 
-    Return None if the data show no effect. `values` contains the n differences B - A, and `means`
-    the mean of every two differences, each difference also paired with itself.
+    Return None if the data show no effect. `values` contains the n differences B - A. `means`
+    contains the mean of every two differences, and each difference itself.
     Source: G. E. Noether, "Sample size determination for some common nonparametric tests", 1987.
     """
     n = len(values)

@@ -93,7 +93,7 @@ class Bridge:
         self._service: MissionService | None = None
 
     def open(self, service: MissionService) -> None:
-        """Accept calls for `service`."""
+        """Begin to accept calls; they are made on `service`."""
         self._service, self.closed = service, ""
 
     def close(self, why: str) -> None:
@@ -116,7 +116,7 @@ class Bridge:
         return future
 
     async def ask(self, call: Call, urgent: Urgent = "") -> Any:
-        """Queue a call for teleop's loop and return its result; for a stop, call `alarm`, too.
+        """Queue a call for teleop's loop, and return its result. A stop also calls `alarm` at once.
 
         Raise an UnavailableError if the bridge is closed, or if the loop does not answer within
         `ANSWER_LIMIT`. In the second case an urgent call stays queued; any other call is withdrawn.

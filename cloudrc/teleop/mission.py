@@ -287,7 +287,7 @@ class Teleop:
         self._seen_ns = now_ns
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Check the time limits, move the setpoint of a track, and repeat a request that is due."""
+        """Check the time limits, move the setpoint along a track, and repeat a request if due."""
         if self.state in UNDER_WAY and (timeout := self._find_timeout(now_ns)):
             self._end(*timeout, now_ns)
         if self.state == FLYING and self._plan.track:
@@ -423,7 +423,10 @@ class Teleop:
         return near and leaves_ns is not None and now_ns >= leaves_ns
 
     def _leaves_ns(self, leg: int) -> int | None:
-        """Return when the dwell time at a waypoint ends [ns]; None if no carrot moves to it."""
+        """Return when the dwell time at waypoint `leg` ends [ns].
+
+        Return None if the present setpoint is not a carrot that moves to this waypoint.
+        """
         setpoint = self._setpoint
         if setpoint is None or type(setpoint.motion) is not Motion or setpoint.waypoint != leg:
             return None

@@ -127,7 +127,7 @@ class RequestSender:
                 self.ask(Request.START, Start.HERE)
 
     def _progress_due(self, seen: RobotStatus, now_ns: int) -> OperatorRequest | None:
-        """Return a request to store the mission's progress in the robot if it is due, else None."""
+        """Return the request that stores the mission's progress in the robot; None if not due."""
         progress = self._progress
         same = seen.mission_id == progress.mission_id != 0
         if not same or seen.reached >= progress.reached or now_ns < self._due_ns:

@@ -142,7 +142,7 @@ def open_store(path: Path, salt: bytes) -> MissionStore:
 
     Raises:
         StoreLockedError: If another process has locked the file.
-        BadInputError: If the file has another content, or cannot be read or made.
+        BadInputError: If the file does not contain missions, or cannot be read or made.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     path.touch(0o600)

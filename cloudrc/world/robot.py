@@ -29,14 +29,14 @@ class Observer(Protocol):
         """Observe a command and the guard's answer; `rejection` is None if the guard accepts it."""
 
     def see_request(self, request: OperatorRequest, now_ns: int) -> None:
-        """Note that the robot has carried out an operator request; called by the robot."""
+        """Observe that the robot has carried out an operator request at `now_ns`."""
 
     def see_session(self, now_ns: int) -> None:
         """Observe that a new session begins; the guard has forgotten all earlier commands."""
 
 
 class Robot:
-    """Run physics, guard and low-level controller step by step, and inform the `observers`."""
+    """Runs physics, guard and low-level controller step by step, and informs `observers`."""
 
     def __init__(self, simulator: Simulator, low_level: LowLevel, guard: Guard) -> None:
         self.simulator = simulator

@@ -18,9 +18,9 @@ from cloudrc.config.schema import Gain
 
 
 class Split(Estimator):
-    """Adds the age of the newest odometry and the average of `applied_minus_stamp`.
+    """Estimates the delay: age of the newest odometry plus the average of `applied_minus_stamp`.
 
-    `applied_minus_stamp` is the measured downlink delay minus the offset between the clocks.
+    `applied_minus_stamp` is the downlink delay of a command minus the clock offset cloud - world.
     """
 
     def __init__(self, gain: float) -> None:
@@ -29,7 +29,7 @@ class Split(Estimator):
         self._applied_minus_stamp: float | None = None
 
     def add_applied(self, applied_minus_stamp: float) -> None:
-        """Average `applied_minus_stamp` [s]: downlink delay of a command plus the clock offset."""
+        """Average `applied_minus_stamp` [s]: downlink delay minus clock offset cloud - world."""
         if self._applied_minus_stamp is None:
             self._applied_minus_stamp = applied_minus_stamp
         else:

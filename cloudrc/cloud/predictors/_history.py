@@ -29,7 +29,7 @@ NO_COMMAND = Command(0, 0, 0, ZERO, 0.0)
 
 
 class History:
-    """The `commands` of a session, and their `stamps` [ns], cloud's clock, rising.
+    """The `commands` of a session, oldest first, and their `stamps` [ns], cloud's clock.
 
     `seen_ns` is the stamp of the newest odometry [ns], world's clock.
     """
@@ -77,7 +77,7 @@ class History:
         self._applied.append((began_ns, stamp_ns))
 
     def is_silent(self, now_ns: int) -> bool:
-        """Whether the last applied command began more than FOLLOWED_NS before `now_ns` [ns]."""
+        """Whether the newest echoed command began more than FOLLOWED_NS before `now_ns` [ns]."""
         return bool(self._applied) and now_ns - self._applied[-1][0] > FOLLOWED_NS
 
     def shift_ns(self, odometry: Odometry, horizon: float) -> int:
@@ -126,7 +126,7 @@ class History:
         """List the velocities [m/s] of one command and the duration of each [s].
 
         A command with a plan has one velocity per step of the plan. `count` is the number of the
-        command in `commands`, from 1; 0 means a command with zero velocity. World follows the
+        command in `commands`: 1 is the first, 0 means zero velocity. World follows the
         command from `start_ns` to `end_ns` [ns], world's clock.
         """
         command = self.commands[count - 1] if count else NO_COMMAND

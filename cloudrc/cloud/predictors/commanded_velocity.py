@@ -48,5 +48,5 @@ class CommandedVelocity(Predictor):
 
 
 def build() -> CommandedVelocity:
-    """Make the predictor of the published code; it has no parameters."""
+    """Make the predictor; it has no parameters."""
     return CommandedVelocity()

@@ -29,8 +29,8 @@ class Kalman(Predictor):
     def __init__(self, replay: Replay, position: float, velocity: float, model: float) -> None:
         """Set `replay`, the predictor that replays the commands, and three standard deviations.
 
-        `position` [m] and `velocity` [m/s] are those of the measured values per axis. `model`
-        [m/s^2] is that of the acceleration of the filter's model.
+        `position` [m] and `velocity` [m/s] are for the measured values, per axis. `model` [m/s^2]
+        is for the acceleration of the filter's model.
         """
         self._replay, self._error = replay, model * model
         self._noise = np.diag([position * position, velocity * velocity])
@@ -115,7 +115,7 @@ def build(
             trusts the odometry more.
 
     Raises:
-        ValueError: If `white_box` has a `model_file`, or `parameters` contain name or model.
+        ValueError: If `white_box` has a `model_file`, or `parameters` has the key name or model.
         BadInputError: If the predictor refuses a parameter.
     """
     given = dict(parameters or {})

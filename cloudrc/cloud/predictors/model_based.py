@@ -1,10 +1,10 @@
 """Predictor: replay the sent commands through a model of the robot and its onboard controller.
 
-The model is a white box: guard's limits, velocity PID, attitude loop, rotors, drag. Its reference,
-integral, thrust and torque are not in the odometry; the model computes them from the commands that
-the echoes confirm. Each odometry sample replaces pose and twist. The predictor estimates effects
-that the model lacks, such as wind, a payload or the arm's weight, as a constant acceleration and a
-constant torque.
+The model contains the guard's limits, the velocity PID, the attitude loop, rotors and drag. The
+odometry lacks the velocity reference, the PID's integral, thrust and torque; the model computes
+them from the commands that the echoes confirm. Each odometry sample replaces the model's pose and
+twist. The predictor estimates effects that the model lacks, such as wind, a payload or the arm's
+weight, as a constant acceleration and a constant torque.
 
 Source: docs/reference/control.md, "Predictors", (e2); docs/reference/plant.md, "Robot", "Low-level
 controller".

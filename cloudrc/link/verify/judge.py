@@ -105,7 +105,8 @@ class Plan:
     """A measurement of one direction: the requested profile, and the datagrams to send.
 
     A train of datagrams is sent back to back. Before each train, the same number of datagrams is
-    sent one by one. `pause` is called every few hundred microseconds: other threads can run then.
+    sent one by one. `draw` calls `pause` every few hundred microseconds, so that other threads can
+    run.
     """
 
     profile: DirectionProfile  # requested conditions
@@ -232,7 +233,7 @@ class Plan:
         return Stream(*(one.reshape(-1, 2 * self.train)[:, : self.train].ravel() for one in parts))
 
     def _shape(self, stream: Stream) -> Floats:
-        """Return the errors of the delays of arrived datagrams [s], shifted to median 0."""
+        """Return measured - requested delay of each arrived datagram [s], shifted to median 0."""
         delays = stream.delays - _requested_delay(self.profile, stream.sent)
         there: Floats = delays[np.isfinite(delays)]
         return there - np.median(there) if len(there) else there

@@ -163,7 +163,7 @@ class LinkMonitor:
             kept.clear()
 
     def _report(self, rows: list[Row], now_ns: int) -> list[Record]:
-        """Make records of the verdicts; an "off" stays "open" until the next check confirms it."""
+        """Make records of the verdicts; report "off" as "open" until the next check confirms it."""
         count, off = len(self._arrivals), {row.name for row in rows if row.verdict == "off"}
         if off - self._suspects:
             rows = [row._replace(verdict="open") if row.name in off else row for row in rows]
@@ -182,7 +182,7 @@ class LinkMonitor:
         return found
 
     def _rows(self) -> list[Row]:
-        """Judge all quantities; add rows for properties that are only reported."""
+        """Judge all quantities; if a profile has a time line, add a row that says so."""
         stream, first, timed = _in_order(self._arrivals, self._period)
         judged = timed and (self._uplink or not self._computes)
         rows, skipped = list[Row](), UNJUDGED if judged else UNJUDGED | DELAYS

@@ -64,6 +64,6 @@ def curves(axes: Axes) -> tuple[list[Path], Any]:
 
 
 def is_free(box: Bbox, lines: list[Path], dots: Any) -> bool:
-    """Check that no line and no dot is in a box [pixels]."""
+    """Return whether a box [pixels] contains no line and no dot."""
     hit = ((dots >= box.min) & (dots <= box.max)).all(axis=1).any()
     return not hit and not any(path.intersects_bbox(box, filled=False) for path in lines)

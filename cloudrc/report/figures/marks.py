@@ -28,7 +28,7 @@ HELD = " Red: the guard was in HOLD."
 
 
 def delays_of(direction: Direction) -> Timeline | None:
-    """Return a direction's conditions over time; None if a file of its profile cannot be read."""
+    """Return the link conditions of a direction over time; None if its file is unreadable."""
     try:
         return Timeline(link_profile(direction))
     except BadInputError:
@@ -105,7 +105,7 @@ def set_in_flight(subject: Subject) -> list[tuple[float, str]]:
 
 
 def legend(subject: Subject) -> str:
-    """Describe the marks of a flight for a caption; "" if there are no marks."""
+    """Explain the marks in a flight's figures (HOLD, changes of the link); "" if none."""
     changes = [
         f"{number}: {cause}, at {begin:.1f} s"
         for number, (begin, cause) in enumerate(set_in_flight(subject), start=1)

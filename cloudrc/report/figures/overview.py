@@ -144,7 +144,11 @@ def _draw_floor(axes: Axes, view: _View, points: Array, height: float) -> None:
 
 
 def _instants(subject: Subject) -> list[int]:
-    """Choose rows of the true states at equal distances flown, up to the touch of the board."""
+    """Choose the rows of the true states at which to draw the robot.
+
+    They are at equal distances along the path, up to the touch of the board. A row too near to
+    another one is left out.
+    """
     truth, touch = subject.flight.truth, first_touch(subject.flight)
     stamps = truth["stamp_ns"]
     if touch is not None:
