@@ -55,7 +55,7 @@ RELEASED_PERIOD = 2.0
 class Command(NamedTuple):
     """One command of a module that defines several commands.
 
-    The fields have the names that the attributes of a module with only one command have.
+    A module with only one command has attributes with the names of these fields.
     """
 
     arguments: Callable[[argparse.ArgumentParser], None]

@@ -14,7 +14,9 @@ class StudentPredictor(Predictor):
     """Predicts with constant velocity and constant angular velocity."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Return the odometry after `horizon` [s], tau; its `stamp_ns` [ns] is later by tau.
+        """Predict the odometry for `horizon` [s] later; the page calls this time tau.
+
+        The stamp `stamp_ns` [ns] of the result is later by the same time.
 
         `odometry._replace(position=(x, y, z))` returns a copy with another position.
         """

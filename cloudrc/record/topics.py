@@ -190,8 +190,8 @@ _TABLE = (
         Field("name", "string", "", _COUNTED),
         Field("total", "int", "", "count since the start"))),
     Topic("/link", "cloudrc_msgs/msg/LinkChanged", rec.LinkChanged, "either",
-        "Conditions of the emulated link in the direction in which the process that writes the row"
-        " sends: the uplink in world, the downlink in cloud, clock of its end. In real time only", (
+        "Conditions of one direction of the emulated link, clock of its end. World writes those of"
+        " the uplink, cloud those of the downlink. In real time only", (
         _WAY,
         Field("shaper", "string", "", "relay or netem"),
         Field("cause", "string", "", "why it changed; empty before the first change"),

@@ -51,7 +51,7 @@ class Robot:
         self.guard.put_on_ground(now_ns, cause)
 
     def run(self, tick_ns: int, until_ns: int) -> int:
-        """Run steps from `tick_ns` [ns] up to `until_ns` [ns]; return when the next step begins."""
+        """Run steps from `tick_ns` up to `until_ns`; return the time of the next step [ns]."""
         simulator, guard, low_level = self.simulator, self.guard, self._low_level
         observers = self.observers
         ticks = range(tick_ns, until_ns, STEP_NS)

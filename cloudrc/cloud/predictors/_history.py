@@ -203,9 +203,9 @@ class Replay(Predictor):
         raise NotImplementedError
 
     def forecast(self, stamp_ns: int) -> Body | None:
-        """Return the model predicted for `stamp_ns` [ns], which is after the newest sample.
+        """Predict from the newest sample; return the model in its state at `stamp_ns` [ns].
 
-        Return None if there is no sample, or if the newest one is not older.
+        Return None if there is no sample, or if the newest sample is not older than `stamp_ns`.
         """
         if self.newest is None or stamp_ns <= self.newest.stamp_ns:
             return None
