@@ -56,7 +56,8 @@ class Flight:
 
     def step(self, position=None, seconds=0.01):
         """Let time pass in periods of 10 ms, telemetry and deadline in each."""
-        self.position = self.position if position is None else position
+        if position is not None:  # else a test may set it at the same time, from its thread
+            self.position = position
         for _ in range(round(seconds * 100)):
             self.now_ns += PERIOD_NS
             if self.uplink:
