@@ -86,9 +86,12 @@ def bounds(subject: Subject, time: Array, *, uplink: bool) -> tuple[Array, Array
     a trace is missing. Return None if all are NaN.
     """
     low, high = np.full((2, len(time)), nan)
-    for begin, origin, direction, _ in parts(subject, uplink=uplink):
-        rows, delays = time >= begin, delays_of(direction)
-        low[rows], high[rows] = band(delays, time[rows] - origin) if delays else (nan, nan)
+    found = parts(subject, uplink=uplink)
+    newest = np.searchsorted([part.begin for part in found], time, "right") - 1
+    for number in np.unique(newest):  # a drag of a slider makes many parts without a time
+        rows, delays = newest == number, delays_of(found[number].direction)
+        if delays:
+            low[rows], high[rows] = band(delays, time[rows] - found[number].origin)
     return None if np.isnan(low).all() else (low, high)
 
 
