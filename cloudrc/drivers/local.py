@@ -205,10 +205,10 @@ class LocalRun:
             url = f"unix:{sockets}/api.sock" if self._api else ""
             kind = SESSION if self._session else RUN
             self.announcement.enter_context(announced(self._folder, url, kind))
-            key = Path(sockets, "key")
-            key.touch(0o600)
-            key.write_text(write(KeySet(Key(os.urandom(KEY_SIZE)))), encoding="ascii")
             try:
+                key = Path(sockets, "key")
+                key.touch(0o600)
+                key.write_text(write(KeySet(Key(os.urandom(KEY_SIZE)))), encoding="ascii")
                 self._fly(limit, Path(sockets), url)
             finally:
                 self._stop()
