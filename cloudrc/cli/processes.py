@@ -449,7 +449,7 @@ def open_relay(
         "uplink": Lane(world, cloud.send, uplink, peek),
         "downlink": Lane(cloud, world.send, downlink, peek),
     }
-    return Relay(lanes, origin_ns=None)
+    return Relay(lanes)
 
 
 class RelayControl:

@@ -65,9 +65,9 @@ class Outcome:
         """Check `measured` <= `limit`, both in `unit` [any unit]; `text` says what is measured."""
         self.checks.append(Check(text, measured, "<=", limit, unit))
 
-    def least(self, text: str, measured: float, limit: float, unit: str = "") -> None:
-        """Check `measured` >= `limit`, both in `unit` [any unit]; `text` says what is measured."""
-        self.checks.append(Check(text, measured, ">=", limit, unit))
+    def least(self, text: str, measured: float, limit: float) -> None:
+        """Check `measured` >= `limit`, both without a unit [1]; `text` says what is measured."""
+        self.checks.append(Check(text, measured, ">=", limit))
 
     def same(self, text: str, measured: float, limit: float) -> None:
         """Check that `measured` equals `limit`, both counts [1]; `text` says what is counted."""

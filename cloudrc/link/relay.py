@@ -238,16 +238,13 @@ class Lane:
 class Relay:
     """Runs one or two `Lane` objects in one thread.
 
-    `lanes` maps the name of each direction to its lane. The time of the link models starts at
-    `origin_ns` [ns], monotonic clock. If `origin_ns` is None, it starts when the first datagram
-    arrives on any lane; in this case, make the models with `origin_ns` 0.
+    `lanes` maps the name of each direction to its lane. The time of the link models starts when
+    the first datagram arrives on any lane: make the models with `origin_ns` 0.
     """
 
-    def __init__(self, lanes: Mapping[str, Lane], origin_ns: int | None) -> None:
+    def __init__(self, lanes: Mapping[str, Lane]) -> None:
         self.lanes, self._lanes = lanes, tuple(lanes.values())
         self._past: deque[ReleaseErrors] = deque([ReleaseErrors()], maxlen=_RECENT)
-        for lane in self._lanes:
-            lane.origin_ns = origin_ns
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Forward datagrams until `stop` returns True; `stop` is called at least every 0.1 s."""
@@ -334,7 +331,8 @@ class RelayShaper(Relay):
         self._outside.setblocking(False)
         self._peer: Address | None = None
         self._lane = Lane(self._inside, self._send, direction, peek)
-        super().__init__({"this": self._lane}, origin_ns=0)
+        self._lane.origin_ns = 0  # the times of `direction` are on the monotonic clock already
+        super().__init__({"this": self._lane})
         tighten_slack()
 
     def follow_peer(self, peer: Address) -> Address:

@@ -81,7 +81,7 @@ class Bench:
             "uplink": Lane(self.world_side, self.cloud_side.send, uplink, peek),
             "downlink": Lane(self.cloud_side, self.world_side.send, downlink, peek),
         }
-        self.relay = Relay(lanes, origin_ns=None)
+        self.relay = Relay(lanes)
         self._stop = Event()
         self._thread = Thread(target=self.relay.run, args=(self._stop.is_set,))
         self._thread.start()
