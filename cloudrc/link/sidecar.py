@@ -1,7 +1,8 @@
-"""Run a pod's `link` container: choose relay or netem, and follow changes of profile and peer.
+"""Shape one direction of the link: choose relay or netem, follow changes of profile and peer.
 
-The peer is the end of the tunnel in the other pod. The route file contains the address to which
-this pod's end of the tunnel has to send.
+The sidecar delays the datagrams that one end of the tunnel sends, its own end: the end in the same
+pod, or one end of a local run. The peer is the other end. The route file contains the address to
+which the own end has to send.
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ from cloudrc.errors import CloudrcError
 from cloudrc.link.follow import Loaded
 from cloudrc.link.netem import Netem
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.relay import Address, RelayShaper
+from cloudrc.link.relay import Address, Relay
 from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, StateFile, publish
 
 Mode: TypeAlias = Literal["auto", "netem", "relay"]
 """Setting `link.mode`: the only allowed shaper, or "auto": netem if it works, else the relay."""
-COUNT_PERIOD_NS = 1_000_000_000  # time between two updates of metrics and lateness file [ns]
+COUNT_PERIOD_NS = 1_000_000_000  # time between two updates of the metrics [ns]
 STEP = 0.05  # longest time until `run` reacts to a new peer or profile [s]
 
-Shaper: TypeAlias = RelayShaper | Netem
-"""Shapes the datagrams that this pod's end of the tunnel sends."""
+Shaper: TypeAlias = Relay | Netem
+"""Shapes the datagrams that the own end of the tunnel sends."""
 Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
 """Function that makes a shaper from a profile and the monotonic start of its time line [ns]."""
 
@@ -33,7 +34,7 @@ Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
 class Machine(NamedTuple):
     """Functions that a sidecar calls on its machine: shapers, clock, sleep and log."""
 
-    relay: Make  # makes a `RelayShaper`
+    relay: Make  # makes a `Relay`
     netem: Make  # makes a `Netem`, without changing the network yet
     clock: Callable[[], int]  # returns the time on the monotonic clock [ns]
     wait: Callable[[float], None]  # sleeps for a time [s]
@@ -41,10 +42,10 @@ class Machine(NamedTuple):
 
 
 class Sidecar:
-    """Shapes the datagrams that this pod's end of the tunnel sends.
+    """Shapes the datagrams that the own end of the tunnel sends.
 
-    Another thread sets `peer`, the address of the other pod's end, and `profile`, the requested
-    profile.
+    Another thread sets `peer`, the address of the other end, and `profile`, the requested profile.
+    It also calls `publish_released`, because the loop that forwards must not wait for a disk.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class Sidecar:
         self._mode, self._direction, self._route = mode, direction, route
         self._released_file = self.states.path.with_suffix(RELEASED_SUFFIX)
         self._reason, self._origin_ns = "", 0
+        self._shaper: Shaper | None = None
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Wait until the peer is known, then shape datagrams until `stop` returns True.
@@ -91,12 +93,19 @@ class Sidecar:
             for file in (self._route, self._released_file):
                 file.unlink(missing_ok=True)
 
+    def publish_released(self) -> None:
+        """Write the lateness of datagrams to a file, which the own end of the tunnel reads."""
+        if self._shaper and (released := self._shaper.released()):
+            with suppress(OSError):
+                publish(self._released_file, json.dumps(released))
+
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
         """Use one shaper until `stop` returns True, or until a profile needs the other shaper."""
         profile, machine = self.profile, self._machine
         if self.states.state and profile.change.restart:
             self._origin_ns = machine.clock()
         shaper, route = self._choose(profile, peer)
+        self._shaper = shaper
         try:
             machine.log(f"{shaper.name} shapes the {self._direction} ({self._reason})")
             state = self._publish_state(shaper, profile)
@@ -115,8 +124,8 @@ class Sidecar:
                 if (now_ns := machine.clock()) >= count_ns:
                     count_ns = now_ns + COUNT_PERIOD_NS
                     self._count(shaper.counts())
-                    self._publish_released(shaper)
         finally:
+            self._shaper = None
             shaper.close()
 
     def _choose(self, profile: Loaded, peer: Address) -> tuple[Shaper, Address]:
@@ -159,12 +168,6 @@ class Sidecar:
         with suppress(OSError):  # shaping continues even if the disk is full
             self.states.publish(state)
         return state
-
-    def _publish_released(self, shaper: Shaper) -> None:
-        """Write the lateness of datagrams to a file, which the pod's world or cloud reads."""
-        if released := shaper.released():
-            with suppress(OSError):
-                publish(self._released_file, json.dumps(released))
 
     def _publish_route(self, route: Address) -> None:
         publish(self._route, f"{route[0]}:{route[1]}\n")

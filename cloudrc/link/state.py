@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from cloudrc.link.follow import Loaded
 
 STATE_FILE = "link.json"  # name of the state file, in the folder of the route file
-PROFILE_FILE = "profile.json"  # profile of a local run's relay, in the folder of the state files
 STATE_MAX = 1 << 16
 """Size limit of a state file that world or cloud reads [bytes]: room for a time line of about 800
 changes. Reading a file of 1 MiB could block the control loop for 2 s."""
@@ -63,7 +62,7 @@ class LinkState:
     change: str = ""  # number of the last change that took effect; "" if unknown
     cause: str = ""  # why the profile was changed, in words; "" before the first change
     asked: dict[str, float | None] = field(default_factory=dict)  # the result of `summary`
-    origin_ns: int | None = None  # start of the time line [ns]; None: the old one continues
+    origin_ns: int = 0  # start of the time line [ns]
     refused: str = ""  # number of the last refused change; "" if no change was refused
     refusal: str = ""  # why the last refused change was refused, in words
 
@@ -81,7 +80,7 @@ class StateFile:
         self.state: LinkState | None = None
 
     def next(
-        self, loaded: Loaded, shaper: str, reason: str, since_ns: int, origin_ns: int | None
+        self, loaded: Loaded, shaper: str, reason: str, since_ns: int, origin_ns: int
     ) -> LinkState:
         """Return the state after a change of profile or shaper; arguments as in `LinkState`."""
         return LinkState(
