@@ -112,7 +112,7 @@ def execute(options: argparse.Namespace) -> int:
             _repeat(resolve_peer, *PEER_PAUSE)
             _repeat(sidecar.publish_released, RELEASED_PERIOD, RELEASED_PERIOD)
             alive = feed.alive_while(stop)
-            sidecar.run(lambda: alive() if sidecar.states.state else stop())
+            sidecar.run(lambda: alive() if sidecar.state else stop())
         finally:
             programs.close()
     return 0
@@ -163,7 +163,7 @@ def _machine(options: argparse.Namespace, seed: int, programs: Programs, tables:
 
     def relay(profile: DirectionProfile, origin_ns: int) -> Relay:
         settle()
-        if not ask_for_fifo():  # most pods lack the permission and do not need it
+        if ask_for_fifo():  # most pods lack the permission and do not need it
             log("the relay runs under SCHED_FIFO")
         direction = LinkDirection(profile, seed, options.direction == "uplink", origin_ns)
         with listening("--listen", options.listen):
@@ -189,8 +189,8 @@ def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None
 def export_state(exporter: Exporter | None, state: LinkState) -> None:
     """Export the state of one direction as metrics."""
     if exporter:
-        exporter.shaped(state.shaper, state.direction, state.mode)
-        exporter.asked(state.direction, state.asked["delay"] or 0.0)
+        delay = state.asked["delay"] or 0.0
+        exporter.link.shaped(state.shaper, state.direction, state.mode, delay)
         exporter.ready(True)
 
 
@@ -202,7 +202,7 @@ def export_counts(exporter: Exporter | None, counts: dict[str, int]) -> None:
 
 def status_page(sidecar: Sidecar) -> str:
     """Return the state of a sidecar as JSON. Any thread may call this function."""
-    peer, state = sidecar.peer, sidecar.states.state
+    peer, state = sidecar.peer, sidecar.state
     netems = _find_netems(peer[0], int(time.monotonic())) if peer else {}
     return json.dumps((asdict(state) if state else {}) | netems) + "\n"
 

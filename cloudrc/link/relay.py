@@ -297,17 +297,13 @@ def tighten_slack() -> None:
         ctypes.CDLL(None).prctl(_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
 
 
-def ask_for_fifo() -> str:
-    """Give the calling thread the real-time class SCHED_FIFO, but not its child processes.
+def ask_for_fifo() -> bool:
+    """Give the calling thread, not its child processes, the real-time class SCHED_FIFO.
 
-    Returns:
-        "" if the thread now has SCHED_FIFO, otherwise the reason why not.
+    Return whether this is permitted: it takes CAP_SYS_NICE or a limit on rtprio.
     """
-    if not hasattr(os, "SCHED_FIFO"):
-        return "this system has no SCHED_FIFO"
-    try:
+    with suppress(AttributeError, OSError):  # a system without SCHED_FIFO; no permission
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(0, policy, os.sched_param(_FIFO_PRIORITY))
-    except OSError as error:
-        return f"{error.strerror}; it takes CAP_SYS_NICE or a limit on rtprio"
-    return ""
+        return True
+    return False

@@ -10,6 +10,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -18,7 +20,7 @@ from cloudrc.link.follow import Loaded
 from cloudrc.link.netem import Netem
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.relay import Address, Relay
-from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, StateFile, publish
+from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, publish, summary, to_text
 
 Mode: TypeAlias = Literal["auto", "netem", "relay"]
 """Setting `link.mode`: the only allowed shaper, or "auto": netem if it works, else the relay."""
@@ -44,8 +46,9 @@ class Machine(NamedTuple):
 class Sidecar:
     """Shapes the datagrams that the own end of the tunnel sends.
 
-    Another thread sets `peer`, the address of the other end, and `profile`, the requested profile.
-    It also calls `publish_released`, because the loop that forwards must not wait for a disk.
+    Other threads set `peer`, the address of the other end, and `profile`, the requested profile.
+    They also call `publish_released`, because the loop that forwards must not wait for a disk.
+    `state` is the last state that is published, None before the first.
     """
 
     def __init__(
@@ -66,10 +69,11 @@ class Sidecar:
         """
         self.peer: Address | None = None
         self.profile = profile
-        self.states = StateFile(route.with_name(STATE_FILE), mode, direction)
+        self.state: LinkState | None = None
         self._machine, self._tell, self._count = machine, tell, count
         self._mode, self._direction, self._route = mode, direction, route
-        self._released_file = self.states.path.with_suffix(RELEASED_SUFFIX)
+        self._state_file = route.with_name(STATE_FILE)
+        self._released_file = self._state_file.with_suffix(RELEASED_SUFFIX)
         self._reason, self._origin_ns = "", 0
         self._shaper: Shaper | None = None
 
@@ -95,20 +99,21 @@ class Sidecar:
 
     def publish_released(self) -> None:
         """Write the lateness of datagrams to a file, which the own end of the tunnel reads."""
-        if self._shaper and (released := self._shaper.released()):
+        shaper = self._shaper  # another thread may replace it
+        if shaper and (released := shaper.released()):
             with suppress(OSError):
                 publish(self._released_file, json.dumps(released))
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
         """Use one shaper until `stop` returns True, or until a profile needs the other shaper."""
         profile, machine = self.profile, self._machine
-        if self.states.state and profile.change.restart:
+        if self.state and profile.change.restart:
             self._origin_ns = machine.clock()
         shaper, route = self._choose(profile, peer)
         self._shaper = shaper
         try:
             machine.log(f"{shaper.name} shapes the {self._direction} ({self._reason})")
-            state = self._publish_state(shaper, profile)
+            state = self._publish_state(self._next_state(shaper, profile))
             self._publish_route(route)
             self._tell(state)
             count_ns = machine.clock()
@@ -153,20 +158,38 @@ class Sidecar:
                 self._machine.log(f"the shaper changes to the relay: {_cause(error)}")
                 return False
             self._machine.log(f"the new profile is refused, the old one stays: {error}")
-            with suppress(OSError):
-                self.states.refuse(profile.change.number, str(error))
+            if self.state:
+                number = profile.change.number
+                self._publish_state(replace(self.state, refused=number, refusal=str(error)))
             return True
         if restart:
             self._origin_ns = self._machine.clock()
         self._machine.log(f"the new profile is in force ({profile.change.cause})")
-        self._tell(self._publish_state(shaper, profile))
+        self._tell(self._publish_state(self._next_state(shaper, profile)))
         return True
 
-    def _publish_state(self, shaper: Shaper, profile: Loaded) -> LinkState:
-        now_ns = self._machine.clock()
-        state = self.states.next(profile, shaper.name, self._reason, now_ns, self._origin_ns)
+    def _next_state(self, shaper: Shaper, profile: Loaded) -> LinkState:
+        """Return the state after a change of profile or shaper."""
+        before = self.state
+        return LinkState(
+            shaper=shaper.name,
+            reason=self._reason,
+            mode=self._mode,
+            direction=self._direction,
+            profile=profile.values,
+            since=datetime.now(UTC).isoformat(timespec="seconds"),
+            since_ns=self._machine.clock(),
+            changes=before.changes + 1 if before else 0,
+            change=profile.change.number,
+            cause=profile.change.cause if before else "",
+            asked=summary(profile.direction),
+            origin_ns=self._origin_ns,
+        )
+
+    def _publish_state(self, state: LinkState) -> LinkState:
+        self.state = state
         with suppress(OSError):  # shaping continues even if the disk is full
-            self.states.publish(state)
+            publish(self._state_file, to_text(state))
         return state
 
     def _publish_route(self, route: Address) -> None:

@@ -7,8 +7,7 @@ records each change; `cloudrc link set` reads in it whether a change has taken e
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field, replace
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -18,8 +17,6 @@ from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
-
-    from cloudrc.link.follow import Loaded
 
 STATE_FILE = "link.json"  # name of the state file, in the folder of the route file
 STATE_MAX = 1 << 16
@@ -65,48 +62,6 @@ class LinkState:
     origin_ns: int = 0  # start of the time line [ns]
     refused: str = ""  # number of the last refused change; "" if no change was refused
     refusal: str = ""  # why the last refused change was refused, in words
-
-
-class StateFile:
-    """The state file of one direction.
-
-    Attributes:
-        state: The last state in the file; None before the first.
-    """
-
-    def __init__(self, path: Path, mode: str, direction: str) -> None:
-        """Set the path of the file, and `mode` and `direction` as in `LinkState`."""
-        self.path, self._mode, self._direction = path, mode, direction
-        self.state: LinkState | None = None
-
-    def next(
-        self, loaded: Loaded, shaper: str, reason: str, since_ns: int, origin_ns: int
-    ) -> LinkState:
-        """Return the state after a change of profile or shaper; arguments as in `LinkState`."""
-        return LinkState(
-            shaper=shaper,
-            reason=reason,
-            mode=self._mode,
-            direction=self._direction,
-            profile=loaded.values,
-            since=datetime.now(UTC).isoformat(timespec="seconds"),
-            since_ns=since_ns,
-            changes=self.state.changes + 1 if self.state else 0,
-            change=loaded.change.number,
-            cause=loaded.change.cause if self.state else "",
-            asked=summary(loaded.direction),
-            origin_ns=origin_ns,
-        )
-
-    def publish(self, state: LinkState) -> None:
-        """Write a state to the file; raise an OSError if this fails."""
-        publish(self.path, to_text(state))
-        self.state = state
-
-    def refuse(self, number: str, refusal: str) -> None:
-        """Note in the file that change `number` was refused; `refusal` is the reason, in words."""
-        if self.state is not None:
-            self.publish(replace(self.state, refused=number, refusal=refusal))
 
 
 def to_text(state: LinkState) -> str:

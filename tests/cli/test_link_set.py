@@ -12,7 +12,7 @@ from cloudrc.config.load import edit_profile
 from cloudrc.drivers import local
 from cloudrc.errors import BadInputError
 from cloudrc.link.follow import HANDED_FILE, Profiles
-from cloudrc.link.state import StateFile
+from cloudrc.link.state import LinkState, publish, summary, to_text
 
 CHANGES = [{"at_s": 9.0, "delay_ms": 50.0, "jitter_ms": 20.0}, {"at_s": 12.0, "loss": 0.1}]
 TIMED = {"uplink": {"delay_ms": 40.0}, "downlink": {"delay_ms": 25.0, "changes": CHANGES}}
@@ -82,23 +82,24 @@ class Flight:
     """A local run whose link reads the change while the command waits."""
 
     def __init__(self, folder):
-        self.profiles, self.states = {}, {}
+        self.links = {}
         for way in ("uplink", "downlink"):
             (own := folder / way).mkdir(parents=True)
             (own / "map.yaml").write_text("{uplink: {delay_ms: 45}, downlink: {delay_ms: 45}}")
             paths = own / "map.yaml", own / HANDED_FILE
-            self.profiles[way] = Profiles(*paths, make_profile_loader(way), print)
-            self.states[way] = StateFile(own / "link.json", "relay", way)
-            self.apply(way, self.profiles[way].first())
+            self.links[own] = Profiles(*paths, make_profile_loader(way), print)
+            self.apply(own, self.links[own].first())
 
-    def apply(self, way, loaded):
-        states = self.states[way]
-        states.publish(states.next(loaded, "relay", "", 1, 1))
+    def apply(self, own, loaded):
+        (_, values, change), asked = loaded, summary(loaded.direction)
+        about = {"change": change.number, "cause": change.cause, "asked": asked}
+        state = LinkState("relay", "", "relay", own.name, values, "", 1, **about)
+        publish(own / "link.json", to_text(state))
 
     def wait(self, _):
-        for way, profiles in self.profiles.items():
+        for own, profiles in self.links.items():
             if loaded := profiles.poll():
-                self.apply(way, loaded)
+                self.apply(own, loaded)
 
 
 @pytest.fixture
@@ -118,7 +119,7 @@ def test_a_run_here_is_found_changed_and_read_back(call):
     assert "2 blackouts" in out, "what has no column of its own"
     downlink = json.loads(call("link set --profile paper-p1 -o json").out)["links"]["downlink"]
     assert downlink["profile"]["downlink"]["delay_ms"] == 20.0
-    assert (downlink["cause"], downlink["changes"]) == ("profile paper-p1", 3)
+    assert downlink["cause"] == "profile paper-p1"
 
 
 @pytest.mark.usefixtures("flight")
