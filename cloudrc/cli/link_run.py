@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from cloudrc.config.schema import Profile
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.link.follow import Load
+    from cloudrc.link.netem import Netem
     from cloudrc.link.sidecar import Machine, Sidecar
     from cloudrc.link.state import LinkState
 
@@ -153,7 +154,6 @@ def prepare_link(folder: Path, link: Profile | ResolvedExperiment) -> None:
 
 def _machine(options: argparse.Namespace, seed: int, programs: Programs, tables: Path) -> Machine:
     from cloudrc.link.model import LinkDirection
-    from cloudrc.link.netem import Netem
     from cloudrc.link.profile import DirectionProfile
     from cloudrc.link.relay import Relay, ask_for_fifo, settle
     from cloudrc.link.sidecar import Machine
@@ -170,6 +170,8 @@ def _machine(options: argparse.Namespace, seed: int, programs: Programs, tables:
             return Relay(options.listen, direction, peek, options.end)
 
     def netem(profile: DirectionProfile, origin_ns: int) -> Netem:
+        from cloudrc.link.netem import Netem
+
         return Netem(
             programs, profile, origin_ns=origin_ns, clock=clock, wait=wait, tables=tables, log=log
         )
