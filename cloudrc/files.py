@@ -110,6 +110,9 @@ def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
 
 
 def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:
-    """Write `data` to a file as with `atomic_file`."""
+    """Replace the content of a file in one step; if this fails, keep it and raise an OSError.
+
+    `mode` is the file's permissions, minus the umask.
+    """
     with atomic_file(path, mode) as file:
         file.write(data)

@@ -119,7 +119,7 @@ class Page:
         self._drawn = 0  # number of drawn points of the trail
 
     def fill(self, experiment: ResolvedExperiment, feed: FlightFeed, steering: Steering) -> None:
-        """Build the scene and the panels; only the first browser to connect gets the controls."""
+        """Build the scene and the panels; only one browser at a time gets the controls."""
         self._experiment, self._feed, self._steering = experiment, feed, steering
         from cloudrc.console.scene import LEGEND, FlightScene  # needs MuJoCo, which takes a second
 

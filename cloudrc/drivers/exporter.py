@@ -186,7 +186,10 @@ class Exporter:
 
     @property
     def is_ready(self) -> bool:
-        """Whether `ready(True)` was called; in world and cloud, also true if the peer sends."""
+        """Whether this process is ready: for world and cloud, whether the peer sends.
+
+        Teleop and the link are ready after a call of `ready(True)`.
+        """
         return self._said_ready or (self._live.end is not None and self._live.end.has_peer)
 
     def serve(self, address: tuple[str, int]) -> int:

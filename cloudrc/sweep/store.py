@@ -98,7 +98,10 @@ def begin(folder: Path, plan: Plan) -> dict[str, Row]:
 
 
 def finish(folder: Path, plan: Plan) -> dict[str, Row]:
-    """Write the sweep's description and, after the last flight, its tables; return key -> row."""
+    """Write a sweep's description and, after its last flight, its tables.
+
+    Return a mapping: key of the flight -> row.
+    """
     rows = read_rows(folder)
     unit_of = _write_summary(folder, plan, rows)
     if len(rows) == len(plan.flights):
