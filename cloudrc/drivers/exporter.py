@@ -186,10 +186,7 @@ class Exporter:
 
     @property
     def is_ready(self) -> bool:
-        """Whether this process is ready: for world and cloud, whether the peer sends.
-
-        Teleop and the link are ready after a call of `ready(True)`.
-        """
+        """Whether `ready(True)` was called, or this is world or cloud and its peer sends."""
         return self._said_ready or (self._live.end is not None and self._live.end.has_peer)
 
     def serve(self, address: tuple[str, int]) -> int:

@@ -85,7 +85,7 @@ class UnixPeer:
         return messages
 
     def send(self, message: Any) -> bool:
-        """Send a message, or for None an empty datagram as a sign of life; return whether it left.
+        """Send a message (None: an empty datagram, a sign of life); return whether it was accepted.
 
         False means that the other process does not run, or that the queue of its socket is full.
         """

@@ -98,10 +98,7 @@ def begin(folder: Path, plan: Plan) -> dict[str, Row]:
 
 
 def finish(folder: Path, plan: Plan) -> dict[str, Row]:
-    """Write a sweep's description and, after its last flight, its tables.
-
-    Return a mapping: key of the flight -> row.
-    """
+    """Write the description and, after the last flight, the tables; return flight key -> row."""
     rows = read_rows(folder)
     unit_of = _write_summary(folder, plan, rows)
     if len(rows) == len(plan.flights):
