@@ -63,7 +63,7 @@ def load(kind: str, name: str, **parameters: Any) -> Any:
 
 
 def find(kind: str, name: str) -> Any:
-    """Import the plug-in with this name or path; return its module, or its entry point's object."""
+    """Import a plug-in by name or path; return its module, or the object of an entry point."""
     if is_path(name) and not Path(name).is_file():
         raise BadInputError(f"{_one(kind)} {name!r}: there is no such file")
     with _explained(kind, name, "cannot be imported"):

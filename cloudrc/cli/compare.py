@@ -183,7 +183,7 @@ def _needed(entry: Mapping[str, Any]) -> str:
 
 
 def _answer(document: Mapping[str, Any]) -> str:
-    """Say whether A or B succeeds more often, if decided, and how B changes the first metric."""
+    """Say how B changes the first metric, and whether A or B succeeds significantly more often."""
     success, text = document["success"], ""
     if success["decided"]:
         more, less = "ba" if success["b"] > success["a"] else "ab"

@@ -191,7 +191,7 @@ def status_page(sidecar: Sidecar) -> str:
 def _find_netems(host: str, second: int) -> dict[str, Any]:
     """Find the netem qdiscs of this pod.
 
-    `second` is the present time in whole seconds [s]: the cache allows one search per second.
+    `second` is the present time [s]. It is an argument so that the cache searches once per second.
     """
     from cloudrc.link.netem import find_netems
 

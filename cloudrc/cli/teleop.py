@@ -230,7 +230,7 @@ def _open_store(
 def _start(
     options: argparse.Namespace, experiment: ResolvedExperiment, service: MissionService
 ) -> bool:
-    """With `--start`, start the experiment's mission; return whether teleop flies this mission."""
+    """With `--start`, start or resume the experiment's mission; return whether that was done."""
     from cloudrc import assembly
     from cloudrc.teleop.store import ConflictError, Order
 

@@ -110,7 +110,7 @@ class EmergencyStopRepeater:
         """Return the emergency stop if cloud has to send it at `now_ns` [ns], else None.
 
         World carries out a request only if its number is higher than the last number. `asked` is
-        the highest number so far in this session; the stop gets a higher number.
+        the highest number of a request in this session so far; the stop gets a higher number.
         """
         if not self.sounds or now_ns < self._due_ns:
             return None

@@ -164,7 +164,7 @@ def send(
 def keep(release: Release, link: LinkParts, sent: Sent) -> None:
     """Write a change to the ConfigMap, from which restarted pods read it.
 
-    Raise an error if the write fails, or if a container failed to apply the change (`sent`).
+    Raise an error if the write fails, or if a link container did not confirm the change.
     """
     said = list(map(str, sent.failed))
     words = ["patch", "configmap", link.name, "--type=merge", "--patch-file=/dev/stdin"]

@@ -119,7 +119,7 @@ class Page:
         self._drawn = 0  # number of drawn points of the trail
 
     def fill(self, experiment: ResolvedExperiment, feed: FlightFeed, steering: Steering) -> None:
-        """Build the scene and the panels; only the first browser to connect gets the controls."""
+        """Build the scene and the panels; only one browser at a time gets the controls."""
         self._experiment, self._feed, self._steering = experiment, feed, steering
         from cloudrc.console.scene import LEGEND, FlightScene  # needs MuJoCo, which takes a second
 
@@ -349,7 +349,7 @@ class Page:
         return x, y, z
 
     def _add_keys(self, gui: viser.GuiApi) -> None:
-        """Add the buttons for driving by hand; viser reports a held button ten times a second."""
+        """Add the buttons for driving by hand; viser calls `on_hold` at 10 Hz."""
         steering = self._steering
         speed = gui.add_slider("Drive [m/s]", 0.1, 1.0, 0.1, 0.4)
         for code, (label, direction) in KEYS.items():

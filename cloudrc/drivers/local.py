@@ -163,8 +163,8 @@ class LocalRun:
 
     Attributes:
         notes: Sentences for the report of the flight.
-        announcement: Owns the flight file of this run; its method `close` removes the file.
-            `fly` calls `close` after a flight. After a session, the caller of `fly` does so.
+        announcement: Keeps the file by which other commands find this run, until its method `close`
+            is called. `fly` calls it after a flight. After a session, the caller of `fly` does so.
     """
 
     def __init__(

@@ -85,7 +85,7 @@ class UnixPeer:
         return messages
 
     def send(self, message: Any) -> bool:
-        """Send a message; None sends an empty datagram. Return whether the datagram was accepted.
+        """Send a message (None: an empty datagram, a sign of life); return whether it was accepted.
 
         False means that the other process does not run, or that the queue of its socket is full.
         """

@@ -64,7 +64,7 @@ class LinkVerdict:
 
     @property
     def verdict(self) -> str:
-        """Verdict on the link: "ok", "off" (not as its profile), "open" (not decided yet)."""
+        """Verdict on the link: "ok", "off" (not as in its profile), "open" (not decided yet)."""
         verdicts = {record.verdict for record in self._newest} - {"told"}
         return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"
 

@@ -357,7 +357,7 @@ def _operators_voice(rng: Generator) -> Lie:
 def _refused_and_released(rng: Generator) -> Lie:
     """Fly fast, and from time to time send NaN, so that the guard lands the robot.
 
-    Meanwhile `at_bad_moments` forges requests of the operator, which acknowledge the landings.
+    Meanwhile forged requests of the operator (`at_bad_moments`) acknowledge the landings.
     """
     fly, pause_ns = _operators_voice(rng), int(rng.uniform(0.5e9, 4e9))
 

@@ -105,8 +105,8 @@ class Watch:
     def see(self, records: list[Record], now_ns: int) -> None:
         """Check in the new `records` of world that each command was applied once and in order.
 
-        A restarted world continues from the last epoch that cloud knows. If cloud knows no epoch,
-        world starts with the first epoch again, which is allowed.
+        A restarted world counts epochs on from the last epoch that cloud knows. If cloud knows
+        none, world starts again with the first epoch, which is allowed.
         """
         for record in records:
             if isinstance(record, CommandApplied | SessionOpened):
@@ -194,7 +194,7 @@ class RobotInvariants:
         self._was, self._state, self._before = state, state, reference
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
-        """Implement `Observer.see_command`: check accepted commands, count impossible ones."""
+        """Check the age of an accepted command; count commands with impossible values or times."""
         if rejection is None:
             basis_ns = command.basis_stamp_ns
             if not 0 <= now_ns - basis_ns <= self._age_ns:
@@ -314,7 +314,7 @@ class RobotInvariants:
     # Contacts and stops of the rotors.
 
     def _check_touches(self, state: GuardState, now_ns: int) -> None:
-        """Check that new contacts are allowed; a robot that collided may then leave the fence."""
+        """Check that new contacts are allowed; after any contact the robot may leave the fence."""
         touches = self._simulator.touches
         if touches is not self._touches:
             self._touches, self._seen = touches, 0

@@ -102,7 +102,7 @@ class RestartableEndpoint:
             self._waiting.append(data)
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Implement `Endpoint.receive_datagram`."""
+        """Receive a datagram at `now_ns` [ns]; `tamper`, if set, changes the datagram first."""
         for each in [data] if self.tamper is None else self.tamper(data, now_ns):
             self.receive_now(each, now_ns)
         self._set_deadline()
@@ -156,7 +156,7 @@ class EndpointGroup:
         self.others: list[Record] = []  # records of all clouds but the first, oldest first
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Pass a datagram on at `now_ns` [ns]; `tamper`, if set, changes it before."""
+        """Pass a datagram to all members at `now_ns` [ns]."""
         for member in self.members:
             member.receive_datagram(data, now_ns)
 

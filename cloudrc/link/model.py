@@ -128,7 +128,7 @@ class LinkDirection:
     def _arrival(self, entry: int, conditions: Conditions, size: int, now_ns: int) -> int | None:
         """Compute when one copy of a packet arrives [ns]; None if the queue is full.
 
-        `entry` is the extra delay of the copy [ns], or OVERTAKES.
+        `entry` is the extra delay of the copy [ns]. With OVERTAKES the copy skips queue and delay.
         """
         arrival = now_ns
         if entry != OVERTAKES:

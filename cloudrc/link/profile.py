@@ -148,7 +148,7 @@ class Timeline:
 
     @property
     def last_ns(self) -> float:
-        """Time from the start of the link to the last change [ns]; infinite for a loop."""
+        """Time from the start of the link to the last change [ns]; infinite if changes repeat."""
         return self.pass_ns[-1] if self.period_ns is None else inf
 
     def only(self) -> Conditions | None:

@@ -61,10 +61,10 @@ def _decode(data: bytes) -> list[str]:
 
 
 def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
-    """Read the distribution of a trace's delays, without lost packets; errors as in `read_trace`.
+    """Read the distribution of a trace's delays, without lost packets.
 
-    Returns:
-        The delays, shifted and scaled to mean 0 and standard deviation 1, rising, shape (n,).
+    Return the delays, shifted and scaled to mean 0 and standard deviation 1, rising, shape (n,).
+    Raise a BadInputError if the file is no trace, or has fewer than two different delays.
     """
     trace = read_trace(path, size_max)
     losses = trace.losses or (0.0,) * len(trace.delays)

@@ -37,7 +37,7 @@ def _prediction_error(flight: Flight) -> float | None:
 
 
 def _estimate_error(flight: Flight) -> float | None:
-    """Compute the RMS distance [m] from predicted positions to the later true positions."""
+    """Compute the RMS distance [m] from predicted to true positions at the predicted times."""
     control = flight.control
     target_ns = control["basis_stamp_ns"] + np.rint(control["horizon"] * 1e9).astype(np.int64)
     return rms(control["position"] - flight.true_position(target_ns))

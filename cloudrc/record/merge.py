@@ -3,12 +3,14 @@
 Only the stamp of a cloud message is converted; other times in the message stay on the clock that
 their description names.
 
-The offset between the clocks is estimated from the packets, because no packet arrives before it was
-sent. Each telemetry datagram shows that world's clock is ahead of cloud's by at least (sent -
-arrived). Each command datagram shows that world's clock is ahead by at most (arrived - sent). The
-fastest packet of each direction gives the narrowest interval: as wide as the sum of both delays.
+On two machines, the offset between the clocks is estimated from the packets, because no packet
+arrives before it was sent. Each telemetry datagram shows that world's clock is ahead of cloud's by
+at least (sent - arrived). Each command datagram shows that world's clock is ahead by at most
+(arrived - sent). The fastest packet of each direction gives the narrowest interval: as wide as the
+sum of both delays.
 
-After a stall of world's process, world's clock is behind the clock of its machine.
+On one machine, world's clock differs from cloud's only by the lag after stalls of world's process.
+Telemetry contains this lag.
 """
 
 from __future__ import annotations

@@ -105,9 +105,9 @@ def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:
 
 
 def _errors(topic: str, flight: Flight, columns: Columns, name: str) -> Iterator[View]:
-    """Yield one view per row: the distance from a position to the robot's true position [m].
+    """Yield messages of `topic`: the distance from a position to the robot's true position [m].
 
-    `name` is the column of `columns` with the positions.
+    `name` is the column of `columns` with the positions. At most one message per PERIOD_NS.
     """
     columns = _thin(columns)
     away = columns[name] - flight.true_position(columns["stamp_ns"])

@@ -107,7 +107,8 @@ def _chance_at_most(total: int, doubled: NDArray[Any]) -> float:
 def _sums(doubled: NDArray[Any]) -> NDArray[Any]:
     """Return the probability of each value 0, 1, 2 ... of twice the sum of the positive ranks.
 
-    The ranks and `doubled` are those of `_chance_at_most`.
+    Each rank is positive or negative with probability 1/2. `doubled` has twice the size of each
+    rank, shape (n,).
     """
     chances = np.zeros(int(doubled.sum()) + 1)
     chances[0] = 1.0

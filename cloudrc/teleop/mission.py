@@ -425,7 +425,7 @@ class Teleop:
     def _leaves_ns(self, leg: int) -> int | None:
         """Return when the dwell time at waypoint `leg` ends [ns].
 
-        Return None if the present setpoint is not a carrot that moves to this waypoint.
+        Return None if the present setpoint does not move gradually (`carrot`) to this waypoint.
         """
         setpoint = self._setpoint
         if setpoint is None or type(setpoint.motion) is not Motion or setpoint.waypoint != leg:
@@ -471,7 +471,7 @@ class Teleop:
 
     @property
     def _may_move(self) -> bool:
-        """Whether a command could move the robot before the mission resets it to the spawn."""
+        """Whether a setpoint sent now could move the robot before its reset to the spawn."""
         return self._from_spawn and not self.requests.waits
 
     def _select_early(self, now_ns: int) -> None:

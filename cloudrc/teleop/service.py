@@ -328,7 +328,7 @@ class MissionService:
 
     @property
     def _blocked(self) -> str:
-        """Why the robot cannot fly before an acknowledgement, in words; "" if it can fly."""
+        """Why the robot cannot fly until the operator's acknowledgement; "" if it can fly."""
         if self._teleop.stopping or self._inherits_stop:
             return "an emergency stop is on its way to the robot"
         seen = self.seen

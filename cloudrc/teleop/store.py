@@ -31,7 +31,7 @@ SHOWN = 100
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Order to fly a mission; the plan has been checked."""
+    """Order to fly a mission, with a plan that has been checked."""
 
     plan: Plan
     name: str = ""  # shown to people

@@ -164,7 +164,7 @@ class ClientHandshake:
     """Cloud's side of the handshake: make hellos, and decide which answers are valid."""
 
     def __init__(self, nonce: bytes, clock: bytes) -> None:
-        """Start without a session; `nonce` and `clock` are as in `ServerHandshake`."""
+        """Start without a session; `nonce` identifies this process, `clock` the machine's clock."""
         self._seed, self._clock = nonce, clock
         self._nonce, self._nonces = nonce, 0
         self._epoch = NO_EPOCH  # the newest known epoch

@@ -162,9 +162,10 @@ class WorldEndpoint(TunnelEnd):
     def _advance(self, until_ns: int, *, samples: bool = False) -> None:
         """Simulate all steps that begin before `until_ns` [ns], world's clock.
 
-        With `samples`, also take the odometry sample that is due at `until_ns`. If an earlier call
-        took this sample, simulate also the step that begins at `until_ns`. A datagram that arrives
-        at `until_ns` then acts on the following step.
+        With `samples`, also take the odometry sample that is due at `until_ns`.
+
+        If an earlier call took the sample at `until_ns`, also simulate the step that begins at this
+        time: a datagram that arrives at `until_ns` acts on the step after it.
         """
         tick_ns = self._tick_ns
         if until_ns == tick_ns == self._sample_ns - self._sample_period_ns:

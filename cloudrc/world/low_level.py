@@ -105,7 +105,7 @@ class LowLevel:
         return speeds
 
     def force(self, velocity: Vector, reference: Vector) -> Vector:
-        """Compute the force that the robot needs [N], and advance the integral by `dt`.
+        """Compute the force that the robot needs [N], and advance the integral by one time step.
 
         e = v - v_ref;  F = -(Kp · e + Ki · int(e dt) + Kd · de/dt) + (0, 0, m · g), with a clamped
         integral. `velocity` is v, `reference` is v_ref, both in [m/s]; all are in the world frame.

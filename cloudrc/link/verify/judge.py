@@ -158,9 +158,10 @@ class Plan:
         return self.chance._replace(bands=bands)
 
     def judge(self, measured: Stream, epoch: int = 1, first: int = 0) -> list[Row]:
-        """Judge a measured stream.
+        """Judge a measured stream; return one row per quantity.
 
-        If the stream cannot show a property, its row has the verdict "told" and no measured value.
+        If the stream cannot show a quantity, the row of this quantity has only the requested value
+        and the verdict "told". The datagrams have the numbers from `first` on in session `epoch`.
         """
         expected = self.expected(measured, epoch, first)
         found = self.quantities(measured, expected.pooled)
@@ -261,8 +262,10 @@ def _requested_delay(profile: DirectionProfile, sent: Floats) -> Floats:
 def netem_makes(profile: DirectionProfile) -> DirectionProfile:
     """Return a profile with which the relay's link model behaves as netem does with `profile`.
 
-    netem hardly correlates delays. If netem selects a packet both for loss and for duplication, one
-    copy arrives. netem can also lose the second copy. Source: Linux, net/sched/sch_netem.c.
+    netem hardly correlates delays. A packet that netem selects both for loss and for duplication
+    arrives once. netem can also lose the copy of a duplicated packet.
+
+    Source: Linux, net/sched/sch_netem.c.
     """
     loss, lost, single = profile.loss, mean_loss(profile.loss), 1.0 - profile.duplicate
     twice = profile.duplicate * (1.0 - lost) ** 2 / max(1e-9, 1.0 - single * lost)

@@ -79,7 +79,8 @@ class LinkMonitor:
     def begin(self, asked: Asked, path: Path | None, load: Load) -> None:
         """Start the thread, which judges the link by the requested profiles `asked`.
 
-        As soon as the state file `path` contains profiles, those replace `asked`; see `look`.
+        As soon as the link's state file `path` contains profiles, these replace `asked`. `load`
+        converts them. If `path` is None, `asked` stays in force.
         """
         self._inbox, self._pause = queue.SimpleQueue(), lambda: time.sleep(1e-4)
         self.follow(asked)
@@ -209,9 +210,9 @@ class LinkMonitor:
     def _excuse(self, row: Row) -> Row:
         """Change a verdict "off" to "open" if late wakes of this machine may explain a long delay.
 
-        If a loop wakes late by t, each datagram that arrives meanwhile waits for up to t. The
-        number of these datagrams grows with t, and the square of their wait with t^2. Therefore the
-        mean square of the added delay grows with t^3.
+        If a loop wakes late by t, about t / period datagrams arrive meanwhile. The mean square of
+        their waits is t^2 / 3, so the sum of the squares is t^3 / (3 · period). Averaged over all
+        wakes, this is the mean square of the added delay.
         """
         late = np.array(self._lates or [0.0])
         added = 2.0 * max((late**2).mean(), (late**3).mean() / (3.0 * self._period)) ** 0.5

@@ -135,8 +135,8 @@ class Descent:
     """Detect the touch-down of a descent, and decide whether the robot may stop above the ground.
 
     After the operator's acknowledgement, the robot stops its descent and holds its position, if
-    nothing stops it from sinking and it is above the lowest z for a hold. Otherwise the robot
-    descends to touch-down, because a hold would make it scrape along the ground or an obstacle.
+    it sinks freely and is above the lowest z for a hold. Otherwise the robot descends to
+    touch-down, because a hold would make it scrape along the ground or an obstacle.
 
     Attributes:
         speed: Planned speed of the descent [m/s].

@@ -63,8 +63,8 @@ def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
     """Return the largest velocity towards a face of the fence [m/s].
 
     The result v solves reaction · v + v^2/6 = distance, where `distance` is the distance to the
-    face minus the margin [m] and `reaction` the reaction time [s]. If `distance` is negative, v is
-    negative, so that the robot returns.
+    face minus the fence's margin [m] and `reaction` the reaction time [s]. If `distance` is
+    negative, v is negative, so that the robot returns.
     """
     if distance > FAR:
         return inf
@@ -233,10 +233,10 @@ class Limits:
 
     @property
     def ramp_ns(self) -> int:
-        """Time after a HOLD in which the reference accelerates by at most BRAKE [ns].
+        """How long after a HOLD the acceleration of the reference is limited to BRAKE [ns].
 
-        In this time the robot can reach its highest speed. The limit also applies after the
-        reference has reached the command, because the first commands after a silence may be zero.
+        In this time the robot can reach its highest speed. The limit does not end earlier when the
+        reference reaches the command, because the first commands after a silence may be zero.
         Source: docs/reference/plant.md, "Leaving HOLD".
         """
         return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)
