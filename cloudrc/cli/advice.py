@@ -130,7 +130,8 @@ def _long_link(
 ) -> Iterator[str]:
     """Yield warnings about limits of guard and cloud that are too short for the link's delays.
 
-    `ages` and `echoes` are the two lists that `simulate_ages` returns [s].
+    `ages` are the ages of the odometry from which cloud computed world's present command [s];
+    `echoes` are the ages of the newest command that telemetry has confirmed [s].
     """
     age_max, cloud = experiment.guard.command_age_max_ms * 1e-3, experiment.cloud
     mean, longest = sum(ages) / len(ages), max(ages)
