@@ -52,8 +52,9 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
 def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]:
     """Simulate telemetry and commands over the experiment's link, without its blackouts.
 
-    Return two lists of ages [s] just before each datagram is sent: of the odometry from which cloud
-    computed world's present command, and of the newest command that telemetry has confirmed.
+    Return two lists of ages [s], measured just before each datagram is sent: the ages of the
+    odometry from which cloud computed world's present command, and the ages of the newest command
+    that telemetry has confirmed.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection
