@@ -52,8 +52,9 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
 def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]:
     """Simulate telemetry and commands over the experiment's link, without its blackouts.
 
-    Return two lists of ages [s] just before each datagram is sent: of the odometry from which cloud
-    computed world's present command, and of the newest command that telemetry has confirmed.
+    Return two lists of ages [s], measured just before each datagram is sent: the ages of the
+    odometry from which cloud computed world's present command, and the ages of the newest command
+    that telemetry has confirmed.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection
@@ -130,7 +131,8 @@ def _long_link(
 ) -> Iterator[str]:
     """Yield warnings about limits of guard and cloud that are too short for the link's delays.
 
-    `ages` and `echoes` are the two lists that `simulate_ages` returns [s].
+    `ages` are the ages of the odometry from which cloud computed world's present command [s];
+    `echoes` are the ages of the newest command that telemetry has confirmed [s].
     """
     age_max, cloud = experiment.guard.command_age_max_ms * 1e-3, experiment.cloud
     mean, longest = sum(ages) / len(ages), max(ages)

@@ -109,7 +109,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def load(name: str, overrides: Iterable[str], seed: int | None = None) -> ResolvedExperiment:
-    """Load an experiment by name or path with `overrides` (KEY=VALUE); check its own metrics."""
+    """Load an experiment by name or path with `overrides` (KEY=VALUE); check `report.metrics`."""
     from cloudrc import metrics
     from cloudrc.config.load import load_experiment
 

@@ -207,7 +207,9 @@ class ControlLoop:
         self._estimator.add_applied((applied_ns - echo_ns) * 1e-9)
 
     def _estimate_horizon(self, age: float) -> float:
-        """Return the horizon [s], limited to its allowed range; `age` is as in `Estimator.horizon`.
+        """Return the estimator's horizon, limited to its allowed range [s].
+
+        `age` is cloud's time minus the stamp of the newest odometry on world's clock [s].
 
         Raises:
             InvalidResultError: If the estimator's horizon is not finite.

@@ -160,7 +160,7 @@ class Source(NamedTuple):
 class Document:
     """Values of a configuration file, possibly combined from several files.
 
-    A value without an entry in `sources` comes from the same source as its parent.
+    A value without an entry in `sources` comes from the same source as the value around it.
     """
 
     tree: dict[str, Any]  # dictionaries with text keys, lists and scalars

@@ -116,7 +116,7 @@ class ResolvedCloud(Cloud):
 
 
 class ResolvedExperiment(Experiment):
-    """An experiment with all values: the mission itself, all limits, all keys of the link."""
+    """An experiment that contains its mission (not only the name), and a value for every key."""
 
     mission: Mission
     guard: ResolvedGuard

@@ -94,7 +94,7 @@ div:has(> button[style*='gray-filled']) {display: inline-block; width: 33.3%;
 
 
 class Page:
-    """The page of one flight, at `url`."""
+    """The console's web page of one flight, at `url`; this process is its server."""
 
     def __init__(self, port: int) -> None:
         """Serve a page on this machine only; port 0 means any free port.

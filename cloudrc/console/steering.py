@@ -235,5 +235,5 @@ class Steering:
 
 
 def is_drive(mission: Mapping[str, Any] | None) -> bool:
-    """Return whether the user steers the robot by keys: whether a hand-driven mission is held."""
+    """Return whether the user steers the robot by keys: the mission is hand-driven and held."""
     return mission is not None and mission["by_hand"] and mission["state"] == "held"

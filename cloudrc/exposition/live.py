@@ -50,7 +50,7 @@ ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total"
 
 
 class LinkVerdict:
-    """Newest verdict on the link's direction to this process: whether it matches its profile."""
+    """Newest verdict on whether the link's direction to this process matches its profile."""
 
     def __init__(self, direction: str) -> None:
         """Set the direction, "uplink" or "downlink"; the verdict is "open" until a check."""

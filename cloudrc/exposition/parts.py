@@ -170,7 +170,7 @@ class DelayJudge:
         self._sent: dict[int, Control] = {}
 
     def sent(self, control: Control) -> None:
-        """Store the record of a control period in which cloud sent a command, for `echoed`."""
+        """Store the record of a sent command, whose delay estimate `echoed` checks later."""
         self._sent[control.stamp_ns] = control
         if len(self._sent) > WAITING_MAX:
             del self._sent[next(iter(self._sent))]  # the oldest

@@ -132,7 +132,7 @@ class Flight:
         return self
 
     def fly_mission(self, limit: float = 120.0) -> Flight:
-        """Continue the flight until 1 s after the mission's end, at most until `limit` [s]."""
+        """Fly until the mission's end or the virtual time `limit` [s], then fly 1 s more."""
         self.fly(limit, lambda: self.teleop.service is not None and self.mission.ended)
         return self.fly(self.now + 1.0)
 

@@ -93,7 +93,7 @@ class RestartableEndpoint:
             self.at(start + n * CFS_PERIOD, lambda now_ns: self.freeze(now_ns, stall))
 
     def receive_now(self, data: bytes, now_ns: int) -> None:
-        """Pass a datagram to the process without `tamper`, which `receive_datagram` calls first."""
+        """Pass a datagram to the process unchanged; keep it while the process is frozen."""
         if self.inner is None:
             return
         if self._frozen_until_ns <= now_ns:

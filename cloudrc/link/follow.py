@@ -37,7 +37,7 @@ _NAME = re.compile(r"[a-zA-Z0-9_][-._a-zA-Z0-9]{0,252}")
 
 
 class Loaded(NamedTuple):
-    """A profile as read from its file."""
+    """One direction of a link profile, and the content of the profile's file."""
 
     direction: DirectionProfile  # profile of the direction that this process shapes, in SI units
     values: dict[str, Any]  # content of the file, without defaults, to show to users

@@ -132,7 +132,8 @@ def table(profile: DirectionProfile) -> list[int]:
 
     Returns:
         Quantiles of the delay's random part at the probabilities (n + 0.5) / 4096, in rising
-        order, shape (4096,). Their unit is jitter · `stretch(profile)` / 8192.
+        order, shape (4096,). Their unit is jitter · s / 8192, where s = `stretch(profile)` keeps
+        them within 16 bits.
     """
     if profile.distribution == "table":
         places = (2 * np.arange(ENTRIES) + 1) * len(profile.table) // (2 * ENTRIES)

@@ -27,7 +27,7 @@ GROWTH_MIN = 0.15
 
 
 class Step(NamedTuple):
-    """Response to one step of the setpoint; a time is None if the robot did not get that far."""
+    """Response to one step of the setpoint; a time is None if the robot did not rise or settle."""
 
     waypoint: int  # index of the waypoint or step
     start: float  # time of the step since the start of the mission [s]

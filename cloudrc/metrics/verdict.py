@@ -164,7 +164,7 @@ def flight_evidence(
     """Collect the evidence for the verdict from the records and from the metrics of a flight.
 
     `real_time` is True if the run had to keep real time: in all modes except virtual. `interrupted`
-    is True if the run was stopped, or if its recording has no end.
+    is True if the run was stopped, or if its recording is incomplete.
     """
     criteria, end_ns = flight.criteria, flight.end_ns
     reached, touch = numbers.get("waypoints_reached"), None
@@ -263,7 +263,7 @@ def _plugins(flight: Flight) -> Iterator[Failure]:
 
 
 def _responses(flight: Flight, settle: float) -> Iterator[Failure]:
-    """Yield a failure if a step did not settle within `settle` [m], and one for unstable steps."""
+    """Yield a failure if steps did not settle within `settle` [m]; one if the loop is unstable."""
     found, unit = steps(flight), "step" if flight.mission.steps else "waypoint"
     far = [step for step in found if step.last_error > settle]
     if far and flight.mission.steps:

@@ -80,7 +80,7 @@ def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
 
 
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
-    """Return the smallest arrival minus departure [ns], on two clocks; None if none arrived."""
+    """Return the smallest delay plus clock offset of a packet [ns]; None if no packet arrived."""
 
     def packets(table: Table) -> Iterator[tuple[tuple[int, int], int]]:
         numbers = zip(table["epoch"].tolist(), table["counter"].tolist(), strict=True)

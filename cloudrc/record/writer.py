@@ -122,8 +122,8 @@ class McapWriter:
     def write_views(self, views: Iterable[tuple[str, int, bytes]]) -> None:
         """Write the messages for viewers, each with topic and log time [ns], after all others.
 
-        They have chunks of their own; readers sort the chunks by the file's index. They are neither
-        counted nor hashed, because they repeat other messages.
+        These messages have separate chunks; readers sort the chunks by the file's index. The
+        messages are neither counted nor hashed, because they repeat other messages.
         """
         self.flush()
         for topic, log_time_ns, data in sorted(views, key=itemgetter(1)):

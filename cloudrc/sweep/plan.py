@@ -208,7 +208,7 @@ def pack(flights: Iterable[Flight]) -> bytes:
 
 
 def unpack(path: Path) -> list[Flight]:
-    """Read the flights in a file from `pack`; raise a BadInputError if the file is unusable."""
+    """Read the flights from a file made by `pack`; raise a BadInputError if it is unusable."""
     try:
         content = json.loads(gzip.decompress(path.read_bytes()))
         points = [

@@ -407,7 +407,7 @@ class ApiServer(uvicorn.Server):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of requests by outcome, and number of lost lines of the audit log, by name."""
+        """Counts by name: requests with each outcome, and lost lines of the audit log."""
         lost = 0 if self.gate.audit is None else self.gate.audit.dropped
         return {f"api_{name}": n for name, n in {**self.gate.counts, "audit_dropped": lost}.items()}
 

@@ -161,7 +161,7 @@ class Gate:
     """Check token and role of every request before the application gets the request."""
 
     def __init__(self, app: ASGIApp, tokens: Tokens | None, audit: Audit | None = None) -> None:
-        """Set the application, `app`; without `tokens`, everybody who can connect may command."""
+        """Set application and audit log; without `tokens`, all who can connect may command."""
         self._app, self.tokens, self.audit = app, tokens, audit
         self._in_flight: Counter[str] = Counter()
         self.counts: Counter[str] = Counter()  # requests by outcome; "served": answered by `app`

@@ -387,8 +387,8 @@ class Teleop:
     def _lead(self, seen: RobotStatus, now_ns: int) -> None:
         """Keep the carrot, a moving setpoint, at the robot while the guard ignores commands.
 
-        Then let the carrot move on. At the first take-off it does not wait until telemetry shows
-        that the guard obeys: this saves a round trip.
+        After that, let the carrot move on. At the first take-off, the carrot moves before telemetry
+        shows that the robot follows commands: this saves a round trip.
         """
         self._followed = self._followed or seen.guard is TRACK
         if seen.guard is not TRACK and (self._followed or seen.guard is not GROUND):

@@ -118,7 +118,7 @@ class RequestSender:
         return pending._replace(epoch=seen.epoch)
 
     def _repeat_start_if_lost(self, seen: RobotStatus, now_ns: int) -> None:
-        """Send the request START again if the robot has probably obeyed another sender's stop."""
+        """Send the request START again if another sender has probably stopped the robot."""
         ours = self._is_started and seen.mission_id == self._progress.mission_id
         if not ours or seen.guard not in (GROUND, HOLD):
             self._flies_ns = now_ns

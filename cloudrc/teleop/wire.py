@@ -1,4 +1,4 @@
-"""Define teleop's plans and messages, and encode the messages between cloud and teleop.
+"""Define what a mission flies, and the messages between cloud and teleop; encode the messages.
 
 Each datagram is a JSON list: the name of the message's type, then its fields in order.
 """

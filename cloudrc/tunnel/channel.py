@@ -12,7 +12,7 @@ USED, LATE, REPEATED = "used", "late", "repeated"
 
 
 class Channel:
-    """Classifies the datagrams of one kind and direction in one session."""
+    """Classifies datagrams of one kind and direction as used, late or repeated, in one session."""
 
     def __init__(self, newest_wins: bool) -> None:
         """Set the rule for a datagram that arrives after a newer datagram.

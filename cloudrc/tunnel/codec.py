@@ -197,7 +197,7 @@ def encode_command(command: Command) -> bytes:
 
 
 def as_planned(velocity: Vector) -> Vector:
-    """Round a velocity [m/s], shape (3,), to single precision, as the datagram of a plan does."""
+    """Round a velocity [m/s], shape (3,), to the single precision of plans in datagrams."""
     return _VELOCITY.unpack(_VELOCITY.pack(*velocity))
 
 

@@ -276,8 +276,9 @@ class WorldEndpoint(TunnelEnd):
     def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
         """Carry out an operator request; ignore repeated and old requests.
 
-        Raise the DecodeError "stale" for a START request that is too old or may have waited in the
-        socket during a stall, and "future" if its odometry is later than world's clock.
+        Raise the DecodeError "stale" for a START request if the odometry that it is based on is too
+        old, or if the request may have waited in the socket during a stall. Raise "future" if this
+        odometry is later than world's clock.
         """
         kind, guard, tick_ns = request.request, self.robot.guard, self._tick_ns
         starts = kind is Request.START

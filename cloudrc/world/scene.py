@@ -70,7 +70,8 @@ def compile_model(robot: str, scene: str, plant: Plant | None = None) -> Any:
     bodies lose their names; therefore each geom of the scene gets the name BODY/NUMBER. Raise a
     BadInputError if a file is missing, does not compile or does not fit the onboard controller.
 
-    With `plant`, the result is the true robot. The check of the files ignores `plant`.
+    After the check of the files, `plant` changes mass, inertia and thrust: the true robot may
+    differ from its file.
     """
     paths = _path("robots", robot), _path("scenes", scene)
     model = _compile_nominal(*paths)

@@ -197,7 +197,7 @@ class Simulator:
         return physics, self.data.qacc_warmstart.copy()
 
     def _feel(self, contacts: int, before: Readings) -> None:
-        """Update the tip's force and impulse after a step, and store new contacts.
+        """Update force and impulse on the arm's tip after a step, and store new contacts.
 
         `contacts` is the number of contacts in the step; `before` has the readings before the step.
         """

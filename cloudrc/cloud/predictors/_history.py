@@ -175,7 +175,7 @@ class Body(Model):
 
 
 class Replay(Predictor):
-    """A predictor that simulates the sent commands with a `Body`; subclasses define `roll`."""
+    """A predictor that simulates the sent commands with a `Body`, which a subclass chooses."""
 
     def __init__(self) -> None:
         self.reset()

@@ -43,7 +43,7 @@ class Kalman(Predictor):
         self._replay.reset()
 
     def commanded(self, command: Command) -> None:
-        """Pass the command on to the predictor that replays the commands."""
+        """Pass a sent command on to `replay`, the predictor that simulates the commands."""
         self._replay.commanded(command)
 
     def applied(self, command_stamp_ns: int, applied_ns: int) -> None:

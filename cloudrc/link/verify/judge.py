@@ -240,7 +240,7 @@ class Plan:
         return there - np.median(there) if len(there) else there
 
     def _rate(self, stream: Stream) -> float:
-        """Compute the bottleneck's rate [bit/s] from the time in which a train arrives.
+        """Compute the bottleneck's rate [bit/s] from the time that a probe train takes to arrive.
 
         Source: M. Jain, C. Dovrolis, IEEE/ACM Trans. Networking 12, 2004: packet dispersion.
         """

@@ -146,8 +146,8 @@ def _draw_floor(axes: Axes, view: _View, points: Array, height: float) -> None:
 def _instants(subject: Subject) -> list[int]:
     """Choose the rows of the true states at which to draw the robot.
 
-    They are at equal distances along the path, up to the touch of the board. A row too near to
-    another one is left out.
+    The positions in these rows are at equal distances along the path, which ends here at the first
+    touch of the board. Leave out a row whose position is too near to that of a chosen row.
     """
     truth, touch = subject.flight.truth, first_touch(subject.flight)
     stamps = truth["stamp_ns"]

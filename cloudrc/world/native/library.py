@@ -49,7 +49,7 @@ class Library(NamedTuple):
 
 
 def library() -> Library:
-    """Load the machine code; compile it if necessary. Later calls return the same result."""
+    """Load the compiled `step.c`; compile it if necessary. Later calls return the same result."""
     return Library(None, f"{SWITCH}=0") if os.environ.get(SWITCH) == "0" else _load()
 
 
