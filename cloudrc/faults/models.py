@@ -147,7 +147,7 @@ class RestartableEndpoint:
 
 
 class EndpointGroup:
-    """Several clouds that share a socket, as one `Endpoint`: each receives all datagrams."""
+    """Makes one `Endpoint` of several clouds; each cloud receives all datagrams from world."""
 
     sealed = True
 
@@ -156,7 +156,7 @@ class EndpointGroup:
         self.others: list[Record] = []  # records of all clouds but the first, oldest first
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Pass a datagram on at `now_ns` [ns]; `tamper`, if set, changes it before."""
+        """Pass a datagram to every cloud at `now_ns` [ns]."""
         for member in self.members:
             member.receive_datagram(data, now_ns)
 
@@ -183,7 +183,7 @@ class EndpointGroup:
 
 
 class _Peer(UnixPeer):
-    """Unix datagram socket of a process, connected to another process's socket."""
+    """Model of a Unix datagram socket that is connected to the socket of another process."""
 
     def __init__(self, is_open: Callable[[], bool]) -> None:
         self.other, self._is_open = self, is_open
