@@ -35,10 +35,7 @@ class Evidence(NamedTuple):
 
 
 def read_metrics(text: str) -> dict[str, float]:
-    """Parse cloudrc's metrics in Prometheus' text format; return a mapping: key -> value.
-
-    The key of `cloudrc_NAME{label="TEXT"}` is "NAME/TEXT"; without labels it is "NAME".
-    """
+    """Parse metrics in Prometheus' text format: `cloudrc_a{b="c"} 1` gives {"a/c": 1.0}."""
     found = re.findall(r"^cloudrc_(\w+)(?:\{(.*)\})? (\S+)$", text, re.MULTILINE)
     names = ["/".join((name, *re.findall(r'="([^"]*)"', labels))) for name, labels, _ in found]
     return {name: float(value) for name, (_, _, value) in zip(names, found, strict=True)}
