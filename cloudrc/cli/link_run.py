@@ -199,7 +199,7 @@ def _find_netems(host: str, second: int) -> dict[str, Any]:
 
 
 def run_tool(words: Sequence[str], environment: dict[str, str] | None = None) -> str:
-    """Run a program and return its output; if it fails, raise the error of `netem.explain`."""
+    """Run a program; return its output, or raise a MissingPrerequisiteError with the remedy."""
     from cloudrc.link.netem import explain
 
     try:
@@ -226,7 +226,7 @@ class Programs:
         self._tc: subprocess.Popen[str] | None = None
 
     def __call__(self, words: Sequence[str]) -> str:
-        """Run a command of tc or ip and return its output; raise the same errors as `run_tool`."""
+        """Run a command of tc or ip; return its output, or raise a MissingPrerequisiteError."""
         try:
             match list(words):
                 case ["tc", "qdisc", "change", *_]:

@@ -468,9 +468,9 @@ class RelayControl:
     ) -> None:
         """Publish the initial state of both directions in `folder`, which is created if missing.
 
-        `links` maps "uplink" and "downlink" to the link of this direction, `first` maps them to its
-        first profile. `asked` is called with a direction and its mean delay [s], now and after each
-        change.
+        `links` and `first` contain the link model and the first profile of each direction, by the
+        name "uplink" or "downlink". `asked` is called with this name and the requested mean delay
+        [s], now and after each change.
         """
         from cloudrc.cli.link_run import make_profile_loader
 

@@ -98,5 +98,5 @@ def fly_seeds(options: argparse.Namespace) -> int:
 
 
 def fly_one(flight: Flight) -> Row:
-    """Fly once and return the row of numbers; an exception ends the command."""
+    """Fly once; return the row of results, such as the verdict. An exception ends the command."""
     return store.make_row(flight, measure(flight.experiment))

@@ -176,10 +176,7 @@ class CloudEndpoint(TunnelEnd):
         return done and self.teleop.outcome is not None
 
     def next_deadline_ns(self) -> int:
-        """Return when cloud has to act next [ns].
-
-        If a computed command still has to leave, cloud then sends it; otherwise it computes one.
-        """
+        """Return when cloud has to send a computed command or to compute the next command [ns]."""
         return self._tick_ns if self._unsent is None else self._unsent[0]
 
     def handle_deadline(self, now_ns: int) -> None:

@@ -123,7 +123,7 @@ class FlightFeed:
             self._downlink = control.rtt - self._uplink
 
     def _take_telemetry(self, telemetry: Telemetry, now: float) -> bool:
-        """Store new telemetry; return False for a copy of the last one."""
+        """Store telemetry; return False if it has the same stamp as the last telemetry."""
         last, self.telemetry = self.telemetry, telemetry
         if last is not None and last.stamp_ns == telemetry.stamp_ns:
             return False

@@ -390,7 +390,7 @@ def _clamp(slider: Any) -> float:
 
 
 def _with_gaps(curve: Array) -> list[float | None]:
-    """Replace NaN by None, which is a gap in the chart. If all are NaN, the first becomes -1."""
+    """Replace NaN by None, a gap in the chart; if all are NaN, begin with -1 to keep the axes."""
     values = [None if value != value else value for value in curve.tolist()]
     return [-1.0, *values[1:]] if not any(value is not None for value in values) else values
 

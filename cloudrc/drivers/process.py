@@ -150,7 +150,7 @@ class Feed:
                 self._write(to_line(record))
 
     def _is_news(self, record: LinkChanged) -> bool:
-        """Return whether a record has a cause, and new conditions of its direction of the link."""
+        """Return whether a record reports changed conditions, not those at the start."""
         last, self._links[record.uplink] = self._links.get(record.uplink), record.conditions
         return last != record.conditions and bool(record.cause)
 

@@ -161,7 +161,7 @@ def _moves_robot(output: Any) -> bool:
 
 
 class LastWord:
-    """Delays the end of cloud's process in flight, to forward teleop's END request first."""
+    """Delays the end of cloud's process until teleop's END request makes the robot hold."""
 
     def __init__(
         self,

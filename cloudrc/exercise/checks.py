@@ -112,7 +112,7 @@ class Flight(NamedTuple):
     none: float  # any unit
 
     def score(self, files: Mapping[str, str]) -> tuple[float, str]:
-        """Fly with `files`, part -> path; return the earned share of points [1] and the reason."""
+        """Fly with `files` (plug-in -> path); return the earned share of points [1], and why."""
         chosen = {f"cloud.{part}": path for part, path in files.items()}
         result = fly(self.experiment, {**chosen, "link.profile": self.link})
         value = result.numbers.get(self.metric, self.none)

@@ -147,7 +147,7 @@ class RestartableEndpoint:
 
 
 class EndpointGroup:
-    """Several clouds that share a socket, as one `Endpoint`: each receives all datagrams."""
+    """Makes one `Endpoint` of several clouds; each cloud receives all datagrams from world."""
 
     sealed = True
 
@@ -183,7 +183,7 @@ class EndpointGroup:
 
 
 class _Peer(UnixPeer):
-    """Unix datagram socket of a process, connected to another process's socket."""
+    """Model of a Unix datagram socket that is connected to the socket of another process."""
 
     def __init__(self, is_open: Callable[[], bool]) -> None:
         self.other, self._is_open = self, is_open

@@ -81,7 +81,6 @@ class Event:
     way: Way = "both"
 
     def __post_init__(self) -> None:
-        """Check the kind and the value of the fault."""
         if self.kind not in KINDS:
             raise ValueError(f"no fault '{self.kind}'; there are: {', '.join(KINDS)}")
         if self.kind in SHARES and self.value > 1.0:

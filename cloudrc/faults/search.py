@@ -32,7 +32,7 @@ def fly_seed(job: Job) -> Finding:
 
 
 class Search:
-    """A search and its result so far; `next` is the next seed."""
+    """A search for faults that break an invariant, and its result; `next` is the next seed."""
 
     def __init__(self, kind: str, first: int, store: Path) -> None:
         """Prepare a search from the seed `first` on; `kind` is a key of `KINDS`.

@@ -85,7 +85,7 @@ def find_nearest_legal(
 
     The search begins at `position` (of the base, [m], world frame), moved into the guard's limits.
     It goes up to 1.5 m along x, y and z, and towards and away from the axes of the pipes.
-    Candidates are whole centimetres, so that a message shows the checked point without rounding.
+    The coordinates of the point are whole centimetres, so that a message can show them exactly.
 
     `yaw` is the heading of the level robot [rad]. If `before` [m] is given, the straight way from
     there to the point is also clear of pipes.

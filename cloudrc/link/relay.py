@@ -56,7 +56,7 @@ _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SET_TIMERSLACK = 35, 40, 29
 
 
 class ReleaseErrors(Counter[int]):
-    """Histogram of how late datagrams left the relay: bucket -> number of datagrams."""
+    """Histogram of the lateness of datagrams: bucket (a range of lateness) -> count."""
 
     def observe(self, error_ns: int) -> None:
         """Count one datagram that left `error_ns` [ns] after it was due."""
@@ -84,7 +84,7 @@ class ReleaseErrors(Counter[int]):
 
 
 def ask_for_stamps(one: socket.socket) -> None:
-    """Let the kernel, if it can, record arrival times on a socket and count dropped datagrams."""
+    """Ask the kernel for the arrival times and the number of dropped datagrams of a socket."""
     for option in (_SO_RXQ_OVFL, _SO_TIMESTAMPNS) if sys.platform == "linux" else ():
         with suppress(OSError):  # without a stamp, the time of reading counts as arrival
             one.setsockopt(socket.SOL_SOCKET, option, 1)

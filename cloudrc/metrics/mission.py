@@ -160,10 +160,7 @@ def _steady_error(flight: Flight, axis: int) -> float | None:
 
 
 def _fault_count(flight: Flight) -> float | None:
-    """Count the faults of a flight: one for each code, however often it occurred.
-
-    For a code in `FAILURES`, add the total of its counter instead.
-    """
+    """Count each fault code once, but a code in `FAILURES` as often as its counter says."""
     totals, count = dict.fromkeys(flight.recording["/fault"]["code"], 1), flight.recording["/count"]
     for name, total in zip(count["name"], count["total"], strict=True):
         if name in FAILURES:  # the largest total: a cloud that restarts counts from 0

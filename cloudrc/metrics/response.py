@@ -60,7 +60,7 @@ def steps(flight: Flight) -> tuple[Step, ...]:
 
 
 def _measure(flight: Flight, row: int, end_ns: int) -> Step | None:
-    """Measure the step at `row` of `flight.control`, until `end_ns` [ns]; None if too short."""
+    """Measure the response to the setpoint in `row`, until `end_ns` [ns]; None for a tiny step."""
     control, truth = flight.control, flight.truth
     begin_ns, setpoint = int(control["stamp_ns"][row]), control["setpoint"][row]
     rows = (truth["stamp_ns"] >= begin_ns) & (truth["stamp_ns"] < end_ns)

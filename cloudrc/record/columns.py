@@ -162,7 +162,7 @@ class RecordStore(RecordHash):
         self.update(from_cloud)
 
     def recording(self) -> Recording:
-        """Return a recording of the records so far, all on one clock."""
+        """Return a recording of the records so far; their stamps must be on one clock."""
         blocks = self.blocks()
         return Recording(lambda topic: _table(topic, blocks.get(topic.source, [])))
 

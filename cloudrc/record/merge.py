@@ -165,8 +165,8 @@ def _join(world: Contents, cloud: Contents) -> Contents:
 def cut_to_last_mission(mission: Contents) -> bool:
     """Reduce a pod's recording of several missions to the mission that was started last.
 
-    Return whether the recording contains the end of that mission. If so, remove from `mission.note`
-    the remark that the file has no end: the pod was still writing to the file during the copy.
+    Return whether the recording contains the end of that mission. If it does, nothing is missing:
+    remove from `mission.note` the remark that the file is cut short. The pod was still writing it.
     """
     began, ended, earlier = _last_mission(mission)
     until = mission.messages[-1][1] if mission.messages else 0
@@ -209,6 +209,6 @@ def _mission_events(contents: Contents) -> Iterator[tuple[int, str]]:
 
 
 def _table(contents: Contents, topic: str) -> Table:
-    """Decode one topic only: decoding all topics takes as long as reading the file."""
+    """Decode only the messages of `topic`, because decoding all topics takes long."""
     messages = [message for message in contents.messages if message[0] == topic]
     return Contents(messages).recording()[topic]

@@ -24,7 +24,7 @@ _new = tuple.__new__  # makes a named tuple in half the time of a call of its cl
 
 
 def arrival_ns(setpoint: Setpoint) -> int:
-    """Return when a moving setpoint comes to rest [ns], cloud's clock; 0 for a constant one."""
+    """Return when a setpoint comes to rest [ns], cloud's clock; 0 if it does not move."""
     if setpoint.motion is None:
         return 0
     _, _, total = _profile(setpoint)

@@ -373,9 +373,9 @@ class MissionService:
     def _start_next(self, now_ns: int, *, queued: bool = False) -> Mission | None:
         """Start the oldest mission that has not ended, unless a mission is already under way.
 
-        If an earlier teleop process has started this mission, continue it. A mission in the queue
-        starts only if `queued` is True, and after its new state is on the disk. Return the mission
-        that is under way then, or None.
+        Continue this mission if an earlier teleop process has started it. Start a queued mission
+        only if `queued` is True, and only after its new state is on the disk. Return the mission
+        that is under way after this call, or None.
         """
         waiting = self.book.open()
         if self._current is not None or not waiting:

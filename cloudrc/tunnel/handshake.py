@@ -180,9 +180,10 @@ class ClientHandshake:
         return self._hello()
 
     def answer_challenge(self, cookie: bytes) -> bytes | None:
-        """Make the body of the HELLO that answers a challenge; None for no answer.
+        """Make the body of the HELLO that answers a challenge; None to send no HELLO.
 
-        A repeated cookie gets no answer, because an old cookie must not replace the newest cookie.
+        Return None for a repeated cookie, because an old cookie must not replace the newest one.
+        Also return None after REPLIES_MAX answers since the last periodic HELLO.
         """
         if self._replies == 0 or cookie in self._cookies:
             return None

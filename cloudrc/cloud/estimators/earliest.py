@@ -15,7 +15,7 @@ from cloudrc.config.schema import Count
 
 
 class Earliest(Estimator):
-    """Adds the age of the newest odometry to the smallest delay of the last `count` commands."""
+    """Estimator: the odometry's age plus the smallest delay of the last `count` commands."""
 
     def __init__(self, count: int) -> None:
         self._offsets: deque[float] = deque(maxlen=count)

@@ -110,10 +110,10 @@ class History:
         return reversed(parts)
 
     def ahead(self, start_ns: int, end_ns: int, shift_ns: int) -> Iterator[tuple[Vector, float]]:
-        """Predict which sent commands world follows; yield velocity [m/s] and duration [s] of each.
+        """Predict which sent commands world follows from `start_ns` to `end_ns` [ns], its clock.
 
-        The interval begins at `start_ns` and ends at `end_ns` [ns], world's clock. A command begins
-        at its stamp plus `shift_ns` [ns].
+        Yield velocity [m/s] and duration [s] of each command. World begins to follow a command at
+        the command's stamp plus `shift_ns` [ns].
         """
         index = bisect_right(self.stamps, start_ns - shift_ns)
         while start_ns < end_ns:

@@ -25,7 +25,7 @@ STEPS_MAX = 200
 
 
 class FirstOrder(Body):
-    """Model per axis: the guard's acceleration limit, a lag as dead time, a lag of the velocity."""
+    """The guard's acceleration limit; then per axis a lag for the dead time, and a velocity lag."""
 
     def __init__(self, axes: Axes, acceleration_max: float) -> None:
         """Begin at rest; `acceleration_max` [m/s^2] is the guard's acceleration limit."""
@@ -60,11 +60,11 @@ class FirstOrder(Body):
 
 
 class CommandHistory(Replay):
-    """Adds the effect of the commands in the horizon to the measured position and velocity.
+    """Adds the effect of the commands during the horizon to the measured position and velocity.
 
-    The velocity loop is linear, except for the acceleration limit at its input. Therefore it is
-    enough to simulate all commands once, from rest: the difference between measured and simulated
-    velocity decays exponentially.
+    The velocity loop is linear, except for the acceleration limit at its input. Therefore the
+    difference between measured and simulated velocity decays exponentially, and one simulation of
+    all commands, from rest, is enough.
     """
 
     def __init__(self, axes: Axes, acceleration_max: float) -> None:

@@ -80,9 +80,9 @@ class Kalman(Predictor):
         return gains
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Return the filtered newest sample, moved by the commands of the next `horizon` [s].
+        """Filter the newest sample `odometry`; extrapolate the result by `horizon` [s].
 
-        With a horizon of 0 the result is the sample as measured.
+        With a horizon of 0, return `odometry` without filtering.
         """
         if self._estimate is None or self._estimate.stamp_ns != odometry.stamp_ns:
             self.observe(odometry)

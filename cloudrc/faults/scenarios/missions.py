@@ -62,7 +62,7 @@ def _invalid_values(outcome: Outcome, seed: int) -> None:
 
 
 def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
-    """Return a lie: it makes `changes` to commands from `at` [s] on, for `duration` [s]."""
+    """Return a function that applies `changes` to commands from `at` [s] on, for `duration` [s]."""
 
     def lie(command: Command, control: Control) -> Command:
         now = control.stamp_ns * 1e-9

@@ -62,8 +62,8 @@ class Flow(NamedTuple):
 class Row(NamedTuple):
     """Verdict on one quantity of one direction of a link; an unknown value is NaN.
 
-    `asked` is the requested value. A `measured` value from `low` to `high` is accepted. These four
-    values have the unit `unit` (any unit).
+    A `measured` value from `low` to `high` is accepted. `asked`, `measured`, `low` and `high` have
+    the unit `unit` (any unit).
     """
 
     name: str  # as in `Plan.quantities`, or "round_trip"
@@ -104,9 +104,9 @@ class Expected(NamedTuple):
 class Plan:
     """A measurement of one direction: the requested profile, and the datagrams to send.
 
-    A train of datagrams is sent back to back. Before each train, the same number of datagrams is
-    sent one by one. `draw` calls `pause` every few hundred microseconds, so that other threads can
-    run.
+    A train is a group of datagrams that are sent back to back to measure the rate. Before each
+    train, the same number of datagrams is sent one by one to measure all other quantities.
+    `draw` calls `pause` every few hundred microseconds, so that other threads can run.
     """
 
     profile: DirectionProfile  # requested conditions
@@ -137,7 +137,7 @@ class Plan:
 
     @cached_property
     def chance(self) -> Expected:
-        """Expected values and their random variation, computed from the simulated `links`."""
+        """Expected values, with bands for the random variation between simulated netem links."""
         return self._expect(self.links)
 
     def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:

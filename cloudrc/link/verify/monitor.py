@@ -58,7 +58,7 @@ class LinkMonitor:
     def __init__(
         self, *, uplink: bool, flow: Flow, period: float = PERIOD, computes: bool = False
     ) -> None:
-        """Monitor a received `flow`: with `uplink` telemetry in cloud, else commands in world.
+        """Monitor the received `flow`: telemetry in cloud if `uplink`, else commands in world.
 
         `period` is the time between two datagrams of the flow [s]. `computes` tells whether cloud
         simulates a computing time; delays that contain this time are not judged.
@@ -183,7 +183,7 @@ class LinkMonitor:
         return found
 
     def _rows(self) -> list[Row]:
-        """Judge all quantities; if a profile has a time line, add a row that says so."""
+        """Judge all quantities; add a row "time_line" if a profile changes over time."""
         stream, first, timed = _in_order(self._arrivals, self._period)
         judged = timed and (self._uplink or not self._computes)
         rows, skipped = list[Row](), UNJUDGED if judged else UNJUDGED | DELAYS

@@ -233,7 +233,7 @@ class NativeRobot(Robot):
         self._in_c = False  # whether C has the newest state of the controller
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
-        """Reset the robot to its spawn; see `Robot.put_on_ground`."""
+        """Reset the robot to its spawn with stopped rotors, and record the reason `cause`."""
         self._in_c = False
         super().put_on_ground(now_ns, cause)
 
