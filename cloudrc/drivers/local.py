@@ -70,7 +70,7 @@ def flights_folder() -> Path:
 
 
 class FlightFile(NamedTuple):
-    """What the flight file of a flight under way tells other commands, besides the folder."""
+    """What a flight file tells other commands about a flight, besides the run's folder."""
 
     api: str  # address of the operator's API; "" for none
     kind: str  # RUN or SESSION
@@ -106,7 +106,7 @@ def under_way() -> dict[Path, str]:
 
 
 def flight_files() -> dict[Path, FlightFile]:
-    """Return the flights of this user under way: folder of the run -> content of its file."""
+    """Return the flights of this user under way: folder of the run -> its flight file."""
     found = {}
     for path in flights_folder().glob("*.json"):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError), path.open() as file:
