@@ -221,7 +221,7 @@ class Programs:
     """
 
     def __init__(self, tables: str = "") -> None:
-        """Set the folder with the distribution tables of tc; start no process yet."""
+        """Set `tables`, the folder in which tc looks for its tables of delays."""
         self._environment = {**os.environ, "TC_LIB_DIR": tables, "LC_ALL": "C"}
         self._tc: subprocess.Popen[str] | None = None
 

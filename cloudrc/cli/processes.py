@@ -199,7 +199,7 @@ def warn_if_exposed(listen: Address) -> None:
 
 @contextmanager
 def _listening(flag: str, listen: Address) -> Iterator[None]:
-    """Warn if other machines can reach `listen`; name `flag` in the error if binding it fails."""
+    """Warn if other machines can reach `listen`; if the block cannot bind it, name `flag`."""
     warn_if_exposed(listen)
     try:
         yield
@@ -404,7 +404,7 @@ def _run_relay(options: argparse.Namespace) -> int:
         threading.Thread(target=control.follow, name="link control", daemon=True).start()
 
     def over() -> bool:
-        """Apply changes of the link and export counts, if due; return whether to stop."""
+        """Apply changes of the link; export the counts, if due; return whether to stop."""
         nonlocal count_due
         if control is not None:
             control.swap()

@@ -128,7 +128,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fly the flights of a sweep that have no row yet; return 1 unless all flights succeed."""
+    """Fly the flights of a sweep that lack a row or a recording; return the exit code."""
     from cloudrc.cli.progress import SweepView
     from cloudrc.cli.run import new_folder
     from cloudrc.sweep import store
@@ -208,7 +208,7 @@ def _rows(
 
 
 def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
-    """Fly a job's flight and return its row; if the job asks for a recording, fly again for it."""
+    """Fly a flight of a sweep and return its row; fly it again if it has to be recorded."""
     from cloudrc.sweep.flight import fly_point
     from cloudrc.sweep.store import make_row
 

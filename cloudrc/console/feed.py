@@ -66,7 +66,7 @@ class FlightFeed:
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL_MAX)  # position and clearance
 
     def take(self, records: Iterable[Record], now: float) -> None:
-        """Take the records of the newest datagrams, oldest first; `now` is their arrival [s]."""
+        """Take the records of the newest datagrams, oldest first; `now` is the arrival time [s]."""
         news = False
         for record in records:
             if isinstance(record, Arrival):

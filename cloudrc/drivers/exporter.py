@@ -158,7 +158,7 @@ class Exporter:
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Set whether teleop or the link is ready; for world and cloud, the records show this."""
+        """Set whether this teleop or link is ready; world and cloud are ready if the peer sends."""
         self._seen_at = time.monotonic()
         self._said_ready = ready
 
@@ -232,7 +232,7 @@ class Exporter:
         return generate_latest(self._registry).decode()
 
     def _page(self) -> Answer:
-        """Return the metrics as text, at most 0.25 s old; one thread at a time makes a new text."""
+        """Return the metrics as text; make a new text if the last one is 0.25 s old."""
         with self._page_lock:
             now = time.monotonic()
             if now - self._made_at >= KEPT:

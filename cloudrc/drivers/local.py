@@ -70,7 +70,7 @@ def flights_folder() -> Path:
 
 
 class FlightFile(NamedTuple):
-    """Content of the file of a flight under way, except the folder of the run."""
+    """What a flight file tells other commands about a flight, besides the run's folder."""
 
     api: str  # address of the operator's API; "" for none
     kind: str  # RUN or SESSION
@@ -106,7 +106,7 @@ def under_way() -> dict[Path, str]:
 
 
 def flight_files() -> dict[Path, FlightFile]:
-    """Return the flights of this user: folder of the run -> content of the flight file."""
+    """Return the flights of this user under way: folder of the run -> its flight file."""
     found = {}
     for path in flights_folder().glob("*.json"):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError), path.open() as file:

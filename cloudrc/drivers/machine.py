@@ -1,4 +1,4 @@
-"""Identify the machine's clock, count its cores, build Python commands, measure time limits."""
+"""The machine: its clock, its usable cores, its Python, and deadlines without suspended time."""
 
 from __future__ import annotations
 

@@ -137,9 +137,9 @@ class Feed:
         return ask
 
     def tell(self, records: Iterable[Record]) -> None:
-        """Write the records with a type in `EVENTS`, but only one record per change of the link.
+        """Write the events among the records; omit repeated records of the same link conditions.
 
-        If a supervisor reads the pipe, also write some of the records with a type in `SAMPLED`.
+        If a supervisor reads the pipe, also write some of the periodic records (`SAMPLED`).
         """
         for record in records:
             if isinstance(record, LinkChanged) and not self._is_news(record):

@@ -130,8 +130,8 @@ class RemoteTeleop:
     def handle_deadline(self, now_ns: int) -> None:
         """Receive teleop's outputs; report a fault if teleop does not answer telemetry for 1 s.
 
-        If cloud has stalled, ignore outputs that start a mission or lead to a waypoint: teleop may
-        have cancelled them, and the cancellation may be lost. Teleop repeats all valid outputs.
+        If cloud has stalled, ignore outputs that start a mission or lead to a waypoint. They may be
+        old: teleop may have cancelled them since. Teleop repeats outputs that are still valid.
         """
         if now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_NS

@@ -57,10 +57,10 @@ def _predict(build: Callable[[], Any], select: Callable[[Odometry], Any]) -> Any
 def _command(
     build: Callable[..., Any], n: int = 1, speed: float = 0.0, sign: bool = False, **gains: Any
 ) -> Any:
-    """Build a controller; return the velocity that it commands before and after a reset.
+    """Build a controller with `gains`; return its last velocity before and first after a reset.
 
-    Before the reset, the controller gets `n` updates, 2 ms apart, at `speed` [m/s]. After the reset
-    it gets one update. If `sign` is False, return the absolute values of both velocities.
+    Before the reset, the controller gets `n` updates, 2 ms apart, of a robot at `speed` [m/s]. If
+    `sign` is False, return the absolute values of both velocities.
     """
     controller, (x, y, z), seen = build(**gains), STATE.position, ZERO
     setpoint = Setpoint((2.0, -1.0, 0.2))
@@ -153,7 +153,7 @@ CHECKS: dict[str, tuple[Formula | Flight, ...]] = {
 
 
 def rows(part: str, scored: Sequence[tuple[float, str]]) -> list[dict[str, Any]]:
-    """Make a row per check from `scored`: share of the points [0, 1], text on what was seen."""
+    """Make a row per check of `part` from its score in [0, 1] and a text on the result."""
     keys = ("part", "test", "points", "max_points", "seen")
     cells = (
         (part, check.test, round(check.points * share, 1), check.points, seen)

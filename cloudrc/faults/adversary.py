@@ -67,7 +67,7 @@ class DishonestLoop(ControlLoop):
 
 
 class HostileOperator:
-    """An `Operator` that forwards teleop's setpoints, but replaces teleop's requests.
+    """An `Operator` that forwards teleop's setpoints, but sends forged requests to the robot.
 
     Until teleop's first setpoint it forwards teleop's requests, too, so that a mission begins.
     """

@@ -300,7 +300,7 @@ class RobotInvariants:
                 self._note(now_ns, "cap", f"{text}{' after a HOLD' if after else ''}")
 
     def _leave_track(self, readings: Readings, now_ns: int) -> None:
-        """Store where the guard left TRACK, and how far from there the robot may come to rest."""
+        """Store where the guard left TRACK, and the largest allowed distance from there at rest."""
         speed = max(hypot(*readings.velocity), hypot(*self._before))
         self._left, self._way = readings.position, speed * (0.2 + speed / 6.0) + REST
         if now_ns - self._touched_ns < REELS_NS:
@@ -423,7 +423,8 @@ def can_stop(speed: float, below: float, above: float) -> bool:
 def growth(before: Vector, after: Vector) -> float:
     """Return how much a velocity grows from `before` to `after` [m/s].
 
-    This is the norm of the growth in speed on each axis. A lower speed counts as no growth.
+    This is the norm of the growth per axis: the increase of the speed, or 0 if the speed falls.
+    If the direction on an axis reverses, all of the new speed is growth.
     """
     (ux, uy, uz), (vx, vy, vz) = before, after
     return sqrt(_grown(ux, vx) ** 2 + _grown(uy, vy) ** 2 + _grown(uz, vz) ** 2)

@@ -175,7 +175,7 @@ class EndpointGroup:
         return [data for member in self.members for data in member.take_datagrams()]
 
     def take_records(self) -> list[Record]:
-        """Return the new records of the first cloud; add those of the others to `others`."""
+        """Return the new records of the first cloud; add those of the other clouds to `others`."""
         first, *others = (member.take_records() for member in self.members)
         for records in others:
             self.others += records

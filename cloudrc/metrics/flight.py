@@ -189,7 +189,7 @@ SHIPPED: dict[str, Metric] = {}
 
 
 def add_metrics(group: str, *rows: tuple[str, str, str, Measure]) -> None:
-    """Add metrics of cloudrc to a group; each row has name, unit, meaning and `measure`."""
+    """Add metrics of cloudrc to a group; each row has name, unit, meaning and function."""
     SHIPPED.update({row[0]: Metric(*row, group) for row in rows})
 
 

@@ -119,9 +119,9 @@ def _impulse(flight: Flight, touch: dict[str, Array]) -> float:
 
 @_of_touch
 def _steady_force(flight: Flight, touch: dict[str, Array]) -> float | None:
-    """Average the contact force in the last PRESSING_NS of the mission [N].
+    """Average the contact force in the last 2 s of a mission that succeeded [N].
 
-    This average does not depend on the simulator's contact parameters.
+    A steady force does not depend on the simulator's contact parameters.
     """
     if flight.ending is None or flight.ending[1] != "done":
         return None

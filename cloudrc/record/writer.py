@@ -104,7 +104,7 @@ class McapWriter:
             self._open_records += 1
 
     def write_row(self, row: Row, log_time_ns: int) -> None:
-        """Write one row; `log_time_ns` [ns] is as for `write_message`."""
+        """Write one row at `log_time_ns` [ns], or at the previous log time if that is later."""
         topic, stamp_ns, values = row
         self.write_message(topic, log_time_ns, encode(TOPICS[topic], stamp_ns, values))
 

@@ -219,7 +219,7 @@ async def _body(request: Request) -> bytes:
 
 
 def _takes(model: type[Section]) -> dict[str, Any]:
-    """Describe a request body that `_body` reads, for the OpenAPI document."""
+    """Return the OpenAPI description of a request body: the schema and an example of `model`."""
     schema = model.model_json_schema()
     if parts := schema.pop("$defs", None):
         schema["properties"]["waypoints"]["items"] = parts["Waypoint"]

@@ -262,7 +262,7 @@ class MissionStore:
         return mission
 
     def note(self, mission: Mission, event: str, text: str, **changed: Any) -> None:
-        """Apply an event by `Mission.apply` and store it; if the disk fails, `catch_up` does so."""
+        """Apply an event to a mission and write it to disk; `catch_up` repeats a failed write."""
         if event == "reached" and changed["waypoint"] < len(mission.reached):
             return  # an earlier teleop has stored it
         self._events += 1

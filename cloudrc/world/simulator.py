@@ -172,7 +172,7 @@ class Simulator:
         return self._sensors[self._tip_sensor]
 
     def take_tip_force(self) -> tuple[float, float]:
-        """Return and reset `tip_force_peak` [N] and `tip_impulse` [N s] since the last call."""
+        """Return the tip's peak force [N] and impulse [N s] since the last call; reset both."""
         found = self.tip_force_peak, self.tip_impulse
         self.tip_force_peak = self.tip_impulse = 0.0
         return found

@@ -29,7 +29,7 @@ class Split(Estimator):
         self._applied_minus_stamp: float | None = None
 
     def add_applied(self, applied_minus_stamp: float) -> None:
-        """Average `applied_minus_stamp` [s]: downlink delay minus clock offset cloud - world."""
+        """Average `applied_minus_stamp` [s]: the downlink delay minus the clock offset."""
         if self._applied_minus_stamp is None:
             self._applied_minus_stamp = applied_minus_stamp
         else:

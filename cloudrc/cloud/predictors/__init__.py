@@ -19,7 +19,7 @@ from cloudrc.messages import Command, Odometry, Quaternion, Vector
 
 
 class Model:
-    """A simulated robot that follows velocity commands; the control loop plans with it."""
+    """A simulated robot; the control loop uses it to plan the commands of the near future."""
 
     def step(self, velocity: Vector, dt: float) -> Odometry:
         """Advance the state by `dt` [s], > 0, under a velocity command [m/s]; return the state."""

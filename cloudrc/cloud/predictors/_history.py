@@ -77,7 +77,7 @@ class History:
         self._applied.append((began_ns, stamp_ns))
 
     def is_silent(self, now_ns: int) -> bool:
-        """Whether the newest echoed command began more than FOLLOWED_NS before `now_ns` [ns]."""
+        """Whether world has begun no command for FOLLOWED_NS at `now_ns` [ns], world's clock."""
         return bool(self._applied) and now_ns - self._applied[-1][0] > FOLLOWED_NS
 
     def shift_ns(self, odometry: Odometry, horizon: float) -> int:
@@ -95,8 +95,8 @@ class History:
     def past(self, start_ns: int, end_ns: int) -> Iterator[tuple[Vector, float]]:
         """Yield velocity [m/s] and duration [s] of each command that world has followed.
 
-        The echoes show when each command began. The interval from `start_ns` to `end_ns` is on
-        world's clock [ns].
+        The commands are those from `start_ns` to `end_ns` [ns], world's clock. The echoes show when
+        each of them began.
         """
         parts = list[tuple[Vector, float]]()
         for began_ns, stamp_ns in reversed(self._applied):
@@ -125,9 +125,9 @@ class History:
     def followed(self, count: int, start_ns: int, end_ns: int) -> list[tuple[Vector, float]]:
         """List the velocities [m/s] of one command and the duration of each [s].
 
-        A command with a plan has one velocity per step of the plan. `count` is the number of the
-        command in `commands`: 1 is the first, 0 means zero velocity. World follows the
-        command from `start_ns` to `end_ns` [ns], world's clock.
+        World follows the command from `start_ns` to `end_ns` [ns], world's clock. A command with a
+        plan has one velocity per step of the plan. `count` = n selects the n-th of `commands`;
+        0 stands for zero velocity, before the first command.
         """
         command = self.commands[count - 1] if count else NO_COMMAND
         if not command.plan:
@@ -212,7 +212,7 @@ class Replay(Predictor):
         return self.roll(self.newest, (stamp_ns - self.newest.stamp_ns) * 1e-9)
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Predict the odometry `horizon` [s] after the newest sample from the sent commands."""
+        """Predict, by the sent commands, the odometry `horizon` [s] after the sample `odometry`."""
         self._last = self.roll(odometry, horizon)
         return self._last.odometry() if horizon else odometry
 

@@ -66,7 +66,7 @@ def _silence(outcome: Outcome, seed: int) -> None:
     expects="HOLD; LAND after 60 s at 0.5 m/s; rotors stop after touch-down; stays in LAND",
 )
 def _long_silence(outcome: Outcome, seed: int) -> None:
-    """Interrupt the link for 75 s, once above the free floor and once among the pipes."""
+    """Interrupt the link for 75 s in two flights: above the free floor, and among the pipes."""
     flight = _landed(outcome, seed, measures.instant(seed, 1.6, 2.6), "over the floor")
     first, last = (flight.trajectory()[n].odometry.position for n in (0, -1))
     text = "over the floor: base above where it took off"

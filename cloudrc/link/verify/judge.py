@@ -128,7 +128,7 @@ class Plan:
 
     @cached_property
     def links(self) -> list[Stream]:
-        """One stream per simulated netem link (200 links); short if the conditions are constant."""
+        """Simulated streams through 200 netem links; constant conditions need fewer datagrams."""
         few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
         sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
         seeds = range(-RUNS, 0)  # the seed of an experiment is not negative

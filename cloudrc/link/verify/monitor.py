@@ -87,7 +87,7 @@ class LinkMonitor:
         threading.Thread(target=self._run, args=(path, load), name="link", daemon=True).start()
 
     def follow(self, asked: Asked | None) -> None:
-        """Replace the requested profiles. None means that they are unknown: judge nothing."""
+        """Set the profiles to judge the link by; None: they are unknown, so judge nothing."""
         if asked != self._asked:
             self._asked, self._fresh = asked, True
             sent = np.arange(float(RUN_LENGTH)) * self._period

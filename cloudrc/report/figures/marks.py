@@ -28,7 +28,7 @@ HELD = " Red: the guard was in HOLD."
 
 
 def delays_of(direction: Direction) -> Timeline | None:
-    """Return the link conditions of a direction over time; None if its file is unreadable."""
+    """Return a direction's link conditions over time; None if its trace or table is unreadable."""
     try:
         return Timeline(link_profile(direction))
     except BadInputError:

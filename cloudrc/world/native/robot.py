@@ -117,9 +117,10 @@ def make_flight(simulator: Simulator, controller: LowLevel, limits: Limits) -> F
 def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
     """Return a box with rounded edges around each geom of the scene, and the robot's radius [m].
 
-    Each row of the array is a box: centre (3,) [m], axes (9,), half sizes (3,) [m], radius of the
-    edges [m]. A ball with the robot's radius around the base's origin contains the robot. If the
-    model has other forces than those of contacts, such as springs, the radius is infinite.
+    While a ball with this radius around the base's origin touches no box, C omits the search for
+    contacts. Each row of the array is a box: centre (3,) [m], axes (9,), half sizes (3,) [m],
+    radius of the edges [m]. If the model has other forces, such as springs, the robot's radius is
+    infinite, so that C omits nothing.
     """
     option, rows, radius = model.opt, [], 0.0
     other = option.density, option.viscosity, model.nflex, model.npair, model.neq, model.ntendon
@@ -223,7 +224,6 @@ class NativeRobot(Robot):
     def __init__(
         self, simulator: Simulator, low_level: LowLevel, guard: Guard, limits: Limits
     ) -> None:
-        """Connect the parts; `limits` are those of the guard."""
         super().__init__(simulator, low_level, guard)
         self._flight = make_flight(simulator, low_level, limits)
         self._address = ctypes.addressof(self._flight)
@@ -238,9 +238,9 @@ class NativeRobot(Robot):
         super().put_on_ground(now_ns, cause)
 
     def run(self, tick_ns: int, until_ns: int) -> int:
-        """Run steps like `Robot.run`: in C up to the first step that only Python can run.
+        """Run steps like `Robot.run`: in C while the guard need not limit a fresh command.
 
-        Python then runs this step and all later ones. The class describes the steps that C runs.
+        Python runs the first step that C cannot run, and all steps after it.
         """
         simulator, guard = self.simulator, self.guard
         in_c = not self.observers and simulator.tape is None
