@@ -341,7 +341,7 @@ def _list(topics: list[str]) -> str:
 
 @dataclass(slots=True)
 class Recovery:
-    """The result of `recover`."""
+    """What `recover` has saved of a damaged recording, and what is lost."""
 
     complete: bool  # whether nothing is missing or doubtful
     share: float  # share of the messages that were kept, in [0, 1]; if unknown, of the bytes

@@ -59,10 +59,10 @@ class RequestSender:
         return seen.guard is GROUND or (seen.epoch, seen.mission) == self._ended
 
     def ask(self, request: Request, start: Start = Start.SPAWN, *, after: bool = False) -> None:
-        """Begin to repeat a request; it replaces the pending request.
+        """Repeat this request, not the pending one, until the robot has carried it out.
 
-        If `after` is True, the new request waits instead until the robot has carried out the
-        pending request. `start` is the place where a mission starts; only a START needs it.
+        If `after` is True, wait until the robot has carried out the pending request. `start` is the
+        place where a mission starts; only a START needs it.
         """
         asked = self._progress._replace(request=request, start=start)
         if self._pending is None or not after:
