@@ -233,7 +233,6 @@ class _File:
         return is_known(ros_type, schema.data.decode("utf-8", "replace"))
 
     def _sort(self) -> None:
-        """Sort the messages by log time and sequence number."""
         messages = self.contents.messages
         if late := sum(after[1] < before[1] for before, after in pairwise(messages)):
             keys = zip((message[1] for message in messages), self._sequences, strict=True)
