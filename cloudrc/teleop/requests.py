@@ -59,9 +59,9 @@ class RequestSender:
         return seen.guard is GROUND or (seen.epoch, seen.mission) == self._ended
 
     def ask(self, request: Request, start: Start = Start.SPAWN, *, after: bool = False) -> None:
-        """Repeat this request, not the pending one, until the robot has carried it out.
+        """Begin to repeat a request until the robot carries it out; drop the pending request.
 
-        If `after` is True, wait until the robot has carried out the pending request. `start` is the
+        If `after` is True, the pending request is not dropped, but finished first. `start` is the
         place where a mission starts; only a START needs it.
         """
         asked = self._progress._replace(request=request, start=start)
