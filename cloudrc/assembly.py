@@ -223,7 +223,7 @@ def mission_plan(
 def with_order(
     experiment: ResolvedExperiment, order: Order, description: str
 ) -> ResolvedExperiment:
-    """Return the experiment with an operator's order as its mission: the reverse of `mission_plan`.
+    """Return the experiment with an operator's order as its mission, for report and repetition.
 
     If the order is a drive by hand, the mission reads its setpoints from the file `DRIVE_FILE`.
     """

@@ -493,7 +493,7 @@ class RelayControl:
                 self._applied_ns[way], self._applied[way] = time.monotonic_ns(), loaded
 
     def follow(self) -> None:
-        """Call `look` periodically, in a thread that never ends."""
+        """Call `look` periodically; never return, so run this method in a thread of its own."""
         while True:
             self.look()
             time.sleep(PROFILE_PERIOD)

@@ -135,7 +135,7 @@ class SweepView:
             self._status.start()
 
     def see(self, row: Row) -> None:
-        """Count a finished flight; print why it failed, or its note, once for each verdict."""
+        """Count a finished flight; print its failure or note, once for each kind of verdict."""
         self._done += 1
         self._failed += row["verdict"] != "success"
         if row["text"] and row["verdict"] not in self._told:

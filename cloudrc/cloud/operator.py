@@ -75,7 +75,7 @@ def make_robot_status(
 
 
 class EmergencyStopRepeater:
-    """Give an emergency stop a number; repeat it until telemetry shows that the robot has obeyed.
+    """Repeats an emergency stop, with a number, until telemetry shows that the robot has obeyed.
 
     Teleop may request the stop any number of times. The stop waits while there is no session.
 

@@ -1,6 +1,6 @@
 """Serve the console's page: all browsers show the flight, one browser can control it.
 
-viser draws and serves the page. The keyboard API of viser does not report the release of a key.
+viser draws and serves the page. It reports the release of a button, but not the release of a key.
 Therefore, while the user holds a key, a script on the page holds the button of the same direction.
 """
 

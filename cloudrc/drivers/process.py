@@ -123,7 +123,8 @@ class Feed:
     def alive_while(self, stop: Callable[[], bool]) -> Callable[[], bool]:
         """Return a function that returns `stop()` and, every `ALIVE_PERIOD`, prints `READY`.
 
-        The line, printed only for a supervisor, shows that this process is alive.
+        `READY` shows a supervisor that this process is alive; without a supervisor, the function
+        does not print.
         """
         due = 0.0
 
@@ -218,7 +219,7 @@ class LinkNotes:
     """
 
     def __init__(self, path: Path, *, uplink: bool) -> None:
-        """Follow the state file at `path`, which may not exist yet; `uplink` is this direction."""
+        """Follow the state file at `path`, which may not exist yet; `uplink` is True in world."""
         self._path, self._uplink = path, uplink
         self._seen: tuple[int, int, int] | None = None
         self._since_ns: int | None = None

@@ -75,7 +75,10 @@ class UnixPeer:
             raise BadInputError(f"--socket: cannot make {own}: {error.strerror}") from error
 
     def receive(self) -> list[Any]:
-        """Return the messages that have arrived; an empty datagram gives None in the list."""
+        """Return the messages that have arrived.
+
+        None in the list stands for an empty datagram, a sign of life of the other process.
+        """
         messages: list[Any] = []
         with suppress(BlockingIOError):
             while len(messages) < DRAIN_MAX:

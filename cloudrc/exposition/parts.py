@@ -156,9 +156,9 @@ class PredictionJudge:
 class DelayJudge:
     """Compares delay estimates with true delays.
 
-    The delay is the time from the stamp of the odometry from which cloud computed a command until
-    world applies this command. Telemetry contains an echo of the newest command that world has
-    applied: the stamp of the command on cloud's clock, and the time since world applied it.
+    Cloud computes each command from an odometry sample. The delay is the time from the stamp of
+    this sample until world applies the command. Telemetry contains an echo of the newest command
+    that world has applied: the command's stamp on cloud's clock, and the time since then.
     """
 
     def __init__(self) -> None:
@@ -179,7 +179,7 @@ class DelayJudge:
         """Compute how wrong the estimated delay was for a command whose echo has arrived.
 
         The echo arrived at `arrival_ns` [ns], cloud's clock. `control` is the record of the first
-        control period after this arrival.
+        control period after this arrival; it contains the delays that the echo shows.
         """
         sent = self._sent.get(arrival_ns - round(control.loop_delay * 1e9))
         if sent is not None:

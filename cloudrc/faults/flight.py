@@ -46,15 +46,19 @@ def conditions(**changes: object) -> Shape:
 
 
 def silent(start: float, duration: float, **changes: object) -> Shape:
-    """Return `conditions` with a blackout from `start` [s] for `duration` [s] and the `changes`."""
+    """Return a function that makes a direction silent from `start` [s] for `duration` [s].
+
+    The function also replaces other fields of the direction's profile by `changes`.
+    """
     return conditions(blackouts=(Blackout(start, duration),), **changes)
 
 
 class Flight:
     """One flight of world, cloud, teleop and link.
 
-    `rings` contains the keys of the running processes, `secrets` the contents of their key files.
-    Every 100 ms, each of `listeners` is called with world's new records and the virtual time [ns].
+    `rings` maps "world" and "cloud" to the keys that the running process uses, `secrets` to the
+    keys in its key file. Every 100 ms, each of `listeners` is called with world's new records and
+    the virtual time [ns].
     """
 
     def __init__(
@@ -73,10 +77,7 @@ class Flight:
         words: Words | None = None,  # makes requests in place of the operator
         second: float | None = None,  # when a second cloud connects [s]
     ) -> None:
-        """Prepare a flight; the comments describe the arguments.
-
-        If `second` [s] is given, a second cloud connects at this time.
-        """
+        """Prepare a flight; the comments describe the arguments. `second` is a time [s]."""
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         self._honest, self._keep = honest, keep
         self._life, self._second, self._lies, self._words = life, second, lies, words
@@ -172,7 +173,7 @@ class Flight:
     def guard_now(self) -> tuple[GuardState, str]:
         """Return the guard's present state and its cause; GROUND while world is not running.
 
-        The records do not always show it: a restarted world begins in GROUND without a record.
+        The records are not enough: a restarted world begins in GROUND, and makes no record of it.
         """
         if self.world.inner is None:
             return GuardState.GROUND, "the world is down"

@@ -103,7 +103,10 @@ def events_of_missions(flight: Flight, name: str) -> list[dict[str, Any]]:
 
 
 def calm_after(flight: Flight, start: float, end: float) -> float:
-    """Return the time [s] from `start` to the last motion before `end`, both [s]; 0 if none."""
+    """Return the time [s] from `start` [s] to the end of the robot's last motion before `end` [s].
+
+    Return 0 if the robot did not move.
+    """
     path = [(r.stamp_ns * 1e-9, hypot(*r.odometry.velocity)) for r in flight.trajectory()]
     fast = [time for time, speed in path if start <= time < end and speed >= STANDS]
     return fast[-1] + SAMPLE - start if fast else 0.0
@@ -139,7 +142,7 @@ def done(outcome: Outcome, flight: Flight) -> None:
 
 
 def fly_safely(outcome: Outcome, flight: Flight, limit: float = 120.0) -> Flight:
-    """Fly the mission, at most until `limit` [s]; then check that it was `safe` and `done`."""
+    """Fly the mission, at most until `limit` [s]; then apply the checks `safe` and `done`."""
     flight.fly_mission(limit)
     safe(outcome, flight)
     done(outcome, flight)

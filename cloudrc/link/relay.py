@@ -351,7 +351,7 @@ class RelayShaper(Relay):
         self._lane.direction.replace_profile(profile, restart=restart)
 
     def released(self) -> dict[str, int]:
-        """Return how late datagrams of this direction left; see `Lane.released`."""
+        """Return statistics of how late datagrams left: the result of `Lane.released`."""
         return self._lane.released()
 
     def close(self) -> None:

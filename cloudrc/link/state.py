@@ -76,14 +76,17 @@ class StateFile:
     """
 
     def __init__(self, path: Path, mode: str, direction: str) -> None:
-        """Set the path of the file, and `mode` and `direction` as in `LinkState`."""
+        """Set the file, the requested shaper `mode`, and `direction`, "uplink" or "downlink"."""
         self.path, self._mode, self._direction = path, mode, direction
         self.state: LinkState | None = None
 
     def next(
         self, loaded: Loaded, shaper: str, reason: str, since_ns: int, origin_ns: int | None
     ) -> LinkState:
-        """Return the state after a change of profile or shaper; arguments as in `LinkState`."""
+        """Return the state after a change of profile or shaper; `loaded` is the present profile.
+
+        The other arguments are the fields of `LinkState` with the same names.
+        """
         return LinkState(
             shaper=shaper,
             reason=reason,

@@ -79,7 +79,10 @@ class Verdict:
 
 
 class Moment(NamedTuple):
-    """`time` since the mission's start [s], and `place`, the true position of the base [m]."""
+    """An instant of a flight; unknown values are None.
+
+    `time` is the time since the mission's start [s], `place` the true position of the base [m].
+    """
 
     time: float | None = None
     place: Vector | None = None

@@ -233,7 +233,6 @@ class _File:
         return is_known(ros_type, schema.data.decode("utf-8", "replace"))
 
     def _sort(self) -> None:
-        """Sort the messages by log time and sequence number."""
         messages = self.contents.messages
         if late := sum(after[1] < before[1] for before, after in pairwise(messages)):
             keys = zip((message[1] for message in messages), self._sequences, strict=True)
@@ -341,7 +340,7 @@ def _list(topics: list[str]) -> str:
 
 @dataclass(slots=True)
 class Recovery:
-    """The result of `recover`."""
+    """What `recover` has saved of a damaged recording, and what is lost."""
 
     complete: bool  # whether nothing is missing or doubtful
     share: float  # share of the messages that were kept, in [0, 1]; if unknown, of the bytes

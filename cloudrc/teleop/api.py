@@ -119,7 +119,7 @@ class Bridge:
         """Queue a call for teleop's loop, and return its result. A stop also calls `alarm` at once.
 
         Raise an UnavailableError if the bridge is closed, or if the loop does not answer within
-        `ANSWER_LIMIT`. In the second case an urgent call stays queued; any other call is withdrawn.
+        `ANSWER_LIMIT`. A stop or hold without an answer stays queued; any other call is withdrawn.
         """
         try:  # queue the stop first: later, telemetry may show it already
             asked = asyncio.wrap_future(self.submit(call, urgent))

@@ -82,7 +82,8 @@ class Tokens:
     def caller(self, token: str) -> Caller | None:
         """Return the caller with this token; None if the token is not valid.
 
-        A change of a file takes effect at once. While a file has no valid token, no token is valid.
+        A change of a file takes effect at once. While one of the two files has no valid token, the
+        token of the other file is not valid either.
         """
         try:
             return self._read().get(hashlib.sha256(token.encode()).digest())
@@ -110,7 +111,10 @@ def _read_token(path: Path) -> str:
 
 
 class Audit(RotatingFileHandler):
-    """Log commands as lines of JSON, in a separate thread. Only the owner can read the files."""
+    """Log file of the commands to the API, as lines of JSON that a separate thread writes.
+
+    Only the owner can read the file.
+    """
 
     def __init__(self, path: Path, complain: Callable[[str], None]) -> None:
         """Start the thread that writes the log to the file `path`.

@@ -86,7 +86,10 @@ def steer(setpoint: Setpoint, velocity: Vector, now_ns: int) -> Setpoint:
 
 
 def _speed_within(distance: float) -> float:
-    """Return the speed [m/s] from which a setpoint stops `distance` [m] after its last request."""
+    """Return the largest speed [m/s] from which a setpoint stops within `distance` [m].
+
+    The setpoint keeps this speed for HEARTBEAT_NS after the operator's last request, then brakes.
+    """
     wait = HEARTBEAT_NS * 1e-9
     return ACCELERATION * (sqrt(wait * wait + 2.0 * max(distance, 0.0) / ACCELERATION) - wait)
 
@@ -107,9 +110,10 @@ def _driven(setpoint: Setpoint, drive: Drive, now_ns: int) -> Setpoint:
 def _change(
     position: Vector, before: Vector, after: Vector, acceleration: float, time: float
 ) -> tuple[Vector, Vector]:
-    """Return position [m] and velocity [m/s], `time` [s] after the velocity left `before`.
+    """Return position [m] and velocity [m/s], `time` [s] after a change of velocity has begun.
 
-    It changes at a constant acceleration [m/s^2] to `after`, and then stays constant.
+    The velocity changes from `before` to `after` at a constant acceleration [m/s^2]; then it stays
+    constant. `position` is the position at the beginning of the change [m].
     """
     ramp = dist(before, after) / acceleration
     share = min(time / ramp, 1.0) if ramp else 1.0

@@ -504,9 +504,9 @@ class Teleop:
             self._select(self._setpoint)
 
     def _select_leg(self, leg: int, begin_ns: int, start: Vector | None = None) -> None:
-        """Make waypoint `leg` the setpoint; if it has a speed, move a carrot, a setpoint, to it.
+        """Make waypoint `leg` the setpoint, or move the setpoint to it if the leg has a speed.
 
-        The carrot starts at the time `begin_ns` [ns], from the point `start` [m] or, by default,
+        The motion begins at the time `begin_ns` [ns], from the point `start` [m] or, by default,
         from the robot.
         """
         to, motion = self._plan.legs[leg], None

@@ -59,10 +59,10 @@ class RequestSender:
         return seen.guard is GROUND or (seen.epoch, seen.mission) == self._ended
 
     def ask(self, request: Request, start: Start = Start.SPAWN, *, after: bool = False) -> None:
-        """Begin to repeat a request; it replaces the pending request.
+        """Begin to repeat a request until the robot carries it out; drop the pending request.
 
-        If `after` is True, the new request waits instead until the robot has carried out the
-        pending request. `start` is the place where a mission starts; only a START needs it.
+        If `after` is True, the pending request is not dropped, but finished first. `start` is the
+        place where a mission starts; only a START needs it.
         """
         asked = self._progress._replace(request=request, start=start)
         if self._pending is None or not after:

@@ -138,14 +138,15 @@ class LowLevel:
 def attitude(force: Vector, readings: Readings) -> Effort:
     """Return the thrust and torque that turn the thrust axis towards `force` and the nose to +x.
 
-    `force` is F [N], world frame, shape (3,); R is the body's orientation and w its rate.
+    `force` is F [N], world frame, shape (3,); R is the body's orientation and w its rate. R_d has
+    the columns x_d, y_d, z_d; k_R and k_w are gains.
         z_d = F/|F|, y_d = z_d x (1, 0, 0) normalised, x_d = y_d x z_d; Q = R_d' R;
         e_R = 1/2 (Q21 - Q12, Q02 - Q20, Q10 - Q01); torque = -(k_R · e_R + k_w · w);
         thrust = F · (R z).
     The code works in the body frame, where the wanted axes are the rows of Q.
-    Deviation: a collision may turn the robot beyond NOSE_COSINE_MIN or YAW_SINE_MAX (a yaw error
-    above 17 degrees). Then the code corrects the tilt about the body's present axes. The correction
-    by e_R would be off by half the yaw error, and would have the wrong sign beyond 90 degrees.
+    Deviation: after a collision, the roll error may be above 60 degrees, or the yaw error above 17
+    degrees. Then the code corrects the tilt about the body's present axes. The correction by e_R
+    would be off by half the yaw error, and would have the wrong sign beyond 90 degrees.
     """
     fx, fy, fz = force
     _, _, _, (p, q, r), (xx, xy, xz, yx, yy, yz, zx, zy, zz) = readings

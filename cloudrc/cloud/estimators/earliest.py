@@ -25,9 +25,9 @@ class Earliest(Estimator):
         self._offsets.append(applied_minus_stamp)
 
     def horizon(self, age: float) -> float:
-        """Return `age` plus the smallest stored value [s]; 0 until `add_applied` is called.
+        """Return the horizon [s]: `age` plus the smallest stored delay; 0 before the first echo.
 
-        Both terms contain the offset between the clocks, with opposite signs, so that it cancels.
+        `age` and the delay contain the clock offset with opposite signs; the sum is free of it.
         """
         return max(0.0, age + min(self._offsets)) if self._offsets else 0.0
 

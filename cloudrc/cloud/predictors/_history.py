@@ -42,7 +42,10 @@ class History:
         self._shift_ns = 0.0
 
     def add(self, command: Command) -> bool:
-        """Store a sent command and return True; ignore it and return False if it is not newer."""
+        """Store a sent command and return True.
+
+        If the command is not newer than the last stored command, ignore it and return False.
+        """
         if self.stamps and command.stamp_ns <= self.stamps[-1]:
             return False
         self.stamps.append(command.stamp_ns)
@@ -191,7 +194,10 @@ class Replay(Predictor):
         self.history.add(command)
 
     def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
-        """Store the time from which the robot follows the command."""
+        """Store the time `applied_ns` from which the robot follows the command with this stamp.
+
+        The time is on world's clock [ns], `command_stamp_ns` is on cloud's clock [ns].
+        """
         self.history.note_applied(command_stamp_ns, applied_ns)
 
     def observe(self, odometry: Odometry) -> None:

@@ -83,7 +83,10 @@ class Expected(NamedTuple):
     known: bool  # whether the random numbers are known, so that a band has no width
 
     def hidden(self, name: str) -> float:
-        """Return half the width of the band of the quantity `name`, divided by its tolerance."""
+        """Return the half width of the band of the quantity `name`, divided by its tolerance.
+
+        If the result is above CHANCE_MAX, the band is too wide for the verdict "ok".
+        """
         mean, low, high = self.bands[name]
         return 0.5 * (high - low) / tolerance(name, mean)
 
@@ -143,9 +146,9 @@ class Plan:
     def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:
         """Return the values that a correct link should give for the datagrams of a measured stream.
 
-        The values are exact if the stream shows the random numbers that a relay would draw.
-        Otherwise they are bands, from simulations of the link with different seeds. `first` is the
-        counter of the first datagram.
+        The values are exact if the delays or losses match those that a relay would compute for the
+        session `epoch`. Otherwise they are bands, from simulations of the link with different
+        seeds. `first` is the counter of the first datagram.
         """
         drawn = self.draw(measured.sent, epoch, first)
         if self._fits(self._singles(measured), self._singles(drawn)):

@@ -197,7 +197,7 @@ class TakeOff:
 
     @property
     def condition(self) -> Cause:
-        """Cause to record when the operator acknowledges LAND or ESTOP, and GROUND begins."""
+        """Cause of the change to GROUND, when the operator acknowledges a landing or a stop."""
         return Cause.ACKNOWLEDGED if self.allowed else Cause.STILL_FIRST
 
     def forget(self, *, stopped: bool = False) -> None:
@@ -213,8 +213,8 @@ class TakeOff:
     def look(self, readings: Readings, flies: bool) -> None:
         """Process the sensor readings of a physics step.
 
-        If `flies` is True, the robot flies: update `over`. Otherwise update the robot's height on
-        the ground and its time at rest.
+        If `flies` is True, find out whether the robot has left the ground, and set `over`.
+        Otherwise update the robot's height on the ground and its time at rest.
         """
         height = readings.position[2]
         if flies:

@@ -171,8 +171,9 @@ class Guard:
     def accept_command(self, command: Command, now_ns: int) -> str | None:
         """Accept a command at `now_ns` [ns] and return None, or return the reason to reject it.
 
-        The reason is "range" for a number that is too large or NaN and for an impossible plan,
-        "stale" for a basis that is too old, and "future" for a basis later than `now_ns`.
+        The reason is "range" for a number that is too large or NaN and for an impossible plan.
+        It is "stale" if the odometry from which cloud computed the command is too old, and "future"
+        if this odometry is later than `now_ns`.
         """
         velocity, yaw_rate = command.velocity, command.yaw_rate
         x, y, z = velocity
@@ -241,8 +242,8 @@ class Guard:
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
         """Return whether a command at `now_ns` may begin TRACK; it is fresh to `fresh_until_ns`.
 
-        Take-off must be allowed. At least SETTLE_NS must lie between the start of the last TRACK
-        and `now_ns`, and between the start of the last HOLD and `fresh_until_ns`.
+        Take-off must be allowed. At least SETTLE_NS must lie between the starts of two TRACKs, and
+        of two HOLDs. Without a newer command, the next HOLD starts at `fresh_until_ns`.
         """
         apart_ns = min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns)
         return self._take_off.allowed and apart_ns >= SETTLE_NS

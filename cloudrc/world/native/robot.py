@@ -271,7 +271,7 @@ class NativeRobot(Robot):
         return super().run(tick_ns, until_ns)
 
     def _give(self, reference: Vector, wanted: Vector, track_ns: int) -> None:
-        """Copy the state and these values of `Guard.plain_track` to the C structure `Flight`."""
+        """Copy the robot's state, and the values from `Guard.plain_track`, to the C structure."""
         simulator = self.simulator
         tip = simulator.tip_force_peak, simulator.tip_impulse
         counts = simulator.contacts, simulator.steps
