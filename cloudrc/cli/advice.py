@@ -64,13 +64,11 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
     plan = plan_length(experiment.cloud.plan_s)
     newest_wins = experiment.tunnel.order == "newest" or plan > 0
     sizes = SIZES[Kind.TELEMETRY], COMMAND_SIZES[plan]
-    profiles = [
-        link_profile(way.model_copy(update={"blackouts": ()}))
-        for way in (experiment.uplink, experiment.downlink)
-    ]
     links = [
-        LinkDirection(profile, experiment.seed, uplink=uplink)
-        for profile, uplink in zip(profiles, (True, False), strict=True)
+        LinkDirection(
+            link_profile(way.model_copy(update={"blackouts": ()})), experiment.seed, uplink
+        )
+        for way, uplink in ((experiment.uplink, True), (experiment.downlink, False))
     ]
     # Per direction: the newest arrived datagram: its stamp, and the stamp that it confirms [ns].
     arrived: list[tuple[int, int] | None] = [None, None]
