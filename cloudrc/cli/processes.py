@@ -199,7 +199,7 @@ def warn_if_exposed(listen: Address) -> None:
 
 @contextmanager
 def _listening(flag: str, listen: Address) -> Iterator[None]:
-    """Warn if other machines can reach `listen`; if the block cannot bind it, name `flag`."""
+    """Warn if other machines can reach `listen`; name `flag` if the block raises an OSError."""
     warn_if_exposed(listen)
     try:
         yield

@@ -208,7 +208,7 @@ def _rows(
 
 
 def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
-    """Fly a flight of a sweep and return its row; fly it again if it has to be recorded."""
+    """Fly a flight and return its row; if a recording is wanted, fly again to make it."""
     from cloudrc.sweep.flight import fly_point
     from cloudrc.sweep.store import make_row
 

@@ -142,8 +142,8 @@ def ending(
     """Return a function that tells whether teleop's process may end.
 
     After `asked()` has become true, the returned function pauses the mission. It returns True as
-    soon as the robot holds its position, or after `PAUSE_LIMIT_NS`. Before, it returns True only
-    if `single` is True and all missions are over.
+    soon as the robot holds its position, or after `PAUSE_LIMIT_NS`. While `asked()` is false, it
+    returns True only if `single` is True and all missions are over.
     """
     until_ns = 0
 

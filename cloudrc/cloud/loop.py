@@ -193,8 +193,9 @@ class ControlLoop:
     def _observe_echo(self, telemetry: Telemetry) -> None:
         """Process the echo of telemetry, which shows when a command was applied.
 
-        A command with a long delay is soon replaced by the next command, so its only echo may be in
-        telemetry that arrives late. Without this echo the average delay would be too small.
+        World soon replaces a command with a long delay by the next command, so perhaps only one
+        telemetry datagram echoes the delayed command. This datagram counts even if it arrives late:
+        otherwise long delays would be missing in the average.
         """
         echo_ns = telemetry.echo_stamp_ns
         if echo_ns > self._newest_echo_ns:

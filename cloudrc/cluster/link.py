@@ -189,7 +189,7 @@ def _needed_files(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[s
 def with_files(
     files: Mapping[str, str], profile: str | None, settings: Sequence[str]
 ) -> tuple[Edit, dict[str, str]]:
-    """Edit the link's profile; return the edit, and the files that are new or changed.
+    """Edit the link's profile; return the new profile, and the files that are new or changed.
 
     `files` maps file names to texts. If `profile` is given, this profile replaces the one in
     `files`. `settings` are texts `key=value`.

@@ -70,7 +70,7 @@ def flights_folder() -> Path:
 
 
 class FlightFile(NamedTuple):
-    """What a flight file tells other commands about a flight, besides the run's folder."""
+    """Content of a flight file besides the run's folder: how other commands reach the flight."""
 
     api: str  # address of the operator's API; "" for none
     kind: str  # RUN or SESSION

@@ -202,7 +202,7 @@ class WorldEnd(End):
 
     @property
     def has_peer(self) -> bool:
-        """Whether commands arrive, or the open session still waits for its first command."""
+        """Whether cloud is connected: commands arrive, or the session has had no command yet."""
         return super().has_peer or (self._opened_ns != NEVER_NS and self._silent)
 
     def _on_sessionopened(self, record: SessionOpened) -> None:

@@ -350,7 +350,7 @@ def _hostile_plans(rng: Generator) -> Lie:
 
 
 def _operators_voice(rng: Generator) -> Lie:
-    """Change commands by a random policy of `FASTEST`; `dishonesty` adds the forged requests."""
+    """Change commands by a random policy of `FASTEST`; `at_bad_moments` forges the requests."""
     return FASTEST[int(rng.integers(len(FASTEST)))](rng)
 
 

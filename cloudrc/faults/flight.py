@@ -41,7 +41,7 @@ SHARED, OTHER = b"one clock for all".ljust(16)[:16], b"another clock..."
 
 
 def conditions(**changes: object) -> Shape:
-    """Return a function that replaces fields of a direction's profile by `changes`."""
+    """Return a function that sets the fields `changes` in the profile of one direction."""
     return lambda profile: replace(profile, **changes)  # type: ignore[arg-type]
 
 

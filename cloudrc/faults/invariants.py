@@ -402,7 +402,7 @@ class RobotInvariants:
             self._alone_ns = now_ns
 
     def _wait_ns(self, state: GuardState) -> float:
-        """Return how long a robot in a mission may wait for commands [ns]."""
+        """Return how long the robot may stay in `state` without commands in a mission [ns]."""
         if state is GROUND:
             return max(self._hold_ns, GROUND_NS)
         return self._hold_ns if state is HOLD else inf

@@ -133,7 +133,7 @@ class RestartableEndpoint:
         return self.inner.take_datagrams()
 
     def take_records(self) -> list[Record]:
-        """Implement `Endpoint.take_records`."""
+        """Return and remove the records since the last call, also those of a killed process."""
         left, self._left = self._left, []
         return left + self.inner.take_records() if self.inner is not None else left
 

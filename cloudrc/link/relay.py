@@ -206,7 +206,7 @@ class Lane:
     def _put_on_link(
         self, data: bytes, kind: int, epoch: int, counter: int, received_ns: int
     ) -> None:
-        """Compute when each copy of a datagram is due, and keep the copies until then."""
+        """Keep a datagram until the link delivers it: never if it is lost, twice if duplicated."""
         if self.origin_ns is None:
             self.origin_ns = received_ns
         elapsed_ns = received_ns - self.origin_ns

@@ -69,10 +69,10 @@ class LinkState:
 
 
 class StateFile:
-    """The state file of one direction.
+    """Writes the state file of one direction of the link.
 
     Attributes:
-        state: The last state in the file; None before the first.
+        state: The last state written to the file; None before the first.
     """
 
     def __init__(self, path: Path, mode: str, direction: str) -> None:

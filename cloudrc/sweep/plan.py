@@ -68,7 +68,7 @@ class Flight(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A sweep whose points have been checked."""
+    """A checked sweep: the content of its file, its points, and the flights of each point."""
 
     file: dict[str, Any]  # content of the file, with `folder`
     axes: dict[str, list[Any]]  # axis -> its values or names

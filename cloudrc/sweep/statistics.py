@@ -62,9 +62,9 @@ def wilson_interval(successes: int, count: int) -> tuple[float, float]:
 def sign_test(less: int, more: int) -> float:
     """Return the exact two-sided p-value for "two kinds of events are equally likely".
 
-    `less` and `more` are the numbers of events of each kind. If B is below A in `less` pairs and
-    above A in `more` pairs, this is the sign test. If only A succeeded in `less` pairs and only B
-    in `more` pairs, this is the exact McNemar test.
+    `less` and `more` are the numbers of events of each kind. In the sign test, `less` counts
+    the pairs with B below A, `more` the pairs with B above A. In the exact McNemar test, `less`
+    counts the pairs in which only A succeeded, `more` the pairs in which only B succeeded.
 
     Source: Q. McNemar, "Note on the sampling error of the difference between correlated
     proportions or percentages", 1947.

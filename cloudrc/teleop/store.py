@@ -262,7 +262,7 @@ class MissionStore:
         return mission
 
     def note(self, mission: Mission, event: str, text: str, **changed: Any) -> None:
-        """Apply an event to a mission and write it to disk; `catch_up` repeats a failed write."""
+        """Store an event and `changed` fields of a mission; `catch_up` repeats a failed write."""
         if event == "reached" and changed["waypoint"] < len(mission.reached):
             return  # an earlier teleop has stored it
         self._events += 1

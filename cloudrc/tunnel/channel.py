@@ -40,8 +40,8 @@ class Channel:
     def take(self, counter: int, newest_wins: bool = False) -> str:
         """Classify the datagram with this counter as USED, LATE or REPEATED.
 
-        For this datagram, `newest_wins` = True overrides the rule of the channel: if a newer
-        datagram has arrived before, this datagram is LATE, not USED.
+        With `newest_wins` = True, a datagram that arrives after a newer datagram is LATE, whatever
+        the channel's rule.
         """
         ahead = counter - self._newest
         if ahead > 0:

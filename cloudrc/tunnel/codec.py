@@ -197,7 +197,7 @@ def encode_command(command: Command) -> bytes:
 
 
 def as_planned(velocity: Vector) -> Vector:
-    """Round a velocity [m/s], shape (3,), to the single precision of plans in datagrams."""
+    """Round a velocity [m/s], shape (3,), to single precision, as a plan in a datagram has it."""
     return _VELOCITY.unpack(_VELOCITY.pack(*velocity))
 
 

@@ -94,8 +94,8 @@ class Session:
     def pass_on(self, kind: int, message: Telemetry | Command) -> Passed:
         """Give `message` the counter of the next datagram of this kind, without encryption.
 
-        Use this method in place of `seal` only if the receiver is in the same process: `open`
-        cannot read the result elsewhere.
+        Use this method in place of `seal` only if the receiver is in the same process: the result
+        is a Python object, not bytes.
         """
         counters = self._counters
         counter = counters[kind]

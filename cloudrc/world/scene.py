@@ -196,10 +196,10 @@ def _words(numbers: ArrayLike) -> str:
 
 
 def _facts(model: Any) -> Facts:
-    """Return the quantities on which controller and rotors depend: name -> value, tolerance.
+    """Return the quantities in which a robot must match the Pelican: name -> value, tolerance.
 
-    The controller works within these tolerances: the velocity loop compensates for a weight
-    that differs by 1 N, and the attitude gains work for an inertia that differs by 50 %.
+    Within the tolerances the Pelican's controller works: its velocity loop compensates for a
+    weight that differs by 1 N, and its attitude gains work for an inertia that differs by 50 %.
     """
     base = model.jnt_bodyid[0]
     turned = rotation(model.body_iquat[base])

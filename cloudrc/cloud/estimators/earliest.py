@@ -21,13 +21,14 @@ class Earliest(Estimator):
         self._offsets: deque[float] = deque(maxlen=count)
 
     def add_applied(self, applied_minus_stamp: float) -> None:
-        """Store `applied_minus_stamp` [s]: downlink delay of a command plus the clock offset."""
+        """Store `applied_minus_stamp` [s]: downlink delay of a command minus the clock offset."""
         self._offsets.append(applied_minus_stamp)
 
     def horizon(self, age: float) -> float:
-        """Return the horizon [s]: `age` plus the smallest stored delay; 0 before the first echo.
+        """Return the horizon [s]; 0 before the first echo of a command.
 
-        `age` and the delay contain the clock offset with opposite signs; the sum is free of it.
+        The horizon is `age`, the age of the odometry, plus the smallest stored delay of a command.
+        The clock offset adds to `age` and reduces the delay, so the sum does not contain it.
         """
         return max(0.0, age + min(self._offsets)) if self._offsets else 0.0
 

@@ -80,7 +80,7 @@ class History:
         self._applied.append((began_ns, stamp_ns))
 
     def is_silent(self, now_ns: int) -> bool:
-        """Whether world has begun no command for FOLLOWED_NS at `now_ns` [ns], world's clock."""
+        """Whether the last echoed command began over FOLLOWED_NS before `now_ns`, world's clock."""
         return bool(self._applied) and now_ns - self._applied[-1][0] > FOLLOWED_NS
 
     def shift_ns(self, odometry: Odometry, horizon: float) -> int:

@@ -35,8 +35,8 @@ class FirstOrder(Body):
     def advance(self, command: Vector, dt: float) -> None:
         """Advance the state by `dt` [s] under a velocity command [m/s].
 
-        The time is divided into steps of about one control period. In each step the reference is
-        constant, and the response of the lags to it is exact.
+        The time is divided into steps of about one control period. Each step takes the reference
+        as constant, and solves the equations of the lags exactly.
         """
         steps = min(ceil(dt * 1e9 / PERIOD_NS - 0.5), STEPS_MAX) or 1
         for _ in range(steps):

@@ -120,7 +120,6 @@ def _wall_of(pipe: Pipe) -> Vector:
     expects="the leg ends at its time limit, and HOLD begins",
 )
 def _unreachable(outcome: Outcome, seed: int) -> None:
-    """Command the robot to stay where it is, so that it cannot reach the next waypoint."""
     at, stays = measures.instant(seed, 12.0, 20.0), list[Vector]()
 
     def stalled(command: Command, control: Control) -> Command:

@@ -210,8 +210,8 @@ class Plan:
     def _fits(self, measured: Stream, drawn: Stream) -> bool:
         """Return whether the `measured` packets match the packets `drawn`.
 
-        `drawn` is the prediction from the relay's random numbers. Compare the delays or, if the
-        delays hardly vary, the losses.
+        `drawn` are the same packets as simulated with the relay's random numbers. Compare the
+        delays or, if the delays hardly vary, the losses.
         """
         lost = np.isnan(measured.delays), np.isnan(drawn.delays)
         both, requested = ~lost[0] & ~lost[1], _requested_delay(self.profile, drawn.sent)

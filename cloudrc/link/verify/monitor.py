@@ -104,7 +104,7 @@ class LinkMonitor:
         return [self._outbox.get_nowait() for _ in range(self._outbox.qsize())]
 
     def look(self, path: Path, load: Load) -> None:
-        """Read the requested profiles from the link's state file; `load` converts its values."""
+        """Read the requested profiles from the link's state file; `load` parses them."""
         try:
             text = read(path, STATE_MAX).decode()
             if text != self._seen:

@@ -86,7 +86,7 @@ class ProbeEnd:
         self._delays, self._copies = np.full(count, inf), np.zeros(count, int)
 
     def _encode(self, number: int) -> bytes:
-        """Encode a probe; copies of its header fill the rest, so that damage is noticed."""
+        """Encode a probe: its header, repeated up to the full size, so that damage is noticed."""
         _, uplink, kind, size = self.plan.flow
         way = Direction.UPLINK if uplink else Direction.DOWNLINK
         header = encode_header(kind, way, 1, number)

@@ -280,11 +280,11 @@ class Guard:
         return self.reference
 
     def plain_track(self, now_ns: int) -> tuple[int, Vector, Vector, int] | None:
-        """Return the guard's values for steps in C (`native/step.c`) from `now_ns` [ns] on.
+        """Return the values with which C (`native/step.c`) runs `step` from `now_ns` [ns] on.
 
-        The four values are the time of the plan's next velocity [ns], the velocity reference and
-        the commanded velocity [m/s], and the time until which the command is fresh [ns]. Return
-        None if the guard's `step` has to run instead.
+        The values are: start of the plan's next velocity [ns], velocity reference [m/s], commanded
+        velocity [m/s], and end of the time in which the robot may follow the command or plan [ns].
+        Return None in all cases that only `step` handles, such as HOLD and the take-off.
         """
         if not (self._take_off.over and self._ramp_until_ns <= now_ns <= self._track_until_ns):
             return None

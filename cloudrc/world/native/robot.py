@@ -117,10 +117,10 @@ def make_flight(simulator: Simulator, controller: LowLevel, limits: Limits) -> F
 def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
     """Return a box with rounded edges around each geom of the scene, and the robot's radius [m].
 
-    While a ball with this radius around the base's origin touches no box, C omits the search for
-    contacts. Each row of the array is a box: centre (3,) [m], axes (9,), half sizes (3,) [m],
-    radius of the edges [m]. If the model has other forces, such as springs, the robot's radius is
-    infinite, so that C omits nothing.
+    Each row of the array is a box: centre (3,) [m], axes (9,), half sizes (3,) [m], radius of the
+    edges [m]. The steps in C search for contacts only while a ball with the robot's radius around
+    the base's origin touches a box. If the model has springs or similar forces, the radius is
+    infinite, so that C never leaves out the search.
     """
     option, rows, radius = model.opt, [], 0.0
     other = option.density, option.viscosity, model.nflex, model.npair, model.neq, model.ntendon
