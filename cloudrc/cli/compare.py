@@ -92,7 +92,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
-    """Fly A and B with each seed.
+    """Fly the experiment with the settings A and with the settings B, each with all seeds.
 
     Return the pairs of flights; why the work ended early, or ""; and the exit code.
     """

@@ -274,7 +274,7 @@ def fly(
 
 
 def _physics_steps(experiment: ResolvedExperiment, usual: str) -> str:
-    """Name what runs the physics: Python for wind or a changed plant, else the text `usual`."""
+    """Return which code runs the physics: Python for wind or a changed plant, else `usual`."""
     from cloudrc.config.schema import Plant
 
     is_usual = experiment.world.plant == Plant() and not experiment.world.wind.blows

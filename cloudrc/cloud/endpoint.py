@@ -90,7 +90,7 @@ class ComputeTime:
         self._cpu_clock, self._began_ns = cpu_clock, 0
 
     def begin(self) -> None:
-        """Start to measure the time to compute a command, if there is a `cpu_clock`."""
+        """Note that the computation of a command begins; call `end` at its end."""
         if self._cpu_clock is not None:
             self._began_ns = self._cpu_clock()
 

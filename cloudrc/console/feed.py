@@ -44,11 +44,11 @@ class Sample(NamedTuple):
 
 
 class FlightFeed:
-    """The present state of a flight, from the records that cloud sends to the tap.
+    """The present state of a flight, from the records that cloud sends to the console.
 
     Attributes:
         telemetry: The newest telemetry; None before the first.
-        control: The newest control period; None while cloud does not control the robot.
+        control: The newest record of a command that cloud computed; None before the first.
         samples: Points of the charts, oldest first.
         flown: Number of points added so far to the trail, the line that shows the robot's path.
     """

@@ -137,7 +137,7 @@ def end_session(run: Path, limit: float) -> None:
 
 @dataclass
 class Child:
-    """A process that the supervisor has started."""
+    """A process of a local run, such as world or relay, which the supervisor has started."""
 
     name: str  # command of the process, such as "relay"
     process: subprocess.Popen[bytes]

@@ -1,4 +1,4 @@
-"""The machine: its clock, its usable cores, its Python, and deadlines without suspended time."""
+"""Find clock, usable cores and Python of the machine; time limits that exclude suspended time."""
 
 from __future__ import annotations
 

@@ -273,7 +273,7 @@ class LinkNotes:
 
 @dataclass
 class EndProcess:
-    """Runs world or cloud as a process."""
+    """The process of world or cloud: runs its endpoint, and records and reports the flight."""
 
     end: str  # "world" or "cloud"
     peer: Peer

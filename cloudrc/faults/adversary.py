@@ -323,7 +323,7 @@ def _stop_and_go(rng: Generator) -> Lie:
 def _hostile_plans(rng: Generator) -> Lie:
     """Send plans of random lengths that begin now or later, with jumps and sometimes NaN.
 
-    Some clouds of this policy mix plans with commands that have no plan. Others send stale
+    `rng` decides whether the cloud also sends commands without a plan, and whether it sends stale
     commands for some time, so that the robot flies a plan to its end.
     """
     ahead, share = float(rng.choice([0.05, 0.5, 9.9])), float(rng.choice([0.0, 0.5]))

@@ -7,8 +7,8 @@ cap, stop  The velocity reference stays within its limits, and the robot can alw
            fence. During LAND the robot may fly down to the floor. After a HOLD the reference
            velocity grows slowly at first.
 stale      World rejects a command that is based on too old odometry. TRACK ends with the session,
-           or when the odometry of the last command is too old and its plan has ended. HOLD changes
-           to TRACK only after `RESUME_COMMANDS` fresh commands within `RESUME_NS`.
+           or when the last command's odometry is too old and the command's plan has ended. HOLD
+           changes to TRACK only after `RESUME_COMMANDS` fresh commands within `RESUME_NS`.
 rest       After TRACK the robot stops within its stopping distance. The rotors stop only on a
            request, after a collision, or if the robot does not move.
 collision  If the cloud is honest, only the arm's tip touches something, and it touches only the
@@ -300,7 +300,7 @@ class RobotInvariants:
                 self._note(now_ns, "cap", f"{text}{' after a HOLD' if after else ''}")
 
     def _leave_track(self, readings: Readings, now_ns: int) -> None:
-        """Store where the guard left TRACK, and the largest allowed distance from there at rest."""
+        """Store where the robot was at the end of TRACK, and how far it may move from there."""
         speed = max(hypot(*readings.velocity), hypot(*self._before))
         self._left, self._way = readings.position, speed * (0.2 + speed / 6.0) + REST
         if now_ns - self._touched_ns < REELS_NS:

@@ -25,7 +25,7 @@ ENDED = Cause.ENDED.words  # cause of a HOLD that the operator has requested
 
 
 def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
-    """Choose a time from `first` to `last` [s]; in the default range the robot is in the pipes."""
+    """Choose a time from `first` to `last` [s]; by default, the robot is among the pipes then."""
     return float(generator(seed, 77).uniform(first, last))
 
 

@@ -156,7 +156,7 @@ class Operator:
         flight.listeners.append(self._look)
 
     def check_stuck(self) -> None:
-        """Check that the guard was in TRACK at some time in the fault-free last `BACK` [s]."""
+        """Check that the robot has flown (TRACK) in the last `BACK` [s], which have no faults."""
         flight, now_ns = self._flight, self._flight.run.now_ns
         if now_ns - self._tracked_ns > BACK * 1e9:
             state, cause = flight.guard_now()

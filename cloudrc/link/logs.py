@@ -67,9 +67,9 @@ class Log:
     def packets(self) -> Packets:
         """Check the packets, sort them by time of sending, and add a note on each correction.
 
-        Raise a BadInputError if no packet arrived; if a delay is negative; if the times jump back
-        by more than the limit at `GAP`, as after a step of the clock; if more than 1 % of the rows
-        are unusable; or if more than 1 % of them have the time of an earlier row.
+        Raise a BadInputError if no packet arrived; if a delay is negative; if the times jump far
+        back once to three times, as after a step of the clock; if more than 1 % of the rows are
+        unusable; or if more than 1 % of the packets have the time of an earlier packet.
         """
         self._refuse_beyond_limit(len(self.unusable), *self.unusable[:1])
         times, delays = np.array(self.entries or [(nan, nan)]).T

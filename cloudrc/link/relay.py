@@ -288,7 +288,7 @@ class Relay:
                         other.origin_ns = lane.origin_ns
 
     def counts(self) -> dict[str, int]:
-        """Return the number of datagrams of all lanes by outcome, and the recent lateness.
+        """Return the number of datagrams by outcome, over all directions, and the recent lateness.
 
         The outcomes are `received`; `forwarded` (including copies); `lost` on the link; `malformed`
         (not from the tunnel); `overflow` (too many in flight, see `IN_FLIGHT_MAX`); `unread` (the

@@ -44,7 +44,7 @@ def _estimate_error(flight: Flight) -> float | None:
 
 
 def _delay_error(flight: Flight) -> float | None:
-    """Compute the RMS difference between horizon and true delay of the commands [s].
+    """Compute the RMS difference between estimated (horizon) and true delay of the commands [s].
 
     Commands before the first measured round trip are left out.
     """

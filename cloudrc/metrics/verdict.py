@@ -266,7 +266,7 @@ def _plugins(flight: Flight) -> Iterator[Failure]:
 
 
 def _responses(flight: Flight, settle: float) -> Iterator[Failure]:
-    """Yield a failure if steps did not settle within `settle` [m]; one if the loop is unstable."""
+    """Yield a failure if a step's last error exceeds `settle` [m]; another for instability."""
     found, unit = steps(flight), "step" if flight.mission.steps else "waypoint"
     far = [step for step in found if step.last_error > settle]
     if far and flight.mission.steps:

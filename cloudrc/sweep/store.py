@@ -98,7 +98,7 @@ def begin(folder: Path, plan: Plan) -> dict[str, Row]:
 
 
 def finish(folder: Path, plan: Plan) -> dict[str, Row]:
-    """Write the description and, after the last flight, the tables; return flight key -> row."""
+    """Write the summary and, if no flight is missing, the tables; return flight key -> row."""
     rows = read_rows(folder)
     unit_of = _write_summary(folder, plan, rows)
     if len(rows) == len(plan.flights):

@@ -116,8 +116,9 @@ class Bridge:
         return future
 
     async def ask(self, call: Call, urgent: Urgent = "") -> Any:
-        """Queue a call for teleop's loop, and return its result. A stop also calls `alarm` at once.
+        """Queue a call for teleop's loop, and return its result.
 
+        For an emergency stop, also send an alarm to cloud at once.
         Raise an UnavailableError if the bridge is closed, or if the loop does not answer within
         `ANSWER_LIMIT`. A stop or hold without an answer stays queued; any other call is withdrawn.
         """

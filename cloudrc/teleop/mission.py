@@ -89,7 +89,7 @@ class LegWatch:
         self.pause()
 
     def pause(self) -> None:
-        """Interrupt the flight to the waypoint; its time is kept, and the dwell time restarts."""
+        """Interrupt the flight to the waypoint: keep the time flown, but restart the dwell time."""
         self._seen_ns = self._near_since_ns = NEVER_NS
 
     @property

@@ -371,10 +371,10 @@ class MissionService:
         return mission
 
     def _start_next(self, now_ns: int, *, queued: bool = False) -> Mission | None:
-        """Start the oldest mission that has not ended, unless a mission is already under way.
+        """If no mission is under way, start the oldest mission that has not ended.
 
-        Continue this mission if an earlier teleop process has started it. Start a queued mission
-        only if `queued` is True, and only after its new state is on the disk. Return the mission
+        If an earlier teleop process has started that mission, continue it. If it is queued, start
+        it only if `queued` is True, and only after its new state is on the disk. Return the mission
         that is under way after this call, or None.
         """
         waiting = self.book.open()

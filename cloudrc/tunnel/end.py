@@ -18,7 +18,7 @@ from cloudrc.tunnel.session import Session
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Clock, process and keys of one end of the tunnel, fixed when its process starts."""
+    """Ids of the clock and the process of one end of the tunnel, and its keys; set at the start."""
 
     clock_id: bytes  # 16 bytes that identify the monotonic clock of this machine
     nonce: bytes  # 16 random bytes that identify this process

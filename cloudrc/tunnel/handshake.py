@@ -128,9 +128,9 @@ class ServerHandshake:
     def _keeps_epoch(self, now_ns: int) -> bool:
         """Return whether the present epoch continues after a repeated HELLO of the session's cloud.
 
-        A HELLO with a newer key ends the epoch. A HELLO with the epoch's key keeps the epoch until
-        the session times out. Besides, the first REPEATS_MAX repeats since the last encrypted
-        datagram always keep the epoch.
+        A HELLO with a newer key ends the epoch. Otherwise the first REPEATS_MAX repeats after an
+        encrypted datagram keep the epoch. Later repeats keep it if they have the epoch's key and
+        the session has not timed out.
         """
         session, key = self._session, self._session.greeting_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current

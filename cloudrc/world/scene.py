@@ -127,7 +127,6 @@ def _compile(
 
 
 def _inertia(model: Any) -> Inertia:
-    """Compute the inertia of the robot, which may have several bodies."""
     data, base = mujoco.MjData(model), model.jnt_bodyid[0]
     mujoco.mj_forward(model, data)
     frame, bodies = data.xmat[base].reshape(3, 3), np.flatnonzero(model.body_rootid == base)

@@ -186,7 +186,7 @@ class Simulator:
         return touches
 
     def state(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Return the arguments `physics` and `warmstart` of `replay`.
+        """Return the state from which `replay` can repeat the next steps: physics and warmstart.
 
         `physics` is the state `mjSTATE_FULLPHYSICS`, shape (n,). `warmstart` has the accelerations
         from which the contact solver of the next step starts, shape (nv,).

@@ -52,7 +52,10 @@ class Predictor:
         raise NotImplementedError
 
     def model(self) -> Model | None:
-        """Return a new model of the robot in the last predicted state, or None (the default)."""
+        """Return a new model of the robot in the last predicted state; cloud plans ahead with it.
+
+        By default, return None: the predictor has no model, and cloud cannot make plans.
+        """
         return None
 
 

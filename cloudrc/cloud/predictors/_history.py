@@ -166,7 +166,7 @@ class Body(Model):
         return self.odometry()
 
     def odometry(self) -> Odometry:
-        """Return the predicted state as odometry; the orientation turns at the measured rate."""
+        """Return the predicted state; its orientation follows from a constant angular velocity."""
         _, _, orientation, _, rate = self.basis
         return Odometry(
             self.basis.stamp_ns + round(self.horizon * 1e9),

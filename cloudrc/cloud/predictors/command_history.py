@@ -68,7 +68,7 @@ class CommandHistory(Replay):
     """
 
     def __init__(self, axes: Axes, acceleration_max: float) -> None:
-        """Set the model of the velocity loop; `acceleration_max` is its limit [m/s^2]."""
+        """Set `axes` and acceleration limit `acceleration_max` [m/s^2] of the velocity loop."""
         self._axes, self._loop = axes, (axes, acceleration_max)
         super().__init__()
 

@@ -47,7 +47,7 @@ class Kalman(Predictor):
         self._replay.commanded(command)
 
     def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
-        """Tell `replay`, which replays the commands, when world applied a command."""
+        """Pass the time at which world applied a command on to `replay`."""
         self._replay.applied(command_stamp_ns, applied_ns)
 
     def observe(self, odometry: Odometry) -> None:

@@ -146,9 +146,9 @@ class Plan:
     def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:
         """Return the values that a correct link should give for the datagrams of a measured stream.
 
-        The values are exact if the delays or losses match those that a relay would compute for the
-        session `epoch`. Otherwise they are bands, from simulations of the link with different
-        seeds. `first` is the counter of the first datagram.
+        If the delays or losses in the stream are those that a relay computes for the session
+        `epoch`, the values are exact. Otherwise each value is a range, from simulations of the link
+        with different seeds. `first` is the counter of the first datagram.
         """
         drawn = self.draw(measured.sent, epoch, first)
         if self._fits(self._singles(measured), self._singles(drawn)):

@@ -79,8 +79,8 @@ class LinkMonitor:
     def begin(self, asked: Asked, path: Path | None, load: Load) -> None:
         """Start the thread, which judges the link by the requested profiles `asked`.
 
-        As soon as the link's state file `path` contains profiles, these replace `asked`. `load`
-        converts them. If `path` is None, `asked` stays in force.
+        If there is a `path`, the thread reads the link's state file there. The profiles in this
+        file replace `asked`; `load` converts them from the values in the file.
         """
         self._inbox, self._pause = queue.SimpleQueue(), lambda: time.sleep(1e-4)
         self.follow(asked)

@@ -62,9 +62,9 @@ def clamp(value: float, low: float, high: float) -> float:
 def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
     """Return the largest velocity towards a face of the fence [m/s].
 
-    The result v solves reaction · v + v^2/6 = distance, where `distance` is the distance to the
-    face minus the fence's margin [m] and `reaction` the reaction time [s]. If `distance` is
-    negative, v is negative, so that the robot returns.
+    The result v solves reaction · v + v^2/6 = distance; v^2/6 is the braking distance at 3 m/s^2.
+    `distance` is the distance to the face minus the fence's margin [m], `reaction` the reaction
+    time [s]. If `distance` is negative, v is negative, so that the robot returns.
     """
     if distance > FAR:
         return inf

@@ -208,7 +208,7 @@ def make_robot(simulator: Simulator, low_level: LowLevel, guard: Guard, limits: 
 
 
 def usable() -> Library:
-    """Return the library of `step.c`; `run` is None if the code is missing or fails its test."""
+    """Return the compiled `step.c`; its field `run` is None if it is missing or fails its test."""
     found = library()
     return found if found.run is None or not (wrong := _self_test()) else Library(None, wrong)
 
@@ -238,9 +238,10 @@ class NativeRobot(Robot):
         super().put_on_ground(now_ns, cause)
 
     def run(self, tick_ns: int, until_ns: int) -> int:
-        """Run steps like `Robot.run`: in C while the guard need not limit a fresh command.
+        """Run steps from `tick_ns` up to `until_ns`; return the time of the next step [ns].
 
-        Python runs the first step that C cannot run, and all steps after it.
+        C runs the steps in which the guard need not limit a fresh command. Python runs the first
+        other step, and all steps after it.
         """
         simulator, guard = self.simulator, self.guard
         in_c = not self.observers and simulator.tape is None
