@@ -157,7 +157,7 @@ class Timeline:
 
 
 def settled(profile: DirectionProfile) -> DirectionProfile:
-    """Return a profile with constant conditions: those after the end of the profile's time line."""
+    """Return the profile with constant conditions: those of the last piece of its time line."""
     last = Timeline(profile).pieces[-1]
     return replace(
         profile,
