@@ -211,7 +211,10 @@ def point_to(folder: Path, link: str) -> None:
 def _local_flight(
     experiment: ResolvedExperiment, mode: str, stream: TextIO, waypoints: int, ready: Ready | None
 ) -> Flight:
-    """Return a function that flies on this machine and shows the progress on `stream`."""
+    """Return a function that flies on this machine and shows the progress on `stream`.
+
+    With `ready`, the function flies a session, and calls `ready` when it waits for missions.
+    """
     from cloudrc.cli.progress import FlightView
 
     def flight(folder: Path) -> dict[str, Any]:
@@ -254,8 +257,10 @@ def fly(
     """Fly in mode "virtual" or "local"; write all files into `folder`, and return the report.
 
     During the flight `see` is called with new records; in local mode some are left out. An
-    interrupted flight also gets a report. Without `page`, write no report.html. With `session`,
-    teleop waits for missions, as in `LocalRun`; the report is that of the last mission.
+    interrupted flight also gets a report. Without `page`, write no report.html.
+
+    With `session`, teleop waits for missions, and the report is that of the last one. When all
+    processes are ready, `session` gets the API's address and process -> HOST:PORT of its metrics.
     """
     from cloudrc.config.load import dump
     from cloudrc.report.write import write_report

@@ -152,7 +152,7 @@ class Source(NamedTuple):
     is_setting: bool = False  # True for `--set` and the like, False for a file or a default
 
     def absolute(self, path: str) -> Path:
-        """Make a `path` from the configuration absolute; no file has to exist there."""
+        """Make `path` absolute: relative to `folder`. No file has to exist there."""
         return Path(os.path.realpath(self.folder / os.path.expanduser(path)))
 
 

@@ -70,10 +70,11 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 
 def speed_cap(command_age_max_ms: float, plan_max_s: float = 0.0) -> float:
-    """Compute the largest speed v [m/s] from which the robot stops within 8.7 m.
+    """Compute the speed cap: the largest speed v [m/s] from which the robot stops within 8.7 m.
 
-    If commands stop arriving, the robot keeps its speed for T + 0.2 s and then brakes at 3 m/s^2:
-    v · (T + 0.2 s) + v^2 / 6 = 8.7 m. T is `command_age_max_ms` [ms] plus `plan_max_s` [s].
+    If commands stop arriving, the robot follows the last one for the time T, reacts within 0.2 s
+    and brakes at 3 m/s^2: v · (T + 0.2 s) + v^2 / (6 m/s^2) = 8.7 m. T is the largest age of a
+    command, `command_age_max_ms` [ms], plus the longest plan, `plan_max_s` [s].
     Source: docs/reference/plant.md, "Speed cap".
     """
     delay = command_age_max_ms * 1e-3 + plan_max_s + 0.2

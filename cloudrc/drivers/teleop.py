@@ -164,7 +164,10 @@ def _moves_robot(output: Any) -> bool:
 
 
 class LastWord:
-    """Delays the end of cloud's process until teleop's END request makes the robot hold."""
+    """Delays the end of cloud's process until the robot stops following commands, at most 0.8 s.
+
+    Meanwhile cloud forwards teleop's request that the robot holds its position.
+    """
 
     def __init__(
         self,
@@ -174,7 +177,7 @@ class LastWord:
     ) -> None:
         """Set the functions that give the state of cloud and robot.
 
-        `asked` returns True after cloud has been asked to end, `flies` while the robot flies.
+        `asked` returns True after cloud has been asked to end, `flies` while the guard is in TRACK.
         `clock` returns the time [ns].
         """
         self._asked, self._flies, self._clock = asked, flies, clock

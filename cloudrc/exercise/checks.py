@@ -57,10 +57,10 @@ def _predict(build: Callable[[], Any], select: Callable[[Odometry], Any]) -> Any
 def _command(
     build: Callable[..., Any], n: int = 1, speed: float = 0.0, sign: bool = False, **gains: Any
 ) -> Any:
-    """Build a controller with `gains`; return its last velocity before and first after a reset.
+    """Return two commands of a controller with `gains`: the last before and first after a reset.
 
-    Before the reset, the controller gets `n` updates, 2 ms apart, of a robot at `speed` [m/s]. If
-    `sign` is False, return the absolute values of both velocities.
+    Before the reset, the controller gets `n` updates, 2 ms apart, of a robot at `speed` [m/s]. A
+    command is a velocity [m/s]; if `sign` is False, return its absolute values.
     """
     controller, (x, y, z), seen = build(**gains), STATE.position, ZERO
     setpoint = Setpoint((2.0, -1.0, 0.2))

@@ -296,7 +296,7 @@ def _strange_numbers(rng: Generator) -> Lie:
 
 
 def _false_basis(rng: Generator) -> Lie:
-    """State a wrong odometry stamp in commands: in the future, or too old."""
+    """Send commands that claim a wrong odometry stamp: one in the future, or one too old."""
     shift_ns = int(rng.choice([1, STEP_NS, 10_000_000, 200_000_000, 2**62]))
     sign = int(rng.choice([-1, 1]))
 

@@ -314,7 +314,7 @@ class RobotInvariants:
     # Contacts and stops of the rotors.
 
     def _check_touches(self, state: GuardState, now_ns: int) -> None:
-        """Check that new contacts are allowed; after any contact the robot may leave the fence."""
+        """Check that new contacts are allowed; a contact may push the robot out of the fence."""
         touches = self._simulator.touches
         if touches is not self._touches:
             self._touches, self._seen = touches, 0

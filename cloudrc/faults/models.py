@@ -165,7 +165,7 @@ class EndpointGroup:
         return min(member.next_deadline_ns() for member in self.members)
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Implement `Endpoint.handle_deadline`."""
+        """Call `handle_deadline` of each cloud whose deadline has come at `now_ns` [ns]."""
         for member in self.members:
             if now_ns >= member.next_deadline_ns():
                 member.handle_deadline(now_ns)
@@ -175,7 +175,7 @@ class EndpointGroup:
         return [data for member in self.members for data in member.take_datagrams()]
 
     def take_records(self) -> list[Record]:
-        """Return the new records of the first cloud; add those of the other clouds to `others`."""
+        """Return the new records of the first cloud; append those of all others to `others`."""
         first, *others = (member.take_records() for member in self.members)
         for records in others:
             self.others += records

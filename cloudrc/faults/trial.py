@@ -82,7 +82,8 @@ def fly(schedule: Schedule, *settings: str, keep: bool = False) -> Finding:
     With `keep` the records are kept and hashed, which doubles the time.
 
     Raises:
-        BadInputError: If the schedule names an unknown profile or policy.
+        BadInputError: If the schedule names an unknown link profile, or an unknown policy of a
+            dishonest cloud.
     """
     flight = _prepare(schedule, settings, keep)
     watch, operator = flight.watch, Operator(flight, schedule)
@@ -231,9 +232,10 @@ def inject(flight: Flight, schedule: Schedule) -> None:
 def _actions(
     flight: Flight, process: RestartableEndpoint, event: Event
 ) -> dict[str, tuple[tuple[float, Action], ...]]:
-    """Return what to do at which times for `event`: kind of fault -> pairs of time [s] and action.
+    """Return a mapping: kind of fault -> pairs of time [s] and action.
 
-    `process` is the process that the event kills or freezes, world or cloud.
+    It has all kinds, at the times of `event`; the caller picks the event's kind. `process` is the
+    process that the event kills or freezes, world or cloud.
     """
     at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
     gone = at + event.value * lasts  # end of teleop after it was asked to end

@@ -180,7 +180,7 @@ class PeerName:
     def __init__(
         self, peer: Address, resolve: Callable[[str], Sequence[str]], log: Callable[[str], None]
     ) -> None:
-        """Follow `peer`, a host name and a port.
+        """Set `peer`, host name and port of the other pod; do not resolve the name yet.
 
         `resolve` returns the addresses of a host name or raises an OSError; `log` writes one line.
         """

@@ -118,9 +118,9 @@ _QUANTILES: dict[str, Callable[[Floats], Floats]] = {
 
 
 def stretch(profile: DirectionProfile) -> int:
-    """Return the number by which `table` divides its entries, so that they fit in 16 bits.
+    """Return the divisor with which the entries of netem's table of delays fit in 16 bits.
 
-    To compensate, tc gets the jitter multiplied by this number.
+    To compensate, tc gets the jitter multiplied by this divisor.
     """
     if profile.distribution != "table":
         return STRETCH[profile.distribution]

@@ -238,8 +238,8 @@ class Lane:
 class Relay:
     """Runs one or two `Lane` objects in one thread.
 
-    `lanes` maps the name of each direction to its lane. The time of the link models starts when
-    the first datagram arrives on any lane: make the models with `origin_ns` 0.
+    `lanes` maps the name of each direction to its lane. Time 0 of the link models is the arrival
+    of the first datagram on any lane; so make the models with `origin_ns` 0.
     """
 
     def __init__(self, lanes: Mapping[str, Lane]) -> None:

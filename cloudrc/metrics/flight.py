@@ -31,7 +31,7 @@ CONTROL_TOPICS = "/estimated_odometry", "/setpoint_position", "/cmd_vel", "/dela
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """A recorded flight, its criteria, its mission and its scene."""
+    """A recorded flight, its criteria of success, its mission and its scene."""
 
     recording: Recording  # all topics; cloud's stamps are shifted to world's clock
     criteria: Criteria

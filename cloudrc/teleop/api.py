@@ -413,7 +413,7 @@ class ApiServer(uvicorn.Server):
         return {f"api_{name}": n for name, n in {**self.gate.counts, "audit_dropped": lost}.items()}
 
     def start(self) -> None:
-        """Start serving."""
+        """Start to serve the API, in a thread of its own."""
         self._thread.start()
 
     def stop(self) -> None:

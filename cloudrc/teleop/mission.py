@@ -201,9 +201,9 @@ class Teleop:
     def drive(self, now_ns: int, velocity: Vector) -> None:
         """Move the setpoint with `velocity` [m/s], world frame, for at most `HEARTBEAT_NS`.
 
-        The setpoint moves only while telemetry shows that the robot follows commands. A call during
-        the start of a hand-driven mission has no effect. Every other call needs a held mission, and
-        raises BadInputError without one.
+        The setpoint moves only while telemetry shows that the robot follows commands. While a
+        hand-driven mission starts, a call has no effect. Otherwise raise a BadInputError if no
+        mission is held.
         """
         if self._plan.by_hand and self.state == STARTING:
             return
@@ -332,7 +332,7 @@ class Teleop:
         return None
 
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
-        """Keep the robot at its position: another teleop may have started the reported mission.
+        """Keep the robot at its position: the mission in telemetry may come from another teleop.
 
         Also request the end of that mission, if the robot stands on the ground, or if this teleop
         knows that the mission has ended.

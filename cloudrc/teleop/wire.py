@@ -31,7 +31,7 @@ class Leg:
 
     If `speed` is 0, the robot has to stay within `tolerance` for the time `dwell`. If `speed` is
     above 0, the setpoint has to rest at the waypoint for the time `dwell`; then the robot has to be
-    within `tolerance`. A random waypoint has an infinite `tolerance`: only the time counts.
+    within `tolerance`. With an infinite `tolerance`, only the time counts.
     """
 
     position: Vector  # [m], world frame, shape (3,)

@@ -178,8 +178,9 @@ def attitude(force: Vector, readings: Readings) -> Effort:
 def allocate(effort: Effort) -> RotorSpeeds:
     """Distribute thrust T and torque (tx, ty, tz) over the rotors; return their speeds w [rad/s].
 
-    f = T/4 + (-ty/2l + tz/4km, tx/2l - tz/4km, ty/2l + tz/4km, -tx/2l - tz/4km) for front, left,
-    back, right, with l = ARM and km = TORQUE_RATIO; w = sqrt(f/kf), limited to [0, 1838 rad/s].
+    The thrusts f of the front, left, back and right rotor are
+    T/4 + (-ty/2l + tz/4km, tx/2l - tz/4km, ty/2l + tz/4km, -tx/2l - tz/4km), with l = ARM and
+    km = TORQUE_RATIO. w = sqrt(f / THRUST_COEFFICIENT), limited to [0, 1838 rad/s].
     """
     thrust, roll, pitch, yaw = effort
     roll, pitch, yaw = roll / _TWO_ARMS, pitch / _TWO_ARMS, yaw / _FOUR_RATIOS

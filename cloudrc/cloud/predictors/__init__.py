@@ -36,7 +36,7 @@ class Predictor:
         """Process a command that cloud has just sent."""
 
     def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
-        """Process the application of a command; called once per command whose echo arrives.
+        """Store when world applied a command; called once per command whose echo arrives.
 
         Args:
             command_stamp_ns: Stamp of the command [ns], cloud's clock. A command may be older than

@@ -145,7 +145,7 @@ class History:
 
 
 class Body(Model):
-    """A model of the robot; its state is `horizon` [s] later than the odometry `basis`.
+    """A model of the robot, in the state predicted for `horizon` [s] after the sample `basis`.
 
     `position` [m] and `velocity` [m/s] are those of the base, world frame.
     """
@@ -178,7 +178,7 @@ class Body(Model):
 
 
 class Replay(Predictor):
-    """A predictor that simulates the sent commands with a `Body`, which a subclass chooses."""
+    """Base of the predictors that feed the sent commands to a model of the robot."""
 
     def __init__(self) -> None:
         self.reset()

@@ -25,7 +25,10 @@ STEPS_MAX = 200
 
 
 class FirstOrder(Body):
-    """The guard's acceleration limit; then per axis a lag for the dead time, and a velocity lag."""
+    """A model of the velocity loop behind the guard's acceleration limit.
+
+    Each axis has two first-order lags in series: one for the dead time, one for the velocity.
+    """
 
     def __init__(self, axes: Axes, acceleration_max: float) -> None:
         """Begin at rest; `acceleration_max` [m/s^2] is the guard's acceleration limit."""

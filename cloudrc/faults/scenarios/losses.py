@@ -19,10 +19,9 @@ from cloudrc.messages import Cause, GuardState
     expects="stays in TRACK, no step above the acceleration cap",
 )
 def _short_silence(outcome: Outcome, seed: int) -> None:
-    """Interrupt both directions at the same time, then only one direction per flight.
+    """Interrupt both directions in one flight, only the uplink or only the downlink in two others.
 
-    In the flights with one interrupted direction, the link has no jitter: a jittered direction has
-    gaps of its own.
+    In these two flights the link has no jitter, because jitter makes gaps of its own.
     """
     at = measures.instant(seed)
     both, steady = silent(at, 0.1), conditions(jitter=0.0)

@@ -97,7 +97,7 @@ class LinkMonitor:
             ]
 
     def after(self, records: Sequence[Record], now_ns: int) -> list[Record]:
-        """Process this end's new records at `now_ns` [ns]; return link verdicts and faults."""
+        """Process this end's new records at `now_ns` [ns]; return `LinkChecked`s and `Fault`s."""
         if self._inbox is None:
             return self._see(records, now_ns)
         self._inbox.put((records, now_ns))

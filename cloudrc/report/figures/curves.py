@@ -207,7 +207,7 @@ ERROR = (
 
 
 def draw_error(subject: Subject) -> Figure:
-    """Draw the distance to the setpoint, as in the paper, and the errors of estimated positions."""
+    """Draw the distance to the setpoint and, in a second panel, the errors of the estimates."""
     figure, (tracking, accuracy) = subject.look.two_panels()
     flight, control, applied = subject.flight, subject.flight.control, subject.flight.applied
 

