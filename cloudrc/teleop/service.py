@@ -321,7 +321,8 @@ class MissionService:
     def _inherits_stop(self) -> Mission | None:
         """Mission that an emergency stop ended before teleop restarted; None without one.
 
-        The first telemetry shows whether the robot obeyed this stop. From then on it is None.
+        The first telemetry shows whether the robot obeyed this stop; from then on, or while
+        teleop repeats a stop, the value is None.
         """
         unknown = self.seen is None and not self._teleop.stopping
         return self.book.stopped() if unknown else None
