@@ -129,8 +129,8 @@ def _long_link(
 ) -> Iterator[str]:
     """Yield warnings about limits of guard and cloud that are too short for the link's delays.
 
-    `ages` are the ages of the odometry from which cloud computed world's present command [s];
-    `echoes` are the ages of the newest command that telemetry has confirmed [s].
+    Both lists have one age per simulated datagram [s]: `ages` that of the odometry from which cloud
+    computed the command in use, `echoes` that of the newest command that telemetry has confirmed.
     """
     age_max, cloud = experiment.guard.command_age_max_ms * 1e-3, experiment.cloud
     mean, longest = sum(ages) / len(ages), max(ages)

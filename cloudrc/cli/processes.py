@@ -347,8 +347,8 @@ def link_monitor(
     """Make the monitor that compares the received datagrams with the link profile.
 
     `uplink` is True in cloud, False in world. In flight, the monitor reads changes of the profile
-    from the link's file `state`. If the link is not `trusted`, the monitor refuses trace files
-    that are larger than TRACE_MAX.
+    from the link's file `state`; with None, the experiment's profile stays in force. If the link is
+    not `trusted`, the monitor refuses trace files that are larger than TRACE_MAX.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile

@@ -128,7 +128,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fly the flights of a sweep that lack a row or a recording; return the exit code."""
+    """Fly the flights of a sweep whose results or recordings are missing; return the exit code."""
     from cloudrc.cli.progress import SweepView
     from cloudrc.cli.run import new_folder
     from cloudrc.sweep import store

@@ -85,7 +85,7 @@ class ControlLoop:
     Attributes:
         period_ns: Time between two commands [ns].
         faults: Faults since the last `take_faults`.
-        counts: How often each failure happened.
+        counts: Name of an event, such as "frozen" -> how often it happened.
     """
 
     def __init__(

@@ -75,9 +75,9 @@ def make_robot_status(
 
 
 class EmergencyStopRepeater:
-    """Repeats an emergency stop, with a number, until telemetry shows that the robot has obeyed.
+    """Repeats an emergency stop until telemetry shows that the robot has obeyed.
 
-    Teleop may request the stop any number of times. The stop waits while there is no session.
+    Further requests for a stop in this time change nothing. Without a session, the stop waits.
 
     Attributes:
         sounds: Whether the stop is being repeated.

@@ -222,7 +222,10 @@ def local_files(value: Any, key: str = "") -> dict[str, str]:
 
 
 def _is_inside_name(path: KeyPath) -> bool:
-    """Return whether the value of a key may come from the file of the mission or link profile."""
+    """Return whether a key is inside the mission or a direction of the link.
+
+    An experiment may replace these parts by the name of a mission or of a link profile.
+    """
     is_direction = path[0] == "link" and len(path) > 2 and path[1] in DIRECTIONS
     return is_direction or (path[0] == "mission" and len(path) > 1)
 

@@ -390,7 +390,10 @@ def _clamp(slider: Any) -> float:
 
 
 def _with_gaps(curve: Array) -> list[float | None]:
-    """Replace NaN by None, a gap in the chart; if all are NaN, begin with -1 to keep the axes."""
+    """Replace each NaN by None, which is a gap in the chart.
+
+    If all are NaN, put -1 first: it is below the chart, which has no axes without any number.
+    """
     values = [None if value != value else value for value in curve.tolist()]
     return [-1.0, *values[1:]] if not any(value is not None for value in values) else values
 

@@ -111,7 +111,10 @@ class Feed:
 
     @classmethod
     def on_stdout(cls, *, watched: bool = True) -> Feed:
-        """Make a feed that owns standard output; redirect other prints to standard error."""
+        """Make a feed that owns standard output; redirect other prints to standard error.
+
+        `watched` is True if a supervisor reads standard output.
+        """
         feed = cls(os.dup(1), watched=watched)
         os.dup2(2, 1)
         return feed

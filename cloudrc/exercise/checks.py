@@ -74,7 +74,7 @@ def _command(
 
 
 class Formula(NamedTuple):
-    """A comparison of the results of the student's plug-in with those of the reference."""
+    """A test that compares the results of the student's plug-in with those of a correct plug-in."""
 
     test: str
     points: int

@@ -99,7 +99,7 @@ class HostileOperator:
                 self.outputs = [*self.outputs, request._replace(number=self._number)]
 
     def take_outputs(self) -> Sequence[Output | Fault]:
-        """Implement `Operator.take_outputs`."""
+        """Return and remove the forwarded and the forged messages since the last call."""
         outputs, self.outputs = self.outputs, []
         return outputs
 

@@ -117,7 +117,8 @@ def clearance_per_pipe(
 def clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: ArrayLike) -> Array:
     """Compute the robot's distance from the nearest pipe's wall [m], shape (n,).
 
-    The arguments are those of `clearance_per_pipe`. Without pipes the distance is infinite.
+    `positions` [m] have the shape (n, 3), `orientations_wxyz` (unit quaternions, body to world) the
+    shape (n, 4). Without pipes the distance is infinite.
     """
     distances = clearance_per_pipe(scene, positions, orientations_wxyz)
     nearest: Array = distances.min(axis=1, initial=np.inf)

@@ -138,7 +138,10 @@ class _HandedFile(ProfileFile):
 
 
 class Profiles:
-    """Watches the profile's file and the file from `link set`; returns each change once."""
+    """Watches the profile's file and the file that `cloudrc link set` writes for changes.
+
+    A change that reaches both files is returned once.
+    """
 
     def __init__(
         self, profile: Path, document: Path, load: Load, log: Callable[[str], None]

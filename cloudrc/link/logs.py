@@ -247,8 +247,9 @@ _IRTT_NAMES = {
 def _irtt_entries(trips: list[dict[str, Any]], what: str) -> list[Entry]:
     """Read the time of sending and the delay of each packet [s]; the first time is 0.
 
-    `what` is a key of `_IRTT_NAMES`. Packets lost in the other direction are left out. The time is
-    always that of the client, even for the downlink: a lost packet has no time of the server.
+    `what` is "uplink", "downlink", or "halves" for half of each round trip. Packets lost in the
+    other direction are left out. The time is always that of the client, even for the downlink: a
+    lost packet has no time of the server.
     """
     other, key = _IRTT_NAMES[what]
     part = 0.5e-9 if what == "halves" else 1e-9

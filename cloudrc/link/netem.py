@@ -239,7 +239,7 @@ def _percent(share: float) -> str:
 
 
 def leaf_of(qdiscs: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """Find the netem qdisc of `Netem` among an interface's qdiscs; return None if it is missing."""
+    """Return the qdisc that `Netem` made, out of an interface's qdiscs; None if it is missing."""
     found = (one for one in qdiscs if one.get("handle") == LEAF and one.get("kind") == "netem")
     return next(found, None) if _is_ours(_root_of(qdiscs)) else None
 

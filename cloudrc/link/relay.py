@@ -193,12 +193,13 @@ class Lane:
         return {**self._counts, "unread": self._stamps.dropped}
 
     def released(self) -> dict[str, int]:
-        """Return statistics of how late datagrams left; any thread may call this method.
+        """Return how many datagrams left and how late; any thread may call this method.
 
         Returns:
-            The values of `ReleaseErrors.in_ns`, and the numbers of datagrams that were dropped
-            because too many were in flight (`overflow`), or that waited `AGE_MAX_NS` or longer to
-            be read (`stalled`). Empty before the first datagram.
+            The number of datagrams that left (`released`), that left too early (`released_early`),
+            that were dropped because too many were in flight (`overflow`), and that waited
+            `AGE_MAX_NS` or longer to be read (`stalled`); and percentiles of the lateness, such as
+            `release_error_p99_ns` [ns]. Empty before the first datagram leaves.
         """
         more = {"overflow": self._counts["overflow"], "stalled": self._stalled}
         return told | more if (told := self.errors.in_ns()) else {}
@@ -318,9 +319,9 @@ class RelayShaper(Relay):
     ) -> None:
         """Open the two sockets; raise an OSError if `listen` is in use or cannot reach `end`.
 
-        This pod's end of the tunnel sends to the address `listen`; with port 0 the kernel chooses a
-        port. It sends from the address `end`; None allows any address. The times of the model
-        `direction` are on the monotonic clock. `peek` reads kind, epoch and counter of a datagram.
+        This pod's world or cloud sends from the address `end` (None: from any address) to the
+        address `listen` (port 0: any free port). The times of the model `direction` are on the
+        monotonic clock. `peek` reads kind, epoch and counter of a datagram.
         """
         self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._inside.bind(listen)

@@ -204,9 +204,9 @@ def _cells(line: str, separator: str, where: str) -> list[str]:
 
 
 def looks_lost(values: Collection[float]) -> bool:
-    """Return whether 0 marks lost packets in `values`, because all other delays are far from 0.
+    """Return whether a 0 in `values`, delays in any unit, probably means a lost packet.
 
-    `values` are delays in any unit. With few decimals, 0 may be a short delay that was rounded.
+    It does if all other delays are far from 0. Otherwise 0 may be a short delay that was rounded.
     """
     decimals = max((len(f"{value:.12g}".partition(".")[2]) for value in values), default=0)
     shortest = min((value for value in values if value > 0.0), default=0.0)

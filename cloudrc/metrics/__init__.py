@@ -75,8 +75,8 @@ def check(own: Iterable[str]) -> None:
 def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
     """Return a note for each metric of the experiment that is a file and was not measured.
 
-    `named` are the experiment's metrics, `own` the metrics that the user names with --metric. The
-    file of a metric is executed only if the user names it.
+    `named` are the experiment's metrics, `own` those that the user names with --metric. A file may
+    be code from somebody else, so it is executed only if the user names it.
     """
     names = set(map(name_of, own))
     return [

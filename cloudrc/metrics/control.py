@@ -54,7 +54,10 @@ def _delay_error(flight: Flight) -> float | None:
 
 
 def wakes(flight: Flight, end: str) -> Columns:
-    """Select the rows of /lateness that `end` ("world", "cloud") recorded; none in virtual time."""
+    """Return how late `end` ("world" or "cloud") woke up: its rows of the topic /lateness.
+
+    There are no rows in virtual time.
+    """
     columns = flight.during("/lateness")
     rows = columns["end"] == end
     return {name: column[rows] for name, column in columns.items()}

@@ -353,5 +353,5 @@ class Observations:
 
 
 def finite_or_none(value: float) -> float | None:
-    """Return `value`, any unit, but None instead of NaN and infinity, which JSON lacks."""
+    """Return `value` [any unit], or None if it is NaN or infinite, which JSON cannot express."""
     return value if isfinite(value) else None

@@ -154,7 +154,7 @@ def _seeds(given: Any) -> tuple[int, ...]:
 def _entries(
     document: Document, file: SweepFile, folder: Path, found: list[Problem]
 ) -> tuple[list[_Entry], dict[str, list[tuple[Any, list[_Entry]]]]]:
-    """Return the settings that all points share, and a mapping: axis -> its choices.
+    """Return the settings that all points of the sweep share, and a mapping: axis -> its choices.
 
     A choice is a label with its settings. Problems of the axes are added to `found`.
     """

@@ -156,10 +156,10 @@ def paired(differences: Sequence[float]) -> Paired:
 
 
 def _cut(n: int) -> int:
-    """Return the critical value of the signed-rank test; -1 if `n` pairs are too few for one.
+    """Return the critical value of the signed-rank test for `n` pairs.
 
-    The test finds a difference if the smaller of the two sums, of the positive ranks and of the
-    negative ranks, is at most this value.
+    The test finds a difference if the sum of the positive ranks, or that of the negative ranks, is
+    at most this value. It is -1 if `n` is too small to find any difference.
     """
     if n > EXACT_MAX:
         mean, spread = n * (n + 1) / 4, math.sqrt(n * (n + 1) * (2 * n + 1) / 24)

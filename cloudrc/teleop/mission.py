@@ -125,7 +125,7 @@ class Teleop:
     """
 
     def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
-        """Begin without a mission; `ended` tells whether a mission (by its number) has ended."""
+        """Begin without a mission; `ended` tells for a mission's number whether it has ended."""
         self.state = "idle"  # of the mission
         self.leg = 0  # index of the current waypoint; their number once all are reached
         self.outcome: MissionEvent | None = None  # event that ended the newest mission

@@ -319,9 +319,10 @@ class MissionService:
 
     @property
     def _inherits_stop(self) -> Mission | None:
-        """Mission that an emergency stop ended before teleop restarted.
+        """Mission that an emergency stop ended before teleop restarted; None without one.
 
-        None after the first telemetry, or if there is no such mission.
+        The first telemetry shows whether the robot obeyed this stop; from then on, or while
+        teleop repeats a stop, the value is None.
         """
         unknown = self.seen is None and not self._teleop.stopping
         return self.book.stopped() if unknown else None

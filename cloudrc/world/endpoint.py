@@ -164,8 +164,8 @@ class WorldEndpoint(TunnelEnd):
 
         With `samples`, also take the odometry sample that is due at `until_ns`.
 
-        If an earlier call took the sample at `until_ns`, also simulate the step that begins at this
-        time: a datagram that arrives at `until_ns` acts on the step after it.
+        If an earlier call took the sample at `until_ns`, also simulate the step that begins at
+        this time. So a datagram that arrives at the time of a sample acts from the next step on.
         """
         tick_ns = self._tick_ns
         if until_ns == tick_ns == self._sample_ns - self._sample_period_ns:

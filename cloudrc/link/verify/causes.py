@@ -133,8 +133,8 @@ measured to requested value, and text."""
 def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
     """Yield code and text of at most two causes of the quantities that are "off".
 
-    The first is the most certain cause that the machine's counters show. A cause that the measured
-    values suggest follows if the counters show no cause, or only the cause "throttled".
+    First comes the most certain cause that the machine's counters show. If they show none, or only
+    "throttled", the most certain cause that the measured values suggest comes next.
     """
     off = {row.name: row for row in one.rows if row.verdict == "off"}
     lost = next((row.measured for row in one.rows if row.name == "loss"), 0.0)

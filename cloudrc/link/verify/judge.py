@@ -83,9 +83,10 @@ class Expected(NamedTuple):
     known: bool  # whether the random numbers are known, so that a band has no width
 
     def hidden(self, name: str) -> float:
-        """Return the half width of the band of the quantity `name`, divided by its tolerance.
+        """Return how uncertain the expected value of quantity `name` is, relative to its tolerance.
 
-        If the result is above CHANCE_MAX, the band is too wide for the verdict "ok".
+        The result is half the width of the value's band, divided by the tolerance [1]. Above
+        CHANCE_MAX the verdict "ok" is impossible, because the band would hide a deviation.
         """
         mean, low, high = self.bands[name]
         return 0.5 * (high - low) / tolerance(name, mean)
@@ -131,7 +132,10 @@ class Plan:
 
     @cached_property
     def links(self) -> list[Stream]:
-        """Simulated streams through 200 netem links; constant conditions need fewer datagrams."""
+        """Simulated streams through 200 netem links with different random numbers.
+
+        The streams are shorter if the conditions are constant.
+        """
         few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
         sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
         seeds = range(-RUNS, 0)  # the seed of an experiment is not negative

@@ -45,8 +45,8 @@ def plan_probes(
 
     Without `seconds`, the duration is long enough for a verdict, and covers the profile's time line
     up to a limit. If the profile limits the rate, the probes are large, and half of them are sent
-    in trains to measure the rate. `drawn` is True for netem, whose random numbers
-    nobody can predict.
+    in trains to measure the rate. `drawn` is True for netem: nobody can predict its random
+    numbers, so a verdict may need more probes.
     """
     timeline, train, step = Timeline(profile), 0, (2.0 if drawn else 1.0) / RATE
     if (rate := min(piece.rate or inf for piece in timeline.pieces)) <= RATE_MAX:

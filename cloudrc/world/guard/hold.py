@@ -211,10 +211,10 @@ class TakeOff:
             self._stopped, self._still_ticks, self._height = True, 0, nan
 
     def look(self, readings: Readings, flies: bool) -> None:
-        """Process the sensor readings of a physics step.
+        """Process the sensor readings of a physics step; `flies` tells whether the rotors turn.
 
-        If `flies` is True, find out whether the robot has left the ground, and set `over`.
-        Otherwise update the robot's height on the ground and its time at rest.
+        While they turn, set `over` if the robot has left the ground. While they stand still, update
+        the robot's height on the ground and its time at rest.
         """
         height = readings.position[2]
         if flies:

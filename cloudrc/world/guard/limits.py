@@ -235,8 +235,8 @@ class Limits:
     def ramp_ns(self) -> int:
         """How long after a HOLD the acceleration of the reference is limited to BRAKE [ns].
 
-        In this time the robot can reach its highest speed. The limit does not end earlier when the
-        reference reaches the command, because the first commands after a silence may be zero.
+        In this time the robot can reach its highest speed. The time is fixed: the reference may
+        reach the command at once, because the first commands after a silence may be zero.
         Source: docs/reference/plant.md, "Leaving HOLD".
         """
         return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)

@@ -304,7 +304,7 @@ def _self_test() -> str:
 
 
 def _fly(robot: Robot) -> list[object]:
-    """Take off and fly curves for 0.8 s; return the states of robot and guard."""
+    """Fly the self-test: 0.8 s with take-off and curves; return the states on the way."""
     robot.put_on_ground(0, "self-test")
     robot.guard.start_mission(0)
     seen: list[object] = []
