@@ -174,8 +174,8 @@ class LastWord:
     ) -> None:
         """Set the functions that give the state of cloud and robot.
 
-        `asked` returns True after cloud has been asked to end, `flies` while the robot flies.
-        `clock` returns the time [ns].
+        `asked` returns whether cloud has been asked to end, `flies` whether the robot flies, and
+        `clock` the time [ns].
         """
         self._asked, self._flies, self._clock = asked, flies, clock
         self._until_ns: int | None = None

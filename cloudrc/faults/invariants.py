@@ -194,7 +194,7 @@ class RobotInvariants:
         self._was, self._state, self._before = state, state, reference
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
-        """Check the age of an accepted command; count commands with impossible values or times."""
+        """Implement `Observer.see_command`: check an accepted command's age, count invalid ones."""
         if rejection is None:
             basis_ns = command.basis_stamp_ns
             if not 0 <= now_ns - basis_ns <= self._age_ns:

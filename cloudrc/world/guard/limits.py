@@ -48,7 +48,7 @@ ROUNDING_FACTOR = 1.0 - 2.0**-45
 
 
 def stopping_distance(speed: float, reaction: float) -> float:
-    """Return the stopping distance [m] from a `speed` [m/s] with a reaction time [s]."""
+    """Return the distance [m] to stop from `speed` [m/s]: `reaction` time [s], then braking."""
     return speed * (reaction + speed * STOP_COEFFICIENT)
 
 
