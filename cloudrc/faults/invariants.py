@@ -336,8 +336,8 @@ class RobotInvariants:
     ) -> None:
         """Check that the rotors stop only on a request, after a collision, or without motion.
 
-        Hard braking also commands a rotor speed of 0. Therefore the check looks for the constant
-        `STOPPED`, which is commanded only if the rotors are to stop.
+        Hard braking also commands rotor speeds of 0. Therefore the check looks for the object
+        `STOPPED` itself, which is commanded only to stop the rotors.
         """
         turns, asked = rotor_speeds is not STOPPED, self._is_asked
         is_hit = state is ESTOP and self._was is not ESTOP and not asked

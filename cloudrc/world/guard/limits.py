@@ -193,8 +193,8 @@ class Limits:
         speed_max: Largest speed of the velocity reference [m/s].
         acceleration_max: Largest rate of change of the velocity reference [m/s^2].
         yaw_rate_max: Largest yaw rate [rad/s].
-        hold_max_ns: Longest HOLD in a mission before LAND begins [ns]; on the ground, it is at
-            least `GROUND_WAIT_MIN_NS`.
+        hold_max_ns: Longest HOLD in a mission before LAND begins [ns]. A robot on the ground waits
+            as long for commands, but at least `GROUND_WAIT_MIN_NS`.
         plan_max_ns: Longest time for which the robot flies a command's plan after its arrival [ns];
             0: a plan does not extend the time for which its command is fresh.
     """
