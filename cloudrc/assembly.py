@@ -158,7 +158,7 @@ def build_cloud(
     `clock` returns cloud's monotonic time [ns]. `teleop` provides the setpoints; without it, a new
     `Teleop` flies the mission at once. In virtual time, `cpu_clock` returns the processor
     time of this thread [ns], which delays commands if `cloud.compute_measured` is set.
-    `make_loop` makes the control loop from the arguments of `ControlLoop`.
+    `make_loop` is called in place of `ControlLoop`, for example to make a loop that lies.
     """
     cloud = experiment.cloud
     loop = make_loop(

@@ -135,7 +135,7 @@ class SweepView:
             self._status.start()
 
     def see(self, row: Row) -> None:
-        """Count a finished flight; print its failure or note, once for each kind of verdict."""
+        """Count a finished flight; print only the first text (failure or note) of each verdict."""
         self._done += 1
         self._failed += row["verdict"] != "success"
         if row["text"] and row["verdict"] not in self._told:

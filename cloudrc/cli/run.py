@@ -333,7 +333,7 @@ def _record_virtual(
 
 
 def _prepare(experiment: ResolvedExperiment) -> bool:
-    """Check the user's robot and scene; return whether the operator's API is installed."""
+    """Check the user's robot and scene; return whether the packages of the API are installed."""
     if absent := missing("api"):
         text = f"no operator's API in this run: {', '.join(absent)} not installed"
         print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)
@@ -354,7 +354,8 @@ def _record_local(
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
     """Fly in real time; yield the merged recording, the experiment and facts about the run.
 
-    With `session`, yield those of the session's last mission.
+    If `session` is given, fly a session, and yield recording, experiment and facts of its last
+    mission. `session` is called with the API's address and the metrics' addresses by process.
     """
     from cloudrc.assembly import flight_limit
     from cloudrc.cli.session import read_last_mission

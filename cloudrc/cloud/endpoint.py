@@ -168,9 +168,10 @@ class CloudEndpoint(TunnelEnd):
 
     @property
     def mission_over(self) -> bool:
-        """Whether the mission has ended and cloud has nothing more to tell the robot.
+        """Whether the mission has ended, so that cloud may stop.
 
-        Either telemetry shows that the robot has acted on the last request, or cloud has given up.
+        Telemetry must show that the robot has acted on the last request, or the mission must have
+        ended more than `GIVE_UP_NS` ago.
         """
         done = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
         return done and self.teleop.outcome is not None

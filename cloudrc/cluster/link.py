@@ -120,7 +120,7 @@ def send(
 
     Args:
         release: The release.
-        link: The present link of the release.
+        link: The link of the release before the change.
         profile: New profile, as in `cloudrc.config.load.edit_profile`.
         settings: Values to set, as in `cloudrc.config.load.edit_profile`.
         note: Function that makes the content of change.json, the number and the cause of the

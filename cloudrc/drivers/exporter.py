@@ -169,7 +169,7 @@ class Exporter:
         return self._live.link
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set a direction's `shaper`, "relay" or "netem"; `mode` is the configured `link.mode`."""
+        """Set the labels of a direction's metric: `shaper`, "relay" or "netem", and `link.mode`."""
         self.link.shaped(shaper, direction, mode)
 
     def asked(self, direction: str, delay: float) -> None:

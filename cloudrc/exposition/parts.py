@@ -55,7 +55,7 @@ def per_axis(vector: Vector) -> dict[Labels, float]:
 
 
 def by_label(counts: Mapping[str, float]) -> dict[Labels, float]:
-    """Convert label value -> count to the reading of a metric that has one label."""
+    """Convert label value -> count to (label value,) -> count, the form of `Readings`."""
     return {(name,): count for name, count in counts.items()}
 
 

@@ -56,9 +56,9 @@ def silent(start: float, duration: float, **changes: object) -> Shape:
 class Flight:
     """One flight of world, cloud, teleop and link.
 
-    `rings` maps "world" and "cloud" to the keys that the running process uses, `secrets` to the
-    keys in its key file. Every 100 ms, each of `listeners` is called with world's new records and
-    the virtual time [ns].
+    `secrets` maps "world" and "cloud" to the keys in their key files; `rings` maps them to the keys
+    that their running processes use. Every 100 ms, each of `listeners` is called with world's new
+    records and the virtual time [ns].
     """
 
     def __init__(

@@ -194,7 +194,7 @@ class RobotInvariants:
         self._was, self._state, self._before = state, state, reference
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
-        """Check the age of an accepted command; count commands with impossible values or times."""
+        """Implement `Observer.see_command`: check an accepted command's age, count invalid ones."""
         if rejection is None:
             basis_ns = command.basis_stamp_ns
             if not 0 <= now_ns - basis_ns <= self._age_ns:
@@ -336,8 +336,8 @@ class RobotInvariants:
     ) -> None:
         """Check that the rotors stop only on a request, after a collision, or without motion.
 
-        Hard braking also commands a rotor speed of 0. Therefore the check looks for the constant
-        `STOPPED`, which is commanded only if the rotors are to stop.
+        Hard braking also commands rotor speeds of 0. Therefore the check looks for the object
+        `STOPPED` itself, which is commanded only to stop the rotors.
         """
         turns, asked = rotor_speeds is not STOPPED, self._is_asked
         is_hit = state is ESTOP and self._was is not ESTOP and not asked

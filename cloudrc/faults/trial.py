@@ -2,7 +2,8 @@
 
 An operator orders one mission after another, and acknowledges each landing and emergency stop. The
 last part of the flight has no faults: the robot must then fly again, otherwise it counts as stuck.
-`cloudrc.faults.schedule.shaped` applies the faults of the link.
+This module injects all faults except those of the link; `cloudrc.faults.schedule.shaped` adds those
+to the link's profile.
 """
 
 from __future__ import annotations
@@ -195,7 +196,6 @@ class Operator:
 
 
 def _check_waypoints(flight: Flight) -> None:
-    """Check the order of the waypoints of each mission in teleop's log."""
     reached: dict[str, list[int]] = {}
     for event in events_of_missions(flight, "reached"):
         reached.setdefault(event["mission"], []).append(event["waypoint"])

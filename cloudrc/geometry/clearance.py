@@ -73,8 +73,8 @@ def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) ->
 def distance_to_pipe(pipe: Pipe, points: Array) -> Array:
     """Compute the distance of points from a pipe's wall [m], shape (...); negative inside the wall.
 
-    `points` are in [m], world frame, shape (..., 3). With s along the axis and r from the axis, the
-    wall is a rectangle in the (s, r) plane.
+    `points` are in [m], world frame, shape (..., 3). With s the position along the axis and r the
+    distance from the axis, the wall is a rectangle in the (s, r) plane.
     """
     relative = points - np.asarray(pipe.centre)
     s = relative @ np.asarray(pipe.axis)

@@ -365,7 +365,7 @@ class Netem:
         return found
 
     def released(self) -> dict[str, int]:
-        """Return an empty dict: the kernel does not report when datagrams leave the queue."""
+        """Return no statistics: the kernel does not report when datagrams leave the queue."""
         return {}
 
     def close(self) -> None:

@@ -352,7 +352,7 @@ class RelayShaper(Relay):
         self._lane.direction.replace_profile(profile, restart=restart)
 
     def released(self) -> dict[str, int]:
-        """Return statistics of how late datagrams left: the result of `Lane.released`."""
+        """Return counts of datagrams, and percentiles of how late they left [ns], by name."""
         return self._lane.released()
 
     def close(self) -> None:

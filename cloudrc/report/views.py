@@ -40,7 +40,7 @@ GOAL, GHOST, GLASS = (0.84, 0.37, 0.0), (0.34, 0.71, 0.91), (0.70, 0.74, 0.78)
 
 
 def add_views(mission: Contents, experiment: ResolvedExperiment) -> Recording:
-    """Add messages for viewers to the recording `mission`, and return its tables.
+    """Add messages for viewers such as Foxglove to the recording `mission`; return its tables.
 
     Raise a BadInputError if the scene of the experiment cannot be read.
     """

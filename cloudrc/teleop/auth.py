@@ -82,8 +82,8 @@ class Tokens:
     def caller(self, token: str) -> Caller | None:
         """Return the caller with this token; None if the token is not valid.
 
-        A change of a file takes effect at once. While one of the two files has no valid token, the
-        token of the other file is not valid either.
+        Each call reads the files of operator and reader again. While one of them contains no valid
+        token, no token is valid.
         """
         try:
             return self._read().get(hashlib.sha256(token.encode()).digest())

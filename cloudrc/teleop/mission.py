@@ -488,7 +488,7 @@ class Teleop:
             self._select_leg(leg, now_ns)
 
     def _repeat_setpoint(self, now_ns: int) -> None:
-        """Send the setpoint again in a new session.
+        """Send the setpoint again, because a new session has begun.
 
         Send the robot's position instead if the operator steers by hand, or if the mission still
         has to reset the robot to the spawn.

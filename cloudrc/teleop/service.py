@@ -126,7 +126,7 @@ class MissionService:
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
         """Create a mission that starts at once or waits; return it, and whether it is new.
 
-        If a mission has the order's key already, return that mission.
+        Two orders with the same key make only one mission: for the second, return that mission.
         """
         known = self.book.with_key(order.key)
         if known is not None:

@@ -65,7 +65,7 @@ NO_PLAN = Plan((Leg(ZERO),))
 
 
 class RobotStatus(NamedTuple):
-    """The robot's status from the newest telemetry, which cloud sends to teleop.
+    """Status of the robot after the newest telemetry; cloud sends it to teleop.
 
     Numbers that are not known yet are NaN.
     """

@@ -113,7 +113,7 @@ class Session:
     def open(self, data: Datagram) -> tuple[int, int, int, Any]:
         """Verify a datagram; return its kind, epoch, counter and decrypted body.
 
-        For a datagram from `pass_on`, the body is the message itself.
+        If `pass_on` made the datagram, it is not encrypted, and the body is the message itself.
 
         Raises:
             DecodeError: "malformed"; "version"; "direction" if this endpoint itself sends in the

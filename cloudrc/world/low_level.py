@@ -45,7 +45,7 @@ error, largest sine of the yaw error [1]. For larger errors, `attitude` uses ano
 
 
 class LowLevel:
-    """Make the robot follow a velocity at a yaw of 0, as the published controller does.
+    """Controller that makes the robot follow a velocity at a yaw of 0, like the published code.
 
     Attributes:
         gains: Force per velocity error, per integrated error and per change of the error in one

@@ -113,7 +113,7 @@ class History:
         return reversed(parts)
 
     def ahead(self, start_ns: int, end_ns: int, shift_ns: int) -> Iterator[tuple[Vector, float]]:
-        """Predict which sent commands world follows from `start_ns` to `end_ns` [ns], its clock.
+        """Predict which commands world follows from `start_ns` to `end_ns`, world's clock [ns].
 
         Yield velocity [m/s] and duration [s] of each command. World begins to follow a command at
         the command's stamp plus `shift_ns` [ns].
@@ -126,11 +126,11 @@ class History:
             start_ns, index = until_ns, index + 1
 
     def followed(self, count: int, start_ns: int, end_ns: int) -> list[tuple[Vector, float]]:
-        """List the velocities [m/s] of one command and the duration of each [s].
+        """List the velocities [m/s] of one command, and for how long world follows each [s].
 
-        World follows the command from `start_ns` to `end_ns` [ns], world's clock. A command with a
-        plan has one velocity per step of the plan. `count` = n selects the n-th of `commands`;
-        0 stands for zero velocity, before the first command.
+        World follows the command from `start_ns` to `end_ns`, world's clock [ns]. A command with a
+        plan has one velocity per step of the plan. `count` = n selects the n-th of `commands`; with
+        `count` = 0, there is no command yet, and the velocity is zero.
         """
         command = self.commands[count - 1] if count else NO_COMMAND
         if not command.plan:

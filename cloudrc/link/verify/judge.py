@@ -144,7 +144,7 @@ class Plan:
 
     @cached_property
     def chance(self) -> Expected:
-        """Expected values, with bands for the random variation between simulated netem links."""
+        """Expected values of a netem link, with bands that contain most of the simulated links."""
         return self._expect(self.links)
 
     def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:
@@ -167,8 +167,9 @@ class Plan:
     def judge(self, measured: Stream, epoch: int = 1, first: int = 0) -> list[Row]:
         """Judge a measured stream; return one row per quantity.
 
-        If the stream cannot show a quantity, the row of this quantity has only the requested value
-        and the verdict "told". The datagrams have the numbers from `first` on in session `epoch`.
+        If the stream cannot show a requested property, such as the rate without trains, its row has
+        only the requested value and the verdict "told". `first` is the counter of the first
+        datagram in the session `epoch`.
         """
         expected = self.expected(measured, epoch, first)
         found = self.quantities(measured, expected.pooled)

@@ -183,7 +183,7 @@ class LinkMonitor:
         return found
 
     def _rows(self) -> list[Row]:
-        """Judge all quantities; add a row "time_line" if a profile changes over time."""
+        """Judge all quantities; add an unjudged row "time_line" if a profile changes over time."""
         stream, first, timed = _in_order(self._arrivals, self._period)
         judged = timed and (self._uplink or not self._computes)
         rows, skipped = list[Row](), UNJUDGED if judged else UNJUDGED | DELAYS

@@ -146,8 +146,8 @@ def _draw_floor(axes: Axes, view: _View, points: Array, height: float) -> None:
 def _instants(subject: Subject) -> list[int]:
     """Choose the rows of the true states at which to draw the robot.
 
-    The positions in these rows are at equal distances along the path, which ends here at the first
-    touch of the board. Leave out a row whose position is too near to that of a chosen row.
+    The rows are at equal distances along the path, up to the first touch of the board. Leave out a
+    row where the robot would be less than APART from a robot that is already drawn.
     """
     truth, touch = subject.flight.truth, first_touch(subject.flight)
     stamps = truth["stamp_ns"]

@@ -135,7 +135,7 @@ class Descent:
     """Detect the touch-down of a descent, and decide whether the robot may stop above the ground.
 
     After the operator's acknowledgement, the robot stops its descent and holds its position, if
-    it sinks freely and is above the lowest z for a hold. Otherwise the robot descends to
+    it sinks unhindered and is above the lowest z for a hold. Otherwise the robot descends to
     touch-down, because a hold would make it scrape along the ground or an obstacle.
 
     Attributes:
@@ -156,8 +156,8 @@ class Descent:
     def may_stop(self, readings: Readings) -> bool:
         """Return whether the robot may stop its descent in the air, and hold its position there.
 
-        The operator must have acknowledged the landing; the robot must sink freely, and be above
-        the lowest height for a position hold.
+        The operator must have acknowledged the landing. The robot must sink at more than half the
+        planned speed, and be above the lowest height for a position hold.
         """
         free = readings.velocity[2] < -0.5 * self.speed and readings.position[2] > self._floor
         return self.acknowledged and free
@@ -197,7 +197,7 @@ class TakeOff:
 
     @property
     def condition(self) -> Cause:
-        """Cause of the change to GROUND, when the operator acknowledges a landing or a stop."""
+        """Cause of GROUND after an acknowledgement; it says if the robot must first be at rest."""
         return Cause.ACKNOWLEDGED if self.allowed else Cause.STILL_FIRST
 
     def forget(self, *, stopped: bool = False) -> None:

@@ -48,7 +48,7 @@ ROUNDING_FACTOR = 1.0 - 2.0**-45
 
 
 def stopping_distance(speed: float, reaction: float) -> float:
-    """Return the stopping distance [m] from a `speed` [m/s] with a reaction time [s]."""
+    """Return the distance [m] to stop from `speed` [m/s]: `reaction` time [s], then braking."""
     return speed * (reaction + speed * STOP_COEFFICIENT)
 
 
@@ -193,8 +193,8 @@ class Limits:
         speed_max: Largest speed of the velocity reference [m/s].
         acceleration_max: Largest rate of change of the velocity reference [m/s^2].
         yaw_rate_max: Largest yaw rate [rad/s].
-        hold_max_ns: Longest HOLD in a mission before LAND begins [ns]; on the ground, it is at
-            least `GROUND_WAIT_MIN_NS`.
+        hold_max_ns: Longest HOLD in a mission before LAND begins [ns]. A robot on the ground waits
+            as long for commands, but at least `GROUND_WAIT_MIN_NS`.
         plan_max_ns: Longest time for which the robot flies a command's plan after its arrival [ns];
             0: a plan does not extend the time for which its command is fresh.
     """

@@ -240,10 +240,11 @@ class Guard:
             self._ramp_until_ns = now_ns + self._limits.ramp_ns
 
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
-        """Return whether a command at `now_ns` may begin TRACK; it is fresh to `fresh_until_ns`.
+        """Return whether TRACK may begin at `now_ns`; prevent fast changes between TRACK and HOLD.
 
         Take-off must be allowed. At least SETTLE_NS must lie between the starts of two TRACKs, and
-        of two HOLDs. Without a newer command, the next HOLD starts at `fresh_until_ns`.
+        between the starts of two HOLDs. The next HOLD may start at `fresh_until_ns`, when the
+        present command is no longer fresh.
         """
         apart_ns = min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns)
         return self._take_off.allowed and apart_ns >= SETTLE_NS
@@ -308,7 +309,7 @@ class Guard:
         self.reference = reference
 
     def _look_after_itself(self, now_ns: int, readings: Readings) -> None:
-        """Change the state if necessary while there is no fresh command."""
+        """Change the guard's state if necessary, in a step without a fresh command."""
         state, limits = self.state, self._limits
         if state is TRACK and self._track_until_ns == NEVER_NS:
             self._enter(HOLD, now_ns, Cause.SESSION)
