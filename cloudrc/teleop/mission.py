@@ -471,7 +471,7 @@ class Teleop:
 
     @property
     def _may_move(self) -> bool:
-        """Whether the robot, before its reset to the spawn, would fly to a setpoint sent now."""
+        """Whether a setpoint sent now would still move the robot before its reset to the spawn."""
         return self._from_spawn and not self.requests.waits
 
     def _select_early(self, now_ns: int) -> None:

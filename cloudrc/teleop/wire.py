@@ -1,4 +1,4 @@
-"""Define what a mission flies, and the messages between cloud and teleop; encode the messages.
+"""Define the plan of a mission, and encode the messages between cloud and teleop.
 
 Each datagram is a JSON list: the name of the message's type, then its fields in order.
 """

@@ -31,7 +31,7 @@ class Channel:
 
     @property
     def is_flooded(self) -> bool:
-        """Whether more repeated datagrams have arrived than the sender has sent in this session.
+        """Whether the repeats that arrived in this session outnumber all datagrams of the sender.
 
         Only an attacker repeats so many datagrams. The receiver then no longer records repeats.
         """

@@ -81,7 +81,7 @@ class CommandHistory(Replay):
         self._bodies: list[FirstOrder] = []  # at the stamp of each command
 
     def commanded(self, command: Command) -> None:
-        """Store a command, and the state of the simulated robot at the command's stamp."""
+        """Store a command, and the state of the predictor's model at the command's stamp."""
         body = self._at(command.stamp_ns)
         if self.history.add(command):
             if len(self._bodies) >= len(self.history.stamps):
@@ -89,7 +89,7 @@ class CommandHistory(Replay):
             self._bodies.append(body)
 
     def _at(self, time_ns: int) -> FirstOrder:
-        """Return the simulated robot at `time_ns`, on cloud's clock [ns]."""
+        """Return the predictor's model of the robot at `time_ns`, on cloud's clock [ns]."""
         history = self.history
         if not history.stamps:
             return FirstOrder(*self._loop)
