@@ -138,7 +138,7 @@ class _HandedFile(ProfileFile):
 
 
 class Profiles:
-    """Watches the profile's file and the file that `cloudrc link set` writes for changes.
+    """Watches two files for changes: the profile's, and the one that `cloudrc link set` writes.
 
     A change that reaches both files is returned once.
     """

@@ -197,7 +197,10 @@ class TakeOff:
 
     @property
     def condition(self) -> Cause:
-        """Cause of GROUND after an acknowledgement; it says if the robot must first be at rest."""
+        """Why the guard is in GROUND after the operator's acknowledgement.
+
+        The cause tells whether the robot must be at rest before it may take off.
+        """
         return Cause.ACKNOWLEDGED if self.allowed else Cause.STILL_FIRST
 
     def forget(self, *, stopped: bool = False) -> None:
