@@ -101,7 +101,7 @@ def send_change(release: Release, pod: str, handed: Handed) -> str:
 
 
 class Sent(NamedTuple):
-    """A change of the link profile that was sent to both link containers; neither refused it."""
+    """Result of `send`: a changed link profile, and the answers of the two link containers."""
 
     edit: Edit  # the edited profile
     files: dict[str, str]  # for the ConfigMap

@@ -186,7 +186,7 @@ class Exporter:
 
     @property
     def is_ready(self) -> bool:
-        """Whether `ready(True)` was called; world and cloud are also ready while the peer sends."""
+        """Whether this process is ready: world or cloud if the peer sends, others by `ready`."""
         return self._said_ready or (self._live.end is not None and self._live.end.has_peer)
 
     def serve(self, address: tuple[str, int]) -> int:

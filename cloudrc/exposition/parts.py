@@ -87,7 +87,7 @@ class DatagramTally:
     def take(self, epoch: int, counter: int) -> bool:
         """Count the arrival of a datagram; return True if the datagram is certainly new.
 
-        Otherwise the datagram may be a replay: anybody can capture a datagram and send it again.
+        Return False for a repeated or very old datagram: an attacker may have sent it again.
         """
         if epoch != self._epoch:
             # Datagrams before the first arrival are not lost: the receiver may not have run.

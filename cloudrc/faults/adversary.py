@@ -46,7 +46,7 @@ status of the robot. `HostileOperator` sets the number of the request."""
 
 
 class DishonestLoop(ControlLoop):
-    """Computes honest commands, and changes them before they are sent."""
+    """Control loop of a dishonest cloud: changes the honest commands before they are sent."""
 
     def __init__(self, lies: Sequence[Lie], *plugins: Any, **limits: Any) -> None:
         """Set `lies`; each command passes through all of them, in this order.

@@ -158,7 +158,7 @@ class Operator:
         flight.listeners.append(self._look)
 
     def check_stuck(self) -> None:
-        """Check that the robot has flown (TRACK) in the last `BACK` [s], which have no faults."""
+        """Report a breach if the guard was never in TRACK in the last `BACK` [s] (no faults)."""
         flight, now_ns = self._flight, self._flight.run.now_ns
         if now_ns - self._tracked_ns > BACK * 1e9:
             state, cause = flight.guard_now()

@@ -47,7 +47,7 @@ Fate: TypeAlias = tuple[int, ...]
 
 
 class Purpose(IntEnum):
-    """What a column of random numbers decides, such as the loss of packets."""
+    """What a random number decides for a packet, such as its loss or its jitter."""
 
     DELAY = 0
     COPY_DELAY = 1

@@ -81,8 +81,8 @@ used, because they allocate whatever size the file claims."""
 class Contents:
     """The contents of a recording's file.
 
-    `note` says what is missing or wrong. `lacking` is `note` without the messages that a
-    killed process did not write; a text in it means that the file was damaged or changed.
+    `note` says what is missing or wrong, for example that the process was killed before it had
+    written all messages. `lacking` says only how the file was damaged or changed; "" if it was not.
     """
 
     # Topic, log time [ns] and CDR bytes of each message, in the order of log times.

@@ -43,7 +43,7 @@ def is_newer(epoch: int, than: int) -> bool:
 
 
 class HelloAnswer(NamedTuple):
-    """World's answer to a hello: its outcome, datagrams to send, whether a session has begun."""
+    """World's answer to a HELLO: its outcome, datagrams to send, whether a session has begun."""
 
     outcome: str
     datagrams: list[bytes]
@@ -91,7 +91,7 @@ class ServerHandshake:
         self.hear(now_ns)
 
     def receive_hello(self, hello: Hello, counter: int, now_ns: int) -> HelloAnswer:
-        """Answer a hello at `now_ns` [ns], after `Session.open` has verified the hello."""
+        """Answer a HELLO at `now_ns` [ns], after `Session.open` has verified the datagram."""
         session, key = self._session, self._session.greeting_key
         if not self._has_cookie(hello, now_ns):
             if now_ns - self._challenged_ns < CHALLENGE_NS:
@@ -161,7 +161,7 @@ class ServerHandshake:
 
 
 class ClientHandshake:
-    """Cloud's side of the handshake: make hellos, and decide which answers are valid."""
+    """Cloud's side of the handshake: make HELLOs, and decide which answers are valid."""
 
     def __init__(self, nonce: bytes, clock: bytes) -> None:
         """Start without a session; `nonce` identifies this process, `clock` the machine's clock."""

@@ -61,8 +61,9 @@ class Simulator:
     ) -> None:
         """Compile `robot` in `scene` (names or paths) and put the robot at its spawn.
 
-        Without `plant`, the true robot equals the model. Raise a BadInputError if a file is missing
-        or does not fit the onboard controller.
+        `plant` tells how the true robot differs from its model; None: not at all. Without `wind`
+        the air is at rest. Raise a BadInputError if a file is missing or does not fit the onboard
+        controller.
         """
         self.model = model = compile_model(robot, scene, plant)
         self._wind = wind

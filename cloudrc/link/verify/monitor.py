@@ -164,7 +164,7 @@ class LinkMonitor:
             kept.clear()
 
     def _report(self, rows: list[Row], now_ns: int) -> list[Record]:
-        """Make records of the verdicts; report "off" as "open" until the next check confirms it."""
+        """Make records of the verdicts; a first "off" becomes "open", a second stays "off"."""
         count, off = len(self._arrivals), {row.name for row in rows if row.verdict == "off"}
         if off - self._suspects:
             rows = [row._replace(verdict="open") if row.name in off else row for row in rows]

@@ -85,8 +85,9 @@ class Guard:
         reference: Velocity reference of the last step [m/s], world frame, shape (3,).
         yaw_rate: Limited yaw rate [rad/s]; unused, as the low-level controller keeps a yaw of 0.
         changes: Changes of the state since the last `take_changes`.
-        counts: How often each limit was applied: "limited_speed" to a command or to a velocity of a
-            plan, "limited_yaw_rate" to a command, "limited_fence" in a step.
+        counts: "limited_speed": number of shortened velocities of commands and plans;
+            "limited_yaw_rate": commands with a limited yaw rate; "limited_fence": steps in which
+            the fence limited the reference.
     """
 
     def __init__(self, limits: Limits) -> None:
