@@ -91,8 +91,8 @@ def build_world(
 ) -> WorldEndpoint:
     """Build world: the robot in its scene, and world's end of the tunnel. Needs MuJoCo.
 
-    `clock` returns the monotonic time [ns]. World's time starts after the scene has been compiled,
-    because compiling takes a while.
+    `clock` returns the monotonic time [ns]. It is called last, at the start of world's time, so
+    that the duration of compiling the scene does not count.
     """
     from cloudrc.world.endpoint import WorldEndpoint
     from cloudrc.world.guard.limits import Limits

@@ -129,8 +129,9 @@ def _long_link(
 ) -> Iterator[str]:
     """Yield warnings about limits of guard and cloud that are too short for the link's delays.
 
-    Both lists have one age per simulated datagram [s]: `ages` that of the odometry from which cloud
-    computed the command in use, `echoes` that of the newest command that telemetry has confirmed.
+    Both lists have one value per simulated datagram [s]. `ages` has the age of the odometry from
+    which cloud computed the command that the robot follows. `echoes` has the age of the newest
+    command that telemetry has confirmed.
     """
     age_max, cloud = experiment.guard.command_age_max_ms * 1e-3, experiment.cloud
     mean, longest = sum(ages) / len(ages), max(ages)

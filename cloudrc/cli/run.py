@@ -279,7 +279,7 @@ def fly(
 
 
 def _physics_steps(experiment: ResolvedExperiment, usual: str) -> str:
-    """Return which code runs the physics: Python for wind or a changed plant, else `usual`."""
+    """Name the code that runs the physics: Python for wind or a changed plant, else `usual`."""
     from cloudrc.config.schema import Plant
 
     is_usual = experiment.world.plant == Plant() and not experiment.world.wind.blows

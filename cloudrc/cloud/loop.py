@@ -342,7 +342,7 @@ class ControlLoop:
         return tuple(plan)
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
-        """Whether the last echo of a new command is older than `horizon` + `freeze_after` [s]."""
+        """Whether the newest echoed command is older than `horizon` + `freeze_after` [s]."""
         if self._echoed_ns < self._newest_echo_ns:
             self._echoed_ns = self._newest_echo_ns
         elif self._echoed_ns == NEVER_NS:

@@ -177,8 +177,8 @@ class LastWord:
     ) -> None:
         """Set the functions that give the state of cloud and robot.
 
-        `asked` returns True after cloud has been asked to end, `flies` while the guard is in TRACK.
-        `clock` returns the time [ns].
+        `asked` returns True after cloud has been asked to end. `flies` returns True while the guard
+        is in TRACK. `clock` returns the time [ns].
         """
         self._asked, self._flies, self._clock = asked, flies, clock
         self._until_ns: int | None = None

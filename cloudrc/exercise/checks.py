@@ -60,7 +60,7 @@ def _command(
     """Return two commands of a controller with `gains`: the last before and first after a reset.
 
     Before the reset, the controller gets `n` updates, 2 ms apart, of a robot at `speed` [m/s]. A
-    command is a velocity [m/s]; if `sign` is False, return its absolute values.
+    command is a velocity [m/s]. If `sign` is False, return absolute values.
     """
     controller, (x, y, z), seen = build(**gains), STATE.position, ZERO
     setpoint = Setpoint((2.0, -1.0, 0.2))

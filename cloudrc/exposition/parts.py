@@ -166,11 +166,11 @@ class DelayJudge:
         self.reset()
 
     def reset(self) -> None:
-        """Drop the control periods that wait for an echo, because a new session has started."""
+        """Drop the records of commands without an echo, because a new session has started."""
         self._sent: dict[int, Control] = {}
 
     def sent(self, control: Control) -> None:
-        """Store the record of a sent command, whose delay estimate `echoed` checks later."""
+        """Store the record of a sent command; its echo will show the true delay."""
         self._sent[control.stamp_ns] = control
         if len(self._sent) > WAITING_MAX:
             del self._sent[next(iter(self._sent))]  # the oldest

@@ -120,7 +120,7 @@ def _sums(doubled: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True, slots=True)
 class Paired:
-    """Evaluation of paired differences B - A of one metric; "u" is the unit of the metric."""
+    """Evaluation of paired differences B - A of one metric; [u] is the unit of the metric."""
 
     count: int
     lower: int  # pairs in which B is below A

@@ -93,7 +93,7 @@ class Bridge:
         self._service: MissionService | None = None
 
     def open(self, service: MissionService) -> None:
-        """Begin to accept calls; they are made on `service`."""
+        """Accept all calls from now on; teleop's loop makes them on `service`."""
         self._service, self.closed = service, ""
 
     def close(self, why: str) -> None:

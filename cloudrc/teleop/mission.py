@@ -201,9 +201,9 @@ class Teleop:
     def drive(self, now_ns: int, velocity: Vector) -> None:
         """Move the setpoint with `velocity` [m/s], world frame, for at most `HEARTBEAT_NS`.
 
-        The setpoint moves only while telemetry shows that the robot follows commands. While a
-        hand-driven mission starts, a call has no effect. Otherwise raise a BadInputError if no
-        mission is held.
+        The mission must be held; a hand-driven mission may also be starting. In other states,
+        raise a BadInputError. The call has no effect while the mission starts, or while telemetry
+        does not show that the robot follows commands.
         """
         if self._plan.by_hand and self.state == STARTING:
             return

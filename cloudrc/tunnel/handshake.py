@@ -128,9 +128,9 @@ class ServerHandshake:
     def _keeps_epoch(self, now_ns: int) -> bool:
         """Return whether the present epoch continues after a repeated HELLO of the session's cloud.
 
-        A HELLO with a newer key ends the epoch. Otherwise the first REPEATS_MAX repeats after an
-        encrypted datagram keep the epoch. Later repeats keep it if they have the epoch's key and
-        the session has not timed out.
+        A HELLO with a newer key ends the epoch. Otherwise the epoch survives REPEATS_MAX repeats
+        without an encrypted datagram in between. It survives further repeats only while they have
+        the epoch's key and the session has not timed out.
         """
         session, key = self._session, self._session.greeting_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current

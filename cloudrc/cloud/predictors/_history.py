@@ -86,8 +86,9 @@ class History:
     def shift_ns(self, odometry: Odometry, horizon: float) -> int:
         """Return the shift [ns]: the time from a command's stamp until world begins to follow it.
 
-        A command with a plan states when it begins. Without a plan, the shift comes from the
-        echoes. Before the first echo, it comes from the newest `odometry` and the `horizon` [s].
+        If the newest command has a plan, the shift ends when the plan begins. Otherwise the echoes
+        show the shift. Before the first echo, the shift comes from the newest `odometry` and the
+        `horizon` [s].
         """
         if self.commands and self.commands[-1].plan:
             return self.commands[-1].planned_ns - self.stamps[-1]

@@ -149,10 +149,10 @@ def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
 
 
 def _of_machine(known: Evidence, off: Mapping[str, Row], lost: float) -> Iterator[tuple[str, str]]:
-    """Yield code and text of each cause why the link deviates, the most certain cause first.
+    """Yield code and text of each cause that this machine's counters show, the most certain first.
 
-    `known` has this machine's counters, which show the causes. `off` has the measurements outside
-    their limits, by name. `lost` is the share of lost packets.
+    `known` has the counters. `off` has the measurements outside their limits, by name. `lost` is
+    the share of lost packets.
     """
     where, elsewhere = known.interface or "the way out", " and ".join(known.elsewhere)
     sent, unshaped = known.sent or 0, known.shaper == "none"

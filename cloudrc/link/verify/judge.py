@@ -110,7 +110,8 @@ class Plan:
 
     A train is a group of datagrams that are sent back to back to measure the rate. Before each
     train, the same number of datagrams is sent one by one to measure all other quantities.
-    `draw` calls `pause` every few hundred microseconds, so that other threads can run.
+    A simulation of the transfer calls `pause` every few hundred microseconds, so that other threads
+    can run.
     """
 
     profile: DirectionProfile  # requested conditions

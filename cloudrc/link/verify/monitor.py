@@ -134,7 +134,7 @@ class LinkMonitor:
             threading.Event().wait(FOLLOW_PERIOD)
 
     def _see(self, records: Sequence[Record], now_ns: int) -> list[Record]:
-        """Store records; every `CHECK_NS`, return verdicts on the present session and profile."""
+        """Store records; return new verdicts every `CHECK_NS`, an empty list in between."""
         for record in records:
             if isinstance(record, Arrival):
                 self._fresh |= record.epoch != self._epoch

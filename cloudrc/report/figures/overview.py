@@ -60,7 +60,7 @@ def _pipe(pipe: Pipe, view: _View) -> list[Face]:
 
 
 class _View:
-    """A parallel projection of the scene; the longer side of the scene is horizontal in it."""
+    """A parallel projection of the scene, with the scene's longer side as the horizontal."""
 
     def __init__(self, points: Array, front: Array) -> None:
         """Look at `points` [m], world frame, shape (n, 3), from the side to which `front` points.

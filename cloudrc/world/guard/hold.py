@@ -216,8 +216,8 @@ class TakeOff:
     def look(self, readings: Readings, flies: bool) -> None:
         """Process the sensor readings of a physics step; `flies` tells whether the rotors turn.
 
-        While they turn, set `over` if the robot has left the ground. While they stand still, update
-        the robot's height on the ground and its time at rest.
+        While the rotors turn, update `over`: whether the robot has left the ground. While they
+        stand still, update the robot's height on the ground and its time at rest.
         """
         height = readings.position[2]
         if flies:

@@ -295,7 +295,7 @@ class Guard:
         return self._next_ns, self.reference, self._wanted, self._track_until_ns
 
     def _follow(self, reference: Vector, now_ns: int, readings: Readings, dt: float) -> None:
-        """Limit a velocity reference to keep the robot upright and inside the fence; store it."""
+        """Store a velocity reference, limited to keep the robot upright and inside the fence."""
         climb, position = readings.velocity[2], readings.position
         if reference[2] < climb - rules.SINK_LEAD_MAX:
             reference = rules.limit_sink(reference, self.reference, climb, self._speed_max)
