@@ -126,7 +126,7 @@ class MissionService:
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
         """Create a mission that starts at once or waits; return it, and whether it is new.
 
-        A client may repeat an order with the same `key`: then return the mission of the first.
+        If an earlier order has the same `key`, return the mission of the earlier order.
         """
         known = self.book.with_key(order.key)
         if known is not None:
