@@ -155,7 +155,7 @@ def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
 
 
 def note_of(edit: Edit, number: str) -> str:
-    """Format change.json: number and cause of a change, and whether the time line restarts."""
+    """Return change.json as text: number, cause, and whether the time line restarts."""
     return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
 
 

@@ -213,7 +213,8 @@ def _local_flight(
 ) -> Flight:
     """Return a function that flies on this machine and shows the progress on `stream`.
 
-    With `ready`, the function flies a session, and calls `ready` when it waits for missions.
+    With `ready`, the function flies a session, in which teleop waits for missions. It calls `ready`
+    when all processes are ready.
     """
     from cloudrc.cli.progress import FlightView
 

@@ -158,7 +158,10 @@ class Exporter:
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Set whether this teleop or link is ready; world and cloud are ready if the peer sends."""
+        """Set whether this process is ready; only teleop and link call this method.
+
+        World and cloud are ready while the peer sends.
+        """
         self._seen_at = time.monotonic()
         self._said_ready = ready
 

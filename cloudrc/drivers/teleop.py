@@ -251,7 +251,7 @@ class TeleopLoop:
         self._send(machine.take_outputs())
 
     def _send(self, outputs: Sequence[Any]) -> None:
-        """Send all unsent events, then `outputs`; call `tell` with the new events and faults."""
+        """Send unsent events, then `outputs`, to cloud; pass new events and faults to `tell`."""
         unsent, peer = self._unsent, self._peer
         while unsent and peer.send(unsent[0]):
             unsent.popleft()

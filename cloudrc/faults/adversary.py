@@ -350,14 +350,17 @@ def _hostile_plans(rng: Generator) -> Lie:
 
 
 def _operators_voice(rng: Generator) -> Lie:
-    """Change commands by a random policy of `FASTEST`; `at_bad_moments` forges the requests."""
+    """Change commands by a random policy of `FASTEST`.
+
+    In the policy "operators-voice", `at_bad_moments` also forges requests of the operator.
+    """
     return FASTEST[int(rng.integers(len(FASTEST)))](rng)
 
 
 def _refused_and_released(rng: Generator) -> Lie:
     """Fly fast, and from time to time send NaN, so that the guard lands the robot.
 
-    Meanwhile forged requests of the operator (`at_bad_moments`) acknowledge the landings.
+    Cloud also forges requests of the operator (`at_bad_moments`), which acknowledge the landings.
     """
     fly, pause_ns = _operators_voice(rng), int(rng.uniform(0.5e9, 4e9))
 

@@ -93,7 +93,7 @@ class Sidecar:
                 file.unlink(missing_ok=True)
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
-        """Use one shaper until `stop` returns True, or until a profile needs the other shaper."""
+        """Run netem or the relay until `stop()` is true, or until a profile needs the other."""
         profile, machine = self.profile, self._machine
         if self.states.state and profile.change.restart:
             self._origin_ns = machine.clock()

@@ -80,7 +80,7 @@ def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
 
 
 def parse_trace(lines: Iterable[str], name: str) -> Trace:
-    """Parse the lines of the trace file `name`; raise the errors of `read_trace`.
+    """Parse the lines of the trace file `name`; raise a BadInputError if they are no trace.
 
     If the first row's time is above `START_MAX` [s], subtract this time from all times.
     """

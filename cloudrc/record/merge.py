@@ -80,7 +80,7 @@ def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
 
 
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
-    """Return the smallest delay plus clock offset of a packet [ns]; None if no packet arrived."""
+    """Return the least (arrival stamp - sending stamp) of a packet [ns]; None if none arrived."""
 
     def packets(table: Table) -> Iterator[tuple[tuple[int, int], int]]:
         numbers = zip(table["epoch"].tolist(), table["counter"].tolist(), strict=True)

@@ -93,10 +93,10 @@ def signed_rank_test(differences: Sequence[float]) -> float:
 
 
 def _chance_at_most(total: int, doubled: NDArray[Any]) -> float:
-    """Return the probability that the sum of the positive ranks, times 2, is at most `total`.
+    """Return the probability that twice the sum of the positive ranks is at most `total`.
 
-    Each rank is positive or negative with probability 1/2. `doubled` contains each rank times 2, a
-    whole number even if differences are tied, shape (n,).
+    By the null hypothesis, each rank is positive or negative with probability 1/2. `doubled`
+    contains twice each rank, a whole number even if differences are tied, shape (n,).
     """
     if len(doubled) > EXACT_MAX:
         spread = math.sqrt(float((doubled.astype(float) ** 2).sum()) / 4)
@@ -105,10 +105,10 @@ def _chance_at_most(total: int, doubled: NDArray[Any]) -> float:
 
 
 def _sums(doubled: NDArray[Any]) -> NDArray[Any]:
-    """Return the distribution of S, the sum of the positive ranks times 2, if there is no effect.
+    """Return the distribution of S, twice the sum of the positive ranks.
 
-    Element k is the probability that S = k. Each rank is positive or negative with probability 1/2.
-    `doubled` contains each rank times 2, shape (n,).
+    Element k is the probability that S = k, if each rank is positive or negative with probability
+    1/2. `doubled` contains twice each rank, shape (n,).
     """
     chances = np.zeros(int(doubled.sum()) + 1)
     chances[0] = 1.0

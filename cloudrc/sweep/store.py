@@ -80,7 +80,7 @@ def append_rows(folder: Path, shard: int | None) -> Iterator[Callable[[Row], Non
 
 
 def begin(folder: Path, plan: Plan) -> dict[str, Row]:
-    """Write the description of a sweep into `folder`; return its earlier rows, key -> row.
+    """Write the file of a sweep into `folder`; return flight key -> row of earlier flights.
 
     Raises:
         BadInputError: If the folder has rows of another sweep.

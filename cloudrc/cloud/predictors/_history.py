@@ -80,7 +80,10 @@ class History:
         self._applied.append((began_ns, stamp_ns))
 
     def is_silent(self, now_ns: int) -> bool:
-        """Whether the last echoed command began over FOLLOWED_NS before `now_ns`, world's clock."""
+        """Return whether the robot follows no command at `now_ns` [ns], world's clock.
+
+        It follows none if world applied the last echoed command over FOLLOWED_NS before `now_ns`.
+        """
         return bool(self._applied) and now_ns - self._applied[-1][0] > FOLLOWED_NS
 
     def shift_ns(self, odometry: Odometry, horizon: float) -> int:

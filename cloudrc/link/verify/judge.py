@@ -123,7 +123,7 @@ class Plan:
     def draw(self, sent: Floats, epoch: int = 1, first: int = 0) -> Stream:
         """Simulate the transfer of datagrams that are sent at `sent` [s] since the link came up.
 
-        The datagrams have the numbers from `first` on in the session `epoch`.
+        The counters of the datagrams begin at `first`, in the session `epoch`.
         """
         seed, uplink, kind, size = self.flow
         link = LinkDirection(self.profile, seed, uplink)
@@ -145,7 +145,7 @@ class Plan:
 
     @cached_property
     def chance(self) -> Expected:
-        """Expected values of a netem link, with bands that contain most of the simulated links."""
+        """Expected quantities of a netem link; each band contains most of the simulated links."""
         return self._expect(self.links)
 
     def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:
