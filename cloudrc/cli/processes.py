@@ -199,7 +199,7 @@ def warn_if_exposed(listen: Address) -> None:
 
 @contextmanager
 def _listening(flag: str, listen: Address) -> Iterator[None]:
-    """Warn if other machines can reach `listen`; name `flag` if the block raises an OSError."""
+    """Warn if other machines can reach `listen`; convert an OSError to an error about `flag`."""
     warn_if_exposed(listen)
     try:
         yield
@@ -404,7 +404,7 @@ def _run_relay(options: argparse.Namespace) -> int:
         threading.Thread(target=control.follow, name="link control", daemon=True).start()
 
     def over() -> bool:
-        """Apply changes of the link; export the counts, if due; return whether to stop."""
+        """Apply changes of the link; export the packet counts, if due; return whether to stop."""
         nonlocal count_due
         if control is not None:
             control.swap()

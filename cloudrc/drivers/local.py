@@ -163,8 +163,8 @@ class LocalRun:
 
     Attributes:
         notes: Sentences for the report of the flight.
-        announcement: Keeps the file by which other commands find this run, until it is closed.
-            `fly` closes it after a flight. After a session, the caller of `fly` has to close it.
+        announcement: Its `close` deletes the file by which other commands find this run. `fly`
+            closes it after a flight. After a session, the caller of `fly` has to close it.
     """
 
     def __init__(

@@ -40,7 +40,8 @@ STATE = Odometry(10**9, (1.0, -2.0, 0.7), (0.6, 0.0, 0.0, 0.8), (0.5, 0.3, -0.2)
 def _horizons(build: Callable[[], Any], *delays: float, hold: float = 0.0) -> Any:
     """Return the horizons [s] of an estimator: before the first delay, and after each delay.
 
-    `delays` are loop delays [s]; each includes the hold time `hold` [s].
+    `delays` are loop delays [s]. Each includes `hold` [s], the time from a command's application to
+    the sending of its echo.
     """
     estimator = build()
     seen = [estimator.horizon(7.0)]

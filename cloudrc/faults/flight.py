@@ -77,7 +77,6 @@ class Flight:
         words: Words | None = None,  # makes requests in place of the operator
         second: float | None = None,  # when a second cloud connects [s]
     ) -> None:
-        """Prepare a flight; a comment beside each argument describes it. `second` is in [s]."""
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         self._honest, self._keep = honest, keep
         self._life, self._second, self._lies, self._words = life, second, lies, words

@@ -86,7 +86,7 @@ class Breach(NamedTuple):
 
 
 class Watch:
-    """Collects the breaches of a flight, and checks the order of commands."""
+    """Collects the breaches of invariants in a flight, and checks the order of commands."""
 
     def __init__(self, limits: ResolvedGuard) -> None:
         self.limits = limits

@@ -142,7 +142,7 @@ def done(outcome: Outcome, flight: Flight) -> None:
 
 
 def fly_safely(outcome: Outcome, flight: Flight, limit: float = 120.0) -> Flight:
-    """Fly the mission, at most until `limit` [s]; then apply the checks `safe` and `done`."""
+    """Fly the mission, at most until `limit` [s]; check that it was safe and was completed."""
     flight.fly_mission(limit)
     safe(outcome, flight)
     done(outcome, flight)

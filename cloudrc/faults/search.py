@@ -48,7 +48,7 @@ class Search:
     def run(
         self, minutes: float, call: Map, jobs: int = 1
     ) -> Generator[dict[str, Any] | None, None, None]:
-        """Fly one flight per seed for `minutes` [min]; `call` runs them in `jobs` processes.
+        """Fly one flight per seed for `minutes` [min]; `call` runs the flights in `jobs` processes.
 
         Yields:
             After each flight: the stored failure, or None if no invariant was broken.

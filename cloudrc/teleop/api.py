@@ -134,7 +134,7 @@ class Bridge:
             raise UnavailableError(text) from None
 
     async def move(self, call: Call) -> Any:
-        """Queue a call that may move the robot; a later stop or hold cancels the call."""
+        """Like `ask`, for a call that may move the robot; a later stop or hold cancels the call."""
         known = self.overtakings
 
         def checked(service: MissionService, now_ns: int) -> Any:

@@ -80,7 +80,7 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
 
 
 class MissionService:
-    """Store and fly all missions of one robot, one after the other.
+    """Stores and flies all missions of one robot, one after the other.
 
     All times `now_ns` are on this process's monotonic clock [ns]. The methods for the operator's
     commands raise ConflictError if the state of mission or robot forbids the command. They raise

@@ -202,9 +202,9 @@ class ClientHandshake:
         """Process an ACCEPT; return cloud's and world's nonce if a new epoch begins, else None.
 
         `asks` is True while cloud asks for a session; only then does cloud accept a new world
-        process. An ACCEPT that the network delayed can make cloud accept a world process that has
-        ended. As soon as the running world process answers again, cloud changes its own nonce, so
-        that all delayed ACCEPTs become invalid.
+        process. A delayed ACCEPT can make cloud accept a world process that has ended. When the
+        running world process then answers, cloud changes its own nonce, so that all delayed
+        ACCEPTs become invalid.
         """
         known = accept.world_nonce == self._world
         if accept.nonce != self._nonce or (self._world and not known and not asks):

@@ -92,7 +92,7 @@ class Expected(NamedTuple):
         return 0.5 * (high - low) / tolerance(name, mean)
 
     def judge(self, name: str, value: float) -> Row:
-        """Judge whether a correct link can give the measured `value` [any unit] of `name`."""
+        """Judge whether a correct link can give the `value` [any unit] of the quantity `name`."""
         mean, low, high = self.bands[name]
         slack, hidden = tolerance(name, mean), self.hidden(name)
         if self.known and name == "deviation":

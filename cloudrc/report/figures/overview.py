@@ -63,9 +63,9 @@ class _View:
     """A parallel projection of the scene, with the scene's longer side as the horizontal."""
 
     def __init__(self, points: Array, front: Array) -> None:
-        """Look at `points` [m], world frame, shape (n, 3), from the side to which `front` points.
+        """Choose the direction of view for `points` [m], world frame, shape (n, 3).
 
-        `front` is a vector in the world frame, shape (3,).
+        The viewer is on the side in the direction `front`, a vector in the world frame, shape (3,).
         """
         level = points[:, :2] - points[:, :2].mean(axis=0)
         x, y = np.linalg.svd(level, full_matrices=False)[2][0]

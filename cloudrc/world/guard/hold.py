@@ -132,7 +132,7 @@ def brake_rate(speed: float) -> float:
 
 
 class Descent:
-    """Detect the touch-down of a descent, and decide whether the robot may stop above the ground.
+    """Detects the touch-down of a descent, and decides whether the robot may stop in the air.
 
     After the operator's acknowledgement, the robot stops its descent and holds its position, if
     it sinks unhindered and is above the lowest z for a hold. Otherwise the robot descends to
@@ -174,7 +174,7 @@ class Descent:
 
 
 class TakeOff:
-    """Detect the end of the take-off, and decide whether the robot may take off.
+    """Detects the end of the take-off, and decides whether the robot may take off.
 
     `over` becomes True when the robot has left the ground. If the rotors stopped in the air, the
     robot may still fall, or be outside the fence, when the operator acknowledges the stop. It may
