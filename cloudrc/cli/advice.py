@@ -53,8 +53,8 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
     """Simulate telemetry and commands over the experiment's link, without its blackouts.
 
     Return two lists of ages [s], measured just before each datagram is sent: the ages of the
-    odometry from which cloud computed world's present command, and the ages of the newest command
-    that telemetry has confirmed.
+    odometry from which cloud computed the command that world follows, and the ages of the newest
+    command that telemetry has confirmed.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection

@@ -138,7 +138,6 @@ def set_here(
 
 
 def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
-    """Return the link of a release; raise an error with the reason if the release has no link."""
     from cloudrc.cluster.link import read_link
     from cloudrc.cluster.pods import find_pod
 

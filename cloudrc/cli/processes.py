@@ -55,7 +55,7 @@ RELEASED_PERIOD = 2.0
 class Command(NamedTuple):
     """One command of a module that defines several commands.
 
-    A module with only one command has attributes with the names of these fields.
+    A module with only one command is used in place of a `Command`: it defines the same names.
     """
 
     arguments: Callable[[argparse.ArgumentParser], None]

@@ -123,8 +123,8 @@ def send(
         link: The link of the release before the change.
         profile: New profile, as in `cloudrc.config.load.edit_profile`.
         settings: Values to set, as in `cloudrc.config.load.edit_profile`.
-        note: Function that makes the content of change.json, the number and the cause of the
-            change, from the edited profile.
+        note: Function that describes the change from the edited profile, as the text of
+            change.json.
 
     Raises:
         BadInputError: If the request is not valid, or if a container refuses the change.

@@ -349,7 +349,7 @@ class Page:
         return x, y, z
 
     def _add_keys(self, gui: viser.GuiApi) -> None:
-        """Add the buttons for driving by hand; viser calls `on_hold` at 10 Hz."""
+        """Add the buttons for driving by hand; a held button repeats its key at 10 Hz."""
         steering = self._steering
         speed = gui.add_slider("Drive [m/s]", 0.1, 1.0, 0.1, 0.4)
         for code, (label, direction) in KEYS.items():

@@ -130,7 +130,7 @@ class PredictionJudge:
         self._measured: Vector = (nan, nan, nan)
 
     def take(self, control: Control) -> None:
-        """Compare the predictions that are due with a new measurement; store the new prediction."""
+        """Judge predictions for times up to a new measurement; store the new prediction."""
         stamp_ns, waiting = control.basis_stamp_ns, self._waiting
         if stamp_ns > self._measured_ns:
             before_ns, before = self._measured_ns, self._measured

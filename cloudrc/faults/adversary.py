@@ -90,7 +90,7 @@ class HostileOperator:
         self._collect()
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Forward teleop's outputs at `now_ns` [ns]; after its first setpoint, forge requests."""
+        """Forward teleop's outputs at `now_ns` [ns]; after the first setpoint, forge requests."""
         self._honest.handle_deadline(now_ns)
         self._collect()
         if self._has_setpoint and self._seen is not None:

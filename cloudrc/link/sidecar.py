@@ -136,7 +136,7 @@ class Sidecar:
         return relay, relay.follow_peer(peer)
 
     def _replace(self, shaper: Shaper, profile: Loaded) -> bool:
-        """Apply or refuse a new profile; return False if only the other shaper can apply it."""
+        """Apply or refuse a new profile; return False if the relay has to replace netem for it."""
         restart = profile.change.restart
         try:
             shaper.follow_profile(profile.direction, restart=restart)

@@ -87,10 +87,11 @@ def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
 
 
 def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Number], list[str]]:
-    """Compute the metrics of cloudrc, of installed packages and of the user (`own`, as for `find`).
+    """Compute the metrics of cloudrc, of installed packages and of the user.
 
-    Return the known numbers by name, sorted, and a note for each metric that failed. An exception
-    in a user's metric affects only this metric.
+    `own` lists the user's metrics by name or file path. Return the known numbers by name, sorted,
+    and a note for each metric that failed. An exception in a user's metric affects only this
+    metric.
     """
     numbers: dict[str, Number] = {}
     notes: list[str] = []

@@ -29,7 +29,8 @@ def _age_of_information(flight: Flight) -> float | None:
 def _prediction_error(flight: Flight) -> float | None:
     """Compute the RMS distance from the predicted to the true position of the robot [m].
 
-    The true position is taken when the robot applies the command: delay errors contribute.
+    The true position is that at the time when the robot applies the command. So an error of the
+    estimated delay adds to the result.
     Source: docs/reference/control.md, "Predictors".
     """
     applied = flight.applied

@@ -266,7 +266,7 @@ def _plugins(flight: Flight) -> Iterator[Failure]:
 
 
 def _responses(flight: Flight, settle: float) -> Iterator[Failure]:
-    """Yield a failure if a step's last error exceeds `settle` [m]; another for instability."""
+    """Yield a failure if a step did not settle to `settle` [m]; another for an unstable loop."""
     found, unit = steps(flight), "step" if flight.mission.steps else "waypoint"
     far = [step for step in found if step.last_error > settle]
     if far and flight.mission.steps:
@@ -340,7 +340,7 @@ class Observations:
     def evidence(self, ending: Ending, elapsed: float, **known: Any) -> Evidence:
         """Return the evidence on a mission that ended at mission time `elapsed` [s].
 
-        `known` contains further fields of `Evidence`.
+        `known` sets further fields of the returned `Evidence`.
         """
         return Evidence(
             ending=ending,

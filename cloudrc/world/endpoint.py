@@ -146,8 +146,8 @@ class WorldEndpoint(TunnelEnd):
         """Return world's time at `now_ns` [ns, monotonic clock]: `now_ns` minus the slip.
 
         If the simulation lags by more than CATCH_UP_NS, add the excess to the slip. If it lags by
-        more than the largest age of a command, world has stalled. Datagrams read at this `now_ns`
-        may have waited in the socket. So store `now_ns`, to refuse commands among them as stale.
+        more than the largest age of a command, world has stalled, and datagrams read at this
+        `now_ns` may have waited in the socket. Then store `now_ns`, to refuse them as stale.
         """
         world_ns = now_ns - self._slip_ns
         behind_ns = world_ns - self._tick_ns

@@ -1,8 +1,8 @@
 """Base class of the predictors that replay the sent commands through a model of the robot.
 
 World follows the newest command that has arrived. On world's clock, a command begins at its stamp
-plus a shift. The shift is the downlink delay plus the clock offset; the echoes in telemetry show
-this sum.
+plus a shift. The shift is the downlink delay plus the clock offset. It follows from telemetry,
+which tells when world applied a command.
 """
 
 from __future__ import annotations

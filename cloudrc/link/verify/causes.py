@@ -131,10 +131,10 @@ measured to requested value, and text."""
 
 
 def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
-    """Yield code and text of at most two causes of the quantities that are "off".
+    """Yield code and text of at most two reasons why quantities have the verdict "off".
 
-    First comes the most certain cause that the machine's counters show. If they show none, or only
-    "throttled", the most certain cause that the measured values suggest comes next.
+    First comes the most certain cause that the machine's counters show. If there is no such cause,
+    or if its code is "throttled", the most certain cause by the measured values comes next.
     """
     off = {row.name: row for row in one.rows if row.verdict == "off"}
     lost = next((row.measured for row in one.rows if row.name == "loss"), 0.0)

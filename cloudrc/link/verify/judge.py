@@ -85,8 +85,8 @@ class Expected(NamedTuple):
     def hidden(self, name: str) -> float:
         """Return how uncertain the expected value of quantity `name` is, relative to its tolerance.
 
-        The result is half the width of the value's band, divided by the tolerance [1]. Above
-        CHANCE_MAX the verdict "ok" is impossible, because the band would hide a deviation.
+        The result is half the width of the band of likely values, divided by the tolerance [1].
+        Above CHANCE_MAX the verdict "ok" is impossible: the band would hide a deviation.
         """
         mean, low, high = self.bands[name]
         return 0.5 * (high - low) / tolerance(name, mean)
@@ -135,7 +135,8 @@ class Plan:
     def links(self) -> list[Stream]:
         """Simulated streams through 200 netem links with different random numbers.
 
-        The streams are shorter if the conditions are constant.
+        They show how much correct links differ by chance. If the conditions are constant, a stream
+        has at most RUN_LENGTH datagrams.
         """
         few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
         sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
@@ -243,7 +244,7 @@ class Plan:
         return Stream(*(one.reshape(-1, 2 * self.train)[:, : self.train].ravel() for one in parts))
 
     def _shape(self, stream: Stream) -> Floats:
-        """Return measured - requested delay of each arrived datagram [s], shifted to median 0."""
+        """Return measured minus requested delay of arrived datagrams [s], shifted to median 0."""
         delays = stream.delays - _requested_delay(self.profile, stream.sent)
         there: Floats = delays[np.isfinite(delays)]
         return there - np.median(there) if len(there) else there

@@ -183,7 +183,7 @@ class LinkMonitor:
         return found
 
     def _rows(self) -> list[Row]:
-        """Judge all quantities; add an unjudged row "time_line" if a profile changes over time."""
+        """Judge all quantities; the row "time_line" tells that a profile changes over time."""
         stream, first, timed = _in_order(self._arrivals, self._period)
         judged = timed and (self._uplink or not self._computes)
         rows, skipped = list[Row](), UNJUDGED if judged else UNJUDGED | DELAYS
@@ -211,8 +211,8 @@ class LinkMonitor:
         """Change a verdict "off" to "open" if late wakes of this machine may explain a long delay.
 
         If a loop wakes late by t, about t / period datagrams arrive meanwhile. The mean square of
-        their waits is t^2 / 3, so the sum of the squares is t^3 / (3 · period). Averaged over all
-        wakes, this is the mean square of the added delay.
+        their waits is t^2 / 3, so the sum of the squares is t^3 / (3 · period). The mean of
+        this sum over all wakes is the mean square of the delay that late wakes add.
         """
         late = np.array(self._lates or [0.0])
         added = 2.0 * max((late**2).mean(), (late**3).mean() / (3.0 * self._period)) ** 0.5

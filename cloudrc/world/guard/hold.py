@@ -97,7 +97,7 @@ class PositionHold:
         return step_towards(reference, (x, y, z - sink), BRAKE * dt)
 
     def _brake(self, reference: Vector, readings: Readings, sink: float, dt: float) -> Vector:
-        """Brake for one step of `dt` [s]; set the hold point once the robot is at rest."""
+        """Brake for one step of `dt` [s]; at the velocity of the descent, set the hold point."""
         if not self.brakes:
             reference, self.brakes = brake_start(reference, readings.velocity), True
         x, y, z = reference
@@ -177,9 +177,9 @@ class TakeOff:
     """Detects the end of the take-off, and decides whether the robot may take off.
 
     `over` becomes True when the robot has left the ground. If the rotors stopped in the air, the
-    robot may still fall, or be outside the fence, when the operator acknowledges the stop. It may
-    then take off only after it has come to rest on the ground, at least TAKE_OFF_MARGIN inside the
-    fence.
+    robot may still fall, or be outside the fence, when the operator acknowledges the stop. Before
+    the robot may take off again, it has to come to rest on the ground, at least TAKE_OFF_MARGIN
+    inside the fence.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:

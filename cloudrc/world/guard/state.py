@@ -243,9 +243,9 @@ class Guard:
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
         """Return whether TRACK may begin at `now_ns`; prevent fast changes between TRACK and HOLD.
 
-        Take-off must be allowed. At least SETTLE_NS must lie between the starts of two TRACKs, and
-        between the starts of two HOLDs. The next HOLD may start at `fresh_until_ns`, when the
-        present command is no longer fresh.
+        Take-off must be allowed, and the last TRACK must have begun at least SETTLE_NS ago. The
+        last HOLD must have begun at least SETTLE_NS before `fresh_until_ns`: at this time the
+        present command becomes too old, and the next HOLD may begin.
         """
         apart_ns = min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns)
         return self._take_off.allowed and apart_ns >= SETTLE_NS

@@ -239,8 +239,8 @@ class NativeRobot(Robot):
     def run(self, tick_ns: int, until_ns: int) -> int:
         """Run steps from `tick_ns` up to `until_ns`; return the time of the next step [ns].
 
-        C runs the steps in which the guard need not limit a fresh command. Python runs the first
-        other step, and all steps after it.
+        C runs the steps while the robot follows a fresh command that the guard need not limit.
+        Python runs the first other step, and all steps after it.
         """
         simulator, guard = self.simulator, self.guard
         in_c = not self.observers and simulator.tape is None
