@@ -60,7 +60,7 @@ class Purpose(IntEnum):
 
 
 def stream_key(seed: int, uplink: bool, epoch: int, kind: int) -> StreamKey:
-    """Compute the Philox key for the random numbers of a direction, session and kind of datagram."""
+    """Return the Philox key for the random numbers of a direction, session and kind of datagram."""
     name = f"cloudrc link {seed} {'up' if uplink else 'down'} {epoch} {kind}"
     digest = blake2b(name.encode(), digest_size=16).digest()
     return int.from_bytes(digest[:8], "little"), int.from_bytes(digest[8:], "little")
