@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.output import (
-    format_document,
     format_number,
     output_argument,
     print_or_drop,
+    print_result,
     table,
 )
 from cloudrc.cli.parser import read_count
@@ -82,12 +82,11 @@ def execute(options: argparse.Namespace) -> int:
         if not found.pairs:
             return code
     document = {
-        **{"schemaVersion": 1, "a": options.a, "b": options.b, "of": found.what},
+        **{"a": options.a, "b": options.b, "of": found.what},
         **{"overrides": options.set, "interrupted": bool(stopped)},
         **compare(found.pairs, found.units, options.number),
     }
-    for_people = options.output == "table"
-    print_or_drop(as_text(document) if for_people else format_document(document, options.output))
+    print_result(options.output, document, as_text(document))
     return code
 
 

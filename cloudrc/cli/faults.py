@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import escape, format_document, output_argument, paint, print_line, table
+from cloudrc.cli.output import escape, output_argument, paint, print_line, print_result, table
 from cloudrc.cli.parser import input_file, number, read_count, whole_number
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.errors import BadInputError
@@ -105,11 +105,9 @@ def print_faults(options: argparse.Namespace) -> int:
 
     names = ("id", "name", "injects", "expects")
     faults = [{name: getattr(each, name) for name in names} for each in SCENARIOS]
-    if options.output != "table":
-        print(format_document({"schemaVersion": 1, "faults": faults}, options.output))
-    else:
-        rows = [tuple(each.values()) for each in faults]
-        print(table([("fault", "name", "injection", "expected reaction"), *rows]))
+    head = "fault", "name", "injection", "expected reaction"
+    text = table([head, *(tuple(each.values()) for each in faults)])
+    print_result(options.output, {"faults": faults}, text)
     return 0
 
 
@@ -130,12 +128,10 @@ def run(options: argparse.Namespace) -> int:
     jobs = [(each.name, options.seed) for each in chosen]
     cause, code = take_each(map_in_order(_run, jobs, options.jobs), take)
     count, failed = len(outcomes), sum(not outcome.passed for outcome in outcomes)
-    if options.output != "table":
-        faults = [each.as_json(done) for each, done in zip(chosen, outcomes, strict=False)]
-        document = {"schemaVersion": 1, "seed": options.seed, "passed": not failed}
-        print(format_document(document | {"faults": faults}, options.output))
-    else:
-        print(f"\nseed {options.seed}: {count - failed} of {count} passed, {failed} failed")
+    faults = [each.as_json(done) for each, done in zip(chosen, outcomes, strict=False)]
+    document = {"seed": options.seed, "passed": not failed, "faults": faults}
+    text = f"\nseed {options.seed}: {count - failed} of {count} passed, {failed} failed"
+    print_result(options.output, document, text)
     if cause:
         text = f"cloudrc: {cause}; {count} of {len(chosen)} faults were run before"
         print(text, file=sys.stderr, flush=True)
@@ -175,13 +171,10 @@ def fly_file(options: argparse.Namespace) -> int:
     except BadInputError as error:  # an unknown profile or policy
         raise BadInputError(f"{options.name}: {error}") from error
     breaches = [breach._asdict() for breach in finding.breaches]
-    if options.output != "table":
-        document = {"schemaVersion": 1, "records_sha256": finding.sha256, "breaches": breaches}
-        print(format_document(document, options.output))
-    else:
-        for breach in finding.breaches:
-            print_line(f"{breach.time:8.3f} s  {breach.kind}: {breach.text}")
-        print(f"{'FAILED' if breaches else 'passed'}  records {finding.sha256[:16]}")
+    lines = [escape(f"{at.time:8.3f} s  {at.kind}: {at.text}") for at in finding.breaches]
+    lines.append(f"{'FAILED' if breaches else 'passed'}  records {finding.sha256[:16]}")
+    document = {"records_sha256": finding.sha256, "breaches": breaches}
+    print_result(options.output, document, "\n".join(lines))
     return FAILED if breaches else 0
 
 
@@ -204,11 +197,8 @@ def search(options: argparse.Namespace) -> int:
     again = f"cloudrc faults search{' --adversarial' if options.adversarial else ''}"
     again += f" --first {searched.next}"
     document = searched.document()
-    if shown:
-        print(f"\n{table(search_rows(document), right=(1, 2))}\n\n{search_summary(document)}")
-        print(f"to continue: {again}")
-    else:
-        print(format_document(document, options.output))
+    lines = table(search_rows(document), right=(1, 2)), "", search_summary(document)
+    print_result(options.output, document, "\n".join(["", *lines, f"to continue: {again}"]))
     if cause:
         print(f"cloudrc: {cause}; continue with '{again}'", file=sys.stderr, flush=True)
     return code or (FAILED if searched.failures else 0)

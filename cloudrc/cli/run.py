@@ -18,11 +18,11 @@ from cloudrc.cli.extras import MODES, missing, require
 from cloudrc.cli.find_run import RUNS
 from cloudrc.cli.output import (
     escape,
-    format_document,
     is_live,
     output_argument,
     print_line,
     print_or_drop,
+    print_result,
 )
 from cloudrc.cli.parser import read_count, whole_number
 from cloudrc.cli.pool import interrupt_on_signals
@@ -164,9 +164,7 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
         if in_cluster and options.out is None and folder.exists():
             point_to(folder, "latest")
     print_traceback(options, report)
-    print_or_drop(
-        format_document(report, options.output) if for_programs else summary(report, folder)
-    )
+    print_result(options.output, report, summary(report, folder))
     return 0 if ready else exit_code(report)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.advice import warn
-from cloudrc.cli.output import escape, format_document, format_number, print_or_drop, table
+from cloudrc.cli.output import escape, format_number, print_or_drop, print_result, table
 from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.cli.report import print_traceback
 from cloudrc.cli.run import load, new_folder
@@ -87,13 +87,13 @@ def fly_seeds(options: argparse.Namespace) -> int:
         text = f"\ncloudrc: {stopped}: {len(rows)} of {len(work)} seeds are finished"
         print_or_drop(text, sys.stderr)
     document = {
-        **{"schemaVersion": 1, "experiment": name, "mode": "virtual", "interrupted": bool(stopped)},
+        **{"experiment": name, "mode": "virtual", "interrupted": bool(stopped)},
         "overrides": list(options.set),
         **summarise(rows, store.read_summary(folder)["units"]),
         "runs": [{key: row[key] for key in ("seed", "verdict", "key")} for row in rows],
     }
-    shown = f"\n{as_table(document)}\n\n{folder / store.SUMMARY}"
-    print_or_drop(shown if for_people else format_document(document, options.output))
+    text = f"\n{as_table(document)}\n\n{folder / store.SUMMARY}"
+    print_result(options.output, document, text)
     return code or max(EXIT_CODES[row["verdict"]] for row in rows)
 
 

@@ -15,10 +15,10 @@ from cloudrc.cli.advice import advise
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.output import (
     escape,
-    format_document,
     output_argument,
     print_line,
     print_or_drop,
+    print_result,
     table,
 )
 from cloudrc.cli.parser import COUNT_MAX, figure_arguments, input_file, read_count
@@ -164,11 +164,9 @@ def run(options: argparse.Namespace) -> int:
         flags = " --on kubernetes, and its other flags" if options.on else ""
         again = f"cloudrc sweep run {options.file} --out {folder}{flags}"
         print_line(f"cloudrc: {stopped}; to continue: {again}", sys.stderr)
-    if options.output == "table":
-        name = store.TABLE if len(rows) == len(plan.flights) else store.SUMMARY
-        print_or_drop(f"\n{_verdicts(rows.values())}\n\n{escape(str(folder / name))}")
-    else:
-        print_or_drop(format_document(store.read_summary(folder), options.output))
+    name = store.TABLE if len(rows) == len(plan.flights) else store.SUMMARY
+    text = f"\n{_verdicts(rows.values())}\n\n{escape(str(folder / name))}"
+    print_result(options.output, store.read_summary(folder), text)
     return code or int(any(rows[each.key]["verdict"] != "success" for each in mine))
 
 
@@ -274,15 +272,13 @@ def print_status(options: argparse.Namespace) -> int:
             found = [row["verdict"] for row in rows if row["point"][axis] == value]
             counts = {"flights": len(found), "success": found.count("success")}
             values.append({"axis": axis, "value": value, **counts})
-    if options.output != "table":
-        document = {"schemaVersion": 1, "flights": summary["flights"], "rows": len(rows)}
-        print(format_document({**document, "axes": values}, options.output))
-        return 0
-    print(f"{len(rows)} of {summary['flights']} flights are done: {_verdicts(rows)}")
+    text = f"{len(rows)} of {summary['flights']} flights are done: {_verdicts(rows)}"
     cells = [(each["axis"], store.as_text(each["value"]), f"{each['success']}/{each['flights']}")
              for each in values]  # fmt: skip
     if cells:
-        print(f"\n{table([('axis', 'value', 'success'), *cells], right=(2,))}")
+        text += f"\n\n{table([('axis', 'value', 'success'), *cells], right=(2,))}"
+    document = {"flights": summary["flights"], "rows": len(rows), "axes": values}
+    print_result(options.output, document, text)
     return 0
 
 

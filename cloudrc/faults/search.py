@@ -66,7 +66,6 @@ class Search:
     def document(self) -> dict[str, Any]:
         """Return the result so far as plain values, for JSON."""
         return {
-            "schemaVersion": 1,
             "kind": self.kind,
             "first": self.first,
             "next": self.next,
