@@ -102,9 +102,9 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"--seeds flies in virtual time; leave out --mode {mode}")
     require(f"mode {mode}", MODES[mode])
     if options.seeds:
-        from cloudrc.cli import seeds
+        from cloudrc.cli.sweep import fly_seeds
 
-        return seeds.fly_seeds(options)
+        return fly_seeds(options)
     return fly_once(options, mode)
 
 

@@ -1,20 +1,30 @@
-"""`cloudrc sweep`: fly a grid of settings with several seeds; write a row of numbers per flight."""
+"""`cloudrc sweep`: fly a grid of settings with several seeds; write a row of numbers per flight.
+
+`cloudrc run --seeds N` is a sweep of one point, with a table of medians and their intervals.
+"""
 
 from __future__ import annotations
 
 import argparse
+import hashlib
+import json
 import os
+import statistics
 import sys
 from collections import Counter
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.advice import advise
+from cloudrc import __version__
+from cloudrc.cli.advice import advise, warn
+from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.output import (
     escape,
+    format_number,
     output_argument,
     print_line,
     print_or_drop,
@@ -23,11 +33,6 @@ from cloudrc.cli.output import (
 )
 from cloudrc.cli.parser import COUNT_MAX, figure_arguments, input_file, read_count
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
-from cloudrc.cli.sweep_pods import (
-    cluster_arguments,
-    print_rows,
-    rows_from_pods,
-)
 from cloudrc.errors import BadInputError, InvalidRunError
 
 if TYPE_CHECKING:
@@ -59,6 +64,8 @@ ARRAYS = {
 with the first index ("": it is 0)."""
 WARNINGS_MAX = 3
 """Largest number of warnings that a sweep prints."""
+IMAGE = f"cloudrc/world:{__version__}"
+METHOD = "95 % interval of the median, by order statistics"
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -77,7 +84,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument("--record", choices=("failed", "all"), help=about)
     about = "fly only part I of N; 'auto' takes I and N from Slurm or Kubernetes"
     run.add_argument("--shard", type=_shard, metavar="I/N", help=about)
-    cluster_arguments(run)
+    add = release_arguments(run)
+    about = "fly in the pods of a Job instead of on this machine"
+    add("--on", choices=("kubernetes",), help=about)
+    add("--shards", type=read_count, default=8, metavar="N", help="number of pods (default: 8)")
+    about = f"image of the pods (default: {IMAGE})"
+    add("--image", default=IMAGE, metavar="IMAGE", help=about)
+    add("--cpu", default="1", metavar="CPU", help="CPU request of a pod (default: 1)")
+    add("--queue", metavar="NAME", help="queue of Kueue that admits the Job")
     rows.add_argument("file", type=input_file, metavar="FILE", help="file of flights, of a Job")
     rows.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N", help=about)
     for each in (status, fly, figure):
@@ -141,25 +155,19 @@ def run(options: argparse.Namespace) -> int:
         folder = new_folder(folder, f"sweep-{options.file.stem}", "latest-sweep")
     before = store.begin(folder, plan)
     mine = [*plan.flights.values()][(shard or 1) - 1 :: count]
-    jobs = [
-        (each, options.record, folder)
+    missing = [
+        each
         for each in mine
         if each.key not in before or _to_record(before[each.key], options.record, folder)
     ]
     part = f", shard {shard} of {count}" if shard else ""
     head = f"{len(plan.points)} points x {len(plan.seeds)} seeds{part}: {len(mine)} flights"
     stream = sys.stdout if options.output == "table" else sys.stderr
-    head += f", {len(mine) - len(jobs)} done before" if len(jobs) < len(mine) else ""
-    view = SweepView(stream, f"{plan.points[0].name}: {head}", len(jobs))
-    with store.append_rows(folder, shard) as append, closing(view):
-
-        def take(row: Row) -> None:
-            if row["key"] not in before:
-                append(row)
-            view.see(row)
-
-        stopped, code = take_each(_rows(options, plan, jobs), take)
-    rows = store.finish(folder, plan)
+    head += f", {len(mine) - len(missing)} done before" if len(missing) < len(mine) else ""
+    view = SweepView(stream, f"{plan.points[0].name}: {head}", len(missing))
+    with closing(view):
+        flown = _fly(options, plan, missing, folder)
+        rows, stopped, code = _keep(flown, folder, plan, shard, before, view.see)
     if stopped:
         flags = " --on kubernetes, and its other flags" if options.on else ""
         again = f"cloudrc sweep run {options.file} --out {folder}{flags}"
@@ -193,26 +201,50 @@ def _plan(options: argparse.Namespace) -> Plan:
     return plan
 
 
-def _rows(
-    options: argparse.Namespace, plan: Plan, jobs: list[tuple[Flight, str | None, Path]]
+def _keep(
+    flown: Generator[Row],
+    folder: Path,
+    plan: Plan,
+    shard: int | None,
+    before: Collection[str],
+    see: Callable[[Row], None],
+) -> tuple[dict[str, Row], str, int]:
+    """Append each new row to the sweep in `folder`, call `see` with it, and write the tables.
+
+    `before` has the keys of the rows that the folder already has. Return all rows, key -> row; why
+    the work ended early, or ""; and the exit code.
+    """
+    from cloudrc.sweep import store
+
+    with store.append_rows(folder, shard) as append:
+
+        def take(row: Row) -> None:
+            if row["key"] not in before:
+                append(row)
+            see(row)
+
+        stopped, code = take_each(flown, take)
+    return store.finish(folder, plan), stopped, code
+
+
+def _fly(
+    options: argparse.Namespace, plan: Plan, flights: list[Flight], folder: Path
 ) -> Generator[Row]:
-    """Fly the jobs on this machine or in pods; yield the row of each flight when it ends."""
+    """Fly on this machine or in pods; yield the row of each flight when it ends."""
     if options.on:
-        yield from rows_from_pods(options, plan, [flight for flight, _, _ in jobs])
+        yield from rows_from_pods(options, plan, flights)
         return
-    for first in range(0, len(jobs), COUNT_MAX):
-        work = jobs[first : first + COUNT_MAX]
-        yield from map_in_order(fly_job, work, options.jobs, in_order=False)
+    fly = partial(fly_row, record=options.record, folder=folder)
+    for first in range(0, len(flights), COUNT_MAX):
+        work = flights[first : first + COUNT_MAX]
+        yield from map_in_order(fly, work, options.jobs, in_order=False)
 
 
-def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
-    """Fly a job's flight and return its row; if the job asks for a recording, fly again for it."""
+def fly_row(flight: Flight, record: str | None = None, folder: Path = Path()) -> Row:
+    """Fly and return the row; if `record` asks for it, fly again with a recording in `folder`."""
     from cloudrc.sweep.flight import fly_point
-    from cloudrc.sweep.store import make_row
 
-    flight, record, folder = job
-    flown = fly_point(flight.experiment)
-    row = make_row(flight, flown)
+    row = flight.row(fly_point(flight.experiment))
     if _to_record(row, record, folder):
         _fly_into(folder / flight.key, flight, page=False)
     return row
@@ -306,3 +338,149 @@ def draw_figure(options: argparse.Namespace) -> int:
 def _verdicts(rows: Iterable[Row]) -> str:
     counts = Counter(row["verdict"] for row in rows)
     return ", ".join(f"{count} {name}" for name, count in sorted(counts.items())[::-1]) or "none"
+
+
+# Sweeps in pods, which run `cloudrc sweep rows`.
+
+
+def rows_from_pods(
+    options: argparse.Namespace, plan: Plan, flights: Sequence[Flight]
+) -> Generator[Row]:
+    """Fly flights of a plan on a cluster, and yield each row once.
+
+    Each pod of a Job flies a share (shard) of the flights and logs their rows. If a pod is deleted
+    just after its last flight, its log is lost, but Kubernetes counts its shard as complete.
+    Therefore further Jobs fly the flights without a row.
+
+    Raises:
+        ClusterError: If a Job fails or yields no row, or if a pod will never run.
+    """
+    from cloudrc.cluster import batch
+    from cloudrc.cluster.client import ClusterError
+    from cloudrc.sweep.plan import pack
+    from cloudrc.sweep.store import parse_row
+
+    def tell(text: str) -> None:
+        print_line(f"  {text}", sys.stderr)
+
+    release = release_from_flags(options)
+    every = "".join(plan.flights).encode() + str(options.shards).encode()
+    name = f"sweep-{hashlib.sha256(every).hexdigest()[:12]}"
+    words = {"image": options.image, "cpu": options.cpu, "queue": options.queue}
+    missing = {flight.key: flight for flight in flights}
+    while missing:
+        before = len(missing)
+        batch.start(release, name, pack(missing.values()), options.shards, **words)
+        tell(
+            f"Job '{name}' {release.where}, {options.shards} pods; it goes on without this command"
+        )
+        for line in batch.read_lines(release, name, tell):
+            row = parse_row(line)
+            if row is not None and missing.pop(row["key"], None) is not None:
+                yield row
+        if len(missing) == before:
+            text = "the same command flies them; is the image of this version of cloudrc?"
+            raise ClusterError(f"the pods printed no row of {before} flights; {text}")
+        if missing:
+            tell(f"the rows of {len(missing)} flights were lost with their pods")
+
+
+def print_rows(options: argparse.Namespace) -> int:
+    """Fly one shard (part) of the flights in a file; print the result of each flight as a row."""
+    from cloudrc.sweep.plan import unpack
+
+    interrupt_on_signals()  # the first process of a container ignores signals by default
+    shard, count = options.shard
+    for flight in unpack(options.file)[shard - 1 :: count]:
+        print(json.dumps(fly_row(flight), allow_nan=False), flush=True)
+    return 0
+
+
+# `cloudrc run --seeds N`.
+
+
+def summarise(rows: Sequence[Row], units: Mapping[str, str]) -> dict[str, Any]:
+    """Count all runs and successful runs; compute the median of each measurement.
+
+    Each median has a confidence interval. A run whose plug-in failed is counted, but its
+    measurements are left out. `units`: metric -> unit.
+    """
+    from cloudrc.sweep.flight import counts
+    from cloudrc.sweep.statistics import median_interval
+
+    numbers, measured = {}, [row["numbers"] for row in rows if counts(row)]
+    for name in dict.fromkeys(name for each in measured for name in each):
+        found = [each[name] for each in measured if name in each]
+        middle = {"median": statistics.median(found), "interval": median_interval(found)}
+        numbers[name] = {**middle, "unit": units[name], "count": len(found)}
+    done = sum(row["verdict"] == "success" for row in rows)
+    return {"done": done, "count": len(rows), "method": METHOD, "numbers": numbers}
+
+
+def as_table(summary: Mapping[str, Any]) -> str:
+    """Format the result of `summarise` as a table; the last line counts the successful runs."""
+    rows = [("number", "median", "95 % interval", "unit")]
+    for name, entry in summary["numbers"].items():
+        between = " .. ".join(map(format_number, entry["interval"] or ())) or "-"
+        unit = "" if entry["unit"] == "1" else entry["unit"]
+        note = "" if entry["count"] == summary["count"] else f"  ({entry['count']} runs)"
+        rows.append((name, format_number(entry["median"]), between, unit + note))
+    method = METHOD if summary["count"] >= 6 else "an interval needs 6 seeds or more"
+    return f"{table(rows, right=(1, 2))}\n\n{method}\ndone {summary['done']}/{summary['count']}"
+
+
+def fly_seeds(options: argparse.Namespace) -> int:
+    """Fly seeds 1 to N and print one table; return 0 if all runs succeed.
+
+    If Ctrl-C or a killed worker ends the command early, the table shows the finished seeds only.
+    """
+    from cloudrc.cli.report import print_traceback
+    from cloudrc.cli.run import load, new_folder
+    from cloudrc.config.document import write_yaml
+    from cloudrc.config.overrides import parse_settings
+    from cloudrc.metrics.verdict import EXIT_CODES
+    from cloudrc.sweep import store
+    from cloudrc.sweep.plan import read_plan
+
+    experiment = load(options.experiment, options.set)
+    warn(experiment)
+    name = experiment.name
+    folder = new_folder(options.out, f"{name}-virtual-{options.seeds}seeds", "latest-sweep")
+    settings = {".".join(path): each.value for path, each in parse_settings(options.set).items()}
+    settings.pop("seed", None)
+    file = {"experiment": options.experiment, "set": settings, "seeds": options.seeds}
+    (folder / store.FILE).write_text(write_yaml(file | {"folder": str(Path.cwd())}), "utf-8")
+    plan, seen = read_plan(folder / store.FILE), []
+    for_people, work = options.output == "table", [*plan.flights.values()]
+
+    def see(row: Row) -> None:
+        seen.append(row)
+        failure = f": {row['text']}" if row["failures"] else ""
+        count = f"{len(seen)}/{len(work)}"
+        line = f"{count:>7}  seed {row['seed']}  {row['verdict']}{failure}"
+        if for_people or sys.stderr.isatty():
+            print_or_drop(escape(line), sys.stdout if for_people else sys.stderr)
+        if not any("traceback" in earlier for earlier in seen[:-1]):
+            print_traceback(options, row)
+
+    flown = map_in_order(fly_seed, work, len(work))
+    _, stopped, code = _keep(flown, folder, plan, None, store.begin(folder, plan), see)
+    if stopped:
+        text = f"\ncloudrc: {stopped}: {len(seen)} of {len(work)} seeds are finished"
+        print_or_drop(text, sys.stderr)
+    document = {
+        **{"experiment": name, "mode": "virtual", "interrupted": bool(stopped)},
+        "overrides": list(options.set),
+        **summarise(seen, store.read_summary(folder)["units"]),
+        "runs": [{key: row[key] for key in ("seed", "verdict", "key")} for row in seen],
+    }
+    text = f"\n{as_table(document)}\n\n{folder / store.SUMMARY}"
+    print_result(options.output, document, text)
+    return code or max(EXIT_CODES[row["verdict"]] for row in seen)
+
+
+def fly_seed(flight: Flight) -> Row:
+    """Fly once and return the row of numbers; an exception ends the command."""
+    from cloudrc.sweep.flight import measure
+
+    return flight.row(measure(flight.experiment))

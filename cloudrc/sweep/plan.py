@@ -28,6 +28,7 @@ from cloudrc.config.overrides import collect_settings
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError
+from cloudrc.sweep.flight import Row
 
 SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
 """Largest seed, and largest number of seeds."""
@@ -64,6 +65,10 @@ class Flight(NamedTuple):
     def experiment(self) -> ResolvedExperiment:
         """The experiment of the point, with the seed of this flight."""
         return self.resolved.model_copy(update={"seed": self.seed})
+
+    def row(self, flown: Row) -> Row:
+        """Return the flight's row in the sweep; `flown` has the results, such as the verdict."""
+        return {"key": self.key, "point": self.point, "seed": self.seed, **flown}
 
 
 @dataclass(frozen=True, slots=True)
