@@ -6,7 +6,10 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from dataclasses import asdict
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +21,7 @@ from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
     from cloudrc.faults.scenario import Outcome, Scenario
+    from cloudrc.faults.trial import Finding
 
 EPILOG = """\
 examples:
@@ -42,6 +46,7 @@ ACTIONS = {
 }
 STORE = Path("faults-found")
 FAILED = 1
+CHUNK = 500  # number of seeds that a search hands to the pool at once
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -125,23 +130,25 @@ def run(options: argparse.Namespace) -> int:
         if options.output == "table":
             _print_outcome(chosen[len(outcomes) - 1], outcome, options.all)
 
-    jobs = [(each.name, options.seed) for each in chosen]
-    cause, code = take_each(map_in_order(_run, jobs, options.jobs), take)
-    count, failed = len(outcomes), sum(not outcome.passed for outcome in outcomes)
-    faults = [each.as_json(done) for each, done in zip(chosen, outcomes, strict=False)]
+    run_seed = partial(_run, seed=options.seed)
+    flown = map_in_order(run_seed, [each.name for each in chosen], options.jobs)
+    cause, code = take_each(flown, take)
+    done, failed = len(outcomes), sum(not outcome.passed for outcome in outcomes)
+    pairs = zip(chosen, outcomes, strict=False)
+    faults = [each.as_json(outcome) for each, outcome in pairs]
     document = {"seed": options.seed, "passed": not failed, "faults": faults}
-    text = f"\nseed {options.seed}: {count - failed} of {count} passed, {failed} failed"
+    text = f"\nseed {options.seed}: {done - failed} of {done} passed, {failed} failed"
     print_result(options.output, document, text)
     if cause:
-        text = f"cloudrc: {cause}; {count} of {len(chosen)} faults were run before"
+        text = f"cloudrc: {cause}; {done} of {len(chosen)} faults were run before"
         print(text, file=sys.stderr, flush=True)
     return code or (FAILED if failed else 0)
 
 
-def _run(job: tuple[str, int]) -> Outcome:
+def _run(name: str, seed: int) -> Outcome:
     from cloudrc.faults.scenarios import find
 
-    (name, seed), began = job, time.monotonic()
+    began = time.monotonic()
     outcome = find(name).run(seed)
     outcome.seconds = time.monotonic() - began
     return outcome
@@ -180,25 +187,109 @@ def fly_file(options: argparse.Namespace) -> int:
 
 def search(options: argparse.Namespace) -> int:
     """Fly random schedules of faults; print the failures, and how to continue the search."""
-    from cloudrc.faults.search import Search, search_rows, search_summary
+    from cloudrc.faults.trial import INVARIANTS
 
     kind, shown = "adversarial" if options.adversarial else "random", options.output == "table"
-    searched = Search(kind, options.first, options.store)
-
-    def take(failure: dict[str, Any] | None) -> None:
-        if failure is not None and shown:
-            print_line(f"FAILED seed {failure['seed']}: {failure['breaches'][0]['text']}")
-            print_line(f"  again: cloudrc faults run {failure['file']}")
-
+    found: dict[str, Any] = {
+        **{"kind": kind, "first": options.first, "next": options.first, "count": 0, "seconds": 0.0},
+        "invariants": {name: {"judged": 0, "broken": 0} for name in INVARIANTS},
+        **{"smallest_margin_m": 9.0, "largest_speed_mps": 0.0, "missions_done": 0, "failures": []},
+    }
     if shown:
         print(f"{kind} schedules from seed {options.first} on, for {options.minutes:g} min")
-    flights = searched.run(options.minutes, map_in_order, options.jobs)
-    cause, code = take_each(flights, take)
+    began = time.monotonic()
+
+    def take(finding: Finding) -> None:
+        found["seconds"] = time.monotonic() - began
+        _count(found, finding)
+        if finding.breaches:
+            failure = _store(finding, options.store)
+            found["failures"].append(failure)
+            if shown:
+                print_line(f"FAILED seed {failure['seed']}: {failure['breaches'][0]['text']}")
+                print_line(f"  again: cloudrc faults run {failure['file']}")
+
+    cause, code = take_each(_fly_seeds(options, began), take)
     again = f"cloudrc faults search{' --adversarial' if options.adversarial else ''}"
-    again += f" --first {searched.next}"
-    document = searched.document()
-    lines = table(search_rows(document), right=(1, 2)), "", search_summary(document)
-    print_result(options.output, document, "\n".join(["", *lines, f"to continue: {again}"]))
+    again += f" --first {found['next']}"
+    lines = table(search_rows(found), right=(1, 2)), "", search_summary(found)
+    print_result(options.output, found, "\n".join(["", *lines, f"to continue: {again}"]))
     if cause:
         print(f"cloudrc: {cause}; continue with '{again}'", file=sys.stderr, flush=True)
-    return code or (FAILED if searched.failures else 0)
+    return code or (FAILED if found["failures"] else 0)
+
+
+def _fly_seeds(options: argparse.Namespace, began: float) -> Generator[Finding]:
+    """Fly one flight per seed, until `options.minutes` [min] have passed since `began` [s]."""
+    fly = partial(fly_seed, adversarial=options.adversarial)
+    for first in count(options.first, CHUNK):
+        for finding in map_in_order(fly, range(first, first + CHUNK), options.jobs):
+            yield finding
+            if time.monotonic() - began >= 60.0 * options.minutes:
+                return
+
+
+def fly_seed(seed: int, adversarial: bool) -> Finding:
+    """Fly the schedule for a seed: random faults, or a dishonest cloud with or without faults."""
+    from cloudrc.faults import trial
+    from cloudrc.faults.adversary import choose
+    from cloudrc.faults.schedule import compose
+
+    return trial.fly((choose if adversarial else compose)(seed))
+
+
+def _count(found: dict[str, Any], finding: Finding) -> None:
+    """Add the finding of the next seed to the document of a search."""
+    from cloudrc.faults.trial import checked_in
+
+    for name in ("next", "count"):
+        found[name] += 1
+    for name in checked_in(finding.schedule):
+        found["invariants"][name]["judged"] += 1
+    for name in finding.kinds:
+        found["invariants"][name]["broken"] += 1
+    found["smallest_margin_m"] = min(found["smallest_margin_m"], finding.margin)
+    found["largest_speed_mps"] = max(found["largest_speed_mps"], finding.speed)
+    found["missions_done"] += finding.missions
+
+
+def _store(finding: Finding, folder: Path) -> dict[str, Any]:
+    """Write a schedule that broke an invariant into `folder`; return the failure for JSON."""
+    from cloudrc.faults.schedule import dump
+
+    schedule, seed = finding.schedule, finding.schedule.seed
+    name = f"{'-'.join(sorted(finding.kinds))}-{schedule.policy or 'seed'}-{seed}.yaml"
+    lines = [f"{each.time:.3f} s: {each.kind}: {each.text}" for each in finding.breaches[:3]]
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_text(dump(schedule, "\n".join(lines)), encoding="utf-8")
+    return {
+        "seed": seed,
+        "breaches": [breach._asdict() for breach in finding.breaches],
+        "schedule": asdict(schedule),
+        "file": str(folder / name),
+    }
+
+
+def search_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return a table of a search: each invariant with an upper bound of its failure probability.
+
+    The bound is the rule of three: with 0 breaches in N flights, p < 3/N with 95 % confidence.
+    """
+    from cloudrc.faults.trial import INVARIANTS
+
+    lines: list[tuple[str, ...]] = [("invariant", "broken in", "of N", "95 % bound")]
+    for name, words in INVARIANTS.items():
+        judged, broken = (document["invariants"][name][each] for each in ("judged", "broken"))
+        bound = "not judged" if not judged else "-" if broken else f"p < {min(3 / judged, 1):.2g}"
+        lines.append((words, str(broken) if judged else "-", str(judged), bound))
+    return lines
+
+
+def search_summary(document: dict[str, Any]) -> str:
+    """Describe a search in one sentence: flights, failures, least distance to fence, top speed."""
+    return (
+        f"{document['count']} {document['kind']} schedules in {document['seconds']:.0f} s, seeds "
+        f"{document['first']} to {document['next'] - 1}: {len(document['failures'])} broken, "
+        f"{document['missions_done']} missions done, nearest to the fence "
+        f"{document['smallest_margin_m']:.3f} m, fastest {document['largest_speed_mps']:.2f} m/s"
+    )

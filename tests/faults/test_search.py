@@ -69,8 +69,8 @@ def find(tmp_path, monkeypatch, capsys):
             return Finding(schedule, breaches, "", 1.0 / (1 + schedule.seed), 2.0, 2)
 
         clock = [0.0]
-        monkeypatch.setattr("cloudrc.faults.search.fly", fly)
-        monkeypatch.setattr("cloudrc.faults.search.time.monotonic", lambda: clock[0])
+        monkeypatch.setattr("cloudrc.faults.trial.fly", fly)
+        monkeypatch.setattr("cloudrc.cli.faults.time.monotonic", lambda: clock[0])
         assert main(["faults", "search", "-o", "json", *flags]) == code
         out, error = capsys.readouterr()
         return json.loads(out), error
