@@ -115,8 +115,7 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
     for name in options.number:
         if name not in unit_of:
             raise BadInputError(f"--number: {unknown_name_text('number', name, sorted(unit_of))}")
-    for side in sides:
-        warn(side)
+    warn(*sides)
     jobs = [side.model_copy(update={"seed": n + 1}) for n in range(options.seeds) for side in sides]
     flights: list[Row] = []
     head = f"{sides[0].name}: A and B, each with seeds 1 to {options.seeds}"

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloudrc import __version__
-from cloudrc.cli.advice import advise, warn
+from cloudrc.cli.advice import warn
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.output import (
@@ -62,8 +62,6 @@ ARRAYS = {
 }
 """Environment variable with the index of a process -> variables with the number of processes and
 with the first index ("": it is 0)."""
-WARNINGS_MAX = 3
-"""Largest number of warnings that a sweep prints."""
 IMAGE = f"cloudrc/world:{__version__}"
 METHOD = "95 % interval of the median, by order statistics"
 
@@ -194,10 +192,7 @@ def _plan(options: argparse.Namespace) -> Plan:
 
         for point in plan.points:
             refuse_local_files(point.model_dump(mode="json"), "or fly without --on")
-    advice = list(dict.fromkeys(text for point in plan.points for text in advise(point)))
-    more = [f"{len(advice)} warnings; the others are alike"] if len(advice) > WARNINGS_MAX else []
-    for text in advice[:WARNINGS_MAX] + more:
-        print_line(f"cloudrc: warning: {text}", sys.stderr)
+    warn(*plan.points)
     return plan
 
 
