@@ -102,7 +102,7 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"--seeds flies in virtual time; leave out --mode {mode}")
     require(f"mode {mode}", MODES[mode])
     if options.seeds:
-        from cloudrc.cli.sweep import fly_seeds
+        from cloudrc.cli.sweep_run import fly_seeds
 
         return fly_seeds(options)
     return fly_once(options, mode)

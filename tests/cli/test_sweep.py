@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from cloudrc.assembly import assemble
-from cloudrc.cli.sweep import _shard, as_table, fly_row, summarise
+from cloudrc.cli.sweep import _shard
+from cloudrc.cli.sweep_run import as_table, fly_row, summarise
 from cloudrc.cluster import batch
 from cloudrc.sweep.plan import read_plan
 from cloudrc.sweep.store import read_rows
@@ -59,7 +60,7 @@ def test_a_sweep_goes_on_where_it_ended(write_sweep, monkeypatch, call):
             raise KeyboardInterrupt
         return fly_row(flight, **words)
 
-    monkeypatch.setattr("cloudrc.cli.sweep.fly_row", fly)
+    monkeypatch.setattr("cloudrc.cli.sweep_run.fly_row", fly)
     said = call("sweep run", write_sweep(ONE, seeds=3), code=130)
     assert said.out.endswith("runs/sweep-grid-1/sweep.json\n")
     again = said.err.partition("to continue: cloudrc ")[2]
@@ -184,7 +185,7 @@ def fly_in_pods(write_sweep, monkeypatch, call):
 
     Each argument is a list of the lines of one Job. `make(rows)` returns such lists.
     """
-    monkeypatch.setattr("cloudrc.cli.sweep.release_from_flags", lambda options: Release())
+    monkeypatch.setattr("cloudrc.cli.sweep_run.release_from_flags", lambda options: Release())
     monkeypatch.setattr(batch, "start", lambda *given, **words: None)
     path = write_sweep()
 

@@ -52,7 +52,7 @@ def test_the_command_prints_json(tmp_path, monkeypatch, capsys):
     printed = json.loads(capsys.readouterr().out)
     assert (printed["schemaVersion"], printed["faults"][0]["result"]) == (1, "passed")
     assert {check["unit"] for check in printed["faults"][0]["checks"]} == {"", "m", "m/s", "yes"}
-    assert pickle.dumps(command._run(("F27", 1))), "a result comes back from another process"
+    assert pickle.dumps(command._run("F27", 1)), "a result comes back from another process"
 
 
 def test_a_failed_check_ends_in_exit_code_1(monkeypatch, capsys):
