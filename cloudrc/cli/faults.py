@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import asdict
 from functools import partial
 from itertools import count
@@ -61,13 +61,18 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     text = "name of the fault, its number: F13, or a schedule's file (.yaml)"
     what.add_argument("name", nargs="?", type=_name_or_file, metavar="NAME", help=text)
     what.add_argument("--all", action="store_true", help="every fault")
-    for name, options in OPTIONS.items():
-        for option, (read, default, metavar, text) in options.items():
-            parsers[name].add_argument(
-                option, type=read, default=default, metavar=metavar, help=text
-            )
-    text = "the cloud has valid keys and tries to break the invariants"
-    parsers["search"].add_argument("--adversarial", action="store_true", help=text)
+    add, seed = parsers["run"].add_argument, whole_number(0, SEED_MAX)
+    add("--seed", type=seed, default=1, metavar="N", help="seed (default: 1)")
+    about = "number of parallel processes, at most one per core (default: 1)"
+    add("--jobs", type=read_count, default=1, metavar="J", help=about)
+    add, minutes = parsers["search"].add_argument, number(0, MINUTES_MAX, "minutes")
+    add("--minutes", type=minutes, default=1.0, metavar="M", help="duration (default: 1)")
+    add("--first", type=seed, default=1, metavar="SEED", help="first seed (default: 1)")
+    add("--jobs", type=read_count, default=1, metavar="J", help=about)
+    about = f"folder for failing schedules (default: ./{STORE})"
+    add("--store", type=_folder, default=STORE, metavar="DIR", help=about)
+    about = "the cloud has valid keys and tries to break the invariants"
+    add("--adversarial", action="store_true", help=about)
 
 
 def _name_or_file(text: str) -> str | Path:
@@ -81,20 +86,6 @@ def _folder(text: str) -> Path:
     if not (existing.is_dir() and os.access(existing, os.W_OK)):
         raise argparse.ArgumentTypeError(f"{text}: cannot be written")
     return path
-
-
-JOBS = (read_count, 1, "J", "number of parallel processes, at most one per core (default: 1)")
-STORED = f"folder for failing schedules (default: ./{STORE})"
-OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
-    "run": {"--seed": (whole_number(0, SEED_MAX), 1, "N", "seed (default: 1)"), "--jobs": JOBS},
-    "search": {
-        "--minutes": (number(0, MINUTES_MAX, "minutes"), 1.0, "M", "duration (default: 1)"),
-        "--first": (whole_number(0, SEED_MAX), 1, "SEED", "first seed (default: 1)"),
-        "--jobs": JOBS,
-        "--store": (_folder, STORE, "DIR", STORED),
-    },
-}
-"""Action -> option -> function that parses the value, default, metavar, help text."""
 
 
 def execute(options: argparse.Namespace) -> int:
