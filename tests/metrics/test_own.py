@@ -29,7 +29,7 @@ def measure(flight):
 FAILING = '"""A metric."""\nUNIT = "1"\ndef measure(flight):\n    '
 BODIES = {
     "overshoot": OVERSHOOT,
-    "raises": f"{FAILING}raise RuntimeError('no such column')",
+    "raises": f"{FAILING}raise RuntimeError('no such\\ncolumn')",
     "infinite": f"{FAILING}return float('inf')",
 }
 SHORT = ["steps", "--mode", "virtual", "--set", "mission.steps.count=1"]
