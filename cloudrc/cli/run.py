@@ -301,7 +301,6 @@ def _record_virtual(
     with McapWriter(folder / "mission.mcap", clock="world") as writer:
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
-            from_cloud = flight.on_world_clock(from_cloud)
             for log_time_ns, row in merged(from_world, from_cloud):
                 writer.write_row(row, log_time_ns)
             store.add(from_world, from_cloud)
@@ -309,9 +308,7 @@ def _record_virtual(
             see(from_world)
 
         try:
-            _, cloud, flight = assembly.assemble(experiment)
-            limit_ns = round(assembly.flight_limit(experiment) * 1e9)
-            flight.fly(lambda: cloud.mission_over, limit_ns, sink)
+            assembly.fly(experiment, sink)
         except KeyboardInterrupt:
             interrupted = True
         try:

@@ -10,7 +10,6 @@ from cloudrc import __version__
 from cloudrc.cli.cluster_flags import release_arguments
 from cloudrc.cli.output import output_argument
 from cloudrc.cli.parser import COUNT_MAX, figure_arguments, input_file, read_count
-from cloudrc.errors import BadInputError
 
 ACTIONS = {
     "run": "fly all points of a grid, or those that are missing in --out",
@@ -40,7 +39,7 @@ IMAGE = f"cloudrc/world:{__version__}"
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", title="actions")
     run, status, fly, figure, rows = (
         actions.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
         for name, text in ACTIONS.items()
@@ -104,9 +103,6 @@ def _shard(text: str) -> tuple[int, int]:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the chosen action; return the exit code."""
-    if options.action is None:
-        names = ", ".join(ACTIONS)
-        raise BadInputError(f"an action is missing: {names}; see 'cloudrc sweep --help'")
     from cloudrc.cli import sweep_run as actions
 
     functions = (actions.run, actions.print_status, actions.fly_again, actions.draw_figure,
