@@ -46,7 +46,6 @@ ACTIONS = {
 }
 STORE = Path("faults-found")
 FAILED = 1
-CHUNK = 500  # number of seeds that a search hands to the pool at once
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -212,11 +211,10 @@ def search(options: argparse.Namespace) -> int:
 def _fly_seeds(options: argparse.Namespace, began: float) -> Generator[Finding]:
     """Fly one flight per seed, until `options.minutes` [min] have passed since `began` [s]."""
     fly = partial(fly_seed, adversarial=options.adversarial)
-    for first in count(options.first, CHUNK):
-        for finding in map_in_order(fly, range(first, first + CHUNK), options.jobs):
-            yield finding
-            if time.monotonic() - began >= 60.0 * options.minutes:
-                return
+    for finding in map_in_order(fly, count(options.first), options.jobs):
+        yield finding
+        if time.monotonic() - began >= 60.0 * options.minutes:
+            return
 
 
 def fly_seed(seed: int, adversarial: bool) -> Finding:

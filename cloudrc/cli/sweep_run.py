@@ -25,7 +25,6 @@ from cloudrc.cli.output import (
     print_result,
     table,
 )
-from cloudrc.cli.parser import COUNT_MAX
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.cli.progress import SweepView
 from cloudrc.cli.report import print_traceback, summary
@@ -124,12 +123,9 @@ def _fly(
 ) -> Generator[Row]:
     """Fly on this machine or in pods; yield the row of each flight when it ends."""
     if options.on:
-        yield from rows_from_pods(options, plan, flights)
-        return
+        return rows_from_pods(options, plan, flights)
     fly = partial(fly_row, record=options.record, folder=folder)
-    for first in range(0, len(flights), COUNT_MAX):
-        work = flights[first : first + COUNT_MAX]
-        yield from map_in_order(fly, work, options.jobs, in_order=False)
+    return map_in_order(fly, flights, options.jobs, in_order=False)
 
 
 def fly_row(flight: Flight, record: str | None = None, folder: Path = Path()) -> Row:

@@ -76,7 +76,7 @@ def test_bad_input_is_told_in_one_line(words, said, refused):
 )
 def test_what_was_flown_before_an_interrupt_is_kept(line, error, code, said, monkeypatch, call):
     def flown(function, work, jobs):
-        yield Finding(Schedule(work[0]), ()) if "search" in line else Outcome()
+        yield Finding(Schedule(1), ()) if "search" in line else Outcome()
         raise error
 
     monkeypatch.setattr("cloudrc.cli.faults.map_in_order", flown)
