@@ -81,7 +81,10 @@ def _new(folder: Path) -> int:
 
 
 def check(folder: Path, limit: float = TIME_LIMIT) -> list[dict[str, Any]]:
-    """Score the student's files in a folder within `limit` [s]; return a dictionary per test."""
+    """Score the student's files in a folder within `limit` [s].
+
+    Return one dictionary per test, with the test's name, its points and the result in words.
+    """
     from cloudrc.drivers.machine import interpreter
     from cloudrc.exercise import checks
 

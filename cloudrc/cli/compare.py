@@ -90,7 +90,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
-    """Fly A and B with each seed.
+    """Fly the experiment with the settings A and with the settings B, each with all seeds.
 
     Return the pairs of flights; why the work ended early, or ""; and the exit code.
     """
@@ -178,7 +178,7 @@ def _needed(entry: Mapping[str, Any]) -> str:
 
 
 def _answer(document: Mapping[str, Any]) -> str:
-    """Say whether A or B succeeds more often, if decided, and how B changes the first metric."""
+    """Say how B changes the first metric, and whether A or B succeeds significantly more often."""
     success, text = document["success"], ""
     if success["decided"]:
         more, less = "ba" if success["b"] > success["a"] else "ab"

@@ -107,7 +107,7 @@ def _cores() -> Check:
 
 
 def _cluster(context: str | None) -> Iterator[Check]:
-    """Check whether a kubeconfig is valid and its cluster answers; Helm checks the version."""
+    """Check whether a kubeconfig is valid and its cluster answers."""
     from cloudrc.cluster.client import connect
 
     name = "kubeconfig"

@@ -51,7 +51,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Find and print the key's largest stable value; return 0, or 1 if no value is stable."""
+    """Print the largest value of KEY at which all flights succeed; return 0, or 1 if none."""
     from cloudrc.cli.run import load
 
     interrupt_on_signals()

@@ -199,7 +199,7 @@ def warn_if_exposed(listen: Address) -> None:
 
 @contextmanager
 def _listening(flag: str, listen: Address) -> Iterator[None]:
-    """Warn if other machines can reach `listen`; name `flag` in the error if binding it fails."""
+    """Warn if other machines can reach `listen`; convert an OSError to an error about `flag`."""
     warn_if_exposed(listen)
     try:
         yield
@@ -347,8 +347,8 @@ def link_monitor(
     """Make the monitor that compares the received datagrams with the link profile.
 
     `uplink` is True in cloud, False in world. In flight, the monitor reads changes of the profile
-    from the link's file `state`. If the link is not `trusted`, the monitor refuses trace files
-    that are larger than TRACE_MAX.
+    from the link's file `state`; with None, the experiment's profile stays in force. If the link is
+    not `trusted`, the monitor refuses trace files that are larger than TRACE_MAX.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile
@@ -404,7 +404,7 @@ def _run_relay(options: argparse.Namespace) -> int:
         threading.Thread(target=control.follow, name="link control", daemon=True).start()
 
     def over() -> bool:
-        """Apply changes of the link and export counts, if due; return whether to stop."""
+        """Apply changes of the link; export the packet counts, if due; return whether to stop."""
         nonlocal count_due
         if control is not None:
             control.swap()
@@ -468,9 +468,9 @@ class RelayControl:
     ) -> None:
         """Publish the initial state of both directions in `folder`, which is created if missing.
 
-        `links` maps "uplink" and "downlink" to the link of this direction, `first` maps them to its
-        first profile. `asked` is called with a direction and its mean delay [s], now and after each
-        change.
+        `links` and `first` contain the link model and the first profile of each direction, by the
+        name "uplink" or "downlink". `asked` is called with this name and the requested mean delay
+        [s], now and after each change.
         """
         from cloudrc.cli.link_run import make_profile_loader
 
@@ -493,7 +493,7 @@ class RelayControl:
                 self._applied_ns[way], self._applied[way] = time.monotonic_ns(), loaded
 
     def follow(self) -> None:
-        """Call `look` periodically, in a thread that never ends."""
+        """Call `look` periodically; never return, so run this method in a thread of its own."""
         while True:
             self.look()
             time.sleep(PROFILE_PERIOD)

@@ -109,7 +109,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def load(name: str, overrides: Iterable[str], seed: int | None = None) -> ResolvedExperiment:
-    """Load an experiment by name or path with `overrides` (KEY=VALUE); check its own metrics."""
+    """Load an experiment by name or path with `overrides` (KEY=VALUE); check `report.metrics`."""
     from cloudrc import metrics
     from cloudrc.config.load import load_experiment
 
@@ -209,7 +209,11 @@ def point_to(folder: Path, link: str) -> None:
 def _local_flight(
     experiment: ResolvedExperiment, mode: str, stream: TextIO, waypoints: int, ready: Ready | None
 ) -> Flight:
-    """Return a function that flies on this machine and shows the progress on `stream`."""
+    """Return a function that flies on this machine and shows the progress on `stream`.
+
+    With `ready`, the function flies a session, in which teleop waits for missions. It calls `ready`
+    when all processes are ready.
+    """
     from cloudrc.cli.progress import FlightView
 
     def flight(folder: Path) -> dict[str, Any]:
@@ -252,8 +256,10 @@ def fly(
     """Fly in mode "virtual" or "local"; write all files into `folder`, and return the report.
 
     During the flight `see` is called with new records; in local mode some are left out. An
-    interrupted flight also gets a report. Without `page`, write no report.html. With `session`,
-    teleop waits for missions, as in `LocalRun`; the report is that of the last mission.
+    interrupted flight also gets a report. Without `page`, write no report.html.
+
+    With `session`, teleop waits for missions, and the report is that of the last one. When all
+    processes are ready, `session` gets the API's address and process -> HOST:PORT of its metrics.
     """
     from cloudrc.config.load import dump
     from cloudrc.report.write import write_report
@@ -323,7 +329,7 @@ def _record_virtual(
 
 
 def _prepare(experiment: ResolvedExperiment) -> bool:
-    """Check the user's robot and scene; return whether the operator's API is installed."""
+    """Check the user's robot and scene; return whether the packages of the API are installed."""
     if absent := missing("api"):
         text = f"no operator's API in this run: {', '.join(absent)} not installed"
         print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)
@@ -344,7 +350,8 @@ def _record_local(
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
     """Fly in real time; yield the merged recording, the experiment and facts about the run.
 
-    With `session`, yield those of the session's last mission.
+    If `session` is given, fly a session, and yield recording, experiment and facts of its last
+    mission. `session` is called with the API's address and the metrics' addresses by process.
     """
     from cloudrc.assembly import flight_limit
     from cloudrc.cli.session import read_last_mission

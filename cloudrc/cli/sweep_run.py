@@ -46,7 +46,7 @@ METHOD = "95 % interval of the median, by order statistics"
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fly the flights of a sweep that have no row yet; return 1 unless all flights succeed."""
+    """Fly the flights of a sweep whose results or recordings are missing; return the exit code."""
     interrupt_on_signals()
     plan, folder, (shard, count) = _plan(options), options.out, options.shard or (None, 1)
     if options.shard:
@@ -129,7 +129,7 @@ def _fly(
 
 
 def fly_row(flight: Flight, record: str | None = None, folder: Path = Path()) -> Row:
-    """Fly and return the row; if `record` asks for it, fly again with a recording in `folder`."""
+    """Fly a flight and return its row; if a recording is wanted, fly again to make it."""
     row = flight.row(fly_point(flight.experiment))
     if _to_record(row, record, folder):
         _fly_into(folder / flight.key, flight, page=False)
@@ -339,5 +339,5 @@ def fly_seeds(options: argparse.Namespace) -> int:
 
 
 def fly_seed(flight: Flight) -> Row:
-    """Fly once and return the row of numbers; an exception ends the command."""
+    """Fly once; return the row of results, such as the verdict. An exception ends the command."""
     return flight.row(measure(flight.experiment))

@@ -70,7 +70,7 @@ def flights_folder() -> Path:
 
 
 class FlightFile(NamedTuple):
-    """Content of the file of a flight under way, except the folder of the run."""
+    """Content of a flight file besides the run's folder: how other commands reach the flight."""
 
     api: str  # address of the operator's API; "" for none
     kind: str  # RUN or SESSION
@@ -106,7 +106,7 @@ def under_way() -> dict[Path, str]:
 
 
 def flight_files() -> dict[Path, FlightFile]:
-    """Return the flights of this user: folder of the run -> content of the flight file."""
+    """Return the flights of this user under way: folder of the run -> its flight file."""
     found = {}
     for path in flights_folder().glob("*.json"):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError), path.open() as file:
@@ -137,7 +137,7 @@ def end_session(run: Path, limit: float) -> None:
 
 @dataclass
 class Child:
-    """A process that the supervisor has started."""
+    """A process of a local run, such as world or relay, which the supervisor has started."""
 
     name: str  # command of the process, such as "relay"
     process: subprocess.Popen[bytes]
@@ -163,8 +163,8 @@ class LocalRun:
 
     Attributes:
         notes: Sentences for the report of the flight.
-        announcement: Owns the flight file of this run; its method `close` removes the file.
-            `fly` calls `close` after a flight. After a session, the caller of `fly` does so.
+        announcement: Its `close` deletes the file by which other commands find this run. `fly`
+            closes it after a flight. After a session, the caller of `fly` has to close it.
     """
 
     def __init__(

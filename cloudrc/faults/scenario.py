@@ -20,7 +20,7 @@ YES = "yes"  # unit of a check that is a statement: its value is 1 if the statem
 
 
 def generator(seed: int, use: int) -> np.random.Generator:
-    """Make a random generator; different numbers `use` give independent sequences."""
+    """Make a random generator from a seed; different `use` give independent sequences."""
     return np.random.Generator(np.random.PCG64([seed, use]))
 
 

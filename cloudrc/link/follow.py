@@ -37,7 +37,7 @@ _NAME = re.compile(r"[a-zA-Z0-9_][-._a-zA-Z0-9]{0,252}")
 
 
 class Loaded(NamedTuple):
-    """A profile as read from its file."""
+    """One direction of a link profile, and the content of the profile's file."""
 
     direction: DirectionProfile  # profile of the direction that this process shapes, in SI units
     values: dict[str, Any]  # content of the file, without defaults, to show to users
@@ -138,7 +138,10 @@ class _HandedFile(ProfileFile):
 
 
 class Profiles:
-    """Watches the profile's file and the file from `link set`; returns each change once."""
+    """Watches two files for changes: the profile's, and the one that `cloudrc link set` writes.
+
+    A change that reaches both files is returned once.
+    """
 
     def __init__(
         self, profile: Path, document: Path, load: Load, log: Callable[[str], None]
@@ -180,7 +183,7 @@ class PeerName:
     def __init__(
         self, peer: Address, resolve: Callable[[str], Sequence[str]], log: Callable[[str], None]
     ) -> None:
-        """Follow `peer`, a host name and a port.
+        """Set `peer`, host name and port of the other pod; do not resolve the name yet.
 
         `resolve` returns the addresses of a host name or raises an OSError; `log` writes one line.
         """

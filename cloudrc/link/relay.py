@@ -56,7 +56,7 @@ _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SET_TIMERSLACK = 35, 40, 29
 
 
 class ReleaseErrors(Counter[int]):
-    """Histogram of how late datagrams left the relay: bucket -> number of datagrams."""
+    """Histogram of the lateness of datagrams: bucket (a range of lateness) -> count."""
 
     def observe(self, error_ns: int) -> None:
         """Count one datagram that left `error_ns` [ns] after it was due."""
@@ -84,7 +84,7 @@ class ReleaseErrors(Counter[int]):
 
 
 def ask_for_stamps(one: socket.socket) -> None:
-    """Let the kernel, if it can, record arrival times on a socket and count dropped datagrams."""
+    """Ask the kernel for the arrival times and the number of dropped datagrams of a socket."""
     for option in (_SO_RXQ_OVFL, _SO_TIMESTAMPNS) if sys.platform == "linux" else ():
         with suppress(OSError):  # without a stamp, the time of reading counts as arrival
             one.setsockopt(socket.SOL_SOCKET, option, 1)
@@ -193,12 +193,13 @@ class Lane:
         return {**self._counts, "unread": self._stamps.dropped}
 
     def released(self) -> dict[str, int]:
-        """Return statistics of how late datagrams left; any thread may call this method.
+        """Return how many datagrams left and how late; any thread may call this method.
 
         Returns:
-            The values of `ReleaseErrors.in_ns`, and the numbers of datagrams that were dropped
-            because too many were in flight (`overflow`), or that waited `AGE_MAX_NS` or longer to
-            be read (`stalled`). Empty before the first datagram.
+            The number of datagrams that left (`released`), that left too early (`released_early`),
+            that were dropped because too many were in flight (`overflow`), and that waited
+            `AGE_MAX_NS` or longer to be read (`stalled`); and percentiles of the lateness, such as
+            `release_error_p99_ns` [ns]. Empty before the first datagram leaves.
         """
         more = {"overflow": self._counts["overflow"], "stalled": self._stalled}
         return told | more if (told := self.errors.in_ns()) else {}
@@ -206,7 +207,7 @@ class Lane:
     def _put_on_link(
         self, data: bytes, kind: int, epoch: int, counter: int, received_ns: int
     ) -> None:
-        """Compute when each copy of a datagram is due, and keep the copies until then."""
+        """Keep a datagram until the link delivers it: never if it is lost, twice if duplicated."""
         if self.origin_ns is None:
             self.origin_ns = received_ns
         elapsed_ns = received_ns - self.origin_ns
@@ -238,8 +239,8 @@ class Lane:
 class Relay:
     """Runs one or two `Lane` objects in one thread.
 
-    `lanes` maps the name of each direction to its lane. The time of the link models starts when
-    the first datagram arrives on any lane: make the models with `origin_ns` 0.
+    `lanes` maps the name of each direction to its lane. Time 0 of the link models is the arrival
+    of the first datagram on any lane; so make the models with `origin_ns` 0.
     """
 
     def __init__(self, lanes: Mapping[str, Lane]) -> None:
@@ -288,7 +289,7 @@ class Relay:
                         other.origin_ns = lane.origin_ns
 
     def counts(self) -> dict[str, int]:
-        """Return the number of datagrams of all lanes by outcome, and the recent lateness.
+        """Return the number of datagrams by outcome, over all directions, and the recent lateness.
 
         The outcomes are `received`; `forwarded` (including copies); `lost` on the link; `malformed`
         (not from the tunnel); `overflow` (too many in flight, see `IN_FLIGHT_MAX`); `unread` (the
@@ -318,9 +319,9 @@ class RelayShaper(Relay):
     ) -> None:
         """Open the two sockets; raise an OSError if `listen` is in use or cannot reach `end`.
 
-        This pod's end of the tunnel sends to the address `listen`; with port 0 the kernel chooses a
-        port. It sends from the address `end`; None allows any address. The times of the model
-        `direction` are on the monotonic clock. `peek` reads kind, epoch and counter of a datagram.
+        This pod's world or cloud sends from the address `end` (None: from any address) to the
+        address `listen` (port 0: any free port). The times of the model `direction` are on the
+        monotonic clock. `peek` reads kind, epoch and counter of a datagram.
         """
         self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._inside.bind(listen)
@@ -351,7 +352,7 @@ class RelayShaper(Relay):
         self._lane.direction.replace_profile(profile, restart=restart)
 
     def released(self) -> dict[str, int]:
-        """Return how late datagrams of this direction left; see `Lane.released`."""
+        """Return counts of datagrams, and percentiles of how late they left [ns], by name."""
         return self._lane.released()
 
     def close(self) -> None:

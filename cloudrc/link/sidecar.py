@@ -58,10 +58,11 @@ class Sidecar:
         tell: Callable[[LinkState], object],
         count: Callable[[dict[str, int]], object],
     ) -> None:
-        """Store the arguments; `route` is the route file. The state file is in the same folder.
+        """Store the arguments; `route` is the file with the address to which the tunnel sends.
 
-        `direction` is "uplink" or "downlink". `tell` exports each new state of the link as metrics.
-        `count` exports the numbers of datagrams by outcome, once a second.
+        The state file is in the same folder. `direction` is "uplink" or "downlink". `tell` exports
+        each new state of the link as metrics. `count` exports the numbers of datagrams by outcome,
+        once a second.
         """
         self.peer: Address | None = None
         self.profile = profile
@@ -92,7 +93,7 @@ class Sidecar:
                 file.unlink(missing_ok=True)
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
-        """Use one shaper until `stop` returns True, or until a profile needs the other shaper."""
+        """Run netem or the relay until `stop()` is true, or until a profile needs the other."""
         profile, machine = self.profile, self._machine
         if self.states.state and profile.change.restart:
             self._origin_ns = machine.clock()

@@ -38,7 +38,7 @@ CHANGE_FILE = "change.json"  # last `Change` of a profile, in the profile's fold
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A change of a link profile, as `cloudrc link set` describes it in `CHANGE_FILE`.
+    """Facts about a change of a link profile; `cloudrc link set` writes them to `CHANGE_FILE`.
 
     If `restart` is True, the profile's time line starts again when the new profile takes effect.
     """
@@ -69,21 +69,24 @@ class LinkState:
 
 
 class StateFile:
-    """The state file of one direction.
+    """Writes the state file of one direction of the link.
 
     Attributes:
-        state: The last state in the file; None before the first.
+        state: The last state written to the file; None before the first.
     """
 
     def __init__(self, path: Path, mode: str, direction: str) -> None:
-        """Set the path of the file, and `mode` and `direction` as in `LinkState`."""
+        """Set the file, the requested shaper `mode`, and `direction`, "uplink" or "downlink"."""
         self.path, self._mode, self._direction = path, mode, direction
         self.state: LinkState | None = None
 
     def next(
         self, loaded: Loaded, shaper: str, reason: str, since_ns: int, origin_ns: int | None
     ) -> LinkState:
-        """Return the state after a change of profile or shaper; arguments as in `LinkState`."""
+        """Return the state after a change of profile or shaper; `loaded` is the present profile.
+
+        The other arguments are the fields of `LinkState` with the same names.
+        """
         return LinkState(
             shaper=shaper,
             reason=reason,
@@ -105,7 +108,7 @@ class StateFile:
         self.state = state
 
     def refuse(self, number: str, refusal: str) -> None:
-        """Note in the file that change `number` was refused; `refusal` is the reason, in words."""
+        """Write to the file which change (`number`) was refused, and why (`refusal`, in words)."""
         if self.state is not None:
             self.publish(replace(self.state, refused=number, refusal=refusal))
 

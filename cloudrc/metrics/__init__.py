@@ -83,9 +83,10 @@ def check(own: Iterable[str]) -> None:
 
 
 def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
-    """Return a note for each metric file that the experiment names but the user does not.
+    """Return a note for each metric of the experiment that is a file and was not measured.
 
-    `named` are the metrics that the experiment names, `own` those that the user names.
+    `named` are the experiment's metrics, `own` those that the user names with --metric. A file may
+    be code from somebody else, so it is executed only if the user names it.
     """
     names = set(map(name_of, own))
     return [

@@ -37,14 +37,14 @@ def _prediction_error(flight: Flight) -> float | None:
 
 
 def _estimate_error(flight: Flight) -> float | None:
-    """Compute the RMS distance [m] from predicted positions to the later true positions."""
+    """Compute the RMS distance [m] from predicted to true positions at the predicted times."""
     control = flight.control
     target_ns = control["basis_stamp_ns"] + np.rint(control["horizon"] * 1e9).astype(np.int64)
     return rms(control["position"] - flight.true_position(target_ns))
 
 
 def _delay_error(flight: Flight) -> float | None:
-    """Compute the RMS difference between horizon and true delay of the commands [s].
+    """Compute the RMS difference between estimated (horizon) and true delay of the commands [s].
 
     Commands before the first measured round trip are left out.
     """
@@ -54,7 +54,10 @@ def _delay_error(flight: Flight) -> float | None:
 
 
 def wakes(flight: Flight, end: str) -> Columns:
-    """Select the rows of /lateness that `end` ("world", "cloud") recorded; none in virtual time."""
+    """Return how late `end` ("world" or "cloud") woke up: its rows of the topic /lateness.
+
+    There are no rows in virtual time.
+    """
     columns = flight.during("/lateness")
     return select(columns, columns["end"] == end)
 

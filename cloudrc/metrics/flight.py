@@ -31,7 +31,7 @@ CONTROL_TOPICS = "/estimated_odometry", "/setpoint_position", "/cmd_vel", "/dela
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """A recorded flight, its criteria, its mission and its scene."""
+    """A recorded flight, its criteria of success, its mission and its scene."""
 
     recording: Recording  # all topics; cloud's stamps are shifted to world's clock
     criteria: Criteria
@@ -192,7 +192,7 @@ SHIPPED: dict[str, Metric] = {}
 
 
 def add_metrics(group: str, *rows: tuple[str, str, str, Measure]) -> None:
-    """Add metrics of cloudrc to a group; each row has name, unit, meaning and `measure`."""
+    """Add metrics of cloudrc to a group; each row has name, unit, meaning and function."""
     SHIPPED.update({row[0]: Metric(*row, group) for row in rows})
 
 

@@ -55,7 +55,7 @@ SHARES = ("loss_", "late_", "overshoot_")
 
 
 def main_numbers(numbers: Mapping[str, Number]) -> list[tuple[str, str, str]]:
-    """Return label, digits and unit of each number in `MAIN` that is known."""
+    """Return label, digits and unit of each number in `MAIN` that was measured."""
     return [
         (text, *readable(name, numbers[name])) for name, text in MAIN.items() if name in numbers
     ]

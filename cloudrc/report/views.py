@@ -40,7 +40,10 @@ GOAL, GHOST, GLASS = (0.84, 0.37, 0.0), (0.34, 0.71, 0.91), (0.70, 0.74, 0.78)
 
 
 def add_views(mission: Contents, experiment: ResolvedExperiment) -> Recording:
-    """Add messages for viewers to the recording `mission`; return its tables; raise as `views`."""
+    """Add messages for viewers such as Foxglove to the recording `mission`; return its tables.
+
+    Raise a BadInputError if the scene of the experiment cannot be read.
+    """
     recording = mission.recording()
     mission.views = views(recording, experiment)
     return recording
@@ -104,9 +107,9 @@ def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:
 
 
 def _errors(topic: str, flight: Flight, columns: Columns, name: str) -> Iterator[View]:
-    """Yield one view per row: the distance from a position to the robot's true position [m].
+    """Yield messages of `topic`: the distance from a position to the robot's true position [m].
 
-    `name` is the column of `columns` with the positions.
+    `name` is the column of `columns` with the positions. At most one message per PERIOD_NS.
     """
     columns = _thin(columns)
     away = columns[name] - flight.true_position(columns["stamp_ns"])

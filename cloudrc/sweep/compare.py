@@ -36,7 +36,7 @@ class Pair(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Pairs of finished flights to compare."""
+    """Pairs of flights, with the units of their metrics and a description of the comparison."""
 
     pairs: list[Pair]
     units: dict[str, str]  # metric -> unit

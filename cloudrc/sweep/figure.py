@@ -79,9 +79,9 @@ def draw_sweep(
 def _choose(
     rows: Sequence[Row], x: str | None, by: str | None
 ) -> tuple[dict[str, list[Any]], str, str | None, list[str]]:
-    """Choose which axis of the sweep is the figure's x axis, and which axis has a line per value.
+    """Choose the axis of the sweep for the figure's x axis, and the axis with one line per value.
 
-    `x` and `by` are the user's choices; None: choose here. Return the values of each axis, the x
+    `x` and `by` are the user's choices of these two, or None. Return the values of each axis, the x
     axis, the axis of the lines (None if no axis is left), and the other axes.
     """
     values = values_of(rows)

@@ -47,7 +47,7 @@ def measure(experiment: ResolvedExperiment) -> Row:
 def counts(row: Row) -> bool:
     """Return whether the metrics of a flight are valid results of its experiment.
 
-    They are invalid if the flight did not end, or if another plug-in replaced one that failed.
+    They are invalid if the flight did not end, or if a plug-in failed in too many periods.
     """
     return row["verdict"] in ("success", "failure") and "plugin_failed" not in row["failures"]
 

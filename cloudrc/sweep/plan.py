@@ -73,7 +73,7 @@ class Flight(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A sweep whose points have been checked."""
+    """A checked sweep: the content of its file, its points, and the flights of each point."""
 
     file: dict[str, Any]  # content of the file, with `folder`
     axes: dict[str, list[Any]]  # axis -> its values or names
@@ -155,7 +155,7 @@ def _seeds(given: Any) -> tuple[int, ...]:
 def _entries(
     document: Document, file: SweepFile, folder: Path, found: list[Problem]
 ) -> tuple[list[_Entry], dict[str, list[tuple[Any, list[_Entry]]]]]:
-    """Return the settings that all points share, and a mapping: axis -> its choices.
+    """Return the settings that all points of the sweep share, and a mapping: axis -> its choices.
 
     A choice is a label with its settings. Problems of the axes are added to `found`.
     """
@@ -209,7 +209,7 @@ def pack(flights: Iterable[Flight]) -> bytes:
 
 
 def unpack(path: Path) -> list[Flight]:
-    """Read the flights in a file from `pack`; raise a BadInputError if the file is unusable."""
+    """Read the flights from a file made by `pack`; raise a BadInputError if it is unusable."""
     try:
         content = json.loads(gzip.decompress(path.read_bytes()))
         points = list[tuple[dict[str, Any], ResolvedExperiment, dict[str, Any]]]()

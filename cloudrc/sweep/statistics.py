@@ -64,9 +64,9 @@ def wilson_interval(successes: int, count: int) -> tuple[float, float]:
 def sign_test(less: int, more: int) -> float:
     """Return the exact two-sided p-value for "two kinds of events are equally likely".
 
-    `less` and `more` are the numbers of events of each kind. If B is below A in `less` pairs and
-    above A in `more` pairs, this is the sign test. If only A succeeded in `less` pairs and only B
-    in `more` pairs, this is the exact McNemar test.
+    `less` and `more` are the numbers of events of each kind. In the sign test, `less` counts
+    the pairs with B below A, `more` the pairs with B above A. In the exact McNemar test, `less`
+    counts the pairs in which only A succeeded, `more` the pairs in which only B succeeded.
 
     Source: Q. McNemar, "Note on the sampling error of the difference between correlated
     proportions or percentages", 1947.
@@ -100,9 +100,10 @@ def signed_rank_test(differences: Sequence[float]) -> float:
 
 
 def _sums(ranks: NDArray[Any]) -> NDArray[Any]:
-    """Return the probability of each value 0, 1, 2 ... of the sum of the positive ranks.
+    """Return the distribution of S, the sum of the positive ranks.
 
-    Each of `ranks`, whole numbers of shape (n,), is positive or negative with probability 1/2.
+    Element k is the probability that S = k, if each of `ranks`, whole numbers of shape (n,), is
+    positive or negative with probability 1/2.
     """
     chances = np.zeros(int(ranks.sum()) + 1)
     chances[0] = 1.0
@@ -114,7 +115,7 @@ def _sums(ranks: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True, slots=True)
 class Paired:
-    """Evaluation of paired differences B - A of one metric; "u" is the unit of the metric."""
+    """Evaluation of paired differences B - A of one metric; [u] is the unit of the metric."""
 
     count: int
     lower: int  # pairs in which B is below A
@@ -150,10 +151,10 @@ def paired(differences: Sequence[float]) -> Paired:
 
 
 def _cut(n: int) -> int:
-    """Return the critical value of the signed-rank test; -1 if `n` pairs are too few for one.
+    """Return the critical value of the signed-rank test for `n` pairs.
 
-    The test finds a difference if the smaller of the two sums, of the positive ranks and of the
-    negative ranks, is at most this value.
+    The test finds a difference if the sum of the positive ranks, or that of the negative ranks, is
+    at most this value. It is -1 if `n` is too small to find any difference.
     """
     if n > EXACT_MAX:
         mean, spread = n * (n + 1) / 4, math.sqrt(n * (n + 1) * (2 * n + 1) / 24)

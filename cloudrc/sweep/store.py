@@ -75,7 +75,7 @@ def append_rows(folder: Path, shard: int | None) -> Iterator[Callable[[Row], Non
 
 
 def begin(folder: Path, plan: Plan) -> dict[str, Row]:
-    """Write the description of a sweep into `folder`; return its earlier rows, key -> row.
+    """Write the file of a sweep into `folder`; return flight key -> row of earlier flights.
 
     Raises:
         BadInputError: If the folder has rows of another sweep.
@@ -93,7 +93,7 @@ def begin(folder: Path, plan: Plan) -> dict[str, Row]:
 
 
 def finish(folder: Path, plan: Plan) -> dict[str, Row]:
-    """Write the sweep's description and, after the last flight, its tables; return key -> row."""
+    """Write the summary and, if no flight is missing, the tables; return flight key -> row."""
     rows = read_rows(folder)
     unit_of = _write_summary(folder, plan, rows)
     if len(rows) == len(plan.flights):

@@ -33,7 +33,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One panel of the figure: a quantity, its unit, and for each setting a line of points."""
+    """One panel of the figure: a quantity, its unit, and a line of points per setting."""
 
     title: str
     unit: str
