@@ -169,7 +169,7 @@ def _columns(table: Table) -> Columns:
 
 
 def select(columns: Columns, rows: Array) -> Columns:
-    """Return some rows of all columns; `rows` are their indices, or a truth value per row."""
+    """Return some rows of all columns; `rows`, shape (n,), are indices or truth values."""
     return {name: column[rows] for name, column in columns.items()}
 
 
