@@ -169,7 +169,7 @@ def _columns(table: Table) -> Columns:
 
 
 def select(columns: Columns, rows: Array) -> Columns:
-    """Return some rows of all columns; `rows`, shape (n,), are indices or truth values."""
+    """Select rows of all columns by `rows` [1]: an index, indices, or a truth value per row."""
     return {name: column[rows] for name, column in columns.items()}
 
 
