@@ -30,7 +30,8 @@ from cloudrc.teleop.wire import Leg, Plan
 from cloudrc.tunnel.end import Identity
 
 if TYPE_CHECKING:
-    from cloudrc.drivers.virtual import VirtualRun
+    from cloudrc.drivers.virtual import Sink, VirtualRun
+    from cloudrc.records import Record
     from cloudrc.teleop.store import Order
     from cloudrc.world.endpoint import WorldEndpoint
     from cloudrc.world.sensors import Sensors
@@ -74,6 +75,20 @@ def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoi
     world = build_world(experiment, Identity(VIRTUAL_CLOCK, b"world".ljust(16), passes=passes))
     cloud = build_cloud(experiment, identity, lambda: own.at(0), cpu_clock=CPU_CLOCK)
     return world, cloud, VirtualRun(world, cloud, *links, cloud_clock=own)
+
+
+def fly(experiment: ResolvedExperiment, see: Sink) -> None:
+    """Fly in virtual time until the mission is over.
+
+    Every 100 ms of virtual time, call `see` with the new records of world and of cloud, both on
+    world's clock.
+    """
+    _, cloud, run = assemble(experiment)
+
+    def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
+        see(from_world, run.on_world_clock(from_cloud))
+
+    run.fly(lambda: cloud.mission_over, round(flight_limit(experiment) * 1e9), sink)
 
 
 def virtual_notes(experiment: ResolvedExperiment) -> tuple[str, ...]:

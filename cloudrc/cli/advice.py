@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 DURATION_NS = 20_000_000_000
 """Simulated time of the link [ns]."""
+WARNINGS_MAX = 3
+"""Largest number of warnings about several experiments that are printed."""
 SAG_MAX = 0.05
 """Largest steady error of the position that needs no warning [m]."""
 WIND_FORCE = 0.24
@@ -27,9 +29,12 @@ WIND_FORCE = 0.24
 rotors, one third comes from the tilt that this drag causes."""
 
 
-def warn(experiment: ResolvedExperiment) -> None:
-    """Print the texts of `advise` as warnings on stderr."""
-    for text in advise(experiment):
+def warn(*experiments: ResolvedExperiment) -> None:
+    """Print the texts of `advise` as warnings on stderr, each once; of a grid, the first ones."""
+    advice = list(dict.fromkeys(text for each in experiments for text in advise(each)))
+    if len(experiments) > 2 and len(advice) > WARNINGS_MAX:
+        advice[WARNINGS_MAX:] = [f"{len(advice)} warnings; the others are alike"]
+    for text in advice:
         print_line(f"cloudrc: warning: {text}", sys.stderr)
 
 

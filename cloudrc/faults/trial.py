@@ -18,6 +18,7 @@ from math import inf, nan
 import numpy as np
 
 from cloudrc.drivers.virtual import Clock
+from cloudrc.errors import describe_error
 from cloudrc.faults.adversary import Lie, dishonesty
 from cloudrc.faults.flight import SECRET, Flight
 from cloudrc.faults.invariants import LATCHED, Breach
@@ -92,7 +93,7 @@ def fly(schedule: Schedule, *settings: str, keep: bool = False) -> Finding:
     try:
         flight.fly(schedule.duration)
     except Exception as error:  # world and cloud must survive every fault
-        watch.note(flight.run.now_ns, "error", f"{type(error).__name__}: {error}")
+        watch.note(flight.run.now_ns, "error", describe_error(error))
     checks: dict[str, Callable[[], None]] = {
         "waypoint": lambda: _check_waypoints(flight),
         "stuck": operator.check_stuck,

@@ -8,10 +8,11 @@ from statistics import median
 from typing import Any
 
 from cloudrc.errors import BadInputError
+from cloudrc.metrics import scale
 from cloudrc.plugins import unknown_name_text
 from cloudrc.report.figures.bands import Panel, Point, draw
 from cloudrc.report.figures.style import Look
-from cloudrc.sweep.compare import NUMBERS, scale
+from cloudrc.sweep.compare import NUMBERS, check_names
 from cloudrc.sweep.flight import Row, counts
 from cloudrc.sweep.statistics import median_interval, wilson_interval
 from cloudrc.sweep.store import values_of
@@ -51,9 +52,7 @@ def draw_sweep(
         BadInputError: If the sweep lacks an axis or a metric.
     """
     known = sorted({name for row in rows if counts(row) for name in row["numbers"]})
-    for name in names:
-        if name not in known:
-            raise BadInputError(f"--number: {unknown_name_text('number', name, known)}")
+    check_names(names, known)
     values, x, by, pooled = _choose(rows, x, by)
     is_numeric = _is_numeric(values[x])
     along = sorted(values[x]) if is_numeric else values[x]
