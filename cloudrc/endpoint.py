@@ -27,7 +27,7 @@ class Endpoint(Protocol):
 
     @property
     def sealed(self) -> bool:
-        """Whether this end authenticates datagrams; if not, its driver must not use a socket."""
+        """Whether this end authenticates datagrams. If not, its driver must not use a socket."""
 
     def receive_datagram(self, data: Datagram, now_ns: int) -> None:
         """Process one datagram; count and drop an invalid datagram, without an exception."""

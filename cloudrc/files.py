@@ -110,6 +110,6 @@ def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
 
 
 def write_atomically(path: Path, data: bytes, mode: int = 0o666) -> None:
-    """Write `data` to a file as with `atomic_file`."""
+    """Replace a file in one step, with the permissions `mode` minus umask; may raise an OSError."""
     with atomic_file(path, mode) as file:
         file.write(data)

@@ -1,7 +1,8 @@
 """Find plug-ins by kind and name, and build them.
 
 A plug-in is one file with a function `build(**parameters)`. Its name in a configuration is the file
-name. A metric has no `build`; see `cloudrc.metrics`. Plug-ins are searched in three places:
+name. A metric has no `build`, but `UNIT` and `measure(flight)`. Plug-ins are searched in three
+places:
 
 1. the package of the kind in cloudrc, without files whose name begins with an underscore;
 2. installed packages with an entry point in the group `cloudrc.<kind>`;
@@ -63,7 +64,7 @@ def load(kind: str, name: str, **parameters: Any) -> Any:
 
 
 def find(kind: str, name: str) -> Any:
-    """Import the plug-in with this name or path; return its module, or its entry point's object."""
+    """Import a plug-in by name or path; return its module, or the object of an entry point."""
     if is_path(name) and not Path(name).is_file():
         raise BadInputError(f"{_one(kind)} {name!r}: there is no such file")
     with _explained(kind, name, "cannot be imported"):

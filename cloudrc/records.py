@@ -41,8 +41,8 @@ class LinkChecked(NamedTuple):
     is not judged: "time_line", "rate", "correlation".
 
     The verdict is "ok", "off" or "open", or "told" for a quantity that is not judged. "open" means
-    that the datagrams are too few, that the next check must confirm "off", or that a process that
-    woke late may have caused "off".
+    that there are too few datagrams, that the next check has to confirm "off", or that "off" may
+    come from a process that woke late.
     """
 
     stamp_ns: int

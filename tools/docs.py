@@ -51,7 +51,7 @@ _STAMPS = {
     ("arrival at world", "once per command that arrives"): "/downlink_delay",
     ("first physics step that follows the command", "once per command applied"): "/command_applied",
     ("physics step in which the state changes", "once per event"): "/guard",
-    ("first row of `/ground_truth` after the contact, at most 10 ms later", "once per event"):
+    ("stamp of the first row of `/ground_truth` after the contact", "once per event"):
         "/contact",
     ("instant at which this session begins in world or in cloud", "once per event"): "/session",
     ("departure of the command", _PERIOD):

@@ -82,9 +82,9 @@ def find_local_run(
 def ask_if_unclear(candidates: Collection[Path], *, steers: bool, flag: str = "--run ") -> None:
     """Raise a BadInputError if it is unclear which flight the user means.
 
-    `candidates` are the folders of the local runs that the command can use. `steers` tells whether
-    the command changes a flight; `flag` names a run in error messages. `find_local_run` explains
-    the errors.
+    It is unclear if there are several `candidates`, the folders of the local runs that the command
+    can use. If the command changes a flight (`steers`), it is also unclear if ./runs/latest has
+    ended or cannot be used. `flag` names a run in error messages.
     """
     from cloudrc.drivers.local import LINK_LOG, under_way
 

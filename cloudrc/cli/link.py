@@ -238,7 +238,7 @@ def _way(
 
 
 def _row_times(trace: Trace) -> list[int]:
-    """Return when to send packets [ns]: once per row, more often if a loss is between 0 and 1."""
+    """Return when to send packets [ns]: one per row; several if a row loses a share of packets."""
     rows = [round(time * 1e9) for time in trace.times]
     has_shares = any(0.0 < loss < 1.0 for loss in trace.losses or ())
     many = -(-ROWS // len(rows)) if has_shares and len(rows) > 1 else 1

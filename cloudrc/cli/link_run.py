@@ -197,7 +197,7 @@ def export_state(exporter: Exporter | None, state: LinkState) -> None:
 
 
 def export_counts(exporter: Exporter | None, counts: dict[str, int]) -> None:
-    """Export the counters of a shaper as metrics: name of the counter -> value."""
+    """Export the counters of a shaper as metrics; `counts`: name of the counter -> value."""
     if exporter:
         exporter.see([Counted(0, "link", name, number) for name, number in counts.items()])
 
@@ -213,7 +213,7 @@ def status_page(sidecar: Sidecar) -> str:
 def _find_netems(host: str, second: int) -> dict[str, Any]:
     """Find the netem qdiscs of this pod.
 
-    `second` is the present time in whole seconds [s]: the cache allows one search per second.
+    `second` is the present time [s]. It is an argument so that the cache searches once per second.
     """
     from cloudrc.link.netem import find_netems
 
@@ -221,7 +221,7 @@ def _find_netems(host: str, second: int) -> dict[str, Any]:
 
 
 def run_tool(words: Sequence[str], environment: dict[str, str] | None = None) -> str:
-    """Run a program and return its output; if it fails, raise the error of `netem.explain`."""
+    """Run a program; return its output, or raise a MissingPrerequisiteError with the remedy."""
     from cloudrc.link.netem import explain
 
     try:
@@ -243,12 +243,12 @@ class Programs:
     """
 
     def __init__(self, tables: str = "") -> None:
-        """Set the folder with the distribution tables of tc; start no process yet."""
+        """Set `tables`, the folder in which tc looks for its tables of delays."""
         self._environment = {**os.environ, "TC_LIB_DIR": tables, "LC_ALL": "C"}
         self._tc: subprocess.Popen[str] | None = None
 
     def __call__(self, words: Sequence[str]) -> str:
-        """Run a command of tc or ip and return its output; raise the same errors as `run_tool`."""
+        """Run a command of tc or ip; return its output, or raise a MissingPrerequisiteError."""
         try:
             match list(words):
                 case ["tc", "qdisc", "change", *_]:

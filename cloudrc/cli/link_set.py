@@ -106,7 +106,7 @@ def read_states(folder: Path) -> list[LinkState]:
 def set_here(
     folder: Path, profile: str | None, settings: Sequence[str], number: str
 ) -> tuple[Edit, list[LinkState]]:
-    """Pass a profile to a local link, and wait until it applies; return the `Edit` and new states.
+    """Pass a profile to a local link; wait until it applies; return the profile and the new states.
 
     `profile` is the name or file of a profile that replaces the present one; None keeps it.
     `settings` are texts such as "uplink.delay_ms=120". `number` identifies the change.
@@ -141,7 +141,6 @@ def set_here(
 
 
 def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
-    """Return the link of a release; raise an error with the reason if the release has no link."""
     from cloudrc.cluster.link import read_link
     from cloudrc.cluster.pods import find_pod
 
@@ -158,7 +157,7 @@ def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
 
 
 def note_of(edit: Edit, number: str) -> str:
-    """Return the text of change.json: a change's number, cause, and if the time line restarts."""
+    """Return change.json as text: number, cause, and whether the time line restarts."""
     return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
 
 

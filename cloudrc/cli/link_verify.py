@@ -104,7 +104,7 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
-    """Read the experiment `target`, or the default experiment with the link profile `target`."""
+    """Read the experiment `target`; for a link profile, use it in the default experiment."""
     experiments, profiles = shipped.names("experiment"), shipped.names("profile")
     is_profile = target not in experiments
     if shipped.is_path(target):
@@ -184,7 +184,7 @@ def measure(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Str
 
 
 def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Findings]:
-    """Send the probes of `plans` over a running link; return direction -> findings."""
+    """Send all probes over a running link, and judge it; return direction -> findings."""
     streams, found = measure(ways, plans), {}
     time.sleep(COUNTS_WAIT)
     for name, way in ways.items():
@@ -321,9 +321,9 @@ def _pods(options: argparse.Namespace) -> Iterator[Pods]:
 
 
 def verify_release(title: str, pods: Pods, limit: float) -> Report:
-    """Report the verdict on each direction of a release's link, from the process that receives it.
+    """Fetch the verdicts on both directions of a release's link, and report them.
 
-    World receives the downlink, cloud the uplink. Wait at most `limit` [s] for both verdicts.
+    World judges the downlink, cloud the uplink. Wait at most `limit` [s] for both verdicts.
 
     Raises:
         TimedOutError: If world or cloud does not answer in time.
@@ -356,7 +356,7 @@ def fetch(url: str) -> str:
 
 
 def _findings(found: Mapping[str, Any], link: str) -> Findings:
-    """Combine the receiver's verdict with the report of the link container at the URL `link`."""
+    """Combine the receiver's verdict `found` with the link container's report at the URL `link`."""
     page, rows = json.loads(fetch(f"{link}/link.json") or "{}"), []
     for one in found["rows"]:
         name, values = one["quantity"], (one.get(key, nan) for key in KEYS)

@@ -37,7 +37,7 @@ not trust this container. Real traces come from a ConfigMap, which holds at most
 class Command(NamedTuple):
     """One command of a module that defines several commands.
 
-    A module with only one command has attributes with the names of these fields.
+    A module with only one command is used in place of a `Command`: it defines the same names.
     """
 
     arguments: Callable[[argparse.ArgumentParser], None]
@@ -170,7 +170,7 @@ def warn_if_exposed(listen: Address) -> None:
 
 @contextmanager
 def listening(flag: str, listen: Address) -> Iterator[None]:
-    """Warn if other machines can reach `listen`; name `flag` in the error if binding it fails."""
+    """Warn if other machines can reach `listen`; convert an OSError to an error about `flag`."""
     warn_if_exposed(listen)
     try:
         yield
@@ -318,8 +318,8 @@ def link_monitor(
     """Make the monitor that compares the received datagrams with the link profile.
 
     `uplink` is True in cloud, False in world. In flight, the monitor reads changes of the profile
-    from the link's file `state`. If the link is not `trusted`, the monitor refuses trace files
-    that are larger than TRACE_MAX.
+    from the link's file `state`; with None, the experiment's profile stays in force. If the link is
+    not `trusted`, the monitor refuses trace files that are larger than TRACE_MAX.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile

@@ -18,11 +18,11 @@ from cloudrc.cli.extras import MODES, missing, require
 from cloudrc.cli.find_run import RUNS
 from cloudrc.cli.output import (
     escape,
-    format_document,
     is_live,
     output_argument,
     print_line,
     print_or_drop,
+    print_result,
 )
 from cloudrc.cli.parser import read_count, whole_number
 from cloudrc.cli.pool import interrupt_on_signals
@@ -102,14 +102,14 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"--seeds flies in virtual time; leave out --mode {mode}")
     require(f"mode {mode}", MODES[mode])
     if options.seeds:
-        from cloudrc.cli import seeds
+        from cloudrc.cli.sweep_run import fly_seeds
 
-        return seeds.fly_seeds(options)
+        return fly_seeds(options)
     return fly_once(options, mode)
 
 
 def load(name: str, overrides: Iterable[str], seed: int | None = None) -> ResolvedExperiment:
-    """Load an experiment by name or path with `overrides` (KEY=VALUE); check its own metrics."""
+    """Load an experiment by name or path with `overrides` (KEY=VALUE); check `report.metrics`."""
     from cloudrc import metrics
     from cloudrc.config.load import load_experiment
 
@@ -164,9 +164,7 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
         if in_cluster and options.out is None and folder.exists():
             point_to(folder, "latest")
     print_traceback(options, report)
-    print_or_drop(
-        format_document(report, options.output) if for_programs else summary(report, folder)
-    )
+    print_result(options.output, report, summary(report, folder))
     return 0 if ready else exit_code(report)
 
 
@@ -211,7 +209,11 @@ def point_to(folder: Path, link: str) -> None:
 def _local_flight(
     experiment: ResolvedExperiment, mode: str, stream: TextIO, waypoints: int, ready: Ready | None
 ) -> Flight:
-    """Return a function that flies on this machine and shows the progress on `stream`."""
+    """Return a function that flies on this machine and shows the progress on `stream`.
+
+    With `ready`, the function flies a session, in which teleop waits for missions. It calls `ready`
+    when all processes are ready.
+    """
     from cloudrc.cli.progress import FlightView
 
     def flight(folder: Path) -> dict[str, Any]:
@@ -254,8 +256,10 @@ def fly(
     """Fly in mode "virtual" or "local"; write all files into `folder`, and return the report.
 
     During the flight `see` is called with new records; in local mode some are left out. An
-    interrupted flight also gets a report. Without `page`, write no report.html. With `session`,
-    teleop waits for missions, as in `LocalRun`; the report is that of the last mission.
+    interrupted flight also gets a report. Without `page`, write no report.html.
+
+    With `session`, teleop waits for missions, and the report is that of the last one. When all
+    processes are ready, `session` gets the API's address and process -> HOST:PORT of its metrics.
     """
     from cloudrc.config.load import dump
     from cloudrc.report.write import write_report
@@ -303,7 +307,6 @@ def _record_virtual(
     with McapWriter(folder / "mission.mcap", clock="world") as writer:
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
-            from_cloud = flight.on_world_clock(from_cloud)
             for log_time_ns, row in merged(from_world, from_cloud):
                 writer.write_row(row, log_time_ns)
             store.add(from_world, from_cloud)
@@ -311,9 +314,7 @@ def _record_virtual(
             see(from_world)
 
         try:
-            _, cloud, flight = assembly.assemble(experiment)
-            limit_ns = round(assembly.flight_limit(experiment) * 1e9)
-            flight.fly(lambda: cloud.mission_over, limit_ns, sink)
+            assembly.fly(experiment, sink)
         except KeyboardInterrupt:
             interrupted = True
         try:
@@ -330,7 +331,7 @@ def _record_virtual(
 def _prepare(experiment: ResolvedExperiment, folder: Path) -> bool:
     """Check the user's robot and scene, and write the link's profile into the run's `folder`.
 
-    Return whether the operator's API is installed.
+    Return whether the packages of the API are installed.
     """
     from cloudrc.cli.link_run import prepare_link
     from cloudrc.drivers.local import LINK_FOLDER
@@ -356,7 +357,8 @@ def _record_local(
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
     """Fly in real time; yield the merged recording, the experiment and facts about the run.
 
-    With `session`, yield those of the session's last mission.
+    If `session` is given, fly a session, and yield recording, experiment and facts of its last
+    mission. `session` is called with the API's address and the metrics' addresses by process.
     """
     from cloudrc.assembly import flight_limit
     from cloudrc.cli.session import read_last_mission

@@ -129,8 +129,8 @@ def read_last_mission(folder: Path) -> tuple[Contents, ResolvedExperiment, bool]
     """Read the last mission of a session that has ended; write its experiment to config.yaml.
 
     Returns:
-        The recording of this mission, the experiment that flies it, and whether the session ended
-        before the mission.
+        The recording of this mission, its experiment, and whether the session ended before the
+        mission.
 
     Raises:
         NothingFlownError: If no mission flew.

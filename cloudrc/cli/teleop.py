@@ -141,9 +141,9 @@ def ending(
 ) -> Callable[[], bool]:
     """Return a function that tells whether teleop's process may end.
 
-    When `asked()` becomes true, that function pauses the mission; it returns True as soon as the
-    robot holds its position, or after `PAUSE_LIMIT_NS`. While `asked()` is false, it returns True
-    only with `single`, as soon as the mission is over.
+    After `asked()` has become true, the returned function pauses the mission. It returns True as
+    soon as the robot holds its position, or after `PAUSE_LIMIT_NS`. While `asked()` is false, it
+    returns True only if `single` is True and all missions are over.
     """
     until_ns = 0
 
@@ -230,7 +230,7 @@ def _open_store(
 def _start(
     options: argparse.Namespace, experiment: ResolvedExperiment, service: MissionService
 ) -> bool:
-    """With `--start`, start the experiment's mission; return whether teleop flies this mission."""
+    """With `--start`, start or resume the experiment's mission; return whether that was done."""
     from cloudrc import assembly
     from cloudrc.teleop.store import ConflictError, Order
 

@@ -90,7 +90,7 @@ class ComputeTime:
         self._cpu_clock, self._began_ns = cpu_clock, 0
 
     def begin(self) -> None:
-        """Start to measure the time to compute a command, if there is a `cpu_clock`."""
+        """Note that the computation of a command begins; call `end` at its end."""
         if self._cpu_clock is not None:
             self._began_ns = self._cpu_clock()
 
@@ -168,18 +168,16 @@ class CloudEndpoint(TunnelEnd):
 
     @property
     def mission_over(self) -> bool:
-        """Whether the mission has ended and cloud has nothing more to tell the robot.
+        """Whether the mission has ended, so that cloud may stop.
 
-        Either telemetry shows that the robot has acted on the last request, or cloud has given up.
+        Telemetry must show that the robot has acted on the last request, or the mission must have
+        ended more than `GIVE_UP_NS` ago.
         """
         done = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
         return done and self.teleop.outcome is not None
 
     def next_deadline_ns(self) -> int:
-        """Return when cloud has to act next [ns].
-
-        If a computed command still has to leave, cloud then sends it; otherwise it computes one.
-        """
+        """Return when cloud has to send a computed command or to compute the next command [ns]."""
         return self._tick_ns if self._unsent is None else self._unsent[0]
 
     def handle_deadline(self, now_ns: int) -> None:

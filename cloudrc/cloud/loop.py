@@ -85,7 +85,7 @@ class ControlLoop:
     Attributes:
         period_ns: Time between two commands [ns].
         faults: Faults since the last `take_faults`.
-        counts: How often each failure happened.
+        counts: Name of an event, such as "frozen" -> how often it happened.
     """
 
     def __init__(
@@ -177,9 +177,8 @@ class ControlLoop:
     def _observe_delay(self, telemetry: Telemetry, now_ns: int) -> None:
         """Process the delays in telemetry that is newer than all earlier telemetry.
 
-        Every telemetry datagram with a short hold time gives one sample of the paper's eq. (1),
-        even if an earlier datagram had the same echo. A mean over the first datagrams of each echo
-        would be too small, because these have the shortest hold times.
+        Every telemetry datagram gives one sample of the paper's eq. (1), even if an earlier
+        datagram had the same echo. A datagram whose hold time is above the limit gives none.
         Source: docs/reference/control.md, "The delay sample".
         """
         echo_ns, hold_ns = telemetry.echo_stamp_ns, telemetry.echo_hold_ns
@@ -193,8 +192,9 @@ class ControlLoop:
     def _observe_echo(self, telemetry: Telemetry) -> None:
         """Process the echo of telemetry, which shows when a command was applied.
 
-        A command with a long delay is soon replaced by the next command, so its only echo may be in
-        telemetry that arrives late. Without this echo the average delay would be too small.
+        World soon replaces a command with a long delay by the next command, so perhaps only one
+        telemetry datagram echoes the delayed command. This datagram counts even if it arrives late:
+        otherwise long delays would be missing in the average.
         """
         echo_ns = telemetry.echo_stamp_ns
         if echo_ns > self._newest_echo_ns:
@@ -207,7 +207,9 @@ class ControlLoop:
         self._estimator.add_applied((applied_ns - echo_ns) * 1e-9)
 
     def _estimate_horizon(self, age: float) -> float:
-        """Return the horizon [s], limited to its allowed range; `age` is as in `Estimator.horizon`.
+        """Return the estimator's horizon, limited to its allowed range [s].
+
+        `age` is cloud's time minus the stamp of the newest odometry on world's clock [s].
 
         Raises:
             InvalidResultError: If the estimator's horizon is not finite.
@@ -339,7 +341,7 @@ class ControlLoop:
         return tuple(plan)
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
-        """Whether the last echo of a new command is older than `horizon` + `freeze_after` [s]."""
+        """Whether the newest echoed command is older than `horizon` + `freeze_after` [s]."""
         if self._echoed_ns < self._newest_echo_ns:
             self._echoed_ns = self._newest_echo_ns
         elif self._echoed_ns == NEVER_NS:

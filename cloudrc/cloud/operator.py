@@ -75,9 +75,9 @@ def make_robot_status(
 
 
 class EmergencyStopRepeater:
-    """Give an emergency stop a number; repeat it until telemetry shows that the robot has obeyed.
+    """Repeats an emergency stop until telemetry shows that the robot has obeyed.
 
-    Teleop may request the stop any number of times. The stop waits while there is no session.
+    Further requests for a stop in this time change nothing. Without a session, the stop waits.
 
     Attributes:
         sounds: Whether the stop is being repeated.
@@ -110,7 +110,7 @@ class EmergencyStopRepeater:
         """Return the emergency stop if cloud has to send it at `now_ns` [ns], else None.
 
         World carries out a request only if its number is higher than the last number. `asked` is
-        the highest number so far in this session; the stop gets a higher number.
+        the highest number of a request in this session so far; the stop gets a higher number.
         """
         if not self.sounds or now_ns < self._due_ns:
             return None

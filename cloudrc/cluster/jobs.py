@@ -120,7 +120,7 @@ def create_job(
 
 
 def owner_of(version: str, kind: str, owner: Any) -> dict[str, Any]:
-    """Make a reference to `owner`; with the owner, Kubernetes deletes all objects that have it."""
+    """Make an owner reference: deleting `owner` also deletes the objects with this reference."""
     metadata = owner.metadata
     return {"apiVersion": version, "kind": kind, "name": metadata.name, "uid": metadata.uid}
 

@@ -101,7 +101,7 @@ def send_change(release: Release, pod: str, handed: Handed) -> str:
 
 
 class Sent(NamedTuple):
-    """A change of the link profile that was sent to both link containers; neither refused it."""
+    """Result of `send`: a changed link profile, and the answers of the two link containers."""
 
     edit: Edit  # the edited profile
     files: dict[str, str]  # for the ConfigMap
@@ -120,11 +120,11 @@ def send(
 
     Args:
         release: The release.
-        link: The present link of the release.
+        link: The link of the release before the change.
         profile: New profile, as in `cloudrc.config.load.edit_profile`.
         settings: Values to set, as in `cloudrc.config.load.edit_profile`.
-        note: Function that makes the content of change.json, the number and the cause of the
-            change, from the edited profile.
+        note: Function that describes the change from the edited profile, as the text of
+            change.json.
 
     Raises:
         BadInputError: If the request is not valid, or if a container refuses the change.
@@ -164,7 +164,7 @@ def send(
 def keep(release: Release, link: LinkParts, sent: Sent) -> None:
     """Write a change to the ConfigMap, from which restarted pods read it.
 
-    Raise an error if the write fails, or if a container failed to apply the change (`sent`).
+    Raise an error if the write fails, or if a link container did not confirm the change.
     """
     said = list(map(str, sent.failed))
     words = ["patch", "configmap", link.name, "--type=merge", "--patch-file=/dev/stdin"]
@@ -189,7 +189,7 @@ def _needed_files(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[s
 def with_files(
     files: Mapping[str, str], profile: str | None, settings: Sequence[str]
 ) -> tuple[Edit, dict[str, str]]:
-    """Edit the link's profile; return the edit, and the files that are new or changed.
+    """Edit the link's profile; return the new profile, and the files that are new or changed.
 
     `files` maps file names to texts. If `profile` is given, this profile replaces the one in
     `files`. `settings` are texts `key=value`.

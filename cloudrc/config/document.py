@@ -152,7 +152,7 @@ class Source(NamedTuple):
     is_setting: bool = False  # True for `--set` and the like, False for a file or a default
 
     def absolute(self, path: str) -> Path:
-        """Make a `path` from the configuration absolute; no file has to exist there."""
+        """Make `path` absolute: relative to `folder`. No file has to exist there."""
         return Path(os.path.realpath(self.folder / os.path.expanduser(path)))
 
 
@@ -160,7 +160,7 @@ class Source(NamedTuple):
 class Document:
     """Values of a configuration file, possibly combined from several files.
 
-    A value without an entry in `sources` comes from the same source as its parent.
+    A value without an entry in `sources` comes from the same source as the value around it.
     """
 
     tree: dict[str, Any]  # dictionaries with text keys, lists and scalars

@@ -70,10 +70,11 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 
 def speed_cap(command_age_max_ms: float, plan_max_s: float = 0.0) -> float:
-    """Compute the largest speed v [m/s] from which the robot stops within 8.7 m.
+    """Compute the speed cap: the largest speed v [m/s] from which the robot stops within 8.7 m.
 
-    If commands stop arriving, the robot keeps its speed for T + 0.2 s and then brakes at 3 m/s^2:
-    v · (T + 0.2 s) + v^2 / 6 = 8.7 m. T is `command_age_max_ms` [ms] plus `plan_max_s` [s].
+    If commands stop arriving, the robot follows the last one for the time T, reacts within 0.2 s
+    and brakes at 3 m/s^2: v · (T + 0.2 s) + v^2 / (6 m/s^2) = 8.7 m. T is the largest age of a
+    command, `command_age_max_ms` [ms], plus the longest plan, `plan_max_s` [s].
     Source: docs/reference/plant.md, "Speed cap".
     """
     delay = command_age_max_ms * 1e-3 + plan_max_s + 0.2
@@ -116,7 +117,7 @@ class ResolvedCloud(Cloud):
 
 
 class ResolvedExperiment(Experiment):
-    """An experiment with all values: the mission itself, all limits, all keys of the link."""
+    """An experiment that contains its mission (not only the name), and a value for every key."""
 
     mission: Mission
     guard: ResolvedGuard
@@ -221,7 +222,10 @@ def local_files(value: Any, key: str = "") -> dict[str, str]:
 
 
 def _is_inside_name(path: KeyPath) -> bool:
-    """Return whether a key is in a mission or link direction that a file may also just name."""
+    """Return whether a key is inside the mission or a direction of the link.
+
+    An experiment may replace these parts by the name of a mission or of a link profile.
+    """
     is_direction = path[0] == "link" and len(path) > 2 and path[1] in DIRECTIONS
     return is_direction or (path[0] == "mission" and len(path) > 1)
 
@@ -416,7 +420,7 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
 
 
 def _drop_from_time_line(document: Document, way: str, key: str) -> list[str]:
-    """Remove what changes `key` over time in a direction; return notes about it for the user."""
+    """Remove what changes `key` over time in the direction `way`; return notes for the user."""
     direction = document.get(way)
     if not isinstance(direction, dict) or key not in CHANGEABLE_KEYS:
         return []

@@ -158,7 +158,7 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
 
 
 def _check_model(predictor: Any, name: str) -> None:
-    """Raise a BadInputError if the predictor `name` lacks the robot model that plans need."""
+    """Raise a BadInputError if the predictor has no robot model, which `cloud.plan_s` needs."""
     predictor.predict(Odometry(0, ZERO, UPRIGHT, ZERO, ZERO), 0.0)
     if predictor.model() is None:
         raise BadInputError(

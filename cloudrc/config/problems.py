@@ -78,7 +78,7 @@ def expectation(model: type[BaseModel], path: KeyPath) -> str:
 
 
 def _nearest_key(model: type[BaseModel], path: KeyPath) -> str:
-    """Suggest a known key that is similar to the unknown key at `path`."""
+    """Return a hint about the unknown key at `path`: a similar known key, or all known keys."""
     *above, key = path
     field = field_at(model, tuple(above))
     models = _models(field.annotation) if field else [] if above else [model]

@@ -54,8 +54,8 @@ def read_setpoints(path: Path) -> tuple[TimedPosition, ...]:
 def write_setpoints(setpoints: Iterable[tuple[float, Sequence[float]]]) -> str:
     """Format times [s] and positions [m] as a CSV text that `read_setpoints` can read.
 
-    A position outside the box in which the guard flies becomes the nearest one inside. Of several
-    setpoints within one microsecond the last one is written.
+    A position outside the box in which the guard lets the robot fly becomes the nearest one inside.
+    Of several setpoints within one microsecond the last one is written.
     """
     inside = {f"{time:.6f}": np.clip(at, INNER_LOW, INNER_HIGH) for time, at in setpoints}
     lines = (f"{time},{x:.6g},{y:.6g},{z:.6g}" for time, (x, y, z) in inside.items())

@@ -44,11 +44,11 @@ class Sample(NamedTuple):
 
 
 class FlightFeed:
-    """The present state of a flight, from the records that cloud sends to the tap.
+    """The present state of a flight, from the records that cloud sends to the console.
 
     Attributes:
         telemetry: The newest telemetry; None before the first.
-        control: The newest control period; None while cloud does not control the robot.
+        control: The newest record of a command that cloud computed; None before the first.
         samples: Points of the charts, oldest first.
         flown: Number of points added so far to the trail, the line that shows the robot's path.
     """
@@ -66,7 +66,7 @@ class FlightFeed:
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL_MAX)  # position and clearance
 
     def take(self, records: Iterable[Record], now: float) -> None:
-        """Take the records of the newest datagrams, oldest first; `now` is their arrival [s]."""
+        """Take the records of the newest datagrams, oldest first; `now` is the arrival time [s]."""
         news = False
         for record in records:
             if isinstance(record, Arrival):
@@ -123,7 +123,7 @@ class FlightFeed:
             self._downlink = control.rtt - self._uplink
 
     def _take_telemetry(self, telemetry: Telemetry, now: float) -> bool:
-        """Store new telemetry; return False for a copy of the last one."""
+        """Store telemetry; return False if it has the same stamp as the last telemetry."""
         last, self.telemetry = self.telemetry, telemetry
         if last is not None and last.stamp_ns == telemetry.stamp_ns:
             return False

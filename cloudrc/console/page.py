@@ -1,6 +1,6 @@
 """Serve the console's page: all browsers show the flight, one browser can control it.
 
-viser draws and serves the page. The keyboard API of viser does not report the release of a key.
+viser draws and serves the page. It reports the release of a button, but not the release of a key.
 Therefore, while the user holds a key, a script on the page holds the button of the same direction.
 """
 
@@ -94,7 +94,7 @@ div:has(> button[style*='gray-filled']) {display: inline-block; width: 33.3%;
 
 
 class Page:
-    """The page of one flight, at `url`."""
+    """The console's web page of one flight, at `url`; this process is its server."""
 
     def __init__(self, port: int) -> None:
         """Serve a page on this machine only; port 0 means any free port.
@@ -119,7 +119,7 @@ class Page:
         self._drawn = 0  # number of drawn points of the trail
 
     def fill(self, experiment: ResolvedExperiment, feed: FlightFeed, steering: Steering) -> None:
-        """Build the scene and the panels; only the first browser to connect gets the controls."""
+        """Build the scene and the panels; only one browser at a time gets the controls."""
         self._experiment, self._feed, self._steering = experiment, feed, steering
         from cloudrc.console.scene import LEGEND, FlightScene  # needs MuJoCo, which takes a second
 
@@ -349,7 +349,7 @@ class Page:
         return x, y, z
 
     def _add_keys(self, gui: viser.GuiApi) -> None:
-        """Add the buttons for driving by hand; viser reports a held button ten times a second."""
+        """Add the buttons for driving by hand; a held button repeats its key at 10 Hz."""
         steering = self._steering
         speed = gui.add_slider("Drive [m/s]", 0.1, 1.0, 0.1, 0.4)
         for code, (label, direction) in KEYS.items():
@@ -390,7 +390,11 @@ def _clamp(slider: Any) -> float:
 
 
 def _with_gaps(curve: Array) -> list[float | None]:
-    """Replace NaN by None, which is a gap in the chart. If all are NaN, the first becomes -1."""
+    """Replace each NaN by None, which is a gap in the chart.
+
+    If all are NaN, make the first value -1: the chart draws its axes only if it has a number. The
+    value is below the visible range.
+    """
     values = [None if value != value else value for value in curve.tolist()]
     return [-1.0, *values[1:]] if not any(value is not None for value in values) else values
 

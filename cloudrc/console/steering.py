@@ -101,7 +101,7 @@ class Steering:
     def ask(self, words: str, path: str, body: Mapping[str, Any] | None = None) -> bool:
         """Post a request to `path` of the API; return whether teleop accepted it.
 
-        Store `words` in `answer`, or the error if teleop refused the request.
+        The newest answer on the page becomes `words` or, if the request failed, the error.
         """
         try:
             self.api.post(path, body)
@@ -235,5 +235,5 @@ class Steering:
 
 
 def is_drive(mission: Mapping[str, Any] | None) -> bool:
-    """Return whether the user steers the robot by keys: whether a hand-driven mission is held."""
+    """Return whether the user steers the robot by keys: the mission is hand-driven and held."""
     return mission is not None and mission["by_hand"] and mission["state"] == "held"

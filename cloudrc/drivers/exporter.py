@@ -158,7 +158,10 @@ class Exporter:
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Set whether teleop or the link is ready; for world and cloud, the records show this."""
+        """Set whether this process is ready; only teleop and link call this method.
+
+        World and cloud are ready while the peer sends.
+        """
         self._seen_at = time.monotonic()
         self._said_ready = ready
 
@@ -178,7 +181,7 @@ class Exporter:
 
     @property
     def is_ready(self) -> bool:
-        """Whether `ready(True)` was called; in world and cloud, also true if the peer sends."""
+        """Whether this process is ready: world or cloud if the peer sends, others by `ready`."""
         return self._said_ready or (self._live.end is not None and self._live.end.has_peer)
 
     def serve(self, address: tuple[str, int]) -> int:
@@ -224,7 +227,7 @@ class Exporter:
         return generate_latest(self._registry).decode()
 
     def _page(self) -> Answer:
-        """Return the metrics as text, at most 0.25 s old; one thread at a time makes a new text."""
+        """Return the metrics as text; make a new text if the last one is 0.25 s old."""
         with self._page_lock:
             now = time.monotonic()
             if now - self._made_at >= KEPT:

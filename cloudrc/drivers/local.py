@@ -64,7 +64,9 @@ RUN, SESSION = "run", "session"
 
 
 def flights_folder() -> Path:
-    """Return the folder for flight files: in XDG_RUNTIME_DIR if this user owns it, or in the home.
+    """Return the folder for flight files, which tell other commands about flights under way.
+
+    It is in XDG_RUNTIME_DIR if this user owns that folder, otherwise in the home folder.
 
     Source: XDG Base Directory Specification.
     """
@@ -74,7 +76,7 @@ def flights_folder() -> Path:
 
 
 class FlightFile(NamedTuple):
-    """Content of the file of a flight under way, except the folder of the run."""
+    """What a flight file tells other commands about a flight, besides the folder of the run."""
 
     api: str  # address of the operator's API; "" for none
     kind: str  # RUN or SESSION
@@ -110,7 +112,7 @@ def under_way() -> dict[Path, str]:
 
 
 def flight_files() -> dict[Path, FlightFile]:
-    """Return the flights of this user: folder of the run -> content of the flight file."""
+    """Return the flights of this user under way: folder of the run -> its flight file."""
     found = {}
     for path in flights_folder().glob("*.json"):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError), path.open() as file:
@@ -141,7 +143,7 @@ def end_session(run: Path, limit: float) -> None:
 
 @dataclass
 class Child:
-    """A process that the supervisor has started."""
+    """A process of a local run, such as world or relay, which the supervisor has started."""
 
     name: str  # "world", "cloud", "teleop", "uplink" or "downlink"
     process: subprocess.Popen[bytes]
@@ -167,8 +169,8 @@ class LocalRun:
 
     Attributes:
         notes: Sentences for the report of the flight.
-        announcement: Owns the flight file of this run; its method `close` removes the file.
-            `fly` calls `close` after a flight. After a session, the caller of `fly` does so.
+        announcement: Its `close` deletes the file by which other commands find this run. `fly`
+            closes it after a flight. After a session, the caller of `fly` has to close it.
     """
 
     def __init__(
@@ -324,7 +326,6 @@ class LocalRun:
             )
 
     def _stop(self) -> None:
-        """End the processes that still run: first by SIGTERM, then by SIGKILL."""
         for child in self._children:
             child.process.terminate()
         deadline = time.monotonic() + STOP_LIMIT

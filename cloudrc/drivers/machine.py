@@ -1,4 +1,4 @@
-"""Identify the machine's clock, count its cores, build Python commands, measure time limits."""
+"""Find clock, usable cores and Python of the machine; time limits that exclude suspended time."""
 
 from __future__ import annotations
 

@@ -111,7 +111,10 @@ class Feed:
 
     @classmethod
     def on_stdout(cls, *, watched: bool = True) -> Feed:
-        """Make a feed that owns standard output; redirect other prints to standard error."""
+        """Make a feed that owns standard output; redirect other prints to standard error.
+
+        `watched` is True if a supervisor reads standard output.
+        """
         feed = cls(os.dup(1), watched=watched)
         os.dup2(2, 1)
         return feed
@@ -123,7 +126,8 @@ class Feed:
     def alive_while(self, stop: Callable[[], bool]) -> Callable[[], bool]:
         """Return a function that returns `stop()` and, every `ALIVE_PERIOD`, prints `READY`.
 
-        The line, printed only for a supervisor, shows that this process is alive.
+        `READY` shows a supervisor that this process is alive; without a supervisor, the function
+        does not print.
         """
         due = 0.0
 
@@ -137,9 +141,9 @@ class Feed:
         return ask
 
     def tell(self, records: Iterable[Record]) -> None:
-        """Write the records with a type in `EVENTS`, but only one record per change of the link.
+        """Write the events among the records; omit repeated records of the same link conditions.
 
-        If a supervisor reads the pipe, also write some of the records with a type in `SAMPLED`.
+        If a supervisor reads the pipe, also write some of the periodic records (`SAMPLED`).
         """
         for record in records:
             if isinstance(record, LinkChanged) and not self._is_news(record):
@@ -150,7 +154,7 @@ class Feed:
                 self._write(to_line(record))
 
     def _is_news(self, record: LinkChanged) -> bool:
-        """Return whether a record has a cause, and new conditions of its direction of the link."""
+        """Return whether a record reports changed conditions, not those at the start."""
         last, self._links[record.uplink] = self._links.get(record.uplink), record.conditions
         return last != record.conditions and bool(record.cause)
 
@@ -218,18 +222,18 @@ class LinkNotes:
     """
 
     def __init__(self, path: Path, *, uplink: bool) -> None:
-        """Follow the state file at `path`, which may not exist yet; `uplink` is this direction."""
+        """Follow the state file at `path`, which may not exist yet; `uplink` is True in world."""
         self._path, self._uplink = path, uplink
         self._seen: tuple[int, int, int] | None = None
         self._since_ns: int | None = None
         self._due_ns = self._released_ns = 0
 
     def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
-        """Return records about the link that are due at `now_ns` [ns], machine's monotonic clock.
+        """Return records of the link's state and of its datagrams' lateness, if they are due.
 
-        `records` are new records of world or cloud. If one of them has a type in `BEGINNINGS`, a
-        mission may begin, and a record of the link's state is due at once. `slip_ns` is the lag of
-        world's or cloud's clock behind the machine's clock [ns].
+        `now_ns` is the time on the machine's clock [ns]; `slip_ns` is the lag of world's or cloud's
+        clock behind it [ns]. `records` are new records of world or cloud. If one of them has a type
+        in `BEGINNINGS`, a mission may begin, and a record of the link's state is due at once.
         """
         noted: list[Record] = []
         begins = not BEGINNINGS.isdisjoint(map(type, records))
@@ -272,7 +276,7 @@ class LinkNotes:
 
 @dataclass
 class EndProcess:
-    """Runs world or cloud as a process."""
+    """The process of world or cloud: runs its endpoint, and records and reports the flight."""
 
     end: str  # "world" or "cloud"
     peer: Peer

@@ -48,7 +48,7 @@ class Tap:
         self._due = 0.0
 
     def tell(self, records: Iterable[Record]) -> None:
-        """Store new `records`, in order of time; if due, send a datagram with the newest ones."""
+        """Store new `records`, oldest first; send the newest if the next datagram is due."""
         for record in records:
             if isinstance(record, Arrival):
                 self._arrival = record if record.used else self._arrival

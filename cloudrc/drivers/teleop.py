@@ -75,7 +75,10 @@ class UnixPeer:
             raise BadInputError(f"--socket: cannot make {own}: {error.strerror}") from error
 
     def receive(self) -> list[Any]:
-        """Return the messages that have arrived; an empty datagram gives None in the list."""
+        """Return the messages that have arrived.
+
+        None in the list stands for an empty datagram, a sign of life of the other process.
+        """
         messages: list[Any] = []
         with suppress(BlockingIOError):
             while len(messages) < DRAIN_MAX:
@@ -85,7 +88,7 @@ class UnixPeer:
         return messages
 
     def send(self, message: Any) -> bool:
-        """Send a message; None sends an empty datagram. Return whether the datagram was accepted.
+        """Send a message (None: an empty datagram, a sign of life); return whether it was accepted.
 
         False means that the other process does not run, or that the queue of its socket is full.
         """
@@ -130,8 +133,8 @@ class RemoteTeleop:
     def handle_deadline(self, now_ns: int) -> None:
         """Receive teleop's outputs; report a fault if teleop does not answer telemetry for 1 s.
 
-        If cloud has stalled, ignore outputs that start a mission or lead to a waypoint: teleop may
-        have cancelled them, and the cancellation may be lost. Teleop repeats all valid outputs.
+        If cloud has stalled, ignore outputs that start a mission or lead to a waypoint. They may be
+        old: teleop may have cancelled them since. Teleop repeats outputs that are still valid.
         """
         if now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_NS
@@ -161,7 +164,10 @@ def _moves_robot(output: Any) -> bool:
 
 
 class LastWord:
-    """Delays the end of cloud's process in flight, to forward teleop's END request first."""
+    """Delays the end of cloud's process until the robot stops following commands, at most 0.8 s.
+
+    Meanwhile cloud forwards teleop's request that the robot holds its position.
+    """
 
     def __init__(
         self,
@@ -171,8 +177,8 @@ class LastWord:
     ) -> None:
         """Set the functions that give the state of cloud and robot.
 
-        `asked` returns True after cloud has been asked to end, `flies` while the robot flies.
-        `clock` returns the time [ns].
+        `asked` returns True after cloud has been asked to end. `flies` returns True while the guard
+        is in TRACK. `clock` returns the time [ns].
         """
         self._asked, self._flies, self._clock = asked, flies, clock
         self._until_ns: int | None = None
@@ -245,7 +251,7 @@ class TeleopLoop:
         self._send(machine.take_outputs())
 
     def _send(self, outputs: Sequence[Any]) -> None:
-        """Send all unsent events, then `outputs`; call `tell` with the new events and faults."""
+        """Send unsent events, then `outputs`, to cloud; pass new events and faults to `tell`."""
         unsent, peer = self._unsent, self._peer
         while unsent and peer.send(unsent[0]):
             unsent.popleft()

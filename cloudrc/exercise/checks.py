@@ -40,7 +40,8 @@ STATE = Odometry(10**9, (1.0, -2.0, 0.7), (0.6, 0.0, 0.0, 0.8), (0.5, 0.3, -0.2)
 def _horizons(build: Callable[[], Any], *delays: float, hold: float = 0.0) -> Any:
     """Return the horizons [s] of an estimator: before the first delay, and after each delay.
 
-    `delays` are loop delays [s]; each includes the hold time `hold` [s].
+    `delays` are loop delays [s]. Each includes `hold` [s], the time from a command's application to
+    the sending of its echo.
     """
     estimator = build()
     seen = [estimator.horizon(7.0)]
@@ -57,10 +58,10 @@ def _predict(build: Callable[[], Any], select: Callable[[Odometry], Any]) -> Any
 def _command(
     build: Callable[..., Any], n: int = 1, speed: float = 0.0, sign: bool = False, **gains: Any
 ) -> Any:
-    """Build a controller; return the velocity that it commands before and after a reset.
+    """Return two commands of a controller with `gains`: the last before and first after a reset.
 
-    Before the reset, the controller gets `n` updates, 2 ms apart, at `speed` [m/s]. After the reset
-    it gets one update. If `sign` is False, return the absolute values of both velocities.
+    Before the reset, the controller gets `n` updates, 2 ms apart, of a robot at `speed` [m/s]. A
+    command is a velocity [m/s]. If `sign` is False, return absolute values.
     """
     controller, (x, y, z), seen = build(**gains), STATE.position, ZERO
     setpoint = Setpoint((2.0, -1.0, 0.2))
@@ -74,7 +75,7 @@ def _command(
 
 
 class Formula(NamedTuple):
-    """A comparison of the results of the student's plug-in with those of the reference."""
+    """A test that compares the results of the student's plug-in with those of a correct plug-in."""
 
     test: str
     points: int
@@ -112,7 +113,7 @@ class Flight(NamedTuple):
     none: float  # any unit
 
     def score(self, files: Mapping[str, str]) -> tuple[float, str]:
-        """Fly with `files`, part -> path; return the earned share of points [1] and the reason."""
+        """Fly with `files` (plug-in -> path); return the earned share of points [1], and why."""
         chosen = {f"cloud.{part}": path for part, path in files.items()}
         result = fly(self.experiment, {**chosen, "link.profile": self.link})
         value = result.numbers.get(self.metric, self.none)
@@ -153,7 +154,7 @@ CHECKS: dict[str, tuple[Formula | Flight, ...]] = {
 
 
 def rows(part: str, scored: Sequence[tuple[float, str]]) -> list[dict[str, Any]]:
-    """Make a row per check from `scored`: share of the points [0, 1], text on what was seen."""
+    """Make a row per check of `part` from its score in [0, 1] and a text on the result."""
     keys = ("part", "test", "points", "max_points", "seen")
     cells = (
         (part, check.test, round(check.points * share, 1), check.points, seen)

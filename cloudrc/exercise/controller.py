@@ -23,7 +23,7 @@ class StudentController(Controller):
         """Forget the integral and everything else: a new mission begins."""
 
     def update(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
-        """Return the velocity u [m/s] from two positions [m]; the last call was `dt` [s] ago."""
+        """Return the velocity command u [m/s]; `dt` is the time since the last call [s]."""
         return ControlOutput(velocity=ZERO, yaw_rate=0.0)  # Your code: eqs. (4) and (5).
 
 

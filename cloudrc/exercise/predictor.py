@@ -14,7 +14,7 @@ class StudentPredictor(Predictor):
     """Predicts with constant velocity and constant angular velocity."""
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Predict the odometry for `horizon` [s] later; the page calls this time tau.
+        """Predict the odometry for `horizon` [s] later; `horizon` is tau in the equations.
 
         The stamp `stamp_ns` [ns] of the result is later by the same time.
 

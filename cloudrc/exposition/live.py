@@ -50,10 +50,10 @@ ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total"
 
 
 class LinkVerdict:
-    """Newest verdict on the link's direction to this process: whether it matches its profile."""
+    """Newest verdict on whether the link's direction to this process matches its profile."""
 
     def __init__(self, direction: str) -> None:
-        """Set the direction, "uplink" or "downlink"; the verdict is "open" until a check."""
+        """Set the direction, "uplink" or "downlink"; before a check the verdict is "open"."""
         self._direction = direction
         self._newest: tuple[LinkChecked, ...] = ()
 
@@ -64,7 +64,7 @@ class LinkVerdict:
 
     @property
     def verdict(self) -> str:
-        """Verdict on the link: "ok", "off" (not as its profile), "open" (not decided yet)."""
+        """Verdict on the link: "ok", "off" (not as in its profile), "open" (not decided yet)."""
         verdicts = {record.verdict for record in self._newest} - {"told"}
         return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"
 
@@ -202,7 +202,7 @@ class WorldEnd(End):
 
     @property
     def has_peer(self) -> bool:
-        """Whether commands arrive, or the open session still waits for its first command."""
+        """Whether cloud is connected: commands arrive, or the session has had no command yet."""
         return super().has_peer or (self._opened_ns != NEVER_NS and self._silent)
 
     def _on_sessionopened(self, record: SessionOpened) -> None:
@@ -328,7 +328,7 @@ class Link:
         self._readings: Readings = {}
 
     def shaped(self, shaper: str, direction: str, mode: str, delay: float) -> None:
-        """Set the `shaper`, "relay" or "netem", of the direction, and the configured `link.mode`.
+        """Store which `shaper` ("relay" or "netem") shapes the direction, and the key `link.mode`.
 
         `delay` is the mean delay that the profile now requests [s].
         """

@@ -55,7 +55,7 @@ def per_axis(vector: Vector) -> dict[Labels, float]:
 
 
 def by_label(counts: Mapping[str, float]) -> dict[Labels, float]:
-    """Convert label value -> count to the reading of a metric that has one label."""
+    """Convert label value -> count to (label value,) -> count, the form of `Readings`."""
     return {(name,): count for name, count in counts.items()}
 
 
@@ -87,7 +87,7 @@ class DatagramTally:
     def take(self, epoch: int, counter: int) -> bool:
         """Count the arrival of a datagram; return True if the datagram is certainly new.
 
-        Otherwise the datagram may be a replay: anybody can capture a datagram and send it again.
+        Return False for a repeated or very old datagram: an attacker may have sent it again.
         """
         if epoch != self._epoch:
             # Datagrams before the first arrival are not lost: the receiver may not have run.
@@ -130,7 +130,7 @@ class PredictionJudge:
         self._measured: Vector = (nan, nan, nan)
 
     def take(self, control: Control) -> None:
-        """Compare the predictions for times up to a new measurement; store the new prediction."""
+        """Judge predictions for times up to a new measurement; store the new prediction."""
         stamp_ns, waiting = control.basis_stamp_ns, self._waiting
         if stamp_ns > self._measured_ns:
             before_ns, before = self._measured_ns, self._measured
@@ -156,9 +156,9 @@ class PredictionJudge:
 class DelayJudge:
     """Compares delay estimates with true delays.
 
-    The delay is the time from the stamp of the odometry from which cloud computed a command until
-    world applies this command. Telemetry contains an echo of the newest command that world has
-    applied: the stamp of the command on cloud's clock, and the time since world applied it.
+    Cloud computes each command from an odometry sample. The delay is the time from the stamp of
+    this sample until world applies the command. Telemetry contains an echo of the newest command
+    that world has applied: the command's stamp on cloud's clock, and the time since then.
     """
 
     def __init__(self) -> None:
@@ -166,11 +166,11 @@ class DelayJudge:
         self.reset()
 
     def reset(self) -> None:
-        """Drop the control periods that wait for an echo, because a new session has started."""
+        """Drop the records of commands without an echo, because a new session has started."""
         self._sent: dict[int, Control] = {}
 
     def sent(self, control: Control) -> None:
-        """Store the record of a control period in which cloud sent a command, for `echoed`."""
+        """Store the record of a sent command; its echo will show the true delay."""
         self._sent[control.stamp_ns] = control
         if len(self._sent) > WAITING_MAX:
             del self._sent[next(iter(self._sent))]  # the oldest
@@ -179,7 +179,7 @@ class DelayJudge:
         """Compute how wrong the estimated delay was for a command whose echo has arrived.
 
         The echo arrived at `arrival_ns` [ns], cloud's clock. `control` is the record of the first
-        control period after this arrival.
+        control period after this arrival; it contains the delays that the echo shows.
         """
         sent = self._sent.get(arrival_ns - round(control.loop_delay * 1e9))
         if sent is not None:

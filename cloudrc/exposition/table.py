@@ -256,5 +256,5 @@ METRICS: Mapping[str, Metric] = MappingProxyType({metric.name: metric for metric
 
 
 def of_role(role: str) -> list[Metric]:
-    """List the metrics that processes of a role expose."""
+    """List the metrics that processes with this role, one of `ROLES`, expose."""
     return [metric for metric in METRICS.values() if role in metric.roles]

@@ -46,7 +46,7 @@ status of the robot. `HostileOperator` sets the number of the request."""
 
 
 class DishonestLoop(ControlLoop):
-    """Computes honest commands, and changes them before they are sent."""
+    """Control loop of a dishonest cloud: changes the honest commands before they are sent."""
 
     def __init__(self, lies: Sequence[Lie], *plugins: Any, **limits: Any) -> None:
         """Set `lies`; each command passes through all of them, in this order.
@@ -67,7 +67,7 @@ class DishonestLoop(ControlLoop):
 
 
 class HostileOperator:
-    """An `Operator` that forwards teleop's setpoints, but replaces teleop's requests.
+    """An `Operator` that forwards teleop's setpoints, but sends forged requests to the robot.
 
     Until teleop's first setpoint it forwards teleop's requests, too, so that a mission begins.
     """
@@ -90,7 +90,7 @@ class HostileOperator:
         self._collect()
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Forward teleop's outputs at `now_ns` [ns]; after its first setpoint, forge requests."""
+        """Forward teleop's outputs at `now_ns` [ns]; after the first setpoint, forge requests."""
         self._honest.handle_deadline(now_ns)
         self._collect()
         if self._has_setpoint and self._seen is not None:
@@ -99,7 +99,7 @@ class HostileOperator:
                 self.outputs = [*self.outputs, request._replace(number=self._number)]
 
     def take_outputs(self) -> Sequence[Output | Fault]:
-        """Implement `Operator.take_outputs`."""
+        """Return and remove the forwarded and the forged messages since the last call."""
         outputs, self.outputs = self.outputs, []
         return outputs
 
@@ -296,7 +296,7 @@ def _strange_numbers(rng: Generator) -> Lie:
 
 
 def _false_basis(rng: Generator) -> Lie:
-    """State a wrong odometry stamp in commands: in the future, or too old."""
+    """Send commands that claim a wrong odometry stamp: one in the future, or one too old."""
     shift_ns = int(rng.choice([1, STEP_NS, 10_000_000, 200_000_000, 2**62]))
     sign = int(rng.choice([-1, 1]))
 
@@ -323,7 +323,7 @@ def _stop_and_go(rng: Generator) -> Lie:
 def _hostile_plans(rng: Generator) -> Lie:
     """Send plans of random lengths that begin now or later, with jumps and sometimes NaN.
 
-    Some clouds of this policy mix plans with commands that have no plan. Others send stale
+    `rng` decides whether the cloud also sends commands without a plan, and whether it sends stale
     commands for some time, so that the robot flies a plan to its end.
     """
     ahead, share = float(rng.choice([0.05, 0.5, 9.9])), float(rng.choice([0.0, 0.5]))
@@ -350,14 +350,17 @@ def _hostile_plans(rng: Generator) -> Lie:
 
 
 def _operators_voice(rng: Generator) -> Lie:
-    """Follow a policy of `FASTEST`, while `at_bad_moments` forges the operator's requests."""
+    """Change commands by a random policy of `FASTEST`.
+
+    In the policy "operators-voice", `at_bad_moments` also forges requests of the operator.
+    """
     return FASTEST[int(rng.integers(len(FASTEST)))](rng)
 
 
 def _refused_and_released(rng: Generator) -> Lie:
     """Fly fast, and from time to time send NaN, so that the guard lands the robot.
 
-    Meanwhile `at_bad_moments` forges requests of the operator, which acknowledge the landings.
+    Cloud also forges requests of the operator (`at_bad_moments`), which acknowledge the landings.
     """
     fly, pause_ns = _operators_voice(rng), int(rng.uniform(0.5e9, 4e9))
 

@@ -41,20 +41,24 @@ SHARED, OTHER = b"one clock for all".ljust(16)[:16], b"another clock..."
 
 
 def conditions(**changes: object) -> Shape:
-    """Return a function that replaces fields of a direction's profile by `changes`."""
+    """Return a function that sets the fields `changes` in the profile of one direction."""
     return lambda profile: replace(profile, **changes)  # type: ignore[arg-type]
 
 
 def silent(start: float, duration: float, **changes: object) -> Shape:
-    """Return `conditions` with a blackout from `start` [s] for `duration` [s] and the `changes`."""
+    """Return a function that makes a direction silent from `start` [s] for `duration` [s].
+
+    The function also replaces other fields of the direction's profile by `changes`.
+    """
     return conditions(blackouts=(Blackout(start, duration),), **changes)
 
 
 class Flight:
     """One flight of world, cloud, teleop and link.
 
-    `rings` contains the keys of the running processes, `secrets` the contents of their key files.
-    Every 100 ms, each of `listeners` is called with world's new records and the virtual time [ns].
+    `secrets` maps "world" and "cloud" to the keys in their key files; `rings` maps them to the keys
+    that their running processes use. Every 100 ms, each of `listeners` is called with world's new
+    records and the virtual time [ns].
     """
 
     def __init__(
@@ -73,10 +77,6 @@ class Flight:
         words: Words | None = None,  # makes requests in place of the operator
         second: float | None = None,  # when a second cloud connects [s]
     ) -> None:
-        """Prepare a flight; the comments describe the arguments.
-
-        If `second` [s] is given, a second cloud connects at this time.
-        """
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         self._honest, self._keep = honest, keep
         self._life, self._second, self._lies, self._words = life, second, lies, words
@@ -132,7 +132,7 @@ class Flight:
         return self
 
     def fly_mission(self, limit: float = 120.0) -> Flight:
-        """Continue the flight until 1 s after the mission's end, at most until `limit` [s]."""
+        """Fly until the mission's end or the virtual time `limit` [s], then fly 1 s more."""
         self.fly(limit, lambda: self.teleop.service is not None and self.mission.ended)
         return self.fly(self.now + 1.0)
 
@@ -153,7 +153,7 @@ class Flight:
         self._second = None
 
     def sha256(self) -> str:
-        """Return the hash of all records so far; without `keep`, the hash of no records."""
+        """Return the hash of all records so far; the flight must have been made with `keep`."""
         return self._hash.hexdigest()
 
     def trajectory(self) -> list[GroundTruth]:
@@ -172,7 +172,7 @@ class Flight:
     def guard_now(self) -> tuple[GuardState, str]:
         """Return the guard's present state and its cause; GROUND while world is not running.
 
-        The records do not always show it: a restarted world begins in GROUND without a record.
+        The records are not enough: a restarted world begins in GROUND, and makes no record of it.
         """
         if self.world.inner is None:
             return GuardState.GROUND, "the world is down"

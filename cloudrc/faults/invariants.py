@@ -7,8 +7,8 @@ cap, stop  The velocity reference stays within its limits, and the robot can alw
            fence. During LAND the robot may fly down to the floor. After a HOLD the reference
            velocity grows slowly at first.
 stale      World rejects a command that is based on too old odometry. TRACK ends with the session,
-           or when the odometry of the last command is too old and its plan has ended. HOLD changes
-           to TRACK only after `RESUME_COMMANDS` fresh commands within `RESUME_NS`.
+           or when the last command's odometry is too old and the command's plan has ended. HOLD
+           changes to TRACK only after `RESUME_COMMANDS` fresh commands within `RESUME_NS`.
 rest       After TRACK the robot stops within its stopping distance. The rotors stop only on a
            request, after a collision, or if the robot does not move.
 collision  If the cloud is honest, only the arm's tip touches something, and it touches only the
@@ -86,7 +86,7 @@ class Breach(NamedTuple):
 
 
 class Watch:
-    """Collects the breaches of a flight, and checks the order of commands."""
+    """Collects the breaches of invariants in a flight, and checks the order of commands."""
 
     def __init__(self, limits: ResolvedGuard) -> None:
         self.limits = limits
@@ -105,8 +105,8 @@ class Watch:
     def see(self, records: list[Record], now_ns: int) -> None:
         """Check in the new `records` of world that each command was applied once and in order.
 
-        A restarted world continues from the last epoch that cloud knows. If cloud knows no epoch,
-        world starts with the first epoch again, which is allowed.
+        The order of commands is that of epochs and, within an epoch, of counters. It begins anew
+        with each process of world: if cloud knows no epoch, a restarted world begins at the first.
         """
         for record in records:
             if isinstance(record, CommandApplied | SessionOpened):
@@ -194,7 +194,7 @@ class RobotInvariants:
         self._was, self._state, self._before = state, state, reference
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
-        """Implement `Observer.see_command`: check accepted commands, count impossible ones."""
+        """Implement `Observer.see_command`: check an accepted command's age, count invalid ones."""
         if rejection is None:
             basis_ns = command.basis_stamp_ns
             if not 0 <= now_ns - basis_ns <= self._age_ns:
@@ -300,7 +300,7 @@ class RobotInvariants:
                 self._note(now_ns, "cap", f"{text}{' after a HOLD' if after else ''}")
 
     def _leave_track(self, readings: Readings, now_ns: int) -> None:
-        """Store where the guard left TRACK, and how far from there the robot may come to rest."""
+        """Store where the robot was at the end of TRACK, and how far it may move from there."""
         speed = max(hypot(*readings.velocity), hypot(*self._before))
         self._left, self._way = readings.position, speed * (0.2 + speed / 6.0) + REST
         if now_ns - self._touched_ns < REELS_NS:
@@ -314,7 +314,7 @@ class RobotInvariants:
     # Contacts and stops of the rotors.
 
     def _check_touches(self, state: GuardState, now_ns: int) -> None:
-        """Check that new contacts are allowed; a robot that collided may then leave the fence."""
+        """Check that new contacts are allowed; a contact may push the robot out of the fence."""
         touches = self._simulator.touches
         if touches is not self._touches:
             self._touches, self._seen = touches, 0
@@ -336,8 +336,8 @@ class RobotInvariants:
     ) -> None:
         """Check that the rotors stop only on a request, after a collision, or without motion.
 
-        Hard braking also commands a rotor speed of 0. Therefore the check looks for the constant
-        `STOPPED`, which is commanded only if the rotors are to stop.
+        Hard braking also commands rotor speeds of 0. Therefore the check looks for the object
+        `STOPPED` itself, which is commanded only to stop the rotors.
         """
         turns, asked = rotor_speeds is not STOPPED, self._is_asked
         is_hit = state is ESTOP and self._was is not ESTOP and not asked
@@ -402,7 +402,7 @@ class RobotInvariants:
             self._alone_ns = now_ns
 
     def _wait_ns(self, state: GuardState) -> float:
-        """Return how long a robot in a mission may wait for commands [ns]."""
+        """Return how long the robot may stay in `state` without commands in a mission [ns]."""
         if state is GROUND:
             return max(self._hold_ns, GROUND_NS)
         return self._hold_ns if state is HOLD else inf
@@ -423,7 +423,8 @@ def can_stop(speed: float, below: float, above: float) -> bool:
 def growth(before: Vector, after: Vector) -> float:
     """Return how much a velocity grows from `before` to `after` [m/s].
 
-    This is the norm of the growth in speed on each axis. A lower speed counts as no growth.
+    This is the norm of the growth per axis: the increase of the speed, or 0 if the speed falls.
+    If the direction on an axis reverses, all of the new speed is growth.
     """
     (ux, uy, uz), (vx, vy, vz) = before, after
     return sqrt(_grown(ux, vx) ** 2 + _grown(uy, vy) ** 2 + _grown(uz, vz) ** 2)

@@ -25,7 +25,7 @@ ENDED = Cause.ENDED.words  # cause of a HOLD that the operator has requested
 
 
 def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
-    """Choose a time from `first` to `last` [s]; in the default range the robot is in the pipes."""
+    """Choose a time from `first` to `last` [s]; by default, the robot is among the pipes then."""
     return float(generator(seed, 77).uniform(first, last))
 
 
@@ -62,7 +62,7 @@ def held_in_time(outcome: Outcome, flight: Flight, text: str = "HOLD after") -> 
 
 
 def basis_age_at_hold(flight: Flight) -> float:
-    """Return how old the last command's odometry was when a HOLD began: the largest age [s]."""
+    """Return the largest age that the commands' newest odometry had when a HOLD began [s]."""
     applied = [(r.stamp_ns, r.basis_stamp_ns) for r in flight.of_world if type(r) is CommandApplied]
     ages = []
     for change in held(flight):
@@ -103,7 +103,10 @@ def events_of_missions(flight: Flight, name: str) -> list[dict[str, Any]]:
 
 
 def calm_after(flight: Flight, start: float, end: float) -> float:
-    """Return the time [s] from `start` to the last motion before `end`, both [s]; 0 if none."""
+    """Return the time [s] from `start` [s] to the end of the robot's last motion before `end` [s].
+
+    Return 0 if the robot did not move.
+    """
     path = [(r.stamp_ns * 1e-9, hypot(*r.odometry.velocity)) for r in flight.trajectory()]
     fast = [time for time, speed in path if start <= time < end and speed >= STANDS]
     return fast[-1] + SAMPLE - start if fast else 0.0
@@ -139,7 +142,7 @@ def done(outcome: Outcome, flight: Flight) -> None:
 
 
 def fly_safely(outcome: Outcome, flight: Flight, limit: float = 120.0) -> Flight:
-    """Fly the mission, at most until `limit` [s]; then check that it was `safe` and `done`."""
+    """Fly the mission, at most until `limit` [s]; check that it was safe and was completed."""
     flight.fly_mission(limit)
     safe(outcome, flight)
     done(outcome, flight)

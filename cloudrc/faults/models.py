@@ -93,7 +93,7 @@ class RestartableEndpoint:
             self.at(start + n * CFS_PERIOD, lambda now_ns: self.freeze(now_ns, stall))
 
     def receive_now(self, data: bytes, now_ns: int) -> None:
-        """Pass a datagram to the process without `tamper`, which `receive_datagram` calls first."""
+        """Pass a datagram to the process unchanged; keep it while the process is frozen."""
         if self.inner is None:
             return
         if self._frozen_until_ns <= now_ns:
@@ -102,7 +102,7 @@ class RestartableEndpoint:
             self._waiting.append(data)
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Implement `Endpoint.receive_datagram`."""
+        """Receive a datagram at `now_ns` [ns]; `tamper`, if set, changes the datagram first."""
         for each in [data] if self.tamper is None else self.tamper(data, now_ns):
             self.receive_now(each, now_ns)
         self._set_deadline()
@@ -133,7 +133,7 @@ class RestartableEndpoint:
         return self.inner.take_datagrams()
 
     def take_records(self) -> list[Record]:
-        """Implement `Endpoint.take_records`."""
+        """Return and remove the records since the last call, also those of a killed process."""
         left, self._left = self._left, []
         return left + self.inner.take_records() if self.inner is not None else left
 
@@ -147,7 +147,7 @@ class RestartableEndpoint:
 
 
 class EndpointGroup:
-    """Several clouds that share a socket, as one `Endpoint`: each receives all datagrams."""
+    """Makes one `Endpoint` of several clouds; each cloud receives all datagrams from world."""
 
     sealed = True
 
@@ -156,26 +156,26 @@ class EndpointGroup:
         self.others: list[Record] = []  # records of all clouds but the first, oldest first
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Pass a datagram on at `now_ns` [ns]; `tamper`, if set, changes it before."""
+        """Pass a datagram to all members at `now_ns` [ns]."""
         for member in self.members:
             member.receive_datagram(data, now_ns)
 
     def next_deadline_ns(self) -> int:
-        """Implement `Endpoint.next_deadline_ns`."""
+        """Return the earliest deadline of all clouds [ns]."""
         return min(member.next_deadline_ns() for member in self.members)
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Implement `Endpoint.handle_deadline`."""
+        """Call `handle_deadline` of each cloud whose deadline has come at `now_ns` [ns]."""
         for member in self.members:
             if now_ns >= member.next_deadline_ns():
                 member.handle_deadline(now_ns)
 
     def take_datagrams(self) -> list[bytes]:
-        """Implement `Endpoint.take_datagrams`."""
+        """Return the new outgoing datagrams of all clouds."""
         return [data for member in self.members for data in member.take_datagrams()]
 
     def take_records(self) -> list[Record]:
-        """Return the new records of the first cloud; add those of the others to `others`."""
+        """Return the first cloud's new records; append those of the other clouds to `others`."""
         first, *others = (member.take_records() for member in self.members)
         for records in others:
             self.others += records
@@ -183,7 +183,7 @@ class EndpointGroup:
 
 
 class _Peer(UnixPeer):
-    """Unix datagram socket of a process, connected to another process's socket."""
+    """Model of a Unix datagram socket that is connected to the socket of another process."""
 
     def __init__(self, is_open: Callable[[], bool]) -> None:
         self.other, self._is_open = self, is_open

@@ -70,7 +70,7 @@ WAYS: tuple[Way, ...] = ("both", "up", "down")
 class Event:
     """One fault, from `at` [s] for `duration` [s]; link faults hit one direction or both.
 
-    `KINDS` explains the meaning and the unit of `value`.
+    The meaning and the unit of `value` depend on the kind of fault; the texts in `KINDS` tell them.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
@@ -81,7 +81,6 @@ class Event:
     way: Way = "both"
 
     def __post_init__(self) -> None:
-        """Check the kind and the value of the fault."""
         if self.kind not in KINDS:
             raise ValueError(f"no fault '{self.kind}'; there are: {', '.join(KINDS)}")
         if self.kind in SHARES and self.value > 1.0:

@@ -2,7 +2,8 @@
 
 An operator orders one mission after another, and acknowledges each landing and emergency stop. The
 last part of the flight has no faults: the robot must then fly again, otherwise it counts as stuck.
-`cloudrc.faults.schedule.shaped` applies the faults of the link.
+This module injects all faults except those of the link; `cloudrc.faults.schedule.shaped` adds those
+to the link's profile.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from math import inf, nan
 import numpy as np
 
 from cloudrc.drivers.virtual import Clock
+from cloudrc.errors import describe_error
 from cloudrc.faults.adversary import Lie, dishonesty
 from cloudrc.faults.flight import SECRET, Flight
 from cloudrc.faults.invariants import LATCHED, Breach
@@ -82,7 +84,8 @@ def fly(schedule: Schedule, *settings: str, keep: bool = False) -> Finding:
     With `keep` the records are kept and hashed, which doubles the time.
 
     Raises:
-        BadInputError: If the schedule names an unknown profile or policy.
+        BadInputError: If the schedule names an unknown link profile, or an unknown policy of a
+            dishonest cloud.
     """
     flight = _prepare(schedule, settings, keep)
     watch, operator = flight.watch, Operator(flight, schedule)
@@ -90,7 +93,7 @@ def fly(schedule: Schedule, *settings: str, keep: bool = False) -> Finding:
     try:
         flight.fly(schedule.duration)
     except Exception as error:  # world and cloud must survive every fault
-        watch.note(flight.run.now_ns, "error", f"{type(error).__name__}: {error}")
+        watch.note(flight.run.now_ns, "error", describe_error(error))
     checks: dict[str, Callable[[], None]] = {
         "waypoint": lambda: _check_waypoints(flight),
         "stuck": operator.check_stuck,
@@ -156,7 +159,7 @@ class Operator:
         flight.listeners.append(self._look)
 
     def check_stuck(self) -> None:
-        """Check that the guard was in TRACK within the last `BACK` [s], a time without faults."""
+        """Report a breach if the guard was never in TRACK in the last `BACK` [s] (no faults)."""
         flight, now_ns = self._flight, self._flight.run.now_ns
         if now_ns - self._tracked_ns > BACK * 1e9:
             state, cause = flight.guard_now()
@@ -194,7 +197,6 @@ class Operator:
 
 
 def _check_waypoints(flight: Flight) -> None:
-    """Check the order of the waypoints of each mission in teleop's log."""
     reached: dict[str, list[int]] = {}
     for event in events_of_missions(flight, "reached"):
         reached.setdefault(event["mission"], []).append(event["waypoint"])
@@ -231,9 +233,10 @@ def inject(flight: Flight, schedule: Schedule) -> None:
 def _actions(
     flight: Flight, process: RestartableEndpoint, event: Event
 ) -> dict[str, tuple[tuple[float, Action], ...]]:
-    """Return what to do at which times for `event`: kind of fault -> pairs of time [s] and action.
+    """Return how to inject `event`: kind of fault -> pairs of time [s] and action.
 
-    `process` is the process that the event kills or freezes, world or cloud.
+    The mapping is the same for all kinds of event; the caller selects the entry of the event's
+    kind. `process`, world or cloud, is the one that the event kills or freezes.
     """
     at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
     gone = at + event.value * lasts  # end of teleop after it was asked to end

@@ -39,7 +39,7 @@ class Spheres(NamedTuple):
 
 
 def key_points() -> Spheres:
-    """Return the 225 points that determine the clearance: on arm, rotors, base box and top rod."""
+    """Return the 225 spheres (on arm, rotors, base box and top rod) that give the clearance."""
     return _points(_box(2, 2, 2), arm=9)
 
 
@@ -73,8 +73,8 @@ def place_points(points: Spheres, positions: Array, orientations_wxyz: Array) ->
 def distance_to_pipe(pipe: Pipe, points: Array) -> Array:
     """Compute the distance of points from a pipe's wall [m], shape (...); negative inside the wall.
 
-    `points` are in [m], world frame, shape (..., 3). With s along the axis and r from the axis, the
-    wall is a rectangle in the (s, r) plane.
+    `points` are in [m], world frame, shape (..., 3). With s the position along the axis and r the
+    distance from the axis, the wall is a rectangle in the (s, r) plane.
     """
     relative = points - np.asarray(pipe.centre)
     s = relative @ np.asarray(pipe.axis)
@@ -117,7 +117,8 @@ def clearance_per_pipe(
 def clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: ArrayLike) -> Array:
     """Compute the robot's distance from the nearest pipe's wall [m], shape (n,).
 
-    The arguments are those of `clearance_per_pipe`. Without pipes the distance is infinite.
+    `positions` [m] have the shape (n, 3), `orientations_wxyz` (unit quaternions, body to world) the
+    shape (n, 4). Without pipes the distance is infinite.
     """
     distances = clearance_per_pipe(scene, positions, orientations_wxyz)
     nearest: Array = distances.min(axis=1, initial=np.inf)

@@ -1,1 +1,1 @@
-"""Emulate the network between world and cloud, defined by a profile, by netem or a relay."""
+"""Emulate the network between world and cloud: netem or a relay acts as a profile says."""

@@ -47,7 +47,7 @@ Fate: TypeAlias = tuple[int, ...]
 
 
 class Purpose(IntEnum):
-    """What a column of random numbers decides, such as the loss of packets."""
+    """What a random number decides for a packet, such as its loss or its jitter."""
 
     DELAY = 0
     COPY_DELAY = 1
@@ -60,7 +60,7 @@ class Purpose(IntEnum):
 
 
 def stream_key(seed: int, uplink: bool, epoch: int, kind: int) -> StreamKey:
-    """Compute the Philox key of the stream for one kind of datagram in a session and direction."""
+    """Return the Philox key for the random numbers of a direction, session and kind of datagram."""
     name = f"cloudrc link {seed} {'up' if uplink else 'down'} {epoch} {kind}"
     digest = blake2b(name.encode(), digest_size=16).digest()
     return int.from_bytes(digest[:8], "little"), int.from_bytes(digest[8:], "little")
@@ -217,7 +217,7 @@ def _packets_hit(key: StreamKey, purpose: Purpose, block: int, chance: float) ->
 
 
 def _lose_in_bursts(table: list[Fate], key: StreamKey, block: int, loss: GilbertElliott) -> None:
-    """Apply loss bursts to a block: lose packets, and delay packets that pass in the bad state."""
+    """Lose packets of a block in bursts; add `delay_bad` to packets that pass in the bad state."""
     extra = round(loss.delay_bad * 1e9)
     draws = uniforms(key, Purpose.LOSS, block).tolist()
     for n, bad in enumerate(bad_states(key, block, loss.bad_start, loss.bad_end)):

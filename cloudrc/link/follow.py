@@ -37,7 +37,7 @@ _NAME = re.compile(r"[a-zA-Z0-9_][-._a-zA-Z0-9]{0,252}")
 
 
 class Loaded(NamedTuple):
-    """A profile as read from its file."""
+    """One direction of a link profile, and the content of the profile's file."""
 
     direction: DirectionProfile  # profile of the direction that this process shapes, in SI units
     values: dict[str, Any]  # content of the file, without defaults, to show to users
@@ -50,7 +50,7 @@ Load = Callable[[Path], Loaded]
 
 @dataclass(frozen=True)
 class Handed:
-    """A change that `cloudrc link set` writes directly into a pod, as a JSON document."""
+    """A change of the link that `cloudrc link set` writes into a pod, as a JSON document."""
 
     change: str  # number and cause of the change, as the text of `CHANGE_FILE`
     files: dict[str, str]  # file name -> text: `profile.yaml` and the traces that it names
@@ -74,7 +74,9 @@ def read_handed(text: bytes | str) -> Handed:
 
 
 class Profiles:
-    """Watches the profile's file and the document from `link set`; returns each change once.
+    """Watches two files for changes: the profile's, and the one that `cloudrc link set` writes.
+
+    A change that reaches both files is returned once.
 
     Kubernetes mounts a ConfigMap as symbolic links into `..data`, which is itself a symbolic link.
     For a new version, Kubernetes replaces `..data`, so that the same path leads to another file.
@@ -158,7 +160,7 @@ class PeerName:
     def __init__(
         self, peer: Address, resolve: Callable[[str], Sequence[str]], log: Callable[[str], None]
     ) -> None:
-        """Follow `peer`, a host name and a port.
+        """Set `peer`, host name and port of the other pod; do not resolve the name yet.
 
         `resolve` returns the addresses of a host name or raises an OSError; `log` writes one line.
         """

@@ -67,9 +67,9 @@ class Log:
     def packets(self) -> Packets:
         """Check the packets, sort them by time of sending, and add a note on each correction.
 
-        Raise a BadInputError if no packet arrived; if a delay is negative; if the times jump back
-        by more than the limit at `GAP`, as after a step of the clock; if more than 1 % of the rows
-        are unusable; or if more than 1 % of them have the time of an earlier row.
+        Raise a BadInputError if no packet arrived; if a delay is negative; if the times jump far
+        back once to three times, as after a step of the clock; if more than 1 % of the rows are
+        unusable; or if more than 1 % of the packets have the time of an earlier packet.
         """
         self._refuse_beyond_limit(len(self.unusable), *self.unusable[:1])
         times, delays = np.array(self.entries or [(nan, nan)]).T
@@ -247,8 +247,9 @@ _IRTT_NAMES = {
 def _irtt_entries(trips: list[dict[str, Any]], what: str) -> list[Entry]:
     """Read the time of sending and the delay of each packet [s]; the first time is 0.
 
-    `what` is a key of `_IRTT_NAMES`. Packets lost in the other direction are left out. The time is
-    always that of the client, even for the downlink: a lost packet has no time of the server.
+    `what` is "uplink", "downlink", or "halves" for half of each round trip. Packets lost in the
+    other direction are left out. The time is always that of the client, even for the downlink: a
+    lost packet has no time of the server.
     """
     other, key = _IRTT_NAMES[what]
     part = 0.5e-9 if what == "halves" else 1e-9

@@ -39,7 +39,7 @@ class LinkDirection:
     ) -> None:
         """Create the model; `uplink` is True for world to cloud.
 
-        `origin_ns` is when the link came up and its time line starts [ns], on the clock of `send`.
+        `origin_ns` is the start of the time line [ns], on the clock of `now_ns` in `send`.
         """
         self._seed, self._uplink = seed, uplink
         self._origin_ns: int | None = origin_ns
@@ -128,7 +128,8 @@ class LinkDirection:
     def _arrival(self, entry: int, conditions: Conditions, size: int, now_ns: int) -> int | None:
         """Compute when one copy of a packet arrives [ns]; None if the queue is full.
 
-        `entry` is the extra delay of the copy [ns], or OVERTAKES.
+        `entry` is the extra delay of the copy [ns]; if it is OVERTAKES, the copy skips queue and
+        delay.
         """
         arrival = now_ns
         if entry != OVERTAKES:

@@ -118,9 +118,9 @@ _QUANTILES: dict[str, Callable[[Floats], Floats]] = {
 
 
 def stretch(profile: DirectionProfile) -> int:
-    """Return the number by which `table` divides its entries, so that they fit in 16 bits.
+    """Return the divisor with which the entries of netem's table of delays fit in 16 bits.
 
-    To compensate, tc gets the jitter multiplied by this number.
+    To compensate, tc gets the jitter multiplied by this divisor.
     """
     if profile.distribution != "table":
         return STRETCH[profile.distribution]
@@ -132,7 +132,8 @@ def table(profile: DirectionProfile) -> list[int]:
 
     Returns:
         Quantiles of the delay's random part at the probabilities (n + 0.5) / 4096, in rising
-        order, shape (4096,). Their unit is jitter · `stretch(profile)` / 8192.
+        order, shape (4096,). Their unit is jitter · s / 8192, where s = `stretch(profile)` keeps
+        them within 16 bits.
     """
     if profile.distribution == "table":
         places = (2 * np.arange(ENTRIES) + 1) * len(profile.table) // (2 * ENTRIES)
@@ -238,7 +239,7 @@ def _percent(share: float) -> str:
 
 
 def leaf_of(qdiscs: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
-    """Find the netem qdisc of `Netem` among an interface's qdiscs; return None if it is missing."""
+    """Return the qdisc that `Netem` made, out of an interface's qdiscs; None if it is missing."""
     found = (one for one in qdiscs if one.get("handle") == LEAF and one.get("kind") == "netem")
     return next(found, None) if _is_ours(_root_of(qdiscs)) else None
 
@@ -364,7 +365,7 @@ class Netem:
         return found
 
     def released(self) -> dict[str, int]:
-        """Return an empty dict: the kernel does not report when datagrams leave the queue."""
+        """Return no statistics: the kernel does not report when datagrams leave the queue."""
         return {}
 
     def close(self) -> None:
@@ -429,7 +430,7 @@ class Netem:
             self._lateness_ns.append(self._stepped_ns - due_ns)
 
     def _next_ns(self) -> float:
-        """Return when `clock` reaches the next change [ns]; infinite after the last change."""
+        """Return when the next change is due [ns]; infinite after the last change."""
         following = self._piece + 1
         if following >= len(self._timeline.pass_ns):
             return inf

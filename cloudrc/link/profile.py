@@ -87,8 +87,8 @@ class DirectionProfile:
     """Requested conditions of one direction.
 
     A negative sum of delay and jitter counts as 0. `keep_order` disables `reorder`. A packet that
-    finds the bottleneck's queue full is dropped. `table` has the equally probable
-    values of the distribution "table": mean 0, standard deviation 1, rising, shape (n,).
+    finds the bottleneck's queue full is dropped. If `distribution` is "table", `table` has equally
+    probable values: mean 0, standard deviation 1, rising, shape (n,).
     """
 
     delay: float = 0.0  # mean one-way delay [s]
@@ -148,7 +148,7 @@ class Timeline:
 
     @property
     def last_ns(self) -> float:
-        """Time from the start of the link to the last change [ns]; infinite for a loop."""
+        """Time from the start of the link to the last change [ns]; infinite if changes repeat."""
         return self.pass_ns[-1] if self.period_ns is None else inf
 
     def only(self) -> Conditions | None:
@@ -157,7 +157,7 @@ class Timeline:
 
 
 def settled(profile: DirectionProfile) -> DirectionProfile:
-    """Return a profile with constant conditions: those after the end of the profile's time line."""
+    """Return the profile with constant conditions: those of the last piece of its time line."""
     last = Timeline(profile).pieces[-1]
     return replace(
         profile,

@@ -51,7 +51,7 @@ _SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SET_TIMERSLACK = 35, 40, 29
 
 
 class ReleaseErrors(Counter[int]):
-    """Histogram of how late datagrams left the relay: bucket -> number of datagrams."""
+    """Histogram of the lateness of datagrams: bucket (a range of lateness) -> count."""
 
     def observe(self, error_ns: int) -> None:
         """Count one datagram that left `error_ns` [ns] after it was due."""
@@ -79,7 +79,7 @@ class ReleaseErrors(Counter[int]):
 
 
 def ask_for_stamps(one: socket.socket) -> None:
-    """Let the kernel, if it can, record arrival times on a socket and count dropped datagrams."""
+    """Ask the kernel for the arrival times and the number of dropped datagrams of a socket."""
     for option in (_SO_RXQ_OVFL, _SO_TIMESTAMPNS) if sys.platform == "linux" else ():
         with suppress(OSError):  # without a stamp, the time of reading counts as arrival
             one.setsockopt(socket.SOL_SOCKET, option, 1)
@@ -128,12 +128,11 @@ class Relay:
     def __init__(
         self, listen: Address, direction: LinkDirection, peek: Peek, end: Address | None = None
     ) -> None:
-        """Open the two sockets; raise an OSError if `listen` is in use or cannot reach `end`.
+        """Open the sockets; raise an OSError if `listen` is in use or cannot reach `end`.
 
-        The end of the tunnel whose datagrams the relay delays sends to the address `listen`; with
-        port 0 the kernel chooses a port. It sends from the address `end`; None allows any address.
-        The times of the model `direction` are on the monotonic clock. `peek` reads kind, epoch and
-        counter of a datagram.
+        World or cloud sends from the address `end` (None: from any address) to the address `listen`
+        (port 0: any free port). The times of the model `direction` are on the monotonic clock.
+        `peek` reads kind, epoch and counter of a datagram.
         """
         self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         # The kernel refuses to send from a socket bound to 127.0.0.1 to another machine.
@@ -200,12 +199,13 @@ class Relay:
         return {**outcomes, **recent, "released_early": errors[_EARLY]}
 
     def released(self) -> dict[str, int]:
-        """Return statistics of how late datagrams left; any thread may call this method.
+        """Return how many datagrams left and how late; any thread may call this method.
 
         Returns:
-            The values of `ReleaseErrors.in_ns`, and the numbers of datagrams that were dropped
-            because too many were in flight (`overflow`), or that waited `AGE_MAX_NS` or longer to
-            be read (`stalled`). Empty before the first datagram.
+            The number of datagrams that left (`released`), that left too early (`released_early`),
+            that were dropped because too many were in flight (`overflow`), and that waited
+            `AGE_MAX_NS` or longer to be read (`stalled`); and percentiles of the lateness, such as
+            `release_error_p99_ns` [ns]. Empty before the first datagram leaves.
         """
         more = {"overflow": self._counts["overflow"], "stalled": self._stalled}
         return told | more if (told := self._errors.in_ns()) else {}
@@ -253,7 +253,7 @@ class Relay:
     def _put_on_link(
         self, data: bytes, kind: int, epoch: int, counter: int, received_ns: int
     ) -> None:
-        """Compute when each copy of a datagram is due, and keep the copies until then."""
+        """Keep a datagram until the link delivers it: never if it is lost, twice if duplicated."""
         releases = self._direction.send(epoch, kind, counter, len(data), received_ns)
         if not releases:
             self._counts["lost"] += 1

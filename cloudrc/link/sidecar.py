@@ -64,10 +64,11 @@ class Sidecar:
         tell: Callable[[LinkState], object],
         count: Callable[[dict[str, int]], object],
     ) -> None:
-        """Store the arguments; `route` is the route file. The state file is in the same folder.
+        """Store the arguments; `route` is the file with the address to which the tunnel sends.
 
-        `direction` is "uplink" or "downlink". `tell` exports each new state of the link as metrics.
-        `count` exports the numbers of datagrams by outcome, once a second.
+        The state file is in the same folder. `direction` is "uplink" or "downlink". `tell` exports
+        each new state of the link as metrics. `count` exports the numbers of datagrams by outcome,
+        once a second.
         """
         self.peer: Address | None = None
         self.profile = profile
@@ -107,7 +108,7 @@ class Sidecar:
                 publish(self._released_file, json.dumps(released))
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
-        """Use one shaper until `stop` returns True, or until a profile needs the other shaper."""
+        """Run netem or the relay until `stop()` is true, or until a profile needs the other."""
         profile, machine = self.profile, self._machine
         if self.state and profile.change.restart:
             self._origin_ns = machine.clock()
@@ -151,7 +152,7 @@ class Sidecar:
         return relay, relay.follow_peer(peer)
 
     def _replace(self, shaper: Shaper, profile: Loaded) -> bool:
-        """Apply or refuse a new profile; return False if only the other shaper can apply it."""
+        """Apply or refuse a new profile; return False if the relay has to replace netem for it."""
         restart = profile.change.restart
         try:
             shaper.follow_profile(profile.direction, restart=restart)

@@ -34,7 +34,7 @@ CHANGE_FILE = "change.json"  # last `Change` of a profile, in the profile's fold
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A change of a link profile, as `cloudrc link set` describes it in `CHANGE_FILE`.
+    """Facts about a change of a link profile; `cloudrc link set` writes them to `CHANGE_FILE`.
 
     If `restart` is True, the profile's time line starts again when the new profile takes effect.
     """

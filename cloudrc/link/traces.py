@@ -61,10 +61,10 @@ def _decode(data: bytes) -> list[str]:
 
 
 def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
-    """Read the distribution of a trace's delays, without lost packets; errors as in `read_trace`.
+    """Read the distribution of a trace's delays, without lost packets.
 
-    Returns:
-        The delays, shifted and scaled to mean 0 and standard deviation 1, rising, shape (n,).
+    Return the delays, shifted and scaled to mean 0 and standard deviation 1, rising, shape (n,).
+    Raise a BadInputError if the file is no trace, or has fewer than two different delays.
     """
     trace = read_trace(path, size_max)
     losses = trace.losses or (0.0,) * len(trace.delays)
@@ -80,7 +80,7 @@ def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
 
 
 def parse_trace(lines: Iterable[str], name: str) -> Trace:
-    """Parse the lines of the trace file `name`; raise the errors of `read_trace`.
+    """Parse the lines of the trace file `name`; raise a BadInputError if they are no trace.
 
     If the first row's time is above `START_MAX` [s], subtract this time from all times.
     """
@@ -204,9 +204,9 @@ def _cells(line: str, separator: str, where: str) -> list[str]:
 
 
 def looks_lost(values: Collection[float]) -> bool:
-    """Return whether 0 marks lost packets in `values`, because all other delays are far from 0.
+    """Return whether a 0 in `values`, delays in any unit, probably means a lost packet.
 
-    `values` are delays in any unit. With few decimals, 0 may be a short delay that was rounded.
+    A 0 means loss if all other delays are far from 0. Otherwise it may be a rounded short delay.
     """
     decimals = max((len(f"{value:.12g}".partition(".")[2]) for value in values), default=0)
     shortest = min((value for value in values if value > 0.0), default=0.0)

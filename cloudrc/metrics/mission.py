@@ -9,7 +9,7 @@ import numpy as np
 
 from cloudrc.config.schema import Waypoint
 from cloudrc.messages import GuardState
-from cloudrc.metrics.flight import Array, Flight, Measure, add_metrics, mean
+from cloudrc.metrics.flight import Array, Flight, Measure, add_metrics, mean, select
 
 BOARD = "board"
 """Name in the scene of the board that the arm must touch."""
@@ -34,7 +34,7 @@ def first_touch(flight: Flight) -> dict[str, Array] | None:
     """Return the first row of /contact in which the arm's tip touches the board, else None."""
     contact = flight.during("/contact")
     touches = np.flatnonzero((contact["body"] == BOARD) & contact["tip"].astype(bool))
-    return {name: column[touches[0]] for name, column in contact.items()} if len(touches) else None
+    return select(contact, touches[0]) if len(touches) else None
 
 
 def holds(flight: Flight) -> list[tuple[int, int]]:
@@ -119,9 +119,9 @@ def _impulse(flight: Flight, touch: dict[str, Array]) -> float:
 
 @_of_touch
 def _steady_force(flight: Flight, touch: dict[str, Array]) -> float | None:
-    """Average the contact force in the last PRESSING_NS of the mission [N].
+    """Average the contact force in the last 2 s of a mission that succeeded [N].
 
-    This average does not depend on the simulator's contact parameters.
+    A steady force does not depend on the simulator's contact parameters.
     """
     if flight.ending is None or flight.ending[1] != "done":
         return None
@@ -160,10 +160,7 @@ def _steady_error(flight: Flight, axis: int) -> float | None:
 
 
 def _fault_count(flight: Flight) -> float | None:
-    """Count the faults of a flight: one for each code, however often it occurred.
-
-    For a code in `FAILURES`, add the total of its counter instead.
-    """
+    """Count each fault code once, but a code in `FAILURES` as often as its counter says."""
     totals, count = dict.fromkeys(flight.recording["/fault"]["code"], 1), flight.recording["/count"]
     for name, total in zip(count["name"], count["total"], strict=True):
         if name in FAILURES:  # the largest total: a cloud that restarts counts from 0

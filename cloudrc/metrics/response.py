@@ -27,7 +27,7 @@ GROWTH_MIN = 0.15
 
 
 class Step(NamedTuple):
-    """Response to one step of the setpoint; a time is None if the robot did not get that far."""
+    """Response to one step of the setpoint; a time is None if the robot did not rise or settle."""
 
     waypoint: int  # index of the waypoint or step
     start: float  # time of the step since the start of the mission [s]
@@ -60,7 +60,7 @@ def steps(flight: Flight) -> tuple[Step, ...]:
 
 
 def _measure(flight: Flight, row: int, end_ns: int) -> Step | None:
-    """Measure the step at `row` of `flight.control`, until `end_ns` [ns]; None if too short."""
+    """Measure the response to the setpoint in `row`, until `end_ns` [ns]; None for a tiny step."""
     control, truth = flight.control, flight.truth
     begin_ns, setpoint = int(control["stamp_ns"][row]), control["setpoint"][row]
     rows = (truth["stamp_ns"] >= begin_ns) & (truth["stamp_ns"] < end_ns)
@@ -94,8 +94,8 @@ def _measure(flight: Flight, row: int, end_ns: int) -> Step | None:
 def _integral(values: Array, times: Array) -> float:
     """Integrate `values` over `times` [s] by the trapezoidal rule.
 
-    The function avoids `numpy.trapezoid`, which needs numpy 2, and `@`, because the last bit of
-    its result depends on the addresses of the arrays.
+    `numpy.trapezoid` needs numpy 2. The last bit of a product by `@` depends on the addresses of
+    the arrays. Therefore the function uses neither.
     """
     return float(((values[1:] + values[:-1]) / 2 * np.diff(times)).sum())
 

@@ -133,7 +133,7 @@ def simulate(given: Array, theta: Array, start: float) -> Array:
 
 
 def _slopes(residuals: Any, theta: Array) -> Array:
-    """Return the derivatives of `residuals` at `theta`, which is (T, d, K), shape (n, 3)."""
+    """Return the derivatives of n residuals by the three parameters `theta`, shape (n, 3)."""
     step = 0.5 * DT
     pairs = [(theta + change, theta - change) for change in np.eye(3) * step]
     return np.stack([(residuals(a) - residuals(b)) / (2.0 * step) for a, b in pairs], axis=1)

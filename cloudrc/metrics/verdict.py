@@ -79,7 +79,10 @@ class Verdict:
 
 
 class Moment(NamedTuple):
-    """`time` since the mission's start [s], and `place`, the true position of the base [m]."""
+    """An instant of a flight; unknown values are None.
+
+    `time` is the time since the mission's start [s], `place` the true position of the base [m].
+    """
 
     time: float | None = None
     place: Vector | None = None
@@ -164,7 +167,7 @@ def flight_evidence(
     """Collect the evidence for the verdict from the records and from the metrics of a flight.
 
     `real_time` is True if the run had to keep real time: in all modes except virtual. `interrupted`
-    is True if the run was stopped, or if its recording has no end.
+    is True if the run was stopped, or if its recording is incomplete.
     """
     criteria, end_ns = flight.criteria, flight.end_ns
     reached, touch = numbers.get("waypoints_reached"), None
@@ -263,7 +266,7 @@ def _plugins(flight: Flight) -> Iterator[Failure]:
 
 
 def _responses(flight: Flight, settle: float) -> Iterator[Failure]:
-    """Yield a failure if a step did not settle within `settle` [m], and one for unstable steps."""
+    """Yield a failure if a step did not settle to `settle` [m]; another for an unstable loop."""
     found, unit = steps(flight), "step" if flight.mission.steps else "waypoint"
     far = [step for step in found if step.last_error > settle]
     if far and flight.mission.steps:
@@ -297,9 +300,9 @@ def _not_real_time(numbers: Mapping[str, Number]) -> str:
 def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, Number]) -> Verdict:
     """Judge a recorded mission with only what the operator knows when the mission ends.
 
-    The operator judges waypoints by the measured position, and timing by the real-time factor. The
-    operator knows neither the report's time limit, nor contacts that telemetry reports only after
-    the end. All other facts are those of the report's `evidence`.
+    A waypoint is reached if teleop reported it, and timing is judged by the real-time factor alone.
+    Contacts count if telemetry reported them before the end. The time limit and violations other
+    than contacts with pipes do not count. All other facts are those of the report's `evidence`.
     """
     basis = flight.control["basis_stamp_ns"]
     seen_ns = int(basis[-1]) if len(basis) else 0
@@ -337,7 +340,7 @@ class Observations:
     def evidence(self, ending: Ending, elapsed: float, **known: Any) -> Evidence:
         """Return the evidence on a mission that ended at mission time `elapsed` [s].
 
-        `known` contains further fields of `Evidence`.
+        `known` sets further fields of the returned `Evidence`.
         """
         return Evidence(
             ending=ending,
@@ -350,5 +353,5 @@ class Observations:
 
 
 def finite_or_none(value: float) -> float | None:
-    """Return `value`, any unit, but None instead of NaN and infinity, which JSON lacks."""
+    """Return `value` [any unit], or None if it is NaN or infinite, which JSON cannot express."""
     return value if isfinite(value) else None

@@ -106,7 +106,7 @@ class Recording:
     def __init__(
         self, make_table: Callable[[Topic], Table], contents: Contents | None = None
     ) -> None:
-        """Store `make_table`, which makes the table of a topic, and the rest of a file's contents.
+        """Set `make_table`, which makes the table of a topic; `contents` give the other attributes.
 
         Outside this package, call `read` or `from_records` instead.
         """
@@ -162,13 +162,12 @@ class RecordStore(RecordHash):
         self.update(from_cloud)
 
     def recording(self) -> Recording:
-        """Return a recording of the records so far, all on one clock."""
+        """Return a recording of the records so far; their stamps must be on one clock."""
         blocks = self.blocks()
         return Recording(lambda topic: _table(topic, blocks.get(topic.source, [])))
 
 
 def _table(topic: Topic, blocks: list[Columns]) -> Table:
-    """Make the table of a topic from the columns of its records."""
     if not blocks:
         return Table(topic, (), ())
     stamps_ns, *columns = (_joined(blocks, path) for path in (topic.stamp_path, *topic.paths()))

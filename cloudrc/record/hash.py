@@ -123,6 +123,6 @@ def messages_sha256(messages: Iterable[tuple[str, int, bytes]]) -> str:
 
 
 def add_message(sha256: hashlib._Hash, topic: str, log_time_ns: int, data: bytes) -> None:
-    """Add one message to the hash of `messages_sha256`."""
+    """Update a hash with topic, log time [ns] and CDR bytes of one message."""
     sha256.update(b"%s %d %d " % (topic.encode(), log_time_ns, len(data)))
     sha256.update(data)

@@ -3,12 +3,14 @@
 Only the stamp of a cloud message is converted; other times in the message stay on the clock that
 their description names.
 
-The offset between the clocks is estimated from the packets, because no packet arrives before it was
-sent. Each telemetry datagram shows that world's clock is ahead of cloud's by at least (sent -
-arrived). Each command datagram shows that world's clock is ahead by at most (arrived - sent). The
-fastest packet of each direction gives the narrowest interval: as wide as the sum of both delays.
+On two machines, the offset between the clocks is estimated from the packets, because no packet
+arrives before it was sent. Each telemetry datagram shows that world's clock is ahead of cloud's by
+at least (sent - arrived). Each command datagram shows that world's clock is ahead by at most
+(arrived - sent). The fastest packet of each direction gives the narrowest interval: as wide as the
+sum of both delays.
 
-After a stall of world's process, world's clock is behind the clock of its machine.
+On one machine, world's clock differs from cloud's only by the lag after stalls of world's process.
+Telemetry contains this lag.
 """
 
 from __future__ import annotations
@@ -78,7 +80,7 @@ def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
 
 
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
-    """Return the smallest arrival minus departure [ns], on two clocks; None if none arrived."""
+    """Return the least (arrival stamp - sending stamp) of a packet [ns]; None if none arrived."""
 
     def packets(table: Table) -> Iterator[tuple[tuple[int, int], int]]:
         numbers = zip(table["epoch"].tolist(), table["counter"].tolist(), strict=True)
@@ -163,8 +165,9 @@ def _join(world: Contents, cloud: Contents) -> Contents:
 def cut_to_last_mission(mission: Contents) -> bool:
     """Reduce a pod's recording of several missions to the mission that was started last.
 
-    Return whether the recording contains the end of that mission. If so, remove from `mission.note`
-    the remark that the file has no end: the pod was still writing to the file during the copy.
+    Return whether the recording contains the end of that mission. If it does, remove the remark
+    that the file is cut short from `mission.note`: the pod was still writing the file, but the
+    mission is complete.
     """
     began, ended, earlier = _last_mission(mission)
     until = mission.messages[-1][1] if mission.messages else 0
@@ -207,6 +210,6 @@ def _mission_events(contents: Contents) -> Iterator[tuple[int, str]]:
 
 
 def _table(contents: Contents, topic: str) -> Table:
-    """Decode one topic only: decoding all topics takes as long as reading the file."""
+    """Decode only the messages of `topic`, because decoding all topics takes long."""
     messages = [message for message in contents.messages if message[0] == topic]
     return Contents(messages).recording()[topic]

@@ -81,8 +81,8 @@ used, because they allocate whatever size the file claims."""
 class Contents:
     """The contents of a recording's file.
 
-    `note` says what is missing or wrong. `lacking` mentions only damaged, removed or added
-    messages, and leaves out the messages that a killed process did not write.
+    `note` says what is missing or wrong, for example that the process was killed before it had
+    written all messages. `lacking` says only how the file was damaged or changed; "" if it was not.
     """
 
     # Topic, log time [ns] and CDR bytes of each message, in the order of log times.
@@ -233,7 +233,6 @@ class _File:
         return is_known(ros_type, schema.data.decode("utf-8", "replace"))
 
     def _sort(self) -> None:
-        """Sort the messages by log time and sequence number."""
         messages = self.contents.messages
         if late := sum(after[1] < before[1] for before, after in pairwise(messages)):
             keys = zip((message[1] for message in messages), self._sequences, strict=True)
@@ -243,7 +242,7 @@ class _File:
 
     @property
     def unread(self) -> int:
-        """Size of the part of the file that was not read [bytes]; 0 if only its index is bad."""
+        """Size of the unread part of the file [bytes]; 0 if only the file's index is damaged."""
         return 0 if self.data_ended and not self.ended else self.size - self.position
 
     @property
@@ -341,7 +340,7 @@ def _list(topics: list[str]) -> str:
 
 @dataclass(slots=True)
 class Recovery:
-    """The result of `recover`."""
+    """What `recover` has saved of a damaged recording, and what is lost."""
 
     complete: bool  # whether nothing is missing or doubtful
     share: float  # share of the messages that were kept, in [0, 1]; if unknown, of the bytes

@@ -35,7 +35,7 @@ class Recorder:
         capacity: int = CAPACITY,
         size_max: int | None = None,
     ) -> None:
-        """Create the queue of `capacity` records; the first `drain` opens the file.
+        """Create a queue of `capacity` records; the first `drain` opens `path` with `open_sink`.
 
         When the file reaches `size_max` [bytes], recording ends; None means no limit.
         """
@@ -66,7 +66,7 @@ class Recorder:
                 self._overflowed += 1
 
     def drain(self, max_records: int = 64) -> int:
-        """Write queued records, at most `max_records` to delay the loop little; return how many."""
+        """Take at most `max_records` from the queue, and write them; return how many."""
         if self._sink is None and not self._ended:
             try:
                 self._sink = self._open_sink(self._path)
@@ -81,7 +81,7 @@ class Recorder:
         return taken
 
     def flush(self) -> None:
-        """Pass data to the operating system; end the file at `size_max` or after a failed sync."""
+        """Pass data to the operating system; close the file if it is full or a sync has failed."""
         if self._sink and not self._ended:
             try:
                 self._sink.flush()

@@ -204,8 +204,8 @@ _TABLE = (
         Field("rate", "float", "bit/s", "profile's rate at the start of the time line, or NaN"),
         Field("conditions", "string", "", "the profile as JSON"))),
     Topic("/link_check", "cloudrc_msgs/msg/LinkChecked", rec.LinkChecked, "either",
-        "A measured quantity of the link in the direction towards the process that writes the row,"
-        " compared with its profile, clock of its end. In real time only", (
+        "A quantity of the link, such as the mean delay: the value that the receiving end measured,"
+        " and the value that the profile asks for, clock of its end. In real time only", (
         _WAY,
         Field("quantity", "string", "", "mean, deviation, round_trip, loss, ..."),
         Field("asked", "float", "s or 1", "value expected from the profile: a delay or a share"),

@@ -50,7 +50,7 @@ value of `COUNTS` is "" until the file is complete."""
 
 
 class McapWriter:
-    """Writes the rows of world, of cloud, or of both to one MCAP file."""
+    """Writes the messages of world, of cloud, or of both to one MCAP file."""
 
     def __init__(
         self,
@@ -104,7 +104,7 @@ class McapWriter:
             self._open_records += 1
 
     def write_row(self, row: Row, log_time_ns: int) -> None:
-        """Write one row; `log_time_ns` [ns] is as for `write_message`."""
+        """Write one row at `log_time_ns` [ns], or at the previous log time if that is later."""
         topic, stamp_ns, values = row
         self.write_message(topic, log_time_ns, encode(TOPICS[topic], stamp_ns, values))
 
@@ -122,8 +122,8 @@ class McapWriter:
     def write_views(self, views: Iterable[tuple[str, int, bytes]]) -> None:
         """Write the messages for viewers, each with topic and log time [ns], after all others.
 
-        They have chunks of their own; readers sort the chunks by the file's index. They are neither
-        counted nor hashed, because they repeat other messages.
+        These messages have separate chunks; readers sort the chunks by the file's index. The
+        messages are neither counted nor hashed, because they repeat other messages.
         """
         self.flush()
         for topic, log_time_ns, data in sorted(views, key=itemgetter(1)):

@@ -144,5 +144,4 @@ def _verdict_document(verdict: Verdict) -> dict[str, Any]:
 
 
 def _known(entries: dict[str, Any]) -> dict[str, Any]:
-    """Remove the entries whose value is None, that is, unknown."""
     return {name: value for name, value in entries.items() if value is not None}

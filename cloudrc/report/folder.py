@@ -70,7 +70,7 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
 
 
 def _read_merged(folder: Path) -> Contents | None:
-    """Read mission.mcap; return None if the recordings of world and cloud have to be merged."""
+    """Read mission.mcap; return None if it has to be made from world.mcap and cloud.mcap."""
     ends = [(folder / f"{end}.mcap").is_file() for end in ("world", "cloud")]
     if not (folder / "mission.mcap").exists():
         if not any(ends):

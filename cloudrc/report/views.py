@@ -18,7 +18,7 @@ import numpy as np
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.geometry.scene import Pipe, load_scene
 from cloudrc.metrics import Flight
-from cloudrc.metrics.flight import Columns
+from cloudrc.metrics.flight import Columns, select
 from cloudrc.record.columns import Recording
 from cloudrc.record.reader import Contents
 from cloudrc.record.ros import encode_view, header, part
@@ -40,7 +40,10 @@ GOAL, GHOST, GLASS = (0.84, 0.37, 0.0), (0.34, 0.71, 0.91), (0.70, 0.74, 0.78)
 
 
 def add_views(mission: Contents, experiment: ResolvedExperiment) -> Recording:
-    """Add messages for viewers to the recording `mission`; return its tables; raise as `views`."""
+    """Add messages for viewers such as Foxglove to the recording `mission`; return its tables.
+
+    Raise a BadInputError if the scene of the experiment cannot be read.
+    """
     recording = mission.recording()
     mission.views = views(recording, experiment)
     return recording
@@ -77,8 +80,7 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[View]:
 
 def _thin(columns: Columns) -> Columns:
     """Keep the first row of `columns` in each period of length `PERIOD_NS`."""
-    rows = np.flatnonzero(np.diff(columns["stamp_ns"] // PERIOD_NS, prepend=-1))
-    return {name: column[rows] for name, column in columns.items()}
+    return select(columns, np.flatnonzero(np.diff(columns["stamp_ns"] // PERIOD_NS, prepend=-1)))
 
 
 def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:
@@ -105,9 +107,9 @@ def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:
 
 
 def _errors(topic: str, flight: Flight, columns: Columns, name: str) -> Iterator[View]:
-    """Yield one view per row: the distance from a position to the robot's true position [m].
+    """Yield messages of `topic`: the distance from a position to the robot's true position [m].
 
-    `name` is the column of `columns` with the positions.
+    `name` is the column of `columns` with the positions. At most one message per PERIOD_NS.
     """
     columns = _thin(columns)
     away = columns[name] - flight.true_position(columns["stamp_ns"])

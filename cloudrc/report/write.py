@@ -69,7 +69,8 @@ def write_report(
     """Write report.json and environment.json and, if `page`, report.html with its figures.
 
     `folder` is the folder of the run; files of an earlier report in it are replaced. `look` is the
-    size of the figures. For the other arguments see `assess`. Return the content of report.json.
+    size of the figures. `own` are names or paths of the user's metrics, whose files are executed.
+    Return the content of report.json.
     """
     assessment = assess(recording, experiment, run, own)
     document, environment = assessment.document, environment_document(run.physics_steps)

@@ -93,7 +93,7 @@ class Bridge:
         self._service: MissionService | None = None
 
     def open(self, service: MissionService) -> None:
-        """Begin to accept calls; they are made on `service`."""
+        """Accept all calls from now on; teleop's loop makes them on `service`."""
         self._service, self.closed = service, ""
 
     def close(self, why: str) -> None:
@@ -116,10 +116,11 @@ class Bridge:
         return future
 
     async def ask(self, call: Call, urgent: Urgent = "") -> Any:
-        """Queue a call for teleop's loop, and return its result. A stop also calls `alarm` at once.
+        """Queue a call for teleop's loop, and return its result.
 
+        For an emergency stop, also send an alarm to cloud at once.
         Raise an UnavailableError if the bridge is closed, or if the loop does not answer within
-        `ANSWER_LIMIT`. In the second case an urgent call stays queued; any other call is withdrawn.
+        `ANSWER_LIMIT`. A stop or hold without an answer stays queued; any other call is withdrawn.
         """
         try:  # queue the stop first: later, telemetry may show it already
             asked = asyncio.wrap_future(self.submit(call, urgent))
@@ -133,7 +134,7 @@ class Bridge:
             raise UnavailableError(text) from None
 
     async def move(self, call: Call) -> Any:
-        """Queue a call that may move the robot; a later stop or hold cancels the call."""
+        """Like `ask`, for a call that may move the robot; a later stop or hold cancels the call."""
         known = self.overtakings
 
         def checked(service: MissionService, now_ns: int) -> Any:
@@ -219,7 +220,7 @@ async def _body(request: Request) -> bytes:
 
 
 def _takes(model: type[Section]) -> dict[str, Any]:
-    """Describe a request body that `_body` reads, for the OpenAPI document."""
+    """Return the OpenAPI description of a request body: the schema and an example of `model`."""
     schema = model.model_json_schema()
     if parts := schema.pop("$defs", None):
         schema["properties"]["waypoints"]["items"] = parts["Waypoint"]
@@ -407,12 +408,12 @@ class ApiServer(uvicorn.Server):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of requests by outcome, and number of lost lines of the audit log, by name."""
+        """Counts by name: requests with each outcome, and lost lines of the audit log."""
         lost = 0 if self.gate.audit is None else self.gate.audit.dropped
         return {f"api_{name}": n for name, n in {**self.gate.counts, "audit_dropped": lost}.items()}
 
     def start(self) -> None:
-        """Start serving."""
+        """Start to serve the API, in a thread of its own."""
         self._thread.start()
 
     def stop(self) -> None:

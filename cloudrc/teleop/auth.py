@@ -82,7 +82,8 @@ class Tokens:
     def caller(self, token: str) -> Caller | None:
         """Return the caller with this token; None if the token is not valid.
 
-        A change of a file takes effect at once. While a file has no valid token, no token is valid.
+        Each call reads the files of operator and reader again. While one of them contains no valid
+        token, no token is valid.
         """
         try:
             return self._read().get(hashlib.sha256(token.encode()).digest())
@@ -110,7 +111,10 @@ def _read_token(path: Path) -> str:
 
 
 class Audit(RotatingFileHandler):
-    """Log commands as lines of JSON, in a separate thread. Only the owner can read the files."""
+    """Log file of the commands to the API, as lines of JSON that a separate thread writes.
+
+    Only the owner can read the file.
+    """
 
     def __init__(self, path: Path, complain: Callable[[str], None]) -> None:
         """Start the thread that writes the log to the file `path`.
@@ -161,7 +165,7 @@ class Gate:
     """Check token and role of every request before the application gets the request."""
 
     def __init__(self, app: ASGIApp, tokens: Tokens | None, audit: Audit | None = None) -> None:
-        """Set the application, `app`; without `tokens`, everybody who can connect may command."""
+        """Set application and audit log; without `tokens`, all who can connect may command."""
         self._app, self.tokens, self.audit = app, tokens, audit
         self._in_flight: Counter[str] = Counter()
         self.counts: Counter[str] = Counter()  # requests by outcome; "served": answered by `app`

@@ -24,7 +24,7 @@ _new = tuple.__new__  # makes a named tuple in half the time of a call of its cl
 
 
 def arrival_ns(setpoint: Setpoint) -> int:
-    """Return when a moving setpoint comes to rest [ns], cloud's clock; 0 for a constant one."""
+    """Return when a setpoint comes to rest [ns], cloud's clock; 0 if it does not move."""
     if setpoint.motion is None:
         return 0
     _, _, total = _profile(setpoint)
@@ -86,7 +86,11 @@ def steer(setpoint: Setpoint, velocity: Vector, now_ns: int) -> Setpoint:
 
 
 def _speed_within(distance: float) -> float:
-    """Return the speed [m/s] from which a setpoint stops `distance` [m] after its last request."""
+    """Return the largest speed [m/s] from which a setpoint stops within `distance` [m].
+
+    The distance is that after the operator's last request: the setpoint keeps its speed for
+    HEARTBEAT_NS, then brakes.
+    """
     wait = HEARTBEAT_NS * 1e-9
     return ACCELERATION * (sqrt(wait * wait + 2.0 * max(distance, 0.0) / ACCELERATION) - wait)
 
@@ -107,9 +111,10 @@ def _driven(setpoint: Setpoint, drive: Drive, now_ns: int) -> Setpoint:
 def _change(
     position: Vector, before: Vector, after: Vector, acceleration: float, time: float
 ) -> tuple[Vector, Vector]:
-    """Return position [m] and velocity [m/s], `time` [s] after the velocity left `before`.
+    """Return position [m] and velocity [m/s], `time` [s] after a change of velocity has begun.
 
-    It changes at a constant acceleration [m/s^2] to `after`, and then stays constant.
+    The velocity changes from `before` to `after` at a constant acceleration [m/s^2]; then it stays
+    constant. `position` is the position at the beginning of the change [m].
     """
     ramp = dist(before, after) / acceleration
     share = min(time / ramp, 1.0) if ramp else 1.0

@@ -89,7 +89,7 @@ class LegWatch:
         self.pause()
 
     def pause(self) -> None:
-        """Interrupt the flight to the waypoint; its time is kept, and the dwell time restarts."""
+        """Interrupt the flight to the waypoint: keep the time flown, but restart the dwell time."""
         self._seen_ns = self._near_since_ns = NEVER_NS
 
     @property
@@ -125,7 +125,7 @@ class Teleop:
     """
 
     def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
-        """Begin without a mission; `ended` tells whether a mission (by its number) has ended."""
+        """Begin without a mission; `ended(n)` tells whether the mission with number n has ended."""
         self.state = "idle"  # of the mission
         self.leg = 0  # index of the current waypoint; their number once all are reached
         self.outcome: MissionEvent | None = None  # event that ended the newest mission
@@ -201,9 +201,9 @@ class Teleop:
     def drive(self, now_ns: int, velocity: Vector) -> None:
         """Move the setpoint with `velocity` [m/s], world frame, for at most `HEARTBEAT_NS`.
 
-        The setpoint moves only while telemetry shows that the robot follows commands. A call during
-        the start of a hand-driven mission has no effect. Every other call needs a held mission, and
-        raises BadInputError without one.
+        The mission must be held; a hand-driven mission may also be starting. In other states,
+        raise a BadInputError. The call has no effect while the mission starts, or while telemetry
+        does not show that the robot follows commands.
         """
         if self._plan.by_hand and self.state == STARTING:
             return
@@ -332,7 +332,7 @@ class Teleop:
         return None
 
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:
-        """Keep the robot at its position: another teleop may have started the reported mission.
+        """Keep the robot at its position: the mission in telemetry may come from another teleop.
 
         Also request the end of that mission, if the robot stands on the ground, or if this teleop
         knows that the mission has ended.
@@ -387,8 +387,8 @@ class Teleop:
     def _lead(self, seen: RobotStatus, now_ns: int) -> None:
         """Keep the carrot, a moving setpoint, at the robot while the guard ignores commands.
 
-        Then let the carrot move on. At the first take-off it does not wait until telemetry shows
-        that the guard obeys: this saves a round trip.
+        After that, let the carrot move on. At the first take-off, the carrot moves before telemetry
+        shows that the robot follows commands: this saves a round trip.
         """
         self._followed = self._followed or seen.guard is TRACK
         if seen.guard is not TRACK and (self._followed or seen.guard is not GROUND):
@@ -425,7 +425,7 @@ class Teleop:
     def _leaves_ns(self, leg: int) -> int | None:
         """Return when the dwell time at waypoint `leg` ends [ns].
 
-        Return None if the present setpoint is not a carrot that moves to this waypoint.
+        Return None if the present setpoint does not move gradually (`carrot`) to this waypoint.
         """
         setpoint = self._setpoint
         if setpoint is None or type(setpoint.motion) is not Motion or setpoint.waypoint != leg:
@@ -471,7 +471,7 @@ class Teleop:
 
     @property
     def _may_move(self) -> bool:
-        """Whether a command could move the robot before the mission resets it to the spawn."""
+        """Whether the robot must be reset to its spawn, and would still follow a setpoint now."""
         return self._from_spawn and not self.requests.waits
 
     def _select_early(self, now_ns: int) -> None:
@@ -488,7 +488,7 @@ class Teleop:
             self._select_leg(leg, now_ns)
 
     def _repeat_setpoint(self, now_ns: int) -> None:
-        """Send the setpoint again in a new session.
+        """Send the setpoint again, because a new session has begun.
 
         Send the robot's position instead if the operator steers by hand, or if the mission still
         has to reset the robot to the spawn.
@@ -504,9 +504,9 @@ class Teleop:
             self._select(self._setpoint)
 
     def _select_leg(self, leg: int, begin_ns: int, start: Vector | None = None) -> None:
-        """Make waypoint `leg` the setpoint; if it has a speed, move a carrot, a setpoint, to it.
+        """Make waypoint `leg` the setpoint, or move the setpoint to it if the leg has a speed.
 
-        The carrot starts at the time `begin_ns` [ns], from the point `start` [m] or, by default,
+        The motion begins at the time `begin_ns` [ns], from the point `start` [m] or, by default,
         from the robot.
         """
         to, motion = self._plan.legs[leg], None

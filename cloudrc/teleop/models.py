@@ -197,7 +197,7 @@ class Stopped(_Answer):
 
 
 class Acknowledged(_Answer):
-    """Answer to an acknowledgement; the robot may not have received it yet."""
+    """Answer to an acknowledgement, which the robot may not have received yet."""
 
     state: Literal["acknowledged"] = _field("A mission can fly once the robot stands still")
 

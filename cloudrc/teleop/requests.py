@@ -59,10 +59,10 @@ class RequestSender:
         return seen.guard is GROUND or (seen.epoch, seen.mission) == self._ended
 
     def ask(self, request: Request, start: Start = Start.SPAWN, *, after: bool = False) -> None:
-        """Begin to repeat a request; it replaces the pending request.
+        """Begin to repeat a request until the robot carries it out; drop the pending request.
 
-        If `after` is True, the new request waits instead until the robot has carried out the
-        pending request. `start` is the place where a mission starts; only a START needs it.
+        If `after` is True, the pending request is not dropped, but finished first. `start` is the
+        place where a mission starts; only a START needs it.
         """
         asked = self._progress._replace(request=request, start=start)
         if self._pending is None or not after:
@@ -118,7 +118,7 @@ class RequestSender:
         return pending._replace(epoch=seen.epoch)
 
     def _repeat_start_if_lost(self, seen: RobotStatus, now_ns: int) -> None:
-        """Send the request START again if the robot has probably obeyed another sender's stop."""
+        """Send the request START again if another sender has probably stopped the robot."""
         ours = self._is_started and seen.mission_id == self._progress.mission_id
         if not ours or seen.guard not in (GROUND, HOLD):
             self._flies_ns = now_ns

@@ -80,7 +80,7 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
 
 
 class MissionService:
-    """Store and fly all missions of one robot, one after the other.
+    """Stores and flies all missions of one robot, one after the other.
 
     All times `now_ns` are on this process's monotonic clock [ns]. The methods for the operator's
     commands raise ConflictError if the state of mission or robot forbids the command. They raise
@@ -126,7 +126,7 @@ class MissionService:
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
         """Create a mission that starts at once or waits; return it, and whether it is new.
 
-        If a mission has the order's key already, return that mission.
+        If an earlier order has the same `key`, return the mission of the earlier order.
         """
         known = self.book.with_key(order.key)
         if known is not None:
@@ -319,16 +319,17 @@ class MissionService:
 
     @property
     def _inherits_stop(self) -> Mission | None:
-        """Mission that an emergency stop ended before teleop restarted.
+        """Mission that an emergency stop ended before teleop restarted; None without one.
 
-        None after the first telemetry, or if there is no such mission.
+        Only the first telemetry shows whether the robot obeyed this stop. Afterwards, and while
+        teleop repeats a stop, the value is None.
         """
         unknown = self.seen is None and not self._teleop.stopping
         return self.book.stopped() if unknown else None
 
     @property
     def _blocked(self) -> str:
-        """Why the robot cannot fly before an acknowledgement, in words; "" if it can fly."""
+        """Why the robot cannot fly until the operator's acknowledgement; "" if it can fly."""
         if self._teleop.stopping or self._inherits_stop:
             return "an emergency stop is on its way to the robot"
         seen = self.seen
@@ -371,11 +372,11 @@ class MissionService:
         return mission
 
     def _start_next(self, now_ns: int, *, queued: bool = False) -> Mission | None:
-        """Start the oldest mission that has not ended, unless a mission is already under way.
+        """If no mission is under way, start the oldest mission that has not ended.
 
-        If an earlier teleop process has started this mission, continue it. A mission in the queue
-        starts only if `queued` is True, and after its new state is on the disk. Return the mission
-        that is under way then, or None.
+        If an earlier teleop process has started that mission, continue it. If it is queued, start
+        it only if `queued` is True, and only after its new state is on the disk. Return the mission
+        that is under way after this call, or None.
         """
         waiting = self.book.open()
         if self._current is not None or not waiting:

@@ -31,7 +31,7 @@ SHOWN = 100
 
 @dataclass(frozen=True, slots=True)
 class Order:
-    """Order to fly a mission; the plan has been checked."""
+    """Order to fly a mission, with a plan that has been checked."""
 
     plan: Plan
     name: str = ""  # shown to people
@@ -262,7 +262,7 @@ class MissionStore:
         return mission
 
     def note(self, mission: Mission, event: str, text: str, **changed: Any) -> None:
-        """Apply an event by `Mission.apply` and store it; if the disk fails, `catch_up` does so."""
+        """Store an event and `changed` fields of a mission; `catch_up` repeats a failed write."""
         if event == "reached" and changed["waypoint"] < len(mission.reached):
             return  # an earlier teleop has stored it
         self._events += 1

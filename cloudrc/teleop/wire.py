@@ -1,4 +1,4 @@
-"""Define teleop's plans and messages, and encode the messages between cloud and teleop.
+"""Define the plan of a mission, and encode the messages between cloud and teleop.
 
 Each datagram is a JSON list: the name of the message's type, then its fields in order.
 """
@@ -29,9 +29,9 @@ from cloudrc.records import FAILURES, MissionEvent
 class Leg:
     """A waypoint, and the conditions under which it counts as reached.
 
-    A random waypoint has an infinite `tolerance`; it counts as reached after the time `dwell`. If
-    `speed` is above 0, the waypoint counts as reached when the setpoint has rested there for the
-    time `dwell` and the robot is within `tolerance`.
+    If `speed` is 0, the robot has to stay within `tolerance` for the time `dwell`. If `speed` is
+    above 0, the setpoint has to rest at the waypoint for the time `dwell`; then the robot has to be
+    within `tolerance`. With an infinite `tolerance`, only the time counts.
     """
 
     position: Vector  # [m], world frame, shape (3,)
@@ -65,7 +65,7 @@ NO_PLAN = Plan((Leg(ZERO),))
 
 
 class RobotStatus(NamedTuple):
-    """The robot's status from the newest telemetry, which cloud sends to teleop.
+    """Status of the robot after the newest telemetry; cloud sends it to teleop.
 
     Numbers that are not known yet are NaN.
     """

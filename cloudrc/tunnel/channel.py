@@ -1,4 +1,4 @@
-"""Classify the datagrams of one stream by their counters as used, late or repeated."""
+"""Decide by the counter of each datagram whether it is to be used, is late, or is repeated."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ USED, LATE, REPEATED = "used", "late", "repeated"
 
 
 class Channel:
-    """Classifies the datagrams of one kind and direction in one session."""
+    """Classifies datagrams of one kind and direction as used, late or repeated, in one session."""
 
     def __init__(self, newest_wins: bool) -> None:
         """Set the rule for a datagram that arrives after a newer datagram.
@@ -31,7 +31,7 @@ class Channel:
 
     @property
     def is_flooded(self) -> bool:
-        """Whether more repeated datagrams have arrived than the sender has sent in this session.
+        """Whether the repeats that arrived in this session outnumber all datagrams of the sender.
 
         Only an attacker repeats so many datagrams. The receiver then no longer records repeats.
         """
@@ -40,8 +40,8 @@ class Channel:
     def take(self, counter: int, newest_wins: bool = False) -> str:
         """Classify the datagram with this counter as USED, LATE or REPEATED.
 
-        For this datagram, `newest_wins` = True overrides the rule of the channel: if a newer
-        datagram has arrived before, this datagram is LATE, not USED.
+        With `newest_wins` = True, a datagram that arrives after a newer datagram is LATE, whatever
+        the channel's rule.
         """
         ahead = counter - self._newest
         if ahead > 0:

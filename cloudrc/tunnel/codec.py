@@ -197,7 +197,7 @@ def encode_command(command: Command) -> bytes:
 
 
 def as_planned(velocity: Vector) -> Vector:
-    """Round a velocity [m/s], shape (3,), to single precision, as the datagram of a plan does."""
+    """Round a velocity [m/s], shape (3,), to single precision, as a plan in a datagram has it."""
     return _VELOCITY.unpack(_VELOCITY.pack(*velocity))
 
 
@@ -236,5 +236,5 @@ def encode(kind: Kind, *fields: Any) -> bytes:
 
 
 def decode(kind: Kind, body: bytes) -> tuple[Any, ...]:
-    """Decode the body of a handshake datagram to the fields that `encode` takes."""
+    """Decode the body of a handshake datagram; return its fields, such as nonce or cookie."""
     return _BODIES[kind].unpack(body)

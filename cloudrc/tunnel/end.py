@@ -18,7 +18,7 @@ from cloudrc.tunnel.session import Session
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Clock, process and keys of one end of the tunnel, fixed when its process starts."""
+    """What an end of the tunnel gets at its start: ids of its clock and its process, and keys."""
 
     clock_id: bytes  # 16 bytes that identify the monotonic clock of this machine
     nonce: bytes  # 16 random bytes that identify this process
@@ -71,9 +71,9 @@ class TunnelEnd:
             self._records.append(Fault(now_ns, code, text))
 
     def _tell_refusal(self, outcome: str, data: bytes, now_ns: int) -> None:
-        """Record at `now_ns` [ns] that the refused datagram `data` has a wrong version or key.
+        """Record a fault at `now_ns` [ns] if `data` was refused for its version or its key.
 
-        `outcome` is the reason of the refusal. For another reason, record nothing.
+        `outcome` is the reason of the refusal, such as "version" or "tag".
         """
         if outcome == "version":
             self._tell("version", VERSION_TEXT.format(data[0], codec.VERSION), now_ns)

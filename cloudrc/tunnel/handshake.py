@@ -43,7 +43,7 @@ def is_newer(epoch: int, than: int) -> bool:
 
 
 class HelloAnswer(NamedTuple):
-    """World's answer to a hello: its outcome, datagrams to send, whether a session has begun."""
+    """World's answer to a HELLO: its outcome, datagrams to send, whether a session has begun."""
 
     outcome: str
     datagrams: list[bytes]
@@ -91,7 +91,7 @@ class ServerHandshake:
         self.hear(now_ns)
 
     def receive_hello(self, hello: Hello, counter: int, now_ns: int) -> HelloAnswer:
-        """Answer a hello at `now_ns` [ns], after `Session.open` has verified the hello."""
+        """Answer a HELLO at `now_ns` [ns], after `Session.open` has verified the datagram."""
         session, key = self._session, self._session.greeting_key
         if not self._has_cookie(hello, now_ns):
             if now_ns - self._challenged_ns < CHALLENGE_NS:
@@ -128,9 +128,9 @@ class ServerHandshake:
     def _keeps_epoch(self, now_ns: int) -> bool:
         """Return whether the present epoch continues after a repeated HELLO of the session's cloud.
 
-        Return False if there is no epoch, or if the hello has a newer key than the epoch. Otherwise
-        the first REPEATS_MAX hellos since the last encrypted datagram keep the epoch. Later hellos
-        keep it only if their key is the epoch's key and the session has not timed out.
+        A HELLO with a newer key ends the epoch. Otherwise the epoch survives REPEATS_MAX repeats
+        without an encrypted datagram in between. It survives further repeats only while they have
+        the epoch's key and the session has not timed out.
         """
         session, key = self._session, self._session.greeting_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current
@@ -161,10 +161,10 @@ class ServerHandshake:
 
 
 class ClientHandshake:
-    """Cloud's side of the handshake: make hellos, and decide which answers are valid."""
+    """Cloud's side of the handshake: make HELLOs, and decide which answers are valid."""
 
     def __init__(self, nonce: bytes, clock: bytes) -> None:
-        """Start without a session; `nonce` and `clock` are as in `ServerHandshake`."""
+        """Start without a session; `nonce` identifies this process, `clock` the machine's clock."""
         self._seed, self._clock = nonce, clock
         self._nonce, self._nonces = nonce, 0
         self._epoch = NO_EPOCH  # the newest known epoch
@@ -180,9 +180,10 @@ class ClientHandshake:
         return self._hello()
 
     def answer_challenge(self, cookie: bytes) -> bytes | None:
-        """Make the body of the HELLO that answers a challenge; None for no answer.
+        """Make the body of the HELLO that answers a challenge; None to send no HELLO.
 
-        A repeated cookie gets no answer, because an old cookie must not replace the newest cookie.
+        Return None for a repeated cookie, because an old cookie must not replace the newest one.
+        Also return None after REPLIES_MAX answers since the last periodic HELLO.
         """
         if self._replies == 0 or cookie in self._cookies:
             return None
@@ -201,9 +202,9 @@ class ClientHandshake:
         """Process an ACCEPT; return cloud's and world's nonce if a new epoch begins, else None.
 
         `asks` is True while cloud asks for a session; only then does cloud accept a new world
-        process. A late ACCEPT can make cloud accept a world process that has ended. As soon as the
-        running world process answers again, cloud changes its own nonce, so that all late ACCEPTs
-        become invalid.
+        process. A delayed ACCEPT can make cloud accept a world process that has ended. When the
+        running world process then answers, cloud changes its own nonce, so that all delayed
+        ACCEPTs become invalid.
         """
         known = accept.world_nonce == self._world
         if accept.nonce != self._nonce or (self._world and not known and not asks):

@@ -37,7 +37,7 @@ class Key:
         object.__setattr__(self, "name", self.derive(b"", b"name")[:4].hex())
 
     def derive(self, salt: bytes, use: bytes) -> bytes:
-        """Derive a key of 32 bytes from this key and `salt`; `use` is a label, one per use."""
+        """Derive a key of 32 bytes from this key and `salt`; `use` is the new key's purpose."""
         return HKDF(SHA256(), KEY_SIZE, salt, _LABEL + use).derive(self._secret)
 
     def tag(self, data: bytes) -> bytes:

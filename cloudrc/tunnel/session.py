@@ -94,8 +94,8 @@ class Session:
     def pass_on(self, kind: int, message: Telemetry | Command) -> Passed:
         """Give `message` the counter of the next datagram of this kind, without encryption.
 
-        Use this method in place of `seal` only if the receiver is in the same process: `open`
-        cannot read the result elsewhere.
+        Use this method in place of `seal` only if the receiver is in the same process: the result
+        is a Python object, not bytes.
         """
         counters = self._counters
         counter = counters[kind]
@@ -113,7 +113,7 @@ class Session:
     def open(self, data: Datagram) -> tuple[int, int, int, Any]:
         """Verify a datagram; return its kind, epoch, counter and decrypted body.
 
-        For a datagram from `pass_on`, the body is the message itself.
+        If `pass_on` made the datagram, it is not encrypted, and the body is the message itself.
 
         Raises:
             DecodeError: "malformed"; "version"; "direction" if this endpoint itself sends in the

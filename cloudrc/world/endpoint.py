@@ -146,8 +146,8 @@ class WorldEndpoint(TunnelEnd):
         """Return world's time at `now_ns` [ns, monotonic clock]: `now_ns` minus the slip.
 
         If the simulation lags by more than CATCH_UP_NS, add the excess to the slip. If it lags by
-        more than the largest age of a command, world has stalled. Then store `now_ns`, because
-        datagrams that are read at this time may have waited in the socket.
+        more than the largest age of a command, world has stalled, and datagrams read at this
+        `now_ns` may have waited in the socket. Then store `now_ns`, to refuse them as stale.
         """
         world_ns = now_ns - self._slip_ns
         behind_ns = world_ns - self._tick_ns
@@ -162,9 +162,10 @@ class WorldEndpoint(TunnelEnd):
     def _advance(self, until_ns: int, *, samples: bool = False) -> None:
         """Simulate all steps that begin before `until_ns` [ns], world's clock.
 
-        With `samples`, also take the odometry sample that is due at `until_ns`. If an earlier call
-        took this sample, simulate also the step that begins at `until_ns`. A datagram that arrives
-        at `until_ns` then acts on the following step.
+        With `samples`, also take the sample of the true state that is due at `until_ns`.
+
+        If an earlier call has taken this sample, also simulate the step that begins at `until_ns`.
+        So a datagram that arrives at the time of a sample acts from the next step on.
         """
         tick_ns = self._tick_ns
         if until_ns == tick_ns == self._sample_ns - self._sample_period_ns:
@@ -275,8 +276,9 @@ class WorldEndpoint(TunnelEnd):
     def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
         """Carry out an operator request; ignore repeated and old requests.
 
-        Raise the DecodeError "stale" for a START request that is too old or may have waited in the
-        socket during a stall, and "future" if its odometry is later than world's clock.
+        Raise the DecodeError "stale" for a START request if the odometry that it is based on is too
+        old, or if the request may have waited in the socket during a stall. Raise "future" if this
+        odometry is later than world's clock.
         """
         kind, guard, tick_ns = request.request, self.robot.guard, self._tick_ns
         starts = kind is Request.START

@@ -45,7 +45,7 @@ error, largest sine of the yaw error [1]. For larger errors, `attitude` uses ano
 
 
 class LowLevel:
-    """Make the robot follow a velocity at a yaw of 0, as the published controller does.
+    """Controller that makes the robot follow a velocity at a yaw of 0, like the published code.
 
     Attributes:
         gains: Force per velocity error, per integrated error and per change of the error in one
@@ -105,7 +105,7 @@ class LowLevel:
         return speeds
 
     def force(self, velocity: Vector, reference: Vector) -> Vector:
-        """Compute the force that the robot needs [N], and advance the integral by `dt`.
+        """Compute the force that the robot needs [N], and advance the integral by one time step.
 
         e = v - v_ref;  F = -(Kp · e + Ki · int(e dt) + Kd · de/dt) + (0, 0, m · g), with a clamped
         integral. `velocity` is v, `reference` is v_ref, both in [m/s]; all are in the world frame.
@@ -138,14 +138,15 @@ class LowLevel:
 def attitude(force: Vector, readings: Readings) -> Effort:
     """Return the thrust and torque that turn the thrust axis towards `force` and the nose to +x.
 
-    `force` is F [N], world frame, shape (3,); R is the body's orientation and w its rate.
+    `force` is F [N], world frame, shape (3,); R is the body's orientation and w its rate. R_d has
+    the columns x_d, y_d, z_d; k_R and k_w are gains.
         z_d = F/|F|, y_d = z_d x (1, 0, 0) normalised, x_d = y_d x z_d; Q = R_d' R;
         e_R = 1/2 (Q21 - Q12, Q02 - Q20, Q10 - Q01); torque = -(k_R · e_R + k_w · w);
         thrust = F · (R z).
     The code works in the body frame, where the wanted axes are the rows of Q.
-    Deviation: a collision may turn the robot beyond NOSE_COSINE_MIN or YAW_SINE_MAX (a yaw error
-    above 17 degrees). Then the code corrects the tilt about the body's present axes. The correction
-    by e_R would be off by half the yaw error, and would have the wrong sign beyond 90 degrees.
+    Deviation: after a collision, the roll error may be above 60 degrees, or the yaw error above 17
+    degrees. Then the code corrects the tilt about the body's present axes. The correction by e_R
+    would be off by half the yaw error, and would have the wrong sign beyond 90 degrees.
     """
     fx, fy, fz = force
     _, _, _, (p, q, r), (xx, xy, xz, yx, yy, yz, zx, zy, zz) = readings
@@ -177,8 +178,9 @@ def attitude(force: Vector, readings: Readings) -> Effort:
 def allocate(effort: Effort) -> RotorSpeeds:
     """Distribute thrust T and torque (tx, ty, tz) over the rotors; return their speeds w [rad/s].
 
-    f = T/4 + (-ty/2l + tz/4km, tx/2l - tz/4km, ty/2l + tz/4km, -tx/2l - tz/4km) for front, left,
-    back, right, with l = ARM and km = TORQUE_RATIO; w = sqrt(f/kf), limited to [0, 1838 rad/s].
+    The thrusts f of the front, left, back and right rotor are
+    T/4 + (-ty/2l + tz/4km, tx/2l - tz/4km, ty/2l + tz/4km, -tx/2l - tz/4km), with l = ARM and
+    km = TORQUE_RATIO. w = sqrt(f / THRUST_COEFFICIENT), limited to [0, 1838 rad/s].
     """
     thrust, roll, pitch, yaw = effort
     roll, pitch, yaw = roll / _TWO_ARMS, pitch / _TWO_ARMS, yaw / _FOUR_RATIOS

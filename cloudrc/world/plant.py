@@ -52,7 +52,10 @@ class Wind:
     def __init__(
         self, mean: tuple[float, float], gust: float, time: float, rng: np.random.Generator
     ) -> None:
-        """Set the wind's `mean` [m/s], deviation `gust` [m/s] and time constant [s] of gusts."""
+        """Set the mean wind [m/s].
+
+        `gust` [m/s] is the standard deviation of the gusts, `time` [s] their time constant.
+        """
         self._mean, self._gust, self._time, self._rng = mean, gust, time, rng
         self._gusts = gust * rng.standard_normal(2)
 

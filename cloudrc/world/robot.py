@@ -20,7 +20,7 @@ TRACK = GuardState.TRACK  # looking up a member of an enum is slow
 
 
 class Observer(Protocol):
-    """Observes the steps and the inputs of a robot. Times are on world's clock [ns]."""
+    """Object that a `Robot` informs of its steps and inputs. Times are on world's clock [ns]."""
 
     def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
         """Observe a physics step that begins at `now_ns` with these readings and rotor speeds."""

@@ -70,7 +70,8 @@ def compile_model(robot: str, scene: str, plant: Plant | None = None) -> Any:
     bodies lose their names; therefore each geom of the scene gets the name BODY/NUMBER. Raise a
     BadInputError if a file is missing, does not compile or does not fit the onboard controller.
 
-    With `plant`, the result is the true robot. The check of the files ignores `plant`.
+    After the check of the files, `plant` changes mass, inertia and thrust: the true robot may
+    differ from its file.
     """
     paths = _path("robots", robot), _path("scenes", scene)
     model = _compile_nominal(*paths)
@@ -126,7 +127,6 @@ def _compile(
 
 
 def _inertia(model: Any) -> Inertia:
-    """Compute the inertia of the robot, which may have several bodies."""
     data, base = mujoco.MjData(model), model.jnt_bodyid[0]
     mujoco.mj_forward(model, data)
     frame, bodies = data.xmat[base].reshape(3, 3), np.flatnonzero(model.body_rootid == base)
@@ -195,10 +195,10 @@ def _words(numbers: ArrayLike) -> str:
 
 
 def _facts(model: Any) -> Facts:
-    """Return the quantities on which controller and rotors depend: name -> value, tolerance.
+    """Return the quantities in which a robot must match the Pelican: name -> value, tolerance.
 
-    The controller works within these tolerances: the velocity loop compensates for a weight
-    that differs by 1 N, and the attitude gains work for an inertia that differs by 50 %.
+    Within the tolerances the Pelican's controller works: its velocity loop compensates for a
+    weight that differs by 1 N, and its attitude gains work for an inertia that differs by 50 %.
     """
     base = model.jnt_bodyid[0]
     turned = rotation(model.body_iquat[base])

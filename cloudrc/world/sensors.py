@@ -58,7 +58,7 @@ class Sensors:
         self._exact = self._position == self._velocity == attitude == rate == NONE
 
     def measure(self, truth: Odometry) -> Odometry:
-        """Return the odometry for cloud: the true odometry with the errors."""
+        """Return the odometry that cloud gets: the true odometry plus the configured errors."""
         if self._exact:
             return truth
         turn = self._attitude.add(ZERO, self._turn_rng)

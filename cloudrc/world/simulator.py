@@ -61,8 +61,9 @@ class Simulator:
     ) -> None:
         """Compile `robot` in `scene` (names or paths) and put the robot at its spawn.
 
-        Without `plant`, the true robot equals the model. Raise a BadInputError if a file is missing
-        or does not fit the onboard controller.
+        `plant` tells how the true robot differs from its model; None: not at all. Without `wind`
+        the air is at rest. Raise a BadInputError if a file is missing or does not fit the onboard
+        controller.
         """
         self.model = model = compile_model(robot, scene, plant)
         self._wind = wind
@@ -133,8 +134,8 @@ class Simulator:
         """Take over the state after steps that `native/step.c` has run on `data`.
 
         `rotor_speeds` are the actual speeds [rad/s], shape (4,). `tip_force_peak` [N],
-        `tip_impulse` [N s], `contacts` and `steps` are the new values of the attributes. `before`
-        has the readings before the last step; None if no contacts of that step are to be stored.
+        `tip_impulse` [N s], `contacts` and `steps` are the new values of the attributes. If
+        `before`, the readings before the last step, is given, store the contacts of that step.
         """
         self._rotors.speeds, self._readings = rotor_speeds, None
         self.tip_force_peak, self.tip_impulse = tip_force_peak, tip_impulse
@@ -172,7 +173,7 @@ class Simulator:
         return self._sensors[self._tip_sensor]
 
     def take_tip_force(self) -> tuple[float, float]:
-        """Return and reset `tip_force_peak` [N] and `tip_impulse` [N s] since the last call."""
+        """Return the tip's peak force [N] and impulse [N s] since the last call; reset both."""
         found = self.tip_force_peak, self.tip_impulse
         self.tip_force_peak = self.tip_impulse = 0.0
         return found
@@ -186,7 +187,7 @@ class Simulator:
         return touches
 
     def state(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Return the arguments `physics` and `warmstart` of `replay`.
+        """Return the state from which `replay` can repeat the next steps: physics and warmstart.
 
         `physics` is the state `mjSTATE_FULLPHYSICS`, shape (n,). `warmstart` has the accelerations
         from which the contact solver of the next step starts, shape (nv,).
@@ -197,7 +198,7 @@ class Simulator:
         return physics, self.data.qacc_warmstart.copy()
 
     def _feel(self, contacts: int, before: Readings) -> None:
-        """Update the tip's force and impulse after a step, and store new contacts.
+        """Update force and impulse on the arm's tip after a step, and store new contacts.
 
         `contacts` is the number of contacts in the step; `before` has the readings before the step.
         """

@@ -40,9 +40,7 @@ def test_a_flight_is_found_while_it_lasts_and_leaves_nothing(tmp_path, flights, 
 
 
 @pytest.mark.parametrize("runtime", ["", "of_others", "missing"])
-def test_without_a_runtime_folder_of_its_own_a_flight_is_in_the_home(
-    tmp_path, runtime, monkeypatch
-):
+def test_a_flight_is_in_the_home_without_a_runtime_folder(tmp_path, runtime, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.setenv("XDG_RUNTIME_DIR", runtime and str(tmp_path / runtime))
     (tmp_path / "of_others").mkdir()

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 
 class DelaySample(NamedTuple):
-    """The delays that one telemetry datagram shows; datagrams with a long hold time give none.
+    """The delays that the echo in one telemetry datagram shows; a long hold time gives no sample.
 
     Attributes:
         loop_delay: Arrival of the echo minus the command's stamp [s]. The loop delay includes the
@@ -37,7 +37,8 @@ class Estimator:
 
         Args:
             applied_minus_stamp: Time of application on world's clock minus the command's stamp on
-                cloud's clock [s]: the downlink delay plus the unknown clock offset world - cloud.
+                cloud's clock [s]: the downlink delay minus the unknown clock offset (cloud's clock
+                minus world's).
         """
 
     def horizon(self, age: float) -> float:
@@ -45,6 +46,7 @@ class Estimator:
 
         Args:
             age: Now on cloud's clock minus the newest odometry's stamp on world's clock [s]: the
-                sum of uplink delay, time in cloud, and the unknown clock offset cloud - world.
+                sum of uplink delay, time in cloud, and the unknown clock offset (cloud's clock
+                minus world's).
         """
         raise NotImplementedError

@@ -15,19 +15,20 @@ from cloudrc.config.schema import Count
 
 
 class Earliest(Estimator):
-    """Adds the age of the newest odometry to the smallest delay of the last `count` commands."""
+    """Estimator: the odometry's age plus the smallest delay of the last `count` commands."""
 
     def __init__(self, count: int) -> None:
         self._offsets: deque[float] = deque(maxlen=count)
 
     def add_applied(self, applied_minus_stamp: float) -> None:
-        """Store `applied_minus_stamp` [s]: downlink delay of a command plus the clock offset."""
+        """Store `applied_minus_stamp` [s]: downlink delay of a command minus the clock offset."""
         self._offsets.append(applied_minus_stamp)
 
     def horizon(self, age: float) -> float:
-        """Return `age` plus the smallest stored value [s]; 0 until `add_applied` is called.
+        """Return the horizon [s]; 0 before the first echo of a command.
 
-        Both terms contain the offset between the clocks, with opposite signs, so that it cancels.
+        The horizon is `age`, the age of the odometry, plus the smallest stored delay of a command.
+        The clock offset adds to `age` and reduces the delay, so the sum does not contain it.
         """
         return max(0.0, age + min(self._offsets)) if self._offsets else 0.0
 

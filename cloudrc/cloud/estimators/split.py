@@ -24,12 +24,12 @@ class Split(Estimator):
     """
 
     def __init__(self, gain: float) -> None:
-        """Set `gain`, in [0, 1]: weight of a new value in the average of `applied_minus_stamp`."""
+        """Set `gain`, in [0, 1]: the weight of the newest command in the average of the delays."""
         self._gain = gain
         self._applied_minus_stamp: float | None = None
 
     def add_applied(self, applied_minus_stamp: float) -> None:
-        """Average `applied_minus_stamp` [s]: downlink delay minus clock offset cloud - world."""
+        """Average `applied_minus_stamp` [s]: the downlink delay minus the clock offset."""
         if self._applied_minus_stamp is None:
             self._applied_minus_stamp = applied_minus_stamp
         else:
@@ -38,10 +38,9 @@ class Split(Estimator):
             )
 
     def horizon(self, age: float) -> float:
-        """Return the horizon [s]: the sum of `age` and the average of `applied_minus_stamp`.
+        """Return the horizon [s]: `age` plus the average downlink delay; 0 before the first echo.
 
-        Both terms contain the offset between the clocks, with opposite signs, so the offset
-        cancels.
+        `age` and the average contain the clock offset with opposite signs; the sum is free of it.
         """
         if self._applied_minus_stamp is None:
             return 0.0

@@ -19,7 +19,7 @@ from cloudrc.messages import Command, Odometry, Quaternion, Vector
 
 
 class Model:
-    """A simulated robot that follows velocity commands; the control loop plans with it."""
+    """A simulated robot; the control loop uses it to plan the commands of the near future."""
 
     def step(self, velocity: Vector, dt: float) -> Odometry:
         """Advance the state by `dt` [s], > 0, under a velocity command [m/s]; return the state."""
@@ -36,7 +36,7 @@ class Predictor:
         """Process a command that cloud has just sent."""
 
     def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
-        """Process the application of a command; called once per command whose echo arrives.
+        """Store when world applied a command; called once per command whose echo arrives.
 
         Args:
             command_stamp_ns: Stamp of the command [ns], cloud's clock. A command may be older than
@@ -52,7 +52,10 @@ class Predictor:
         raise NotImplementedError
 
     def model(self) -> Model | None:
-        """Return a new model of the robot in the last predicted state, or None (the default)."""
+        """Return a new model of the robot in the last predicted state; cloud plans ahead with it.
+
+        By default, return None: the predictor has no model, and cloud cannot make plans.
+        """
         return None
 
 

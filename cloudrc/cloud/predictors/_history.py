@@ -1,8 +1,8 @@
 """Base class of the predictors that replay the sent commands through a model of the robot.
 
 World follows the newest command that has arrived. On world's clock, a command begins at its stamp
-plus a shift. The shift is the downlink delay plus the clock offset; the echoes in telemetry show
-this sum.
+plus a shift. The shift is the downlink delay plus the clock offset. It follows from telemetry,
+which tells when world applied a command.
 """
 
 from __future__ import annotations
@@ -42,7 +42,10 @@ class History:
         self._shift_ns = 0.0
 
     def add(self, command: Command) -> bool:
-        """Store a sent command and return True; ignore it and return False if it is not newer."""
+        """Store a sent command and return True.
+
+        If the command is not newer than the last stored command, ignore it and return False.
+        """
         if self.stamps and command.stamp_ns <= self.stamps[-1]:
             return False
         self.stamps.append(command.stamp_ns)
@@ -77,14 +80,18 @@ class History:
         self._applied.append((began_ns, stamp_ns))
 
     def is_silent(self, now_ns: int) -> bool:
-        """Whether the newest echoed command began more than FOLLOWED_NS before `now_ns` [ns]."""
+        """Return whether the robot follows no command at `now_ns` [ns], world's clock.
+
+        It follows none if world applied the last echoed command over FOLLOWED_NS before `now_ns`.
+        """
         return bool(self._applied) and now_ns - self._applied[-1][0] > FOLLOWED_NS
 
     def shift_ns(self, odometry: Odometry, horizon: float) -> int:
         """Return the shift [ns]: the time from a command's stamp until world begins to follow it.
 
-        A command with a plan states when it begins. Without a plan, the shift comes from the
-        echoes. Before the first echo, it comes from the newest `odometry` and the `horizon` [s].
+        If the newest command has a plan, the shift ends when the plan begins. Otherwise the echoes
+        show the shift. Before the first echo, the shift comes from the newest `odometry` and the
+        `horizon` [s].
         """
         if self.commands and self.commands[-1].plan:
             return self.commands[-1].planned_ns - self.stamps[-1]
@@ -95,8 +102,8 @@ class History:
     def past(self, start_ns: int, end_ns: int) -> Iterator[tuple[Vector, float]]:
         """Yield velocity [m/s] and duration [s] of each command that world has followed.
 
-        The echoes show when each command began. The interval from `start_ns` to `end_ns` is on
-        world's clock [ns].
+        The commands are those from `start_ns` to `end_ns` [ns], world's clock. The echoes show when
+        each of them began.
         """
         parts = list[tuple[Vector, float]]()
         for began_ns, stamp_ns in reversed(self._applied):
@@ -110,10 +117,10 @@ class History:
         return reversed(parts)
 
     def ahead(self, start_ns: int, end_ns: int, shift_ns: int) -> Iterator[tuple[Vector, float]]:
-        """Predict which sent commands world follows; yield velocity [m/s] and duration [s] of each.
+        """Predict which commands world follows from `start_ns` to `end_ns`, world's clock [ns].
 
-        The interval begins at `start_ns` and ends at `end_ns` [ns], world's clock. A command begins
-        at its stamp plus `shift_ns` [ns].
+        Yield velocity [m/s] and duration [s] of each command. World begins to follow a command at
+        the command's stamp plus `shift_ns` [ns].
         """
         index = bisect_right(self.stamps, start_ns - shift_ns)
         while start_ns < end_ns:
@@ -123,11 +130,11 @@ class History:
             start_ns, index = until_ns, index + 1
 
     def followed(self, count: int, start_ns: int, end_ns: int) -> list[tuple[Vector, float]]:
-        """List the velocities [m/s] of one command and the duration of each [s].
+        """List the velocities [m/s] of one command, and for how long world follows each [s].
 
-        A command with a plan has one velocity per step of the plan. `count` is the number of the
-        command in `commands`: 1 is the first, 0 means zero velocity. World follows the
-        command from `start_ns` to `end_ns` [ns], world's clock.
+        World follows the command from `start_ns` to `end_ns`, world's clock [ns]. A command with a
+        plan has one velocity per step of the plan. `count` = n selects the n-th of `commands`; with
+        `count` = 0, there is no command yet, and the velocity is zero.
         """
         command = self.commands[count - 1] if count else NO_COMMAND
         if not command.plan:
@@ -142,7 +149,7 @@ class History:
 
 
 class Body(Model):
-    """A model of the robot; its state is `horizon` [s] later than the odometry `basis`.
+    """A model of the robot, in the state predicted for `horizon` [s] after the sample `basis`.
 
     `position` [m] and `velocity` [m/s] are those of the base, world frame.
     """
@@ -163,7 +170,7 @@ class Body(Model):
         return self.odometry()
 
     def odometry(self) -> Odometry:
-        """Return the predicted state as odometry; the orientation turns at the measured rate."""
+        """Return the predicted state; its orientation follows from a constant angular velocity."""
         _, _, orientation, _, rate = self.basis
         return Odometry(
             self.basis.stamp_ns + round(self.horizon * 1e9),
@@ -175,7 +182,7 @@ class Body(Model):
 
 
 class Replay(Predictor):
-    """A predictor that simulates the sent commands with a `Body`; subclasses define `roll`."""
+    """Base of the predictors that feed the sent commands to a model of the robot."""
 
     def __init__(self) -> None:
         self.reset()
@@ -191,7 +198,10 @@ class Replay(Predictor):
         self.history.add(command)
 
     def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
-        """Store the time from which the robot follows the command."""
+        """Store the time `applied_ns` from which the robot follows the command with this stamp.
+
+        The time is on world's clock [ns], `command_stamp_ns` is on cloud's clock [ns].
+        """
         self.history.note_applied(command_stamp_ns, applied_ns)
 
     def observe(self, odometry: Odometry) -> None:
@@ -212,7 +222,7 @@ class Replay(Predictor):
         return self.roll(self.newest, (stamp_ns - self.newest.stamp_ns) * 1e-9)
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Predict the odometry `horizon` [s] after the newest sample from the sent commands."""
+        """Predict, by the sent commands, the odometry `horizon` [s] after the sample `odometry`."""
         self._last = self.roll(odometry, horizon)
         return self._last.odometry() if horizon else odometry
 

@@ -25,7 +25,10 @@ STEPS_MAX = 200
 
 
 class FirstOrder(Body):
-    """Model per axis: the guard's acceleration limit, a lag as dead time, a lag of the velocity."""
+    """A model of the velocity loop behind the guard's acceleration limit.
+
+    Each axis has two first-order lags in series: one for the dead time, one for the velocity.
+    """
 
     def __init__(self, axes: Axes, acceleration_max: float) -> None:
         """Begin at rest; `acceleration_max` [m/s^2] is the guard's acceleration limit."""
@@ -35,8 +38,8 @@ class FirstOrder(Body):
     def advance(self, command: Vector, dt: float) -> None:
         """Advance the state by `dt` [s] under a velocity command [m/s].
 
-        The time is divided into steps of about one control period. In each step the reference is
-        constant, and the response of the lags to it is exact.
+        The time is divided into steps of about one control period. Each step takes the reference
+        as constant, and solves the equations of the lags exactly.
         """
         steps = min(ceil(dt * 1e9 / PERIOD_NS - 0.5), STEPS_MAX) or 1
         for _ in range(steps):
@@ -60,15 +63,15 @@ class FirstOrder(Body):
 
 
 class CommandHistory(Replay):
-    """Adds the effect of the commands in the horizon to the measured position and velocity.
+    """Adds the effect of the commands during the horizon to the measured position and velocity.
 
-    The velocity loop is linear, except for the acceleration limit at its input. Therefore it is
-    enough to simulate all commands once, from rest: the difference between measured and simulated
-    velocity decays exponentially.
+    The velocity loop is linear, except for the acceleration limit at its input. Therefore the
+    difference between measured and simulated velocity decays exponentially, and one simulation of
+    all commands, from rest, is enough.
     """
 
     def __init__(self, axes: Axes, acceleration_max: float) -> None:
-        """Set the model of the velocity loop; `acceleration_max` is its limit [m/s^2]."""
+        """Set `axes` and acceleration limit `acceleration_max` [m/s^2] of the velocity loop."""
         self._axes, self._loop = axes, (axes, acceleration_max)
         super().__init__()
 
@@ -78,7 +81,7 @@ class CommandHistory(Replay):
         self._bodies: list[FirstOrder] = []  # at the stamp of each command
 
     def commanded(self, command: Command) -> None:
-        """Store a command, and the state of the simulated robot at the command's stamp."""
+        """Store a command, and the state of the predictor's model at the command's stamp."""
         body = self._at(command.stamp_ns)
         if self.history.add(command):
             if len(self._bodies) >= len(self.history.stamps):
@@ -86,7 +89,7 @@ class CommandHistory(Replay):
             self._bodies.append(body)
 
     def _at(self, time_ns: int) -> FirstOrder:
-        """Return the simulated robot at `time_ns`, on cloud's clock [ns]."""
+        """Return the predictor's model of the robot at `time_ns`, on cloud's clock [ns]."""
         history = self.history
         if not history.stamps:
             return FirstOrder(*self._loop)

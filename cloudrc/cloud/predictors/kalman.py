@@ -43,11 +43,11 @@ class Kalman(Predictor):
         self._replay.reset()
 
     def commanded(self, command: Command) -> None:
-        """Pass the command on to the predictor that replays the commands."""
+        """Pass a sent command on to `replay`, the predictor that simulates the commands."""
         self._replay.commanded(command)
 
     def applied(self, command_stamp_ns: int, applied_ns: int) -> None:
-        """Tell `replay`, which replays the commands, when world applied a command."""
+        """Pass the time at which world applied a command on to `replay`."""
         self._replay.applied(command_stamp_ns, applied_ns)
 
     def observe(self, odometry: Odometry) -> None:
@@ -80,9 +80,9 @@ class Kalman(Predictor):
         return gains
 
     def predict(self, odometry: Odometry, horizon: float) -> Odometry:
-        """Return the filtered newest sample, moved by the commands of the next `horizon` [s].
+        """Filter the newest sample `odometry`; extrapolate the result by `horizon` [s].
 
-        With a horizon of 0 the result is the sample as measured.
+        With a horizon of 0, return `odometry` without filtering.
         """
         if self._estimate is None or self._estimate.stamp_ns != odometry.stamp_ns:
             self.observe(odometry)
@@ -91,7 +91,7 @@ class Kalman(Predictor):
         return prediction if horizon else odometry
 
     def model(self) -> Model | None:
-        """Return the robot's model in the state of the last prediction; None before the first."""
+        """Return the robot's model in the last predicted state; None before any prediction."""
         return self._replay.model()
 
 

@@ -178,7 +178,7 @@ def _limit(reference: Vector, last: Vector, height: float, climb: float) -> Vect
 
 
 class ModelBased(Replay):
-    """Simulates a `WhiteBox`, from the newest odometry, under the commands in the horizon."""
+    """Simulates `WhiteBox`, a model of the robot, from the newest odometry to the horizon."""
 
     def __init__(self, gains: tuple[float, ...], acceleration_max: float) -> None:
         """Set the gains of the onboard velocity loop, and `acceleration_max` [m/s^2]."""
@@ -191,7 +191,7 @@ class ModelBased(Replay):
         self._body: WhiteBox | None = None  # at the newest sample
 
     def forecast(self, stamp_ns: int) -> WhiteBox | None:
-        """Return the model moved on to `stamp_ns` [ns]; None without recent odometry or command."""
+        """Predict the model's state at `stamp_ns` [ns]; None without recent odometry or command."""
         body = copy(self._body)
         if body is None or not 0 < stamp_ns - body.basis.stamp_ns < GAP_NS:
             return None

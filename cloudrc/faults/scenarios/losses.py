@@ -19,10 +19,9 @@ from cloudrc.messages import Cause, GuardState
     expects="stays in TRACK, no step above the acceleration cap",
 )
 def _short_silence(outcome: Outcome, seed: int) -> None:
-    """Interrupt both directions at the same time, then only one direction per flight.
+    """Fly three times: interrupt both directions, then only the uplink, then only the downlink.
 
-    In the flights with one interrupted direction, the link has no jitter: a jittered direction has
-    gaps of its own.
+    The last two flights have no jitter, because jitter, too, makes gaps between datagrams.
     """
     at = measures.instant(seed)
     both, steady = silent(at, 0.1), conditions(jitter=0.0)
@@ -66,7 +65,7 @@ def _silence(outcome: Outcome, seed: int) -> None:
     expects="HOLD; LAND after 60 s at 0.5 m/s; rotors stop after touch-down; stays in LAND",
 )
 def _long_silence(outcome: Outcome, seed: int) -> None:
-    """Interrupt the link for 75 s, once above the free floor and once among the pipes."""
+    """Interrupt the link for 75 s in two flights: above the free floor, and among the pipes."""
     flight = _landed(outcome, seed, measures.instant(seed, 1.6, 2.6), "over the floor")
     first, last = (flight.trajectory()[n].odometry.position for n in (0, -1))
     text = "over the floor: base above where it took off"

@@ -62,7 +62,7 @@ def _invalid_values(outcome: Outcome, seed: int) -> None:
 
 
 def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
-    """Return a lie: it makes `changes` to commands from `at` [s] on, for `duration` [s]."""
+    """Return a function that applies `changes` to commands from `at` [s] on, for `duration` [s]."""
 
     def lie(command: Command, control: Control) -> Command:
         now = control.stamp_ns * 1e-9
@@ -120,7 +120,6 @@ def _wall_of(pipe: Pipe) -> Vector:
     expects="the leg ends at its time limit, and HOLD begins",
 )
 def _unreachable(outcome: Outcome, seed: int) -> None:
-    """Command the robot to stay where it is, so that it cannot reach the next waypoint."""
     at, stays = measures.instant(seed, 12.0, 20.0), list[Vector]()
 
     def stalled(command: Command, control: Control) -> Command:

@@ -66,7 +66,6 @@ def _clocks(outcome: Outcome, seed: int) -> None:
     expects="estimator `split` within 20 % in 0.5 s; no HOLD; the caps hold",
 )
 def _delay_step(outcome: Outcome, seed: int) -> None:
-    """Raise the delay in one step; a jitter of 1 ms makes all round trips different."""
     at = measures.instant(seed)
     shape = conditions(delay=0.01, jitter=0.001, changes=(Change(at, delay=0.1),))
     flight = fly_safely(outcome, Flight("cloud.estimator=split", seed=seed, link=shape))

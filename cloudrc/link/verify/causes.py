@@ -35,7 +35,7 @@ class Evidence(NamedTuple):
 
 
 def read_metrics(text: str) -> dict[str, float]:
-    """Parse Prometheus' text format: "name" or "name/label value" -> value."""
+    """Parse metrics in Prometheus' text format: `cloudrc_a{b="c"} 1` gives {"a/c": 1.0}."""
     found = re.findall(r"^cloudrc_(\w+)(?:\{(.*)\})? (\S+)$", text, re.MULTILINE)
     names = ["/".join((name, *re.findall(r'="([^"]*)"', labels))) for name, labels, _ in found]
     return {name: float(value) for name, (_, _, value) in zip(names, found, strict=True)}
@@ -131,10 +131,10 @@ measured to requested value, and text."""
 
 
 def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
-    """Yield code and text of at most two causes of the quantities that are "off".
+    """Yield code and text of at most two reasons why quantities have the verdict "off".
 
-    The first is the cause for which the machine's counters are the best evidence. If it is missing
-    or "throttled", the next is a cause that the measured values suggest.
+    First comes the most certain cause that the machine's counters show. If there is no such cause,
+    or if its code is "throttled", the most certain cause by the measured values comes next.
     """
     off = {row.name: row for row in one.rows if row.verdict == "off"}
     lost = next((row.measured for row in one.rows if row.name == "loss"), 0.0)
@@ -149,10 +149,10 @@ def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
 
 
 def _of_machine(known: Evidence, off: Mapping[str, Row], lost: float) -> Iterator[tuple[str, str]]:
-    """Yield code and text of each cause why the link deviates, the most certain cause first.
+    """Yield code and text of each cause that this machine's counters show, the most certain first.
 
-    `known` has this machine's counters, which show the causes. `off` has the measurements outside
-    their limits, by name. `lost` is the share of lost packets.
+    `known` has the counters. `off` has the measurements outside their limits, by name. `lost` is
+    the share of lost packets.
     """
     where, elsewhere = known.interface or "the way out", " and ".join(known.elsewhere)
     sent, unshaped = known.sent or 0, known.shaper == "none"

@@ -62,8 +62,8 @@ class Flow(NamedTuple):
 class Row(NamedTuple):
     """Verdict on one quantity of one direction of a link; an unknown value is NaN.
 
-    `asked` is the requested value. A `measured` value from `low` to `high` is accepted. These four
-    values have the unit `unit` (any unit).
+    A `measured` value from `low` to `high` is accepted. `asked`, `measured`, `low` and `high` have
+    the unit `unit` (any unit).
     """
 
     name: str  # as in `Plan.quantities`, or "round_trip"
@@ -83,12 +83,16 @@ class Expected(NamedTuple):
     known: bool  # whether the random numbers are known, so that a band has no width
 
     def hidden(self, name: str) -> float:
-        """Return half the width of the band of the quantity `name`, divided by its tolerance."""
+        """Return how uncertain the expected value of quantity `name` is, relative to its tolerance.
+
+        The result is half the width of the band of likely values, divided by the tolerance [1].
+        Above CHANCE_MAX the verdict "ok" is impossible: the band would hide a deviation.
+        """
         mean, low, high = self.bands[name]
         return 0.5 * (high - low) / tolerance(name, mean)
 
     def judge(self, name: str, value: float) -> Row:
-        """Judge whether a correct link can give the measured `value` [any unit] of `name`."""
+        """Judge whether a correct link can give the `value` [any unit] of the quantity `name`."""
         mean, low, high = self.bands[name]
         slack, hidden = tolerance(name, mean), self.hidden(name)
         if self.known and name == "deviation":
@@ -104,9 +108,10 @@ class Expected(NamedTuple):
 class Plan:
     """A measurement of one direction: the requested profile, and the datagrams to send.
 
-    A train of datagrams is sent back to back. Before each train, the same number of datagrams is
-    sent one by one. `draw` calls `pause` every few hundred microseconds, so that other threads can
-    run.
+    A train is a group of datagrams that are sent back to back to measure the rate. Before each
+    train, the same number of datagrams is sent one by one to measure all other quantities.
+    A simulation of the transfer calls `pause` every few hundred microseconds, so that other threads
+    can run.
     """
 
     profile: DirectionProfile  # requested conditions
@@ -118,7 +123,7 @@ class Plan:
     def draw(self, sent: Floats, epoch: int = 1, first: int = 0) -> Stream:
         """Simulate the transfer of datagrams that are sent at `sent` [s] since the link came up.
 
-        The datagrams have the numbers from `first` on in the session `epoch`.
+        The counters of the datagrams begin at `first`, in the session `epoch`.
         """
         seed, uplink, kind, size = self.flow
         link = LinkDirection(self.profile, seed, uplink)
@@ -128,7 +133,11 @@ class Plan:
 
     @cached_property
     def links(self) -> list[Stream]:
-        """One stream per simulated netem link (200 links); short if the conditions are constant."""
+        """Simulated streams through 200 netem links with different random numbers.
+
+        They show how much correct links differ by chance. If the conditions are constant, a stream
+        has at most RUN_LENGTH datagrams.
+        """
         few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
         sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
         seeds = range(-RUNS, 0)  # the seed of an experiment is not negative
@@ -137,15 +146,15 @@ class Plan:
 
     @cached_property
     def chance(self) -> Expected:
-        """Expected values and their random variation, computed from the simulated `links`."""
+        """Expected quantities of a netem link; each band contains most of the simulated links."""
         return self._expect(self.links)
 
     def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:
         """Return the values that a correct link should give for the datagrams of a measured stream.
 
-        The values are exact if the stream shows the random numbers that a relay would draw.
-        Otherwise they are bands, from simulations of the link with different seeds. `first` is the
-        counter of the first datagram.
+        If the delays or losses in the stream are those that a relay computes for the session
+        `epoch`, the values are exact. Otherwise each value is a range, from simulations of the link
+        with different seeds. `first` is the counter of the first datagram.
         """
         drawn = self.draw(measured.sent, epoch, first)
         if self._fits(self._singles(measured), self._singles(drawn)):
@@ -158,9 +167,11 @@ class Plan:
         return self.chance._replace(bands=bands)
 
     def judge(self, measured: Stream, epoch: int = 1, first: int = 0) -> list[Row]:
-        """Judge a measured stream.
+        """Judge a measured stream; return one row per quantity.
 
-        If the stream cannot show a property, its row has the verdict "told" and no measured value.
+        If the stream cannot show a requested property, such as the rate without trains, its row has
+        only the requested value and the verdict "told". `first` is the counter of the first
+        datagram in the session `epoch`.
         """
         expected = self.expected(measured, epoch, first)
         found = self.quantities(measured, expected.pooled)
@@ -206,8 +217,8 @@ class Plan:
     def _fits(self, measured: Stream, drawn: Stream) -> bool:
         """Return whether the `measured` packets match the packets `drawn`.
 
-        `drawn` is the prediction from the relay's random numbers. Compare the delays or, if the
-        delays hardly vary, the losses.
+        `drawn` are the same packets as simulated with the relay's random numbers. Compare the
+        delays or, if the delays hardly vary, the losses.
         """
         lost = np.isnan(measured.delays), np.isnan(drawn.delays)
         both, requested = ~lost[0] & ~lost[1], _requested_delay(self.profile, drawn.sent)
@@ -233,13 +244,13 @@ class Plan:
         return Stream(*(one.reshape(-1, 2 * self.train)[:, : self.train].ravel() for one in parts))
 
     def _shape(self, stream: Stream) -> Floats:
-        """Return measured - requested delay of each arrived datagram [s], shifted to median 0."""
+        """Return measured minus requested delay of arrived datagrams [s], shifted to median 0."""
         delays = stream.delays - _requested_delay(self.profile, stream.sent)
         there: Floats = delays[np.isfinite(delays)]
         return there - np.median(there) if len(there) else there
 
     def _rate(self, stream: Stream) -> float:
-        """Compute the bottleneck's rate [bit/s] from the time in which a train arrives.
+        """Compute the bottleneck's rate [bit/s] from the time that a probe train takes to arrive.
 
         Source: M. Jain, C. Dovrolis, IEEE/ACM Trans. Networking 12, 2004: packet dispersion.
         """
@@ -261,8 +272,10 @@ def _requested_delay(profile: DirectionProfile, sent: Floats) -> Floats:
 def netem_makes(profile: DirectionProfile) -> DirectionProfile:
     """Return a profile with which the relay's link model behaves as netem does with `profile`.
 
-    netem hardly correlates delays. If netem selects a packet both for loss and for duplication, one
-    copy arrives. netem can also lose the second copy. Source: Linux, net/sched/sch_netem.c.
+    netem hardly correlates delays. A packet that netem selects both for loss and for duplication
+    arrives once. netem can also lose the copy of a duplicated packet.
+
+    Source: Linux, net/sched/sch_netem.c.
     """
     loss, lost, single = profile.loss, mean_loss(profile.loss), 1.0 - profile.duplicate
     twice = profile.duplicate * (1.0 - lost) ** 2 / max(1e-9, 1.0 - single * lost)

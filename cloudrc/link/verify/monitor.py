@@ -58,7 +58,7 @@ class LinkMonitor:
     def __init__(
         self, *, uplink: bool, flow: Flow, period: float = PERIOD, computes: bool = False
     ) -> None:
-        """Monitor a received `flow`: with `uplink` telemetry in cloud, else commands in world.
+        """Monitor the received `flow`: telemetry in cloud if `uplink`, else commands in world.
 
         `period` is the time between two datagrams of the flow [s]. `computes` tells whether cloud
         simulates a computing time; delays that contain this time are not judged.
@@ -79,14 +79,15 @@ class LinkMonitor:
     def begin(self, asked: Asked, path: Path | None, load: Load) -> None:
         """Start the thread, which judges the link by the requested profiles `asked`.
 
-        As soon as the state file `path` contains profiles, those replace `asked`; see `look`.
+        If there is a `path`, the thread reads the link's state file there. The profiles in this
+        file replace `asked`; `load` converts them from the values in the file.
         """
         self._inbox, self._pause = queue.SimpleQueue(), lambda: time.sleep(1e-4)
         self.follow(asked)
         threading.Thread(target=self._run, args=(path, load), name="link", daemon=True).start()
 
     def follow(self, asked: Asked | None) -> None:
-        """Replace the requested profiles. None means that they are unknown: judge nothing."""
+        """Set the profiles to judge the link by; None: they are unknown, so judge nothing."""
         if asked != self._asked:
             self._asked, self._fresh = asked, True
             sent = np.arange(float(RUN_LENGTH)) * self._period
@@ -96,14 +97,14 @@ class LinkMonitor:
             ]
 
     def after(self, records: Sequence[Record], now_ns: int) -> list[Record]:
-        """Process this end's new records at `now_ns` [ns]; return link verdicts and faults."""
+        """Process this end's new records at `now_ns` [ns]; return `LinkChecked`s and `Fault`s."""
         if self._inbox is None:
             return self._see(records, now_ns)
         self._inbox.put((records, now_ns))
         return [self._outbox.get_nowait() for _ in range(self._outbox.qsize())]
 
     def look(self, path: Path, load: Load) -> None:
-        """Read the requested profiles from the link's state file, `path`; `load` converts them."""
+        """Read the requested profiles from the link's state file; `load` parses them."""
         try:
             text = read(path, STATE_MAX).decode()
             if text != self._seen:
@@ -133,7 +134,7 @@ class LinkMonitor:
             threading.Event().wait(FOLLOW_PERIOD)
 
     def _see(self, records: Sequence[Record], now_ns: int) -> list[Record]:
-        """Store records; every `CHECK_NS`, return verdicts on the present session and profile."""
+        """Store records; return new verdicts every `CHECK_NS`, an empty list in between."""
         for record in records:
             if isinstance(record, Arrival):
                 self._fresh |= record.epoch != self._epoch
@@ -163,7 +164,7 @@ class LinkMonitor:
             kept.clear()
 
     def _report(self, rows: list[Row], now_ns: int) -> list[Record]:
-        """Make records of the verdicts; report "off" as "open" until the next check confirms it."""
+        """Make records of the verdicts; a first "off" becomes "open", a second stays "off"."""
         count, off = len(self._arrivals), {row.name for row in rows if row.verdict == "off"}
         if off - self._suspects:
             rows = [row._replace(verdict="open") if row.name in off else row for row in rows]
@@ -182,7 +183,7 @@ class LinkMonitor:
         return found
 
     def _rows(self) -> list[Row]:
-        """Judge all quantities; if a profile has a time line, add a row that says so."""
+        """Judge all quantities; the row "time_line" tells that a profile changes over time."""
         stream, first, timed = _in_order(self._arrivals, self._period)
         judged = timed and (self._uplink or not self._computes)
         rows, skipped = list[Row](), UNJUDGED if judged else UNJUDGED | DELAYS
@@ -209,9 +210,9 @@ class LinkMonitor:
     def _excuse(self, row: Row) -> Row:
         """Change a verdict "off" to "open" if late wakes of this machine may explain a long delay.
 
-        If a loop wakes late by t, each datagram that arrives meanwhile waits for up to t. The
-        number of these datagrams grows with t, and the square of their wait with t^2. Therefore the
-        mean square of the added delay grows with t^3.
+        If a loop wakes late by t, about t / period datagrams arrive meanwhile. The mean square of
+        their waits is t^2 / 3, so the sum of the squares is t^3 / (3 · period). The mean of
+        this sum over all wakes is the mean square of the delay that late wakes add.
         """
         late = np.array(self._lates or [0.0])
         added = 2.0 * max((late**2).mean(), (late**3).mean() / (3.0 * self._period)) ** 0.5

@@ -45,8 +45,8 @@ def plan_probes(
 
     Without `seconds`, the duration is long enough for a verdict, and covers the profile's time line
     up to a limit. If the profile limits the rate, the probes are large, and half of them are sent
-    in trains to measure the rate. `drawn` is True for netem, whose random numbers
-    nobody can predict.
+    in trains to measure the rate. `drawn` is True for netem: nobody can predict its random
+    numbers, so a verdict may need more probes.
     """
     timeline, train, step = Timeline(profile), 0, (2.0 if drawn else 1.0) / RATE
     if (rate := min(piece.rate or inf for piece in timeline.pieces)) <= RATE_MAX:
@@ -86,7 +86,7 @@ class ProbeEnd:
         self._delays, self._copies = np.full(count, inf), np.zeros(count, int)
 
     def _encode(self, number: int) -> bytes:
-        """Encode a probe; copies of its header fill the rest, so that damage is noticed."""
+        """Encode a probe: its header, repeated up to the full size, so that damage is noticed."""
         _, uplink, kind, size = self.plan.flow
         way = Direction.UPLINK if uplink else Direction.DOWNLINK
         header = encode_header(kind, way, 1, number)
@@ -99,7 +99,7 @@ class ProbeEnd:
             self.socket.sendto(self.probes[number], self.route)
 
     def receive(self, far: socket.socket) -> None:
-        """Read a datagram from the other end's socket `far`; record it if this end sent it."""
+        """Read a datagram from the other end's socket `far`; record this end's probes."""
         with suppress(OSError, ValueError):  # no receiver of an earlier probe; not a probe
             data, ancillary, _, _ = far.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
             at_ns, number = self._stamps.wall_ns(ancillary) or time.time_ns(), peek(data)[2]

@@ -22,7 +22,7 @@ LOOKS = (
 
 
 class Point(NamedTuple):
-    """A value with its interval; NaN if unknown."""
+    """A point of a line: a value, and its interval from `low` to `high`; NaN if unknown."""
 
     x: float  # any unit, or the index of a name
     middle: float  # any unit
@@ -33,7 +33,7 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One panel of the figure: a quantity, its unit, and for each setting a line of points."""
+    """One panel of the figure: a quantity, its unit, and a line of points per setting."""
 
     title: str
     unit: str

@@ -181,7 +181,10 @@ def _draw_inset(rows: Any, subject: Subject) -> None:
 
 
 def _free_box(axes: Axes, time: float, width: float, height: float) -> Bbox | None:
-    """Find a box near `time` [s] without curves; `width` and `height` are shares of the panel."""
+    """Find a place near `time` [s] for a box that no curve crosses; return None if there is none.
+
+    `width` and `height` of the box are shares of the panel.
+    """
     to_axes = axes.transData - axes.transAxes
     paths = [to_axes.transform_path(line.get_path()) for line in axes.lines]
     at = to_axes.transform((time, 0.0))[0]
@@ -204,7 +207,7 @@ ERROR = (
 
 
 def draw_error(subject: Subject) -> Figure:
-    """Draw the distance to the setpoint, as in the paper, and the errors of estimated positions."""
+    """Draw the distance to the setpoint and, in a second panel, the errors of the estimates."""
     figure, (tracking, accuracy) = subject.look.two_panels()
     flight, control, applied = subject.flight, subject.flight.control, subject.flight.applied
 

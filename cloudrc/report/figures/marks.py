@@ -28,7 +28,7 @@ HELD = " Red: the guard was in HOLD."
 
 
 def delays_of(direction: Direction) -> Timeline | None:
-    """Return the link conditions of a direction over time; None if its file is unreadable."""
+    """Return a direction's link conditions over time; None if a file for them is unreadable."""
     try:
         return Timeline(link_profile(direction))
     except BadInputError:
@@ -80,10 +80,10 @@ def parts(subject: Subject, *, uplink: bool) -> list[Part]:
 
 
 def bounds(subject: Subject, time: Array, *, uplink: bool) -> tuple[Array, Array] | None:
-    """Compute the profile's `band` of delays [s] at each `time` [s] since the flight's start.
+    """Compute delay - jitter and delay + jitter [s] at each `time` [s] since the flight's start.
 
-    Return the lower and the upper limit of the band. They are NaN in blackouts, and if the file of
-    a trace is missing. Return None if all are NaN.
+    The values are those of the profile in force. They are NaN in blackouts, and if the file of a
+    trace is missing. Return None if all are NaN.
     """
     low, high = np.full((2, len(time)), nan)
     found = parts(subject, uplink=uplink)

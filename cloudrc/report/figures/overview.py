@@ -60,12 +60,12 @@ def _pipe(pipe: Pipe, view: _View) -> list[Face]:
 
 
 class _View:
-    """A parallel projection of the scene; the longer side of the scene is horizontal in it."""
+    """A parallel projection of the scene, with the scene's longer side as the horizontal."""
 
     def __init__(self, points: Array, front: Array) -> None:
-        """Look at `points` [m], world frame, shape (n, 3), from the side to which `front` points.
+        """Choose the direction of view for `points` [m], world frame, shape (n, 3).
 
-        `front` is a vector in the world frame, shape (3,).
+        The viewer is on the side in the direction `front`, a vector in the world frame, shape (3,).
         """
         level = points[:, :2] - points[:, :2].mean(axis=0)
         x, y = np.linalg.svd(level, full_matrices=False)[2][0]
@@ -100,7 +100,7 @@ class _View:
 
 
 def draw(subject: Subject) -> Figure:
-    """Draw the figure, which has one panel."""
+    """Draw the overview of the flight in one panel."""
     truth, scene = subject.flight.truth, subject.flight.scene
     rows, path = _instants(subject), truth["position"]
     # The ends of the pipes' axes are enough to choose the view. The start is before the first pipe.
@@ -146,8 +146,8 @@ def _draw_floor(axes: Axes, view: _View, points: Array, height: float) -> None:
 def _instants(subject: Subject) -> list[int]:
     """Choose the rows of the true states at which to draw the robot.
 
-    They are at equal distances along the path, up to the touch of the board. A row too near to
-    another one is left out.
+    The rows are at equal distances along the path, up to the first touch of the board. Leave out a
+    row where the robot would be less than APART from a robot that is already drawn.
     """
     truth, touch = subject.flight.truth, first_touch(subject.flight)
     stamps = truth["stamp_ns"]

@@ -97,7 +97,7 @@ class PositionHold:
         return step_towards(reference, (x, y, z - sink), BRAKE * dt)
 
     def _brake(self, reference: Vector, readings: Readings, sink: float, dt: float) -> Vector:
-        """Brake for one step of `dt` [s]; set the hold point once the robot is at rest."""
+        """Brake for one step of `dt` [s]; at the velocity of the descent, set the hold point."""
         if not self.brakes:
             reference, self.brakes = brake_start(reference, readings.velocity), True
         x, y, z = reference
@@ -132,11 +132,11 @@ def brake_rate(speed: float) -> float:
 
 
 class Descent:
-    """Detect the touch-down of a descent, and decide whether the robot may stop above the ground.
+    """Detects the touch-down of a descent, and decides whether the robot may stop in the air.
 
     After the operator's acknowledgement, the robot stops its descent and holds its position, if
-    nothing stops it from sinking and it is above the lowest z for a hold. Otherwise the robot
-    descends to touch-down, because a hold would make it scrape along the ground or an obstacle.
+    it sinks unhindered and is above the lowest z for a hold. Otherwise the robot descends to
+    touch-down, because a hold would make it scrape along the ground or an obstacle.
 
     Attributes:
         speed: Planned speed of the descent [m/s].
@@ -156,8 +156,8 @@ class Descent:
     def may_stop(self, readings: Readings) -> bool:
         """Return whether the robot may stop its descent in the air, and hold its position there.
 
-        The operator must have acknowledged the landing; the robot must sink freely, and be above
-        the lowest height for a position hold.
+        The operator must have acknowledged the landing. The robot must sink at more than half the
+        planned speed, and be above the lowest height for a position hold.
         """
         free = readings.velocity[2] < -0.5 * self.speed and readings.position[2] > self._floor
         return self.acknowledged and free
@@ -174,12 +174,12 @@ class Descent:
 
 
 class TakeOff:
-    """Detect the end of the take-off, and decide whether the robot may take off.
+    """Detects the end of the take-off, and decides whether the robot may take off.
 
     `over` becomes True when the robot has left the ground. If the rotors stopped in the air, the
-    robot may still fall, or be outside the fence, when the operator acknowledges the stop. It may
-    then take off only after it has come to rest on the ground, at least TAKE_OFF_MARGIN inside the
-    fence.
+    robot may still fall, or be outside the fence, when the operator acknowledges the stop. Before
+    the robot may take off again, it has to come to rest on the ground, at least TAKE_OFF_MARGIN
+    inside the fence.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
@@ -197,7 +197,10 @@ class TakeOff:
 
     @property
     def condition(self) -> Cause:
-        """Cause to record when the operator acknowledges LAND or ESTOP, and GROUND begins."""
+        """Why the guard is in GROUND after the operator's acknowledgement.
+
+        The cause tells whether the robot must be at rest before it may take off.
+        """
         return Cause.ACKNOWLEDGED if self.allowed else Cause.STILL_FIRST
 
     def forget(self, *, stopped: bool = False) -> None:
@@ -211,10 +214,10 @@ class TakeOff:
             self._stopped, self._still_ticks, self._height = True, 0, nan
 
     def look(self, readings: Readings, flies: bool) -> None:
-        """Process the sensor readings of a physics step.
+        """Process the sensor readings of a physics step; `flies` tells whether the rotors turn.
 
-        If `flies` is True, the robot flies: update `over`. Otherwise update the robot's height on
-        the ground and its time at rest.
+        While the rotors turn, update `over`: whether the robot has left the ground. While they
+        stand still, update the robot's height on the ground and its time at rest.
         """
         height = readings.position[2]
         if flies:

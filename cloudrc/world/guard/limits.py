@@ -48,7 +48,7 @@ ROUNDING_FACTOR = 1.0 - 2.0**-45
 
 
 def stopping_distance(speed: float, reaction: float) -> float:
-    """Return the stopping distance [m] from a `speed` [m/s] with a reaction time [s]."""
+    """Return the distance [m] to stop from `speed` [m/s]: `reaction` time [s], then braking."""
     return speed * (reaction + speed * STOP_COEFFICIENT)
 
 
@@ -62,9 +62,9 @@ def clamp(value: float, low: float, high: float) -> float:
 def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
     """Return the largest velocity towards a face of the fence [m/s].
 
-    The result v solves reaction · v + v^2/6 = distance, where `distance` is the distance to the
-    face minus the margin [m] and `reaction` the reaction time [s]. If `distance` is negative, v is
-    negative, so that the robot returns.
+    The result v solves reaction · v + v^2/6 = distance; v^2/6 is the braking distance at 3 m/s^2.
+    `distance` is the distance to the face minus the fence's margin [m], `reaction` the reaction
+    time [s]. If `distance` is negative, v is negative, so that the robot returns.
     """
     if distance > FAR:
         return inf
@@ -193,8 +193,8 @@ class Limits:
         speed_max: Largest speed of the velocity reference [m/s].
         acceleration_max: Largest rate of change of the velocity reference [m/s^2].
         yaw_rate_max: Largest yaw rate [rad/s].
-        hold_max_ns: Longest HOLD in a mission before LAND begins [ns]; on the ground,
-            `alone_max_ns` applies.
+        hold_max_ns: Longest HOLD in a mission before LAND begins [ns]. A robot on the ground waits
+            as long for commands, but at least `GROUND_WAIT_MIN_NS`.
         plan_max_ns: Longest time for which the robot flies a command's plan after its arrival [ns];
             0: a plan does not extend the time for which its command is fresh.
     """
@@ -212,8 +212,8 @@ class Limits:
         """Check the limits; raise a ValueError that names the first invalid limit.
 
         Each limit has to be finite and above 0; only `plan_max_ns` may be 0. From `speed_max` the
-        robot has to stop within `STOPPING_DISTANCE`. It starts to brake after the largest age of a
-        command, the longest plan and the reaction time.
+        robot has to stop within `STOPPING_DISTANCE`. Before it brakes, it flies on for the sum of
+        the largest age of a command, the longest plan and the reaction time.
         """
         for name in self.__slots__[2:-1]:
             value = getattr(self, name)
@@ -233,10 +233,10 @@ class Limits:
 
     @property
     def ramp_ns(self) -> int:
-        """Time after a HOLD in which the reference accelerates by at most BRAKE [ns].
+        """How long after a HOLD the acceleration of the reference is limited to BRAKE [ns].
 
-        In this time the robot can reach its highest speed. The limit also applies after the
-        reference has reached the command, because the first commands after a silence may be zero.
+        In this time the robot can reach its highest speed. The limit does not end earlier when the
+        reference reaches the command, because the first commands after a silence may be zero.
         Source: docs/reference/plant.md, "Leaving HOLD".
         """
         return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)

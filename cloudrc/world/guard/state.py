@@ -83,10 +83,11 @@ class Guard:
         cause: Why the guard is in this state; in LAND always the reason of the landing.
         armed: Whether a mission is active: from the operator's start to its end, LAND or ESTOP.
         reference: Velocity reference of the last step [m/s], world frame, shape (3,).
-        yaw_rate: Limited yaw rate [rad/s]; the published low-level controller ignores it.
+        yaw_rate: Limited yaw rate [rad/s]; unused, as the low-level controller keeps a yaw of 0.
         changes: Changes of the state since the last `take_changes`.
-        counts: How often each limit was applied: "limited_speed" to a command or to a velocity of a
-            plan, "limited_yaw_rate" to a command, "limited_fence" in a step.
+        counts: "limited_speed": number of shortened velocities of commands and plans;
+            "limited_yaw_rate": commands with a limited yaw rate; "limited_fence": steps in which
+            the fence limited the reference.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -171,8 +172,9 @@ class Guard:
     def accept_command(self, command: Command, now_ns: int) -> str | None:
         """Accept a command at `now_ns` [ns] and return None, or return the reason to reject it.
 
-        The reason is "range" for a number that is too large or NaN and for an impossible plan,
-        "stale" for a basis that is too old, and "future" for a basis later than `now_ns`.
+        The reason is "range" for a number that is too large or NaN and for an impossible plan.
+        It is "stale" if the odometry from which cloud computed the command is too old, and "future"
+        if this odometry is later than `now_ns`.
         """
         velocity, yaw_rate = command.velocity, command.yaw_rate
         x, y, z = velocity
@@ -239,10 +241,11 @@ class Guard:
             self._ramp_until_ns = now_ns + self._limits.ramp_ns
 
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
-        """Return whether a command at `now_ns` may begin TRACK; it is fresh to `fresh_until_ns`.
+        """Return whether TRACK may begin at `now_ns`; prevent fast changes between TRACK and HOLD.
 
-        Take-off must be allowed. At least SETTLE_NS must lie between the start of the last TRACK
-        and `now_ns`, and between the start of the last HOLD and `fresh_until_ns`.
+        Take-off must be allowed, and the last TRACK must have begun at least SETTLE_NS ago. The
+        last HOLD must have begun at least SETTLE_NS before `fresh_until_ns`: at this time the
+        present command becomes too old, and the next HOLD may begin.
         """
         apart_ns = min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns)
         return self._take_off.allowed and apart_ns >= SETTLE_NS
@@ -279,11 +282,11 @@ class Guard:
         return self.reference
 
     def plain_track(self, now_ns: int) -> tuple[int, Vector, Vector, int] | None:
-        """Return the guard's values for steps in C (`native/step.c`) from `now_ns` [ns] on.
+        """Return the values with which C (`native/step.c`) runs `step` from `now_ns` [ns] on.
 
-        The four values are the time of the plan's next velocity [ns], the velocity reference and
-        the commanded velocity [m/s], and the time until which the command is fresh [ns]. Return
-        None if the guard's `step` has to run instead.
+        The values are: start of the plan's next velocity [ns], velocity reference [m/s], commanded
+        velocity [m/s], and end of the time in which the robot may follow the command or plan [ns].
+        Return None in all cases that only `step` handles, such as HOLD and the take-off.
         """
         if not (self._take_off.over and self._ramp_until_ns <= now_ns <= self._track_until_ns):
             return None
@@ -292,7 +295,7 @@ class Guard:
         return self._next_ns, self.reference, self._wanted, self._track_until_ns
 
     def _follow(self, reference: Vector, now_ns: int, readings: Readings, dt: float) -> None:
-        """Limit a velocity reference to keep the robot upright and inside the fence; store it."""
+        """Store a velocity reference, limited to keep the robot upright and inside the fence."""
         climb, position = readings.velocity[2], readings.position
         if reference[2] < climb - rules.SINK_LEAD_MAX:
             reference = rules.limit_sink(reference, self.reference, climb, self._speed_max)
@@ -307,7 +310,7 @@ class Guard:
         self.reference = reference
 
     def _look_after_itself(self, now_ns: int, readings: Readings) -> None:
-        """Change the state if necessary while there is no fresh command."""
+        """Change the guard's state if necessary, in a step without a fresh command."""
         state, limits = self.state, self._limits
         if state is TRACK and self._track_until_ns == NEVER_NS:
             self._enter(HOLD, now_ns, Cause.SESSION)

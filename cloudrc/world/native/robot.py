@@ -83,10 +83,10 @@ class Flight(ctypes.Structure):
 
 
 def make_flight(simulator: Simulator, controller: LowLevel, limits: Limits) -> Flight:
-    """Make a `Flight` with all fields except the present state.
+    """Make the C structure `Flight`; fill all fields except the present state of the robot.
 
     Call `make_flight` after a reset of the simulator. Raise an OSError, AttributeError, KeyError or
-    ImportError if MuJoCo is not as expected.
+    ImportError if this version of MuJoCo lacks a part that `step.c` needs.
     """
     model, data = simulator.model, simulator.data
     turning, (low, high) = rotors.Rotors(simulator.dt), limits.inner_corners()
@@ -118,8 +118,9 @@ def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
     """Return a box with rounded edges around each geom of the scene, and the robot's radius [m].
 
     Each row of the array is a box: centre (3,) [m], axes (9,), half sizes (3,) [m], radius of the
-    edges [m]. A ball with the robot's radius around the base's origin contains the robot. If the
-    model has other forces than those of contacts, such as springs, the radius is infinite.
+    edges [m]. The steps in C search for contacts only while a ball with the robot's radius around
+    the base's origin touches a box. If the model has springs or similar forces, the radius is
+    infinite, so that C never leaves out the search.
     """
     option, rows, radius = model.opt, [], 0.0
     other = option.density, option.viscosity, model.nflex, model.npair, model.neq, model.ntendon
@@ -207,23 +208,21 @@ def make_robot(simulator: Simulator, low_level: LowLevel, guard: Guard, limits: 
 
 
 def usable() -> Library:
-    """Return the library of `step.c`; `run` is None if the code is missing or fails its test."""
+    """Return the compiled `step.c`; its field `run` is None if it is missing or fails its test."""
     found = library()
     return found if found.run is None or not (wrong := _self_test()) else Library(None, wrong)
 
 
 class NativeRobot(Robot):
-    """A `Robot` whose usual steps run in C, in `step.c`.
+    """A `Robot` that simulates usual steps in C (`step.c`) and all others in Python.
 
-    In a usual step the robot follows a fresh command that the guard need not limit. Python runs all
-    other steps. It runs every step while the robot has observers, or while the simulator stores its
-    controls in a `tape`.
+    In a usual step the robot follows a fresh command that the guard need not limit. No step runs in
+    C while the robot has observers, or while `Simulator.tape` records the controls of each step.
     """
 
     def __init__(
         self, simulator: Simulator, low_level: LowLevel, guard: Guard, limits: Limits
     ) -> None:
-        """Connect the parts; `limits` are those of the guard."""
         super().__init__(simulator, low_level, guard)
         self._flight = make_flight(simulator, low_level, limits)
         self._address = ctypes.addressof(self._flight)
@@ -233,14 +232,15 @@ class NativeRobot(Robot):
         self._in_c = False  # whether C has the newest state of the controller
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
-        """Reset the robot to its spawn; see `Robot.put_on_ground`."""
+        """Reset the robot to its spawn with stopped rotors, and record the reason `cause`."""
         self._in_c = False
         super().put_on_ground(now_ns, cause)
 
     def run(self, tick_ns: int, until_ns: int) -> int:
-        """Run steps like `Robot.run`: in C up to the first step that only Python can run.
+        """Run steps from `tick_ns` up to `until_ns`; return the time of the next step [ns].
 
-        Python then runs this step and all later ones. The class describes the steps that C runs.
+        C runs the steps while the robot follows a fresh command that the guard need not limit.
+        Python runs the first other step, and all steps after it.
         """
         simulator, guard = self.simulator, self.guard
         in_c = not self.observers and simulator.tape is None
@@ -271,7 +271,7 @@ class NativeRobot(Robot):
         return super().run(tick_ns, until_ns)
 
     def _give(self, reference: Vector, wanted: Vector, track_ns: int) -> None:
-        """Copy the state and these values of `Guard.plain_track` to the C structure `Flight`."""
+        """Copy the robot's state and the arguments to the C structure, before steps in C."""
         simulator = self.simulator
         tip = simulator.tip_force_peak, simulator.tip_impulse
         counts = simulator.contacts, simulator.steps
@@ -303,7 +303,7 @@ def _self_test() -> str:
 
 
 def _fly(robot: Robot) -> list[object]:
-    """Take off and fly curves for 0.8 s; return the states of robot and guard."""
+    """Fly the self-test: 0.8 s with take-off and curves; return the states on the way."""
     robot.put_on_ground(0, "self-test")
     robot.guard.start_mission(0)
     seen: list[object] = []
