@@ -18,8 +18,7 @@ import numpy as np
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
 from cloudrc.errors import BadInputError
-from cloudrc.faults.scenario import generator
-from cloudrc.faults.schedule import DURATION, PAPER, Schedule, compose
+from cloudrc.faults.schedule import DURATION, PAPER, Schedule, compose, generator
 from cloudrc.geometry.fence import HIGH, LOW
 from cloudrc.messages import (
     MISSION_OVER,

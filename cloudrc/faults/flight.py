@@ -21,7 +21,7 @@ from cloudrc.endpoint import Endpoint
 from cloudrc.faults.adversary import DishonestLoop, HostileOperator, Lie, Words
 from cloudrc.faults.invariants import Watch
 from cloudrc.faults.models import EndpointGroup, RestartableEndpoint, TeleopModel
-from cloudrc.faults.scenario import generator
+from cloudrc.faults.schedule import generator
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, DirectionProfile
 from cloudrc.messages import GuardState

@@ -11,8 +11,12 @@ import yaml
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from cloudrc.errors import BadInputError, to_one_line
-from cloudrc.faults.scenario import generator
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
+
+
+def generator(seed: int, use: int) -> np.random.Generator:
+    """Make a random generator; different numbers `use` give independent sequences."""
+    return np.random.Generator(np.random.PCG64([seed, use]))
 
 
 class Kind(NamedTuple):

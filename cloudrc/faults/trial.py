@@ -23,8 +23,7 @@ from cloudrc.faults.flight import SECRET, Flight
 from cloudrc.faults.invariants import LATCHED, Breach
 from cloudrc.faults.measures import events_of_missions, held
 from cloudrc.faults.models import Action, Call, RestartableEndpoint, Tamper
-from cloudrc.faults.scenario import generator
-from cloudrc.faults.schedule import Event, Schedule, shaped
+from cloudrc.faults.schedule import Event, Schedule, generator, shaped
 from cloudrc.messages import Command, GuardState
 from cloudrc.records import Control, GuardChange, Record
 from cloudrc.teleop.service import MissionService

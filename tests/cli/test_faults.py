@@ -5,7 +5,7 @@ import json
 import pytest
 
 from cloudrc.cli.pool import WorkerDiedError
-from cloudrc.faults.scenario import Outcome
+from cloudrc.faults.measures import Outcome
 from cloudrc.faults.schedule import Schedule
 from cloudrc.faults.trial import Finding
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cloudrc.faults.flight import Flight, conditions
-from cloudrc.faults.scenario import generator
+from cloudrc.faults.schedule import generator
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.records import Arrival, CommandApplied, Control, TelemetrySent

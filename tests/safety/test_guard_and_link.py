@@ -4,7 +4,7 @@ import pytest
 
 from cloudrc.faults.adversary import POLICIES, at_bad_moments
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.scenario import generator
+from cloudrc.faults.schedule import generator
 from cloudrc.messages import GuardState
 from cloudrc.world.guard.state import Guard
 

@@ -9,8 +9,8 @@ from typing import TypeAlias
 
 from cloudrc.faults import measures
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.measures import fly_safely, refused
-from cloudrc.faults.scenario import Outcome, generator, scenario
+from cloudrc.faults.measures import Outcome, fly_safely, refused, scenario
+from cloudrc.faults.schedule import generator
 from cloudrc.faults.trial import flipped
 from cloudrc.tunnel import codec
 
