@@ -20,7 +20,7 @@ from cloudrc.drivers.virtual import Clock, VirtualRun
 from cloudrc.endpoint import Endpoint
 from cloudrc.faults.adversary import DishonestLoop, HostileOperator, Lie, Words
 from cloudrc.faults.invariants import Watch
-from cloudrc.faults.models import EndpointGroup, RestartableEndpoint, TeleopModel
+from cloudrc.faults.models import RestartableEndpoint, TeleopModel
 from cloudrc.faults.schedule import generator
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import Blackout, DirectionProfile
@@ -149,8 +149,7 @@ class Flight:
 
     def end_rival(self) -> None:
         """Stop the second cloud, so that the first cloud can control the robot again."""
-        if isinstance(self.cloud.inner, EndpointGroup):
-            self.cloud.inner.members = self.cloud.inner.members[:1]
+        self.cloud.members = self.cloud.members[:1]
         self._second = None
 
     def sha256(self) -> str:
@@ -179,13 +178,13 @@ class Flight:
             return GuardState.GROUND, "the world is down"
         return self.robot.guard.state, self.robot.guard.cause.words
 
-    def _build_world(self, start_ns: int) -> WorldEndpoint:
+    def _build_world(self, start_ns: int) -> list[Endpoint]:
         identity = self._begin("world", SHARED)
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
         self.watch.attach(world.robot, start_ns, honest=self._honest)
-        return world
+        return [world]
 
-    def _build_cloud(self, start_ns: int) -> Endpoint:
+    def _build_cloud(self, start_ns: int) -> list[Endpoint]:
         identity = self._begin("cloud", self._clock_id)
         teleop: Operator = self.teleop.join(start_ns)
         if self._words is not None:
@@ -195,9 +194,9 @@ class Flight:
             self.experiment, identity, lambda: start_ns, teleop, make_loop=make_loop
         )
         if self._second is None:
-            return cloud
+            return [cloud]
         joins_ns = max(self._clock.at(round(self._second * 1e9)), start_ns)
-        return EndpointGroup([cloud, self._build_rival(joins_ns)])
+        return [cloud, self._build_rival(joins_ns)]
 
     def _build_rival(self, start_ns: int) -> CloudEndpoint:
         """Build a second cloud with the same key; it has its own teleop and the same mission."""

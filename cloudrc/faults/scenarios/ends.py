@@ -15,7 +15,6 @@ from cloudrc.faults import measures
 from cloudrc.faults.adversary import Lie
 from cloudrc.faults.flight import Flight, silent
 from cloudrc.faults.measures import Outcome, fly_safely, refused, scenario
-from cloudrc.faults.models import EndpointGroup
 from cloudrc.faults.schedule import generator
 from cloudrc.geometry import fence
 from cloudrc.geometry.scene import Pipe, load_scene
@@ -107,8 +106,6 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
 def _two_clouds(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed, 4.0, 12.0)
     flight = Flight(seed=seed, second=at)
-    group = flight.cloud.inner
-    assert isinstance(group, EndpointGroup)
     flight.fly(at + 5.0)
     opened = max(measures.epochs(flight), default=-1)
     outcome.same("epochs while both clouds run", opened, 2)
@@ -116,11 +113,11 @@ def _two_clouds(outcome: Outcome, seed: int) -> None:
     outcome.same("HOLDs while both clouds run", len(measures.held(flight)), 0)
     faults = [record for record in flight.of_cloud if isinstance(record, Fault)]
     outcome.same("faults that the first cloud reports", len(faults), 0)
-    group.members = group.members[1:]  # the first leaves
+    flight.cloud.members = flight.cloud.members[1:]  # the first leaves
     flight.fly(at + 14.0)
     measures.safe(outcome, flight)
     refused(outcome, flight, "busy")
-    told = measures.told(group.others, "busy")
+    told = measures.told(flight.cloud.others, "busy")
     outcome.true("the second reports once why it waits", [r.text for r in told] == [BUSY_TEXT])
     said = min((r.stamp_ns * 1e-9 for r in told), default=nan)
     outcome.most("the second cloud reports it after", said - at, 1.0, "s")
