@@ -191,6 +191,7 @@ def search(options: argparse.Namespace) -> int:
 
     kind, shown = "adversarial" if options.adversarial else "random", options.output == "table"
     searched = Search(kind, options.first, options.store)
+    document = searched.document
 
     def take(failure: dict[str, Any] | None) -> None:
         if failure is not None and shown:
@@ -202,8 +203,7 @@ def search(options: argparse.Namespace) -> int:
     flights = searched.run(options.minutes, map_in_order, options.jobs)
     cause, code = take_each(flights, take)
     again = f"cloudrc faults search{' --adversarial' if options.adversarial else ''}"
-    again += f" --first {searched.next}"
-    document = searched.document()
+    again += f" --first {document['next']}"
     if shown:
         print(f"\n{table(search_rows(document), right=(1, 2))}\n\n{search_summary(document)}")
         print(f"to continue: {again}")
@@ -211,4 +211,4 @@ def search(options: argparse.Namespace) -> int:
         print(format_document(document, options.output))
     if cause:
         print(f"cloudrc: {cause}; continue with '{again}'", file=sys.stderr, flush=True)
-    return code or (FAILED if searched.failures else 0)
+    return code or (FAILED if document["failures"] else 0)

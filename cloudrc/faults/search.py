@@ -6,7 +6,6 @@ Seeds are consecutive numbers. To continue a search that ended before seed N, us
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -32,18 +31,27 @@ def fly_seed(job: Job) -> Finding:
 
 
 class Search:
-    """A search for faults that break an invariant, and its result; `next` is the next seed."""
+    """A search for faults that break an invariant; `document` is the result so far, for JSON."""
 
     def __init__(self, kind: str, first: int, store: Path) -> None:
         """Prepare a search from the seed `first` on; `kind` is a key of `KINDS`.
 
         The search writes schedules that break an invariant to the folder `store`.
         """
-        self.kind, self.first, self.next, self._store = kind, first, first, store
-        self.failures: list[dict[str, Any]] = []  # schedules that broke an invariant
-        self._checked: Counter[str] = Counter()
-        self._broken: Counter[str] = Counter()
-        self._margin, self._speed, self._seconds, self._missions = 9.0, 0.0, 0.0, 0
+        self._store = store
+        self.document: dict[str, Any] = {
+            "schemaVersion": 1,
+            "kind": kind,
+            "first": first,
+            "next": first,
+            "count": 0,
+            "seconds": 0.0,
+            "invariants": {name: {"judged": 0, "broken": 0} for name in INVARIANTS},
+            "smallest_margin_m": 9.0,
+            "largest_speed_mps": 0.0,
+            "missions_done": 0,
+            "failures": [],
+        }
 
     def run(
         self, minutes: float, call: Map, jobs: int = 1
@@ -53,46 +61,31 @@ class Search:
         Yields:
             After each flight: the stored failure, or None if no invariant was broken.
         """
-        began = time.monotonic()
+        began, found = time.monotonic(), self.document
         while True:
-            chunk = [(self.kind, self.next + n) for n in range(CHUNK)]
+            chunk = [(found["kind"], found["next"] + n) for n in range(CHUNK)]
             for finding in call(fly_seed, chunk, jobs):
                 failure = self._take(finding)
-                self._seconds = time.monotonic() - began
+                found["seconds"] = time.monotonic() - began
                 yield failure
-                if self._seconds >= 60.0 * minutes:
+                if found["seconds"] >= 60.0 * minutes:
                     return
 
-    def document(self) -> dict[str, Any]:
-        """Return the result so far as plain values, for JSON."""
-        return {
-            "schemaVersion": 1,
-            "kind": self.kind,
-            "first": self.first,
-            "next": self.next,
-            "count": self.next - self.first,
-            "seconds": self._seconds,
-            "invariants": {
-                name: {"judged": self._checked[name], "broken": self._broken[name]}
-                for name in INVARIANTS
-            },
-            "smallest_margin_m": self._margin,
-            "largest_speed_mps": self._speed,
-            "missions_done": self._missions,
-            "failures": self.failures,
-        }
-
     def _take(self, finding: Finding) -> dict[str, Any] | None:
-        self.next += 1
-        self._checked.update(checked_in(finding.schedule))
-        self._broken.update(finding.kinds)
-        self._margin = min(self._margin, finding.margin)
-        self._speed = max(self._speed, finding.speed)
-        self._missions += finding.missions
+        found, judged = self.document, checked_in(finding.schedule)
+        found["next"] += 1
+        found["count"] += 1
+        for name, counts in found["invariants"].items():
+            counts["judged"] += name in judged
+            counts["broken"] += name in finding.kinds
+        found["smallest_margin_m"] = min(found["smallest_margin_m"], finding.margin)
+        found["largest_speed_mps"] = max(found["largest_speed_mps"], finding.speed)
+        found["missions_done"] += finding.missions
         if not finding.breaches:
             return None
-        self.failures.append(self._keep(finding))
-        return self.failures[-1]
+        failure = self._keep(finding)
+        found["failures"].append(failure)
+        return failure
 
     def _keep(self, finding: Finding) -> dict[str, Any]:
         schedule, seed = finding.schedule, finding.schedule.seed
