@@ -2,7 +2,8 @@
 
 scenarios/             named faults with checks of the required reaction
 measures               checks, their result, and measurements in a flight for them
-schedule, adversary    random faults of one flight; dishonest clouds
+schedule, inject       random faults of one flight, and how they are injected
+adversary              dishonest clouds
 models, flight         models of processes, clocks and teleop; a whole flight
 invariants             safety rules, checked after every step of the physics
 trial, search          fly one schedule of faults; search over many schedules

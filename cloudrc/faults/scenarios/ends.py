@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from math import hypot, inf, nan
 from typing import Any
 
@@ -13,9 +12,9 @@ from cloudrc.config.mission_check import check_mission
 from cloudrc.config.schema import Mission
 from cloudrc.faults import measures
 from cloudrc.faults.adversary import Lie
-from cloudrc.faults.flight import Flight, silent
+from cloudrc.faults.flight import Flight
 from cloudrc.faults.measures import Outcome, fly_safely, refused, scenario
-from cloudrc.faults.schedule import generator
+from cloudrc.faults.schedule import Event, Schedule, Way, generator
 from cloudrc.geometry import fence
 from cloudrc.geometry.scene import Pipe, load_scene
 from cloudrc.messages import Command, GuardState, Vector
@@ -42,8 +41,7 @@ EXCESSIVE: dict[str, dict[str, Any]] = {
 )
 def _cloud_killed(outcome: Outcome, seed: int) -> None:
     at, down = measures.instant(seed), 0.8
-    flight = Flight(seed=seed)
-    flight.cloud.at(at, partial(flight.cloud.restart, down=down))
+    flight = Flight(Schedule(seed, events=(Event("cloud_killed", at, down),)))
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
     commands = [r.stamp_ns * 1e-9 - at for r in flight.of_world if isinstance(r, CommandApplied)]
@@ -60,9 +58,8 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
     expects="HOLD; world applies no command that is too old",
 )
 def _cloud_paused(outcome: Outcome, seed: int) -> None:
-    at = measures.instant(seed)
-    flight = Flight(seed=seed)
-    flight.cloud.at(at, partial(flight.cloud.freeze, duration=5.0))
+    paused = Event("cloud_paused", measures.instant(seed), 5.0)
+    flight = Flight(Schedule(seed, events=(paused,)))
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
@@ -79,8 +76,7 @@ def _cloud_paused(outcome: Outcome, seed: int) -> None:
 )
 def _world_restarted(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
-    flight = Flight(seed=seed)
-    flight.world.at(at, partial(flight.world.restart, down=2.0))
+    flight = Flight(Schedule(seed, events=(Event("world_killed", at, 2.0),)))
     flight.fly(at + 12.0)
     measures.safe(outcome, flight)
     after = [c for c in flight.changes if c.stamp_ns * 1e-9 > at]
@@ -105,7 +101,7 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
 )
 def _two_clouds(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed, 4.0, 12.0)
-    flight = Flight(seed=seed, second=at)
+    flight = Flight(Schedule(seed, events=(Event("second_cloud", at, 60.0),)))
     flight.fly(at + 5.0)
     opened = max(measures.epochs(flight), default=-1)
     outcome.same("epochs while both clouds run", opened, 2)
@@ -142,13 +138,11 @@ def _swizzle(outcome: Outcome, seed: int) -> None:
     starts = measures.instant(seed) + np.cumsum(rng.uniform(0.1, 1.0, 5))
     ends = rng.permutation(starts[-1] + np.cumsum(rng.uniform(0.1, 1.5, 5)))
     spans = zip(starts.tolist(), (ends - starts).tolist(), strict=True)
-    uplink, downlink, cloud, world, teleop = spans
-    limit, links = "criteria.time_limit_s=120", (silent(*uplink), silent(*downlink))
-    flight = Flight(limit, seed=seed, uplink=links[0], downlink=links[1])
-    for process, (start, duration) in ((flight.cloud, cloud), (flight.world, world)):
-        process.at(start, partial(process.freeze, duration=duration))
-    flight.cloud.at(teleop[0], flight.teleop.kill)
-    flight.cloud.at(sum(teleop), flight.teleop.start)
+    ways: tuple[Way, ...] = ("up", "down", "both", "both", "both")
+    kinds = ("blackout", "blackout", "cloud_paused", "world_paused", "teleop_killed")
+    faults = zip(kinds, spans, ways, strict=True)
+    events = tuple(Event(kind, *span, way=way) for kind, span, way in faults)
+    flight = Flight(Schedule(seed, events=events), "criteria.time_limit_s=120")
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
     for end, records in (("cloud", flight.of_cloud), ("world", flight.of_world)):
@@ -166,7 +160,7 @@ def _swizzle(outcome: Outcome, seed: int) -> None:
 def _invalid_values(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
     for name, changes in IMPOSSIBLE.items():
-        flight = Flight(seed=seed, lies=[_for_a_while(at, 1.0, changes)]).fly(40.0)
+        flight = Flight(Schedule(seed), lies=[_for_a_while(at, 1.0, changes)]).fly(40.0)
         measures.safe(outcome, flight)
         landed = measures.first_into(flight, GuardState.LAND)
         outcome.most(f"{name}: LAND after", landed - at, 1.0, "s")
@@ -178,12 +172,12 @@ def _invalid_values(outcome: Outcome, seed: int) -> None:
         measures.refused(outcome, flight, "range")
     for limit, changes in EXCESSIVE.items():
         lie, harmless = _for_a_while(at, 1.0, changes), limit != "speed"  # it may hit a pipe
-        flight = Flight(seed=seed, honest=harmless, lies=[lie]).fly(40.0)
+        flight = Flight(Schedule(seed), honest=harmless, lies=[lie]).fly(40.0)
         measures.safe(outcome, flight)
         refused = sum("impossible" in change.cause for change in flight.changes)
         outcome.same(f"100 times {limit}: rejected as impossible", refused, 0)
         outcome.least(f"100 times {limit}: limited", flight.count(f"limited_{limit}"), 20)
-    one = Flight(seed=seed, lies=[_for_a_while(at, 0.005, IMPOSSIBLE["NaN"])]).fly(40.0)
+    one = Flight(Schedule(seed), lies=[_for_a_while(at, 0.005, IMPOSSIBLE["NaN"])]).fly(40.0)
     measures.safe(outcome, one)
     measures.done(outcome, one)
     outcome.same("a single NaN: LAND", len(measures.changes_into(one, GuardState.LAND)), 0)
@@ -257,7 +251,7 @@ def _unreachable(outcome: Outcome, seed: int) -> None:
         x, y, z = (a - b for a, b in zip(stays[0], control.measured, strict=True))
         return command._replace(velocity=(x, y, z))
 
-    flight = Flight("criteria.time_limit_s=300", seed=seed, lies=[stalled])
+    flight = Flight(Schedule(seed), "criteria.time_limit_s=300", lies=[stalled])
     flight.fly_mission(200.0)
     measures.safe(outcome, flight)
     outcome.true("the mission ends", flight.mission.state == "failed")

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from math import isnan, nan
 
-from cloudrc.drivers.virtual import Clock
 from cloudrc.faults import measures
-from cloudrc.faults.flight import Flight, conditions, silent
+from cloudrc.faults.flight import Flight
 from cloudrc.faults.measures import Outcome, fly_safely, scenario
-from cloudrc.link.profile import Change, GilbertElliott
+from cloudrc.faults.schedule import WAYS, Event, Schedule
 from cloudrc.messages import Cause, GuardState
 from cloudrc.records import Arrival, Control
 
-HOUR_NS = 3_600_000_000_000
+HOUR = 3600.0  # [s]
+STEADY = "link.both.jitter_ms=0"
+"""Setting for a link without jitter, because jitter makes gaps of its own."""
 
 
 @scenario(
@@ -24,17 +25,16 @@ HOUR_NS = 3_600_000_000_000
 def _short_silence(outcome: Outcome, seed: int) -> None:
     """Interrupt both directions in one flight, only the uplink or only the downlink in two others.
 
-    In these two flights the link has no jitter, because jitter makes gaps of its own.
+    In these two flights the link has no jitter.
     """
     at = measures.instant(seed)
-    both, steady = silent(at, 0.1), conditions(jitter=0.0)
-    cut = silent(at, 0.1, jitter=0.0)
-    cases = {"both ways": (both, both), "up": (cut, steady), "down": (steady, cut)}
-    for what, (up, down) in cases.items():
-        flight = fly_safely(outcome, Flight(seed=seed, uplink=up, downlink=down))
+    for silent in WAYS:
+        what, settings = ("both ways", []) if silent == "both" else (silent, [STEADY])
+        cut = Schedule(seed, events=(Event("blackout", at, 0.1, way=silent),))
+        flight = fly_safely(outcome, Flight(cut, *settings))
         outcome.same(f"silent {what}: HOLDs", len(measures.held(flight)), 0)
-        for way, link, shape in (("up", flight.uplink, up), ("down", flight.downlink, down)):
-            lost, most = link.counts()["blackout"], 0 if shape is steady else 11
+        for way, link in (("up", flight.uplink), ("down", flight.downlink)):
+            lost, most = link.counts()["blackout"], 11 if silent in ("both", way) else 0
             outcome.most(f"silent {what}: datagrams lost, {way}", lost, most)
 
 
@@ -49,7 +49,8 @@ def _silence(outcome: Outcome, seed: int) -> None:
     for duration in (0.5, 3.0, 20.0):
         back, what = at + duration, f"{duration:g} s of silence"
         slow = ("guard.speed_max_mps=1.5", "criteria.time_limit_s=150")
-        flight = Flight(*slow, seed=seed, link=silent(at, duration))
+        cut = Schedule(seed, events=(Event("blackout", at, duration),))
+        flight = Flight(cut, *slow)
         fly_safely(outcome, flight, 150.0)
         measures.held_in_time(outcome, flight, f"{what}: HOLD after")
         if duration >= 3.0:
@@ -81,8 +82,8 @@ def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
 
     `where` is the place of the robot, for the texts of the checks.
     """
-    limit = "criteria.time_limit_s=200"
-    flight = Flight(limit, seed=seed, link=silent(at, 75.0))
+    cut = Schedule(seed, events=(Event("blackout", at, 75.0),))
+    flight = Flight(cut, "criteria.time_limit_s=200")
     flight.fly(at + 80.0)
     measures.safe(outcome, flight)
     held = measures.first_into(flight, GuardState.HOLD)
@@ -110,8 +111,8 @@ def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
     expects="TRACK, tracking error <= 1.5 times that without loss",
 )
 def _loss(outcome: Outcome, seed: int) -> None:
-    clean = Flight(seed=seed).fly_mission()
-    flight = fly_safely(outcome, Flight(seed=seed, link=conditions(loss=0.3)))
+    clean = Flight(Schedule(seed)).fly_mission()
+    flight = fly_safely(outcome, Flight(Schedule(seed), "link.both.loss=0.3"))
     outcome.same("HOLDs", len(measures.held(flight)), 0)
     error, usual = (measures.number(each, "tracking_rms_measured") for each in (flight, clean))
     outcome.most("tracking error, relative to that without loss", error / usual, 1.5)
@@ -126,8 +127,8 @@ def _loss(outcome: Outcome, seed: int) -> None:
 )
 def _bursts(outcome: Outcome, seed: int) -> None:
     for packets in (5, 20, 50):
-        shape = conditions(loss=GilbertElliott(bad_start=1 / 200, bad_end=1 / packets))
-        flight = Flight("criteria.time_limit_s=150", seed=seed, link=shape).fly_mission(150.0)
+        loss = f"link.both.loss={{bad_start: 0.005, bad_end: {1 / packets}}}"
+        flight = Flight(Schedule(seed), "criteria.time_limit_s=150", loss).fly_mission(150.0)
         measures.safe(outcome, flight)
         if packets < 50:  # else it hardly ever rests on the board for 4 s, and a leg may time out
             measures.done(outcome, flight)
@@ -145,8 +146,8 @@ def _bursts(outcome: Outcome, seed: int) -> None:
     expects="late commands are dropped, never applied",
 )
 def _disorder(outcome: Outcome, seed: int) -> None:
-    shape = conditions(delay=0.05, jitter=0.0, reorder=0.25)
-    flight = fly_safely(outcome, Flight(seed=seed, link=shape))
+    link = STEADY, "link.both.delay_ms=50"
+    flight = fly_safely(outcome, Flight(Schedule(seed, reorder=0.25), *link))
     outcome.least("late commands dropped", flight.count("late"), 100)
 
 
@@ -157,9 +158,8 @@ def _disorder(outcome: Outcome, seed: int) -> None:
     expects="the same path, bit by bit",
 )
 def _copies(outcome: Outcome, seed: int) -> None:
-    clean = Flight(seed=seed, link=conditions(jitter=0.0)).fly_mission()
-    twice = conditions(jitter=0.0, duplicate=1.0)
-    flight = fly_safely(outcome, Flight(seed=seed, link=twice))
+    clean = Flight(Schedule(seed), STEADY).fly_mission()
+    flight = fly_safely(outcome, Flight(Schedule(seed, duplicate=1.0), STEADY))
     same = clean.trajectory() == flight.trajectory()
     outcome.true("the same path, bit by bit", same)
     outcome.least("copies dropped", flight.count("repeated"), 1000)
@@ -172,13 +172,14 @@ def _copies(outcome: Outcome, seed: int) -> None:
     expects="the same path, bit by bit; no HOLD with the drift",
 )
 def _clocks(outcome: Outcome, seed: int) -> None:
-    clean = Flight(seed=seed).fly_mission()
+    clean = Flight(Schedule(seed)).fly_mission()
     for hours in (47, 49):
-        apart = Flight(seed=seed, cloud_clock=Clock(hours * HOUR_NS)).fly_mission()
+        apart = Flight(Schedule(seed, cloud_offset=hours * HOUR)).fly_mission()
         text = f"cloud's clock {hours} h ahead: the same path, bit by bit"
         outcome.true(text, clean.trajectory() == apart.trajectory())
     for ppm in (-500, 500):
-        drifting = fly_safely(outcome, Flight(seed=seed, cloud_clock=Clock(HOUR_NS, ppm)))
+        drift = Schedule(seed, cloud_offset=HOUR, cloud_drift=ppm)
+        drifting = fly_safely(outcome, Flight(drift))
         outcome.same(f"drift of {ppm} ppm: HOLDs", len(measures.held(drifting)), 0)
 
 
@@ -190,8 +191,9 @@ def _clocks(outcome: Outcome, seed: int) -> None:
 )
 def _delay_step(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
-    shape = conditions(delay=0.01, jitter=0.001, changes=(Change(at, delay=0.1),))
-    flight = fly_safely(outcome, Flight("cloud.estimator=split", seed=seed, link=shape))
+    link = "cloud.estimator=split", "link.both.delay_ms=10", "link.both.jitter_ms=1"
+    step = Schedule(seed, events=(Event("delay", at, HOUR, 0.09),))
+    flight = fly_safely(outcome, Flight(step, *link))
     off = [
         abs(r.horizon - r.loop_delay) / r.loop_delay
         for r in flight.of_cloud
@@ -208,8 +210,9 @@ def _delay_step(outcome: Outcome, seed: int) -> None:
     expects="no HOLD, because ages need only one clock; no one-way delay is reported",
 )
 def _asymmetry(outcome: Outcome, seed: int) -> None:
-    settings = "link.profile=ideal", "link.uplink.delay_ms=10", "link.downlink.delay_ms=190"
-    flight = fly_safely(outcome, Flight(*settings, seed=seed, cloud_clock=Clock(HOUR_NS)))
+    apart = Schedule(seed, "ideal", cloud_offset=HOUR)
+    delays = "link.uplink.delay_ms=10", "link.downlink.delay_ms=190"
+    flight = fly_safely(outcome, Flight(apart, *delays))
     outcome.same("HOLDs", len(measures.held(flight)), 0)
     rtt = measures.number(flight, "rtt_mean")
     outcome.most("deviation of the mean round trip from 0.2 s", abs(rtt - 0.2), 0.01, "s")
@@ -224,9 +227,10 @@ def _asymmetry(outcome: Outcome, seed: int) -> None:
     expects="first no HOLD; then at most 2 changes between TRACK and HOLD in any second",
 )
 def _jitter(outcome: Outcome, seed: int) -> None:
-    flight = fly_safely(outcome, Flight("link.profile=paper-p3", seed=seed))
+    flight = fly_safely(outcome, Flight(Schedule(seed, "paper-p3")))
     outcome.same("jitter 40 ms: HOLDs", len(measures.held(flight)), 0)
-    flight = Flight(seed=seed, link=conditions(delay=0.15, jitter=0.15)).fly(60.0)
+    link = "link.both.delay_ms=150", "link.both.jitter_ms=150"
+    flight = Flight(Schedule(seed), *link).fly(60.0)
     measures.safe(outcome, flight)
     busiest = measures.busiest_second(flight.changes)
     outcome.most("jitter 150 ms: changes of the guard in any second", busiest, 2)
