@@ -6,5 +6,5 @@ schedule, inject       random faults of one flight, and how they are injected
 adversary              dishonest clouds
 models, flight         models of processes, clocks and teleop; a whole flight
 invariants             safety rules, checked after every step of the physics
-trial, search          fly one schedule of faults; search over many schedules
+trial                  fly one schedule of faults
 """

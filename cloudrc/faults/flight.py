@@ -144,7 +144,7 @@ class Flight:
         self._rival_at = None
 
     def sha256(self) -> str:
-        """Return the hash of all records so far; it has a meaning only in a flight with `keep`."""
+        """Return the hash of all records so far; the flight must have been made with `keep`."""
         return self._hash.hexdigest()
 
     def trajectory(self) -> list[GroundTruth]:

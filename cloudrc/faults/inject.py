@@ -91,10 +91,10 @@ def inject(flight: Flight) -> None:
 def _actions(
     flight: Flight, process: RestartableEndpoint, event: Event
 ) -> dict[str, tuple[tuple[float, Action], ...]]:
-    """Return a mapping: kind of fault -> pairs of time [s] and action.
+    """Return how to inject `event`: kind of fault -> pairs of time [s] and action.
 
-    It has all kinds, at the times of `event`; the caller picks the event's kind. `process` is the
-    process that the event kills or freezes, world or cloud.
+    The mapping is the same for all kinds of event; the caller selects the entry of the event's
+    kind. `process`, world or cloud, is the one that the event kills or freezes.
     """
     at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
     gone = at + event.value * lasts  # end of teleop after it was asked to end

@@ -11,6 +11,7 @@ from itertools import pairwise
 from math import dist, hypot, isfinite, nan
 from typing import Any, Literal, TypeAlias
 
+from cloudrc.errors import describe_error
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.schedule import generator
 from cloudrc.messages import Cause, GuardState
@@ -122,7 +123,7 @@ class Scenario:
         try:
             self.inject(outcome, seed)
         except Exception as error:  # the other scenarios still run
-            outcome.error = f"{type(error).__name__}: {error}"
+            outcome.error = describe_error(error)
         return outcome
 
     def as_json(self, outcome: Outcome) -> dict[str, Any]:
@@ -185,7 +186,7 @@ def held_in_time(outcome: Outcome, flight: Flight, text: str = "HOLD after") -> 
 
 
 def basis_age_at_hold(flight: Flight) -> float:
-    """Return the largest age of the last command's odometry at the beginning of a HOLD [s]."""
+    """Return the largest age that the commands' newest odometry had when a HOLD began [s]."""
     applied = [(r.stamp_ns, r.basis_stamp_ns) for r in flight.of_world if type(r) is CommandApplied]
     ages = []
     for change in held(flight):
@@ -265,7 +266,7 @@ def done(outcome: Outcome, flight: Flight) -> None:
 
 
 def fly_safely(outcome: Outcome, flight: Flight, limit: float = 120.0) -> Flight:
-    """Fly the mission, at most until `limit` [s]; then apply the checks `safe` and `done`."""
+    """Fly the mission, at most until `limit` [s]; check that it was safe and was completed."""
     flight.fly_mission(limit)
     safe(outcome, flight)
     done(outcome, flight)

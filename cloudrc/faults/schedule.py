@@ -14,7 +14,7 @@ from cloudrc.errors import BadInputError, to_one_line
 
 
 def generator(seed: int, use: int) -> np.random.Generator:
-    """Make a random generator; different numbers `use` give independent sequences."""
+    """Make a random generator from a seed; different `use` give independent sequences."""
     return np.random.Generator(np.random.PCG64([seed, use]))
 
 
@@ -73,7 +73,7 @@ WAYS: tuple[Way, ...] = ("both", "up", "down")
 class Event:
     """One fault, from `at` [s] for `duration` [s]; link faults hit one direction or both.
 
-    `KINDS` explains the meaning and the unit of `value`.
+    The meaning and the unit of `value` depend on the kind of fault; the texts in `KINDS` tell them.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG

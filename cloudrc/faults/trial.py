@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from cloudrc.errors import describe_error
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.invariants import LATCHED, Breach
 from cloudrc.faults.measures import events_of_missions, held
@@ -73,7 +74,7 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
     try:
         flight.fly(schedule.duration)
     except Exception as error:  # world and cloud must survive every fault
-        watch.note(flight.run.now_ns, "error", f"{type(error).__name__}: {error}")
+        watch.note(flight.run.now_ns, "error", describe_error(error))
     checks: dict[str, Callable[[], None]] = {
         "waypoint": lambda: _check_waypoints(flight),
         "stuck": operator.check_stuck,
@@ -111,7 +112,7 @@ class Operator:
         flight.listeners.append(self._look)
 
     def check_stuck(self) -> None:
-        """Check that the robot has flown (TRACK) in the last `BACK` [s], which have no faults."""
+        """Report a breach if the guard was never in TRACK in the last `BACK` [s] (no faults)."""
         flight, now_ns = self._flight, self._flight.run.now_ns
         if now_ns - self._tracked_ns > BACK * 1e9:
             state, cause = flight.guard_now()

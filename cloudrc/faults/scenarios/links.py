@@ -13,7 +13,7 @@ from cloudrc.records import Arrival, Control
 
 HOUR = 3600.0  # [s]
 STEADY = "link.both.jitter_ms=0"
-"""Setting for a link without jitter, because jitter makes gaps of its own."""
+"""Setting for a link without jitter."""
 
 
 @scenario(
@@ -23,9 +23,9 @@ STEADY = "link.both.jitter_ms=0"
     expects="stays in TRACK, no step above the acceleration cap",
 )
 def _short_silence(outcome: Outcome, seed: int) -> None:
-    """Interrupt both directions in one flight, only the uplink or only the downlink in two others.
+    """Fly three times: interrupt both directions, then only the uplink, then only the downlink.
 
-    In these two flights the link has no jitter.
+    The last two flights have no jitter, because jitter, too, makes gaps between datagrams.
     """
     at = measures.instant(seed)
     for silent in WAYS:
