@@ -1,7 +1,7 @@
 """Run `cloudrc link run`: the process that shapes one direction of the link of a pod or local run.
 
-GET /link.json on the metrics port returns the state of the shaper and the pod's netem qdiscs. The
-process calls tc and ip for this answer, at most once a second.
+GET /link.json on the metrics port returns the state of the shaper and the netem qdiscs of this pod
+or machine. The process calls tc and ip for this answer, at most once a second.
 """
 
 from __future__ import annotations
@@ -63,14 +63,16 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     peer = "address of the other tunnel end"
     add("--peer", type=read_address, required=True, metavar="HOST:PORT", help=peer)
     end = (
-        "address from which this pod's tunnel end sends; the relay takes datagrams from no"
+        "address from which the own tunnel end sends; the relay takes datagrams from no"
         " other (default: from any that reaches --listen)"
     )
     add("--end", type=read_address, metavar="HOST:PORT", help=end)
     listen, here = "where the relay receives datagrams (default: 127.0.0.1:7401)", "127.0.0.1"
     add("--listen", type=read_address, default=(here, 7401), metavar="HOST:PORT", help=listen)
-    route = "write the address to which this pod's tunnel end must send, once ready"
+    route = "write the address to which the own tunnel end must send, once ready"
     add("--route", type=Path, required=True, metavar="FILE", help=route)
+    origin = "start of the time line, monotonic clock [ns] (default: when the link comes up)"
+    add("--origin", type=int, default=0, metavar="NS", help=origin)
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -94,6 +96,7 @@ def execute(options: argparse.Namespace) -> int:
             mode=options.mode,
             direction=options.direction,
             route=options.route,
+            origin_ns=options.origin,
             tell=partial(export_state, exporter),
             count=partial(export_counts, exporter),
         )

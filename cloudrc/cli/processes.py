@@ -144,7 +144,7 @@ def _addresses(name: str, family: int) -> list[str]:
     return [str(entry[4][0]) for entry in found]
 
 
-def resolve_address(flag: str, where: Address, listen: Address = ("0.0.0.0", 0)) -> Address:
+def resolve_address(flag: str, where: Address, listen: Address) -> Address:
     """Resolve the host of an address before a control loop starts: the loop must not wait for DNS.
 
     The result is IPv4 or IPv6, like the address `listen` of this process. If `listen` is [::], the

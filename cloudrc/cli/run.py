@@ -53,7 +53,7 @@ NO_C = "Python (wind, or a robot that differs from its model)"
 """Where the physics steps run if the C code does not cover the experiment."""
 EPILOG = """\
 modes:
-  local    real time: four processes, UDP on 127.0.0.1
+  local    real time: five processes, UDP on 127.0.0.1
   virtual  one process, virtual time: the same flight in seconds, repeatable
   cluster  Kubernetes: installs the chart, flies by a Job, fetches the recording
 

@@ -143,7 +143,7 @@ def end_session(run: Path, limit: float) -> None:
 
 @dataclass
 class Child:
-    """A process of a local run, such as world or relay, which the supervisor has started."""
+    """A process of a local run, such as world, which the supervisor has started."""
 
     name: str  # "world", "cloud", "teleop", "uplink" or "downlink"
     process: subprocess.Popen[bytes]
@@ -238,9 +238,9 @@ class LocalRun:
             self._start(name, name, *(("--record-flights",) if session else ()), **more)
 
         def start_link(way: str, end: str, peer: str) -> None:
-            more = {"listen": at[way], "end": at[end], "peer": at[peer]}
+            more: dict[str, object] = {"listen": at[way], "end": at[end], "peer": at[peer]}
             words = link_words(folder / LINK_FOLDER, way)
-            self._start(way, *words, mode="relay", **more)
+            self._start(way, *words, mode="relay", origin=origin_ns, **more)
 
         start_end("world", "uplink")
         # Only this user can open the socket of the API: no token is needed.
@@ -250,7 +250,8 @@ class LocalRun:
         start = () if session else ("--start",)
         self._start("teleop", "teleop", *start, socket=sockets, **given)
         self._wait_until_ready()
-        # With cloud, which sends first: the time line of the link begins with the flight.
+        # With cloud, which sends first: the time lines of the link begin shortly before the flight.
+        origin_ns = time.monotonic_ns()  # one start for both directions
         start_link("uplink", "world", "cloud")
         start_link("downlink", "cloud", "world")
         start_end("cloud", "downlink", teleop=sockets, tap=sockets / TAP_FILE)

@@ -140,13 +140,19 @@ class Relay:
         try:
             self._inside.bind(listen)
             if end is not None:
-                self._inside.connect(end)
+                try:
+                    self._inside.connect(end)
+                except OSError as error:
+                    error.strerror = f"it does not reach --end {end[0]} ({error.strerror})"
+                    raise
         except OSError:
             self.close()
             raise
         for one in (self._inside, self._outside):
             one.setblocking(False)
         ask_for_stamps(self._inside)
+        # Room for the datagrams that arrive while this process stands still.
+        self._inside.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
         self._peer: Address | None = None
         self._direction, self._peek = direction, peek
         # Due time [ns], a number that keeps the order of equal times, data.

@@ -63,12 +63,13 @@ class Sidecar:
         route: Path,
         tell: Callable[[LinkState], object],
         count: Callable[[dict[str, int]], object],
+        origin_ns: int = 0,
     ) -> None:
         """Store the arguments; `route` is the file with the address to which the tunnel sends.
 
         The state file is in the same folder. `direction` is "uplink" or "downlink". `tell` exports
         each new state of the link as metrics. `count` exports the numbers of datagrams by outcome,
-        once a second.
+        once a second. `origin_ns` is the start of the time line [ns]; 0: when the link comes up.
         """
         self.peer: Address | None = None
         self.profile = profile
@@ -77,7 +78,7 @@ class Sidecar:
         self._mode, self._direction, self._route = mode, direction, route
         self._state_file = route.with_name(STATE_FILE)
         self._released_file = self._state_file.with_suffix(RELEASED_SUFFIX)
-        self._reason, self._origin_ns = "", 0
+        self._reason, self._origin_ns = "", origin_ns
         self._shaper: Shaper | None = None
 
     def run(self, stop: Callable[[], bool]) -> None:
@@ -92,7 +93,7 @@ class Sidecar:
             if stop():
                 return
             self._machine.wait(STEP)
-        self._origin_ns = self._machine.clock()
+        self._origin_ns = self._origin_ns or self._machine.clock()
         try:
             while not stop():
                 self._shape(self.peer, stop)

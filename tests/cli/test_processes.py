@@ -109,7 +109,7 @@ def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch):
         ipv4_addresses("cloud")
     assert resolve_address("--peer", ("cloud", 1), ("::1", 2)) == ("::5", 1)
     with pytest.raises(BadInputError, match="--peer cloud:1: cloud cannot be resolved"):
-        resolve_address("--peer", ("cloud", 1))
+        resolve_address("--peer", ("cloud", 1), ("0.0.0.0", 0))
 
 
 def test_sizes_are_read_as_in_kubernetes():

@@ -248,3 +248,9 @@ def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(tmp_path):
         assert process.returncode == 0
         killer.cancel()
     assert [path.name for path in folder.iterdir()] == ["link.json"]
+
+
+def test_an_end_that_cannot_be_reached_is_named():
+    direction = LinkDirection(PLAIN, 1, True)
+    with pytest.raises(OSError, match=r"does not reach --end 198\.51\.100\.7"):
+        Relay(("127.0.0.1", 0), direction, peek, ("198.51.100.7", 7400))
