@@ -29,7 +29,6 @@ from typing import NamedTuple
 from cloudrc.drivers.machine import Deadline, interpreter
 from cloudrc.drivers.process import PARENT, READY, from_line
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.drivers.tap import TAP_FILE
 from cloudrc.drivers.teleop import PATH_MAX
 from cloudrc.errors import InvalidRunError, TimedOutError
 from cloudrc.records import Fault, Record
@@ -238,7 +237,7 @@ class LocalRun:
         given |= {"journal": folder / JOURNAL_FILE} if session else {}
         self._start("teleop", *(() if session else ("--start",)), socket=sockets, **given)
         self._wait_until_ready()
-        start_end("cloud", cloud, from_cloud, "downlink", teleop=sockets, tap=sockets / TAP_FILE)
+        start_end("cloud", cloud, from_cloud, "downlink", teleop=sockets)
         self._wait_until_ready()
         if session:
             session(url, self._metrics)
