@@ -328,8 +328,14 @@ def _record_virtual(
                 writer.attach(name, data)
 
 
-def _prepare(experiment: ResolvedExperiment) -> bool:
-    """Check the user's robot and scene; return whether the packages of the API are installed."""
+def _prepare(experiment: ResolvedExperiment, folder: Path) -> bool:
+    """Check the user's robot and scene, and write the link's profile into the run's `folder`.
+
+    Return whether the packages of the API are installed.
+    """
+    from cloudrc.cli.link_run import prepare_link
+    from cloudrc.drivers.local import LINK_FOLDER
+
     if absent := missing("api"):
         text = f"no operator's API in this run: {', '.join(absent)} not installed"
         print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)
@@ -338,6 +344,7 @@ def _prepare(experiment: ResolvedExperiment) -> bool:
         from cloudrc.world.scene import compile_model
 
         compile_model(world.robot, world.scene)  # report an invalid model before the flight
+    prepare_link(folder / LINK_FOLDER, experiment)
     return not absent
 
 
@@ -363,7 +370,7 @@ def _record_local(
     from cloudrc.report.write import attachments
     from cloudrc.world.native.library import library
 
-    local = LocalRun(folder, see, api=_prepare(experiment), session=session)
+    local = LocalRun(folder, see, api=_prepare(experiment, folder), session=session)
     broken, interrupted = None, True
     try:
         local.fly(inf if session else flight_limit(experiment))
