@@ -16,18 +16,24 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit
 
 from cloudrc.cli.output import escape, print_line
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.files import read_token, warn_if_readable
 
+if TYPE_CHECKING:
+    from cloudrc.teleop.wire import RobotStatus
+
 REQUEST_TIMEOUT = 10.0
 """Time limit of one request [s]."""
 STREAM_TIMEOUT = 30.0
 """Time without data after which the client stops reading a stream of events [s]. The API sends data
 at least every 10 s."""
+ROBOT_TIMEOUT = 1.0
+"""Time without data after which the client stops reading the stream of the robot's status [s]. The
+API sends data 30 times a second."""
 RETRY_STATUSES = (408, 429, 502, 503, 504)
 """HTTP status codes after which the same request may succeed later."""
 UNIX = "unix:"
@@ -86,6 +92,14 @@ class Api:
             for line in stream:
                 if line.startswith(b"data: "):
                     yield json.loads(line.removeprefix(b"data: "))
+
+    def robot(self) -> Iterator[RobotStatus | None]:
+        """Yield the robot's newest status 30 times a second until teleop ends."""
+        from cloudrc.teleop.wire import read_line
+
+        with self._answer("GET", "/v1/robot", None, ROBOT_TIMEOUT) as stream:
+            for line in stream:
+                yield read_line(line)
 
     @contextmanager
     def _answer(

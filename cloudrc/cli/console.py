@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import fcntl
 import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from secrets import token_hex
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from cloudrc.cli.client import UNIX, Api, token_argument, token_file, token_reader
+from cloudrc.cli.client import Api, token_argument, token_file, token_reader
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
 from cloudrc.cli.extras import require
 from cloudrc.cli.find_run import find_local_run
@@ -34,10 +35,8 @@ Keys: arrows fly along x and y, W and S up and down, while they are held; Space
 holds; Shift+X stops the rotors."""
 LINK_SET = "link set "
 """Start of a line that a pod's console prints to request a change of the link."""
-PERIOD = 0.04
-"""Longest wait for the next records from cloud [s]."""
-LOOK_PERIOD = 1.0
-"""Time between two checks whether the flight has ended [s]."""
+RETRY_PERIOD = 0.2
+"""Time between two attempts to read the robot's status from the API [s]."""
 OWN_S = 150.0
 """Time for which the page in a pod shows a requested value of the link [s]. Afterwards the page
 shows the value in the profile's file, which Kubernetes has updated by then."""
@@ -56,7 +55,6 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     release_arguments(parser)
     pod = parser.add_argument_group("in the container of the chart")
     for flag, metavar, text in (
-        ("--tap", "FILE", "socket to which 'cloudrc cloud --tap' sends"),
         ("--config", "FILE", "experiment file"),
         ("--profile", "FILE", "file of the link profile"),
     ):
@@ -70,8 +68,8 @@ def execute(options: argparse.Namespace) -> int:
     if options.cluster or options.context or options.namespace or options.release:
         return _show_release(options)
     require("the console", ("console", "world"))
-    flight = _in_pod(options) if options.tap else _local(options)
-    _serve(options.port, flight, with_browser=not (options.no_open or options.tap))
+    flight = _in_pod(options) if options.config else _local(options)
+    _serve(options.port, flight, with_browser=not (options.no_open or options.config))
     print_line("the flight has ended", sys.stderr)
     return 0
 
@@ -80,7 +78,6 @@ class Flight(NamedTuple):
     """The flight that the console shows and steers."""
 
     config: Path  # experiment file
-    tap: Path  # socket to which cloud sends its records
     api: Api  # of teleop
     link: Link  # reads and changes the link
     has_ended: Callable[[], bool]
@@ -92,10 +89,12 @@ def _serve(port: int, flight: Flight, *, with_browser: bool) -> None:
 
         page = Page(port)
         opened.callback(page.close)
-        from cloudrc.drivers.tap import TapListener
-
-        tap = TapListener(flight.tap)
-        opened.callback(tap.close)
+        config = opened.enter_context(flight.config.open())
+        try:
+            fcntl.flock(config, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            text = "this run has a console already; open its page, or end it first"
+            raise BadInputError(text) from None
         print_line(f"console: {page.url}")
         if with_browser:
             open_page(page.url)
@@ -110,23 +109,19 @@ def _serve(port: int, flight: Flight, *, with_browser: bool) -> None:
         steering.watch()
         steering.start()
         page.fill(experiment, feed, steering)
-        looked = time.monotonic()
-        while True:
-            records = tap.receive(PERIOD)
-            now = time.monotonic()
-            feed.take(records, now)
-            page.update(now)
-            if now - looked > LOOK_PERIOD:
-                looked = now
-                if flight.has_ended():
-                    return
+        while not flight.has_ended():
+            with suppress(CloudrcError):  # teleop starts or ends; the page says what is wrong
+                for status in flight.api.robot():
+                    feed.take(status, time.monotonic())
+                    page.update(time.monotonic())
+            page.update(time.monotonic())
+            time.sleep(RETRY_PERIOD)
 
 
 def _local(options: argparse.Namespace) -> Flight:
     from cloudrc.cli.link_set import read_states, set_here
     from cloudrc.console.steering import Link
     from cloudrc.drivers.local import LINK_FOLDER, under_way
-    from cloudrc.drivers.tap import TAP_FILE
 
     found = find_local_run(options, lambda run, api: (run, api), "no run flies there", flag="")
     if found is None:
@@ -140,8 +135,7 @@ def _local(options: argparse.Namespace) -> Flight:
         return states[0].profile if states else {}
 
     link = Link(read, lambda settings: set_here(run / LINK_FOLDER, None, settings, token_hex(4)))
-    tap = Path(url.removeprefix(UNIX)).with_name(TAP_FILE)
-    return Flight(run / "config.yaml", tap, Api(url), link, lambda: under_way().get(run) != url)
+    return Flight(run / "config.yaml", Api(url), link, lambda: under_way().get(run) != url)
 
 
 def _in_pod(options: argparse.Namespace) -> Flight:
@@ -169,7 +163,7 @@ def _in_pod(options: argparse.Namespace) -> Flight:
         print_line(f"{LINK_SET}{' '.join(settings)}")
 
     api = Api(options.api, token_reader(token_file(options)))
-    return Flight(options.config, options.tap, api, Link(read, change), lambda: False)
+    return Flight(options.config, api, Link(read, change), lambda: False)
 
 
 def _show_release(options: argparse.Namespace) -> int:

@@ -447,12 +447,12 @@ def _run_job(options: argparse.Namespace) -> int:
     # After 'helm install' without --wait, the release needs some seconds to become ready.
     wait_ready(release, timeout=options.timeout, tell=print_line)
     job = run_job(release, mission, limit=limit, queue=options.queue)
-    print_line(f"Job {job.name} on release '{release.name}' in namespace '{release.namespace}'")
+    print_line(f"Job {job} on release '{release.name}' in namespace '{release.namespace}'")
     try:
-        ended = follow(release, job.name, print_line)
+        ended = follow(release, job, print_line)
     except KeyboardInterrupt:
-        command = f"kubectl {' '.join(release.flags)} delete job {job.name}"
-        print_line(f"Job {job.name} is still running; cancel its mission: {command}", sys.stderr)
+        command = f"kubectl {' '.join(release.flags)} delete job {job}"
+        print_line(f"Job {job} is still running; cancel its mission: {command}", sys.stderr)
         raise
     if ended.exit_code is None:
         print_line(ended.message)

@@ -80,7 +80,6 @@ def _end_arguments(parser: argparse.ArgumentParser) -> None:
 def _cloud_arguments(parser: argparse.ArgumentParser) -> None:
     _end_arguments(parser)
     _add(parser, "--teleop", "DIR", "missions from 'cloudrc teleop --socket DIR' (default: own)")
-    _add(parser, "--tap", "FILE", "Unix socket of a console, for samples (default: off)")
 
 
 def read_address(text: str) -> Address:
@@ -210,7 +209,6 @@ def _run_world(options: argparse.Namespace) -> int:
 def _run_cloud(options: argparse.Namespace) -> int:
     stop: Callable[[], bool] = StopSignal()
     from cloudrc import assembly
-    from cloudrc.drivers.tap import Tap
     from cloudrc.drivers.teleop import LastWord, RemoteTeleop, UnixPeer
     from cloudrc.messages import GuardState
     from cloudrc.teleop import wire
@@ -221,8 +219,6 @@ def _run_cloud(options: argparse.Namespace) -> int:
         paths = options.teleop / "cloud.sock", options.teleop / "teleop.sock"
         teleop = RemoteTeleop(UnixPeer(*paths, wire.encode, wire.decode), time.monotonic_ns())
     cloud = assembly.build_cloud(experiment, identity, time.monotonic_ns, teleop)
-    if options.tap:
-        end.tap = Tap(options.tap, lambda: cloud.telemetry)
 
     def flies() -> bool:
         return cloud.guard is GuardState.TRACK

@@ -33,7 +33,7 @@ from cloudrc.messages import (
     Setpoint,
     Telemetry,
 )
-from cloudrc.records import Arrival, Counted, MissionEvent, SessionOpened
+from cloudrc.records import Arrival, Control, Counted, MissionEvent, SessionOpened
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import LATE, REPEATED, USED
 from cloudrc.tunnel.codec import Accept, DecodeError, Direction, Kind
@@ -140,7 +140,8 @@ class CloudEndpoint(TunnelEnd):
         self._setpoint: Setpoint | None = None
         self._world = ""  # identifies the world process of the session
         self.telemetry: Telemetry | None = None
-        self._delays = (nan, nan, nan)  # horizon, round trip and loop delay of the last command [s]
+        self._control: Control | None = None  # record of the session's last command
+        self._uplink_delay = nan  # of the newest telemetry [s]
         self._alarm = EmergencyStopRepeater()
         self._period_ns = loop.period_ns
         self._late_ns, self._late_window_ns = 0, start_ns  # missed time, begin of its window [ns]
@@ -285,6 +286,7 @@ class CloudEndpoint(TunnelEnd):
         self._channel.reset()
         self._loop.reset(now_ns)
         self._setpoint = None  # the robot may have moved; teleop sends a new one
+        self._control, self._uplink_delay = None, nan
         self._asked = 0  # numbers of the previous session no longer count
         self._alarm.restart_numbers()
         self._world = accept.world_nonce.hex()
@@ -314,7 +316,9 @@ class CloudEndpoint(TunnelEnd):
                 self._start = None
             self._loop.observe(telemetry, now_ns)
             self._asked = max(self._asked, telemetry.mission)
-            self.teleop.see(make_robot_status(telemetry, epoch, self._world, self._delays), now_ns)
+            # The last command was made before this telemetry: it has the delay of the one before.
+            known, self._uplink_delay = (self._uplink_delay, self._control), delay
+            self.teleop.see(make_robot_status(telemetry, epoch, self._world, *known), now_ns)
             if self.teleop.outputs:
                 self._take_from_teleop()
 
@@ -366,7 +370,7 @@ class CloudEndpoint(TunnelEnd):
         else:
             self._unsent = now_ns + compute.end(), self._make_datagram(COMMAND, command)
         self._records.append(control)
-        self._delays = (control.horizon, control.rtt, control.loop_delay)
+        self._control = control
 
     def _record_counts(self, now_ns: int) -> None:
         self._count_ns = max(self._count_ns, now_ns - COUNT_PERIOD_NS) + COUNT_PERIOD_NS

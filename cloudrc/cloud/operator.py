@@ -5,8 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint, Telemetry
-from cloudrc.records import Fault, MissionEvent
+from cloudrc.messages import (
+    NEVER_NS,
+    GuardState,
+    OperatorRequest,
+    Request,
+    Setpoint,
+    Telemetry,
+)
+from cloudrc.records import Control, Fault, MissionEvent
 from cloudrc.teleop.wire import Output, RobotStatus
 from cloudrc.tunnel.session import NO_EPOCH
 
@@ -57,19 +64,21 @@ def is_for_session(epoch: int, output: Output | Fault) -> bool:
 
 
 def make_robot_status(
-    telemetry: Telemetry, epoch: int, world: str, delays: tuple[float, float, float]
+    telemetry: Telemetry, epoch: int, world: str, delay: float, control: Control | None
 ) -> RobotStatus:
     """Make the status message for teleop from new telemetry.
 
-    `world` identifies world's process. `delays` are horizon, round trip and loop delay [s].
+    `world` identifies world's process. `control` is the last command of the session, and `delay`
+    the delay of the telemetry before it [s], NaN if unknown.
     """
     # fmt: off
-    _, odometry, _, _, _, slip_ns, mission, guard, pipes, touch, mission_id, reached, cause = (
-        telemetry
-    )
+    stamp_ns, odometry, _, echo_ns, hold_ns, slip_ns, mission, guard, *rest = telemetry
+    _, position, orientation, velocity, _ = odometry
+    pipes, touch, mission_id, reached, cause = rest
+    age_ns = NEVER_NS if echo_ns == NEVER_NS else hold_ns
     return _new(RobotStatus, (
-        epoch, odometry.position, guard, mission, world, pipes, touch, slip_ns, *delays,
-        mission_id, reached, cause,
+        epoch, position, guard, mission, world, pipes, touch, slip_ns, mission_id, reached, cause,
+        stamp_ns, orientation, velocity, age_ns, delay, control,
     ))
     # fmt: on
 

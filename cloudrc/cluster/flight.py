@@ -201,18 +201,18 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
     mission = experiment.mission.model_dump(mode="json", include=flown)
     document = {"name": experiment.name, "time_limit_s": limit, **mission}
     job = run_job(release, document, limit=limit)
-    tell(f"Job {job.name} flies {experiment.name}")
+    tell(f"Job {job} flies {experiment.name}")
     try:
-        ended = follow(release, job.name, tell)
+        ended = follow(release, job, tell)
     except KeyboardInterrupt:
         tell("cancelling the mission")
         try:
-            delete_job(release, job.name)
+            delete_job(release, job)
         except CloudrcError as error:
             tell(f"cannot cancel: {error}")
         raise
     if ended.exit_code not in FLOWN:
-        raise ClusterError(f"Job {job.name} did not fly its mission: {ended.message}")
+        raise ClusterError(f"Job {job} did not fly its mission: {ended.message}")
 
 
 def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Contents:

@@ -12,9 +12,8 @@ import secrets
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from math import ceil
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -50,18 +49,13 @@ LOOK_PERIOD = 0.5
 """Time between two requests for the state of a Job [s]."""
 DELETE_LIMIT = 40.0
 """Time limit for a deleted Job to end [s]; Kubernetes gives the Job's pod 30 s."""
-ENDED = ("complete", "failed")
-"""States of a Job that has ended, in `JobStatus.state`."""
 
 
-@dataclass(frozen=True, slots=True)
-class JobStatus:
-    """State of a mission's Job."""
+class Ended(NamedTuple):
+    """End of a mission's Job."""
 
-    name: str
-    state: str  # "pending", "flying", "complete" or "failed"
-    exit_code: int | None  # of the container; None until the container has ended
-    message: str  # verdict in words; "" until it is known
+    exit_code: int | None  # of the container; None if the container has not ended
+    message: str  # verdict in words, or why the Job failed
 
 
 def run_job(
@@ -71,8 +65,8 @@ def run_job(
     name: str = "",
     limit: float = 60.0,
     queue: bool = False,
-) -> JobStatus:
-    """Create the Job of a mission; the Job runs to its end even if no client follows it.
+) -> str:
+    """Create the Job of a mission, and return its name; the Job runs even if nobody follows it.
 
     Args:
         release: Release that flies the mission.
@@ -100,13 +94,14 @@ def run_job(
     job["spec"]["template"]["metadata"]["labels"] = labels
     _fill_pod(job["spec"]["template"]["spec"], release, deployment, name, queue)
     plan["data"] = {FILE: json.dumps(mission, indent=2) + "\n"}
-    return _status(create_job(release, job, plan, labels, COMPONENT), None)
+    create_job(release, job, plan, labels, COMPONENT)
+    return name
 
 
 def create_job(
     release: Release, job: Any, files: Any, labels: Mapping[str, str], component: str
-) -> Any:
-    """Create a Job, and `files` as a ConfigMap of the same name; return the created Job."""
+) -> None:
+    """Create a Job, and `files` as a ConfigMap of the same name."""
     name, created = job["metadata"]["name"], release.request("create", "jobs", body=job)
     owner = owner_of("batch/v1", "Job", created)
     files["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
@@ -116,7 +111,6 @@ def create_job(
         with suppress(CloudrcError):
             delete_job(release, name, component)
         raise
-    return created
 
 
 def owner_of(version: str, kind: str, owner: Any) -> dict[str, Any]:
@@ -168,20 +162,6 @@ def delete_job(release: Release, name: str, component: str = COMPONENT) -> None:
         time.sleep(LOOK_PERIOD)
 
 
-def _status(job: Any, pod: Any) -> JobStatus:
-    exit_code, message, state = None, "", "pending"
-    for container in container_statuses(pod) if pod is not None else ():
-        if container.name == COMPONENT:  # a service mesh may add containers
-            ended = container.state.terminated
-            state = "flying" if ended or container.state.running else state
-            exit_code = ended and ended.exit_code
-            message = to_one_line(ended and ended.message)
-    cause = failure_of(job)
-    if cause is not None:
-        state, message = ("failed", message or cause) if cause else ("complete", message)
-    return JobStatus(job.metadata.name, state, exit_code, message)
-
-
 def failure_of(job: Any) -> str | None:
     """Return why a Job has failed, "" if it is complete, None if it has not ended."""
     for condition in job.status.conditions or []:
@@ -193,7 +173,7 @@ def failure_of(job: Any) -> str | None:
     return None
 
 
-def follow(release: Release, name: str, write: Callable[[str], None]) -> JobStatus:
+def follow(release: Release, name: str, write: Callable[[str], None]) -> Ended:
     """Follow a Job until it has ended; `write` receives each line of the Job's log.
 
     Kubernetes ends the Job after the Job's time limit. Raise a ClusterError if the Job's pod cannot
@@ -201,25 +181,27 @@ def follow(release: Release, name: str, write: Callable[[str], None]) -> JobStat
     """
     written = 0
     while True:
-        status, lines = _look(release, name)
-        for line in lines[written:]:
-            write(line)
-        written = max(written, len(lines))
-        if status.state in ENDED:
-            return status
+        job = release.request("get", "jobs", name=name)
+        uids = ((pod, pod.metadata.labels.get(UID_LABEL)) for pod in list_pods(release, COMPONENT))
+        pod = next((pod for pod, uid in uids if uid == job.metadata.uid), None)
+        # A service mesh may add containers.
+        states = [c.state for c in container_statuses(pod) if c.name == COMPONENT] if pod else []
+        ended = next((state.terminated for state in states if state.terminated), None)
+        cause = failure_of(job)
+        if cause is None and not ended and not any(state.running for state in states):
+            _check_can_start(release, name, pod)
+        elif pod is not None and pod.status.phase != "Pending":
+            lines = pod_log(release, pod.metadata.name, COMPONENT).splitlines()
+            for line in lines[written:]:
+                write(line)
+            written = max(written, len(lines))
+        if cause is not None:
+            return Ended(ended and ended.exit_code, to_one_line(ended and ended.message) or cause)
         time.sleep(LOOK_PERIOD)
 
 
-def _look(release: Release, name: str) -> tuple[JobStatus, list[str]]:
-    """Read a Job's state and log; raise a ClusterError if the Job's pod will never run."""
-    job = release.request("get", "jobs", name=name)
-    uids = ((pod, pod.metadata.labels.get(UID_LABEL)) for pod in list_pods(release, COMPONENT))
-    pod = next((pod for pod, uid in uids if uid == job.metadata.uid), None)
-    status = _status(job, pod)
-    if status.state != "pending":
-        if pod is None or pod.status.phase == "Pending":
-            return status, []
-        return status, pod_log(release, pod.metadata.name, COMPONENT).splitlines()
+def _check_can_start(release: Release, name: str, pod: Any) -> None:
+    """Raise a ClusterError if the pod of a Job will never run; `pod` is None if there is none."""
     if pod is not None:
         why = pod_failure(pod)
     else:  # the cluster may refuse the pod, for example for a quota
@@ -231,4 +213,3 @@ def _look(release: Release, name: str) -> tuple[JobStatus, list[str]]:
             f"Job '{name}' cannot start: {why}; fix this, then delete the Job: "
             f"kubectl {' '.join(release.flags)} delete job {name}"
         )
-    return status, []

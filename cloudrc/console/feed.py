@@ -1,13 +1,12 @@
 """Store what a console shows of a flight: the newest pose, the charts of the last 25 s, the trail.
 
-The input is the records that cloud sends to the tap, a UNIX socket. If world and cloud share a
-clock, the delay of the downlink is the newest round trip minus the delay of the uplink.
+The input is the robot's status from teleop's API. If world and cloud share a clock, the delay of
+the downlink is the newest round trip minus the delay of the uplink.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
 from math import dist, hypot, inf, nan
 from typing import NamedTuple
 
@@ -16,8 +15,9 @@ import numpy as np
 from cloudrc.exposition.parts import PredictionJudge
 from cloudrc.geometry.clearance import Array, clearance
 from cloudrc.geometry.scene import Scene
-from cloudrc.messages import NEVER_NS, GuardState, Telemetry
-from cloudrc.records import Arrival, Control, Record, SessionOpened, TelemetrySent
+from cloudrc.messages import NEVER_NS, GuardState
+from cloudrc.records import Control
+from cloudrc.teleop.wire import RobotStatus
 
 WINDOW = 25.0
 """Time that the charts show [s]."""
@@ -44,11 +44,10 @@ class Sample(NamedTuple):
 
 
 class FlightFeed:
-    """The present state of a flight, from the records that cloud sends to the console.
+    """The present state of a flight, from the statuses of the robot that teleop sends.
 
     Attributes:
-        telemetry: The newest telemetry; None before the first.
-        control: The newest record of a command that cloud computed; None before the first.
+        status: The robot's newest status; None before the first.
         samples: Points of the charts, oldest first.
         flown: Number of points added so far to the trail, the line that shows the robot's path.
     """
@@ -56,31 +55,29 @@ class FlightFeed:
     def __init__(self, scene: Scene) -> None:
         """Begin without records; measure the clearance from the pipes of `scene`."""
         self._scene, self._judge = scene, PredictionJudge()
-        self.telemetry: Telemetry | None = None
-        self.control: Control | None = None
+        self.status: RobotStatus | None = None
         self.samples: deque[Sample] = deque()
         self.flown = 0
         # Times of the newest telemetry, control period, judged prediction and echo [s].
         self._heard = self._controlled = self._judged = self._echoed = -inf
-        self._uplink = self._downlink = self._rtt = nan
+        self._downlink = self._rtt = nan
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL_MAX)  # position and clearance
 
-    def take(self, records: Iterable[Record], now: float) -> None:
-        """Take the records of the newest datagrams, oldest first; `now` is the arrival time [s]."""
-        news = False
-        for record in records:
-            if isinstance(record, Arrival):
-                self._uplink = record.delay
-            elif isinstance(record, Control):
-                self._take_control(record, now)
-            elif isinstance(record, TelemetrySent):
-                news |= self._take_telemetry(record.telemetry, now)
-            elif isinstance(record, SessionOpened):
-                self._judge.reset()
-                self._judged = -inf
-        if news:
-            self.samples.append(self._sample(now))
-        while self.samples and self.samples[0].time < now - WINDOW:
+    def take(self, status: RobotStatus | None, now: float) -> None:
+        """Store the robot's status that has arrived at `now` [s], unless it is old or None."""
+        last = self.status
+        if status is None or (last and last.stamp_ns == status.stamp_ns):
+            return
+        self.status, self._heard = status, now
+        if last is None or last.epoch != status.epoch:
+            self._judge.reset()
+            self._judged = -inf
+        control, before = status.control, last and last.control
+        if control and (before is None or before.stamp_ns != control.stamp_ns):
+            self._take_control(control, status.uplink_delay, now)
+        self._follow(status, last)
+        self.samples.append(self._sample(status, now))
+        while self.samples[0].time < now - WINDOW:
             self.samples.popleft()
 
     def silence(self, now: float) -> float:
@@ -89,15 +86,16 @@ class FlightFeed:
 
     def command_age(self, now: float) -> float:
         """Return the age of the last applied command at `now` [s]; infinite if none."""
-        told = self.telemetry
-        if told is None or told.echo_stamp_ns == NEVER_NS:
+        if self.status is None or self.status.command_age_ns == NEVER_NS:
             return inf
-        return told.echo_hold_ns * 1e-9 + self.silence(now)
+        return self.status.command_age_ns * 1e-9 + self.silence(now)
 
-    def controls(self, now: float) -> bool:
-        """Return whether cloud controls the robot at `now` [s]; False for a robot on the ground."""
-        grounded = self.telemetry is not None and self.telemetry.guard == GuardState.GROUND
-        return now - self._controlled < STALE and not grounded
+    def control(self, now: float) -> Control | None:
+        """Return cloud's last command; None if it is old at `now` [s] or the robot is grounded."""
+        status = self.status
+        if status is None or status.guard is GuardState.GROUND or now - self._controlled >= STALE:
+            return None
+        return status.control
 
     def trail(self) -> tuple[Array, Array]:
         """Return the flown path [m], shape (n, 3), and the clearances on it [m], shape (n,)."""
@@ -113,39 +111,33 @@ class FlightFeed:
         rows[:, 0] -= rows[-1, 0]
         return np.ascontiguousarray(rows.T)
 
-    def _take_control(self, control: Control, now: float) -> None:
-        self.control, self._controlled, judged = control, now, self._judge.judged
+    def _take_control(self, control: Control, uplink_delay: float, now: float) -> None:
+        self._controlled, judged = now, self._judge.judged
         self._judge.take(control)
         if self._judge.judged > judged:
             self._judged = now
         if control.rtt != self._rtt:  # a new echo
             self._rtt, self._echoed = control.rtt, now
-            self._downlink = control.rtt - self._uplink
+            self._downlink = control.rtt - uplink_delay
 
-    def _take_telemetry(self, telemetry: Telemetry, now: float) -> bool:
-        """Store telemetry; return False if it has the same stamp as the last telemetry."""
-        last, self.telemetry = self.telemetry, telemetry
-        if last is not None and last.stamp_ns == telemetry.stamp_ns:
-            return False
-        self._heard, position = now, telemetry.odometry.position
-        if last is not None and dist(position, last.odometry.position) > JUMP:
+    def _follow(self, status: RobotStatus, last: RobotStatus | None) -> None:
+        """Add the robot's position to the trail; begin a new trail after a reset of the robot."""
+        position = status.position
+        if last is not None and dist(position, last.position) > JUMP:
             self._trail.clear()
         if not self._trail or dist(position, self._trail[-1][:3]) > TRAIL_STEP:
-            near = clearance(self._scene, [position], [telemetry.odometry.orientation_wxyz])
+            near = clearance(self._scene, [position], [status.orientation_wxyz])
             self._trail.append((*position, float(near[0])))
             self.flown += 1
-        return True
 
-    def _sample(self, now: float) -> Sample:
-        assert self.telemetry is not None
-        speed = hypot(*self.telemetry.odometry.velocity)
-        control = self.control
-        if control is None or not self.controls(now):
-            return Sample(now, self._uplink, speed=speed)
+    def _sample(self, status: RobotStatus, now: float) -> Sample:
+        uplink, speed = status.uplink_delay, hypot(*status.velocity)
+        if (control := self.control(now)) is None:
+            return Sample(now, uplink, speed=speed)
         judged, echoed = now - self._judged < STALE, now - self._echoed < STALE
         return Sample(
             now,
-            self._uplink,
+            uplink,
             self._downlink if echoed else nan,
             control.horizon,
             dist(control.setpoint, control.measured),

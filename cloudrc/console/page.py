@@ -24,7 +24,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.geometry import fence
 from cloudrc.geometry.clearance import Array
 from cloudrc.geometry.scene import SPAWN, load_scene
-from cloudrc.messages import ZERO, GuardState, Quaternion, Vector
+from cloudrc.messages import ZERO, Quaternion, Vector
 
 SLOW_PERIOD = 0.3
 """Time between two updates of the page, except for the moving bodies [s]."""
@@ -142,10 +142,9 @@ class Page:
         """Show the present state; `now` is the time [s], on the clock of the feed."""
         feed, scene = self._feed, self._scene
         with self._server.atomic():
-            if feed.telemetry is not None:
-                odometry = feed.telemetry.odometry
-                scene.move("robot", *_visible(odometry.position, odometry.orientation_wxyz))
-            control = feed.control if feed.controls(now) else None
+            if (status := feed.status) is not None:
+                scene.move("robot", *_visible(status.position, status.orientation_wxyz))
+            control = feed.control(now)
             ghost = control and _visible(control.position, control.orientation_wxyz)
             scene.move("ghost", *(ghost or (None,)))
             scene.move("setpoint", control.setpoint if control else None)
@@ -195,9 +194,9 @@ class Page:
     def _describe(self, now: float) -> str:
         """Return guard, command age, mission and the newest answer, as Markdown."""
         feed, state = self._feed, self._steering.state
-        if feed.telemetry is None:
+        if feed.status is None:
             return "**waiting for the robot**"
-        guard, silence, age = feed.telemetry.guard, feed.silence(now), feed.command_age(now)
+        silence, age = feed.silence(now), feed.command_age(now)
         mission = state.get("mission")
         doing = "none"
         is_free = not mission or mission["by_hand"] or mission["state"] == "held"
@@ -209,7 +208,7 @@ class Page:
             reached = f"{len(mission['reached'])} of {mission['waypoints']} waypoints"
             doing = f"{mission['name'] or mission['id']}, {mission['state']}, {reached}"
         lines = [
-            f"**{GuardState(guard).name}**: {feed.telemetry.cause.words}",
+            f"**{feed.status.guard.name}**: {feed.status.cause.words}",
             f"Last command: {'none' if age == inf else f'{age:.2f} s ago'}",
             f"Mission: {doing}",
         ]
@@ -341,10 +340,10 @@ class Page:
         It is the setpoint if cloud controls the robot, else the point 0.6 m above the robot.
         """
         feed = self._feed
-        if feed.control is not None and feed.controls(now):
-            at: Any = feed.control.setpoint
+        if (control := feed.control(now)) is not None:
+            at: Any = control.setpoint
         else:
-            at = np.add(feed.telemetry.odometry.position if feed.telemetry else SPAWN, (0, 0, 0.6))
+            at = np.add(feed.status.position if feed.status else SPAWN, (0, 0, 0.6))
         x, y, z = map(float, np.round(np.clip(at, fence.INNER_LOW, fence.INNER_HIGH), 2))
         return x, y, z
 

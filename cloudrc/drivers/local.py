@@ -30,7 +30,6 @@ from typing import IO, NamedTuple
 from cloudrc.drivers.machine import Deadline, interpreter
 from cloudrc.drivers.process import PARENT, READY, from_line
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.drivers.tap import TAP_FILE
 from cloudrc.drivers.teleop import PATH_MAX
 from cloudrc.errors import InvalidRunError, TimedOutError
 from cloudrc.link.follow import PROFILE
@@ -254,7 +253,7 @@ class LocalRun:
         origin_ns = time.monotonic_ns()  # one start for both directions
         start_link("uplink", "world", "cloud")
         start_link("downlink", "cloud", "world")
-        start_end("cloud", "downlink", teleop=sockets, tap=sockets / TAP_FILE)
+        start_end("cloud", "downlink", teleop=sockets)
         self._wait_until_ready()
         if session:
             session(url, self._metrics)

@@ -42,7 +42,6 @@ from cloudrc.records import (
 
 if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
-    from cloudrc.drivers.tap import Tap
     from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.record.recorder import Recorder
 
@@ -287,7 +286,6 @@ class EndProcess:
     flights_only: bool = False  # whether to record no samples while the robot does not fly
     link: Path | None = None  # file with the state of the link
     check: LinkMonitor | None = None  # compares the received datagrams with the link profile
-    tap: Tap | None = None  # sends records to a console
 
     def __post_init__(self) -> None:
         self._notes = LinkNotes(self.link, uplink=self.end == "world") if self.link else None
@@ -326,11 +324,9 @@ class EndProcess:
             thread.stop()
 
     def tell(self, records: list[Record]) -> None:
-        """Send records, and problems of the recorder, to supervisor, console and metrics."""
+        """Send records, and problems of the recorder, to supervisor and metrics."""
         recorder = self.recorder
         self.feed.tell(records)
-        if self.tap is not None:
-            self.tap.tell(records)
         if records and recorder.error != self._trouble:
             self._trouble = recorder.error
             self.feed.tell([Fault(records[-1].stamp_ns, "recorder", self._trouble)])

@@ -37,8 +37,10 @@ from cloudrc.teleop.store import (
     UnavailableError,
     UnknownMissionError,
 )
-from cloudrc.teleop.wire import Leg
+from cloudrc.teleop.wire import Leg, RobotStatus, write_line
 
+ROBOT_PERIOD = 0.033
+"""Time between two lines of a stream of the robot's status [s]."""
 LOOK_PERIOD = 0.1
 """Time between two checks of an event stream for new events [s]."""
 ALIVE_PERIOD = 10.0
@@ -91,6 +93,11 @@ class Bridge:
         self._urgent: deque[tuple[Call, Future[Any]]] = deque()  # stops and holds
         self._calls: deque[tuple[Call, Future[Any]]] = deque()
         self._service: MissionService | None = None
+
+    @property
+    def seen(self) -> RobotStatus | None:
+        """The robot's newest status; unlike a call, this does not wait for teleop's loop."""
+        return self._service.seen if self._service else None
 
     def open(self, service: MissionService) -> None:
         """Accept all calls from now on; teleop's loop makes them on `service`."""
@@ -370,6 +377,30 @@ async def stream_events(
 
     headers = {"Cache-Control": "no-store"}
     return StreamingResponse(stream(), media_type="text/event-stream", headers=headers)
+
+
+@router.get(
+    "/robot",
+    response_class=StreamingResponse,
+    responses={200: {"content": {"application/jsonl": {}}, "description": "A stream"}},
+)
+async def stream_robot(request: Request, bridge: Bridged) -> StreamingResponse:
+    """Stream the robot's newest status, about 30 times a second, as lines of JSON.
+
+    A line is an object with the fields of `RobotStatus` in cloudrc/teleop/wire.py: pose, velocity
+    and guard of the robot, and in `control` the last command. It is null before the first
+    telemetry. Unknown values are null. A slow client misses lines. The stream ends like that of
+    the events.
+    """
+    await bridge.ask(lambda service, now_ns: None)  # raises an error if teleop cannot answer
+
+    async def stream() -> AsyncIterator[bytes]:
+        while not bridge.closed and await request.scope["caller"]() is not None:
+            yield write_line(bridge.seen)
+            await asyncio.sleep(ROBOT_PERIOD)
+
+    headers = {"Cache-Control": "no-store"}
+    return StreamingResponse(stream(), media_type="application/jsonl", headers=headers)
 
 
 class ApiServer(uvicorn.Server):

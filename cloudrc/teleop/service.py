@@ -296,6 +296,7 @@ class MissionService:
         if seen is None or cloud_age is None:
             return shown
         age, state = (now_ns - self._seen_ns) * 1e-9, mission.state if mission else None
+        control = seen.control
         if mission is not None and state == HELD:
             last, pause_ns = mission.events[-1]["event"], now_ns - self._driven_ns
             back = last == "operator_lost" and pause_ns <= HEARTBEAT_NS
@@ -311,9 +312,9 @@ class MissionService:
             "next_step": next_step(seen.guard, age, cloud_age, state),
             "pipe_contacts": seen.pipe_contacts,
             "touch_speed_mps": finite_or_none(seen.touch_speed),
-            "horizon_s": finite_or_none(seen.horizon),
-            "rtt_s": finite_or_none(seen.rtt),
-            "loop_delay_s": finite_or_none(seen.loop_delay),
+            "horizon_s": control and finite_or_none(control.horizon),
+            "rtt_s": control and finite_or_none(control.rtt),
+            "loop_delay_s": control and finite_or_none(control.loop_delay),
         }
         return shown
 

@@ -8,21 +8,25 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from math import nan
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from pydantic import TypeAdapter, ValidationError
+from pydantic_core import to_json
 
 from cloudrc.messages import (
+    NEVER_NS,
+    UPRIGHT,
     ZERO,
     Cause,
     GuardState,
     OperatorRequest,
+    Quaternion,
     Request,
     Setpoint,
     Start,
     Vector,
 )
-from cloudrc.records import FAILURES, MissionEvent
+from cloudrc.records import FAILURES, Control, MissionEvent
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,12 +82,15 @@ class RobotStatus(NamedTuple):
     pipe_contacts: int = 0  # number of contacts with pipes in the mission
     touch_speed: float = nan  # of the arm's tip at the mission's first touch of the board [m/s]
     slip_ns: int = 0  # lag of world's clock behind its machine's clock [ns]
-    horizon: float = nan  # prediction horizon of cloud's last command [s]
-    rtt: float = nan  # last round trip, without the hold time on board [s]
-    loop_delay: float = nan  # last round trip, with the hold time on board [s]
     mission_id: int = 0  # number of the mission of the last start request; 0 if none
     reached: int = 0  # waypoints that world has stored as reached, or `MISSION_OVER`
     cause: Cause = Cause.SPAWN  # why the guard is in its state
+    stamp_ns: int = NEVER_NS  # stamp of the telemetry [ns], world's clock
+    orientation_wxyz: Quaternion = UPRIGHT  # measured orientation, unit quaternion
+    velocity: Vector = ZERO  # measured velocity of the base [m/s], world frame
+    command_age_ns: int = NEVER_NS  # age of the last applied command [ns]; `NEVER_NS` if none
+    uplink_delay: float = nan  # of the telemetry before `control` [s]; NaN without a common clock
+    control: Control | None = None  # last command of the session; None before the first
 
 
 QUEUED, STARTING, FLYING, HELD = "queued", "starting", "flying", "held"
@@ -103,6 +110,7 @@ Output: TypeAlias = Setpoint | OperatorRequest | MissionEvent
 Message: TypeAlias = RobotStatus | Output
 ALARM = OperatorRequest(0, Request.ESTOP)
 """Emergency stop without a number. Cloud adds the number, so every part of teleop can send this."""
+_STATUS = TypeAdapter(RobotStatus)
 _KINDS: dict[str, TypeAdapter[Message]] = {
     kind.__name__: TypeAdapter(kind)
     for kind in (RobotStatus, Setpoint, OperatorRequest, MissionEvent)
@@ -111,7 +119,7 @@ _KINDS: dict[str, TypeAdapter[Message]] = {
 
 def encode(message: Message) -> bytes:
     """Encode a message as one datagram."""
-    return json.dumps([type(message).__name__, message]).encode()
+    return to_json([type(message).__name__, message], inf_nan_mode="constants")
 
 
 def decode(data: bytes) -> Message:
@@ -121,3 +129,21 @@ def decode(data: bytes) -> Message:
         return _KINDS[name].validate_python(fields)
     except (ValidationError, ValueError, TypeError, KeyError, RecursionError) as error:
         raise ValueError(f"not a message of teleop: {data[:60]!r}") from error
+
+
+def write_line(status: RobotStatus | None) -> bytes:
+    """Encode a status as a line of JSON with the fields' names; unknown numbers become null."""
+    if status is None:
+        return b"null\n"
+    control = status.control and status.control._asdict()
+    return to_json({**status._asdict(), "control": control}, inf_nan_mode="null") + b"\n"
+
+
+def read_line(line: bytes) -> RobotStatus | None:
+    """Decode a line of `write_line`; raise ValueError if it is malformed."""
+
+    def with_nan(part: dict[str, Any]) -> dict[str, Any]:
+        return {k: nan if v is None and k != "control" else v for k, v in part.items()}
+
+    tree = json.loads(line, object_hook=with_nan)
+    return None if tree is None else _STATUS.validate_python(tree)

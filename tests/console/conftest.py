@@ -1,4 +1,4 @@
-"""Records of cloud, as the tap sends them, and an API that a test answers."""
+"""Statuses of the robot, as teleop's API sends them, and an API that a test answers."""
 
 import time
 from math import nan
@@ -7,8 +7,9 @@ import pytest
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import Scene
-from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
-from cloudrc.records import Control, TelemetrySent
+from cloudrc.messages import UPRIGHT, ZERO, GuardState
+from cloudrc.records import Control
+from cloudrc.teleop.wire import RobotStatus
 
 LIMIT = 120.0
 """Time limit for what has no number of its own [s]: a browser without a graphics card is slow."""
@@ -33,13 +34,10 @@ def control(at, basis=0.0, **fields):
     return Control(**{**still, **fields})
 
 
-def told(at, position=(0.0, 0.0, 1.0), velocity=ZERO, **fields):
-    """Make the record of telemetry of `at` [s]."""
-    odometry = Odometry(round(at * 1e9), position, UPRIGHT, velocity, ZERO)
-    whole = {"echo_stamp_ns": -1, "echo_hold_ns": 0, "slip_ns": 0, "mission": 0, "touch_speed": 0.0}
-    whole |= {"stamp_ns": odometry.stamp_ns, "odometry": odometry, "tip_force": 0.0}
-    telemetry = Telemetry(**{**whole, "guard": GuardState.TRACK, **fields})
-    return TelemetrySent(telemetry.stamp_ns, 0, 0, telemetry)
+def status(at, position=(0.0, 0.0, 1.0), control=None, **fields):
+    """Make a status of the robot from telemetry of `at` [s]."""
+    known = {"epoch": 1, "mission": 0, "guard": GuardState.TRACK, "stamp_ns": round(at * 1e9)}
+    return RobotStatus(position=position, control=control, **{**known, **fields})
 
 
 class FakeApi:

@@ -1,4 +1,4 @@
-"""What the console shows follows from the records of the tap."""
+"""What the console shows follows from the statuses of the robot."""
 
 from math import inf, isnan
 
@@ -7,8 +7,7 @@ import pytest
 from cloudrc.console.feed import STALE, WINDOW, FlightFeed
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
-from cloudrc.records import Arrival, SessionOpened
-from tests.console.conftest import control, told
+from tests.console.conftest import control, status
 
 
 @pytest.fixture
@@ -17,19 +16,19 @@ def feed(nowhere):
 
 
 def test_the_downlink_s_delay_is_round_trip_minus_uplink(feed):
-    up = Arrival(0, True, 1, 1, 0.030, True)
-    feed.take([up, control(0.1, rtt=0.080, horizon=0.085), told(0.1)], 1.0)
+    first = control(0.1, rtt=0.080, horizon=0.085)
+    feed.take(status(0.1, control=first, uplink_delay=0.030), 1.0)
     sample = feed.samples[-1]
     assert (sample.uplink, sample.estimate) == (0.030, 0.085)
     assert sample.downlink == pytest.approx(0.050)
     # The round trip is the old one: the new delay of the uplink says nothing about it.
-    feed.take([up._replace(delay=0.060), control(0.2, rtt=0.080), told(0.2)], 1.1)
+    feed.take(status(0.2, control=control(0.2, rtt=0.080), uplink_delay=0.060), 1.1)
     assert feed.samples[-1].downlink == pytest.approx(0.050)
 
 
-def test_error_and_speed_are_those_of_the_newest_records(feed):
+def test_error_and_speed_are_those_of_the_newest_status(feed):
     near = control(0.1, setpoint=(0.0, 0.3, 1.4))
-    feed.take([near, told(0.1, velocity=(0.6, 0.0, -0.8))], 1.0)
+    feed.take(status(0.1, control=near, velocity=(0.6, 0.0, -0.8)), 1.0)
     assert feed.samples[-1].error == pytest.approx(0.5)
     assert feed.samples[-1].speed == pytest.approx(1.0)
 
@@ -38,7 +37,7 @@ def test_a_prediction_is_compared_at_its_own_instant(feed):
     for step in range(8):  # 1 m/s; each prediction for 60 ms later is 20 mm too far
         at, x = 0.03 * step, 0.03 * step
         ahead = control(at, at, measured=(x, 0, 1), position=(x + 0.08, 0, 1), horizon=0.06)
-        feed.take([ahead, told(at)], 1.0 + at)
+        feed.take(status(at, control=ahead), 1.0 + at)
     assert isnan(feed.samples[0].prediction_error)
     assert feed.samples[-1].prediction_error == pytest.approx(0.020)
 
@@ -46,37 +45,37 @@ def test_a_prediction_is_compared_at_its_own_instant(feed):
 def test_no_prediction_is_judged_across_two_sessions(feed):
     for step in range(4):
         at = 0.03 * step
-        feed.take([control(at, at, horizon=0.06), told(at)], 1.0 + at)
-    opened = SessionOpened(0, "cloud", 2, "world accepted")
-    feed.take([opened, control(0.12, 0.12, measured=(5, 5, 5)), told(0.12)], 1.12)
+        feed.take(status(at, control=control(at, at, horizon=0.06)), 1.0 + at)
+    feed.take(status(0.12, control=control(0.12, 0.12, measured=(5, 5, 5)), epoch=2), 1.12)
     assert isnan(feed.samples[-1].prediction_error)
 
 
 def test_error_and_estimate_are_unknown_without_control(feed):
-    feed.take([control(0.1), told(0.1)], 1.0)
-    assert feed.controls(1.0)
-    assert not feed.controls(1.0 + STALE)
-    feed.take([told(0.7)], 1.6)
-    feed.take([control(0.8), told(0.8, guard=GuardState.GROUND)], 1.7)
+    feed.take(status(0.1, control=control(0.1)), 1.0)
+    assert feed.control(1.0)
+    assert not feed.control(1.0 + STALE)
+    feed.take(status(0.7, control=control(0.1)), 1.6)  # no new command
+    feed.take(status(0.8, control=control(0.8), guard=GuardState.GROUND), 1.7)
     for sample in [*feed.samples][1:]:
         assert isnan(sample.error)
         assert isnan(sample.estimate)
 
 
-def test_copies_of_telemetry_are_silence(feed):
+def test_copies_of_a_status_are_silence(feed):
+    feed.take(None, 4.0)
     assert feed.silence(5.0) == inf
-    feed.take([told(0.1)], 1.0)
-    feed.take([told(0.1)], 3.0)
+    feed.take(status(0.1), 1.0)
+    feed.take(status(0.1), 3.0)
     assert feed.silence(3.0) == 2.0
     assert len(feed.samples) == 1
     assert feed.command_age(1.0) == inf, "no command yet"
-    feed.take([told(0.2, echo_stamp_ns=7, echo_hold_ns=40_000_000)], 1.1)
+    feed.take(status(0.2, command_age_ns=40_000_000), 1.1)
     assert feed.command_age(1.3) == pytest.approx(0.24)
 
 
 def test_samples_older_than_the_window_are_dropped(feed):
     for second in range(40):
-        feed.take([told(second)], float(second))
+        feed.take(status(second), float(second))
     columns = feed.columns(1)
     assert columns[0].min() >= -WINDOW
     assert columns[0][-1] == 0.0
@@ -84,11 +83,11 @@ def test_samples_older_than_the_window_are_dropped(feed):
 
 def test_the_trail_is_coloured_by_the_clearance_from_the_pipes():
     feed = FlightFeed(load_scene("pipes"))
-    feed.take([told(0.1, (0.5, 0.0, 0.7))], 1.0)
-    feed.take([told(0.2, (0.505, 0.0, 0.7))], 1.1)  # too near to be a new point
-    feed.take([told(0.3, (0.7, 0.0, 0.7))], 1.2)
+    feed.take(status(0.1, (0.5, 0.0, 0.7)), 1.0)
+    feed.take(status(0.2, (0.505, 0.0, 0.7)), 1.1)  # too near to be a new point
+    feed.take(status(0.3, (0.7, 0.0, 0.7)), 1.2)
     points, clearances = feed.trail()
     assert points.tolist() == [[0.5, 0.0, 0.7], [0.7, 0.0, 0.7]]
     assert clearances[1] == pytest.approx(clearances[0] + 0.2, abs=0.01)
-    feed.take([told(0.4, (0.0, 0.0, 0.1))], 1.3)  # reset
+    feed.take(status(0.4, (0.0, 0.0, 0.1)), 1.3)  # reset
     assert feed.trail()[0].tolist() == [[0.0, 0.0, 0.1]]

@@ -21,7 +21,7 @@ from cloudrc.console.steering import Steering
 from cloudrc.drivers.local import under_way
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import Scene, load_scene
-from tests.console.conftest import LIMIT, told, wait_for
+from tests.console.conftest import LIMIT, status, wait_for
 
 
 def start(folder, *words):
@@ -221,7 +221,7 @@ def test_the_state_tells_a_drive_and_names_buttons(filled):
     drive = {"id": "m1", "by_hand": True, "state": "held", "reached": []}
     words = "to continue: cloudrc mission resume, or cancel"
     steering.state = {"mission": drive, "seen": {"next_step": words}}
-    feed.take([told(0.1)], 1.0)
+    feed.take(status(0.1), 1.0)
     page.update(1.0)
     assert "Mission: drive, waits for keys" in page._status.content
     assert "to continue: resume, or cancel" in page._status.content

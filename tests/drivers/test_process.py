@@ -31,7 +31,7 @@ from cloudrc.records import (
     SessionOpened,
     TelemetrySent,
 )
-from tests.console.conftest import told as sample
+from tests.exposition.test_live import told as sample
 
 
 def test_it_ends_if_it_is_not_the_child_of_who_has_started_it(monkeypatch):

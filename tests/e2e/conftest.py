@@ -192,9 +192,11 @@ def mean_delays(seconds):
 
 
 def job_end(name):
-    """Wait for the end of a Job; return its final state and its log."""
+    """Wait for the end of a Job; check that its state fits its end; return its end and its log."""
     lines: list[str] = []
-    return follow(place(), name, lines.append), "\n".join(lines)
+    end = follow(place(), name, lines.append)
+    assert read("job", name)["status"].get("succeeded", 0) == (end.exit_code == 0), end
+    return end, "\n".join(lines)
 
 
 def job_log(name):

@@ -68,7 +68,7 @@ def replace(component):
 def check_completed(name):
     """Check that the Job completes, reaches each waypoint once, and that no pipe was touched."""
     end, log = job_end(name)
-    assert (end.state, end.exit_code) == ("complete", 0), end
+    assert end.exit_code == 0, end
     for number in range(1, 8):
         assert log.count(f"waypoint {number} of 7 reached") == 1, log
     touched = {
@@ -95,7 +95,7 @@ def test_a_deleted_world_ends_the_mission_as_failed(installed):
     fly_until("orphaned", "waypoint 1 of 7 reached")
     replace("world")
     end, _ = job_end("orphaned")
-    assert (end.state, end.exit_code) == ("failed", 1), end
+    assert end.exit_code == 1, end
     assert "world_restarted" in end.message
     wait_ready(place(), timeout=60.0)
 

@@ -9,7 +9,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.exposition import table
 from cloudrc.exposition.live import ONE_SHAPER, LinkVerdict, LiveMetrics
 from cloudrc.exposition.parts import Histogram
-from cloudrc.messages import ZERO, Cause, GuardState
+from cloudrc.messages import UPRIGHT, ZERO, Cause, GuardState, Odometry, Telemetry
 from cloudrc.records import (
     Arrival,
     CommandApplied,
@@ -20,11 +20,21 @@ from cloudrc.records import (
     LinkChecked,
     MissionEvent,
     SessionOpened,
+    TelemetrySent,
 )
-from tests.console.conftest import control, told
+from tests.console.conftest import control
 from tests.flights.conftest import records
 
 MS = 1_000_000
+
+
+def told(at, position=(0.0, 0.0, 1.0), velocity=ZERO, **fields):
+    """Make the record of telemetry of `at` [s]."""
+    odometry = Odometry(round(at * 1e9), position, UPRIGHT, velocity, ZERO)
+    whole = {"echo_stamp_ns": -1, "echo_hold_ns": 0, "slip_ns": 0, "mission": 0, "touch_speed": 0.0}
+    whole |= {"stamp_ns": odometry.stamp_ns, "odometry": odometry, "tip_force": 0.0}
+    telemetry = Telemetry(**{**whole, "guard": GuardState.TRACK, **fields})
+    return TelemetrySent(telemetry.stamp_ns, 0, 0, telemetry)
 
 
 def value(live, name, *label_values):

@@ -161,6 +161,38 @@ def test_a_stream_shows_its_life_until_its_token_is_withdrawn(monkeypatch):
         assert time.monotonic() - began < 1.5
 
 
+# The robot's status
+
+
+def test_a_reader_follows_the_robot_until_teleop_ends():
+    with running(ready=False) as api:
+        api.flight.uplink = False
+        api.bridge.open(api.flight.teleop)
+        statuses = Api(api.url, lambda: READER).robot()
+        assert next(statuses) is None, "no telemetry yet"
+        api.flight.uplink, api.flight.position = True, A
+        began = time.monotonic()
+        assert {next(statuses).position for _ in range(61)} <= {(0.0, 0.0, 0.1), A}
+        assert time.monotonic() - began < 61 / 20.0, "20 updates a second or more"
+        assert next(statuses).position == A
+        api.bridge.closed = "teleop ends"
+        assert len([*statuses]) < 3
+
+
+def test_a_client_that_does_not_read_misses_statuses(monkeypatch):
+    monkeypatch.setattr(api_module, "ROBOT_PERIOD", 0.0)
+    with running() as api, connect(api) as stream:
+        sent = []
+        monkeypatch.setattr(api_module, "write_line", lambda seen: sent.append(1) or b"x" * 4096)
+        stream.sendall(head("GET", "/v1/robot", token=READER))
+        before = -1
+        while before < len(sent):  # until the buffers are full
+            before = len(sent)
+            time.sleep(0.2)
+        assert len(sent) < 10_000
+        assert api.post("/v1/estop")[0] == 200
+
+
 # Stop and hold
 
 

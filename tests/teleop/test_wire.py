@@ -1,12 +1,15 @@
 """Datagrams between cloud and teleop: every message comes back as it was, nothing else does."""
 
+import json
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.messages import OperatorRequest, Setpoint
+from cloudrc.messages import Cause, GuardState, OperatorRequest, Setpoint
 from cloudrc.records import Fault, MissionEvent
-from cloudrc.teleop.wire import RobotStatus, decode, encode
+from cloudrc.teleop.wire import RobotStatus, decode, encode, read_line, write_line
+from tests.console.conftest import control
 
 messages = st.one_of(*map(st.from_type, (RobotStatus, Setpoint, OperatorRequest, MissionEvent)))
 
@@ -19,6 +22,18 @@ def test_a_message_comes_back_as_it_was(message):
     assert [type(value) for value in (back, *back)] == [
         type(value) for value in (message, *message)
     ]
+
+
+@pytest.mark.parametrize("known", [None, control(0.1)])
+def test_a_status_comes_back_from_its_line(known):
+    status = RobotStatus(
+        1, (0.0, 0.0, 1.0), GuardState.TRACK, 7, cause=Cause.COMMAND, control=known
+    )
+    line = write_line(status)
+    assert repr(read_line(line)) == repr(status)
+    tree = json.loads(line, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    assert (tree["touch_speed"], tree["position"]) == (None, [0.0, 0.0, 1.0])
+    assert read_line(write_line(None)) is None
 
 
 @pytest.mark.parametrize(
