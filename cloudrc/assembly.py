@@ -28,6 +28,7 @@ from cloudrc.messages import Start
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.wire import Leg, Plan
 from cloudrc.tunnel.end import Identity
+from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 
 if TYPE_CHECKING:
     from cloudrc.drivers.virtual import VirtualRun
@@ -53,6 +54,8 @@ GRACE = 30.0
 """Time after the end of the mission's time limit at which a flight is stopped [s]."""
 VIRTUAL_CLOCK = bytes(16)
 """Identity of the virtual clock, which world and cloud share."""
+VIRTUAL_RING = KeyRing(KeySet(Key(b"nothing is secret in one process")))
+"""Keys of world and cloud in virtual time; with them both ends refuse damaged datagrams."""
 SAME_KEYS = {
     *("distribution", "correlation", "duplicate", "reorder", "corrupt", "keep_order"),
     "queue_packets",
@@ -70,9 +73,10 @@ def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoi
     links = build_links(experiment)
     passes = not any(link.corrupts for link in links)  # only bytes can be damaged
     clock_id = VIRTUAL_CLOCK if own == Clock() else CLOUD_CLOCK
-    identity = Identity(clock_id, b"cloud".ljust(16), passes=passes)
-    world = build_world(experiment, Identity(VIRTUAL_CLOCK, b"world".ljust(16), passes=passes))
-    cloud = build_cloud(experiment, identity, lambda: own.at(0), cpu_clock=CPU_CLOCK)
+    of_world = Identity(VIRTUAL_CLOCK, b"world".ljust(16), VIRTUAL_RING, passes)
+    of_cloud = Identity(clock_id, b"cloud".ljust(16), VIRTUAL_RING, passes)
+    world = build_world(experiment, of_world)
+    cloud = build_cloud(experiment, of_cloud, lambda: own.at(0), cpu_clock=CPU_CLOCK)
     return world, cloud, VirtualRun(world, cloud, *links, cloud_clock=own)
 
 

@@ -43,8 +43,6 @@ Call: TypeAlias = Callable[[MissionService, int], object]
 class RestartableEndpoint:
     """An `Endpoint`: world or cloud in a process that a scenario can kill, freeze and start."""
 
-    sealed = True  # world and cloud have keys
-
     def __init__(self, build: Callable[[int], Endpoint], clock: Clock) -> None:
         """Start a process; `build` makes world or cloud, given the time on `clock` [ns]."""
         self._build, self.clock = build, clock
@@ -148,8 +146,6 @@ class RestartableEndpoint:
 
 class EndpointGroup:
     """Makes one `Endpoint` of several clouds; each cloud receives all datagrams from world."""
-
-    sealed = True
 
     def __init__(self, members: Sequence[Endpoint]) -> None:
         self.members = members

@@ -44,8 +44,8 @@ def bare_robot():
     return Mock(guard=guard, simulator=simulator, observers=[], run=run)
 
 
-def bare_world(nonce=b"w", ring=None, start_ns=0):
-    """Make world's end, sealed if it gets keys."""
+def bare_world(ring, nonce=b"w", start_ns=0):
+    """Make world's end of the tunnel with a robot that flies every command."""
     return WorldEndpoint(
         bare_robot(),
         SimpleNamespace(measure=lambda truth: truth),
@@ -117,7 +117,7 @@ class Bare:
     def __init__(self, keys, *, flies=False):
         """Start world, with a simulated robot if it `flies`."""
         identity = Identity(CLOCK, b"world".ljust(16), keys)
-        self.world = assembly.build_world(HOVER, identity) if flies else bare_world(ring=keys)
+        self.world = assembly.build_world(HOVER, identity) if flies else bare_world(keys)
         self.keys, self.now_ns, self.born = keys, 0, 0
         self.clouds = {}
         self.sent = []  # everything that any cloud has ever sent

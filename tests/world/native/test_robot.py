@@ -23,6 +23,7 @@ from cloudrc.world.native.robot import NativeRobot, make_robot, usable
 from cloudrc.world.robot import Robot
 from cloudrc.world.scene import FOLDER, mujoco
 from cloudrc.world.simulator import Simulator
+from tests.flights.conftest import CLOCK, ring
 from tests.world.guard.conftest import LIMITS, MS, SECOND, UP, Flight, hostile
 
 pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
@@ -199,7 +200,7 @@ def test_in_air_that_acts_on_geoms_c_uses_the_whole_model(setting):
     ],
 )
 def test_an_experiment_has_the_same_records_in_c(name, settings, monkeypatch):
-    experiment, identity = load_experiment(name, settings), Identity(bytes(16), bytes(16))
+    experiment, identity = load_experiment(name, settings), Identity(CLOCK, bytes(16), ring())
     assert isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
     in_c = fly_in_memory(experiment).run.records_sha256
     monkeypatch.setenv(SWITCH, "0")
