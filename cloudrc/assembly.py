@@ -99,36 +99,23 @@ def build_world(
     because compiling takes a while.
     """
     from cloudrc.world.endpoint import WorldEndpoint
-    from cloudrc.world.guard.limits import Limits
     from cloudrc.world.guard.state import Guard
     from cloudrc.world.low_level import LowLevel
     from cloudrc.world.native.robot import make_robot
     from cloudrc.world.plant import Wind
     from cloudrc.world.simulator import Simulator
 
-    world, guard, seed = experiment.world, experiment.guard, experiment.seed
-    limits = Limits(
-        fence_low=fence.LOW,
-        fence_high=fence.HIGH,
-        command_age_max_ns=round(guard.command_age_max_ms * MS_TO_NS),
-        speed_max=guard.speed_max_mps,
-        acceleration_max=guard.acceleration_max_mps2,
-        yaw_rate_max=guard.yaw_rate_max_radps,
-        hold_max_ns=round(guard.hold_max_s * 1e9),
-        plan_max_ns=round(guard.plan_max_s * 1e9),
-    )
+    world, seed = experiment.world, experiment.seed
     air, wind = world.wind, None
     if air.blows:
         wind = Wind(air.velocity_mps, air.gust_mps, air.gust_time_s, _generator(seed, "wind"))
     simulator = Simulator(world.robot, world.scene, world.plant, wind)
     low_level = LowLevel(**world.low_level.model_dump())
-    robot = make_robot(simulator, low_level, Guard(limits), limits)
     return WorldEndpoint(
-        robot,
+        make_robot(simulator, low_level, Guard(experiment.guard)),
         _sensors(world.sensors, seed),
         identity,
         newest_wins=experiment.tunnel.order == "newest",
-        command_age_max_ns=limits.command_age_max_ns,
         odometry_period_ns=SECOND_NS // world.odometry_rate_hz,
         start_ns=clock(),
     )

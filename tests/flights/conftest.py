@@ -35,7 +35,7 @@ KEY = Key(b"k" * 32)
 def bare_robot():
     """A robot that flies every accepted command."""
     guard = Mock(state=GuardState.TRACK, cause=Cause.COMMAND, latched=False, armed=True)
-    guard.configure_mock(counts={}, changes=[], reference=ZERO)
+    guard.configure_mock(command_age_max_ns=250 * MS, counts={}, changes=[], reference=ZERO)
     guard.accept_command.return_value = None
     truth = lambda now_ns: Odometry(now_ns, ZERO, UPRIGHT, ZERO, ZERO)  # noqa: E731
     simulator = Mock(tip_force=lambda: 0.0, truth=truth, touches=[])
@@ -51,7 +51,6 @@ def bare_world(ring, nonce=b"w", start_ns=0):
         SimpleNamespace(measure=lambda truth: truth),
         Identity(CLOCK, nonce.ljust(16), ring),
         newest_wins=True,
-        command_age_max_ns=250 * MS,
         start_ns=start_ns,
     )
 

@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from cloudrc.config.load import ResolvedGuard
 from cloudrc.geometry import fence
 from cloudrc.messages import Command, Vector
 from cloudrc.world import low_level, rotors
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard import state
-from cloudrc.world.guard.limits import Limits
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.native.library import Library, library
@@ -82,14 +82,14 @@ class Flight(ctypes.Structure):
     _fields_ = tuple(_FIELDS.items())
 
 
-def make_flight(simulator: Simulator, controller: LowLevel, limits: Limits) -> Flight:
+def make_flight(simulator: Simulator, controller: LowLevel, guard: Guard) -> Flight:
     """Make a `Flight` with all fields except the present state.
 
     Call `make_flight` after a reset of the simulator. Raise an OSError, AttributeError, KeyError or
     ImportError if MuJoCo is not as expected.
     """
     model, data = simulator.model, simulator.data
-    turning, (low, high) = rotors.Rotors(simulator.dt), limits.inner_corners()
+    turning = rotors.Rotors(simulator.dt)
     limit_xy, limit_z, dt = controller.limits
     arrays = data.qpos, data.qvel, data.ctrl, data.qfrc_applied
     tip_force = data.sensordata[model.sensor(f"{ROBOT_PREFIX}tip").adr[0] :]
@@ -106,8 +106,8 @@ def make_flight(simulator: Simulator, controller: LowLevel, limits: Limits) -> F
         *(data._address + _contacts_offset(), timer, obstacles.ctypes.data),
         *_VALUES.values(),
         *(turning.up, turning.down, controller.gains, limit_xy, limit_z, dt),
-        limits.acceleration_max * STEP,
-        *(low, high, simulator.dt, radius, ACCELERATION_MAX, STEP_NS),
+        guard.acceleration_max * STEP,
+        *(fence.INNER_LOW, fence.INNER_HIGH, simulator.dt, radius, ACCELERATION_MAX, STEP_NS),
         *(CONTACT_CHECK_STEPS, len(obstacles)),
     )
     flight.keep = obstacles, free_model  # else Python frees their memory
@@ -196,15 +196,15 @@ _pack_memory, _unpack_memory = Struct("q10dq").pack_into, Struct("40x6d").unpack
 _unpack_before = Struct("13d").unpack_from
 
 
-def make_robot(simulator: Simulator, low_level: LowLevel, guard: Guard, limits: Limits) -> Robot:
-    """Make a robot that uses C if this machine can; `limits` are those of the guard.
+def make_robot(simulator: Simulator, low_level: LowLevel, guard: Guard) -> Robot:
+    """Make a robot that uses C if this machine can.
 
     With wind, or if the true robot differs from its model, all steps run in Python, because
     `step.c` can simulate neither.
     """
     if usable().run is None or not simulator.is_nominal:
         return Robot(simulator, low_level, guard)
-    return NativeRobot(simulator, low_level, guard, limits)
+    return NativeRobot(simulator, low_level, guard)
 
 
 def usable() -> Library:
@@ -221,11 +221,9 @@ class NativeRobot(Robot):
     controls in a `tape`.
     """
 
-    def __init__(
-        self, simulator: Simulator, low_level: LowLevel, guard: Guard, limits: Limits
-    ) -> None:
+    def __init__(self, simulator: Simulator, low_level: LowLevel, guard: Guard) -> None:
         super().__init__(simulator, low_level, guard)
-        self._flight = make_flight(simulator, low_level, limits)
+        self._flight = make_flight(simulator, low_level, guard)
         self._address = ctypes.addressof(self._flight)
         run = library().run
         assert run is not None
@@ -290,11 +288,11 @@ class NativeRobot(Robot):
 @cache
 def _self_test() -> str:
     """Fly in C and in Python; return how the results differ, in words; "" if they are equal."""
-    limits = Limits(fence.LOW, fence.HIGH)
+    limits = ResolvedGuard()
     parts = [(Simulator("pelican", "empty"), LowLevel(), Guard(limits)) for _ in range(2)]
     wrong = ""
     try:
-        if _fly(Robot(*parts[0])) != _fly(NativeRobot(*parts[1], limits)):
+        if _fly(Robot(*parts[0])) != _fly(NativeRobot(*parts[1])):
             wrong = "C and Python differ"
     except (OSError, AttributeError, KeyError, ImportError) as error:
         wrong = f"MuJoCo is not as expected: {error!r}"
