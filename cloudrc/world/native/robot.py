@@ -10,7 +10,7 @@ import ctypes
 import logging
 from copy import copy
 from functools import cache
-from math import dist, inf, prod
+from math import dist, inf
 from pathlib import Path
 from struct import Struct
 from typing import Any
@@ -42,6 +42,10 @@ MARGIN = 1e-3
 """Distance added to every geom with its own margin and gap [m]; it covers rounding errors."""
 HUGE = 1e4
 """Half the edge of the box that stands for the space below a plane [m]."""
+PAGE = 4096
+"""Smallest size of a page [bytes]: a program may read all bytes of a page, or none."""
+MARK = 0x6E636F6E
+"""Number that no other part of `mjData` contains."""
 UNUSED_WITHOUT_CONTACTS = sum(
     int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{part}", 0))  # old versions lack the last two
     for part in ("CONTACT", "CONSTRAINT", "SENSOR", "SPRING", "DAMPER")
@@ -85,8 +89,8 @@ class Flight(ctypes.Structure):
 def make_flight(simulator: Simulator, controller: LowLevel, guard: Guard) -> Flight:
     """Make a `Flight` with all fields except the present state.
 
-    Call `make_flight` after a reset of the simulator. Raise an OSError, AttributeError, KeyError or
-    ImportError if MuJoCo is not as expected.
+    Call `make_flight` after a reset of the simulator. Raise an OSError, AttributeError or
+    ValueError if MuJoCo is not as expected.
     """
     model, data = simulator.model, simulator.data
     turning = rotors.Rotors(simulator.dt)
@@ -103,7 +107,7 @@ def make_flight(simulator: Simulator, controller: LowLevel, guard: Guard) -> Fli
         # MuJoCo has no public name for the addresses.
         *(model._address, free_model._address, data._address),
         *(array.ctypes.data for array in (*arrays, tip_force)),
-        *(data._address + _contacts_offset(), timer, obstacles.ctypes.data),
+        *(data._address + _contacts_offset(data), timer, obstacles.ctypes.data),
         *_VALUES.values(),
         *(turning.up, turning.down, controller.gains, limit_xy, limit_z, dt),
         guard.acceleration_max * STEP,
@@ -153,41 +157,26 @@ def _mujoco_library() -> ctypes.CDLL:
     return ctypes.CDLL(str(files[0]))
 
 
-def _contacts_offset() -> int:
+def _contacts_offset(data: Any) -> int:
     """Return the offset of the number of contacts in MuJoCo's `mjData` [bytes].
 
-    The offset depends on MuJoCo's version; `mujoco.introspect` describes the structure.
+    The offset depends on MuJoCo's version. The function writes MARK to `data.ncon`, searches the
+    memory of `data` for it, and restores the number. The address of `qpos` ends the search; it is
+    in `mjData`, too, so that the search never leaves the memory of `data`.
     """
-    from mujoco.introspect import structs
-
-    fields = []
-    for field in structs.STRUCTS["mjData"].fields:
-        fields.append((field.name, _ctype(field.type, structs.STRUCTS)))
-        if field.name == "ncon":
-            break
-    layout: Any = type("Data", (ctypes.Structure,), {"_fields_": fields})
-    offset: int = layout.ncon.offset
+    mark, end = Struct("i").pack(MARK), Struct("P").pack(data.qpos.ctypes.data)
+    place, block, contacts = data._address, b"", data.ncon
+    try:
+        data.ncon = MARK
+        while mark not in block:
+            if end in block:
+                raise OSError("mjData does not contain the number of contacts")
+            place += len(block)
+            block = ctypes.string_at(place, PAGE - place % PAGE)
+    finally:
+        data.ncon = contacts
+    offset: int = place + block.index(mark) - data._address
     return offset
-
-
-_SCALARS = {
-    **dict.fromkeys(("int", "float", "mjtTimer"), ctypes.c_int32),
-    **dict.fromkeys(("mjtBool", "mjtByte"), ctypes.c_uint8),
-    **dict.fromkeys(("mjtNum", "mjtSize", "size_t", "uintptr_t", "uint64_t"), _int64),
-}
-"""Types of `mujoco.introspect`, as types of the same size."""
-
-
-def _ctype(kind: Any, structs: Any) -> Any:
-    """Return the type of ctypes for a type of `mujoco.introspect`; KeyError if it is unknown."""
-    if hasattr(kind, "extents"):
-        return _ctype(kind.inner_type, structs) * prod(kind.extents)
-    if not hasattr(kind, "name"):
-        return ctypes.c_void_p
-    if kind.name in _SCALARS:
-        return _SCALARS[kind.name]
-    fields = [(field.name, _ctype(field.type, structs)) for field in structs[kind.name].fields]
-    return type(kind.name, (ctypes.Structure,), {"_fields_": fields})
 
 
 _TRACK, _MEMORY, _BEFORE = Flight.reference.offset, Flight.free_steps.offset, Flight.before.offset
@@ -294,7 +283,7 @@ def _self_test() -> str:
     try:
         if _fly(Robot(*parts[0])) != _fly(NativeRobot(*parts[1])):
             wrong = "C and Python differ"
-    except (OSError, AttributeError, KeyError, ImportError) as error:
+    except (OSError, AttributeError, ValueError) as error:
         wrong = f"MuJoCo is not as expected: {error!r}"
     if wrong:
         logging.getLogger("cloudrc").warning("all steps run in Python: %s; report this", wrong)

@@ -1,8 +1,10 @@
 """Flights in C and in Python have the same bits, whatever the cloud sends."""
 
 import logging
+from ctypes import c_int
 from functools import cache, partial
 from math import inf
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -211,6 +213,19 @@ def test_an_experiment_has_the_same_records_in_c(name, settings, monkeypatch):
     assert not isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
 
 
+def test_the_number_of_contacts_is_found_in_the_memory_of_mujoco():
+    simulator = Simulator("pelican", "empty")
+    data, contacts = simulator.data, simulator.data.ncon
+    number = c_int.from_address(data._address + native._contacts_offset(data))
+    assert number.value == data.ncon == contacts > 0
+    data.ncon = 0
+    assert number.value == 0
+    elsewhere = SimpleNamespace(ncon=3, qpos=data.qpos, _address=data._address)
+    with pytest.raises(OSError, match="does not contain the number of contacts"):
+        native._contacts_offset(elsewhere)
+    assert elsewhere.ncon == 3
+
+
 def test_observers_and_a_tape_see_every_step():
     robot = robot_of(NativeRobot)
     count, seen = Count(robot), []
@@ -236,11 +251,15 @@ def test_a_robot_that_moves_from_c_to_python_flies_on_the_same():
     assert pilots[0].seen == pilots[1].seen
 
 
+def unfit(data):
+    raise ValueError("undefined symbol")
+
+
 @pytest.mark.parametrize(
     ("what", "value", "text"),
     [
         ("_VALUES", native._VALUES | {"mass": 1.05 + 1e-12}, "C and Python differ"),
-        ("_mujoco_library", lambda: {}["mjtNew"], "MuJoCo is not as expected: KeyError('mjtNew')"),
+        ("_contacts_offset", unfit, "MuJoCo is not as expected: ValueError('undefined symbol')"),
     ],
 )
 def test_a_failed_self_test_means_python_and_one_warning(what, value, text, monkeypatch, caplog):
