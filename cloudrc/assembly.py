@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from cloudrc.drivers.virtual import VirtualRun
     from cloudrc.teleop.store import Order
     from cloudrc.world.endpoint import WorldEndpoint
-    from cloudrc.world.sensors import Sensors
 
 MS_TO_NS = 1_000_000
 SECOND_NS = 1_000_000_000
@@ -103,35 +102,23 @@ def build_world(
     from cloudrc.world.low_level import LowLevel
     from cloudrc.world.native.robot import make_robot
     from cloudrc.world.plant import Wind
+    from cloudrc.world.robot import Robot
+    from cloudrc.world.sensors import Sensors
     from cloudrc.world.simulator import Simulator
 
     world, seed = experiment.world, experiment.seed
-    air, wind = world.wind, None
-    if air.blows:
-        wind = Wind(air.velocity_mps, air.gust_mps, air.gust_time_s, _generator(seed, "wind"))
+    wind = Wind(world.wind, _generator(seed, "wind")) if world.wind.blows else None
     simulator = Simulator(world.robot, world.scene, world.plant, wind)
     low_level = LowLevel(**world.low_level.model_dump())
+    noise, turn_noise = _generator(seed, "odometry noise"), _generator(seed, "attitude noise")
+    make = make_robot if world.is_nominal else Robot
     return WorldEndpoint(
-        make_robot(simulator, low_level, Guard(experiment.guard)),
-        _sensors(world.sensors, seed),
+        make(simulator, low_level, Guard(experiment.guard)),
+        Sensors(world.sensors, noise, turn_noise),
         identity,
         newest_wins=experiment.tunnel.order == "newest",
         odometry_period_ns=SECOND_NS // world.odometry_rate_hz,
         start_ns=clock(),
-    )
-
-
-def _sensors(seen: schema.Sensors, seed: int) -> Sensors:
-    from cloudrc.world.sensors import Errors, Sensors
-
-    roll, pitch, yaw = map(radians, seen.attitude_bias_deg)
-    return Sensors(
-        seen.position_noise_m,
-        seen.velocity_noise_mps,
-        _generator(seed, "odometry noise"),
-        Errors(radians(seen.attitude_noise_deg), (roll, pitch, yaw)),
-        Errors(seen.rate_noise_radps, seen.rate_bias_radps),
-        _generator(seed, "attitude noise"),
     )
 
 

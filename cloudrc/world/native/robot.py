@@ -188,12 +188,11 @@ _unpack_before = Struct("13d").unpack_from
 def make_robot(simulator: Simulator, low_level: LowLevel, guard: Guard) -> Robot:
     """Make a robot that uses C if this machine can.
 
-    With wind, or if the true robot differs from its model, all steps run in Python, because
-    `step.c` can simulate neither.
+    `step.c` simulates neither wind nor a true robot that differs from its model: in these cases,
+    make a `Robot`.
     """
-    if usable().run is None or not simulator.is_nominal:
-        return Robot(simulator, low_level, guard)
-    return NativeRobot(simulator, low_level, guard)
+    kind = Robot if usable().run is None else NativeRobot
+    return kind(simulator, low_level, guard)
 
 
 def usable() -> Library:
