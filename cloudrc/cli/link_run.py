@@ -175,7 +175,7 @@ def export_state(exporter: Exporter | None, state: LinkState) -> None:
 
 
 def export_counts(exporter: Exporter | None, counts: dict[str, int]) -> None:
-    """Export the counters of a shaper as metrics: name of the counter -> value."""
+    """Export the counters of a shaper as metrics; `counts`: name of the counter -> value."""
     if exporter:
         exporter.see([Counted(0, "link", name, number) for name, number in counts.items()])
 

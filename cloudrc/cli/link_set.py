@@ -138,7 +138,6 @@ def set_here(
 
 
 def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
-    """Return the link of a release; raise an error with the reason if the release has no link."""
     from cloudrc.cluster.link import read_link
     from cloudrc.cluster.pods import find_pod
 
@@ -155,7 +154,7 @@ def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
 
 
 def note_of(edit: Edit, number: str) -> str:
-    """Format change.json: number and cause of a change, and whether the time line restarts."""
+    """Return change.json as text: number, cause, and whether the time line restarts."""
     return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
 
 

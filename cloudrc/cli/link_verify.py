@@ -187,7 +187,7 @@ def measure(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Str
 
 
 def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Findings]:
-    """Send the probes of `plans` over the link from `run_link`; return direction -> findings."""
+    """Send all probes over a running link, and judge it; return direction -> findings."""
     streams, found = measure(ways, plans), {}
     time.sleep(COUNTS_WAIT)
     for name, way in ways.items():

@@ -54,8 +54,7 @@ SHARED = {
 """Commands without a module of their own -> the module in `cloudrc/cli` that contains them."""
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
 COUNT_MAX = 10_000
-"""Largest number of repeats, seeds or processes that a flag accepts. Before Python 3.11.6, a pool
-of processes hangs with more than 16,384 tasks (cpython issue 105829)."""
+"""Largest number of repeats, seeds or processes that a flag accepts."""
 
 ABOUT = "Fly a simulated drone from a simulated cloud, over an emulated network."
 EXAMPLES = """\

@@ -55,7 +55,7 @@ RELEASED_PERIOD = 2.0
 class Command(NamedTuple):
     """One command of a module that defines several commands.
 
-    A module with only one command has attributes with the names of these fields.
+    A module with only one command is used in place of a `Command`: it defines the same names.
     """
 
     arguments: Callable[[argparse.ArgumentParser], None]
@@ -199,7 +199,7 @@ def warn_if_exposed(listen: Address) -> None:
 
 @contextmanager
 def _listening(flag: str, listen: Address) -> Iterator[None]:
-    """Warn if other machines can reach `listen`; name `flag` if the block raises an OSError."""
+    """Warn if other machines can reach `listen`; convert an OSError to an error about `flag`."""
     warn_if_exposed(listen)
     try:
         yield
@@ -404,7 +404,7 @@ def _run_relay(options: argparse.Namespace) -> int:
         threading.Thread(target=control.follow, name="link control", daemon=True).start()
 
     def over() -> bool:
-        """Apply changes of the link; export the counts, if due; return whether to stop."""
+        """Apply changes of the link; export the packet counts, if due; return whether to stop."""
         nonlocal count_due
         if control is not None:
             control.swap()

@@ -158,7 +158,10 @@ class Exporter:
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Set whether this teleop or link is ready; world and cloud are ready if the peer sends."""
+        """Set whether this process is ready; only teleop and link call this method.
+
+        World and cloud are ready while the peer sends.
+        """
         self._seen_at = time.monotonic()
         self._said_ready = ready
 
@@ -186,7 +189,7 @@ class Exporter:
 
     @property
     def is_ready(self) -> bool:
-        """Whether `ready(True)` was called; world and cloud are also ready while the peer sends."""
+        """Whether this process is ready: world or cloud if the peer sends, others by `ready`."""
         return self._said_ready or (self._live.end is not None and self._live.end.has_peer)
 
     def serve(self, address: tuple[str, int]) -> int:

@@ -60,7 +60,9 @@ RUN, SESSION = "run", "session"
 
 
 def flights_folder() -> Path:
-    """Return the folder for flight files: in XDG_RUNTIME_DIR if this user owns it, or in the home.
+    """Return the folder for flight files, which tell other commands about flights under way.
+
+    It is in XDG_RUNTIME_DIR if this user owns that folder, otherwise in the home folder.
 
     Source: XDG Base Directory Specification.
     """
@@ -70,7 +72,7 @@ def flights_folder() -> Path:
 
 
 class FlightFile(NamedTuple):
-    """Content of a flight file besides the run's folder: how other commands reach the flight."""
+    """What a flight file tells other commands about a flight, besides the folder of the run."""
 
     api: str  # address of the operator's API; "" for none
     kind: str  # RUN or SESSION
@@ -163,8 +165,8 @@ class LocalRun:
 
     Attributes:
         notes: Sentences for the report of the flight.
-        announcement: Keeps the file by which other commands find this run, until it is closed.
-            `fly` closes it after a flight. After a session, the caller of `fly` has to close it.
+        announcement: Its `close` deletes the file by which other commands find this run. `fly`
+            closes it after a flight. After a session, the caller of `fly` has to close it.
     """
 
     def __init__(
@@ -319,7 +321,6 @@ class LocalRun:
             )
 
     def _stop(self) -> None:
-        """End the processes that still run: first by SIGTERM, then by SIGKILL."""
         for child in self._children:
             child.process.terminate()
         deadline = time.monotonic() + STOP_LIMIT

@@ -53,7 +53,7 @@ class LinkVerdict:
     """Newest verdict on whether the link's direction to this process matches its profile."""
 
     def __init__(self, direction: str) -> None:
-        """Set the direction, "uplink" or "downlink"; the verdict is "open" until a check."""
+        """Set the direction, "uplink" or "downlink"; before a check the verdict is "open"."""
         self._direction = direction
         self._newest: tuple[LinkChecked, ...] = ()
 
@@ -329,7 +329,7 @@ class Link:
         self._delays: dict[str, float] = {}
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set the `shaper` of a direction, "relay" or "netem", and the configured `link.mode`."""
+        """Store which `shaper` ("relay" or "netem") shapes a direction, and the key `link.mode`."""
         self._shapers[direction] = (shaper, direction, mode)
 
     def asked(self, direction: str, delay: float) -> None:

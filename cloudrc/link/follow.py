@@ -87,7 +87,7 @@ class ProfileFile:
 
 @dataclass(frozen=True)
 class Handed:
-    """A change that `cloudrc link set` writes directly into a pod, as a JSON document."""
+    """A change of the link that `cloudrc link set` writes into a pod, as a JSON document."""
 
     change: str  # number and cause of the change, as the text of `CHANGE_FILE`
     files: dict[str, str]  # file name -> text: `profile.yaml` and the traces that it names

@@ -317,7 +317,7 @@ class RelayShaper(Relay):
     def __init__(
         self, listen: Address, direction: LinkDirection, peek: Peek, end: Address | None = None
     ) -> None:
-        """Open the two sockets; raise an OSError if `listen` is in use or cannot reach `end`.
+        """Open the sockets; raise an OSError if `listen` is in use or cannot reach `end`.
 
         This pod's world or cloud sends from the address `end` (None: from any address) to the
         address `listen` (port 0: any free port). The times of the model `direction` are on the

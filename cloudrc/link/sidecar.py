@@ -93,7 +93,7 @@ class Sidecar:
                 file.unlink(missing_ok=True)
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
-        """Use one shaper until `stop` returns True, or until a profile needs the other shaper."""
+        """Run netem or the relay until `stop()` is true, or until a profile needs the other."""
         profile, machine = self.profile, self._machine
         if self.states.state and profile.change.restart:
             self._origin_ns = machine.clock()
@@ -136,7 +136,7 @@ class Sidecar:
         return relay, relay.follow_peer(peer)
 
     def _replace(self, shaper: Shaper, profile: Loaded) -> bool:
-        """Apply or refuse a new profile; return False if only the other shaper can apply it."""
+        """Apply or refuse a new profile; return False if the relay has to replace netem for it."""
         restart = profile.change.restart
         try:
             shaper.follow_profile(profile.direction, restart=restart)

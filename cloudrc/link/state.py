@@ -108,7 +108,7 @@ class StateFile:
         self.state = state
 
     def refuse(self, number: str, refusal: str) -> None:
-        """Note in the file that change `number` was refused; `refusal` is the reason, in words."""
+        """Write to the file which change (`number`) was refused, and why (`refusal`, in words)."""
         if self.state is not None:
             self.publish(replace(self.state, refused=number, refusal=refusal))
 

@@ -28,7 +28,7 @@ HELD = " Red: the guard was in HOLD."
 
 
 def delays_of(direction: Direction) -> Timeline | None:
-    """Return a direction's link conditions over time; None if its trace or table is unreadable."""
+    """Return a direction's link conditions over time; None if a file for them is unreadable."""
     try:
         return Timeline(link_profile(direction))
     except BadInputError:

@@ -174,8 +174,9 @@ Source: docs/reference/faults.md, "F23"."""
 def ramp_ns(speed_max: float) -> int:
     """Return how long after a HOLD the acceleration of the reference is limited to BRAKE [ns].
 
-    In this time the robot can reach its highest speed, `speed_max` [m/s]. The time is fixed: the
-    reference may reach the command at once, because the first commands after a silence may be zero.
+    In this time the robot can reach its highest speed, `speed_max` [m/s]. The limit does not end
+    earlier when the reference reaches the command, because the first commands after a silence may
+    be zero.
     Source: docs/reference/plant.md, "Leaving HOLD".
     """
     return round(max(RAMP_MIN, speed_max / BRAKE) * 1e9)
