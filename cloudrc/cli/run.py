@@ -377,8 +377,7 @@ def _record_local(
         raise error
     notes = (*local.notes, *([str(broken)] if broken else ()))
     facts = messages_sha256(mission.messages), interrupted, notes
-    steps = library().text if experiment.world.is_nominal else NO_C
-    run = Run("local", "relay", *facts, steps)
+    run = Run("local", "relay", *facts, library().text if experiment.world.is_nominal else NO_C)
     try:
         yield add_views(mission, experiment), experiment, run
     finally:
