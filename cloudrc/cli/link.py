@@ -33,10 +33,10 @@ examples:
   cloudrc link verify paper-p3
   cloudrc link set downlink.delay_ms=120
 
-All delays are one way. The chart starts 'cloudrc link run' in each pod. It
-shapes what the pod sends: the uplink in the world pod, the downlink in the
-cloud pod. It watches its profile file and the address of its peer, and ends on
-SIGTERM."""
+All delays are one way. 'cloudrc run --mode local' starts 'cloudrc link run' for
+each direction, the chart starts it in each pod: the uplink beside world, the
+downlink beside cloud. It watches its profile file and the address of its peer,
+and ends on SIGTERM."""
 ACTIONS = {
     "show": "draw a profile and print its delay and loss statistics",
     "record": "turn measured delays into a trace that a profile can replay",
@@ -90,7 +90,7 @@ KINDS = ("png", "svg", "pdf")
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", title="actions")
     here = {
         "show": (SHOW_EPILOG, show_arguments, show),
         "verify": (VERIFY_EPILOG, verify_arguments, _verify),
@@ -117,8 +117,6 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the action that the user has chosen, such as `set`; return the exit code."""
-    if options.action is None:
-        raise BadInputError("an action is missing; see 'cloudrc link --help'")
     code: int = options.act(options)
     return code
 

@@ -43,12 +43,11 @@ GROUPS: dict[str, dict[str, str]] = {
         "world": "the robot: physics, sensors, guard, low-level control",
         "cloud": "the remote controller",
         "teleop": "missions and the operator's HTTP API",
-        "relay": "the emulated link between world and cloud",
     },
 }
 """Group of commands -> command -> help line. `cloudrc/cli/<command>.py` contains the command."""
 SHARED = {
-    **dict.fromkeys(("world", "cloud", "relay"), "processes"),
+    **dict.fromkeys(("world", "cloud"), "processes"),
     **dict.fromkeys(("up", "down"), "session"),
 }
 """Commands without a module of their own -> the module in `cloudrc/cli` that contains them."""

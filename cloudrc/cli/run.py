@@ -119,6 +119,17 @@ def load(name: str, overrides: Iterable[str], seed: int | None = None) -> Resolv
     return experiment
 
 
+def refuse_seed(texts: Iterable[str]) -> None:
+    """Raise a BadInputError if one of the settings `texts` (KEY=VALUE) sets the seed.
+
+    Commands with --seeds replace the seed in every flight.
+    """
+    from cloudrc.config.overrides import parse_settings
+
+    if ("seed",) in parse_settings(texts):
+        raise BadInputError("seed: each flight has its own seed; give their number with --seeds")
+
+
 def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None) -> int:
     """Fly as `options` say, print the summary, and return the exit code.
 
@@ -321,8 +332,14 @@ def _record_virtual(
                 writer.attach(name, data)
 
 
-def _prepare(experiment: ResolvedExperiment) -> bool:
-    """Check the user's robot and scene; return whether the packages of the API are installed."""
+def _prepare(experiment: ResolvedExperiment, folder: Path) -> bool:
+    """Check the user's robot and scene, and write the link's profile into the run's `folder`.
+
+    Return whether the packages of the API are installed.
+    """
+    from cloudrc.cli.link_run import prepare_link
+    from cloudrc.drivers.local import LINK_FOLDER
+
     if absent := missing("api"):
         text = f"no operator's API in this run: {', '.join(absent)} not installed"
         print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)
@@ -331,6 +348,7 @@ def _prepare(experiment: ResolvedExperiment) -> bool:
         from cloudrc.world.scene import compile_model
 
         compile_model(world.robot, world.scene)  # report an invalid model before the flight
+    prepare_link(folder / LINK_FOLDER, experiment)
     return not absent
 
 
@@ -356,7 +374,7 @@ def _record_local(
     from cloudrc.report.write import attachments
     from cloudrc.world.native.library import library
 
-    local = LocalRun(folder, see, api=_prepare(experiment), session=session)
+    local = LocalRun(folder, see, api=_prepare(experiment, folder), session=session)
     broken, interrupted = None, True
     try:
         local.fly(inf if session else flight_limit(experiment))

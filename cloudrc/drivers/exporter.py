@@ -171,14 +171,6 @@ class Exporter:
         assert self._live.link is not None, "only a link is shaped"
         return self._live.link
 
-    def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set the labels of a direction's metric: `shaper`, "relay" or "netem", and `link.mode`."""
-        self.link.shaped(shaper, direction, mode)
-
-    def asked(self, direction: str, delay: float) -> None:
-        """Set the mean delay [s] that the current profile requests for a direction."""
-        self.link.asked(direction, delay)
-
     def unresolved(self, count: int) -> None:
         """Set the number of failed DNS queries for the peer's name. Any thread may call this."""
         self._live.see([Counted(0, "link", "unresolved", count)])

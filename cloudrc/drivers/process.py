@@ -266,7 +266,7 @@ class LinkNotes:
             shaper=to_one_line(state.shaper),
             cause=to_one_line(state.cause),
             age=max(0, now_ns - state.since_ns) * 1e-9,
-            time_line=nan if state.origin_ns is None else (now_ns - state.origin_ns) * 1e-9,
+            time_line=(now_ns - state.origin_ns) * 1e-9,
             **{name: asked.get(name, nan) for name in ("delay", "jitter", "loss", "rate")},
             conditions=json.dumps(state.profile.get(state.direction, {})),
         )
