@@ -28,13 +28,13 @@ from cloudrc.messages import Start
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.wire import Leg, Plan
 from cloudrc.tunnel.end import Identity
+from cloudrc.tunnel.keys import Key, KeyRing, KeySet
 
 if TYPE_CHECKING:
     from cloudrc.drivers.virtual import Sink, VirtualRun
     from cloudrc.records import Record
     from cloudrc.teleop.store import Order
     from cloudrc.world.endpoint import WorldEndpoint
-    from cloudrc.world.sensors import Sensors
 
 MS_TO_NS = 1_000_000
 SECOND_NS = 1_000_000_000
@@ -54,6 +54,8 @@ GRACE = 30.0
 """Time after the end of the mission's time limit at which a flight is stopped [s]."""
 VIRTUAL_CLOCK = bytes(16)
 """Identity of the virtual clock, which world and cloud share."""
+VIRTUAL_RING = KeyRing(KeySet(Key(b"nothing is secret in one process")))
+"""Keys of world and cloud in virtual time; with them both ends refuse damaged datagrams."""
 SAME_KEYS = {
     *("distribution", "correlation", "duplicate", "reorder", "corrupt", "keep_order"),
     "queue_packets",
@@ -71,9 +73,10 @@ def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoi
     links = build_links(experiment)
     passes = not any(link.corrupts for link in links)  # only bytes can be damaged
     clock_id = VIRTUAL_CLOCK if own == Clock() else CLOUD_CLOCK
-    identity = Identity(clock_id, b"cloud".ljust(16), passes=passes)
-    world = build_world(experiment, Identity(VIRTUAL_CLOCK, b"world".ljust(16), passes=passes))
-    cloud = build_cloud(experiment, identity, lambda: own.at(0), cpu_clock=CPU_CLOCK)
+    of_world = Identity(VIRTUAL_CLOCK, b"world".ljust(16), VIRTUAL_RING, passes)
+    of_cloud = Identity(clock_id, b"cloud".ljust(16), VIRTUAL_RING, passes)
+    world = build_world(experiment, of_world)
+    cloud = build_cloud(experiment, of_cloud, lambda: own.at(0), cpu_clock=CPU_CLOCK)
     return world, cloud, VirtualRun(world, cloud, *links, cloud_clock=own)
 
 
@@ -110,52 +113,27 @@ def build_world(
     that the duration of compiling the scene does not count.
     """
     from cloudrc.world.endpoint import WorldEndpoint
-    from cloudrc.world.guard.limits import Limits
     from cloudrc.world.guard.state import Guard
     from cloudrc.world.low_level import LowLevel
     from cloudrc.world.native.robot import make_robot
     from cloudrc.world.plant import Wind
+    from cloudrc.world.robot import Robot
+    from cloudrc.world.sensors import Sensors
     from cloudrc.world.simulator import Simulator
 
-    world, guard, seed = experiment.world, experiment.guard, experiment.seed
-    limits = Limits(
-        fence_low=fence.LOW,
-        fence_high=fence.HIGH,
-        command_age_max_ns=round(guard.command_age_max_ms * MS_TO_NS),
-        speed_max=guard.speed_max_mps,
-        acceleration_max=guard.acceleration_max_mps2,
-        yaw_rate_max=guard.yaw_rate_max_radps,
-        hold_max_ns=round(guard.hold_max_s * 1e9),
-        plan_max_ns=round(guard.plan_max_s * 1e9),
-    )
-    air, wind = world.wind, None
-    if air.blows:
-        wind = Wind(air.velocity_mps, air.gust_mps, air.gust_time_s, _generator(seed, "wind"))
+    world, seed = experiment.world, experiment.seed
+    wind = Wind(world.wind, _generator(seed, "wind")) if world.wind.blows else None
     simulator = Simulator(world.robot, world.scene, world.plant, wind)
     low_level = LowLevel(**world.low_level.model_dump())
-    robot = make_robot(simulator, low_level, Guard(limits), limits)
+    noise, turn_noise = _generator(seed, "odometry noise"), _generator(seed, "attitude noise")
+    make = make_robot if world.is_nominal else Robot
     return WorldEndpoint(
-        robot,
-        _sensors(world.sensors, seed),
+        make(simulator, low_level, Guard(experiment.guard)),
+        Sensors(world.sensors, noise, turn_noise),
         identity,
         newest_wins=experiment.tunnel.order == "newest",
-        command_age_max_ns=limits.command_age_max_ns,
         odometry_period_ns=SECOND_NS // world.odometry_rate_hz,
         start_ns=clock(),
-    )
-
-
-def _sensors(seen: schema.Sensors, seed: int) -> Sensors:
-    from cloudrc.world.sensors import Errors, Sensors
-
-    roll, pitch, yaw = map(radians, seen.attitude_bias_deg)
-    return Sensors(
-        seen.position_noise_m,
-        seen.velocity_noise_mps,
-        _generator(seed, "odometry noise"),
-        Errors(radians(seen.attitude_noise_deg), (roll, pitch, yaw)),
-        Errors(seen.rate_noise_radps, seen.rate_bias_radps),
-        _generator(seed, "attitude noise"),
     )
 
 

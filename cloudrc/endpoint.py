@@ -25,10 +25,6 @@ from cloudrc.records import Record
 class Endpoint(Protocol):
     """World or cloud, as its driver sees it. All times are integer nanoseconds on its own clock."""
 
-    @property
-    def sealed(self) -> bool:
-        """Whether this end authenticates datagrams. If not, its driver must not use a socket."""
-
     def receive_datagram(self, data: Datagram, now_ns: int) -> None:
         """Process one datagram; count and drop an invalid datagram, without an exception."""
 

@@ -288,14 +288,6 @@ def fly(
         raise CloudrcError(f"{where}: {error.strerror or error}; choose another folder") from error
 
 
-def _physics_steps(experiment: ResolvedExperiment, usual: str) -> str:
-    """Name the code that runs the physics: Python for wind or a changed plant, else `usual`."""
-    from cloudrc.config.schema import Plant
-
-    is_usual = experiment.world.plant == Plant() and not experiment.world.wind.blows
-    return usual if is_usual else NO_C
-
-
 @contextlib.contextmanager
 def _record_virtual(
     experiment: ResolvedExperiment, folder: Path, see: See
@@ -330,7 +322,8 @@ def _record_virtual(
             interrupted = True
         try:
             facts = store.hexdigest(), interrupted, assembly.virtual_notes(experiment)
-            run = Run("virtual", "virtual", *facts, _physics_steps(experiment, usable().text))
+            steps = usable().text if experiment.world.is_nominal else NO_C
+            run = Run("virtual", "virtual", *facts, steps)
             recording = store.recording()
             writer.write_views(views(recording, experiment))
             yield recording, experiment, run
@@ -402,7 +395,7 @@ def _record_local(
         raise error
     notes = (*local.notes, *([str(broken)] if broken else ()))
     facts = messages_sha256(mission.messages), interrupted, notes
-    run = Run("local", "relay", *facts, _physics_steps(experiment, library().text))
+    run = Run("local", "relay", *facts, library().text if experiment.world.is_nominal else NO_C)
     try:
         yield add_views(mission, experiment), experiment, run
     finally:

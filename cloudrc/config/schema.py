@@ -394,6 +394,11 @@ class World(Section):
     odometry_rate_hz: Literal[20, 25, 50, 100, 125, 250, 500] = 100
     """Rate of the odometry for cloud [Hz]. The true state is recorded at 100 Hz or more"""
 
+    @property
+    def is_nominal(self) -> bool:
+        """Whether there is no wind and the true robot equals its model, as C steps assume."""
+        return self.plant == Plant() and not self.wind.blows
+
 
 class Guard(Section):
     """Limits of the onboard guard; only world reads them."""

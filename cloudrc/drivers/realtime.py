@@ -178,15 +178,13 @@ def serve(
     """Run world or cloud in real time until `stop()` is true.
 
     Args:
-        endpoint: World or cloud, with a key; without a key, a ValueError is raised.
+        endpoint: World or cloud.
         peer: Socket of the endpoint, and address of the other endpoint.
         end: "world" or "cloud", for the records.
         sink: Called with new records, at least every 20 ms if there are any. It must not block.
         stop: Called at every wake, at least every 100 ms.
         slip_ns: Returns the lag of the endpoint's clock behind the machine's monotonic clock [ns].
     """
-    if not endpoint.sealed:
-        raise ValueError(f"{end} has no key; a process must seal all its datagrams")
     gc.collect()
     gc.freeze()  # the garbage collector then skips all objects loaded so far
     stalled, sink_ns = False, time.monotonic_ns()

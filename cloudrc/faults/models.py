@@ -50,8 +50,6 @@ class RestartableEndpoint:
         others: Records of the second cloud, oldest first.
     """
 
-    sealed = True  # world and cloud have keys
-
     def __init__(self, build: Callable[[int], list[Endpoint]], clock: Clock) -> None:
         """Start a process; `build` makes its members, given the time on `clock` [ns]."""
         self._build, self.clock = build, clock

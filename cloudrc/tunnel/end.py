@@ -22,7 +22,7 @@ class Identity:
 
     clock_id: bytes  # 16 bytes that identify the monotonic clock of this machine
     nonce: bytes  # 16 random bytes that identify this process
-    ring: KeyRing | None = None  # the pre-shared keys; None if both ends are in one process
+    ring: KeyRing  # the pre-shared keys
     passes: bool = False  # whether telemetry and commands go to the other end as objects
 
 
@@ -44,11 +44,6 @@ class TunnelEnd:
     def epoch(self) -> int:
         """Number of the present session; 0 without a session."""
         return self._session.epoch
-
-    @property
-    def sealed(self) -> bool:
-        """Whether the datagrams are encrypted and authenticated."""
-        return self._session.sealed
 
     def take_datagrams(self) -> list[Datagram]:
         """Return the outgoing datagrams that were made since the last call."""

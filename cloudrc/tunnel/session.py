@@ -3,9 +3,6 @@
 A datagram changes no state before its tag is verified. Counters restart with every session, except
 those of HELLO, CHALLENGE and BUSY: the emulated link decides by epoch and counter which datagrams
 it loses. With restarted counters, it would lose the same handshake datagrams in every attempt.
-
-World and cloud in one process need no keys: no datagram reaches a network. Encryption would take
-5 % of the run time. Drivers with a socket refuse a session without keys (`Endpoint.sealed`).
 """
 
 from __future__ import annotations
@@ -26,25 +23,11 @@ from cloudrc.tunnel.codec import (
     check,
     encode_header,
 )
-from cloudrc.tunnel.keys import Key, KeyRing, KeySet
+from cloudrc.tunnel.keys import Key, KeyRing
 
 NO_EPOCH = 0  # epoch of an end without a session, and of every HELLO, CHALLENGE and BUSY datagram
 TIMELESS = frozenset(range(1, LAST_GREETING + 1)) - {Kind.ACCEPT}  # kinds without a session
-_PUBLIC_KEY = b"nothing is secret in one process"
-_NO_TAG = bytes(TAG_SIZE)
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
-
-
-class NoCipher:
-    """Replaces the cipher if world and cloud are in one process: no encryption, a tag of zeros."""
-
-    def encrypt(self, nonce: bytes, body: bytes, header: bytes) -> bytes:
-        """Return the body with a tag of zeros, not encrypted."""
-        return body + _NO_TAG
-
-    def decrypt(self, nonce: bytes, data: bytes, header: bytes) -> bytes:
-        """Return the body, which is not encrypted: `data` without the tag."""
-        return data[:-TAG_SIZE]
 
 
 class Session:
@@ -55,15 +38,9 @@ class Session:
     pre-shared key that verified the last handshake datagram.
     """
 
-    def __init__(self, sends: Direction, ring: KeyRing | None) -> None:
-        """Set the direction in which this endpoint sends, and the pre-shared keys.
-
-        `ring` contains these keys. It is None if world and cloud run in one process: then no
-        secret is needed.
-        """
-        self.epoch, self.sealed = NO_EPOCH, ring is not None
-        self.ring = ring or KeyRing(KeySet(Key(_PUBLIC_KEY)))
-        self._keys = self.ring.keys
+    def __init__(self, sends: Direction, ring: KeyRing) -> None:
+        """Set the direction in which this endpoint sends, and `ring`, the pre-shared keys."""
+        self.epoch, self.ring, self._keys = NO_EPOCH, ring, ring.keys
         self.greeting_key = self.epoch_key = self._keys.current
         self.is_outdated = False
         self._sends, self._opens = int(sends), 1 - int(sends)
@@ -160,9 +137,7 @@ class Session:
                 return signed[HEADER_SIZE:]
         raise DecodeError("tag")
 
-    def _derive(self, direction: int) -> AESGCM | NoCipher:
+    def _derive(self, direction: int) -> AESGCM:
         assert self._nonces, "the handshake comes first"
-        if not self.sealed:
-            return NoCipher()
         use = b"session %d %d" % (direction, self.epoch)
         return AESGCM(self.epoch_key.derive(self._nonces, use))

@@ -70,24 +70,20 @@ class WorldEndpoint(TunnelEnd):
         identity: Identity,
         *,
         newest_wins: bool,
-        command_age_max_ns: int,
         odometry_period_ns: int = ODOMETRY_PERIOD_NS,
         start_ns: int = 0,
     ) -> None:
         """Connect a robot with stopped rotors to the tunnel; there is no session yet.
 
         With `newest_wins`, a command that arrives after a newer command is dropped.
-        `command_age_max_ns` is the largest accepted age of a command [ns], `odometry_period_ns` the
-        time between two odometry samples [ns], a multiple of the step. `start_ns` is the present
-        time on the monotonic clock [ns].
+        `odometry_period_ns` is the time between two odometry samples [ns], a multiple of the step.
+        `start_ns` is the present time on the monotonic clock [ns].
         """
         super().__init__(identity, Direction.UPLINK, newest_wins)
         self.robot, self._sensors = robot, sensors
         self._tick_ns, self._slip_ns = start_ns, 0  # world's clock and its lag
-        self._door = ServerHandshake(
-            self._session, identity.nonce, identity.clock_id, command_age_max_ns
-        )
-        self._command_age_max_ns = command_age_max_ns
+        self._command_age_max_ns = age_max_ns = robot.guard.command_age_max_ns
+        self._door = ServerHandshake(self._session, identity.nonce, identity.clock_id, age_max_ns)
         self._stalled_wake_ns = NEVER_NS
         self._sample_ns = self._odometry_ns = start_ns
         self._odometry_period_ns = odometry_period_ns

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.config.schema import Plant
+from cloudrc.config import schema
 from cloudrc.world.readings import Readings
 
 Array: TypeAlias = NDArray[np.float64]
@@ -27,7 +27,7 @@ def point_inertia(mass: float, place: Array) -> Array:
     return mass * (place @ place * np.eye(3) - np.outer(place, place))
 
 
-def true_inertia(plant: Plant, model: Inertia) -> Inertia:
+def true_inertia(plant: schema.Plant, model: Inertia) -> Inertia:
     """Return the inertia of the true robot: `model`, scaled by factors of `plant`, plus payload.
 
     By the parallel-axis theorem, the payload adds the inertia of a point mass m1 m2/(m1 + m2) at
@@ -49,15 +49,9 @@ class Wind:
     Deviation: both axes have this spectrum, with a given time constant.
     """
 
-    def __init__(
-        self, mean: tuple[float, float], gust: float, time: float, rng: np.random.Generator
-    ) -> None:
-        """Set the mean wind [m/s].
-
-        `gust` [m/s] is the standard deviation of the gusts, `time` [s] their time constant.
-        """
-        self._mean, self._gust, self._time, self._rng = mean, gust, time, rng
-        self._gusts = gust * rng.standard_normal(2)
+    def __init__(self, wind: schema.Wind, rng: np.random.Generator) -> None:
+        self._mean, self._gust, self._time = wind.velocity_mps, wind.gust_mps, wind.gust_time_s
+        self._rng, self._gusts = rng, self._gust * rng.standard_normal(2)
 
     def seen_from(self, readings: Readings, dt: float) -> Readings:
         """Return readings with the velocity relative to the air; advance the gusts by `dt` [s].

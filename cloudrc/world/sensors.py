@@ -5,10 +5,12 @@ Guard and onboard controller use the true state, without errors.
 
 from __future__ import annotations
 
+from math import radians
 from typing import NamedTuple
 
 import numpy as np
 
+from cloudrc.config import schema
 from cloudrc.messages import ZERO, Odometry, Quaternion, Vector
 from cloudrc.world.scene import mujoco
 
@@ -38,24 +40,20 @@ class Sensors:
     """Measure the robot's pose and twist for cloud, with errors."""
 
     def __init__(
-        self,
-        position_noise: float,
-        velocity_noise: float,
-        rng: np.random.Generator,
-        attitude: Errors = NONE,
-        rate: Errors = NONE,
-        turn_rng: np.random.Generator | None = None,
+        self, errors: schema.Sensors, rng: np.random.Generator, turn_rng: np.random.Generator
     ) -> None:
-        """Set the errors of the measured position, velocity, `attitude` and body `rate`.
+        """Set the errors of the measured position, velocity, attitude and body rate.
 
-        `position_noise` [m] and `velocity_noise` [m/s] are standard deviations per axis. The error
-        of the attitude is a rotation about the body's axes. The noise of attitude and rate comes
-        from `turn_rng`, so that it does not change the noise of position and velocity.
+        The noise of attitude and rate comes from `turn_rng`, so that it does not change the noise
+        of position and velocity.
         """
-        self._position, self._velocity = Errors(position_noise), Errors(velocity_noise)
-        self._attitude, self._rate = attitude, rate
-        self._rng, self._turn_rng = rng, turn_rng or rng
-        self._exact = self._position == self._velocity == attitude == rate == NONE
+        roll, pitch, yaw = map(radians, errors.attitude_bias_deg)
+        self._position = Errors(errors.position_noise_m)
+        self._velocity = Errors(errors.velocity_noise_mps)
+        self._attitude = Errors(radians(errors.attitude_noise_deg), (roll, pitch, yaw))
+        self._rate = Errors(errors.rate_noise_radps, errors.rate_bias_radps)
+        self._rng, self._turn_rng = rng, turn_rng
+        self._exact = errors == schema.Sensors()
 
     def measure(self, truth: Odometry) -> Odometry:
         """Return the odometry that cloud gets: the true odometry plus the configured errors."""

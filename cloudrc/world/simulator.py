@@ -42,7 +42,6 @@ class Simulator:
         model: The compiled `MjModel`.
         data: The `MjData` of the simulation.
         dt: Duration of a step [s].
-        is_nominal: Whether there is no wind and the true robot equals its model.
         steps: Number of steps since the last reset.
         contacts: Number of contacts in the last step.
         tip_force_peak: Largest force on the arm's tip since the last call of `take_tip_force` [N].
@@ -67,7 +66,6 @@ class Simulator:
         """
         self.model = model = compile_model(robot, scene, plant)
         self._wind = wind
-        self.is_nominal = wind is None and plant in (None, Plant())
         self.dt: float = model.opt.timestep
         self.tape: list[Controls] | None = None
         self.data = data = mujoco.MjData(model)

@@ -1,4 +1,4 @@
-"""The real-time driver: addresses and routes, sockets, stalls and floods, seals."""
+"""The real-time driver: addresses and routes, sockets, stalls and floods."""
 
 import os
 import socket
@@ -100,8 +100,6 @@ def test_ends_meet_over_ipv6_and_at_both_families(listen, other):
 class Late:
     """An end with a given lateness at each wake [ns]."""
 
-    sealed = True
-
     def __init__(self, *late_ns):
         self._late_ns = list(late_ns)
         self.wakes = []
@@ -148,15 +146,11 @@ def test_what_waited_through_a_stall_is_taken_in_one_wake(late_ns, arrive, wakes
         assert end.wakes == wakes
 
 
-def test_no_socket_without_keys_and_no_answer_to_strangers():
+def test_an_end_does_not_answer_strangers():
     with bind(("127.0.0.1", 0)) as stranger:
         stranger.settimeout(0.06)
         peer, asked = Peer.bind(("127.0.0.1", 0), stranger.getsockname()), iter([False] * 3)
         with closing(peer.socket):
-            serve(
-                bare_world(ring=ring()), peer, end="world", sink=list, stop=lambda: next(asked, 1)
-            )
-            with pytest.raises(ValueError, match="world has no key; a process must seal"):
-                serve(bare_world(ring=None), peer, end="world", sink=list, stop=lambda: False)
+            serve(bare_world(ring()), peer, end="world", sink=list, stop=lambda: next(asked, 1))
         with pytest.raises(TimeoutError):
             stranger.recv(2048)

@@ -8,6 +8,7 @@ from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.messages import ZERO, Command
 from cloudrc.tunnel.codec import PLAN_MAX, Direction, Kind
 from cloudrc.tunnel.end import Identity, TunnelEnd
+from tests.flights.conftest import CLOCK, ring
 
 
 class Link:
@@ -38,7 +39,7 @@ def endpoint(deadline_ns, datagrams=()):
 def test_a_command_loads_the_link_as_its_bytes_would(planned):
     sizes = []
     for passes in (False, True):
-        end = TunnelEnd(Identity(bytes(16), bytes(16), passes=passes), Direction.DOWNLINK, True)
+        end = TunnelEnd(Identity(CLOCK, bytes(16), ring(), passes), Direction.DOWNLINK, True)
         end._session.begin(1, bytes(32))
         end._send_message(Kind.COMMAND, Command(1, 2, 3, ZERO, 0.0, (ZERO,) * planned, 4))
         downlink = Link()

@@ -15,7 +15,8 @@ from cloudrc.messages import ZERO
 from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
 from cloudrc.tunnel.channel import LATE, USED, Channel
-from cloudrc.world.guard.limits import Limits as GuardLimits
+from cloudrc.world.guard import limits
+from cloudrc.world.guard.state import Guard
 from tests.conftest import nightly
 from tests.faults.conftest import guard
 
@@ -94,8 +95,8 @@ def fails_to_shut_down(patch):
     ("breaks", "kind", "schedule"),
     [
         (lambda patch: None, "", HELD),
-        (ignores(GuardLimits, "ramp_ns", 0), "cap", replace(HELD, duration=9.0)),
-        (ignores(GuardLimits, "alone_max_ns", lambda *_: 3_600_000 * MS), "hold", HELD),
+        (ignores(limits, "ramp_ns", lambda _: 0), "cap", replace(HELD, duration=9.0)),
+        (ignores(Guard, "_alone_max_ns", 3_600_000 * MS), "hold", HELD),
         (applies_late_commands, "order", Schedule(1, reorder=0.5, duration=4.0)),
         (ignores(EmergencyStopRepeater, "sound"), "obeyed", HELD),
         (ignores(MissionService, "acknowledge"), "stuck", HELD),

@@ -35,7 +35,7 @@ KEY = Key(b"k" * 32)
 def bare_robot():
     """A robot that flies every accepted command."""
     guard = Mock(state=GuardState.TRACK, cause=Cause.COMMAND, latched=False, armed=True)
-    guard.configure_mock(counts={}, changes=[], reference=ZERO)
+    guard.configure_mock(command_age_max_ns=250 * MS, counts={}, changes=[], reference=ZERO)
     guard.accept_command.return_value = None
     truth = lambda now_ns: Odometry(now_ns, ZERO, UPRIGHT, ZERO, ZERO)  # noqa: E731
     simulator = Mock(tip_force=lambda: 0.0, truth=truth, touches=[])
@@ -44,14 +44,13 @@ def bare_robot():
     return Mock(guard=guard, simulator=simulator, observers=[], run=run)
 
 
-def bare_world(nonce=b"w", ring=None, start_ns=0):
-    """Make world's end, sealed if it gets keys."""
+def bare_world(ring, nonce=b"w", start_ns=0):
+    """Make world's end of the tunnel with a robot that flies every command."""
     return WorldEndpoint(
         bare_robot(),
         SimpleNamespace(measure=lambda truth: truth),
         Identity(CLOCK, nonce.ljust(16), ring),
         newest_wins=True,
-        command_age_max_ns=250 * MS,
         start_ns=start_ns,
     )
 
@@ -117,7 +116,7 @@ class Bare:
     def __init__(self, keys, *, flies=False):
         """Start world, with a simulated robot if it `flies`."""
         identity = Identity(CLOCK, b"world".ljust(16), keys)
-        self.world = assembly.build_world(HOVER, identity) if flies else bare_world(ring=keys)
+        self.world = assembly.build_world(HOVER, identity) if flies else bare_world(keys)
         self.keys, self.now_ns, self.born = keys, 0, 0
         self.clouds = {}
         self.sent = []  # everything that any cloud has ever sent

@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -14,8 +15,9 @@ from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.messages import Passed
 from cloudrc.record.columns import RecordStore
 from cloudrc.sweep.flight import fly_in_memory
+from cloudrc.tunnel.codec import DecodeError
 from cloudrc.tunnel.end import Identity
-from tests.flights.conftest import ring
+from tests.flights.conftest import both_ways, ring
 
 SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 1.0}]", "criteria.contact=false")
 ROOT = Path(__file__).resolve().parents[2]
@@ -53,16 +55,12 @@ PLAN = ("cloud.predictor=model_based", "cloud.estimator=earliest", "cloud.plan_s
         ("link.profile=paper-p3", *PLAN),
     ],
 )
-def test_messages_without_bytes_or_seals_make_the_same_records(settings):
-    experiment = short(*settings)
-    found = set()
-    for keys in (None, ring()):
-        identity = Identity(bytes(16), bytes(16), keys)
-        world, cloud = build_world(experiment, identity), build_cloud(experiment, identity)
-        run, sealed = VirtualRun(world, cloud, *build_links(experiment)), RecordStore()
-        run.fly(lambda cloud=cloud: cloud.mission_over, 150_000_000_000, sealed.add)
-        found.add(sealed.hexdigest())
-    assert found == {digest(experiment)}
+def test_objects_and_encrypted_bytes_make_the_same_records(settings):
+    experiment, identity = short(*settings), Identity(bytes(16), bytes(16), ring())
+    world, cloud = build_world(experiment, identity), build_cloud(experiment, identity)
+    run, records = VirtualRun(world, cloud, *build_links(experiment)), RecordStore()
+    run.fly(lambda: cloud.mission_over, 150_000_000_000, records.add)
+    assert records.hexdigest() == digest(experiment)
 
 
 def test_a_link_that_damages_datagrams_gets_bytes():
@@ -72,6 +70,41 @@ def test_a_link_that_damages_datagrams_gets_bytes():
         run.fly(lambda: False, 200_000_000, lambda of_world, of_cloud: None)
         world.handle_deadline(world.next_deadline_ns())
         assert {type(data) for data in world.take_datagrams()} == {kind}
+
+
+def watch_damage(link, session):
+    """Count how `session` answers the datagrams that `link` damages: the refusal, or "opened"."""
+    outcomes, damaged, corrupt, verify = Counter(), set(), link.corrupted, session.open
+
+    def corrupted(epoch, kind, counter, data):
+        arrives = corrupt(epoch, kind, counter, data)
+        damaged.update({arrives} - {data})
+        return arrives
+
+    def opened(data):
+        try:
+            found = verify(data)
+        except DecodeError as error:
+            outcomes[str(error)] += data in damaged
+            raise
+        outcomes["opened"] += data in damaged
+        return found
+
+    link.corrupted, session.open = corrupted, opened
+    return outcomes
+
+
+def test_both_ends_refuse_every_damaged_datagram_in_virtual_time():
+    damaging = both_ways(corrupt=0.3)
+    world, cloud, run = assemble(load_experiment("hover", ["link.profile=ideal", *damaging]))
+    ways = ((run._downlink, world), (run._uplink, cloud))
+    seen = [watch_damage(link, end._session) for link, end in ways]
+    run.fly(lambda: False, 3_000_000_000, lambda of_world, of_cloud: None)
+    for (link, end), outcomes in zip(ways, seen, strict=True):
+        assert outcomes.total() == link.counts()["corrupted"] > 70
+        assert outcomes["opened"] == 0
+        assert end.counts["tag"] == outcomes["tag"] > 0.7 * outcomes.total(), "else in the header"
+        assert end.counts["used"] > 200
 
 
 WALL = re.compile(

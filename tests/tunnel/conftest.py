@@ -15,8 +15,8 @@ OTHER = b"m" * 16
 
 
 def pair(epoch=1, secret=b"p" * 32):
-    """Make world's and cloud's end of a session; no encryption if `secret` is None."""
-    ring = None if secret is None else KeyRing(KeySet(Key(secret)))
+    """Make world's and cloud's end of a session."""
+    ring = KeyRing(KeySet(Key(secret)))
     ends = Session(Direction.UPLINK, ring), Session(Direction.DOWNLINK, ring)
     for end in ends:
         end.begin(epoch, b"cloud".ljust(16) + b"world".ljust(16))

@@ -37,7 +37,7 @@ class Target:
     def __init__(self, pace=5_000):
         """Begin a session; time passes after every `pace` datagrams."""
         self.pace, self.now_ns = pace, 0
-        self.world = bare_world(ring=ring())
+        self.world = bare_world(ring())
         self.cloud = build_cloud(HOVER, Identity(CLOCK, b"c" * 16, ring()))
         self.frames: list[bytes] = []
         for _ in range(40):  # until both are in one session

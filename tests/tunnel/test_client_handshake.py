@@ -129,7 +129,7 @@ def test_another_version_or_key_is_logged_once(code, text):
 
 
 def test_a_text_is_told_once_in_a_session():
-    end = TunnelEnd(Identity(CLOCK, NONCE), codec.Direction.UPLINK, True)
+    end = TunnelEnd(Identity(CLOCK, NONCE, ring()), codec.Direction.UPLINK, True)
     for data in (bytes(16), bytes([4]) + bytes(15), bytes(16)):
         end._tell_refusal("version", data, 7)
     end._tell_refusal("malformed", bytes(16), 7)
@@ -144,7 +144,7 @@ def test_an_end_gives_its_datagrams_and_records_once():
     bare = Bare(ring())
     world = bare.world
     bare.send(bare.cloud("a").hello())
-    assert (world.sealed, world.epoch) == (True, 1)
+    assert world.epoch == 1
     assert any(isinstance(record, SessionOpened) for record in world.take_records())
     assert world.take_records() == []
     world.handle_deadline(world.next_deadline_ns())

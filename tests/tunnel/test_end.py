@@ -6,6 +6,7 @@ from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState, Odometry, Passe
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Direction, Kind
 from cloudrc.tunnel.end import Identity, TunnelEnd
+from tests.flights.conftest import CLOCK, ring
 
 COMMAND = Command(1, 2, 3, (0.5, -0.5, 0.25), 0.0)
 TELEMETRY = Telemetry(
@@ -21,10 +22,10 @@ TELEMETRY = Telemetry(
     ],
 )
 def test_a_message_arrives_the_same_with_and_without_bytes(kind, message, decode):
-    bodies = []
+    bodies, keys = [], ring()
     for passes in (False, True):
-        end = TunnelEnd(Identity(bytes(16), bytes(16), passes=passes), Direction.UPLINK, True)
-        peer = TunnelEnd(Identity(bytes(16), bytes(16)), Direction.DOWNLINK, True)
+        end = TunnelEnd(Identity(CLOCK, bytes(16), keys, passes), Direction.UPLINK, True)
+        peer = TunnelEnd(Identity(CLOCK, bytes(16), keys), Direction.DOWNLINK, True)
         for each in (end, peer):
             each._session.begin(1, bytes(32))
         end._send_message(kind, message)
@@ -37,7 +38,7 @@ def test_a_message_arrives_the_same_with_and_without_bytes(kind, message, decode
 
 
 def test_a_rare_message_is_sent_as_bytes_between_ends_that_pass():
-    end = TunnelEnd(Identity(bytes(16), bytes(16), passes=True), Direction.DOWNLINK, True)
+    end = TunnelEnd(Identity(CLOCK, bytes(16), ring(), passes=True), Direction.DOWNLINK, True)
     end._session.begin(1, bytes(32))
     end._send(Kind.OPERATOR, b"body")
     (data,) = end.take_datagrams()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from cloudrc.config import schema
 from cloudrc.config.schema import Plant
 from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.world.plant import Wind, point_inertia
@@ -70,7 +71,8 @@ def test_a_weak_rotor_has_less_thrust_and_less_torque():
 
 
 def test_gusts_have_their_deviation_and_their_time_constant():
-    wind = Wind((3.0, -1.0), 0.8, 0.2, np.random.default_rng(5))
+    section = schema.Wind(velocity_mps=(3.0, -1.0), gust_mps=0.8, gust_time_s=0.2)
+    wind = Wind(section, np.random.default_rng(5))
     still = Readings.of((*ZERO, *UPRIGHT), (*ZERO, *ZERO))
     air = -np.array([wind.seen_from(still, 0.02).velocity for _ in range(40_000)])
     assert not air[:, 2].any()

@@ -3,18 +3,20 @@
 import numpy as np
 import pytest
 
+from cloudrc.config import schema
 from cloudrc.messages import Odometry
-from cloudrc.world.sensors import Errors, Sensors
+from cloudrc.world.sensors import Sensors
 
 TRUTH = Odometry(5, (1.0, 2.0, 3.0), (0.6, 0.0, 0.8, 0.0), (4.0, 5.0, 6.0), (7.0, 8.0, 9.0))
 
 
+def sensors(**errors):
+    return Sensors(schema.Sensors(**errors), np.random.default_rng(1), np.random.default_rng(2))
+
+
 def test_attitude_and_rate_have_their_bias_about_the_body_axes():
-    turn = (0.0, 0.0, np.pi / 2)
-    biased = Sensors(
-        0.0, 0.0, np.random.default_rng(1),
-        attitude=Errors(bias=turn), rate=Errors(bias=(0.1, -0.2, 0.3)),
-    ).measure(TRUTH)  # fmt: skip
+    errors = {"attitude_bias_deg": (0.0, 0.0, 90.0), "rate_bias_radps": (0.1, -0.2, 0.3)}
+    biased = sensors(**errors).measure(TRUTH)
     half = np.sqrt(0.5)  # (.6 + .8 j) (half + half k) = .6 half + .8 half i + .8 half j + .6 half k
     assert biased.orientation_wxyz == pytest.approx(
         (0.6 * half, 0.8 * half, 0.8 * half, 0.6 * half)
@@ -26,12 +28,9 @@ def test_attitude_and_rate_have_their_bias_about_the_body_axes():
 
 def test_noise_has_the_configured_deviation_per_axis():
     """Noise of attitude and rate does not change that of position and velocity."""
-
-    def sensors(**errors):
-        first, second = np.random.default_rng(1), np.random.default_rng(2)
-        return Sensors(0.005, 0.02, first, turn_rng=second, **errors)
-
-    plain, noisy = sensors(), sensors(attitude=Errors(0.01), rate=Errors(0.05))
+    errors = {"position_noise_m": 0.005, "velocity_noise_mps": 0.02}
+    turns = {"attitude_noise_deg": float(np.degrees(0.01)), "rate_noise_radps": 0.05}
+    plain, noisy = sensors(**errors), sensors(**errors, **turns)
     pairs = [(plain.measure(TRUTH), noisy.measure(TRUTH)) for _ in range(2000)]
     assert all(a.position == b.position and a.velocity == b.velocity for a, b in pairs)
     deviations = {"position": 0.005, "velocity": 0.02, "angular_velocity_body": 0.05}

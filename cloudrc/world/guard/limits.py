@@ -1,18 +1,18 @@
-"""The limits of the guard, and functions that keep a velocity reference within these limits.
+"""Functions that keep a velocity reference within the limits of the guard.
 
-The limits come from world's experiment; no message changes them. Each limit is finite and above 0,
-so no value switches a limit off. Functions accept NaN and infinity unless their docstring says
-otherwise; for this, comparisons are written so that NaN leads to the safe branch.
+The limits come from world's experiment; no message changes them. `config.load.ResolvedGuard` checks
+each limit, so no value switches a limit off. Functions accept NaN and infinity unless their
+docstring says otherwise; for this, comparisons are written so that NaN leads to the safe branch.
 `tests/world/guard/test_proof.py` proves the bounds of the scalar functions for all floats.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from math import copysign, inf, isfinite, sqrt
+from math import copysign, inf, sqrt
 
-from cloudrc.geometry.fence import FLOOR_MARGIN, WALL_MARGIN
+from cloudrc.config.schema import COMMAND_AGE_MS
+from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Vector
 
 BRAKE = 3.0
@@ -21,15 +21,12 @@ Source: docs/reference/plant.md, "Stop rule"."""
 REACTION = 0.2
 """Time from the start of braking until the robot decelerates at BRAKE [s].
 Source: docs/reference/plant.md, "Stop rule"."""
-STOPPING_DISTANCE = 8.7
-"""Largest distance that the robot may need to stop [m]; this limit determines the speed cap.
-Source: docs/reference/plant.md, "Speed cap"."""
 STOP_COEFFICIENT = 1.0 / (2.0 * BRAKE)
 """Braking distance divided by the square of the speed [s^2/m]."""
-FENCE_REACTION, FENCE_MARGIN = 0.6, WALL_MARGIN
-"""Stop rule at the walls and the ceiling of the fence: reaction time [s] and margin [m]. The guard
-limits the speed v so that FENCE_REACTION · v + v^2/6 <= distance - FENCE_MARGIN. At the floor the
-guard uses REACTION and FLOOR_MARGIN, because the robot can stop a descent quickly.
+FENCE_REACTION = 0.6
+"""Reaction time in the stop rule at the walls and the ceiling of the fence [s]. The guard limits
+the speed v so that FENCE_REACTION · v + v^2/6 <= distance - WALL_MARGIN. At the floor the guard
+uses REACTION and FLOOR_MARGIN, because the robot can stop a descent quickly.
 Deviation: docs/reference/plant.md, "Stop rule", has 0.2 s and 0.1 m. With 0.2 s and 0.1 m a hostile
 cloud can move the robot 0.3 m beyond the fence, because the robot reacts with a delay."""
 FAR = 1e6
@@ -45,11 +42,6 @@ SINK_LEAD_MAX = 0.5
 difference the low-level controller would turn the robot over."""
 ROUNDING_FACTOR = 1.0 - 2.0**-45
 """Factor on the speed cap, just below 1, so that rounding errors never exceed the cap."""
-
-
-def stopping_distance(speed: float, reaction: float) -> float:
-    """Return the distance [m] to stop from `speed` [m/s]: `reaction` time [s], then braking."""
-    return speed * (reaction + speed * STOP_COEFFICIENT)
 
 
 def clamp(value: float, low: float, high: float) -> float:
@@ -78,8 +70,8 @@ def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector
     """Slow a finite `velocity` [m/s], axis by axis, so that the robot can stop before the fence.
 
     Near the floor the horizontal velocity is limited, too, because a rotor that touches the floor
-    at speed turns the robot over. `position` is that of the base [m]. `low` and `high` [m] are from
-    `Limits.inner_corners`. All are in the world frame, shape (3,).
+    at speed turns the robot over. `position` is that of the base [m]. `low` and `high` are the
+    corners of the box in which the robot may fly [m]. All are in the world frame, shape (3,).
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     if not z >= az - FLOOR_MARGIN + LOW_HEIGHT:
@@ -167,89 +159,24 @@ def limit_sink(reference: Vector, before: Vector, climb: float, speed_max: float
     return limit_length((x, y, lowest), speed_max) if z < lowest else reference
 
 
-AGE_MAX_NS = 10_000_000_000
-"""Largest value of `Limits.command_age_max_ns` that an experiment may set [ns]."""
-PLAN_MAX_NS = 2_000_000_000
-"""Largest value of `Limits.plan_max_ns` that an experiment may set [ns]."""
+AGE_MAX_NS = COMMAND_AGE_MS[1] * 1_000_000
+"""Largest value of guard.command_age_max_ms that an experiment may set, in [ns]."""
 GROUND_WAIT_MIN_NS = 10_000_000_000
 """Shortest time for which a robot on the ground waits for the first command of its mission [ns]."""
 RAMP_MIN = 1.0
-"""Smallest value of `Limits.ramp_ns`, in [s]."""
+"""Smallest value of `ramp_ns`, in [s]."""
 COMMAND_MAX = 1000.0
 """Largest component of a command that the guard accepts [m/s, rad/s]. A command with a larger
 component comes from a bug, so its direction cannot be trusted either.
 Source: docs/reference/faults.md, "F23"."""
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """The limits of the guard.
+def ramp_ns(speed_max: float) -> int:
+    """Return how long after a HOLD the acceleration of the reference is limited to BRAKE [ns].
 
-    Attributes:
-        fence_low: Lower corner of the box that the base may not leave [m], world frame, shape (3,).
-        fence_high: Upper corner of the box [m], world frame, shape (3,).
-        command_age_max_ns: Largest accepted age of the odometry from which cloud computed a
-            command [ns].
-        speed_max: Largest speed of the velocity reference [m/s].
-        acceleration_max: Largest rate of change of the velocity reference [m/s^2].
-        yaw_rate_max: Largest yaw rate [rad/s].
-        hold_max_ns: Longest HOLD in a mission before LAND begins [ns]. A robot on the ground waits
-            as long for commands, but at least `GROUND_WAIT_MIN_NS`.
-        plan_max_ns: Longest time for which the robot flies a command's plan after its arrival [ns];
-            0: a plan does not extend the time for which its command is fresh.
+    In this time the robot can reach its highest speed, `speed_max` [m/s]. The limit does not end
+    earlier when the reference reaches the command, because the first commands after a silence may
+    be zero.
+    Source: docs/reference/plant.md, "Leaving HOLD".
     """
-
-    fence_low: Vector
-    fence_high: Vector
-    command_age_max_ns: int = 250_000_000
-    speed_max: float = 6.0
-    acceleration_max: float = 12.0
-    yaw_rate_max: float = 1.0
-    hold_max_ns: int = 60_000_000_000
-    plan_max_ns: int = 0
-
-    def __post_init__(self) -> None:
-        """Check the limits; raise a ValueError that names the first invalid limit.
-
-        Each limit has to be finite and above 0; only `plan_max_ns` may be 0. From `speed_max` the
-        robot has to stop within `STOPPING_DISTANCE`. Before it brakes, it flies on for the sum of
-        the largest age of a command, the longest plan and the reaction time.
-        """
-        for name in self.__slots__[2:-1]:
-            value = getattr(self, name)
-            if not (isfinite(value) and value > 0):
-                raise ValueError(f"guard: {name} is {value}; it must be finite and above 0")
-        if self.command_age_max_ns > AGE_MAX_NS:
-            raise ValueError(f"guard: command_age_max_ns is {self.command_age_max_ns}, above 10 s")
-        if not 0 <= self.plan_max_ns <= PLAN_MAX_NS:
-            raise ValueError(f"guard: plan_max_ns is {self.plan_max_ns}; allowed are 0 to 2 s")
-        delay = (self.command_age_max_ns + self.plan_max_ns) * 1e-9 + REACTION
-        way = stopping_distance(self.speed_max, delay)
-        if way > STOPPING_DISTANCE + 1e-4:
-            raise ValueError(
-                f"guard: speed_max is {self.speed_max:g} m/s; with this command age the robot needs"
-                f" {way:.2f} m to stop, and at most {STOPPING_DISTANCE:g} m are allowed"
-            )
-
-    @property
-    def ramp_ns(self) -> int:
-        """How long after a HOLD the acceleration of the reference is limited to BRAKE [ns].
-
-        In this time the robot can reach its highest speed. The limit does not end earlier when the
-        reference reaches the command, because the first commands after a silence may be zero.
-        Source: docs/reference/plant.md, "Leaving HOLD".
-        """
-        return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)
-
-    def alone_max_ns(self, flies: bool) -> int:
-        """Return how long a robot in a mission waits for cloud's commands before LAND [ns].
-
-        `flies` tells whether the robot is in the air.
-        """
-        return self.hold_max_ns if flies else max(self.hold_max_ns, GROUND_WAIT_MIN_NS)
-
-    def inner_corners(self) -> tuple[Vector, Vector]:
-        """Return the fence's lower and upper corner, moved inwards by the margins [m]."""
-        (ax, ay, az), (bx, by, bz) = self.fence_low, self.fence_high
-        low = (ax + FENCE_MARGIN, ay + FENCE_MARGIN, az + FLOOR_MARGIN)
-        return low, (bx - FENCE_MARGIN, by - FENCE_MARGIN, bz - FENCE_MARGIN)
+    return round(max(RAMP_MIN, speed_max / BRAKE) * 1e9)

@@ -37,6 +37,8 @@ from __future__ import annotations
 from collections import Counter, deque
 from math import inf
 
+from cloudrc.config.load import ResolvedGuard
+from cloudrc.geometry import fence
 from cloudrc.messages import (
     NEVER_NS,
     PLAN_STEP_NS,
@@ -49,7 +51,7 @@ from cloudrc.messages import (
 from cloudrc.records import GuardChange
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.hold import Descent, PositionHold, TakeOff
-from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX, Limits
+from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX
 from cloudrc.world.readings import Readings
 
 OVERTURNED_COSINE = 0.2
@@ -84,20 +86,28 @@ class Guard:
         armed: Whether a mission is active: from the operator's start to its end, LAND or ESTOP.
         reference: Velocity reference of the last step [m/s], world frame, shape (3,).
         yaw_rate: Limited yaw rate [rad/s]; unused, as the low-level controller keeps a yaw of 0.
+        command_age_max_ns: Largest accepted age of the odometry from which cloud computed a command
+            [ns].
+        acceleration_max: Largest rate of change of the velocity reference [m/s^2].
         changes: Changes of the state since the last `take_changes`.
         counts: "limited_speed": number of shortened velocities of commands and plans;
             "limited_yaw_rate": commands with a limited yaw rate; "limited_fence": steps in which
             the fence limited the reference.
     """
 
-    def __init__(self, limits: Limits) -> None:
-        self._limits = limits
-        self._speed_max = limits.speed_max * rules.ROUNDING_FACTOR
-        self._low, self._high = limits.inner_corners()
-        self._floor, half = self._low[2], 0.5 * limits.speed_max
+    def __init__(self, limits: ResolvedGuard) -> None:
+        self.command_age_max_ns = round(limits.command_age_max_ms * 1_000_000)
+        self._hold_max_ns = round(limits.hold_max_s * 1e9)
+        self._plan_max_ns = round(limits.plan_max_s * 1e9)
+        self._ramp_ns = rules.ramp_ns(limits.speed_max_mps)
+        self.acceleration_max = limits.acceleration_max_mps2
+        self._yaw_rate_max = limits.yaw_rate_max_radps
+        self._speed_max = limits.speed_max_mps * rules.ROUNDING_FACTOR
+        self._low, self._high = fence.INNER_LOW, fence.INNER_HIGH
+        self._floor, half = self._low[2], 0.5 * limits.speed_max_mps
         self._position_hold = PositionHold(self._low, self._high, half)
         self._descent = Descent(self._floor, half)
-        self._take_off = TakeOff(limits.fence_low, limits.fence_high)
+        self._take_off = TakeOff(fence.LOW, fence.HIGH)
         self.changes: list[GuardChange] = []
         self.counts: Counter[str] = Counter()
         self.state, self.cause = GROUND, Cause.SPAWN
@@ -120,6 +130,12 @@ class Guard:
     def latched(self) -> bool:
         """Whether the state is LAND or ESTOP, which only the operator's acknowledgement ends."""
         return self.state is LAND or self.state is ESTOP
+
+    @property
+    def _alone_max_ns(self) -> int:
+        """How long a robot in a mission waits for cloud's commands before LAND [ns]."""
+        hold_ns = self._hold_max_ns
+        return hold_ns if self._flies else max(hold_ns, rules.GROUND_WAIT_MIN_NS)
 
     def take_changes(self) -> list[GuardChange]:
         """Return the changes of the state since the last call."""
@@ -182,20 +198,19 @@ class Guard:
         if not (abs(x) <= most and abs(y) <= most and abs(z) <= most and abs(yaw_rate) <= most):
             self._note_invalid(now_ns)
             return "range"
-        limits = self._limits
         age_ns = now_ns - command.basis_stamp_ns
         if age_ns < 0:
             self._note_invalid(now_ns)
             return "future"
-        if age_ns > limits.command_age_max_ns:
+        if age_ns > self.command_age_max_ns:
             return "stale"
         if command.plan and not self._is_plan_possible(command):
             self._note_invalid(now_ns)
             return "range"
         if self.armed:
-            fresh_until_ns = command.basis_stamp_ns + limits.command_age_max_ns
+            fresh_until_ns = command.basis_stamp_ns + self.command_age_max_ns
             self._play(command, now_ns)
-            self.yaw_rate = rules.clamp(yaw_rate, -limits.yaw_rate_max, limits.yaw_rate_max)
+            self.yaw_rate = rules.clamp(yaw_rate, -self._yaw_rate_max, self._yaw_rate_max)
             if self.yaw_rate != yaw_rate:
                 self.counts["limited_yaw_rate"] += 1
             if self.state is GROUND:
@@ -217,7 +232,7 @@ class Guard:
     def _plan_end_ns(self, command: Command, now_ns: int) -> int:
         """Return until when [ns] the robot may follow a plan that arrives at `now_ns` [ns]."""
         end_ns = command.planned_ns + (len(command.plan) + 1) * PLAN_STEP_NS
-        return min(end_ns, now_ns + self._limits.plan_max_ns)
+        return min(end_ns, now_ns + self._plan_max_ns)
 
     def _play(self, command: Command, now_ns: int) -> None:
         """Take the wanted velocity for `now_ns` [ns] from a command, or from the command's plan."""
@@ -238,7 +253,7 @@ class Guard:
         if enough and self._settled(now_ns, fresh_until_ns):
             text = f"{RESUME_COMMANDS} fresh commands within {took_ns * 1e-9:.3f} s"
             self._enter(TRACK, now_ns, Cause.COMMANDS, text)
-            self._ramp_until_ns = now_ns + self._limits.ramp_ns
+            self._ramp_until_ns = now_ns + self._ramp_ns
 
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
         """Return whether TRACK may begin at `now_ns`; prevent fast changes between TRACK and HOLD.
@@ -270,7 +285,7 @@ class Guard:
         elif not self._take_off.over:
             self._take_off.look(readings, self._flies)
         if now_ns <= self._track_until_ns:
-            change_max = self._limits.acceleration_max * dt
+            change_max = self.acceleration_max * dt
             reference = rules.step_towards(self.reference, self._wanted, change_max)
         else:
             self._look_after_itself(now_ns, readings)
@@ -302,7 +317,7 @@ class Guard:
         inside = rules.limit_to_fence(reference, position, self._low, self._high)
         if inside != reference:
             self.counts["limited_fence"] += 1
-            step = self._limits.acceleration_max * dt
+            step = self.acceleration_max * dt
             inside = rules.limit_growth(self.reference, inside, step)
             reference = rules.limit_length(inside, self._speed_max)
         if now_ns < self._ramp_until_ns:
@@ -311,17 +326,17 @@ class Guard:
 
     def _look_after_itself(self, now_ns: int, readings: Readings) -> None:
         """Change the guard's state if necessary, in a step without a fresh command."""
-        state, limits = self.state, self._limits
+        state = self.state
         if state is TRACK and self._track_until_ns == NEVER_NS:
             self._enter(HOLD, now_ns, Cause.SESSION)
         elif state is TRACK:
             age_ns = now_ns - self._played.basis_stamp_ns
-            limit = limits.command_age_max_ns * 1e-9
+            limit = self.command_age_max_ns * 1e-9
             ended = ", and its plan has ended" if self._played.plan else ""
             text = f"command age {age_ns * 1e-9:.3f} s above {limit:.3f} s{ended}"
             self._enter(HOLD, now_ns, Cause.SILENCE, text)
-        elif self.armed and now_ns - self._alone_ns > limits.alone_max_ns(self._flies):
-            text = f"held for {limits.alone_max_ns(self._flies) * 1e-9:g} s without the cloud"
+        elif self.armed and now_ns - self._alone_ns > self._alone_max_ns:
+            text = f"held for {self._alone_max_ns * 1e-9:g} s without the cloud"
             self._enter(LAND, now_ns, Cause.ALONE, text)
             self._flies = state is HOLD  # not in GROUND
         elif state is LAND and self._flies:

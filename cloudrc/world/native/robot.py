@@ -10,19 +10,19 @@ import ctypes
 import logging
 from copy import copy
 from functools import cache
-from math import dist, inf, prod
+from math import dist, inf
 from pathlib import Path
 from struct import Struct
 from typing import Any
 
 import numpy as np
 
+from cloudrc.config.load import ResolvedGuard
 from cloudrc.geometry import fence
 from cloudrc.messages import Command, Vector
 from cloudrc.world import low_level, rotors
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard import state
-from cloudrc.world.guard.limits import Limits
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.native.library import Library, library
@@ -42,6 +42,10 @@ MARGIN = 1e-3
 """Distance added to every geom with its own margin and gap [m]; it covers rounding errors."""
 HUGE = 1e4
 """Half the edge of the box that stands for the space below a plane [m]."""
+PAGE = 4096
+"""Smallest size of a page [bytes]: a program may read all bytes of a page, or none."""
+MARK = 0x6E636F6E
+"""Number that no other part of `mjData` contains."""
 UNUSED_WITHOUT_CONTACTS = sum(
     int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{part}", 0))  # old versions lack the last two
     for part in ("CONTACT", "CONSTRAINT", "SENSOR", "SPRING", "DAMPER")
@@ -82,14 +86,14 @@ class Flight(ctypes.Structure):
     _fields_ = tuple(_FIELDS.items())
 
 
-def make_flight(simulator: Simulator, controller: LowLevel, limits: Limits) -> Flight:
+def make_flight(simulator: Simulator, controller: LowLevel, guard: Guard) -> Flight:
     """Make the C structure `Flight`; fill all fields except the present state of the robot.
 
-    Call `make_flight` after a reset of the simulator. Raise an OSError, AttributeError, KeyError or
-    ImportError if this version of MuJoCo lacks a part that `step.c` needs.
+    Call `make_flight` after a reset of the simulator. Raise an OSError, AttributeError or
+    ValueError if this version of MuJoCo lacks a part that `step.c` needs.
     """
     model, data = simulator.model, simulator.data
-    turning, (low, high) = rotors.Rotors(simulator.dt), limits.inner_corners()
+    turning = rotors.Rotors(simulator.dt)
     limit_xy, limit_z, dt = controller.limits
     arrays = data.qpos, data.qvel, data.ctrl, data.qfrc_applied
     tip_force = data.sensordata[model.sensor(f"{ROBOT_PREFIX}tip").adr[0] :]
@@ -103,11 +107,11 @@ def make_flight(simulator: Simulator, controller: LowLevel, limits: Limits) -> F
         # MuJoCo has no public name for the addresses.
         *(model._address, free_model._address, data._address),
         *(array.ctypes.data for array in (*arrays, tip_force)),
-        *(data._address + _contacts_offset(), timer, obstacles.ctypes.data),
+        *(data._address + _contacts_offset(data), timer, obstacles.ctypes.data),
         *_VALUES.values(),
         *(turning.up, turning.down, controller.gains, limit_xy, limit_z, dt),
-        limits.acceleration_max * STEP,
-        *(low, high, simulator.dt, radius, ACCELERATION_MAX, STEP_NS),
+        guard.acceleration_max * STEP,
+        *(fence.INNER_LOW, fence.INNER_HIGH, simulator.dt, radius, ACCELERATION_MAX, STEP_NS),
         *(CONTACT_CHECK_STEPS, len(obstacles)),
     )
     flight.keep = obstacles, free_model  # else Python frees their memory
@@ -153,41 +157,26 @@ def _mujoco_library() -> ctypes.CDLL:
     return ctypes.CDLL(str(files[0]))
 
 
-def _contacts_offset() -> int:
+def _contacts_offset(data: Any) -> int:
     """Return the offset of the number of contacts in MuJoCo's `mjData` [bytes].
 
-    The offset depends on MuJoCo's version; `mujoco.introspect` describes the structure.
+    The offset depends on MuJoCo's version. The function writes MARK to `data.ncon`, searches the
+    memory of `data` for it, and restores the number. The address of `qpos` ends the search; it is
+    in `mjData`, too, so that the search never leaves the memory of `data`.
     """
-    from mujoco.introspect import structs
-
-    fields = []
-    for field in structs.STRUCTS["mjData"].fields:
-        fields.append((field.name, _ctype(field.type, structs.STRUCTS)))
-        if field.name == "ncon":
-            break
-    layout: Any = type("Data", (ctypes.Structure,), {"_fields_": fields})
-    offset: int = layout.ncon.offset
+    mark, end = Struct("i").pack(MARK), Struct("P").pack(data.qpos.ctypes.data)
+    place, block, contacts = data._address, b"", data.ncon
+    try:
+        data.ncon = MARK
+        while mark not in block:
+            if end in block:
+                raise OSError("mjData does not contain the number of contacts")
+            place += len(block)
+            block = ctypes.string_at(place, PAGE - place % PAGE)
+    finally:
+        data.ncon = contacts
+    offset: int = place + block.index(mark) - data._address
     return offset
-
-
-_SCALARS = {
-    **dict.fromkeys(("int", "float", "mjtTimer"), ctypes.c_int32),
-    **dict.fromkeys(("mjtBool", "mjtByte"), ctypes.c_uint8),
-    **dict.fromkeys(("mjtNum", "mjtSize", "size_t", "uintptr_t", "uint64_t"), _int64),
-}
-"""Types of `mujoco.introspect`, as types of the same size."""
-
-
-def _ctype(kind: Any, structs: Any) -> Any:
-    """Return the type of ctypes for a type of `mujoco.introspect`; KeyError if it is unknown."""
-    if hasattr(kind, "extents"):
-        return _ctype(kind.inner_type, structs) * prod(kind.extents)
-    if not hasattr(kind, "name"):
-        return ctypes.c_void_p
-    if kind.name in _SCALARS:
-        return _SCALARS[kind.name]
-    fields = [(field.name, _ctype(field.type, structs)) for field in structs[kind.name].fields]
-    return type(kind.name, (ctypes.Structure,), {"_fields_": fields})
 
 
 _TRACK, _MEMORY, _BEFORE = Flight.reference.offset, Flight.free_steps.offset, Flight.before.offset
@@ -196,15 +185,14 @@ _pack_memory, _unpack_memory = Struct("q10dq").pack_into, Struct("40x6d").unpack
 _unpack_before = Struct("13d").unpack_from
 
 
-def make_robot(simulator: Simulator, low_level: LowLevel, guard: Guard, limits: Limits) -> Robot:
-    """Make a robot that uses C if this machine can; `limits` are those of the guard.
+def make_robot(simulator: Simulator, low_level: LowLevel, guard: Guard) -> Robot:
+    """Make a robot that uses C if this machine can.
 
-    With wind, or if the true robot differs from its model, all steps run in Python, because
-    `step.c` can simulate neither.
+    `step.c` simulates neither wind nor a true robot that differs from its model: in these cases,
+    make a `Robot`.
     """
-    if usable().run is None or not simulator.is_nominal:
-        return Robot(simulator, low_level, guard)
-    return NativeRobot(simulator, low_level, guard, limits)
+    kind = Robot if usable().run is None else NativeRobot
+    return kind(simulator, low_level, guard)
 
 
 def usable() -> Library:
@@ -220,11 +208,9 @@ class NativeRobot(Robot):
     C while the robot has observers, or while `Simulator.tape` records the controls of each step.
     """
 
-    def __init__(
-        self, simulator: Simulator, low_level: LowLevel, guard: Guard, limits: Limits
-    ) -> None:
+    def __init__(self, simulator: Simulator, low_level: LowLevel, guard: Guard) -> None:
         super().__init__(simulator, low_level, guard)
-        self._flight = make_flight(simulator, low_level, limits)
+        self._flight = make_flight(simulator, low_level, guard)
         self._address = ctypes.addressof(self._flight)
         run = library().run
         assert run is not None
@@ -289,13 +275,13 @@ class NativeRobot(Robot):
 @cache
 def _self_test() -> str:
     """Fly in C and in Python; return how the results differ, in words; "" if they are equal."""
-    limits = Limits(fence.LOW, fence.HIGH)
+    limits = ResolvedGuard()
     parts = [(Simulator("pelican", "empty"), LowLevel(), Guard(limits)) for _ in range(2)]
     wrong = ""
     try:
-        if _fly(Robot(*parts[0])) != _fly(NativeRobot(*parts[1], limits)):
+        if _fly(Robot(*parts[0])) != _fly(NativeRobot(*parts[1])):
             wrong = "C and Python differ"
-    except (OSError, AttributeError, KeyError, ImportError) as error:
+    except (OSError, AttributeError, ValueError) as error:
         wrong = f"MuJoCo is not as expected: {error!r}"
     if wrong:
         logging.getLogger("cloudrc").warning("all steps run in Python: %s; report this", wrong)

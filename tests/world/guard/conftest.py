@@ -14,9 +14,9 @@ from random import Random
 import pytest
 import z3
 
+from cloudrc.config.load import ResolvedGuard
 from cloudrc.geometry import fence
 from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState
-from cloudrc.world.guard.limits import Limits
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.readings import Readings
@@ -28,7 +28,7 @@ TICK = 2 * MS
 DT = 0.002
 SECOND = 1000 * MS
 HERE = (1.0, 2.0, 1.3)
-LIMITS = Limits(fence.LOW, fence.HIGH)
+LIMITS = ResolvedGuard()
 
 
 def command(velocity=(1.0, 0.0, 0.0), basis_ns=0, yaw_rate=0.0):

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cloudrc.geometry import fence
 from cloudrc.messages import GuardState
 from cloudrc.world.guard.limits import COMMAND_MAX, growth
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, armed, command, sensed
@@ -65,16 +66,14 @@ def test_any_input_is_flown_inside_the_caps(
         assert dist(before, after) <= step_max or guard.counts["limited_fence"] > limited
     for now_ns in range(after_ns + TICK, after_ns + 60 * MS, TICK):
         check_flown(guard, guard.step(now_ns, sensed(position, velocity), DT), position)
-        assert hypot(*guard.reference) <= limits.speed_max
+        assert hypot(*guard.reference) <= limits.speed_max_mps
 
 
 def check_flown(guard, reference, position):
     """Check that a reference is within the caps and lets the robot stop before the fence."""
-    assert abs(guard.yaw_rate) <= LIMITS.yaw_rate_max
-    assert hypot(*reference) <= LIMITS.speed_max  # therefore no component is infinite or NaN
-    for v, at, low, high in zip(
-        reference, position, LIMITS.fence_low, LIMITS.fence_high, strict=True
-    ):
+    assert abs(guard.yaw_rate) <= LIMITS.yaw_rate_max_radps
+    assert hypot(*reference) <= LIMITS.speed_max_mps  # therefore no component is infinite or NaN
+    for v, at, low, high in zip(reference, position, fence.LOW, fence.HIGH, strict=True):
         room = high - at if v > 0 else at - low
         if guard.state is not GuardState.LAND and v != 0.0 and isfinite(at):
             assert 0.2 * abs(v) + v * v / 6 <= room - 0.1 + 1e-9

@@ -4,11 +4,12 @@ from math import hypot, nan
 
 import pytest
 
+from cloudrc.geometry import fence
 from cloudrc.messages import ZERO
 from cloudrc.world.guard import hold as rules
 from cloudrc.world.guard.hold import PositionHold, TakeOff, brake_start
 from cloudrc.world.guard.limits import BRAKE
-from tests.world.guard.conftest import DT, HERE, LIMITS, sensed
+from tests.world.guard.conftest import DT, HERE, sensed
 
 LOW, HIGH = (-2.8, -8.3, 0.0), (9.0, 5.3, 2.3)
 ENOUGH = 1.0
@@ -124,7 +125,7 @@ def test_the_hold_point_is_inside_the_margins(position, back):
 # Take-off
 
 STANDS = (0.0, 0.0, 0.1)
-FENCE = (LIMITS.fence_low, LIMITS.fence_high)
+FENCE = (fence.LOW, fence.HIGH)
 
 
 @pytest.mark.parametrize(

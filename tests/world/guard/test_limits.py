@@ -1,6 +1,5 @@
 """No limit can be switched off, and the arithmetic keeps them for any float."""
 
-from dataclasses import FrozenInstanceError, fields
 from itertools import product
 from math import hypot, inf, isfinite, nan
 
@@ -8,47 +7,42 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cloudrc.config.load import ResolvedGuard
+from cloudrc.geometry import fence
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.hold import brake_start
-from cloudrc.world.guard.limits import Limits
 from tests.world.guard.conftest import LIMITS, MS, SECOND, TICK, armed, command, run
-
-NUMBERS = [field.name for field in fields(Limits) if not field.name.startswith("fence")]
-
-
-def limits(**values):
-    return Limits(LIMITS.fence_low, LIMITS.fence_high, **values)
 
 
 @pytest.mark.promise("commands-within-caps")
-@pytest.mark.parametrize("name", NUMBERS)
+@pytest.mark.parametrize("name", ResolvedGuard.model_fields)
 def test_a_limit_cannot_be_switched_off_or_changed(name):
     # Without plans, the age of commands alone counts.
-    for value in (2 * SECOND + 1 if name == "plan_max_ns" else 0, -1, inf, nan):
-        with pytest.raises(ValueError, match=f"guard: {name} is"):
-            limits(**{name: value})
-    with pytest.raises(FrozenInstanceError):
+    for value in (2.001 if name == "plan_max_s" else 0.0, -1.0, inf, nan):
+        with pytest.raises(ValueError, match=name):
+            ResolvedGuard(**{name: value})
+    with pytest.raises(ValueError, match="frozen"):
         setattr(LIMITS, name, getattr(LIMITS, name))
 
 
 @pytest.mark.parametrize(("age_ms", "fastest"), [(250, 6.0), (400, 5.645805), (800, 4.823043)])
 def test_a_speed_beyond_the_stop_rule_is_refused(age_ms, fastest):
     # v (T + 0.2) + v^2 / 6 = 8.7 m, solved by hand.
-    limits(command_age_max_ns=age_ms * MS, speed_max=fastest)
-    with pytest.raises(ValueError, match="speed_max"):
-        limits(command_age_max_ns=age_ms * MS, speed_max=fastest + 1e-3)
-    limits(command_age_max_ns=10 * SECOND, speed_max=0.5)
-    with pytest.raises(ValueError, match="above 10 s"):
-        limits(command_age_max_ns=10 * SECOND + 1, speed_max=0.5)
-    later = min(age_ms, 300)
-    limits(command_age_max_ns=(age_ms - later) * MS + 1, plan_max_ns=later * MS, speed_max=fastest)
+    for plan_ms in (0, age_ms // 2):
+        times = {"command_age_max_ms": age_ms - plan_ms, "plan_max_s": plan_ms / 1000}
+        ResolvedGuard(**times, speed_max_mps=fastest)
+        with pytest.raises(ValueError, match="speed_max_mps"):
+            ResolvedGuard(**times, speed_max_mps=fastest + 1e-3)
+    ResolvedGuard(command_age_max_ms=10_000.0, speed_max_mps=0.5)
+    with pytest.raises(ValueError, match="command_age_max_ms"):
+        ResolvedGuard(command_age_max_ms=10_001.0, speed_max_mps=0.5)
 
 
 @pytest.mark.parametrize(("hold_s", "waited_s"), [(0.1, 10), (11, 11)])
 def test_on_the_ground_it_waits_for_a_mission_for_10_s_at_least(hold_s, waited_s):
     """The longest hold may be too short for a first command to arrive."""
-    guard = armed(limits(hold_max_ns=round(hold_s * SECOND)))
+    guard = armed(ResolvedGuard(hold_max_s=hold_s))
     guard.accept_command(command(basis_ns=-300 * MS), SECOND)  # a stale command does not count
     run(guard, 0, waited_s * SECOND + TICK)
     assert guard.state is GuardState.GROUND
@@ -59,12 +53,6 @@ def test_on_the_ground_it_waits_for_a_mission_for_10_s_at_least(hold_s, waited_s
     assert guard.state is GuardState.GROUND, "without a touch-down"
 
 
-def test_the_inner_corners_have_the_margins_taken_off():
-    low, high = Limits((0.0, 10.0, 20.0), (5.0, 15.0, 25.0)).inner_corners()
-    assert low == pytest.approx((0.2, 10.2, 20.35))
-    assert high == pytest.approx((4.8, 14.8, 24.8))
-
-
 BIG, TINY = 1.7976931348623157e308, 5e-324
 SPECIAL = (0.0, -0.0, 1.0, -1.0, 6.0, TINY, -TINY, 2.2e-308, 1e154, -1e200, BIG, -BIG)
 SPECIAL_BAD = (*SPECIAL, nan, inf, -inf)
@@ -72,7 +60,7 @@ ANY = st.floats(allow_nan=True, allow_infinity=True)
 VECTORS = st.tuples(ANY, ANY, ANY)
 PLACES = st.tuples(st.floats(-4, 10), st.floats(-9, 6), st.floats(-0.2, 3))
 SPEEDS = st.tuples(*[st.floats(-8, 8)] * 3)
-LOW, HIGH = LIMITS.inner_corners()
+LOW, HIGH = fence.INNER_LOW, fence.INNER_HIGH
 MANY = settings(max_examples=1000, deadline=None)
 
 
@@ -121,9 +109,7 @@ def test_step_towards_moves_by_at_most_a_step(step):
 @given(SPEEDS, PLACES)
 @MANY
 def test_limit_to_fence_lets_the_robot_stop_before_each_face(velocity, position):
-    axes = zip(
-        fenced(velocity, position), position, LIMITS.fence_low, LIMITS.fence_high, strict=True
-    )
+    axes = zip(fenced(velocity, position), position, fence.LOW, fence.HIGH, strict=True)
     for v, at, low, high in axes:
         room = high - at if v > 0 else at - low
         assert v == 0.0 or 0.2 * abs(v) + v * v / 6 <= room - 0.1 + 1e-12 or room > 5

@@ -6,13 +6,13 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
+from cloudrc.config.load import ResolvedGuard
 from cloudrc.messages import GuardState
-from cloudrc.world.guard.limits import Limits
 from cloudrc.world.guard.state import Guard
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, command, sensed
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
-AGE_MAX_NS = LIMITS.command_age_max_ns
+AGE_MAX_NS = 250 * MS
 SECONDS = st.sampled_from([0.002, 0.01, 0.1, 0.3, 1.2, 6.0])
 VELOCITIES = st.tuples(*[st.sampled_from([-1e3, -2.0, 0.0, 0.5, 9.0])] * 3)
 
@@ -39,7 +39,7 @@ ALLOWED = {
 class GuardMachine(RuleBasedStateMachine):
     @initialize()
     def begin(self):
-        self.guard = Guard(Limits(LIMITS.fence_low, LIMITS.fence_high, hold_max_ns=5_000 * MS))
+        self.guard = Guard(ResolvedGuard(hold_max_s=5.0))
         self.now_ns = 0
         self.height = 1.0
         self.climb = 0.0
@@ -180,8 +180,8 @@ class GuardMachine(RuleBasedStateMachine):
 
     @invariant()
     def what_is_flown_is_inside_the_caps(self):
-        assert self.flown is None or hypot(*self.flown) <= LIMITS.speed_max
-        assert hypot(*self.guard.reference) <= LIMITS.speed_max
+        assert self.flown is None or hypot(*self.flown) <= LIMITS.speed_max_mps
+        assert hypot(*self.guard.reference) <= LIMITS.speed_max_mps
 
     @invariant()
     def it_does_not_chatter(self):

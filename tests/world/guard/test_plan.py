@@ -6,14 +6,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cloudrc.config.load import ResolvedGuard
 from cloudrc.messages import Cause, GuardState
 from cloudrc.tunnel.codec import PLAN_MAX
-from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX, Limits
-from tests.world.guard.conftest import DT, LIMITS, MS, TICK, armed, command, run, sensed
+from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX
+from tests.world.guard.conftest import DT, MS, TICK, armed, command, run, sensed
 from tests.world.guard.test_state import told
 
 TRACK, HOLD = GuardState.TRACK, GuardState.HOLD
-PLANS = Limits(LIMITS.fence_low, LIMITS.fence_high, speed_max=4.0, plan_max_ns=800 * MS)
+PLANS = ResolvedGuard(speed_max_mps=4.0, plan_max_s=0.8)
 
 
 def planned(speeds, basis_ns=0, planned_ns=None):
@@ -62,9 +63,7 @@ def test_the_newest_plan_wins():
     ],
 )
 def test_a_plan_is_fresh_while_it_lasts(steps, planned_ms, arrival_ms, plan_max_ms, until_ms):
-    limits = Limits(
-        LIMITS.fence_low, LIMITS.fence_high, speed_max=4.0, plan_max_ns=plan_max_ms * MS
-    )
+    limits = ResolvedGuard(speed_max_mps=4.0, plan_max_s=plan_max_ms / 1000)
     plan = planned([0.1] * steps, planned_ns=planned_ms * MS)
     guard = following(plan, limits, arrival_ms * MS)
     run(guard, arrival_ms * MS, until_ms * MS + 1)
@@ -80,7 +79,7 @@ def test_a_plan_is_fresh_while_it_lasts(steps, planned_ms, arrival_ms, plan_max_
 @pytest.mark.promise("brakes-without-commands")
 @given(
     ahead_ns=st.integers(0, AGE_MAX_NS),
-    age_ns=st.integers(0, PLANS.command_age_max_ns),
+    age_ns=st.integers(0, 250 * MS),
     count=st.integers(1, PLAN_MAX),
 )
 @settings(max_examples=100, deadline=None)
@@ -89,7 +88,7 @@ def test_no_plan_is_flown_longer_than_the_cap_allows(ahead_ns, age_ns, count):
     basis_ns = arrival_ns - age_ns
     sent = planned([0.1] * (count + 1), basis_ns, basis_ns + ahead_ns)
     guard = following(sent, now_ns=arrival_ns)
-    guard.step(arrival_ns + PLANS.plan_max_ns + 1, sensed(), DT)
+    guard.step(arrival_ns + 800 * MS + 1, sensed(), DT)
     assert guard.state is not TRACK
 
 

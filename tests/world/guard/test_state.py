@@ -1,14 +1,14 @@
 """How the guard is armed, limits commands, holds, lands, stops, and takes off."""
 
-from dataclasses import replace
 from math import cos, dist, inf, nan, nextafter, radians, sin
 
 import pytest
 
+from cloudrc.config.load import ResolvedGuard
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.world.guard.hold import LAND_SPEED, STILL_SPEED
-from cloudrc.world.guard.limits import COMMAND_MAX
+from cloudrc.world.guard.limits import COMMAND_MAX, ramp_ns
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.readings import Readings
 from tests.world.guard.conftest import (
@@ -199,7 +199,7 @@ def test_from_one_hold_or_track_to_the_next_it_takes_a_second():
 @pytest.mark.parametrize(("speed_max", "ramp_s"), [(6.0, 2.0), (4.5, 1.5), (1.5, 1.0)])
 def test_after_a_hold_the_ramp_lasts_until_the_cap(speed_max, ramp_s):
     """A first command of zero, or one that the reference reaches, does not end the ramp."""
-    guard = holding(replace(LIMITS, speed_max=speed_max))
+    guard = holding(ResolvedGuard(speed_max_mps=speed_max))
     feed(guard, 2 * SECOND, 10, ZERO)
     assert guard.state is TRACK
     ends_ns = 2 * SECOND + 90 * MS + round(ramp_s * SECOND)
@@ -215,7 +215,7 @@ def test_after_a_hold_the_ramp_lasts_until_the_cap(speed_max, ramp_s):
 
 def test_a_long_hold_in_a_mission_ends_in_land():
     """Repeated starts do not delay it."""
-    guard = holding(replace(LIMITS, hold_max_ns=5 * SECOND))
+    guard = holding(ResolvedGuard(hold_max_s=5.0))
     for second in range(2, 5):
         guard.start_mission(second * SECOND)
         run(guard, second * SECOND, second * SECOND + TICK)
@@ -355,7 +355,7 @@ def test_a_landing_acknowledged_in_a_climb_holds_once_it_sinks():
 
 @pytest.mark.parametrize("speed_max", [0.01, 0.2, 6.0])
 def test_slow_sinking_under_a_low_cap_is_no_touch_down(speed_max):
-    guard = landing(replace(LIMITS, speed_max=speed_max))
+    guard = landing(ResolvedGuard(speed_max_mps=speed_max))
     sinks = (0.0, 0.0, -0.5 * min(LAND_SPEED, 0.5 * speed_max))
     assert None not in run(guard, 2 * SECOND, 5 * SECOND, velocity=sinks)
     guard.acknowledge(5 * SECOND)
@@ -502,6 +502,6 @@ def test_c_runs_no_step_before_take_off_or_after_a_hold():
     now_ns = feed(guard, 2 * SECOND, 20, (0.0, 0.0, 1.0), position=(0.0, 0.0, 1.1))
     assert states(guard) == [HOLD, TRACK]
     assert guard.plain_track(now_ns) is None
-    ramp_ns = LIMITS.ramp_ns
-    now_ns = feed(guard, now_ns, 1 + ramp_ns // (10 * MS), ZERO, position=(0.0, 0.0, 1.1))
+    periods = 1 + ramp_ns(6.0) // (10 * MS)
+    now_ns = feed(guard, now_ns, periods, ZERO, position=(0.0, 0.0, 1.1))
     assert guard.plain_track(now_ns) is not None

@@ -1,20 +1,21 @@
 """Flights in C and in Python have the same bits, whatever the cloud sends."""
 
 import logging
+from ctypes import c_int
 from functools import cache, partial
 from math import inf
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from cloudrc import assembly
-from cloudrc.config.load import load_experiment
+from cloudrc.config.load import ResolvedGuard, load_experiment
 from cloudrc.geometry import fence
 from cloudrc.messages import Command, GuardState
 from cloudrc.sweep.flight import fly_in_memory
 from cloudrc.tunnel.end import Identity
 from cloudrc.world.guard import limits as rules
-from cloudrc.world.guard.limits import Limits
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.low_level import LowLevel
 from cloudrc.world.native import robot as native
@@ -23,6 +24,7 @@ from cloudrc.world.native.robot import NativeRobot, make_robot, usable
 from cloudrc.world.robot import Robot
 from cloudrc.world.scene import FOLDER, mujoco
 from cloudrc.world.simulator import Simulator
+from tests.flights.conftest import CLOCK, ring
 from tests.world.guard.conftest import LIMITS, MS, SECOND, UP, Flight, hostile
 
 pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
@@ -30,7 +32,7 @@ pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
 
 def robot_of(kind, scene="empty", limits=LIMITS, model="pelican"):
     parts = Simulator(model, scene), LowLevel(), Guard(limits)
-    return NativeRobot(*parts, limits) if kind is NativeRobot else Robot(*parts)
+    return kind(*parts)
 
 
 def both(scene="empty", limits=LIMITS, model="pelican"):
@@ -81,7 +83,7 @@ def silence(pilot):
 
 
 TOUCHING, IN_PIPE = (8.0, -6.42, 0.9), (-1.0, 0.5, 0.5)
-HOLDS = Limits(fence.LOW, fence.HIGH, hold_max_ns=2000 * MS)
+HOLDS = ResolvedGuard(hold_max_s=2.0)
 
 
 @pytest.mark.parametrize(
@@ -110,7 +112,7 @@ def test_commands_fly_the_same_in_c(make, seconds, spawn, limits, least, scene_a
 @pytest.mark.parametrize("seed", range(3))
 def test_plans_fly_the_same_in_c(seed):
     """Commands every 10 ms or much later; a plan's velocities are due at odd times."""
-    robots = both(limits=Limits(fence.LOW, fence.HIGH, speed_max=4.0, plan_max_ns=800 * MS))
+    robots = both(limits=ResolvedGuard(speed_max_mps=4.0, plan_max_s=0.8))
     count, pilots = Count(robots[1]), [Pilot(robot) for robot in robots]
     for pilot in pilots:
         rng = np.random.default_rng(seed)
@@ -130,12 +132,16 @@ def test_plans_fly_the_same_in_c(seed):
 
 def test_a_micrometre_of_room_means_that_no_fence_limits():
     """`ROOM` in `step.c`: velocities with which the robot can just stop that far from a face."""
-    rng, found, (low, high) = np.random.default_rng(1), 0, np.array(LIMITS.inner_corners())
+    rng, found, (low, high) = (
+        np.random.default_rng(1),
+        0,
+        np.array((fence.INNER_LOW, fence.INNER_HIGH)),
+    )
     for _ in range(20_000):
         velocity, place, axis = rng.uniform(-6.0, 6.0, 3), rng.uniform(low, high), rng.integers(3)
         slow = (velocity < 0.0) & ([False, False, True])
         reaction = np.where(slow, rules.REACTION, rules.FENCE_REACTION)
-        way = rules.stopping_distance(abs(velocity), reaction) + 1e-6
+        way = abs(velocity) * (reaction + abs(velocity) * rules.STOP_COEFFICIENT) + 1e-6
         nearest, farthest = low + way * (velocity <= 0.0), high - way * (velocity > 0.0)
         place[axis] = (farthest if velocity[axis] > 0.0 else nearest)[axis]
         if ((nearest <= place) & (place <= farthest)).all():
@@ -159,7 +165,7 @@ def test_where_c_looks_for_no_contact_there_is_none(kind):
     model, data = parts[0].model, parts[0].data
     rng, free = np.random.default_rng(1), 0
     getattr(model, f"geom_{kind}")[:] = rng.choice([0.0, 0.1], model.ngeom)
-    robot = NativeRobot(*parts, LIMITS)
+    robot = NativeRobot(*parts)
     for _ in range(3000):
         data.qpos[:3] = rng.uniform((-2.0, -7.0, 0.3), (9.0, 3.0, 1.6))
         data.qpos[3:] = rng.normal(size=4)
@@ -187,7 +193,7 @@ def test_in_air_that_acts_on_geoms_c_uses_the_whole_model(setting):
     parts = Simulator("pelican", "empty"), LowLevel(), Guard(LIMITS)
     for name, value in setting.items():
         setattr(parts[0].model.opt, name, value)
-    assert NativeRobot(*parts, LIMITS)._flight.robot_radius == inf
+    assert NativeRobot(*parts)._flight.robot_radius == inf
 
 
 @pytest.mark.parametrize(
@@ -199,12 +205,32 @@ def test_in_air_that_acts_on_geoms_c_uses_the_whole_model(setting):
     ],
 )
 def test_an_experiment_has_the_same_records_in_c(name, settings, monkeypatch):
-    experiment, identity = load_experiment(name, settings), Identity(bytes(16), bytes(16))
+    experiment, identity = load_experiment(name, settings), Identity(CLOCK, bytes(16), ring())
     assert isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
     in_c = fly_in_memory(experiment).run.records_sha256
     monkeypatch.setenv(SWITCH, "0")
     assert fly_in_memory(experiment).run.records_sha256 == in_c
     assert not isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
+
+
+@pytest.mark.parametrize("setting", ["wind.velocity_mps=[0, 1]", "plant.mass_factor=1.1"])
+def test_what_c_cannot_simulate_is_flown_in_python(setting):
+    experiment = load_experiment("hover", [f"world.{setting}"])
+    identity = Identity(CLOCK, bytes(16), ring())
+    assert not isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
+
+
+def test_the_number_of_contacts_is_found_in_the_memory_of_mujoco():
+    simulator = Simulator("pelican", "empty")
+    data, contacts = simulator.data, simulator.data.ncon
+    number = c_int.from_address(data._address + native._contacts_offset(data))
+    assert number.value == data.ncon == contacts > 0
+    data.ncon = 0
+    assert number.value == 0
+    elsewhere = SimpleNamespace(ncon=3, qpos=data.qpos, _address=data._address)
+    with pytest.raises(OSError, match="does not contain the number of contacts"):
+        native._contacts_offset(elsewhere)
+    assert elsewhere.ncon == 3
 
 
 def test_observers_and_a_tape_see_every_step():
@@ -232,11 +258,15 @@ def test_a_robot_that_moves_from_c_to_python_flies_on_the_same():
     assert pilots[0].seen == pilots[1].seen
 
 
+def unfit(data):
+    raise ValueError("undefined symbol")
+
+
 @pytest.mark.parametrize(
     ("what", "value", "text"),
     [
         ("_VALUES", native._VALUES | {"mass": 1.05 + 1e-12}, "C and Python differ"),
-        ("_mujoco_library", lambda: {}["mjtNew"], "MuJoCo is not as expected: KeyError('mjtNew')"),
+        ("_contacts_offset", unfit, "MuJoCo is not as expected: ValueError('undefined symbol')"),
     ],
 )
 def test_a_failed_self_test_means_python_and_one_warning(what, value, text, monkeypatch, caplog):
@@ -244,7 +274,7 @@ def test_a_failed_self_test_means_python_and_one_warning(what, value, text, monk
     monkeypatch.setattr(native, what, value)
     with caplog.at_level(logging.WARNING):
         assert usable() == Library(None, text)
-        robot = make_robot(Simulator("pelican", "empty"), LowLevel(), Guard(LIMITS), LIMITS)
+        robot = make_robot(Simulator("pelican", "empty"), LowLevel(), Guard(LIMITS))
     assert not isinstance(robot, NativeRobot)
     (warning,) = [record.message for record in caplog.records]
     assert warning == f"all steps run in Python: {text}; report this"
