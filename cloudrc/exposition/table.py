@@ -144,7 +144,7 @@ cloudrc_prediction_error_square_meters_total: Sum of the squared lengths of all 
 cloudrc_predictions_judged_total: Predictions compared with a measurement.
 cloudrc_tracking_error_meters[axis]: Setpoint minus measured position, in the newest period.
 cloudrc_setpoint_meters[axis]: Position setpoint, world frame.
-cloudrc_pid_output[axis, term]: Terms of the controller's output [m/s], in the newest period.
+cloudrc_pid_output[term, axis]: Terms of the controller's output [m/s], in the newest period.
 cloudrc_command_velocity_meters_per_second[axis]: Commanded velocity, world frame.
 cloudrc_command_yaw_rate_radians_per_second: Commanded yaw rate.
 cloudrc_horizon_clamped_total = horizon_clamped: Delay estimates clamped to the range 0 to
@@ -176,7 +176,7 @@ cloudrc_journal_repaired_total = journal_repaired: Times that teleop set a damag
     began a new one.
 
 link
-cloudrc_link_info[shaper, direction, mode]: Always 1; the labels name the shaper of a direction of
+cloudrc_link_info[direction, shaper, mode]: Always 1; the labels name the shaper of a direction of
     the link, and the configured mode.
 cloudrc_link_delay_seconds[direction]: Mean one-way delay that the current link profile sets.
 cloudrc_link_step_lateness_seconds[percentile] = step_lateness_p*_ns: Lateness of netem's last
