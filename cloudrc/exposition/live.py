@@ -52,7 +52,7 @@ class LinkVerdict:
     """Newest verdict on whether the link's direction to this process matches its profile."""
 
     def __init__(self, direction: str, values: Values) -> None:
-        """Set the direction, "uplink" or "downlink"; the verdict is "open" until a check."""
+        """Set the direction, "uplink" or "downlink"; before a check the verdict is "open"."""
         self._direction, self._values = direction, values
         self._newest: tuple[LinkChecked, ...] = ()
 
@@ -273,7 +273,7 @@ class Link:
         self._values = values
 
     def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set the `shaper` of a direction, "relay" or "netem", and the configured `link.mode`."""
+        """Store which `shaper` ("relay" or "netem") shapes a direction, and the key `link.mode`."""
         self._values["cloudrc_link_info"][direction] = {shaper: {mode: 1.0}}
 
     def asked(self, direction: str, delay: float) -> None:

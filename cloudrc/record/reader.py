@@ -81,8 +81,8 @@ used, because they allocate whatever size the file claims."""
 class Contents:
     """The contents of a recording's file.
 
-    `note` says what is missing or wrong. `lacking` is `note` without the messages that a
-    killed process did not write; a text in it means that the file was damaged or changed.
+    `note` says what is missing or wrong, for example that the process was killed before it had
+    written all messages. `lacking` says only how the file was damaged or changed; "" if it was not.
     """
 
     # Topic, log time [ns] and CDR bytes of each message, in the order of log times.
@@ -242,7 +242,7 @@ class _File:
 
     @property
     def unread(self) -> int:
-        """Size of the part of the file that was not read [bytes]; 0 if only its index is bad."""
+        """Size of the unread part of the file [bytes]; 0 if only the file's index is damaged."""
         return 0 if self.data_ended and not self.ended else self.size - self.position
 
     @property

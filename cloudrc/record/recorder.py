@@ -35,7 +35,7 @@ class Recorder:
         capacity: int = CAPACITY,
         size_max: int | None = None,
     ) -> None:
-        """Create the queue of `capacity` records; the first `drain` opens the file.
+        """Create a queue of `capacity` records; the first `drain` opens `path` with `open_sink`.
 
         When the file reaches `size_max` [bytes], recording ends; None means no limit.
         """

@@ -50,7 +50,7 @@ value of `COUNTS` is "" until the file is complete."""
 
 
 class McapWriter:
-    """Writes the rows of world, of cloud, or of both to one MCAP file."""
+    """Writes the messages of world, of cloud, or of both to one MCAP file."""
 
     def __init__(
         self,
