@@ -266,19 +266,19 @@ class CloudEnd(End):
 
 
 class Link:
-    """Metrics of a process that shapes one direction of the link or both."""
+    """Metrics of a process that shapes one direction of the link."""
 
     def __init__(self, values: Values) -> None:
         self.tell: Callable[[], str] = lambda: "{}\n"  # content of /link.json, the shaper's state
         self._values = values
 
-    def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Store which `shaper` ("relay" or "netem") shapes a direction, and the key `link.mode`."""
-        self._values["cloudrc_link_info"][direction] = {shaper: {mode: 1.0}}
+    def shaped(self, shaper: str, direction: str, mode: str, delay: float) -> None:
+        """Store which `shaper` ("relay" or "netem") shapes the direction, and the key `link.mode`.
 
-    def asked(self, direction: str, delay: float) -> None:
-        """Set the mean delay [s] that the profile now requests for a direction."""
-        self._values["cloudrc_link_delay_seconds"][direction] = delay
+        `delay` is the mean delay that the profile now requests [s].
+        """
+        self._values["cloudrc_link_info"] = {shaper: {direction: {mode: 1.0}}}
+        self._values["cloudrc_link_delay_seconds"] = {direction: delay}
 
 
 NO_WAYPOINT = -1

@@ -176,7 +176,7 @@ cloudrc_journal_repaired_total = journal_repaired: Times that teleop set a damag
     began a new one.
 
 link
-cloudrc_link_info[direction, shaper, mode]: Always 1; the labels name the shaper of a direction of
+cloudrc_link_info[shaper, direction, mode]: Always 1; the labels name the shaper of a direction of
     the link, and the configured mode.
 cloudrc_link_delay_seconds[direction]: Mean one-way delay that the current link profile sets.
 cloudrc_link_step_lateness_seconds[percentile] = step_lateness_p*_ns: Lateness of netem's last
