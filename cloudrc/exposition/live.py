@@ -7,11 +7,10 @@ clock: they are computed from differences between stamps of one clock.
 from __future__ import annotations
 
 import json
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from itertools import product
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable
 from math import nan
-from typing import Any, get_args
+from typing import Any, TypeAlias, get_args
 
 from cloudrc.exposition import table
 from cloudrc.exposition.parts import (
@@ -20,11 +19,9 @@ from cloudrc.exposition.parts import (
     Histogram,
     PredictionJudge,
     Readings,
-    by_label,
-    per_axis,
-    unlabelled,
+    samples,
 )
-from cloudrc.exposition.table import Kind, Labels, Metric, of_role
+from cloudrc.exposition.table import Kind, Metric, of_role
 from cloudrc.messages import NEVER_NS, Cause, GuardState
 from cloudrc.records import (
     BY_HAND,
@@ -45,6 +42,8 @@ from cloudrc.records import (
     TelemetrySent,
 )
 
+Values: TypeAlias = dict[str, Any]
+"""Name of a metric -> its current value, of a kind that `samples` converts, or its histogram."""
 ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total")
 """Metrics that only relay or only netem has; without a count they are left out."""
 
@@ -52,15 +51,17 @@ ONE_SHAPER = ("cloudrc_link_restored_total", "cloudrc_link_released_early_total"
 class LinkVerdict:
     """Newest verdict on whether the link's direction to this process matches its profile."""
 
-    def __init__(self, direction: str) -> None:
+    def __init__(self, direction: str, values: Values) -> None:
         """Set the direction, "uplink" or "downlink"; before a check the verdict is "open"."""
-        self._direction = direction
+        self._direction, self._values = direction, values
         self._newest: tuple[LinkChecked, ...] = ()
 
     def _on_linkchecked(self, record: LinkChecked) -> None:
         """Store the verdict on one quantity, and drop verdicts of earlier checks."""
         newest = [one for one in self._newest if one.stamp_ns == record.stamp_ns]
         self._newest = (*newest, record)  # a new tuple: another thread may read the old one
+        believed = {"ok": 1.0, "off": 0.0}.get(self.verdict, nan)
+        self._values["cloudrc_link_believed"] = {self._direction: believed}
 
     @property
     def verdict(self) -> str:
@@ -77,12 +78,6 @@ class LinkVerdict:
         document = {"direction": self._direction, "verdict": self.verdict, "rows": known}
         return json.dumps(document, indent=2) + "\n"
 
-    def read(self) -> Readings:
-        """Return the current metrics, without metrics whose values are unknown."""
-        if self.verdict == "open":
-            return {}
-        return {"cloudrc_link_believed": {(self._direction,): float(self.verdict == "ok")}}
-
 
 CLOCK_SET = "wall_clock"
 """Fault code for a step of the wall clock."""
@@ -93,19 +88,19 @@ SILENCE_NS = 2_000_000_000
 class End:
     """Metrics that both world and cloud have: session, datagrams, one-way delay, loop timing."""
 
-    def __init__(self, role: str, counts: Mapping[str, int]) -> None:
-        """Make the metrics of `role`, "world" or "cloud"; `counts` maps counter names to values."""
-        self._counts, self._stream = counts, DatagramTally()
-        self._outgoing, self._incoming, others = "uplink", "downlink", table.ONLY_CLOUD
+    def __init__(self, role: str, values: Values) -> None:
+        """Make the metrics of `role`, "world" or "cloud", in `values`."""
+        self._values, self._stream = values, DatagramTally()
+        outgoing, self._incoming, others = "uplink", "downlink", table.ONLY_CLOUD
         if role == table.CLOUD:
-            self._outgoing, self._incoming, others = "downlink", "uplink", table.ONLY_WORLD
-        self._outcomes = tuple(name for name in table.OUTCOMES[1:] if name not in others)
-        self.check = LinkVerdict(self._incoming)
-        self._histograms = {
-            metric.name: Histogram(metric.buckets) for metric in of_role(role) if metric.buckets
-        }
-        self._busy, self._clock_steps = 0.0, 0
-        self._sessions, self._epoch, self._opened_ns = 0, 0, NEVER_NS
+            outgoing, self._incoming, others = "downlink", "uplink", table.ONLY_WORLD
+        outcomes = dict.fromkeys((name for name in table.OUTCOMES[1:] if name not in others), 0)
+        values["cloudrc_datagrams_total"] = {self._incoming: outcomes, outgoing: {"sent": 0}}
+        for name in ("expected", "lost", "reordered"):
+            values[f"cloudrc_datagrams_{name}_total"] = {self._incoming: 0}
+        values["cloudrc_session_epoch"] = 0
+        self.check = LinkVerdict(self._incoming, values)
+        self._opened_ns = NEVER_NS
         self._arrival_ns = self._woke_ns = self._deadline_ns = NEVER_NS
         self._silent = True  # whether no telemetry or command has arrived in this session
         # Arrival [ns] and one-way delay [s] of the newest used datagram.
@@ -117,25 +112,29 @@ class End:
         return self._opened_ns != NEVER_NS and self._woke_ns - self._arrival_ns < SILENCE_NS
 
     def _observe(self, name: str, seconds: float) -> None:
-        self._histograms[f"cloudrc_{name}_seconds"].observe(seconds)
+        self._values[f"cloudrc_{name}_seconds"].observe(seconds)
 
     def _on_arrival(self, record: Arrival) -> None:
         stamp_ns, _, epoch, counter, delay, used = record
-        if self._stream.take(epoch, counter):  # not a replay, which anybody can send
+        values, stream, incoming = self._values, self._stream, self._incoming
+        if stream.take(epoch, counter):  # not a replay, which anybody can send
             if not self._silent:
                 self._observe("link_gap", (stamp_ns - self._arrival_ns) * 1e-9)
             self._arrival_ns, self._silent = stamp_ns, False
+            values["cloudrc_datagrams_expected_total"][incoming] = stream.expected
+            values["cloudrc_datagrams_lost_total"][incoming] = stream.lost
+            values["cloudrc_datagrams_reordered_total"][incoming] = stream.reordered
         if delay == delay:  # not NaN: both ends share a clock
-            self._observe(f"{self._incoming}_delay", delay)
+            self._observe(f"{incoming}_delay", delay)
         if used:
             self._newest_ns, self._newest_delay = stamp_ns, delay
 
     def _on_fault(self, record: Fault) -> None:
-        self._clock_steps += record.code == CLOCK_SET
+        self._values["cloudrc_clock_steps_total"] += record.code == CLOCK_SET
 
     def _on_sessionopened(self, record: SessionOpened) -> None:
-        self._sessions += 1
-        self._epoch = record.epoch
+        self._values["cloudrc_sessions_opened_total"] += 1
+        self._values["cloudrc_session_epoch"] = record.epoch
         self._opened_ns = self._arrival_ns = record.stamp_ns
         self._silent, self._newest_delay = True, nan
 
@@ -146,36 +145,13 @@ class End:
             self._observe("loop_period", (now_ns - self._deadline_ns) * 1e-9)
         self._deadline_ns, self._woke_ns = now_ns, stamp_ns
         self._observe("loop_lateness", lateness)
-        self._busy += busy
+        self._values["cloudrc_loop_busy_seconds_total"] += busy
 
     def _count_age(self, now_ns: int) -> None:
         """Store the age of the newest datagram at `now_ns` [ns], this process's clock."""
         delay = self._newest_delay
         if delay == delay:
             self._observe("age_of_information", delay + (now_ns - self._newest_ns) * 1e-9)
-
-    def read(self) -> Readings:
-        """Return the current metrics, without metrics whose values are unknown."""
-        counts, stream, incoming = self._counts, self._stream, self._incoming
-        datagrams: dict[Labels, float] = {
-            (incoming, name): counts.get(name, 0) for name in self._outcomes
-        }
-        datagrams[self._outgoing, "sent"] = counts.get("sent", 0)
-        readings: Readings = {
-            **self._histograms,
-            "cloudrc_session_epoch": unlabelled(self._epoch),
-            "cloudrc_sessions_opened_total": unlabelled(self._sessions),
-            "cloudrc_datagrams_total": datagrams,
-            "cloudrc_datagrams_expected_total": {(incoming,): stream.expected},
-            "cloudrc_datagrams_lost_total": {(incoming,): stream.lost},
-            "cloudrc_datagrams_reordered_total": {(incoming,): stream.reordered},
-            "cloudrc_loop_busy_seconds_total": unlabelled(self._busy),
-            "cloudrc_clock_steps_total": unlabelled(self._clock_steps),
-        }
-        one_way = f"cloudrc_{incoming}_delay_seconds"
-        if not self._histograms[one_way].cumulative()[-1]:  # no shared clock: leave out delays
-            del readings[one_way], readings["cloudrc_age_of_information_seconds"]
-        return readings
 
 
 STEP_NS, STEPS = 1_000_000_000, 10
@@ -187,15 +163,10 @@ ADMITTED = "cloud said hello"
 class WorldEnd(End):
     """Metrics of world: all of `End`, and those of robot, guard, contacts and real-time factor."""
 
-    def __init__(self, counts: Mapping[str, int]) -> None:
-        super().__init__(table.WORLD, counts)
-        self._truth: GroundTruth | None = None
-        self._guard = GuardState.GROUND
-        self._changes = dict.fromkeys(table.GUARD_STATES, 0)
+    def __init__(self, values: Values) -> None:
+        super().__init__(table.WORLD, values)
+        values["cloudrc_guard_state"] = GuardState.GROUND
         self._reason = GuardState.GROUND, Cause.SPAWN
-        self._causes = dict.fromkeys(table.GUARD_CAUSES.values(), 0)
-        self._contacts = dict.fromkeys(table.BODIES, 0)
-        self._slip_ns = self._admitted = 0
         self._basis_ns = NEVER_NS
         # Samples of world's clock and of the machine's clock [ns].
         self._instants: deque[tuple[int, int]] = deque(maxlen=STEPS + 1)
@@ -207,10 +178,11 @@ class WorldEnd(End):
 
     def _on_sessionopened(self, record: SessionOpened) -> None:
         super()._on_sessionopened(record)
-        self._admitted += record.cause == ADMITTED
+        self._values["cloudrc_clouds_admitted_total"] += record.cause == ADMITTED
 
     def _on_groundtruth(self, record: GroundTruth) -> None:
-        self._truth = record
+        self._values["cloudrc_position_meters"] = record.odometry.position
+        self._values["cloudrc_tip_force_newtons"] = record.tip_force
 
     def _on_commandapplied(self, record: CommandApplied) -> None:
         self._basis_ns = record.basis_stamp_ns
@@ -219,55 +191,40 @@ class WorldEnd(End):
         self._count_age(record.stamp_ns)
         reason = record.telemetry.guard, record.telemetry.cause
         if reason != self._reason:
-            self._causes[table.GUARD_CAUSES[reason[1]]] += 1
+            self._values["cloudrc_guard_causes_total"][table.GUARD_CAUSES[reason[1]]] += 1
             self._reason = reason
         if record.telemetry.guard is GuardState.TRACK:  # no other state uses commands
             self._observe("command_age", (record.stamp_ns - self._basis_ns) * 1e-9)
 
     def _on_guardchange(self, record: GuardChange) -> None:
-        if record.state != self._guard or record.state is GuardState.GROUND:
+        state, values = record.state, self._values
+        if state != values["cloudrc_guard_state"] or state is GuardState.GROUND:
             # A record with the state LAND at touch-down is no change of the state.
-            self._changes[table.GUARD_STATES[record.state]] += 1
-        self._guard = record.state
+            values["cloudrc_guard_transitions_total"][table.GUARD_STATES[state]] += 1
+        values["cloudrc_guard_state"] = state
 
     def _on_contact(self, record: Contact) -> None:
-        kind = record.body.rstrip("_0123456789")
-        self._contacts[kind if kind in self._contacts else "other"] += 1
+        kind, contacts = record.body.rstrip("_0123456789"), self._values["cloudrc_contacts_total"]
+        contacts[kind if kind in contacts else "other"] += 1
 
     def _on_lateness(self, record: Lateness) -> None:
         super()._on_lateness(record)
-        self._slip_ns, now_ns = record.slip_ns, self._deadline_ns
-        if not self._instants or now_ns >= self._instants[-1][1] + STEP_NS:
-            self._instants.append((record.stamp_ns, now_ns))
-
-    def read(self) -> Readings:
-        """Return the current metrics, without metrics whose values are unknown."""
-        readings = super().read() | {
-            "cloudrc_clouds_admitted_total": unlabelled(self._admitted),
-            "cloudrc_guard_state": unlabelled(self._guard),
-            "cloudrc_guard_transitions_total": by_label(self._changes),
-            "cloudrc_guard_causes_total": by_label(self._causes),
-            "cloudrc_contacts_total": by_label(self._contacts),
-            "cloudrc_world_slip_seconds_total": unlabelled(self._slip_ns * 1e-9),
-        }
-        if self._truth is not None:
-            readings["cloudrc_position_meters"] = per_axis(self._truth.odometry.position)
-            readings["cloudrc_tip_force_newtons"] = unlabelled(self._truth.tip_force)
-        instants = list(self._instants)
-        if len(instants) > 1:
-            (world_ns, machine_ns), (world_end_ns, machine_end_ns) = instants[0], instants[-1]
-            factor = (world_end_ns - world_ns) / (machine_end_ns - machine_ns)
-            readings["cloudrc_real_time_factor"] = unlabelled(factor)
-        return readings
+        self._values["cloudrc_world_slip_seconds_total"] = record.slip_ns * 1e-9
+        now_ns, instants = self._deadline_ns, self._instants
+        if not instants or now_ns >= instants[-1][1] + STEP_NS:
+            instants.append((record.stamp_ns, now_ns))
+            if len(instants) > 1:
+                (world_ns, machine_ns), (world_end_ns, machine_end_ns) = instants[0], instants[-1]
+                factor = (world_end_ns - world_ns) / (machine_end_ns - machine_ns)
+                self._values["cloudrc_real_time_factor"] = factor
 
 
 class CloudEnd(End):
     """Metrics of cloud: those of `End`, and those of loop delay, prediction and control."""
 
-    def __init__(self, counts: Mapping[str, int]) -> None:
-        super().__init__(table.CLOUD, counts)
+    def __init__(self, values: Values) -> None:
+        super().__init__(table.CLOUD, values)
         self._prediction, self._delay = PredictionJudge(), DelayJudge()
-        self._control: Control | None = None
         self._loop_delay, self._used_count = nan, 0
 
     def _on_sessionopened(self, record: SessionOpened) -> None:
@@ -280,7 +237,6 @@ class CloudEnd(End):
         self._used_count += record.used
 
     def _on_control(self, record: Control) -> None:
-        self._control = record
         self._count_age(record.stamp_ns)
         self._prediction.take(record)
         loop_delay = record.loop_delay
@@ -292,102 +248,94 @@ class CloudEnd(End):
                 self._delay.echoed(record, self._newest_ns)
         self._used_count = 0
         self._delay.sent(record)
-
-    def read(self) -> Readings:
-        """Return the current metrics, without metrics whose values are unknown."""
-        prediction, control = self._prediction, self._control
-        readings = super().read() | {
-            "cloudrc_delay_estimate_error_seconds": unlabelled(self._delay.error),
-            "cloudrc_prediction_error_meters": per_axis(prediction.error),
-            "cloudrc_prediction_error_square_meters_total": unlabelled(prediction.square),
-            "cloudrc_predictions_judged_total": unlabelled(prediction.judged),
-        }
-        if control is None:
-            return readings
-        terms = control.proportional, control.integral, control.derivative
-        (sx, sy, sz), (mx, my, mz) = control.setpoint, control.measured
-        return readings | {
-            "cloudrc_delay_estimate_seconds": unlabelled(control.horizon),
-            "cloudrc_tracking_error_meters": per_axis((sx - mx, sy - my, sz - mz)),
-            "cloudrc_setpoint_meters": per_axis(control.setpoint),
-            "cloudrc_command_velocity_meters_per_second": per_axis(control.command),
-            "cloudrc_command_yaw_rate_radians_per_second": unlabelled(control.yaw_rate),
-            "cloudrc_pid_output": {
-                (axis, name): value
-                for name, term in zip(table.TERMS, terms, strict=True)
-                for axis, value in zip(table.AXES, term, strict=True)
-            },
-        }
+        (sx, sy, sz), (mx, my, mz) = record.setpoint, record.measured
+        values = self._values
+        values["cloudrc_delay_estimate_seconds"] = record.horizon
+        values["cloudrc_delay_estimate_error_seconds"] = self._delay.error
+        values["cloudrc_prediction_error_meters"] = self._prediction.error
+        values["cloudrc_prediction_error_square_meters_total"] = self._prediction.square
+        values["cloudrc_predictions_judged_total"] = self._prediction.judged
+        values["cloudrc_tracking_error_meters"] = (sx - mx, sy - my, sz - mz)
+        values["cloudrc_setpoint_meters"] = record.setpoint
+        values["cloudrc_command_velocity_meters_per_second"] = record.command
+        values["cloudrc_command_yaw_rate_radians_per_second"] = record.yaw_rate
+        terms = values["cloudrc_pid_output"]
+        terms["proportional"] = record.proportional
+        terms["integral"] = record.integral
+        terms["derivative"] = record.derivative
 
 
 class Link:
     """Metrics of a process that shapes one direction of the link."""
 
-    def __init__(self) -> None:
+    def __init__(self, values: Values) -> None:
         self.tell: Callable[[], str] = lambda: "{}\n"  # content of /link.json, the shaper's state
-        self._readings: Readings = {}
+        self._values = values
 
     def shaped(self, shaper: str, direction: str, mode: str, delay: float) -> None:
         """Store which `shaper` ("relay" or "netem") shapes the direction, and the key `link.mode`.
 
         `delay` is the mean delay that the profile now requests [s].
         """
-        self._readings = {
-            "cloudrc_link_info": {(shaper, direction, mode): 1.0},
-            "cloudrc_link_delay_seconds": {(direction,): delay},
-        }
-
-    def read(self) -> Readings:
-        """Return the current metrics; {} before the link is up."""
-        return self._readings
+        self._values["cloudrc_link_info"] = {shaper: {direction: {mode: 1.0}}}
+        self._values["cloudrc_link_delay_seconds"] = {direction: delay}
 
 
 NO_WAYPOINT = -1
 """Index of the waypoint while no mission is active."""
+HELD = table.MISSION_STATES.index("held")
 
 
 class Mission:
     """Metrics of missions, computed from mission events."""
 
-    def __init__(self) -> None:
-        self._state, self._waypoint, self._reached = "idle", NO_WAYPOINT, 0
-        self._ended = dict.fromkeys(table.MISSION_OUTCOMES, 0)
+    def __init__(self, values: Values) -> None:
+        self._values = values
+        self._set("idle", NO_WAYPOINT)
+
+    def _set(self, state: str, waypoint: int) -> None:
+        self._values["cloudrc_mission_state"] = table.MISSION_STATES.index(state)
+        self._values["cloudrc_mission_waypoint"] = waypoint
 
     def _on_missionevent(self, record: MissionEvent) -> None:
-        event = record.event
+        event, values = record.event, self._values
         if event not in UNDER_WAY:
-            self._ended[event if event in self._ended else "other"] += 1
-            self._state = event if event in ("done", "cancelled") else "failed"
-            self._waypoint = NO_WAYPOINT
+            ended = values["cloudrc_missions_total"]
+            ended[event if event in ended else "other"] += 1
+            self._set(event if event in ("done", "cancelled") else "failed", NO_WAYPOINT)
         elif event == "reached":
-            self._reached += 1
-            self._waypoint = record.waypoint + 1
+            values["cloudrc_waypoints_reached_total"] += 1
+            values["cloudrc_mission_waypoint"] = record.waypoint + 1
         elif event in ("held", "paused"):
-            self._state = "held"
+            values["cloudrc_mission_state"] = HELD
         elif event not in BY_HAND:
-            self._state, self._waypoint = "flying", record.waypoint
-        elif self._state != "held":  # a new mission; in HOLD, these only move the hold point
-            self._state, self._waypoint = "starting", NO_WAYPOINT
-
-    def read(self) -> Readings:
-        """Return the current metrics."""
-        return {
-            "cloudrc_mission_state": unlabelled(table.MISSION_STATES.index(self._state)),
-            "cloudrc_mission_waypoint": unlabelled(self._waypoint),
-            "cloudrc_waypoints_reached_total": unlabelled(self._reached),
-            "cloudrc_missions_total": by_label(self._ended),
-        }
+            self._set("flying", record.waypoint)
+        # A new mission; in HOLD, these events only move the hold point.
+        elif values["cloudrc_mission_state"] != HELD:
+            self._set("starting", NO_WAYPOINT)
 
 
-def _read_count(metric: Metric, counts: Mapping[str, int]) -> dict[Labels, float]:
-    """Return the values of a metric that is a count; convert a count of ns to s."""
-    begins_at_0 = metric.kind is Kind.COUNTER and metric.name not in ONE_SHAPER
-    found: dict[Labels, float] = {}
-    for labels in product(*metric.labels.values()):  # of one label or none
-        name = metric.counted.replace("*", *labels or [""]).replace(".", "")
-        if begins_at_0 or name in counts:
-            found[labels] = counts.get(name, 0) * (1e-9 if name.endswith("_ns") else 1)
-    return found
+def _beginning(metric: Metric) -> Any:
+    """Return the value of a metric before the first record: 0 for a counter, else unknown."""
+    if metric.buckets:
+        return Histogram(metric.buckets)
+    value = 0 if metric.kind is Kind.COUNTER and metric.name not in ONE_SHAPER else nan
+    return dict.fromkeys(next(iter(metric.labels.values())), value) if metric.labels else value
+
+
+def _places(metrics: Iterable[Metric], values: Values) -> dict[str, list[tuple[Values, str]]]:
+    """Map the name of each count to the dicts and keys under which its total is stored."""
+    counted = [("*", outcomes) for outcomes in values.get("cloudrc_datagrams_total", {}).values()]
+    places = defaultdict(list)
+    for metric in metrics:
+        if metric.counted and metric.labels:
+            counted.append((metric.counted, values[metric.name]))
+        elif metric.counted:
+            places[metric.counted].append((values, metric.name))
+    for pattern, by_label in counted:
+        for label in by_label:
+            places[pattern.replace("*", label).replace(".", "")].append((by_label, label))
+    return places
 
 
 class LiveMetrics:
@@ -398,25 +346,28 @@ class LiveMetrics:
 
         `missions` is False in a cloud whose separate teleop exposes the metrics of missions.
         """
-        self._role = role
-        self._counts: dict[str, int] = {}
+        of_missions = (table.CLOUD, table.TELEOP)  # processes that expose the metrics of missions
+        # The exporter reads the metrics that all processes have.
+        omitted = (table.ROLES,) if missions else (table.ROLES, of_missions)
+        metrics = [metric for metric in of_role(role) if metric.roles not in omitted]
+        # It has a key per metric from now on: another thread may read it at any time.
+        self._values = values = {metric.name: _beginning(metric) for metric in metrics}
         ends: dict[str, type[WorldEnd | CloudEnd]] = {table.WORLD: WorldEnd, table.CLOUD: CloudEnd}
-        self.end: End | None = ends[role](self._counts) if role in ends else None
-        self.link = Link() if role == table.LINK else None
-        has_mission = missions and role in (table.CLOUD, table.TELEOP)
-        mission = Mission() if has_mission else None
-        parts = self.end, self.end and self.end.check, self.link, mission
-        self._parts = [part for part in parts if part is not None]
+        self.end: End | None = ends[role](values) if role in ends else None
+        self.link = Link(values) if role == table.LINK else None
+        mission = Mission(values) if missions and role in of_missions else None
+        self._places = _places(metrics, values)
         # The method `_on_NAME` of a part handles the records of the class NAME.
         self._handlers: dict[type, Callable[[Any], None]] = {
             kind: getattr(part, name)
-            for part in (self, *self._parts)
+            for part in (self, self.end, self.end and self.end.check, mission)
             for kind in get_args(Record)
             if hasattr(part, name := f"_on_{kind.__name__.lower()}")
         }
 
     def _on_counted(self, record: Counted) -> None:
-        self._counts[record.name] = record.total
+        for values, key in self._places.get(record.name, ()):
+            values[key] = record.total * (1e-9 if record.name.endswith("_ns") else 1)
 
     def see(self, records: Iterable[Record]) -> None:
         """Update the metrics with new records of this process, oldest first, without blocking."""
@@ -426,11 +377,8 @@ class LiveMetrics:
 
     def read(self) -> Readings:
         """Return the current metrics, without metrics whose values are unknown."""
-        counts = dict(self._counts)
-        readings: Readings = {}
-        for metric in of_role(self._role):
-            if metric.counted and (found := _read_count(metric, counts)):
-                readings[metric.name] = found
-        for part in self._parts:
-            readings |= part.read()
-        return readings
+        readings = {
+            name: value if isinstance(value, Histogram) else samples(value)
+            for name, value in self._values.items()
+        }
+        return {name: reading for name, reading in readings.items() if reading}

@@ -7,11 +7,10 @@ serves the metrics does all other work.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Mapping
 from heapq import heappop, heappush
 from itertools import accumulate
 from math import isnan, nan
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from cloudrc.exposition.table import AXES, Labels
 from cloudrc.messages import NEVER_NS, Vector
@@ -29,6 +28,10 @@ class Histogram:
         self.total = 0.0  # sum of all observed values
         self._counts = [0] * (len(bounds) + 1)
 
+    def __bool__(self) -> bool:
+        """Return whether any value was observed."""
+        return any(self._counts)
+
     def observe(self, value: float) -> None:
         """Add `value` [unit of the bounds] to the count of its bucket and to the total."""
         self._counts[bisect_left(self.bounds, value)] += 1
@@ -43,20 +46,18 @@ Readings: TypeAlias = dict[str, "dict[Labels, float] | Histogram"]
 """Name of a metric -> its values by tuple of label values, or a histogram, which has no labels."""
 
 
-def unlabelled(value: float) -> dict[Labels, float]:
-    """Return `value` [unit of the metric] as the reading of a metric without labels; {} for NaN."""
-    return {} if isnan(value) else {(): value}
+def samples(value: Any, labels: Labels = ()) -> dict[Labels, float]:
+    """Convert the value of a metric to its values by tuple of label values; leave out NaN.
 
-
-def per_axis(vector: Vector) -> dict[Labels, float]:
-    """Map each axis to its value in `vector` [unit of the metric]; leave out NaN."""
-    values = zip(AXES, vector, strict=True)
-    return {(axis,): value for axis, value in values if not isnan(value)}
-
-
-def by_label(counts: Mapping[str, float]) -> dict[Labels, float]:
-    """Convert label value -> count to (label value,) -> count, the form of `Readings`."""
-    return {(name,): count for name, count in counts.items()}
+    `value` is a number, a vector with the label `axis`, or a dict: value of a label -> number,
+    vector or dict. `labels` are the label values that are already known.
+    """
+    if isinstance(value, tuple):
+        value = dict(zip(AXES, value, strict=True))
+    if not isinstance(value, dict):
+        return {} if isnan(value) else {labels: value}
+    parts = (samples(each, (*labels, label)) for label, each in value.items())
+    return {key: number for part in parts for key, number in part.items()}
 
 
 WINDOW = 128

@@ -144,7 +144,7 @@ cloudrc_prediction_error_square_meters_total: Sum of the squared lengths of all 
 cloudrc_predictions_judged_total: Predictions compared with a measurement.
 cloudrc_tracking_error_meters[axis]: Setpoint minus measured position, in the newest period.
 cloudrc_setpoint_meters[axis]: Position setpoint, world frame.
-cloudrc_pid_output[axis, term]: Terms of the controller's output [m/s], in the newest period.
+cloudrc_pid_output[term, axis]: Terms of the controller's output [m/s], in the newest period.
 cloudrc_command_velocity_meters_per_second[axis]: Commanded velocity, world frame.
 cloudrc_command_yaw_rate_radians_per_second: Commanded yaw rate.
 cloudrc_horizon_clamped_total = horizon_clamped: Delay estimates clamped to the range 0 to

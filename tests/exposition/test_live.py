@@ -7,7 +7,7 @@ import pytest
 
 from cloudrc.config.load import load_experiment
 from cloudrc.exposition import table
-from cloudrc.exposition.live import ONE_SHAPER, LinkVerdict, LiveMetrics
+from cloudrc.exposition.live import ONE_SHAPER, LiveMetrics
 from cloudrc.exposition.parts import Histogram
 from cloudrc.messages import UPRIGHT, ZERO, Cause, GuardState, Odometry, Telemetry
 from cloudrc.records import (
@@ -95,8 +95,8 @@ def test_control_periods_give_delays_errors_and_terms():
     assert histogram(live, "cloudrc_loop_delay_seconds").total == pytest.approx(0.1)
     assert value(live, "cloudrc_tracking_error_meters", "x") == 1.0
     assert value(live, "cloudrc_tracking_error_meters", "y") == -0.5
-    assert value(live, "cloudrc_pid_output", "z", "derivative") == -0.7
-    assert live.read()["cloudrc_prediction_error_meters"] == {}  # no prediction compared yet
+    assert value(live, "cloudrc_pid_output", "derivative", "z") == -0.7
+    assert "cloudrc_prediction_error_meters" not in live.read(), "no prediction compared yet"
 
 
 @pytest.mark.parametrize(
@@ -243,13 +243,11 @@ def test_mission_metrics_follow_the_events():
 
 
 def test_the_newest_verdict_on_the_link_is_exposed():
-    check = LinkVerdict("uplink")
+    live = LiveMetrics("cloud")
     for stamp_ns, verdict, believed in ((1, "open", None), (2, "ok", 1.0), (2, "off", 0.0)):
-        check._on_linkchecked(
-            LinkChecked(stamp_ns, True, "mean", 0.04, math.nan, 0.03, 0.05, verdict, 900)
-        )
-        found = {("uplink",): believed}
-        assert check.read() == ({} if believed is None else {"cloudrc_link_believed": found})
-    document = json.loads(check.text())
+        live.see([LinkChecked(stamp_ns, True, "mean", 0.04, math.nan, 0.03, 0.05, verdict, 900)])
+        found = None if believed is None else {("uplink",): believed}
+        assert live.read().get("cloudrc_link_believed") == found
+    document = json.loads(live.end.check.text())
     assert (document["verdict"], len(document["rows"])) == ("off", 2)
     assert "measured" not in document["rows"][0], "an unknown value is left out"
