@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
+from contextlib import suppress
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +14,7 @@ import numpy as np
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
-from cloudrc.files import write_atomically
+from cloudrc.files import read, write_atomically
 from cloudrc.geometry.scene import load_scene
 from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
@@ -66,20 +68,32 @@ def write_report(
     page: bool = True,
     look: Look | None = None,
 ) -> dict[str, Any]:
-    """Write report.json and environment.json and, if `page`, report.html with its figures.
+    """Write report.json and, if `page`, report.html with its figures.
+
+    Also write environment.json, if the flight has left none.
 
     `folder` is the folder of the run; files of an earlier report in it are replaced. `look` is the
     size of the figures. `own` are names or paths of the user's metrics, whose files are executed.
     Return the content of report.json.
     """
     assessment = assess(recording, experiment, run, own)
-    document, environment = assessment.document, environment_document(run.physics_steps)
+    document = assessment.document
     write_json(folder / "report.json", document)
-    write_json(folder / "environment.json", environment)
+    environment = _environment(folder / "environment.json", run)
     if driven := _driven(assessment.flight):
         write_atomically(folder / DRIVE_FILE, driven.encode())
     if page:
         _write_page(folder, assessment, environment, look)
+    return document
+
+
+def _environment(path: Path, run: Run) -> dict[str, Any]:
+    """Return the description of the machine that flew; without its file, describe this machine."""
+    with suppress(OSError, ValueError, RecursionError):
+        if not path.is_symlink() and isinstance(known := json.loads(read(path)), dict):
+            return known
+    document = environment_document(run.physics_steps)
+    write_json(path, document)
     return document
 
 

@@ -1,6 +1,7 @@
 """The folder of a run gives the same report again, or an error, and then stays unchanged."""
 
 import json
+import os
 import re
 import shutil
 from pathlib import Path
@@ -48,6 +49,17 @@ def test_a_run_gives_the_same_report_again(run):
     assert write_report(run, *read_run(run), page=False) == first
     (run / "report.json").unlink()
     assert write_report(run, *read_run(run), page=False) == first
+
+
+def test_a_new_report_keeps_the_description_of_the_machine_that_flew(run):
+    environment = run / "environment.json"
+    environment.write_text(flown := '{"cores": 3, "physics_steps": "C (compiled by cc)"}')
+    write_report(run, *read_run(run), page=False)
+    assert environment.read_text() == flown
+    for unusable in ("{", "[1]", "[" * 10_000):
+        environment.write_text(unusable)
+        write_report(run, *read_run(run), page=False)
+        assert json.loads(environment.read_text())["cores"] == os.cpu_count()
 
 
 def filtered(**options):
