@@ -79,7 +79,7 @@ def run(code):
 def test_a_flight_needs_no_package_for_recording():
     code = (
         f"import sys; sys.modules.update(dict.fromkeys({NEEDED}))\n"
-        "from cloudrc.record import hash, recorder, topics\n"
+        "from cloudrc.record import hash, topics\n"
         "print('numpy' in sys.modules)\n"
         "from cloudrc.record import columns\n"
         "import cloudrc.drivers.recording\n"
