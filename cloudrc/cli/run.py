@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import heapq
 import itertools
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from math import inf
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -296,7 +298,7 @@ def _record_virtual(
     of the report to mission.mcap.
     """
     from cloudrc import assembly
-    from cloudrc.record.columns import RecordStore, merged
+    from cloudrc.record.columns import Recording, RecordStore
     from cloudrc.record.writer import McapWriter
     from cloudrc.report.document import Run
     from cloudrc.report.views import views
@@ -309,8 +311,7 @@ def _record_virtual(
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
             from_cloud = flight.on_world_clock(from_cloud)
-            for log_time_ns, row in merged(from_world, from_cloud):
-                writer.write_row(row, log_time_ns)
+            writer.write(heapq.merge(from_world, from_cloud, key=attrgetter("stamp_ns")))
             store.add(from_world, from_cloud)
             see(from_cloud)
             see(from_world)
@@ -322,9 +323,10 @@ def _record_virtual(
         except KeyboardInterrupt:
             interrupted = True
         try:
-            facts = store.hexdigest(), interrupted, assembly.virtual_notes(experiment)
-            run = Run("virtual", "virtual", *facts, _physics_steps(experiment, usable().text))
-            recording = store.recording()
+            steps = _physics_steps(experiment, usable().text)
+            run = Run("virtual", "virtual", interrupted, assembly.virtual_notes(experiment), steps)
+            writer.note(run.metadata)
+            recording = Recording(records=store)
             writer.write_views(views(recording, experiment))
             yield recording, experiment, run
         finally:
@@ -360,10 +362,9 @@ def _record_local(
     from cloudrc.assembly import flight_limit
     from cloudrc.cli.session import read_last_mission
     from cloudrc.drivers.local import LocalRun
-    from cloudrc.record.hash import messages_sha256
     from cloudrc.record.merge import merge
     from cloudrc.report.document import Run
-    from cloudrc.report.views import add_views
+    from cloudrc.report.views import views
     from cloudrc.report.write import attachments
     from cloudrc.world.native.library import library
 
@@ -387,10 +388,11 @@ def _record_local(
             raise broken or nothing from None
         raise error
     notes = (*local.notes, *([str(broken)] if broken else ()))
-    facts = messages_sha256(mission.messages), interrupted, notes
-    run = Run("local", "relay", *facts, _physics_steps(experiment, library().text))
+    run = Run("local", "relay", interrupted, notes, _physics_steps(experiment, library().text))
+    mission.metadata |= run.metadata
     try:
-        yield add_views(mission, experiment), experiment, run
+        mission.views = views(mission, experiment)
+        yield mission, experiment, run
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))
         local.announcement.close()

@@ -24,11 +24,6 @@ from cloudrc.report.document import Assessment, Run, environment_document, write
 if TYPE_CHECKING:
     from cloudrc.report.figures.style import Look
 
-DIFFERS = "From telemetry at the end of the mission, the operator's verdict was "
-"""First words of a note: the operator's verdict differs from the verdict of the report."""
-RECORDING_NOTE = "The recording "
-"""First words of each note about a recording; a new report drops old notes with these words."""
-
 
 def assess(
     recording: Recording, experiment: ResolvedExperiment, run: Run, own: Iterable[str] = ()
@@ -41,21 +36,25 @@ def assess(
     scene = load_scene(experiment.world.scene)
     flight = Flight(recording, experiment.criteria, experiment.mission, scene)
     numbers, metric_notes = measure_all(flight, own)
-    real_time, stopped = run.mode != "virtual", run.interrupted or not recording.complete
+    real_time, stopped = run.mode != "virtual", run.interrupted or bool(recording.note)
     evidence = flight_evidence(flight, numbers, real_time=real_time, interrupted=stopped)
     verdict, operator = judge(evidence), None
     notes = list(run.notes)
-    if not recording.complete:
-        notes.append(f"{RECORDING_NOTE}is incomplete: {recording.note}.")
-    notes += [f"{RECORDING_NOTE}{remark}." for remark in recording.remarks]
+    if recording.note:
+        notes.append(f"The recording is incomplete: {recording.note}.")
+    notes += [f"The recording {remark}." for remark in recording.remarks]
     notes += [f"{text[0].upper()}{text[1:]}." for text in recording["/fault"]["text"] if text]
     if flight.ending is not None:
         seen = operator_verdict(flight, evidence, numbers)
         if seen.outcome != verdict.outcome:
             operator = seen
-            notes.append(f"{DIFFERS}{seen.outcome}. The verdict of this report counts.")
+            notes.append(
+                "From telemetry at the end of the mission, the operator's verdict was "
+                f"{seen.outcome}. The verdict of this report counts."
+            )
     kept = tuple(dict.fromkeys([*notes, *metric_notes]))
-    return Assessment(run, experiment, flight, numbers, verdict, operator, kept)
+    digest = None if recording.note else recording.sha256
+    return Assessment(run, experiment, flight, numbers, verdict, operator, kept, digest)
 
 
 def write_report(

@@ -12,7 +12,7 @@ from cloudrc.assembly import assemble, build_cloud, build_links, build_world
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.messages import Passed
-from cloudrc.record.columns import RecordStore
+from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.sweep.flight import fly_in_memory
 from cloudrc.tunnel.end import Identity
 from tests.flights.conftest import ring
@@ -27,7 +27,7 @@ print(digest(short()))
 
 
 def digest(experiment):
-    return fly_in_memory(experiment).run.records_sha256
+    return fly_in_memory(experiment).records_sha256
 
 
 def short(*settings):
@@ -61,7 +61,7 @@ def test_messages_without_bytes_or_seals_make_the_same_records(settings):
         world, cloud = build_world(experiment, identity), build_cloud(experiment, identity)
         run, sealed = VirtualRun(world, cloud, *build_links(experiment)), RecordStore()
         run.fly(lambda cloud=cloud: cloud.mission_over, 150_000_000_000, sealed.add)
-        found.add(sealed.hexdigest())
+        found.add(Recording(records=sealed).sha256)
     assert found == {digest(experiment)}
 
 
