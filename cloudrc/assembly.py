@@ -30,7 +30,8 @@ from cloudrc.teleop.wire import Leg, Plan
 from cloudrc.tunnel.end import Identity
 
 if TYPE_CHECKING:
-    from cloudrc.drivers.virtual import VirtualRun
+    from cloudrc.drivers.virtual import Sink, VirtualRun
+    from cloudrc.records import Record
     from cloudrc.teleop.store import Order
     from cloudrc.world.endpoint import WorldEndpoint
     from cloudrc.world.sensors import Sensors
@@ -76,6 +77,20 @@ def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoi
     return world, cloud, VirtualRun(world, cloud, *links, cloud_clock=own)
 
 
+def fly(experiment: ResolvedExperiment, see: Sink) -> None:
+    """Fly in virtual time until the mission is over.
+
+    Every 100 ms of virtual time, call `see` with the new records of world and of cloud, both on
+    world's clock.
+    """
+    _, cloud, run = assemble(experiment)
+
+    def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
+        see(from_world, run.on_world_clock(from_cloud))
+
+    run.fly(lambda: cloud.mission_over, round(flight_limit(experiment) * 1e9), sink)
+
+
 def virtual_notes(experiment: ResolvedExperiment) -> tuple[str, ...]:
     """Return warnings for the report of a flight in virtual time; () if there are none."""
     return (MEASURED,) if experiment.cloud.compute_measured else ()
@@ -91,8 +106,8 @@ def build_world(
 ) -> WorldEndpoint:
     """Build world: the robot in its scene, and world's end of the tunnel. Needs MuJoCo.
 
-    `clock` returns the monotonic time [ns]. World's time starts after the scene has been compiled,
-    because compiling takes a while.
+    `clock` returns the monotonic time [ns]. It is called last, at the start of world's time, so
+    that the duration of compiling the scene does not count.
     """
     from cloudrc.world.endpoint import WorldEndpoint
     from cloudrc.world.guard.limits import Limits

@@ -36,7 +36,7 @@ class DiskFullError(MissingPrerequisiteError):
     """The disk is full, so that the recording or the report is not complete."""
 
     def __init__(self, where: str) -> None:
-        """Name the file or folder on the full disk."""
+        """Set `where`, the file or folder on the full disk."""
         super().__init__(where)  # pickle passes these arguments to the parent process
 
     def __str__(self) -> str:

@@ -211,7 +211,7 @@ class Setpoint(NamedTuple):
 
 
 class Passed(NamedTuple):
-    """What an endpoint sends, instead of bytes, to an endpoint in the same process."""
+    """Datagram to an endpoint in the same process; to save time, the message is not encoded."""
 
     kind: int  # a `tunnel.codec.Kind`
     epoch: int

@@ -25,7 +25,7 @@ class LinkChanged(NamedTuple):
     shaper: str  # "relay" or "netem"
     cause: str  # why the conditions changed, in words; "" at the start
     age: float  # time since these conditions took effect [s]
-    time_line: float  # time since the time line began [s]; NaN if the change did not restart it
+    time_line: float  # time since the time line began [s]
     delay: float  # requested one-way delay [s]
     jitter: float  # requested jitter, as in the profile [s]
     loss: float  # requested long-run loss, in [0, 1]

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 DURATION_NS = 20_000_000_000
 """Simulated time of the link [ns]."""
+WARNINGS_MAX = 3
+"""Largest number of warnings about several experiments that are printed."""
 SAG_MAX = 0.05
 """Largest steady error of the position that needs no warning [m]."""
 WIND_FORCE = 0.24
@@ -27,9 +29,12 @@ WIND_FORCE = 0.24
 rotors, one third comes from the tilt that this drag causes."""
 
 
-def warn(experiment: ResolvedExperiment) -> None:
-    """Print the texts of `advise` as warnings on stderr."""
-    for text in advise(experiment):
+def warn(*experiments: ResolvedExperiment) -> None:
+    """Print the texts of `advise` as warnings on stderr, each once; of a grid, the first ones."""
+    advice = list(dict.fromkeys(text for each in experiments for text in advise(each)))
+    if len(experiments) > 2 and len(advice) > WARNINGS_MAX:
+        advice[WARNINGS_MAX:] = [f"{len(advice)} warnings; the others are alike"]
+    for text in advice:
         print_line(f"cloudrc: warning: {text}", sys.stderr)
 
 
@@ -53,8 +58,8 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
     """Simulate telemetry and commands over the experiment's link, without its blackouts.
 
     Return two lists of ages [s], measured just before each datagram is sent: the ages of the
-    odometry from which cloud computed world's present command, and the ages of the newest command
-    that telemetry has confirmed.
+    odometry from which cloud computed the command that world follows, and the ages of the newest
+    command that telemetry has confirmed.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection
@@ -129,8 +134,9 @@ def _long_link(
 ) -> Iterator[str]:
     """Yield warnings about limits of guard and cloud that are too short for the link's delays.
 
-    Both lists have one age per simulated datagram [s]: `ages` that of the odometry from which cloud
-    computed the command in use, `echoes` that of the newest command that telemetry has confirmed.
+    Both lists have one value per simulated datagram [s]. `ages` has the age of the odometry from
+    which cloud computed the command that the robot follows. `echoes` has the age of the newest
+    command that telemetry has confirmed.
     """
     age_max, cloud = experiment.guard.command_age_max_ms * 1e-3, experiment.cloud
     mean, longest = sum(ages) / len(ages), max(ages)

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import format_document, output_argument, table
+from cloudrc.cli.output import output_argument, print_result, table
 from cloudrc.cli.parser import read_count
 from cloudrc.errors import CloudrcError
 
@@ -58,19 +58,16 @@ def execute(options: argparse.Namespace) -> int:
     }
     costs = measure(parts, options.repeats)
     raw, steps = costs["raw mj_step"], usable().text
-    if options.output != "table":
-        figures = {
-            name: {"us_per_step": cost * 1e6, "ratio": raw / cost, "real_time_factor": STEP / cost}
-            for name, cost in costs.items()
-        }
-        document = {"schemaVersion": 1, "physics_steps": steps, **figures}
-        print(format_document(document, options.output))
-        return 0
+    figures = {
+        name: {"us_per_step": cost * 1e6, "ratio": raw / cost, "real_time_factor": STEP / cost}
+        for name, cost in costs.items()
+    }
     rows = [("experiment paper, mode virtual", "us a step", "ratio to raw", "x real time")]
     for name, cost in costs.items():
         rows.append((name, f"{cost * 1e6:.2f}", f"{raw / cost:.3f}", f"{STEP / cost:.0f}"))
-    print(table(rows, right=(1, 2, 3)))
-    print(f"\n'raw mj_step' ended in the same bits as the flight; steps of the flight: {steps}")
+    text = f"'raw mj_step' ended in the same bits as the flight; steps of the flight: {steps}"
+    document = {"physics_steps": steps, **figures}
+    print_result(options.output, document, f"{table(rows, right=(1, 2, 3))}\n\n{text}")
     return 0
 
 

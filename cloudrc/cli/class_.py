@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cloudrc.cli.output import format_document, print_or_drop, table
+from cloudrc.cli.output import format_document, print_or_drop, print_result, table
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.errors import BadInputError
 
@@ -50,14 +50,6 @@ def execute(options: argparse.Namespace) -> int:
     interrupt_on_signals()
     rows = check(options.folder.resolve())
     score, of = (round(sum(row[key] for row in rows), 1) for key in ("points", "max_points"))
-    if options.output == "table":
-        cells = [("part", "test", "points", "seen")]
-        cells += [
-            (r["part"], r["test"], f"{r['points']:g}/{r['max_points']}", r["seen"]) for r in rows
-        ]
-        print_or_drop(f"{table(cells, right=(2,))}\n\nscore {score:g} of {of}")
-        return 0
-    document = {"schemaVersion": 1, "score": score, "max_score": of, "checks": rows}
     if options.output == "gradescope":
         names = {"points": "score", "max_points": "max_score", "seen": "output"}
         tests = [
@@ -65,8 +57,13 @@ def execute(options: argparse.Namespace) -> int:
             | {name: row[key] for key, name in names.items()}
             for row in rows
         ]
-        document = {"score": score, "visibility": "visible", "tests": tests}
-    print_or_drop(format_document(document, options.output.replace("gradescope", "json")))
+        results = {"score": score, "visibility": "visible", "tests": tests}
+        print_or_drop(format_document(results, "json"))
+        return 0
+    cells = [("part", "test", "points", "seen")]
+    cells += [(r["part"], r["test"], f"{r['points']:g}/{r['max_points']}", r["seen"]) for r in rows]
+    text = f"{table(cells, right=(2,))}\n\nscore {score:g} of {of}"
+    print_result(options.output, {"score": score, "max_score": of, "checks": rows}, text)
     return 0
 
 

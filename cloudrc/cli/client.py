@@ -60,7 +60,7 @@ class Api:
             raise BadInputError(f"--api {url}: give http://HOST:PORT or unix:PATH") from None
 
     def say(self, text: str) -> None:
-        """Print a text; before it, print the name of the run or release, if there is one."""
+        """Print a text after the name of the run or release; without a name, only the text."""
         print_line(f"{self.place}: {text}" if self.place else text)
 
     def get(self, path: str) -> Any:

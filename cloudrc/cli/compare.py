@@ -11,16 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.output import (
-    format_document,
     format_number,
     output_argument,
     print_or_drop,
+    print_result,
     table,
 )
 from cloudrc.cli.parser import read_count
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.errors import BadInputError
-from cloudrc.plugins import unknown_name_text
 
 if TYPE_CHECKING:
     from cloudrc.sweep.compare import Found
@@ -82,12 +81,11 @@ def execute(options: argparse.Namespace) -> int:
         if not found.pairs:
             return code
     document = {
-        **{"schemaVersion": 1, "a": options.a, "b": options.b, "of": found.what},
+        **{"a": options.a, "b": options.b, "of": found.what},
         **{"overrides": options.set, "interrupted": bool(stopped)},
         **compare(found.pairs, found.units, options.number),
     }
-    for_people = options.output == "table"
-    print_or_drop(as_text(document) if for_people else format_document(document, options.output))
+    print_result(options.output, document, as_text(document))
     return code
 
 
@@ -99,7 +97,7 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
     from cloudrc.cli.advice import warn
     from cloudrc.cli.progress import SweepView
     from cloudrc.cli.run import load
-    from cloudrc.sweep.compare import Found, Pair
+    from cloudrc.sweep.compare import Found, Pair, check_names
     from cloudrc.sweep.flight import fly_point, units
 
     for text in (options.a, options.b):
@@ -113,11 +111,8 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
     if sides[0] == sides[1]:
         raise BadInputError("A and B are the same experiment; change one of them")
     unit_of = units({name for each in sides for name in each.report.metrics})
-    for name in options.number:
-        if name not in unit_of:
-            raise BadInputError(f"--number: {unknown_name_text('number', name, sorted(unit_of))}")
-    for side in sides:
-        warn(side)
+    check_names(options.number, unit_of)
+    warn(*sides)
     jobs = [side.model_copy(update={"seed": n + 1}) for n in range(options.seeds) for side in sides]
     flights: list[Row] = []
     head = f"{sides[0].name}: A and B, each with seeds 1 to {options.seeds}"
@@ -170,7 +165,7 @@ def _row(name: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _scaled(entry: Mapping[str, Any]) -> tuple[float, str]:
-    from cloudrc.sweep.compare import scale
+    from cloudrc.metrics import scale
 
     return scale(entry["unit"], max(abs(entry["a_median"]), abs(entry["b_median"])))
 

@@ -147,8 +147,8 @@ def _local(options: argparse.Namespace) -> Flight:
 def _in_pod(options: argparse.Namespace) -> Flight:
     """Return the flight of the pod in which this process runs.
 
-    The pod has no right to change the link. It prints the changes that the operator asks for, and
-    `cloudrc console --cluster` carries them out with the rights of its user.
+    The pod has no right to change the link. Therefore this process prints the changes that the
+    operator asks for, and `cloudrc console --cluster` carries them out with its user's rights.
     """
     from cloudrc.config.document import read_document
     from cloudrc.console.steering import Link

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 from cloudrc.cli.extras import EXTRAS, MODES, missing
-from cloudrc.cli.output import format_document, output_argument, paint, table
+from cloudrc.cli.output import output_argument, paint, print_result, table
 from cloudrc.drivers.machine import interpreter, usable_cores
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 
@@ -137,22 +137,19 @@ def execute(options: argparse.Namespace) -> int:
     mode, checks = options.mode, list(all_checks(options.mode, options.context))
     blocking = [check.name for check in checks if check.state == "missing" and mode in check.modes]
     code = MissingPrerequisiteError.exit_code if blocking else 0
-    if options.output != "table":
-        document = {"schemaVersion": 1, "mode": mode, "ready": not blocking}
-        found = [check._asdict() for check in checks]
-        print(format_document({**document, "checks": found}, options.output))
-        return code
+    found, text = [check._asdict() for check in checks], list[str]()
     for title, needed in ((f"Needed for mode {mode}:", True), ("Good to know:", False)):
         block = [check for check in checks if (mode in check.modes) is needed]
         lines = table([(check.state, check.name, check.found) for check in block]).splitlines()
-        print(title)
+        text.append(title)
         for check, line in zip(block, lines, strict=True):
-            print(f"  {line.replace(check.state, paint(check.state, COLOURS[check.state]), 1)}")
+            state = paint(check.state, COLOURS[check.state])
+            text.append(f"  {line.replace(check.state, state, 1)}")
             if check.fix:
-                print(f"           -> {check.fix}")
-        print()
-    if blocking:
-        print(paint(f"Mode {mode} cannot run: {', '.join(blocking)}.", "red"))
-    else:
-        print(paint(f"Mode {mode} can run.", "green"))
+                text.append(f"           -> {check.fix}")
+        text.append("")
+    can = f"cannot run: {', '.join(blocking)}" if blocking else "can run"
+    text.append(paint(f"Mode {mode} {can}.", "red" if blocking else "green"))
+    document = {"mode": mode, "ready": not blocking, "checks": found}
+    print_result(options.output, document, "\n".join(text))
     return code

@@ -6,18 +6,22 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Generator
+from dataclasses import asdict
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import escape, format_document, output_argument, paint, print_line, table
+from cloudrc.cli.output import escape, output_argument, paint, print_line, print_result, table
 from cloudrc.cli.parser import input_file, number, read_count, whole_number
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
     from cloudrc.faults.scenario import Outcome, Scenario
+    from cloudrc.faults.trial import Finding
 
 EPILOG = """\
 examples:
@@ -56,13 +60,18 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     text = "name of the fault, its number: F13, or a schedule's file (.yaml)"
     what.add_argument("name", nargs="?", type=_name_or_file, metavar="NAME", help=text)
     what.add_argument("--all", action="store_true", help="every fault")
-    for name, options in OPTIONS.items():
-        for option, (read, default, metavar, text) in options.items():
-            parsers[name].add_argument(
-                option, type=read, default=default, metavar=metavar, help=text
-            )
-    text = "the cloud has valid keys and tries to break the invariants"
-    parsers["search"].add_argument("--adversarial", action="store_true", help=text)
+    add, seed = parsers["run"].add_argument, whole_number(0, SEED_MAX)
+    add("--seed", type=seed, default=1, metavar="N", help="seed (default: 1)")
+    about = "number of parallel processes, at most one per core (default: 1)"
+    add("--jobs", type=read_count, default=1, metavar="J", help=about)
+    add, minutes = parsers["search"].add_argument, number(0, MINUTES_MAX, "minutes")
+    add("--minutes", type=minutes, default=1.0, metavar="M", help="duration (default: 1)")
+    add("--first", type=seed, default=1, metavar="SEED", help="first seed (default: 1)")
+    add("--jobs", type=read_count, default=1, metavar="J", help=about)
+    about = f"folder for failing schedules (default: ./{STORE})"
+    add("--store", type=_folder, default=STORE, metavar="DIR", help=about)
+    about = "the cloud has valid keys and tries to break the invariants"
+    add("--adversarial", action="store_true", help=about)
 
 
 def _name_or_file(text: str) -> str | Path:
@@ -78,20 +87,6 @@ def _folder(text: str) -> Path:
     return path
 
 
-JOBS = (read_count, 1, "J", "number of parallel processes, at most one per core (default: 1)")
-STORED = f"folder for failing schedules (default: ./{STORE})"
-OPTIONS: dict[str, dict[str, tuple[Callable[[str], Any], Any, str, str]]] = {
-    "run": {"--seed": (whole_number(0, SEED_MAX), 1, "N", "seed (default: 1)"), "--jobs": JOBS},
-    "search": {
-        "--minutes": (number(0, MINUTES_MAX, "minutes"), 1.0, "M", "duration (default: 1)"),
-        "--first": (whole_number(0, SEED_MAX), 1, "SEED", "first seed (default: 1)"),
-        "--jobs": JOBS,
-        "--store": (_folder, STORE, "DIR", STORED),
-    },
-}
-"""Action -> option -> function that parses the value, default, metavar, help text."""
-
-
 def execute(options: argparse.Namespace) -> int:
     """Run the chosen action; return 1 if a check failed, 130 after an interrupt signal."""
     require("the fault suite", ("world", "record"))
@@ -105,11 +100,9 @@ def print_faults(options: argparse.Namespace) -> int:
 
     names = ("id", "name", "injects", "expects")
     faults = [{name: getattr(each, name) for name in names} for each in SCENARIOS]
-    if options.output != "table":
-        print(format_document({"schemaVersion": 1, "faults": faults}, options.output))
-    else:
-        rows = [tuple(each.values()) for each in faults]
-        print(table([("fault", "name", "injection", "expected reaction"), *rows]))
+    head = "fault", "name", "injection", "expected reaction"
+    text = table([head, *(tuple(each.values()) for each in faults)])
+    print_result(options.output, {"faults": faults}, text)
     return 0
 
 
@@ -120,32 +113,31 @@ def run(options: argparse.Namespace) -> int:
     if isinstance(options.name, Path):
         return fly_file(options)
     chosen = SCENARIOS if options.all else (find(options.name),)
-    outcomes: list[Outcome] = []
+    faults: list[dict[str, Any]] = []
 
     def take(outcome: Outcome) -> None:
-        outcomes.append(outcome)
+        scenario = chosen[len(faults)]
+        faults.append(scenario.as_json(outcome))
         if options.output == "table":
-            _print_outcome(chosen[len(outcomes) - 1], outcome, options.all)
+            _print_outcome(scenario, outcome, options.all)
 
-    jobs = [(each.name, options.seed) for each in chosen]
-    cause, code = take_each(map_in_order(_run, jobs, options.jobs), take)
-    count, failed = len(outcomes), sum(not outcome.passed for outcome in outcomes)
-    if options.output != "table":
-        faults = [each.as_json(done) for each, done in zip(chosen, outcomes, strict=False)]
-        document = {"schemaVersion": 1, "seed": options.seed, "passed": not failed}
-        print(format_document(document | {"faults": faults}, options.output))
-    else:
-        print(f"\nseed {options.seed}: {count - failed} of {count} passed, {failed} failed")
+    run_seed = partial(_run, seed=options.seed)
+    flown = map_in_order(run_seed, [each.name for each in chosen], options.jobs)
+    cause, code = take_each(flown, take)
+    done, failed = len(faults), sum(each["result"] == "failed" for each in faults)
+    document = {"seed": options.seed, "passed": not failed, "faults": faults}
+    text = f"\nseed {options.seed}: {done - failed} of {done} passed, {failed} failed"
+    print_result(options.output, document, text)
     if cause:
-        text = f"cloudrc: {cause}; {count} of {len(chosen)} faults were run before"
+        text = f"cloudrc: {cause}; {done} of {len(chosen)} faults were run before"
         print(text, file=sys.stderr, flush=True)
     return code or (FAILED if failed else 0)
 
 
-def _run(job: tuple[str, int]) -> Outcome:
+def _run(name: str, seed: int) -> Outcome:
     from cloudrc.faults.scenarios import find
 
-    (name, seed), began = job, time.monotonic()
+    began = time.monotonic()
     outcome = find(name).run(seed)
     outcome.seconds = time.monotonic() - began
     return outcome
@@ -175,40 +167,117 @@ def fly_file(options: argparse.Namespace) -> int:
     except BadInputError as error:  # an unknown profile or policy
         raise BadInputError(f"{options.name}: {error}") from error
     breaches = [breach._asdict() for breach in finding.breaches]
-    if options.output != "table":
-        document = {"schemaVersion": 1, "records_sha256": finding.sha256, "breaches": breaches}
-        print(format_document(document, options.output))
-    else:
-        for breach in finding.breaches:
-            print_line(f"{breach.time:8.3f} s  {breach.kind}: {breach.text}")
-        print(f"{'FAILED' if breaches else 'passed'}  records {finding.sha256[:16]}")
+    lines = [escape(f"{at.time:8.3f} s  {at.kind}: {at.text}") for at in finding.breaches]
+    lines.append(f"{'FAILED' if breaches else 'passed'}  records {finding.sha256[:16]}")
+    document = {"records_sha256": finding.sha256, "breaches": breaches}
+    print_result(options.output, document, "\n".join(lines))
     return FAILED if breaches else 0
 
 
 def search(options: argparse.Namespace) -> int:
     """Fly random schedules of faults; print the failures, and how to continue the search."""
-    from cloudrc.faults.search import Search, search_rows, search_summary
+    from cloudrc.faults.trial import INVARIANTS
 
     kind, shown = "adversarial" if options.adversarial else "random", options.output == "table"
-    searched = Search(kind, options.first, options.store)
-
-    def take(failure: dict[str, Any] | None) -> None:
-        if failure is not None and shown:
-            print_line(f"FAILED seed {failure['seed']}: {failure['breaches'][0]['text']}")
-            print_line(f"  again: cloudrc faults run {failure['file']}")
-
+    found: dict[str, Any] = {
+        **{"kind": kind, "first": options.first, "next": options.first, "count": 0, "seconds": 0.0},
+        "invariants": {name: {"judged": 0, "broken": 0} for name in INVARIANTS},
+        **{"smallest_margin_m": 9.0, "largest_speed_mps": 0.0, "missions_done": 0, "failures": []},
+    }
     if shown:
         print(f"{kind} schedules from seed {options.first} on, for {options.minutes:g} min")
-    flights = searched.run(options.minutes, map_in_order, options.jobs)
-    cause, code = take_each(flights, take)
+    began = time.monotonic()
+
+    def take(finding: Finding) -> None:
+        found["seconds"] = time.monotonic() - began
+        _count(found, finding)
+        if finding.breaches:
+            failure = _store(finding, options.store)
+            found["failures"].append(failure)
+            if shown:
+                print_line(f"FAILED seed {failure['seed']}: {failure['breaches'][0]['text']}")
+                print_line(f"  again: cloudrc faults run {failure['file']}")
+
+    cause, code = take_each(_fly_seeds(options, began), take)
     again = f"cloudrc faults search{' --adversarial' if options.adversarial else ''}"
-    again += f" --first {searched.next}"
-    document = searched.document()
-    if shown:
-        print(f"\n{table(search_rows(document), right=(1, 2))}\n\n{search_summary(document)}")
-        print(f"to continue: {again}")
-    else:
-        print(format_document(document, options.output))
+    again += f" --first {found['next']}"
+    lines = table(search_rows(found), right=(1, 2)), "", search_summary(found)
+    print_result(options.output, found, "\n".join(["", *lines, f"to continue: {again}"]))
     if cause:
         print(f"cloudrc: {cause}; continue with '{again}'", file=sys.stderr, flush=True)
-    return code or (FAILED if searched.failures else 0)
+    return code or (FAILED if found["failures"] else 0)
+
+
+def _fly_seeds(options: argparse.Namespace, began: float) -> Generator[Finding]:
+    """Fly one flight per seed, until `options.minutes` [min] have passed since `began` [s]."""
+    fly = partial(fly_seed, adversarial=options.adversarial)
+    for finding in map_in_order(fly, count(options.first), options.jobs):
+        yield finding
+        if time.monotonic() - began >= 60.0 * options.minutes:
+            return
+
+
+def fly_seed(seed: int, adversarial: bool) -> Finding:
+    """Fly the schedule for a seed: random faults, or a dishonest cloud with or without faults."""
+    from cloudrc.faults import trial
+    from cloudrc.faults.adversary import choose
+    from cloudrc.faults.schedule import compose
+
+    return trial.fly((choose if adversarial else compose)(seed))
+
+
+def _count(found: dict[str, Any], finding: Finding) -> None:
+    """Add the finding of the next seed to the document of a search."""
+    from cloudrc.faults.trial import checked_in
+
+    for name in ("next", "count"):
+        found[name] += 1
+    for name in checked_in(finding.schedule):
+        found["invariants"][name]["judged"] += 1
+    for name in finding.kinds:
+        found["invariants"][name]["broken"] += 1
+    found["smallest_margin_m"] = min(found["smallest_margin_m"], finding.margin)
+    found["largest_speed_mps"] = max(found["largest_speed_mps"], finding.speed)
+    found["missions_done"] += finding.missions
+
+
+def _store(finding: Finding, folder: Path) -> dict[str, Any]:
+    """Write a schedule that broke an invariant into `folder`; return the failure for JSON."""
+    from cloudrc.faults.schedule import dump
+
+    schedule, seed = finding.schedule, finding.schedule.seed
+    name = f"{'-'.join(sorted(finding.kinds))}-{schedule.policy or 'seed'}-{seed}.yaml"
+    lines = [f"{each.time:.3f} s: {each.kind}: {each.text}" for each in finding.breaches[:3]]
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_text(dump(schedule, "\n".join(lines)), encoding="utf-8")
+    return {
+        "seed": seed,
+        "breaches": [breach._asdict() for breach in finding.breaches],
+        "schedule": asdict(schedule),
+        "file": str(folder / name),
+    }
+
+
+def search_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return a table of a search: each invariant with an upper bound of its failure probability.
+
+    The bound is the rule of three: with 0 breaches in N flights, p < 3/N with 95 % confidence.
+    """
+    from cloudrc.faults.trial import INVARIANTS
+
+    lines: list[tuple[str, ...]] = [("invariant", "broken in", "of N", "95 % bound")]
+    for name, words in INVARIANTS.items():
+        judged, broken = (document["invariants"][name][each] for each in ("judged", "broken"))
+        bound = "not judged" if not judged else "-" if broken else f"p < {min(3 / judged, 1):.2g}"
+        lines.append((words, str(broken) if judged else "-", str(judged), bound))
+    return lines
+
+
+def search_summary(document: dict[str, Any]) -> str:
+    """Describe a search in one sentence: flights, failures, least distance to fence, top speed."""
+    return (
+        f"{document['count']} {document['kind']} schedules in {document['seconds']:.0f} s, seeds "
+        f"{document['first']} to {document['next'] - 1}: {len(document['failures'])} broken, "
+        f"{document['missions_done']} missions done, nearest to the fence "
+        f"{document['smallest_margin_m']:.3f} m, fastest {document['largest_speed_mps']:.2f} m/s"
+    )

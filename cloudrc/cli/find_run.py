@@ -86,14 +86,14 @@ def ask_if_unclear(candidates: Collection[Path], *, steers: bool, flag: str = "-
     can use. If the command changes a flight (`steers`), it is also unclear if ./runs/latest has
     ended or cannot be used. `flag` names a run in error messages.
     """
-    from cloudrc.drivers.local import RELAY_LOG, under_way
+    from cloudrc.drivers.local import LINK_LOG, under_way
 
     latest = Path(os.path.realpath(RUNS / "latest"))
     names = " or ".join(f"{flag}{short(run)}" for run in sorted(candidates))
     if len(candidates) > 1:
         raise BadInputError(f"{len(candidates)} runs are flying here; choose one: {names}")
     is_mine = latest in candidates
-    if steers and not is_mine and (latest / RELAY_LOG).exists():  # this user steered that flight
+    if steers and not is_mine and (latest / LINK_LOG).exists():  # this user steered that flight
         names = names or "--release NAME (in a cluster)"
         why = "does not take this command" if latest in under_way() else "has ended"
         raise BadInputError(

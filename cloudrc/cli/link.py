@@ -33,10 +33,10 @@ examples:
   cloudrc link verify paper-p3
   cloudrc link set downlink.delay_ms=120
 
-All delays are one way. The chart starts 'cloudrc link run' in each pod. It
-shapes what the pod sends: the uplink in the world pod, the downlink in the
-cloud pod. It watches its profile file and the address of its peer, and ends on
-SIGTERM."""
+All delays are one way. 'cloudrc run --mode local' starts 'cloudrc link run' for
+each direction, the chart starts it in each pod: the uplink beside world, the
+downlink beside cloud. It watches its profile file and the address of its peer,
+and ends on SIGTERM."""
 ACTIONS = {
     "show": "draw a profile and print its delay and loss statistics",
     "record": "turn measured delays into a trace that a profile can replay",

@@ -1,4 +1,4 @@
-"""Run `cloudrc link run`: the process in a pod's link container, which shapes one direction.
+"""Run `cloudrc link run`: the process that shapes one direction of the link of a pod or local run.
 
 GET /link.json on the metrics port returns the state of the shaper and the pod's netem qdiscs. The
 process calls tc and ip for this answer, at most once a second.
@@ -24,22 +24,26 @@ from typing import TYPE_CHECKING, Any
 from cloudrc.cli.output import print_line
 from cloudrc.cli.processes import (
     ipv4_addresses,
+    listening,
     open_exporter,
     process_arguments,
     read_address,
-    warn_if_exposed,
 )
-from cloudrc.drivers.process import StopSignal
+from cloudrc.drivers.process import Feed, StopSignal
 from cloudrc.records import Counted
 
 if TYPE_CHECKING:
+    from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.config.schema import Profile
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.link.follow import Load
+    from cloudrc.link.netem import Netem
     from cloudrc.link.sidecar import Machine, Sidecar
     from cloudrc.link.state import LinkState
 
 EPILOG = ""
 TOOL_TIMEOUT = 5.0  # time limit of one call of tc or ip [s]
+RELEASED_PERIOD = 1.0  # time between two updates of the file with the lateness of datagrams [s]
 _BATCH = ("tc", "-s", "-j", "-force", "-batch", "-")
 _END = "qdisc show dev lo"
 """Command that follows each command to tc. Its answer, a list of qdiscs, marks the end of the
@@ -76,7 +80,7 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.link.follow import HANDED_FILE, PEER_PAUSE, PROFILE_PERIOD, PeerName, Profiles
     from cloudrc.link.sidecar import Sidecar
 
-    warn_if_exposed(options.listen)
+    feed = Feed.on_stdout(watched=options.feed)
     experiment = read_experiment(str(options.config))
     exporter = open_exporter(options, "link", experiment)
     document = options.route.with_name(HANDED_FILE)
@@ -107,7 +111,9 @@ def execute(options: argparse.Namespace) -> int:
         try:
             _repeat(poll_profile, PROFILE_PERIOD, PROFILE_PERIOD)
             _repeat(resolve_peer, *PEER_PAUSE)
-            sidecar.run(stop)
+            _repeat(sidecar.publish_released, RELEASED_PERIOD, RELEASED_PERIOD)
+            alive = feed.alive_while(stop)
+            sidecar.run(lambda: alive() if sidecar.state else stop())
         finally:
             programs.close()
     return 0
@@ -132,24 +138,40 @@ def make_profile_loader(direction: str) -> Load:
     return load
 
 
+def prepare_link(folder: Path, link: Profile | ResolvedExperiment) -> None:
+    """Make the folder of a link on this machine, with its profile and a folder per direction."""
+    from cloudrc.config.document import write_yaml
+    from cloudrc.config.load import DIRECTIONS
+    from cloudrc.config.schema import Profile
+    from cloudrc.link.follow import PROFILE
+
+    for way in DIRECTIONS:
+        (folder / way).mkdir(parents=True)
+    profile = Profile(uplink=link.uplink, downlink=link.downlink)
+    text = write_yaml(profile.model_dump(mode="json", exclude_defaults=True))
+    (folder / PROFILE).write_text(text, encoding="utf-8")
+
+
 def _machine(options: argparse.Namespace, seed: int, programs: Programs, tables: Path) -> Machine:
     from cloudrc.link.model import LinkDirection
-    from cloudrc.link.netem import Netem
     from cloudrc.link.profile import DirectionProfile
-    from cloudrc.link.relay import RelayShaper, ask_for_fifo, settle
+    from cloudrc.link.relay import Relay, ask_for_fifo, settle
     from cloudrc.link.sidecar import Machine
     from cloudrc.tunnel.codec import peek
 
     clock, wait = time.monotonic_ns, time.sleep
 
-    def relay(profile: DirectionProfile, origin_ns: int) -> RelayShaper:
+    def relay(profile: DirectionProfile, origin_ns: int) -> Relay:
         settle()
-        if not ask_for_fifo():  # most pods lack the permission and do not need it
+        if ask_for_fifo():  # most pods lack the permission and do not need it
             log("the relay runs under SCHED_FIFO")
         direction = LinkDirection(profile, seed, options.direction == "uplink", origin_ns)
-        return RelayShaper(options.listen, direction, peek, options.end)
+        with listening("--listen", options.listen):
+            return Relay(options.listen, direction, peek, options.end)
 
     def netem(profile: DirectionProfile, origin_ns: int) -> Netem:
+        from cloudrc.link.netem import Netem
+
         return Netem(
             programs, profile, origin_ns=origin_ns, clock=clock, wait=wait, tables=tables, log=log
         )
@@ -169,20 +191,20 @@ def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None
 def export_state(exporter: Exporter | None, state: LinkState) -> None:
     """Export the state of one direction as metrics."""
     if exporter:
-        exporter.shaped(state.shaper, state.direction, state.mode)
-        exporter.asked(state.direction, state.asked["delay"] or 0.0)
+        delay = state.asked["delay"] or 0.0
+        exporter.link.shaped(state.shaper, state.direction, state.mode, delay)
         exporter.ready(True)
 
 
 def export_counts(exporter: Exporter | None, counts: dict[str, int]) -> None:
-    """Export the counters of a shaper as metrics: name of the counter -> value."""
+    """Export the counters of a shaper as metrics; `counts`: name of the counter -> value."""
     if exporter:
         exporter.see([Counted(0, "link", name, number) for name, number in counts.items()])
 
 
 def status_page(sidecar: Sidecar) -> str:
     """Return the state of a sidecar as JSON. Any thread may call this function."""
-    peer, state = sidecar.peer, sidecar.states.state
+    peer, state = sidecar.peer, sidecar.state
     netems = _find_netems(peer[0], int(time.monotonic())) if peer else {}
     return json.dumps((asdict(state) if state else {}) | netems) + "\n"
 

@@ -42,7 +42,7 @@ anew; single values leave them running. The change is recorded. It lasts until
 the next change, the end of the run, or 'helm upgrade'."""
 COLUMNS = ("delay_ms", "jitter_ms", "distribution", "loss", "rate_kbit")
 """Keys of a direction that have columns of their own; the column OTHER shows all other keys."""
-LOCAL_TIMEOUT = 5.0  # time limit for a local relay to apply a change [s]; a relay needs about 0.2 s
+LOCAL_TIMEOUT = 5.0  # time limit for a local link to apply a change [s]; it needs about 0.2 s
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -93,12 +93,12 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def read_states(folder: Path) -> list[LinkState]:
-    """Read the states of both directions from the relay's folder; [] while there is no link."""
+    """Read the states of both directions from the link's folder; [] while there is no link."""
     from cloudrc.config.load import DIRECTIONS
-    from cloudrc.link.state import from_text
+    from cloudrc.link.state import STATE_FILE, from_text
 
     try:
-        return [from_text((folder / f"{way}.json").read_text("utf-8")) for way in DIRECTIONS]
+        return [from_text((folder / way / STATE_FILE).read_text("utf-8")) for way in DIRECTIONS]
     except (OSError, ValueError):
         return []
 
@@ -106,39 +106,41 @@ def read_states(folder: Path) -> list[LinkState]:
 def set_here(
     folder: Path, profile: str | None, settings: Sequence[str], number: str
 ) -> tuple[Edit, list[LinkState]]:
-    """Pass a profile to the relay; wait until it applies; return the profile and the new states.
+    """Pass a profile to a local link; wait until it applies; return the profile and the new states.
 
     `profile` is the name or file of a profile that replaces the present one; None keeps it.
     `settings` are texts such as "uplink.delay_ms=120". `number` identifies the change.
 
     Raises:
         BadInputError: If there is no link yet, or if a value cannot be used.
-        TimedOutError: If the relay does not apply the change.
+        TimedOutError: If a direction does not apply the change.
     """
-    from cloudrc.config.document import Document
+    from cloudrc.config.document import Document, write_yaml
     from cloudrc.config.load import edit_profile
-    from cloudrc.link.state import CHANGE_FILE, PROFILE_FILE, publish
+    from cloudrc.link.follow import HANDED_FILE, PROFILE, Handed, write_handed
+    from cloudrc.link.state import publish
 
     states = read_states(folder)
     if not states:
         raise BadInputError(f"{folder.parent}: no link is up there (yet); wait for the start")
     edit = edit_profile(Document(states[0].profile), profile, settings)
-    publish(folder / CHANGE_FILE, note_of(edit, number))
-    publish(folder / PROFILE_FILE, json.dumps(edit.values, indent=2) + "\n")
+    handed = Handed(note_of(edit, number), {PROFILE: write_yaml(edit.values)})
+    for state in states:
+        publish(folder / state.direction / HANDED_FILE, write_handed(handed))
     deadline = monotonic() + LOCAL_TIMEOUT
-    while not (states := read_states(folder)) or any(state.change != number for state in states):
+    while late := [state.direction for state in states if state.change != number]:
         if monotonic() > deadline:
-            late = [s.direction for s in states if s.change != number] or ["link"]
+            logs = " and ".join(str(folder.parent / f"{way}.log") for way in late)
             raise TimedOutError(
                 f"the {' and '.join(late)} did not apply the change within {LOCAL_TIMEOUT:g} s; "
-                f"see {folder.parent / 'relay.log'}"
+                f"see {logs}"
             )
         sleep(0.05)
+        states = read_states(folder) or states
     return edit, states
 
 
 def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
-    """Return the link of a release; raise an error with the reason if the release has no link."""
     from cloudrc.cluster.link import read_link
     from cloudrc.cluster.pods import find_pod
 
@@ -155,7 +157,7 @@ def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
 
 
 def note_of(edit: Edit, number: str) -> str:
-    """Format change.json: number and cause of a change, and whether the time line restarts."""
+    """Return change.json as text: number, cause, and whether the time line restarts."""
     return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
 
 

@@ -27,17 +27,16 @@ from typing import Any, TypeAlias
 from cloudrc.assembly import link_profile
 from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.link import VERIFY_DEFAULT
-from cloudrc.cli.link_run import run_tool
+from cloudrc.cli.link_run import prepare_link, run_tool
 from cloudrc.cli.output import escape, format_document, paint, table
 from cloudrc.cli.pool import interrupt_on_signals
+from cloudrc.cli.processes import show_address
 from cloudrc.cluster.client import end_process
 from cloudrc.cluster.pods import METRICS, NO_PROXY
 from cloudrc.config import shipped
-from cloudrc.config.document import write_yaml
 from cloudrc.config.load import ResolvedExperiment, dump, read_experiment
 from cloudrc.config.schema import Experiment, Profile
-from cloudrc.drivers.machine import interpreter
-from cloudrc.drivers.process import PARENT
+from cloudrc.drivers.local import link_words, start_process
 from cloudrc.drivers.realtime import bind, free_ports, split_address
 from cloudrc.errors import (
     BadInputError,
@@ -179,15 +178,13 @@ def measure(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Str
     since_wall_ns, ends = time.time_ns() - time.monotonic_ns(), []
     for name, way in ways.items():
         route = split_address((way.folder / "route").read_text())
-        origin_ns = (
-            from_text((way.folder / STATE_FILE).read_text()).origin_ns or 0
-        ) + since_wall_ns
+        origin_ns = from_text((way.folder / STATE_FILE).read_text()).origin_ns + since_wall_ns
         ends.append(ProbeEnd(way.own, route, plans[name], origin_ns))
     return dict(zip(ways, send_probes(ends), strict=True))
 
 
 def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Findings]:
-    """Send the probes of `plans` over the link from `run_link`; return direction -> findings."""
+    """Send all probes over a running link, and judge it; return direction -> findings."""
     streams, found = measure(ways, plans), {}
     time.sleep(COUNTS_WAIT)
     for name, way in ways.items():
@@ -213,12 +210,10 @@ def run_link(
     Raises:
         CloudrcError: If a process of the link ends early or starts too slowly.
     """
-    profile = applied or Profile(uplink=experiment.uplink, downlink=experiment.downlink)
-    text = write_yaml(profile.model_dump(mode="json", exclude_defaults=True))
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cloudrc-verify-")))
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
-        (folder / "profile.yaml").write_text(text, encoding="utf-8")
+        prepare_link(folder, applied or experiment)
         names, hosts = dict.fromkeys(WAYS, ""), dict.fromkeys(WAYS, LOOPBACK)
         if shaper == "netem":
             names, hosts = stack.enter_context(_namespaces()), HOSTS
@@ -230,7 +225,6 @@ def run_link(
             ways[name] = Way(own, (listen, pages), names[name], folder=folder / name)
         for (name, way), other in zip(ways.items(), reversed(ways.values()), strict=True):
             way.peer = other.own.getsockname()
-            way.folder.mkdir()
             way.process = _start(name, way, shaper)
             stack.callback(end_process, way.process)
         deadline = time.monotonic() + START_LIMIT
@@ -246,18 +240,11 @@ def run_link(
 
 def _start(name: str, way: Way, shaper: str) -> subprocess.Popen[bytes]:
     relay, pages = (f"{LOOPBACK}:{port}" for port in way.ports)
-    words = [f"--peer={way.peer[0]}:{way.peer[1]}", f"--listen={relay}", f"--metrics={pages}"]
-    words += [f"--{file}={way.folder.parent / file}.yaml" for file in ("config", "profile")]
-    words += [f"--direction={name}", f"--mode={shaper}", f"--route={way.folder / 'route'}"]
+    options: dict[str, object] = {"listen": relay, "metrics": pages, "mode": shaper}
+    options |= {"config": way.folder.parent / "config.yaml", "peer": show_address(way.peer)}
+    words = link_words(way.folder.parent, name)
     with (way.folder / "log").open("wb") as log, inside(way.namespace):
-        return subprocess.Popen(
-            interpreter("-m", "cloudrc", "link", "run", *words),
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            env={**os.environ, PARENT: str(os.getpid())},
-            start_new_session=True,  # Ctrl-C reaches only this process, which ends its children
-        )
+        return start_process(words, options, log, log)
 
 
 def _ended(name: str, code: int, log: str) -> CloudrcError:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 
-from cloudrc.cli.output import format_document, output_argument, paint, table
+from cloudrc.cli.output import output_argument, paint, print_result, table
 
 PLUGINS = ("estimators", "predictors", "controllers", "metrics")
 YAML = ("experiments", "missions", "profiles")
@@ -28,18 +28,15 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Print name and description of each plug-in or shipped file of one kind, or of all kinds."""
     found = {kind: describe_all(kind) for kind in ([options.what] if options.what else KINDS)}
-    if options.output == "table":
-        blocks = []
-        for kind, lines in found.items():
-            rows = [(f"  {name}", text) for name, text in lines.items()]
-            blocks.append(f"{paint(kind, 'bold')}\n{table(rows)}")
-        print("\n\n".join(blocks))
-        return 0
+    blocks = []
+    for kind, lines in found.items():
+        rows = [(f"  {name}", text) for name, text in lines.items()]
+        blocks.append(f"{paint(kind, 'bold')}\n{table(rows)}")
     entries = {
         kind: [{"name": name, "description": text} for name, text in lines.items()]
         for kind, lines in found.items()
     }
-    print(format_document({"schemaVersion": 1, **entries}, options.output))
+    print_result(options.output, entries, "\n\n".join(blocks))
     return 0
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from cloudrc.cli.advice import simulate_ages
 from cloudrc.cli.compare import flight_arguments
 from cloudrc.cli.extras import MODES, require
-from cloudrc.cli.output import format_document, output_argument, print_or_drop
+from cloudrc.cli.output import output_argument, print_or_drop, print_result
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order
 from cloudrc.errors import BadInputError
 
@@ -78,7 +78,7 @@ def execute(options: argparse.Namespace) -> int:
     # The search assumes that all smaller values are stable: check two of them.
     odd = [step for step in (low - 1, low * 3 // 4) if step > 0 and not works(step)]
     document = {
-        **{"schemaVersion": 1, "key": key, "experiment": options.experiment},
+        **{"key": key, "experiment": options.experiment},
         **{"overrides": options.set, "seeds": options.seeds, "resolution": size},
         "stable_up_to": tried[low]["value"] if low else None,
         "fails_at": tried[high]["value"] if high else None,
@@ -90,8 +90,7 @@ def execute(options: argparse.Namespace) -> int:
         answer += ", the largest value tried; raise --max"
     for step in [*([high] if high else []), *odd]:
         answer += f"; fails at {_value(key, tried[step])}: {_result(tried[step])}"
-    for_people = options.output == "table"
-    print_or_drop(f"\n{answer}" if for_people else format_document(document, options.output))
+    print_result(options.output, document, f"\n{answer}")
     return 0 if low else 1
 
 

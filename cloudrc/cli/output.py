@@ -9,8 +9,8 @@ import json
 import os
 import re
 import sys
-from collections.abc import Sequence
-from typing import TextIO
+from collections.abc import Mapping, Sequence
+from typing import Any, TextIO
 
 _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1"}
 
@@ -29,6 +29,15 @@ def format_document(document: object, form: str) -> str:
     from cloudrc.config.document import write_yaml
 
     return write_yaml(json.loads(text)).rstrip("\n")
+
+
+def print_result(form: str, document: Mapping[str, Any], text: str) -> None:
+    """Print the result of a command: `text` if `form` is "table", else the document in this form.
+
+    The document begins with the version of its schema.
+    """
+    for_people = form == "table"
+    print_or_drop(text if for_people else format_document({"schemaVersion": 1, **document}, form))
 
 
 def is_live(stream: TextIO) -> bool:

@@ -43,19 +43,17 @@ GROUPS: dict[str, dict[str, str]] = {
         "world": "the robot: physics, sensors, guard, low-level control",
         "cloud": "the remote controller",
         "teleop": "missions and the operator's HTTP API",
-        "relay": "the emulated link between world and cloud",
     },
 }
 """Group of commands -> command -> help line. `cloudrc/cli/<command>.py` contains the command."""
 SHARED = {
-    **dict.fromkeys(("world", "cloud", "relay"), "processes"),
+    **dict.fromkeys(("world", "cloud"), "processes"),
     **dict.fromkeys(("up", "down"), "session"),
 }
 """Commands without a module of their own -> the module in `cloudrc/cli` that contains them."""
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
 COUNT_MAX = 10_000
-"""Largest number of repeats, seeds or processes that a flag accepts. Before Python 3.11.6, a pool
-of processes hangs with more than 16,384 tasks (cpython issue 105829)."""
+"""Largest number of repeats, seeds or processes that a flag accepts."""
 
 ABOUT = "Fly a simulated drone from a simulated cloud, over an emulated network."
 EXAMPLES = """\

@@ -6,10 +6,11 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
+from itertools import chain, islice
 from types import FrameType
 from typing import Any, TypeVar
 
@@ -18,6 +19,9 @@ from cloudrc.errors import InterruptedRunError, InvalidRunError
 
 Work = TypeVar("Work")
 Result = TypeVar("Result")
+CHUNK = 5_000
+"""Number of calls that wait for a worker at once. Before Python 3.11.6, a pool of processes hangs
+with more than 16,384 of them (cpython issue 105829)."""
 
 
 class WorkerDiedError(InvalidRunError):
@@ -71,28 +75,32 @@ def isolated_start() -> Iterator[None]:
 
 
 def map_in_order(
-    function: Callable[[Work], Result], work: Sequence[Work], jobs: int, *, in_order: bool = True
+    function: Callable[[Work], Result], work: Iterable[Work], jobs: int, *, in_order: bool = True
 ) -> Generator[Result]:
     """Call a function on each piece of work, in parallel, and yield the results in order.
 
-    With `in_order` False, yield each result once it is ready. At most `jobs` worker processes
-    run, and at most one per core. If one worker is enough, this process makes the calls itself. The
-    function has to be at module level: a worker imports the function. Ctrl-C or closing the
-    generator kills the workers and drops all calls that have not ended.
+    `work` may be endless. With `in_order` False, yield each result once it is ready. At most `jobs`
+    worker processes run, and at most one per core. If one worker is enough, this process makes the
+    calls itself. The function has to be at module level: a worker imports the function. Ctrl-C or
+    closing the generator kills the workers and drops all calls that have not ended.
     """
-    workers = min(jobs, len(work), usable_cores())
+    rest = iter(work)
+    chunk = [*islice(rest, CHUNK)]
+    workers = min(jobs, len(chunk), usable_cores())
     if workers <= 1:
-        yield from map(function, work)
+        yield from map(function, chain(chunk, rest))
         return
     # Spawn, do not fork: libraries may have started threads in this process.
     context = multiprocessing.get_context("spawn")
     with isolated_start():  # starts multiprocessing's resource tracker
         pool = ProcessPoolExecutor(workers, context, _end_with_parent)
     try:
-        with isolated_start():  # submit() starts the workers
-            futures = [pool.submit(function, each) for each in work]
-        for future in futures if in_order else as_completed(futures):
-            yield future.result()
+        while chunk:
+            with isolated_start():  # submit() starts the workers
+                futures = [pool.submit(function, each) for each in chunk]
+            for future in futures if in_order else as_completed(futures):
+                yield future.result()
+            chunk = [*islice(rest, CHUNK)]
     except BrokenProcessPool as error:
         text = "a worker was killed, perhaps by the kernel because memory ran out"
         raise WorkerDiedError(f"{text}; use fewer processes") from error

@@ -1,12 +1,4 @@
-"""Run the processes `cloudrc world`, `cloudrc cloud` and `cloudrc relay` of a local run or a pod.
-
-With `--link DIR`, the relay and `cloudrc link set` exchange files: `link set` writes the files in
-the first line of this list, the relay writes the others.
-
-    DIR/profile.json, change.json            requested profile; missing before the first change
-    DIR/uplink.json, downlink.json           applied state of the link (`cloudrc/link/state.py`)
-    DIR/uplink.released, downlink.released   how late datagrams left the relay, written every 2 s
-"""
+"""Run the processes `cloudrc world` and `cloudrc cloud` of a local run or a pod."""
 
 from __future__ import annotations
 
@@ -16,46 +8,36 @@ import os
 import re
 import socket
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import print_line
 from cloudrc.drivers.process import EndProcess, Feed, StopSignal
-from cloudrc.drivers.realtime import Address, Peer, bind, split_address
+from cloudrc.drivers.realtime import Address, Peer, split_address
 from cloudrc.errors import BadInputError
 from cloudrc.files import warn_if_readable
-from cloudrc.link.follow import PROFILE_PERIOD, Loaded, ProfileFile
-from cloudrc.link.state import PROFILE_FILE, RELEASED_SUFFIX, StateFile, publish, summary
-from cloudrc.records import Counted
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.drivers.recording import Recorder
-    from cloudrc.link.model import LinkDirection
     from cloudrc.link.profile import DirectionProfile
-    from cloudrc.link.relay import Relay
     from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.tunnel.end import Identity
 
 TRACE_MAX = 2 << 20
 """Maximum size of a trace file whose name comes from the link container [bytes]. World and cloud do
 not trust this container. Real traces come from a ConfigMap, which holds at most 1 MiB."""
-PERIOD = 1.0
-"""Time between two updates of the relay's counts in the metrics [s]."""
-RELEASED_PERIOD = 2.0
-"""Time between two updates of the files with the lateness of datagrams [s]."""
 
 
 class Command(NamedTuple):
     """One command of a module that defines several commands.
 
-    A module with only one command has attributes with the names of these fields.
+    A module with only one command is used in place of a `Command`: it defines the same names.
     """
 
     arguments: Callable[[argparse.ArgumentParser], None]
@@ -75,7 +57,7 @@ def _add(
 
 
 def process_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the flags that world, cloud, relay and teleop have in common."""
+    """Declare the flags that world, cloud, link and teleop have in common."""
     _add(parser, "--config", "FILE", "experiment file (YAML)", required=True)
     _add(parser, "--feed", "", "write status for a supervisor to stdout (default: events only)")
     _add(parser, "--metrics", "HOST:PORT", "serve metrics and health checks here (default: off)")
@@ -99,17 +81,6 @@ def _cloud_arguments(parser: argparse.ArgumentParser) -> None:
     _end_arguments(parser)
     _add(parser, "--teleop", "DIR", "missions from 'cloudrc teleop --socket DIR' (default: own)")
     _add(parser, "--tap", "FILE", "Unix socket of a console, for samples (default: off)")
-
-
-def _relay_arguments(parser: argparse.ArgumentParser) -> None:
-    process_arguments(parser)
-    for end in ("world", "cloud"):
-        text = f"address to receive from {end} at"
-        _add(parser, f"--{end}-side", "HOST:PORT", text, required=True)
-        text = f"address at which {end} receives; a name is resolved once"
-        _add(parser, f"--{end}", "HOST:PORT", text, required=True)
-    _add(parser, "--link", "DIR", "folder of the link's state and of changes by 'link set'")
-    _add(parser, "--fifo", "", "use real-time priority (SCHED_FIFO), if permitted")
 
 
 def read_address(text: str) -> Address:
@@ -198,8 +169,8 @@ def warn_if_exposed(listen: Address) -> None:
 
 
 @contextmanager
-def _listening(flag: str, listen: Address) -> Iterator[None]:
-    """Warn if other machines can reach `listen`; name `flag` if the block raises an OSError."""
+def listening(flag: str, listen: Address) -> Iterator[None]:
+    """Warn if other machines can reach `listen`; convert an OSError to an error about `flag`."""
     warn_if_exposed(listen)
     try:
         yield
@@ -308,7 +279,7 @@ def open_peer(options: argparse.Namespace) -> Peer:
         target = resolve_address("--peer", options.peer, options.listen)
     elif not options.route.exists():
         print(f"cloudrc: sends nothing until {target} exists", file=sys.stderr)
-    with _listening("--listen", options.listen):
+    with listening("--listen", options.listen):
         return Peer.bind(options.listen, target)
 
 
@@ -375,160 +346,5 @@ def link_monitor(
     return check
 
 
-def _run_relay(options: argparse.Namespace) -> int:
-    stop = StopSignal()
-    from cloudrc import assembly
-    from cloudrc.config.load import read_experiment
-    from cloudrc.link.relay import ask_for_fifo, settle
-
-    experiment = read_experiment(str(options.config))
-    exporter = open_exporter(options, "link", experiment)
-    links = dict(zip(("uplink", "downlink"), assembly.build_links(experiment), strict=True))
-    ways = {"uplink": experiment.uplink, "downlink": experiment.downlink}
-    values = {way: d.model_dump(mode="json", exclude_defaults=True) for way, d in ways.items()}
-    profiles = {way: Loaded(assembly.link_profile(d), values) for way, d in ways.items()}
-    settle()
-    if options.fifo:
-        refused = ask_for_fifo()
-        _log(f"runs at normal priority: {refused}" if refused else "runs under SCHED_FIFO")
-    relay = open_relay(options, *links.values())
-    if exporter is not None:
-        for way, loaded in profiles.items():
-            exporter.shaped("relay", way, "relay")
-            exporter.asked(way, summary(loaded.direction)["delay"] or 0.0)
-        exporter.ready(True)
-    feed, control, count_due = Feed.on_stdout(watched=options.feed), None, 0.0
-    if options.link:
-        asked = exporter.asked if exporter else lambda way, delay: None
-        control = RelayControl(options.link, links, profiles, asked, relay)
-        threading.Thread(target=control.follow, name="link control", daemon=True).start()
-
-    def over() -> bool:
-        """Apply changes of the link; export the counts, if due; return whether to stop."""
-        nonlocal count_due
-        if control is not None:
-            control.swap()
-        if exporter is not None and time.monotonic() >= count_due:
-            count_due = time.monotonic() + PERIOD
-            exporter.see([Counted(0, "link", name, n) for name, n in relay.counts().items()])
-        return stop()
-
-    feed.ready()
-    relay.run(feed.alive_while(over))
-    _log(", ".join(f"{name} {count:g}" for name, count in relay.counts().items()))
-    return 0
-
-
-def open_relay(
-    options: argparse.Namespace, uplink: LinkDirection, downlink: LinkDirection
-) -> Relay:
-    """Open the relay's sockets at the addresses of the command line; return the relay.
-
-    Raise a BadInputError if an address cannot be used.
-    """
-    from cloudrc.link.relay import Lane, Relay
-    from cloudrc.tunnel.codec import peek
-
-    with ExitStack() as opened:
-        sides = []
-        for end in ("world", "cloud"):
-            peer = resolve_address(f"--{end}", getattr(options, end))
-            listen = getattr(options, f"{end}_side")
-            with _listening(f"--{end}-side", listen):
-                sides.append(opened.enter_context(bind(listen)))
-            try:
-                sides[-1].connect(peer)  # takes datagrams from this address alone
-            except OSError as error:
-                raise BadInputError(
-                    f"the relay cannot reach --{end} from --{end}-side ({error.strerror or error});"
-                    " give it an address that reaches its end"
-                ) from error
-        opened.pop_all()  # they stay open until this process ends
-    world, cloud = sides
-    lanes = {
-        "uplink": Lane(world, cloud.send, uplink, peek),
-        "downlink": Lane(cloud, world.send, downlink, peek),
-    }
-    return Relay(lanes)
-
-
-class RelayControl:
-    """Applies the changes of `cloudrc link set` to a relay, and publishes the relay's state.
-
-    A separate thread reads the files. The relay's loop replaces the profiles.
-    """
-
-    def __init__(
-        self,
-        folder: Path,
-        links: Mapping[str, LinkDirection],
-        first: Mapping[str, Loaded],
-        asked: Callable[[str, float], object],
-        relay: Relay,
-    ) -> None:
-        """Publish the initial state of both directions in `folder`, which is created if missing.
-
-        `links` and `first` contain the link model and the first profile of each direction, by the
-        name "uplink" or "downlink". `asked` is called with this name and the requested mean delay
-        [s], now and after each change.
-        """
-        from cloudrc.cli.link_run import make_profile_loader
-
-        self._folder, self._links, self._asked, self._relay = folder, links, asked, relay
-        folder.mkdir(exist_ok=True)
-        file, self._released_at = folder / PROFILE_FILE, 0.0
-        self._files = {way: ProfileFile(file, make_profile_loader(way), _log) for way in links}
-        self._states = {way: StateFile(folder / f"{way}.json", "relay", way) for way in links}
-        self._requested, self._applied, self._published = dict(first), dict(first), dict(first)
-        self._applied_ns = dict.fromkeys(first, time.monotonic_ns())
-        for way, loaded in first.items():
-            self._publish(way, loaded)
-
-    def swap(self) -> None:
-        """Apply the requested profiles; the relay's loop calls this between two datagrams."""
-        for way, loaded in self._requested.items():
-            if loaded is not self._applied[way]:
-                self._relay.take_in()
-                self._links[way].replace_profile(loaded.direction, restart=loaded.change.restart)
-                self._applied_ns[way], self._applied[way] = time.monotonic_ns(), loaded
-
-    def follow(self) -> None:
-        """Call `look` periodically; never return, so run this method in a thread of its own."""
-        while True:
-            self.look()
-            time.sleep(PROFILE_PERIOD)
-
-    def look(self) -> None:
-        """Read the requested profiles; publish applied profiles and the lateness of the datagrams.
-
-        `follow` calls this in its own thread, because the relay's loop must not wait for a disk.
-        """
-        for way, file in self._files.items():
-            self._requested[way] = file.poll() or self._requested[way]
-            if (loaded := self._applied[way]) is not self._published[way]:
-                with suppress(OSError):  # such as a full disk: the next call tries again
-                    self._publish(way, loaded)
-                    self._published[way] = loaded
-        if time.monotonic() - self._released_at >= RELEASED_PERIOD:
-            self._released_at = time.monotonic()
-            for way in self._links:
-                if released := self._relay.lanes[way].released():
-                    with suppress(OSError):
-                        publish(self._folder / f"{way}{RELEASED_SUFFIX}", json.dumps(released))
-
-    def _publish(self, way: str, loaded: Loaded) -> None:
-        now_ns, states = self._applied_ns[way], self._states[way]
-        # None: the time line of the first profile starts with the first datagram.
-        origin_ns = now_ns if states.state and loaded.change.restart else None
-        state = states.next(loaded, "relay", "local mode", now_ns, origin_ns)
-        self._asked(way, state.asked["delay"] or 0.0)
-        states.publish(state)
-
-
-def _log(line: str) -> None:
-    print_line(f"cloudrc relay: {line}", sys.stderr)
-
-
 world = Command(_end_arguments, _run_world)
 cloud = Command(_cloud_arguments, _run_cloud)
-relay = Command(_relay_arguments, _run_relay)

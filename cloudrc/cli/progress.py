@@ -135,7 +135,7 @@ class SweepView:
             self._status.start()
 
     def see(self, row: Row) -> None:
-        """Count a finished flight; print only the first text (failure or note) of each verdict."""
+        """Count a finished flight; print its failure or note if it is the first of its verdict."""
         self._done += 1
         self._failed += row["verdict"] != "success"
         if row["text"] and row["verdict"] not in self._told:

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import format_document, output_argument, print_line
+from cloudrc.cli.output import escape, output_argument, print_result
 from cloudrc.cli.parser import input_file
 from cloudrc.errors import BadInputError
 
@@ -44,15 +44,10 @@ def execute(options: argparse.Namespace) -> int:
     except OSError as error:  # this error names a temporary file, not `target`
         reason = error.strerror or error
         raise BadInputError(f"{target}: {reason}; name another file with --to") from error
-    if options.output != "table":
-        document = {"schemaVersion": 1, "file": str(target), **asdict(recovery)}
-        print(format_document(document, options.output))
-        return 0 if recovery.complete else LOSSY
     kept = ", ".join(f"{count} {kind}" for kind, count in recovery.kept.items() if count)
-    print(f"kept {recovery.share:.1%}: {kept}")
-    for note in recovery.notes:
-        print_line(f"lossy: {note}")
+    lines = [f"kept {recovery.share:.1%}: {kept}", *(f"lossy: {note}" for note in recovery.notes)]
     if recovery.complete and recovery.index_is_new:
-        print("the index was missing or damaged and is rebuilt; nothing is lost")
-    print_line(str(target))
+        lines.append("the index was missing or damaged and is rebuilt; nothing is lost")
+    text = "\n".join(map(escape, [*lines, str(target)]))
+    print_result(options.output, {"file": str(target), **asdict(recovery)}, text)
     return 0 if recovery.complete else LOSSY

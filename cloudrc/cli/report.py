@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.extras import missing, require
-from cloudrc.cli.output import escape, format_document, output_argument, paint, print_line, table
+from cloudrc.cli.output import escape, output_argument, paint, print_line, print_result, table
 from cloudrc.cli.parser import figure_arguments
 from cloudrc.errors import BadInputError
 
@@ -59,10 +59,7 @@ def execute(options: argparse.Namespace) -> int:
     look = Look(options.width, options.font_size)
     document = write_report(options.run, recording, experiment, run, own=options.metric, look=look)
     print_traceback(options, document)
-    for_people = options.output == "table"
-    print(
-        summary(document, options.run) if for_people else format_document(document, options.output)
-    )
+    print_result(options.output, document, summary(document, options.run))
     return exit_code(document)
 
 

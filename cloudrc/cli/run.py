@@ -20,11 +20,11 @@ from cloudrc.cli.extras import MODES, missing, require
 from cloudrc.cli.find_run import RUNS
 from cloudrc.cli.output import (
     escape,
-    format_document,
     is_live,
     output_argument,
     print_line,
     print_or_drop,
+    print_result,
 )
 from cloudrc.cli.parser import read_count, whole_number
 from cloudrc.cli.pool import interrupt_on_signals
@@ -104,9 +104,9 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"--seeds flies in virtual time; leave out --mode {mode}")
     require(f"mode {mode}", MODES[mode])
     if options.seeds:
-        from cloudrc.cli import seeds
+        from cloudrc.cli.sweep_run import fly_seeds
 
-        return seeds.fly_seeds(options)
+        return fly_seeds(options)
     return fly_once(options, mode)
 
 
@@ -166,9 +166,7 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
         if in_cluster and options.out is None and folder.exists():
             point_to(folder, "latest")
     print_traceback(options, report)
-    print_or_drop(
-        format_document(report, options.output) if for_programs else summary(report, folder)
-    )
+    print_result(options.output, report, summary(report, folder))
     return 0 if ready else exit_code(report)
 
 
@@ -215,7 +213,8 @@ def _local_flight(
 ) -> Flight:
     """Return a function that flies on this machine and shows the progress on `stream`.
 
-    With `ready`, the function flies a session, and calls `ready` when it waits for missions.
+    With `ready`, the function flies a session, in which teleop waits for missions. It calls `ready`
+    when all processes are ready.
     """
     from cloudrc.cli.progress import FlightView
 
@@ -281,7 +280,7 @@ def fly(
 
 
 def _physics_steps(experiment: ResolvedExperiment, usual: str) -> str:
-    """Return which code runs the physics: Python for wind or a changed plant, else `usual`."""
+    """Name the code that runs the physics: Python for wind or a changed plant, else `usual`."""
     from cloudrc.config.schema import Plant
 
     is_usual = experiment.world.plant == Plant() and not experiment.world.wind.blows
@@ -310,16 +309,13 @@ def _record_virtual(
     with McapWriter(folder / "mission.mcap", clock="world") as writer:
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
-            from_cloud = flight.on_world_clock(from_cloud)
             writer.write(heapq.merge(from_world, from_cloud, key=attrgetter("stamp_ns")))
             store.add(from_world, from_cloud)
             see(from_cloud)
             see(from_world)
 
         try:
-            _, cloud, flight = assembly.assemble(experiment)
-            limit_ns = round(assembly.flight_limit(experiment) * 1e9)
-            flight.fly(lambda: cloud.mission_over, limit_ns, sink)
+            assembly.fly(experiment, sink)
         except KeyboardInterrupt:
             interrupted = True
         try:
@@ -334,8 +330,14 @@ def _record_virtual(
                 writer.attach(name, data)
 
 
-def _prepare(experiment: ResolvedExperiment) -> bool:
-    """Check the user's robot and scene; return whether the packages of the API are installed."""
+def _prepare(experiment: ResolvedExperiment, folder: Path) -> bool:
+    """Check the user's robot and scene, and write the link's profile into the run's `folder`.
+
+    Return whether the packages of the API are installed.
+    """
+    from cloudrc.cli.link_run import prepare_link
+    from cloudrc.drivers.local import LINK_FOLDER
+
     if absent := missing("api"):
         text = f"no operator's API in this run: {', '.join(absent)} not installed"
         print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)
@@ -344,6 +346,7 @@ def _prepare(experiment: ResolvedExperiment) -> bool:
         from cloudrc.world.scene import compile_model
 
         compile_model(world.robot, world.scene)  # report an invalid model before the flight
+    prepare_link(folder / LINK_FOLDER, experiment)
     return not absent
 
 
@@ -368,7 +371,7 @@ def _record_local(
     from cloudrc.report.write import attachments
     from cloudrc.world.native.library import library
 
-    local = LocalRun(folder, see, api=_prepare(experiment), session=session)
+    local = LocalRun(folder, see, api=_prepare(experiment, folder), session=session)
     broken, interrupted = None, True
     try:
         local.fly(inf if session else flight_limit(experiment))

@@ -4,35 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
-from collections import Counter
-from collections.abc import Generator, Iterable
-from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.advice import advise
-from cloudrc.cli.extras import MODES, require
-from cloudrc.cli.output import (
-    escape,
-    format_document,
-    output_argument,
-    print_line,
-    print_or_drop,
-    table,
-)
+from cloudrc import __version__
+from cloudrc.cli.cluster_flags import release_arguments
+from cloudrc.cli.output import output_argument
 from cloudrc.cli.parser import COUNT_MAX, figure_arguments, input_file, read_count
-from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
-from cloudrc.cli.sweep_pods import (
-    cluster_arguments,
-    print_rows,
-    rows_from_pods,
-)
-from cloudrc.errors import BadInputError, InvalidRunError
-
-if TYPE_CHECKING:
-    from cloudrc.sweep.flight import Row
-    from cloudrc.sweep.plan import Flight, Plan
 
 ACTIONS = {
     "run": "fly all points of a grid, or those that are missing in --out",
@@ -57,13 +34,12 @@ ARRAYS = {
 }
 """Environment variable with the index of a process -> variables with the number of processes and
 with the first index ("": it is 0)."""
-WARNINGS_MAX = 3
-"""Largest number of warnings that a sweep prints."""
+IMAGE = f"cloudrc/world:{__version__}"
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", title="actions")
     run, status, fly, figure, rows = (
         actions.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
         for name, text in ACTIONS.items()
@@ -77,9 +53,16 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument("--record", choices=("failed", "all"), help=about)
     about = "fly only part I of N; 'auto' takes I and N from Slurm or Kubernetes"
     run.add_argument("--shard", type=_shard, metavar="I/N", help=about)
-    cluster_arguments(run)
     rows.add_argument("file", type=input_file, metavar="FILE", help="file of flights, of a Job")
     rows.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N", help=about)
+    add = release_arguments(run)
+    about = "fly in the pods of a Job instead of on this machine"
+    add("--on", choices=("kubernetes",), help=about)
+    add("--shards", type=read_count, default=8, metavar="N", help="number of pods (default: 8)")
+    about = f"image of the pods (default: {IMAGE})"
+    add("--image", default=IMAGE, metavar="IMAGE", help=about)
+    add("--cpu", default="1", metavar="CPU", help="CPU request of a pod (default: 1)")
+    add("--queue", metavar="NAME", help="queue of Kueue that admits the Job")
     for each in (status, fly, figure):
         each.add_argument("folder", type=Path, metavar="DIR", help="folder of a sweep")
     fly.add_argument("key", metavar="KEY", help="key of the row, or its first digits")
@@ -120,193 +103,8 @@ def _shard(text: str) -> tuple[int, int]:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the chosen action; return the exit code."""
-    if options.action is None:
-        names = ", ".join(ACTIONS)
-        raise BadInputError(f"an action is missing: {names}; see 'cloudrc sweep --help'")
-    functions = (run, print_status, fly_again, draw_figure, print_rows)
+    from cloudrc.cli import sweep_run as actions
+
+    functions = (actions.run, actions.print_status, actions.fly_again, actions.draw_figure,
+                 actions.print_rows)  # fmt: skip
     return dict(zip(ACTIONS, functions, strict=True))[options.action](options)
-
-
-def run(options: argparse.Namespace) -> int:
-    """Fly the flights of a sweep whose results or recordings are missing; return the exit code."""
-    from cloudrc.cli.progress import SweepView
-    from cloudrc.cli.run import new_folder
-    from cloudrc.sweep import store
-
-    interrupt_on_signals()
-    plan, folder, (shard, count) = _plan(options), options.out, options.shard or (None, 1)
-    if options.shard:
-        folder.mkdir(parents=True, exist_ok=True)  # another shard may be faster
-    elif folder is None or not (folder / store.FILE).is_file():
-        folder = new_folder(folder, f"sweep-{options.file.stem}", "latest-sweep")
-    before = store.begin(folder, plan)
-    mine = [*plan.flights.values()][(shard or 1) - 1 :: count]
-    jobs = [
-        (each, options.record, folder)
-        for each in mine
-        if each.key not in before or _to_record(before[each.key], options.record, folder)
-    ]
-    part = f", shard {shard} of {count}" if shard else ""
-    head = f"{len(plan.points)} points x {len(plan.seeds)} seeds{part}: {len(mine)} flights"
-    stream = sys.stdout if options.output == "table" else sys.stderr
-    head += f", {len(mine) - len(jobs)} done before" if len(jobs) < len(mine) else ""
-    view = SweepView(stream, f"{plan.points[0].name}: {head}", len(jobs))
-    with store.append_rows(folder, shard) as append, closing(view):
-
-        def take(row: Row) -> None:
-            if row["key"] not in before:
-                append(row)
-            view.see(row)
-
-        stopped, code = take_each(_rows(options, plan, jobs), take)
-    rows = store.finish(folder, plan)
-    if stopped:
-        flags = " --on kubernetes, and its other flags" if options.on else ""
-        again = f"cloudrc sweep run {options.file} --out {folder}{flags}"
-        print_line(f"cloudrc: {stopped}; to continue: {again}", sys.stderr)
-    if options.output == "table":
-        name = store.TABLE if len(rows) == len(plan.flights) else store.SUMMARY
-        print_or_drop(f"\n{_verdicts(rows.values())}\n\n{escape(str(folder / name))}")
-    else:
-        print_or_drop(format_document(store.read_summary(folder), options.output))
-    return code or int(any(rows[each.key]["verdict"] != "success" for each in mine))
-
-
-def _plan(options: argparse.Namespace) -> Plan:
-    """Check the flags, read the plan, and print warnings; nothing is written yet."""
-    from cloudrc.sweep.plan import read_plan
-
-    if not options.on:
-        require("a sweep", MODES["virtual"] if options.record else ("world",))
-    elif options.record or options.shard:
-        raise BadInputError("--on kubernetes has no --record and no --shard; see --shards")
-    if options.shard and options.out is None:
-        raise BadInputError("--shard needs --out, the folder that all shards share")
-    plan = read_plan(options.file)
-    if options.on:
-        from cloudrc.cluster.pods import refuse_local_files
-
-        for point in plan.points:
-            refuse_local_files(point.model_dump(mode="json"), "or fly without --on")
-    advice = list(dict.fromkeys(text for point in plan.points for text in advise(point)))
-    more = [f"{len(advice)} warnings; the others are alike"] if len(advice) > WARNINGS_MAX else []
-    for text in advice[:WARNINGS_MAX] + more:
-        print_line(f"cloudrc: warning: {text}", sys.stderr)
-    return plan
-
-
-def _rows(
-    options: argparse.Namespace, plan: Plan, jobs: list[tuple[Flight, str | None, Path]]
-) -> Generator[Row]:
-    """Fly the jobs on this machine or in pods; yield the row of each flight when it ends."""
-    if options.on:
-        yield from rows_from_pods(options, plan, [flight for flight, _, _ in jobs])
-        return
-    for first in range(0, len(jobs), COUNT_MAX):
-        work = jobs[first : first + COUNT_MAX]
-        yield from map_in_order(fly_job, work, options.jobs, in_order=False)
-
-
-def fly_job(job: tuple[Flight, str | None, Path]) -> Row:
-    """Fly a flight and return its row; if a recording is wanted, fly again to make it."""
-    from cloudrc.sweep.flight import fly_point
-    from cloudrc.sweep.store import make_row
-
-    flight, record, folder = job
-    flown = fly_point(flight.experiment)
-    row = make_row(flight, flown)
-    if _to_record(row, record, folder):
-        _fly_into(folder / flight.key, flight, page=False)
-    return row
-
-
-def _to_record(row: Row, record: str | None, folder: Path) -> bool:
-    """Return whether a flight still needs a recording.
-
-    `record` names the flights to record: "failed", "all" or None for no flights.
-    """
-    wanted = record == "all" or (record == "failed" and row["verdict"] != "success")
-    has = (folder / row["key"] / "report.json").is_file()
-    return wanted and row["verdict"] != "error" and not has
-
-
-def _fly_into(folder: Path, flight: Flight, *, page: bool) -> dict[str, Any]:
-    from cloudrc.cli.run import fly
-
-    folder.mkdir(exist_ok=True)
-    return fly(flight.experiment, "virtual", folder, page=page)
-
-
-def fly_again(options: argparse.Namespace) -> int:
-    """Repeat a flight of a sweep with recording and report; exit with 6 if its records changed."""
-    from cloudrc.cli.report import print_traceback, summary
-    from cloudrc.sweep import store
-    from cloudrc.sweep.plan import read_plan
-
-    require("a report", MODES["virtual"])
-    store.read_summary(options.folder)
-    rows = [row for key, row in store.read_rows(options.folder).items()
-            if key.startswith(options.key)]  # fmt: skip
-    if len(rows) != 1:
-        text = f"{len(rows)} rows have a key that begins like this; give one key"
-        raise BadInputError(f"{options.folder}: {options.key}: {text}")
-    key, flights = rows[0]["key"], read_plan(options.folder / store.FILE).flights
-    changed = f"{key}: a plug-in, the processor or a package has changed since; fly the sweep again"
-    if key not in flights:
-        raise InvalidRunError(changed)
-    report = _fly_into(options.folder / key, flights[key], page=True)
-    print_traceback(options, report)
-    print_or_drop(summary(report, options.folder / key))
-    if rows[0]["records_sha256"] != report["records_sha256"]:
-        raise InvalidRunError(changed)
-    print_or_drop("\nthe records are those of the sweep", sys.stderr)
-    return 0
-
-
-def print_status(options: argparse.Namespace) -> int:
-    """Print how many flights of a sweep are done, and how many succeeded per value of an axis."""
-    from cloudrc.sweep import store
-
-    summary = store.read_summary(options.folder)
-    rows, values = store.read_rows(options.folder).values(), []
-    for axis, choices in summary["axes"].items():
-        for value in choices:
-            found = [row["verdict"] for row in rows if row["point"][axis] == value]
-            counts = {"flights": len(found), "success": found.count("success")}
-            values.append({"axis": axis, "value": value, **counts})
-    if options.output != "table":
-        document = {"schemaVersion": 1, "flights": summary["flights"], "rows": len(rows)}
-        print(format_document({**document, "axes": values}, options.output))
-        return 0
-    print(f"{len(rows)} of {summary['flights']} flights are done: {_verdicts(rows)}")
-    cells = [(each["axis"], store.as_text(each["value"]), f"{each['success']}/{each['flights']}")
-             for each in values]  # fmt: skip
-    if cells:
-        print(f"\n{table([('axis', 'value', 'success'), *cells], right=(2,))}")
-    return 0
-
-
-def draw_figure(options: argparse.Namespace) -> int:
-    """Draw a sweep and write the figure as PDF, PNG and SVG; print the caption and the paths."""
-    require("a figure", ("report",))
-    from cloudrc.files import write_atomically
-    from cloudrc.report.figures.style import Look
-    from cloudrc.sweep.figure import draw_sweep
-    from cloudrc.sweep.store import read_flights
-
-    rows, units, missing = read_flights(options.folder)
-    look = Look(options.width, options.font_size)
-    files, caption = draw_sweep(rows, units, options.number, options.x, options.by, look)
-    out = options.out or options.folder / "figure"
-    stem = out.stem if out.suffix.removeprefix(".") in files else out.name
-    print_or_drop(caption + (f" {missing}." if missing else "") + "\n")
-    for kind, data in files.items():
-        path = out.with_name(f"{stem}.{kind}")
-        write_atomically(path, data)
-        print_or_drop(escape(str(path)))
-    return 0
-
-
-def _verdicts(rows: Iterable[Row]) -> str:
-    counts = Counter(row["verdict"] for row in rows)
-    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items())[::-1]) or "none"

@@ -177,9 +177,8 @@ class ControlLoop:
     def _observe_delay(self, telemetry: Telemetry, now_ns: int) -> None:
         """Process the delays in telemetry that is newer than all earlier telemetry.
 
-        Every telemetry datagram with a short hold time gives one sample of the paper's eq. (1),
-        even if an earlier datagram had the same echo. A mean over the first datagrams of each echo
-        would be too small, because these have the shortest hold times.
+        Every telemetry datagram gives one sample of the paper's eq. (1), even if an earlier
+        datagram had the same echo. A datagram whose hold time is above the limit gives none.
         Source: docs/reference/control.md, "The delay sample".
         """
         echo_ns, hold_ns = telemetry.echo_stamp_ns, telemetry.echo_hold_ns
@@ -342,7 +341,7 @@ class ControlLoop:
         return tuple(plan)
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
-        """Whether the last echo of a new command is older than `horizon` + `freeze_after` [s]."""
+        """Whether the newest echoed command is older than `horizon` + `freeze_after` [s]."""
         if self._echoed_ns < self._newest_echo_ns:
             self._echoed_ns = self._newest_echo_ns
         elif self._echoed_ns == NEVER_NS:

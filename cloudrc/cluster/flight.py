@@ -40,12 +40,12 @@ FLOWN = (0, 1, 6, 130)
 
 
 def install(release: Release, values: Mapping[str, Any], timeout: float, tell: Tell) -> None:
-    """Install or upgrade a release, and wait until its pods are ready, as `wait_ready` does.
+    """Install or upgrade a release, and wait for its pods; raise an error if one cannot run.
 
     Args:
         release: Context, namespace and name; a missing namespace is created.
         values: Values that override the chart's defaults.
-        timeout: Time limit for the pods to become ready [s].
+        timeout: Time limit for the pods to become ready [s]; after it, raise a TimedOutError.
         tell: Receives a line about each change of the pods' state.
     """
     arguments = ["upgrade", "--install", release.name, str(chart_folder()), *release.helm_flags]

@@ -101,7 +101,7 @@ def send_change(release: Release, pod: str, handed: Handed) -> str:
 
 
 class Sent(NamedTuple):
-    """A change of the link profile that was sent to both link containers; neither refused it."""
+    """Result of `send`: a changed link profile, and the answers of the two link containers."""
 
     edit: Edit  # the edited profile
     files: dict[str, str]  # for the ConfigMap
@@ -123,8 +123,8 @@ def send(
         link: The link of the release before the change.
         profile: New profile, as in `cloudrc.config.load.edit_profile`.
         settings: Values to set, as in `cloudrc.config.load.edit_profile`.
-        note: Function that makes the content of change.json, the number and the cause of the
-            change, from the edited profile.
+        note: Function that describes the change from the edited profile, as the text of
+            change.json.
 
     Raises:
         BadInputError: If the request is not valid, or if a container refuses the change.

@@ -420,7 +420,7 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
 
 
 def _drop_from_time_line(document: Document, way: str, key: str) -> list[str]:
-    """Remove changes of `key` over time from the direction `way`; return notes for the user."""
+    """Remove what changes `key` over time in the direction `way`; return notes for the user."""
     direction = document.get(way)
     if not isinstance(direction, dict) or key not in CHANGEABLE_KEYS:
         return []

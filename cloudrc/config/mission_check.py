@@ -105,7 +105,7 @@ def _check_ways(positions: Array, scene: Scene) -> Iterator[Problem]:
 
 
 def _check_steps(steps: Steps, scene: Scene) -> str:
-    """Check the box of the random setpoints; return the problem, or "" if there is none."""
+    """Check the box that contains all random setpoints; return the problem, "" if none."""
     axis = np.linspace(-1, 1, 9)
     box = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     with np.errstate(over="ignore"):  # an infinite position is outside the fence, too

@@ -349,7 +349,7 @@ class Page:
         return x, y, z
 
     def _add_keys(self, gui: viser.GuiApi) -> None:
-        """Add the buttons for driving by hand; viser calls `on_hold` at 10 Hz."""
+        """Add the buttons for driving by hand; a held button repeats its key at 10 Hz."""
         steering = self._steering
         speed = gui.add_slider("Drive [m/s]", 0.1, 1.0, 0.1, 0.4)
         for code, (label, direction) in KEYS.items():
@@ -392,7 +392,8 @@ def _clamp(slider: Any) -> float:
 def _with_gaps(curve: Array) -> list[float | None]:
     """Replace each NaN by None, which is a gap in the chart.
 
-    If all are NaN, put -1 first: it is below the chart, which has no axes without any number.
+    If all are NaN, make the first value -1: the chart draws its axes only if it has a number. The
+    value is below the visible range.
     """
     values = [None if value != value else value for value in curve.tolist()]
     return [-1.0, *values[1:]] if not any(value is not None for value in values) else values

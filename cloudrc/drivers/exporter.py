@@ -158,7 +158,10 @@ class Exporter:
         self._live.see(records)
 
     def ready(self, ready: bool) -> None:
-        """Set whether this teleop or link is ready; world and cloud are ready if the peer sends."""
+        """Set whether this process is ready; only teleop and link call this method.
+
+        World and cloud are ready while the peer sends.
+        """
         self._seen_at = time.monotonic()
         self._said_ready = ready
 
@@ -167,14 +170,6 @@ class Exporter:
         """The metrics of the emulated link; only an exporter with the role "link" has them."""
         assert self._live.link is not None, "only a link is shaped"
         return self._live.link
-
-    def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set the labels of a direction's metric: `shaper`, "relay" or "netem", and `link.mode`."""
-        self.link.shaped(shaper, direction, mode)
-
-    def asked(self, direction: str, delay: float) -> None:
-        """Set the mean delay [s] that the current profile requests for a direction."""
-        self.link.asked(direction, delay)
 
     def unresolved(self, count: int) -> None:
         """Set the number of failed DNS queries for the peer's name. Any thread may call this."""
@@ -186,7 +181,7 @@ class Exporter:
 
     @property
     def is_ready(self) -> bool:
-        """Whether `ready(True)` was called; world and cloud are also ready while the peer sends."""
+        """Whether this process is ready: world or cloud if the peer sends, others by `ready`."""
         return self._said_ready or (self._live.end is not None and self._live.end.has_peer)
 
     def serve(self, address: tuple[str, int]) -> int:

@@ -1,7 +1,8 @@
-"""Run relay, world, teleop and cloud as processes on this machine and supervise them.
+"""Run and supervise world, teleop, cloud and the two directions of the link on this machine.
 
-The supervisor (this process) reads the records that these processes print. It ends them when
-teleop ends after the mission, when one of them dies or hangs, or when the user interrupts.
+Each of these five is a process. The supervisor (this process) reads the records that they print. It
+ends them when teleop ends after the mission, when one of them dies or hangs, or when the user
+interrupts.
 
 During a flight, the flight file names the folder of the run and the address of the operator's API.
 It is a locked file in a private folder of this user. Commands trust the flight file, but not the
@@ -21,10 +22,10 @@ import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 from cloudrc.drivers.machine import Deadline, interpreter
 from cloudrc.drivers.process import PARENT, READY, from_line
@@ -32,6 +33,8 @@ from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.tap import TAP_FILE
 from cloudrc.drivers.teleop import PATH_MAX
 from cloudrc.errors import InvalidRunError, TimedOutError
+from cloudrc.link.follow import PROFILE
+from cloudrc.link.state import STATE_FILE
 from cloudrc.records import Fault, Record
 from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
 
@@ -50,17 +53,20 @@ SOCKET_NAME = "/cloudrc-12345678/teleop.sock"
 API_FILE, AUDIT_FILE = "api.json", "audit.jsonl"
 """Files in a run's folder: the API's address, and the log of the API's commands."""
 LINK_FOLDER = "link"
-"""Folder in a run's folder, for the relay's state and the profile from `cloudrc link set`."""
+"""Folder in a run's folder, during the flight: the link's profile, and a folder per direction with
+the state of the link and the change from `cloudrc link set`."""
 JOURNAL_FILE = "missions.journal"
 """File in a session's folder: teleop's store of the missions."""
-RELAY_LOG = "relay.log"
+LINK_LOG = "uplink.log"
 """File in the folder of every run in real time."""
 RUN, SESSION = "run", "session"
 """Kinds of flights: a run (`cloudrc run`) ends with its mission, a session with `cloudrc down`."""
 
 
 def flights_folder() -> Path:
-    """Return the folder for flight files: in XDG_RUNTIME_DIR if this user owns it, or in the home.
+    """Return the folder for flight files, which tell other commands about flights under way.
+
+    It is in XDG_RUNTIME_DIR if this user owns that folder, otherwise in the home folder.
 
     Source: XDG Base Directory Specification.
     """
@@ -70,7 +76,7 @@ def flights_folder() -> Path:
 
 
 class FlightFile(NamedTuple):
-    """Content of a flight file besides the run's folder: how other commands reach the flight."""
+    """What a flight file tells other commands about a flight, besides the folder of the run."""
 
     api: str  # address of the operator's API; "" for none
     kind: str  # RUN or SESSION
@@ -139,7 +145,7 @@ def end_session(run: Path, limit: float) -> None:
 class Child:
     """A process of a local run, such as world or relay, which the supervisor has started."""
 
-    name: str  # command of the process, such as "relay"
+    name: str  # "world", "cloud", "teleop", "uplink" or "downlink"
     process: subprocess.Popen[bytes]
     log: Path  # file with the process's standard error
     unread: bytes = b""  # start of a line of output whose end has not arrived yet
@@ -159,12 +165,12 @@ class Child:
 
 
 class LocalRun:
-    """Runs and supervises the four processes of a flight.
+    """Runs and supervises the five processes of a flight.
 
     Attributes:
         notes: Sentences for the report of the flight.
-        announcement: Keeps the file by which other commands find this run, until it is closed.
-            `fly` closes it after a flight. After a session, the caller of `fly` has to close it.
+        announcement: Its `close` deletes the file by which other commands find this run. `fly`
+            closes it after a flight. After a session, the caller of `fly` has to close it.
     """
 
     def __init__(
@@ -175,10 +181,11 @@ class LocalRun:
         api: bool = True,
         session: Callable[[str, dict[str, str]], None] | None = None,
     ) -> None:
-        """Prepare a run in `folder`, which contains config.yaml; start no process yet.
+        """Prepare a run in `folder`; start no process yet.
 
-        The run writes world.mcap, cloud.mcap and four logs there. It calls `see` with the records
-        that the processes print. With `api`, teleop serves the operator's API.
+        It contains config.yaml and the folder `LINK_FOLDER`, as `link_words` needs it. The run
+        writes world.mcap, cloud.mcap and five logs there. It calls `see` with the records that the
+        processes print. With `api`, teleop serves the operator's API.
 
         If `session` is given, the run is a session: teleop waits for missions, all processes serve
         metrics, and the recordings contain only the flights. When all processes are ready,
@@ -218,47 +225,47 @@ class LocalRun:
                     self.announcement.close()
 
     def _fly(self, limit: float, sockets: Path, url: str) -> None:
-        folder, link, session = self._folder, self._folder / LINK_FOLDER, self._session
-        places = [f"127.0.0.1:{port}" for port in free_ports(8 if session else 4)]
-        world, from_world, from_cloud, cloud = places[:4]
-        self._metrics = dict(zip(("world", "cloud", "teleop", "relay"), places[4:], strict=False))
-        sides = {"world-side": from_world, "cloud-side": from_cloud, "world": world, "cloud": cloud}
-        self._start("relay", "--fifo", **sides, link=link)
+        folder, session = self._folder, self._session
+        ports = [f"127.0.0.1:{port}" for port in free_ports(9 if session else 4)]
+        at = dict(zip(("world", "cloud", "uplink", "downlink"), ports, strict=False))
+        names = ("world", "cloud", "teleop", "uplink", "downlink")
+        self._metrics = dict(zip(names, ports[4:], strict=False))
 
-        def start_end(name: str, listen: str, peer: str, way: str, **more: object) -> None:
-            more |= {"key": sockets / "key", "link": link / f"{way}.json"}
+        def start_end(name: str, way: str, **more: object) -> None:
+            more |= {"listen": at[name], "peer": at[way], "key": sockets / "key"}
             more |= {"record": folder / f"{name}.mcap"}
-            flags = ("--record-flights",) if session else ()
-            self._start(name, *flags, listen=listen, peer=peer, **more)
+            more |= {"link": folder / LINK_FOLDER / way / STATE_FILE}
+            self._start(name, name, *(("--record-flights",) if session else ()), **more)
 
-        start_end("world", world, from_world, "uplink")
+        def start_link(way: str, end: str, peer: str) -> None:
+            more = {"listen": at[way], "end": at[end], "peer": at[peer]}
+            words = link_words(folder / LINK_FOLDER, way)
+            self._start(way, *words, mode="relay", **more)
+
+        start_end("world", "uplink")
         # Only this user can open the socket of the API: no token is needed.
         files = {"api-file": folder / API_FILE, "audit": folder / AUDIT_FILE}
         given: dict[str, object] = {"api": url, **files} if url else {}
         given |= {"journal": folder / JOURNAL_FILE} if session else {}
-        self._start("teleop", *(() if session else ("--start",)), socket=sockets, **given)
+        start = () if session else ("--start",)
+        self._start("teleop", "teleop", *start, socket=sockets, **given)
         self._wait_until_ready()
-        start_end("cloud", cloud, from_cloud, "downlink", teleop=sockets, tap=sockets / TAP_FILE)
+        # With cloud, which sends first: the time line of the link begins with the flight.
+        start_link("uplink", "world", "cloud")
+        start_link("downlink", "cloud", "world")
+        start_end("cloud", "downlink", teleop=sockets, tap=sockets / TAP_FILE)
         self._wait_until_ready()
         if session:
             session(url, self._metrics)
         self._watch(limit)
 
-    def _start(self, name: str, *flags: str, **options: object) -> None:
-        log = self._folder / f"{name}.log"
+    def _start(self, name: str, *words: str, **options: object) -> None:
         options["config"] = self._folder / "config.yaml"
         if name in self._metrics:
             options["metrics"] = self._metrics[name]
-        words = [*flags, *(f"--{option}={value}" for option, value in options.items())]
+        log = self._folder / f"{name}.log"
         with log.open("wb") as errors:
-            process = subprocess.Popen(
-                interpreter("-m", "cloudrc", name, "--feed", *words),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=errors,
-                env={**os.environ, PARENT: str(os.getpid())},
-                start_new_session=True,  # Ctrl-C reaches only the supervisor, which ends them
-            )
+            process = start_process([*words, "--feed"], options, subprocess.PIPE, errors)
         assert process.stdout is not None
         os.set_blocking(process.stdout.fileno(), False)
         self._children.append(Child(name, process, log))
@@ -319,7 +326,6 @@ class LocalRun:
             )
 
     def _stop(self) -> None:
-        """End the processes that still run: first by SIGTERM, then by SIGKILL."""
         for child in self._children:
             child.process.terminate()
         deadline = time.monotonic() + STOP_LIMIT
@@ -329,6 +335,33 @@ class LocalRun:
             child.process.kill()
             child.process.communicate()
         self._selector.close()
+
+
+def start_process(
+    words: Sequence[str], options: Mapping[str, object], output: int | IO[bytes], log: IO[bytes]
+) -> subprocess.Popen[bytes]:
+    """Start `cloudrc WORDS` with the flags `--NAME=VALUE` of `options`.
+
+    The process writes its errors to `log`, and ends if this process ends.
+    """
+    flags = [f"--{name}={value}" for name, value in options.items()]
+    return subprocess.Popen(
+        interpreter("-m", "cloudrc", *words, *flags),
+        stdin=subprocess.DEVNULL,
+        stdout=output,
+        stderr=log,
+        env={**os.environ, PARENT: str(os.getpid())},
+        start_new_session=True,  # Ctrl-C reaches only this process, which ends its children
+    )
+
+
+def link_words(folder: Path, way: str) -> list[str]:
+    """Return the words to start the process of a direction, "uplink" or "downlink", of a link.
+
+    `folder` contains profile.yaml and, for route and state, a folder per direction.
+    """
+    files = [f"--profile={folder / PROFILE}", f"--route={folder / way / 'route'}"]
+    return ["link", "run", f"--direction={way}", *files]
 
 
 def socket_folder() -> str:

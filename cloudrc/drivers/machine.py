@@ -52,7 +52,7 @@ def usable_cores() -> int:
 
 
 def interpreter(*words: str) -> list[str]:
-    """Build a command line for this Python interpreter, for example with `-m cloudrc relay`.
+    """Build a command line for this Python interpreter, for example with `-m cloudrc world`.
 
     The new process imports modules from the working folder only if this process does: the folder
     may contain files from somebody else.

@@ -228,11 +228,11 @@ class LinkNotes:
         self._due_ns = self._released_ns = 0
 
     def after(self, records: Iterable[Record], now_ns: int, slip_ns: int = 0) -> list[Record]:
-        """Return records of the link's state and lateness that are due at `now_ns` [ns].
+        """Return records of the link's state and of its datagrams' lateness, if they are due.
 
-        `now_ns` is on the machine's clock; `slip_ns` is the lag of world's or cloud's clock behind
-        it [ns]. `records` are new records of world or cloud. If one of them has a type in
-        `BEGINNINGS`, a mission may begin, and a record of the link's state is due at once.
+        `now_ns` is the time on the machine's clock [ns]; `slip_ns` is the lag of world's or cloud's
+        clock behind it [ns]. `records` are new records of world or cloud. If one of them has a type
+        in `BEGINNINGS`, a mission may begin, and a record of the link's state is due at once.
         """
         noted: list[Record] = []
         begins = not BEGINNINGS.isdisjoint(map(type, records))
@@ -265,7 +265,7 @@ class LinkNotes:
             shaper=to_one_line(state.shaper),
             cause=to_one_line(state.cause),
             age=max(0, now_ns - state.since_ns) * 1e-9,
-            time_line=nan if state.origin_ns is None else (now_ns - state.origin_ns) * 1e-9,
+            time_line=(now_ns - state.origin_ns) * 1e-9,
             **{name: asked.get(name, nan) for name in ("delay", "jitter", "loss", "rate")},
             conditions=json.dumps(state.profile.get(state.direction, {})),
         )

@@ -177,8 +177,8 @@ class LastWord:
     ) -> None:
         """Set the functions that give the state of cloud and robot.
 
-        `asked` returns True after cloud has been asked to end, `flies` while the guard is in TRACK.
-        `clock` returns the time [ns].
+        `asked` returns True after cloud has been asked to end. `flies` returns True while the guard
+        is in TRACK. `clock` returns the time [ns].
         """
         self._asked, self._flies, self._clock = asked, flies, clock
         self._until_ns: int | None = None
@@ -251,7 +251,7 @@ class TeleopLoop:
         self._send(machine.take_outputs())
 
     def _send(self, outputs: Sequence[Any]) -> None:
-        """Send all unsent events, then `outputs`; call `tell` with the new events and faults."""
+        """Send unsent events, then `outputs`, to cloud; pass new events and faults to `tell`."""
         unsent, peer = self._unsent, self._peer
         while unsent and peer.send(unsent[0]):
             unsent.popleft()

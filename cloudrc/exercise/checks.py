@@ -40,7 +40,8 @@ STATE = Odometry(10**9, (1.0, -2.0, 0.7), (0.6, 0.0, 0.0, 0.8), (0.5, 0.3, -0.2)
 def _horizons(build: Callable[[], Any], *delays: float, hold: float = 0.0) -> Any:
     """Return the horizons [s] of an estimator: before the first delay, and after each delay.
 
-    `delays` are loop delays [s]; each includes the hold time `hold` [s].
+    `delays` are loop delays [s]. Each includes `hold` [s], the time from a command's application to
+    the sending of its echo.
     """
     estimator = build()
     seen = [estimator.horizon(7.0)]
@@ -60,7 +61,7 @@ def _command(
     """Return two commands of a controller with `gains`: the last before and first after a reset.
 
     Before the reset, the controller gets `n` updates, 2 ms apart, of a robot at `speed` [m/s]. A
-    command is a velocity [m/s]; if `sign` is False, return its absolute values.
+    command is a velocity [m/s]. If `sign` is False, return absolute values.
     """
     controller, (x, y, z), seen = build(**gains), STATE.position, ZERO
     setpoint = Setpoint((2.0, -1.0, 0.2))

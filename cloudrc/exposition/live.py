@@ -53,7 +53,7 @@ class LinkVerdict:
     """Newest verdict on whether the link's direction to this process matches its profile."""
 
     def __init__(self, direction: str) -> None:
-        """Set the direction, "uplink" or "downlink"; the verdict is "open" until a check."""
+        """Set the direction, "uplink" or "downlink"; before a check the verdict is "open"."""
         self._direction = direction
         self._newest: tuple[LinkChecked, ...] = ()
 
@@ -321,27 +321,25 @@ class CloudEnd(End):
 
 
 class Link:
-    """Metrics of a process that shapes one direction of the link or both."""
+    """Metrics of a process that shapes one direction of the link."""
 
     def __init__(self) -> None:
         self.tell: Callable[[], str] = lambda: "{}\n"  # content of /link.json, the shaper's state
-        self._shapers: dict[str, Labels] = {}
-        self._delays: dict[str, float] = {}
+        self._readings: Readings = {}
 
-    def shaped(self, shaper: str, direction: str, mode: str) -> None:
-        """Set the `shaper` of a direction, "relay" or "netem", and the configured `link.mode`."""
-        self._shapers[direction] = (shaper, direction, mode)
+    def shaped(self, shaper: str, direction: str, mode: str, delay: float) -> None:
+        """Store which `shaper` ("relay" or "netem") shapes the direction, and the key `link.mode`.
 
-    def asked(self, direction: str, delay: float) -> None:
-        """Set the mean delay [s] that the profile now requests for a direction."""
-        self._delays[direction] = delay
+        `delay` is the mean delay that the profile now requests [s].
+        """
+        self._readings = {
+            "cloudrc_link_info": {(shaper, direction, mode): 1.0},
+            "cloudrc_link_delay_seconds": {(direction,): delay},
+        }
 
     def read(self) -> Readings:
-        """Return the current metrics, without metrics whose values are unknown."""
-        return {
-            "cloudrc_link_info": dict.fromkeys(list(self._shapers.values()), 1.0),
-            "cloudrc_link_delay_seconds": by_label(dict(self._delays)),
-        }
+        """Return the current metrics; {} before the link is up."""
+        return self._readings
 
 
 NO_WAYPOINT = -1

@@ -87,7 +87,7 @@ class DatagramTally:
     def take(self, epoch: int, counter: int) -> bool:
         """Count the arrival of a datagram; return True if the datagram is certainly new.
 
-        Otherwise the datagram may be a replay: anybody can capture a datagram and send it again.
+        Return False for a repeated or very old datagram: an attacker may have sent it again.
         """
         if epoch != self._epoch:
             # Datagrams before the first arrival are not lost: the receiver may not have run.
@@ -130,7 +130,7 @@ class PredictionJudge:
         self._measured: Vector = (nan, nan, nan)
 
     def take(self, control: Control) -> None:
-        """Compare the predictions that are due with a new measurement; store the new prediction."""
+        """Judge predictions for times up to a new measurement; store the new prediction."""
         stamp_ns, waiting = control.basis_stamp_ns, self._waiting
         if stamp_ns > self._measured_ns:
             before_ns, before = self._measured_ns, self._measured
@@ -166,11 +166,11 @@ class DelayJudge:
         self.reset()
 
     def reset(self) -> None:
-        """Drop the control periods that wait for an echo, because a new session has started."""
+        """Drop the records of commands without an echo, because a new session has started."""
         self._sent: dict[int, Control] = {}
 
     def sent(self, control: Control) -> None:
-        """Store the record of a sent command, whose delay estimate `echoed` checks later."""
+        """Store the record of a sent command; its echo will show the true delay."""
         self._sent[control.stamp_ns] = control
         if len(self._sent) > WAITING_MAX:
             del self._sent[next(iter(self._sent))]  # the oldest

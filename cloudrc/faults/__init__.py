@@ -5,5 +5,5 @@ measures               measurements in a flight, for the checks of the scenarios
 schedule, adversary    random faults of one flight; dishonest clouds
 models, flight         models of processes, clocks and teleop; a whole flight
 invariants             safety rules, checked after every step of the physics
-trial, search          fly one schedule of faults; search over many schedules
+trial                  fly one schedule of faults
 """

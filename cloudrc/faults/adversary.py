@@ -46,7 +46,7 @@ status of the robot. `HostileOperator` sets the number of the request."""
 
 
 class DishonestLoop(ControlLoop):
-    """Computes honest commands, and changes them before they are sent."""
+    """Control loop of a dishonest cloud: changes the honest commands before they are sent."""
 
     def __init__(self, lies: Sequence[Lie], *plugins: Any, **limits: Any) -> None:
         """Set `lies`; each command passes through all of them, in this order.
@@ -90,7 +90,7 @@ class HostileOperator:
         self._collect()
 
     def handle_deadline(self, now_ns: int) -> None:
-        """Forward teleop's outputs at `now_ns` [ns]; after its first setpoint, forge requests."""
+        """Forward teleop's outputs at `now_ns` [ns]; after the first setpoint, forge requests."""
         self._honest.handle_deadline(now_ns)
         self._collect()
         if self._has_setpoint and self._seen is not None:
@@ -350,14 +350,17 @@ def _hostile_plans(rng: Generator) -> Lie:
 
 
 def _operators_voice(rng: Generator) -> Lie:
-    """Change commands by a random policy of `FASTEST`; `at_bad_moments` forges the requests."""
+    """Change commands by a random policy of `FASTEST`.
+
+    In the policy "operators-voice", `at_bad_moments` also forges requests of the operator.
+    """
     return FASTEST[int(rng.integers(len(FASTEST)))](rng)
 
 
 def _refused_and_released(rng: Generator) -> Lie:
     """Fly fast, and from time to time send NaN, so that the guard lands the robot.
 
-    Meanwhile forged requests of the operator (`at_bad_moments`) acknowledge the landings.
+    Cloud also forges requests of the operator (`at_bad_moments`), which acknowledge the landings.
     """
     fly, pause_ns = _operators_voice(rng), int(rng.uniform(0.5e9, 4e9))
 

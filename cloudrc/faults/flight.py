@@ -77,7 +77,6 @@ class Flight:
         words: Words | None = None,  # makes requests in place of the operator
         second: float | None = None,  # when a second cloud connects [s]
     ) -> None:
-        """Prepare a flight; a comment beside each argument describes it. `second` is in [s]."""
         self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
         self._honest, self._keep = honest, keep
         self._life, self._second, self._lies, self._words = life, second, lies, words
@@ -154,7 +153,7 @@ class Flight:
         self._second = None
 
     def sha256(self) -> str:
-        """Return the hash of all records so far; it has a meaning only in a flight with `keep`."""
+        """Return the hash of all records so far; the flight must have been made with `keep`."""
         return Recording.from_records(self.of_world, self.of_cloud).sha256
 
     def trajectory(self) -> list[GroundTruth]:

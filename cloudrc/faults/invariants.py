@@ -86,7 +86,7 @@ class Breach(NamedTuple):
 
 
 class Watch:
-    """Collects the breaches of a flight, and checks the order of commands."""
+    """Collects the breaches of invariants in a flight, and checks the order of commands."""
 
     def __init__(self, limits: ResolvedGuard) -> None:
         self.limits = limits
@@ -105,8 +105,8 @@ class Watch:
     def see(self, records: list[Record], now_ns: int) -> None:
         """Check in the new `records` of world that each command was applied once and in order.
 
-        A restarted world counts epochs on from the last epoch that cloud knows. If cloud knows
-        none, world starts again with the first epoch, which is allowed.
+        The order of commands is that of epochs and, within an epoch, of counters. It begins anew
+        with each process of world: if cloud knows no epoch, a restarted world begins at the first.
         """
         for record in records:
             if isinstance(record, CommandApplied | SessionOpened):

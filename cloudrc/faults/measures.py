@@ -62,7 +62,7 @@ def held_in_time(outcome: Outcome, flight: Flight, text: str = "HOLD after") -> 
 
 
 def basis_age_at_hold(flight: Flight) -> float:
-    """Return the largest age of the last command's odometry at the beginning of a HOLD [s]."""
+    """Return the largest age that the commands' newest odometry had when a HOLD began [s]."""
     applied = [(r.stamp_ns, r.basis_stamp_ns) for r in flight.of_world if type(r) is CommandApplied]
     ages = []
     for change in held(flight):
@@ -142,7 +142,7 @@ def done(outcome: Outcome, flight: Flight) -> None:
 
 
 def fly_safely(outcome: Outcome, flight: Flight, limit: float = 120.0) -> Flight:
-    """Fly the mission, at most until `limit` [s]; then apply the checks `safe` and `done`."""
+    """Fly the mission, at most until `limit` [s]; check that it was safe and was completed."""
     flight.fly_mission(limit)
     safe(outcome, flight)
     done(outcome, flight)

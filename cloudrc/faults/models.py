@@ -161,7 +161,7 @@ class EndpointGroup:
             member.receive_datagram(data, now_ns)
 
     def next_deadline_ns(self) -> int:
-        """Implement `Endpoint.next_deadline_ns`."""
+        """Return the earliest deadline of all clouds [ns]."""
         return min(member.next_deadline_ns() for member in self.members)
 
     def handle_deadline(self, now_ns: int) -> None:
@@ -171,11 +171,11 @@ class EndpointGroup:
                 member.handle_deadline(now_ns)
 
     def take_datagrams(self) -> list[bytes]:
-        """Implement `Endpoint.take_datagrams`."""
+        """Return the new outgoing datagrams of all clouds."""
         return [data for member in self.members for data in member.take_datagrams()]
 
     def take_records(self) -> list[Record]:
-        """Return the new records of the first cloud; append those of all others to `others`."""
+        """Return the first cloud's new records; append those of the other clouds to `others`."""
         first, *others = (member.take_records() for member in self.members)
         for records in others:
             self.others += records

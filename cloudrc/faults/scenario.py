@@ -12,13 +12,15 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from cloudrc.errors import describe_error
+
 Relation: TypeAlias = Literal["<=", ">=", "=="]
 _COMPARE = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
 YES = "yes"  # unit of a check that is a statement: its value is 1 if the statement holds, else 0
 
 
 def generator(seed: int, use: int) -> np.random.Generator:
-    """Make a random generator; different numbers `use` give independent sequences."""
+    """Make a random generator from a seed; different `use` give independent sequences."""
     return np.random.Generator(np.random.PCG64([seed, use]))
 
 
@@ -113,7 +115,7 @@ class Scenario:
         try:
             self.inject(outcome, seed)
         except Exception as error:  # the other scenarios still run
-            outcome.error = f"{type(error).__name__}: {error}"
+            outcome.error = describe_error(error)
         return outcome
 
     def as_json(self, outcome: Outcome) -> dict[str, Any]:

@@ -70,7 +70,7 @@ WAYS: tuple[Way, ...] = ("both", "up", "down")
 class Event:
     """One fault, from `at` [s] for `duration` [s]; link faults hit one direction or both.
 
-    `KINDS` explains the meaning and the unit of `value`.
+    The meaning and the unit of `value` depend on the kind of fault; the texts in `KINDS` tell them.
     """
 
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG

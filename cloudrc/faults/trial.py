@@ -18,6 +18,7 @@ from math import inf, nan
 import numpy as np
 
 from cloudrc.drivers.virtual import Clock
+from cloudrc.errors import describe_error
 from cloudrc.faults.adversary import Lie, dishonesty
 from cloudrc.faults.flight import SECRET, Flight
 from cloudrc.faults.invariants import LATCHED, Breach
@@ -92,7 +93,7 @@ def fly(schedule: Schedule, *settings: str, keep: bool = False) -> Finding:
     try:
         flight.fly(schedule.duration)
     except Exception as error:  # world and cloud must survive every fault
-        watch.note(flight.run.now_ns, "error", f"{type(error).__name__}: {error}")
+        watch.note(flight.run.now_ns, "error", describe_error(error))
     checks: dict[str, Callable[[], None]] = {
         "waypoint": lambda: _check_waypoints(flight),
         "stuck": operator.check_stuck,
@@ -158,7 +159,7 @@ class Operator:
         flight.listeners.append(self._look)
 
     def check_stuck(self) -> None:
-        """Check that the robot has flown (TRACK) in the last `BACK` [s], which have no faults."""
+        """Report a breach if the guard was never in TRACK in the last `BACK` [s] (no faults)."""
         flight, now_ns = self._flight, self._flight.run.now_ns
         if now_ns - self._tracked_ns > BACK * 1e9:
             state, cause = flight.guard_now()
@@ -232,10 +233,10 @@ def inject(flight: Flight, schedule: Schedule) -> None:
 def _actions(
     flight: Flight, process: RestartableEndpoint, event: Event
 ) -> dict[str, tuple[tuple[float, Action], ...]]:
-    """Return a mapping: kind of fault -> pairs of time [s] and action.
+    """Return how to inject `event`: kind of fault -> pairs of time [s] and action.
 
-    It has all kinds, at the times of `event`; the caller picks the event's kind. `process` is the
-    process that the event kills or freezes, world or cloud.
+    The mapping is the same for all kinds of event; the caller selects the entry of the event's
+    kind. `process`, world or cloud, is the one that the event kills or freezes.
     """
     at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
     gone = at + event.value * lasts  # end of teleop after it was asked to end

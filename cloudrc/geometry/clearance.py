@@ -39,7 +39,7 @@ class Spheres(NamedTuple):
 
 
 def key_points() -> Spheres:
-    """Return the 225 points that determine the clearance: on arm, rotors, base box and top rod."""
+    """Return the 225 spheres (on arm, rotors, base box and top rod) that give the clearance."""
     return _points(_box(2, 2, 2), arm=9)
 
 

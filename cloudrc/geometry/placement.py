@@ -49,13 +49,13 @@ def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray
 
 
 def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.int64]:
-    """Find the first pipe to which the robot comes too near, for each of n straight ways.
+    """Find the first pipe along each of n straight ways to which the robot comes too near.
 
     Too near is a distance below `CLEARANCE_MIN`. The robot is level with yaw 0. A way may begin
-    nearer to a wall than `CLEARANCE_MIN` if it leads away from this wall. The board does not count.
+    nearer to a wall than `CLEARANCE_MIN` if it leads away from this wall. The board is ignored.
 
     `starts` and `ends` are positions of the base [m], world frame, inside or near the fence, shape
-    (n, 3). Return the index of the pipe for each way, or -1, shape (n,).
+    (n, 3). Return the index of the pipe for each way, -1 if there is none, shape (n,).
     """
     result = np.full(len(starts), -1, dtype=np.int64)
     length = np.linalg.norm(ends - starts, axis=1)

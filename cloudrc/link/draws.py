@@ -47,7 +47,7 @@ Fate: TypeAlias = tuple[int, ...]
 
 
 class Purpose(IntEnum):
-    """What a column of random numbers decides, such as the loss of packets."""
+    """What a random number decides for a packet, such as its loss or its jitter."""
 
     DELAY = 0
     COPY_DELAY = 1
@@ -60,7 +60,7 @@ class Purpose(IntEnum):
 
 
 def stream_key(seed: int, uplink: bool, epoch: int, kind: int) -> StreamKey:
-    """Compute the Philox key of the stream for one kind of datagram in a session and direction."""
+    """Return the Philox key for the random numbers of a direction, session and kind of datagram."""
     name = f"cloudrc link {seed} {'up' if uplink else 'down'} {epoch} {kind}"
     digest = blake2b(name.encode(), digest_size=16).digest()
     return int.from_bytes(digest[:8], "little"), int.from_bytes(digest[8:], "little")

@@ -48,46 +48,9 @@ Load = Callable[[Path], Loaded]
 """Function that reads and checks a profile's file; raises a BadInputError if it is invalid."""
 
 
-class ProfileFile:
-    """Reads a profile's file again whenever the file changes.
-
-    Kubernetes mounts a ConfigMap as symbolic links into `..data`, which is itself a symbolic link.
-    For a new version, Kubernetes replaces `..data`, so that the same path leads to another file.
-    A check for a change takes only one system call, because it runs 20 times per second.
-    """
-
-    def __init__(self, path: Path, load: Load, log: Callable[[str], None]) -> None:
-        self._path, self._load, self._log = path, load, log
-        self._seen: object = None
-
-    def first(self) -> Loaded:
-        """Read the file for the first time; raise a BadInputError if the profile is invalid."""
-        self._seen = version(self._path)
-        return self._read()
-
-    def poll(self) -> Loaded | None:
-        """Return the new profile; None if the file is unchanged, or invalid (which is logged)."""
-        before, self._seen = self._seen, version(self._path)
-        if self._seen == before:
-            return None
-        try:
-            return self._read()
-        except (BadInputError, OSError, ValueError) as error:
-            self._log(f"the new profile is refused, the old one stays: {error}")
-            return None
-
-    def _read(self) -> Loaded:
-        loaded = self._load(self._path)
-        try:
-            note = self._path.with_name(CHANGE_FILE).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError):
-            return loaded
-        return loaded._replace(change=read_change(note))
-
-
 @dataclass(frozen=True)
 class Handed:
-    """A change that `cloudrc link set` writes directly into a pod, as a JSON document."""
+    """A change of the link that `cloudrc link set` writes into a pod, as a JSON document."""
 
     change: str  # number and cause of the change, as the text of `CHANGE_FILE`
     files: dict[str, str]  # file name -> text: `profile.yaml` and the traces that it names
@@ -110,66 +73,80 @@ def read_handed(text: bytes | str) -> Handed:
     return handed
 
 
-class _HandedFile(ProfileFile):
-    """Reads the JSON document that `cloudrc link set` writes into a pod.
-
-    A document that exists when the process starts is ignored, because the ConfigMap already
-    contains the same change.
-    """
-
-    def __init__(self, path: Path, load: Load, log: Callable[[str], None]) -> None:
-        super().__init__(path, load, log)
-        self._seen = version(path)
-
-    def _read(self) -> Loaded:
-        """Read the document; raise a ValueError if the file belongs to another user.
-
-        All containers of the pod can write to the folder, but only the sidecar may run as root. So
-        a sidecar that runs as root follows only changes that root has made.
-        """
-        if self._path.lstat().st_uid != os.geteuid():
-            raise ValueError(f"{self._path} belongs to another user")
-        handed = read_handed(read(self._path, SIZE_MAX))
-        with TemporaryDirectory(prefix="handed-", dir=self._path.parent) as folder:
-            for name, text in handed.files.items():
-                (Path(folder) / name).write_text(text, encoding="utf-8")
-            loaded = self._load(Path(folder) / PROFILE)
-        return loaded._replace(change=read_change(handed.change))
-
-
 class Profiles:
     """Watches two files for changes: the profile's, and the one that `cloudrc link set` writes.
 
     A change that reaches both files is returned once.
+
+    Kubernetes mounts a ConfigMap as symbolic links into `..data`, which is itself a symbolic link.
+    For a new version, Kubernetes replaces `..data`, so that the same path leads to another file.
+    A check for a change takes only one system call per file, because it runs 20 times per second.
     """
 
     def __init__(
         self, profile: Path, document: Path, load: Load, log: Callable[[str], None]
     ) -> None:
-        self._file = ProfileFile(profile, load, log)
-        self._sources = _HandedFile(document, load, log), self._file
+        """Watch `profile` and `document`; a document that exists already is ignored.
+
+        In a pod the ConfigMap already contains the change of this document.
+        """
+        self._profile, self._load, self._log = profile, load, log
+        self._readers = {document: self._read_document, profile: self._read_profile}
+        self._seen = {path: version(path) for path in self._readers}
         self._known: dict[str, dict[str, Any]] = {}
 
     def first(self) -> Loaded:
         """Read the profile for the first time; raise a BadInputError if it is invalid."""
-        loaded = self._file.first()
+        self._seen[self._profile] = version(self._profile)
+        loaded = self._read_profile(self._profile)
         self._known[loaded.change.number] = loaded.values
         return loaded
 
     def poll(self) -> Loaded | None:
-        """Return a profile that has been changed since the last call; None if there is none."""
-        for source in self._sources:
-            loaded = source.poll()
-            if loaded is None:
+        """Return a profile that has been changed since the last call; None if there is none.
+
+        An invalid profile is logged.
+        """
+        for path, read_file in self._readers.items():
+            before, self._seen[path] = self._seen[path], version(path)
+            if self._seen[path] == before:
+                continue
+            try:
+                loaded = read_file(path)
+            except (BadInputError, OSError, ValueError) as error:
+                self._log(f"the new profile is refused, the old one stays: {error}")
                 continue
             number = loaded.change.number
-            before = self._known.get(number) if number else None
+            known = self._known.get(number) if number else None
             self._known[number] = loaded.values
-            if before is None:
+            if known is None:
                 return loaded
-            if before != loaded.values:  # `helm upgrade` keeps the number of the previous change
+            if known != loaded.values:  # `helm upgrade` keeps the number of the previous change
                 return loaded._replace(change=Change())
         return None
+
+    def _read_profile(self, path: Path) -> Loaded:
+        loaded = self._load(path)
+        try:
+            note = path.with_name(CHANGE_FILE).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError):
+            return loaded
+        return loaded._replace(change=read_change(note))
+
+    def _read_document(self, path: Path) -> Loaded:
+        """Read the document; raise a ValueError if the file belongs to another user.
+
+        All containers of the pod can write to the folder, but only the sidecar may run as root. So
+        a sidecar that runs as root follows only changes that root has made.
+        """
+        if path.lstat().st_uid != os.geteuid():
+            raise ValueError(f"{path} belongs to another user")
+        handed = read_handed(read(path, SIZE_MAX))
+        with TemporaryDirectory(prefix="handed-", dir=path.parent) as folder:
+            for name, text in handed.files.items():
+                (Path(folder) / name).write_text(text, encoding="utf-8")
+            loaded = self._load(Path(folder) / PROFILE)
+        return loaded._replace(change=read_change(handed.change))
 
 
 class PeerName:

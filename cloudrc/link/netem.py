@@ -430,7 +430,7 @@ class Netem:
             self._lateness_ns.append(self._stepped_ns - due_ns)
 
     def _next_ns(self) -> float:
-        """Return when `clock` reaches the next change [ns]; infinite after the last change."""
+        """Return when the next change is due [ns]; infinite after the last change."""
         following = self._piece + 1
         if following >= len(self._timeline.pass_ns):
             return inf

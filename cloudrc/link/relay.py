@@ -1,10 +1,8 @@
 """Forward datagrams in real time, and delay, lose or copy each one as the link's model computes.
 
-In local mode one process runs a `Relay` with both directions. In a pod, `RelayShaper` shapes the
-datagrams that the pod sends:
+A relay shapes one direction of the link:
 
-    world <-> [world side]  Relay  [cloud side] <-> cloud
-    tunnel end > [listen]  RelayShaper  [any port] > the other pod's tunnel end
+    world or cloud > [listen]  Relay  [any port] > cloud or world
 
 A datagram is due at its time of arrival at the kernel plus the delay from the model. The relay
 never sends a datagram before it is due. A sleeping thread wakes 15 to 50 us late; so the relay
@@ -21,7 +19,7 @@ import select
 import socket
 import sys
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import count
 from time import monotonic_ns, time_ns
@@ -33,14 +31,11 @@ from cloudrc.link.profile import DirectionProfile
 Address: TypeAlias = tuple[str, int]
 Peek: TypeAlias = Callable[[bytes], tuple[int, int, int]]
 """Function that returns kind, epoch and counter of a datagram, or raises a ValueError."""
-Send: TypeAlias = Callable[[bytes], object]
-"""Function that sends a datagram; raises an OSError if the kernel refuses."""
 
 IN_FLIGHT_MAX = 10_000  # datagrams in flight in one direction; more are dropped and counted
 DATAGRAM_MAX = 2_048  # largest length of a datagram, to limit the memory in use [bytes]
-BATCH = 32  # datagrams that one direction reads or sends before the other direction's turn
+BATCH = 32  # datagrams that a relay reads before it sends, and sends before it reads again
 SPIN_NS = 60_000  # the relay reads the clock in a loop for this time before a datagram is due [ns]
-STOP_PERIOD = 0.1  # longest time between two calls of the argument `stop` of `Relay.run` [s]
 ANCILLARY_SIZE = 64  # buffer for the kernel's time stamp and count of dropped datagrams [bytes]
 AGE_MAX_NS = 50_000_000  # largest time from arrival to reading that the relay compensates [ns]
 QUANTILES = {"p50": 0.5, "p99": 0.99, "p999": 0.999}  # name -> quantile of the lateness, in [0, 1]
@@ -125,40 +120,120 @@ class Stamps:
         return 0 if wall_ns is None else min(max(0, now_ns - wall_ns), AGE_MAX_NS)
 
 
-class Lane:
-    """One direction of the relay: reads datagrams, and sends them when they are due.
+class Relay:
+    """Shapes one direction of the link without the kernel's netem; same methods as `Netem`."""
 
-    The datagrams arrive at the bound UDP socket `source`, which the caller closes. `origin_ns` is
-    time 0 of the link model, monotonic clock [ns], or None before the first datagram.
-    """
+    name = "relay"
 
     def __init__(
-        self, source: socket.socket, send: Send, direction: LinkDirection, peek: Peek
+        self, listen: Address, direction: LinkDirection, peek: Peek, end: Address | None = None
     ) -> None:
-        source.setblocking(False)
-        ask_for_stamps(source)
-        self.source, self.direction = source, direction
-        self.origin_ns: int | None = None
-        self.errors = ReleaseErrors()
-        self._output, self._peek = send, peek
+        """Open the sockets; raise an OSError if `listen` is in use or cannot reach `end`.
+
+        World or cloud sends from the address `end` (None: from any address) to the address `listen`
+        (port 0: any free port). The times of the model `direction` are on the monotonic clock.
+        `peek` reads kind, epoch and counter of a datagram.
+        """
+        self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        # The kernel refuses to send from a socket bound to 127.0.0.1 to another machine.
+        self._outside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._inside.bind(listen)
+            if end is not None:
+                self._inside.connect(end)
+        except OSError:
+            self.close()
+            raise
+        for one in (self._inside, self._outside):
+            one.setblocking(False)
+        ask_for_stamps(self._inside)
+        self._peer: Address | None = None
+        self._direction, self._peek = direction, peek
         # Due time [ns], a number that keeps the order of equal times, data.
         self._in_flight: list[tuple[int, int, bytes]] = []
         self._numbers = count()
-        self._stamps = Stamps()
+        self._stamps, self._stalled = Stamps(), 0
         outcomes = ("received", "forwarded", "lost", "malformed", "overflow", "unsent")
-        self._counts, self._stalled = dict.fromkeys(outcomes, 0), 0
+        self._counts = dict.fromkeys(outcomes, 0)
+        self._errors = ReleaseErrors()
+        self._past: deque[ReleaseErrors] = deque([ReleaseErrors()], maxlen=_RECENT)
+        tighten_slack()
 
-    def due_ns(self) -> int | None:
-        """Return when the next datagram is due [ns], monotonic clock; None if none is waiting."""
-        return self._in_flight[0][0] if self._in_flight else None
+    def follow_peer(self, peer: Address) -> Address:
+        """Send all datagrams to this peer from now on, including those in flight.
 
-    def take_in(self) -> None:
+        Returns:
+            The relay's own address, to which the sending end of the tunnel has to send.
+        """
+        self._peer = peer
+        host, port = self._inside.getsockname()
+        return host, port
+
+    def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
+        """Use this profile from now on; with `restart`, its time line starts at the next packet."""
+        self._take_in()  # datagrams that have arrived belong to the old profile
+        self._direction.replace_profile(profile, restart=restart)
+
+    def step(self, timeout: float) -> None:
+        """Forward datagrams for `timeout` [s] or slightly longer."""
+        until_ns = monotonic_ns() + round(timeout * 1e9)
+        while (rest_ns := until_ns - monotonic_ns()) > 0:
+            self._step_once(rest_ns * 1e-9)
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of datagrams by outcome, and the recent lateness.
+
+        The outcomes are `received`; `forwarded` (including copies); `lost` on the link; `malformed`
+        (not from the tunnel); `overflow` (too many in flight, see `IN_FLIGHT_MAX`); `unread` (the
+        socket's buffer was full); `unsent` (the receiver is unknown or the kernel refused).
+
+        Call this method once a second; the percentiles of the lateness [ns] then cover the last
+        10 s. `released_early` is the number of datagrams that left before they were due, since the
+        start.
+        """
+        errors = ReleaseErrors(self._errors)
+        recent = ReleaseErrors(errors - self._past[0]).in_ns()
+        self._past.append(errors)
+        recent.pop("released", None)
+        outcomes = {**self._counts, "unread": self._stamps.dropped}
+        return {**outcomes, **recent, "released_early": errors[_EARLY]}
+
+    def released(self) -> dict[str, int]:
+        """Return how many datagrams left and how late; any thread may call this method.
+
+        Returns:
+            The number of datagrams that left (`released`), that left too early (`released_early`),
+            that were dropped because too many were in flight (`overflow`), and that waited
+            `AGE_MAX_NS` or longer to be read (`stalled`); and percentiles of the lateness, such as
+            `release_error_p99_ns` [ns]. Empty before the first datagram leaves.
+        """
+        more = {"overflow": self._counts["overflow"], "stalled": self._stalled}
+        return told | more if (told := self._errors.in_ns()) else {}
+
+    def close(self) -> None:
+        """Close the sockets; datagrams in flight are lost."""
+        self._inside.close()
+        self._outside.close()
+
+    def _step_once(self, timeout: float) -> None:
+        """Wait at most `timeout` [s] until datagrams arrive or are due; read and send them."""
+        due_ns = self._in_flight[0][0] if self._in_flight else 0
+        if due_ns:
+            timeout = min(timeout, max(0.0, (due_ns - SPIN_NS - monotonic_ns()) * 1e-9))
+        readable, _, _ = select.select([self._inside], (), (), timeout)
+        if due_ns and due_ns - monotonic_ns() <= SPIN_NS:
+            while monotonic_ns() < due_ns:
+                pass
+            self._release()  # before reading: new datagrams have a time stamp and can wait
+        if readable:
+            self._take_in()
+            self._release()  # datagrams without delay
+
+    def _take_in(self) -> None:
         """Read up to `BATCH` datagrams from the socket, and compute when each is due."""
         for _ in range(BATCH):
             try:
-                data, beside, flags, _ = self.source.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
-            except ConnectionRefusedError:  # an earlier datagram had no receiver
-                continue
+                data, beside, flags, _ = self._inside.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
             except OSError:  # no datagram waits
                 return
             self._counts["received"] += 1
@@ -175,195 +250,37 @@ class Lane:
             else:
                 self._put_on_link(data, *header, received_ns)
 
-    def release(self) -> None:
+    def _put_on_link(
+        self, data: bytes, kind: int, epoch: int, counter: int, received_ns: int
+    ) -> None:
+        """Keep a datagram until the link delivers it: never if it is lost, twice if duplicated."""
+        releases = self._direction.send(epoch, kind, counter, len(data), received_ns)
+        if not releases:
+            self._counts["lost"] += 1
+        elif self._direction.corrupts:
+            data = self._direction.corrupted(epoch, kind, counter, data)
+        for due_ns in releases:
+            if len(self._in_flight) >= IN_FLIGHT_MAX:
+                self._counts["overflow"] += 1
+            else:
+                heapq.heappush(self._in_flight, (due_ns, next(self._numbers), data))
+
+    def _release(self) -> None:
         """Send up to `BATCH` datagrams that are due."""
         for _ in range(BATCH):
             now_ns = monotonic_ns()
             if not self._in_flight or self._in_flight[0][0] > now_ns:
                 return
             due_ns, _, data = heapq.heappop(self._in_flight)
-            if self._send(data):
-                self._counts["forwarded"] += 1
-                self.errors.observe(now_ns - due_ns)
-            else:
-                self._counts["unsent"] += 1
-
-    def counts(self) -> dict[str, int]:
-        """Return the number of datagrams by outcome; `Relay.counts` explains the outcomes."""
-        return {**self._counts, "unread": self._stamps.dropped}
-
-    def released(self) -> dict[str, int]:
-        """Return how many datagrams left and how late; any thread may call this method.
-
-        Returns:
-            The number of datagrams that left (`released`), that left too early (`released_early`),
-            that were dropped because too many were in flight (`overflow`), and that waited
-            `AGE_MAX_NS` or longer to be read (`stalled`); and percentiles of the lateness, such as
-            `release_error_p99_ns` [ns]. Empty before the first datagram leaves.
-        """
-        more = {"overflow": self._counts["overflow"], "stalled": self._stalled}
-        return told | more if (told := self.errors.in_ns()) else {}
-
-    def _put_on_link(
-        self, data: bytes, kind: int, epoch: int, counter: int, received_ns: int
-    ) -> None:
-        """Keep a datagram until the link delivers it: never if it is lost, twice if duplicated."""
-        if self.origin_ns is None:
-            self.origin_ns = received_ns
-        elapsed_ns = received_ns - self.origin_ns
-        releases = self.direction.send(epoch, kind, counter, len(data), elapsed_ns)
-        if not releases:
-            self._counts["lost"] += 1
-        elif self.direction.corrupts:
-            data = self.direction.corrupted(epoch, kind, counter, data)
-        for release_ns in releases:
-            if len(self._in_flight) >= IN_FLIGHT_MAX:
-                self._counts["overflow"] += 1
-            else:
-                due_ns = release_ns + self.origin_ns
-                heapq.heappush(self._in_flight, (due_ns, next(self._numbers), data))
-
-    def _send(self, data: bytes) -> bool:
-        for _ in range(2):
             try:
-                self._output(data)
-            except ConnectionRefusedError:  # reports an earlier datagram; this one was not sent
-                continue
+                if self._peer is None:
+                    raise OSError("no peer yet")
+                self._outside.sendto(data, self._peer)
             except OSError:
-                return False
+                self._counts["unsent"] += 1
             else:
-                return True
-        return False
-
-
-class Relay:
-    """Runs one or two `Lane` objects in one thread.
-
-    `lanes` maps the name of each direction to its lane. Time 0 of the link models is the arrival
-    of the first datagram on any lane; so make the models with `origin_ns` 0.
-    """
-
-    def __init__(self, lanes: Mapping[str, Lane]) -> None:
-        self.lanes, self._lanes = lanes, tuple(lanes.values())
-        self._past: deque[ReleaseErrors] = deque([ReleaseErrors()], maxlen=_RECENT)
-
-    def run(self, stop: Callable[[], bool]) -> None:
-        """Forward datagrams until `stop` returns True; `stop` is called at least every 0.1 s."""
-        tighten_slack()
-        while not stop():
-            self.step(STOP_PERIOD)
-
-    def step(self, timeout: float) -> None:
-        """Forward datagrams for `timeout` [s] or slightly longer."""
-        until_ns = monotonic_ns() + round(timeout * 1e9)
-        while (rest_ns := until_ns - monotonic_ns()) > 0:
-            self._step_once(rest_ns * 1e-9)
-
-    def _step_once(self, timeout: float) -> None:
-        """Wait at most `timeout` [s] until datagrams arrive or are due; read and send them."""
-        due_ns = min((due for lane in self._lanes if (due := lane.due_ns()) is not None), default=0)
-        if due_ns:
-            timeout = min(timeout, max(0.0, (due_ns - SPIN_NS - monotonic_ns()) * 1e-9))
-        sources = [lane.source for lane in self._lanes]
-        readable, _, _ = select.select(sources, (), (), timeout)
-        if due_ns and due_ns - monotonic_ns() <= SPIN_NS:
-            while monotonic_ns() < due_ns:
-                pass
-            for lane in self._lanes:  # before reading: new datagrams have a time stamp and can wait
-                lane.release()
-        self.take_in(readable)
-        for lane in self._lanes:  # datagrams without delay
-            lane.release()
-
-    def take_in(self, readable: Collection[socket.socket] | None = None) -> None:
-        """Read waiting datagrams from the `readable` sockets, by default from all sockets.
-
-        Call this method before a profile changes, so that waiting datagrams get the old conditions.
-        """
-        for lane in self._lanes:
-            if readable is None or lane.source in readable:
-                known = lane.origin_ns is not None
-                lane.take_in()
-                if not known:
-                    for other in self._lanes:
-                        other.origin_ns = lane.origin_ns
-
-    def counts(self) -> dict[str, int]:
-        """Return the number of datagrams by outcome, over all directions, and the recent lateness.
-
-        The outcomes are `received`; `forwarded` (including copies); `lost` on the link; `malformed`
-        (not from the tunnel); `overflow` (too many in flight, see `IN_FLIGHT_MAX`); `unread` (the
-        socket's buffer was full); `unsent` (the receiver is unknown or the kernel refused).
-
-        Call this method once a second; the percentiles of the lateness [ns] then cover the last
-        10 s. `released_early` is the number of datagrams that left before they were due, since the
-        start.
-        """
-        outcomes, errors = Counter[str](), ReleaseErrors()
-        for lane in self._lanes:
-            outcomes.update(lane.counts())
-            errors.update(lane.errors.copy())
-        recent = ReleaseErrors(errors - self._past[0]).in_ns()
-        self._past.append(errors)
-        recent.pop("released", None)
-        return {**outcomes, **recent, "released_early": errors[_EARLY]}
-
-
-class RelayShaper(Relay):
-    """Shapes one direction of the link without the kernel's netem; same methods as `Netem`."""
-
-    name = "relay"
-
-    def __init__(
-        self, listen: Address, direction: LinkDirection, peek: Peek, end: Address | None = None
-    ) -> None:
-        """Open the two sockets; raise an OSError if `listen` is in use or cannot reach `end`.
-
-        This pod's world or cloud sends from the address `end` (None: from any address) to the
-        address `listen` (port 0: any free port). The times of the model `direction` are on the
-        monotonic clock. `peek` reads kind, epoch and counter of a datagram.
-        """
-        self._inside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._inside.bind(listen)
-        if end is not None:
-            self._inside.connect(end)
-        # The kernel refuses to send from a socket bound to 127.0.0.1 to another machine.
-        self._outside = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._outside.setblocking(False)
-        self._peer: Address | None = None
-        self._lane = Lane(self._inside, self._send, direction, peek)
-        self._lane.origin_ns = 0  # the times of `direction` are on the monotonic clock already
-        super().__init__({"this": self._lane})
-        tighten_slack()
-
-    def follow_peer(self, peer: Address) -> Address:
-        """Send all datagrams to this peer from now on, including those in flight.
-
-        Returns:
-            The relay's own address, to which this pod's end of the tunnel has to send.
-        """
-        self._peer = peer
-        host, port = self._inside.getsockname()
-        return host, port
-
-    def follow_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
-        """Use this profile from now on; with `restart`, its time line starts at the next packet."""
-        self.take_in()  # datagrams that have arrived belong to the old profile
-        self._lane.direction.replace_profile(profile, restart=restart)
-
-    def released(self) -> dict[str, int]:
-        """Return counts of datagrams, and percentiles of how late they left [ns], by name."""
-        return self._lane.released()
-
-    def close(self) -> None:
-        """Close the sockets; datagrams in flight are lost."""
-        self._inside.close()
-        self._outside.close()
-
-    def _send(self, data: bytes) -> None:
-        if self._peer is None:
-            raise OSError("no peer yet")
-        self._outside.sendto(data, self._peer)
+                self._counts["forwarded"] += 1
+                self._errors.observe(now_ns - due_ns)
 
 
 def settle() -> None:
@@ -380,17 +297,13 @@ def tighten_slack() -> None:
         ctypes.CDLL(None).prctl(_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
 
 
-def ask_for_fifo() -> str:
-    """Give the calling thread the real-time class SCHED_FIFO, but not its child processes.
+def ask_for_fifo() -> bool:
+    """Give the calling thread, not its child processes, the real-time class SCHED_FIFO.
 
-    Returns:
-        "" if the thread now has SCHED_FIFO, otherwise the reason why not.
+    Return whether this is permitted: it takes CAP_SYS_NICE or a limit on rtprio.
     """
-    if not hasattr(os, "SCHED_FIFO"):
-        return "this system has no SCHED_FIFO"
-    try:
+    with suppress(AttributeError, OSError):  # a system without SCHED_FIFO; no permission
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(0, policy, os.sched_param(_FIFO_PRIORITY))
-    except OSError as error:
-        return f"{error.strerror}; it takes CAP_SYS_NICE or a limit on rtprio"
-    return ""
+        return True
+    return False

@@ -1,7 +1,8 @@
-"""Run a pod's `link` container: choose relay or netem, and follow changes of profile and peer.
+"""Shape one direction of the link: choose relay or netem, follow changes of profile and peer.
 
-The peer is the end of the tunnel in the other pod. The route file contains the address to which
-this pod's end of the tunnel has to send.
+The sidecar delays the datagrams that one end of the tunnel sends, its own end: the end in the same
+pod, or one end of a local run. The peer is the other end. The route file contains the address to
+which the own end has to send.
 """
 
 from __future__ import annotations
@@ -9,23 +10,27 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 from cloudrc.errors import CloudrcError
 from cloudrc.link.follow import Loaded
-from cloudrc.link.netem import Netem
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.relay import Address, RelayShaper
-from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, StateFile, publish
+from cloudrc.link.relay import Address, Relay
+from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, publish, summary, to_text
+
+if TYPE_CHECKING:
+    from cloudrc.link.netem import Netem
 
 Mode: TypeAlias = Literal["auto", "netem", "relay"]
 """Setting `link.mode`: the only allowed shaper, or "auto": netem if it works, else the relay."""
-COUNT_PERIOD_NS = 1_000_000_000  # time between two updates of metrics and lateness file [ns]
+COUNT_PERIOD_NS = 1_000_000_000  # time between two updates of the metrics [ns]
 STEP = 0.05  # longest time until `run` reacts to a new peer or profile [s]
 
-Shaper: TypeAlias = RelayShaper | Netem
-"""Shapes the datagrams that this pod's end of the tunnel sends."""
+Shaper: TypeAlias = "Relay | Netem"
+"""Shapes the datagrams that the own end of the tunnel sends."""
 Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
 """Function that makes a shaper from a profile and the monotonic start of its time line [ns]."""
 
@@ -33,7 +38,7 @@ Make: TypeAlias = Callable[[DirectionProfile, int], Shaper]
 class Machine(NamedTuple):
     """Functions that a sidecar calls on its machine: shapers, clock, sleep and log."""
 
-    relay: Make  # makes a `RelayShaper`
+    relay: Make  # makes a `Relay`
     netem: Make  # makes a `Netem`, without changing the network yet
     clock: Callable[[], int]  # returns the time on the monotonic clock [ns]
     wait: Callable[[float], None]  # sleeps for a time [s]
@@ -41,10 +46,11 @@ class Machine(NamedTuple):
 
 
 class Sidecar:
-    """Shapes the datagrams that this pod's end of the tunnel sends.
+    """Shapes the datagrams that the own end of the tunnel sends.
 
-    Another thread sets `peer`, the address of the other pod's end, and `profile`, the requested
-    profile.
+    Other threads set `peer`, the address of the other end, and `profile`, the requested profile.
+    They also call `publish_released`, because the loop that forwards must not wait for a disk.
+    `state` is the last state that is published, None before the first.
     """
 
     def __init__(
@@ -66,11 +72,13 @@ class Sidecar:
         """
         self.peer: Address | None = None
         self.profile = profile
-        self.states = StateFile(route.with_name(STATE_FILE), mode, direction)
+        self.state: LinkState | None = None
         self._machine, self._tell, self._count = machine, tell, count
         self._mode, self._direction, self._route = mode, direction, route
-        self._released_file = self.states.path.with_suffix(RELEASED_SUFFIX)
+        self._state_file = route.with_name(STATE_FILE)
+        self._released_file = self._state_file.with_suffix(RELEASED_SUFFIX)
         self._reason, self._origin_ns = "", 0
+        self._shaper: Shaper | None = None
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Wait until the peer is known, then shape datagrams until `stop` returns True.
@@ -92,15 +100,23 @@ class Sidecar:
             for file in (self._route, self._released_file):
                 file.unlink(missing_ok=True)
 
+    def publish_released(self) -> None:
+        """Write the lateness of datagrams to a file, which the own end of the tunnel reads."""
+        shaper = self._shaper  # another thread may replace it
+        if shaper and (released := shaper.released()):
+            with suppress(OSError):
+                publish(self._released_file, json.dumps(released))
+
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
-        """Use one shaper until `stop` returns True, or until a profile needs the other shaper."""
+        """Run netem or the relay until `stop()` is true, or until a profile needs the other."""
         profile, machine = self.profile, self._machine
-        if self.states.state and profile.change.restart:
+        if self.state and profile.change.restart:
             self._origin_ns = machine.clock()
         shaper, route = self._choose(profile, peer)
+        self._shaper = shaper
         try:
             machine.log(f"{shaper.name} shapes the {self._direction} ({self._reason})")
-            state = self._publish_state(shaper, profile)
+            state = self._publish_state(self._next_state(shaper, profile))
             self._publish_route(route)
             self._tell(state)
             count_ns = machine.clock()
@@ -116,8 +132,8 @@ class Sidecar:
                 if (now_ns := machine.clock()) >= count_ns:
                     count_ns = now_ns + COUNT_PERIOD_NS
                     self._count(shaper.counts())
-                    self._publish_released(shaper)
         finally:
+            self._shaper = None
             shaper.close()
 
     def _choose(self, profile: Loaded, peer: Address) -> tuple[Shaper, Address]:
@@ -136,7 +152,7 @@ class Sidecar:
         return relay, relay.follow_peer(peer)
 
     def _replace(self, shaper: Shaper, profile: Loaded) -> bool:
-        """Apply or refuse a new profile; return False if only the other shaper can apply it."""
+        """Apply or refuse a new profile; return False if the relay has to replace netem for it."""
         restart = profile.change.restart
         try:
             shaper.follow_profile(profile.direction, restart=restart)
@@ -145,27 +161,39 @@ class Sidecar:
                 self._machine.log(f"the shaper changes to the relay: {_cause(error)}")
                 return False
             self._machine.log(f"the new profile is refused, the old one stays: {error}")
-            with suppress(OSError):
-                self.states.refuse(profile.change.number, str(error))
+            if self.state:
+                number = profile.change.number
+                self._publish_state(replace(self.state, refused=number, refusal=str(error)))
             return True
         if restart:
             self._origin_ns = self._machine.clock()
         self._machine.log(f"the new profile is in force ({profile.change.cause})")
-        self._tell(self._publish_state(shaper, profile))
+        self._tell(self._publish_state(self._next_state(shaper, profile)))
         return True
 
-    def _publish_state(self, shaper: Shaper, profile: Loaded) -> LinkState:
-        now_ns = self._machine.clock()
-        state = self.states.next(profile, shaper.name, self._reason, now_ns, self._origin_ns)
-        with suppress(OSError):  # shaping continues even if the disk is full
-            self.states.publish(state)
-        return state
+    def _next_state(self, shaper: Shaper, profile: Loaded) -> LinkState:
+        """Return the state after a change of profile or shaper."""
+        before = self.state
+        return LinkState(
+            shaper=shaper.name,
+            reason=self._reason,
+            mode=self._mode,
+            direction=self._direction,
+            profile=profile.values,
+            since=datetime.now(UTC).isoformat(timespec="seconds"),
+            since_ns=self._machine.clock(),
+            changes=before.changes + 1 if before else 0,
+            change=profile.change.number,
+            cause=profile.change.cause if before else "",
+            asked=summary(profile.direction),
+            origin_ns=self._origin_ns,
+        )
 
-    def _publish_released(self, shaper: Shaper) -> None:
-        """Write the lateness of datagrams to a file, which the pod's world or cloud reads."""
-        if released := shaper.released():
-            with suppress(OSError):
-                publish(self._released_file, json.dumps(released))
+    def _publish_state(self, state: LinkState) -> LinkState:
+        self.state = state
+        with suppress(OSError):  # shaping continues even if the disk is full
+            publish(self._state_file, to_text(state))
+        return state
 
     def _publish_route(self, route: Address) -> None:
         publish(self._route, f"{route[0]}:{route[1]}\n")

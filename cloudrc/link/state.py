@@ -7,8 +7,7 @@ records each change; `cloudrc link set` reads in it whether a change has taken e
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field, replace
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -19,10 +18,7 @@ from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
-    from cloudrc.link.follow import Loaded
-
 STATE_FILE = "link.json"  # name of the state file, in the folder of the route file
-PROFILE_FILE = "profile.json"  # profile of a local run's relay, in the folder of the state files
 STATE_MAX = 1 << 16
 """Size limit of a state file that world or cloud reads [bytes]: room for a time line of about 800
 changes. Reading a file of 1 MiB could block the control loop for 2 s."""
@@ -63,54 +59,9 @@ class LinkState:
     change: str = ""  # number of the last change that took effect; "" if unknown
     cause: str = ""  # why the profile was changed, in words; "" before the first change
     asked: dict[str, float | None] = field(default_factory=dict)  # the result of `summary`
-    origin_ns: int | None = None  # start of the time line [ns]; None: the old one continues
+    origin_ns: int = 0  # start of the time line [ns]
     refused: str = ""  # number of the last refused change; "" if no change was refused
     refusal: str = ""  # why the last refused change was refused, in words
-
-
-class StateFile:
-    """Writes the state file of one direction of the link.
-
-    Attributes:
-        state: The last state written to the file; None before the first.
-    """
-
-    def __init__(self, path: Path, mode: str, direction: str) -> None:
-        """Set the file, the requested shaper `mode`, and `direction`, "uplink" or "downlink"."""
-        self.path, self._mode, self._direction = path, mode, direction
-        self.state: LinkState | None = None
-
-    def next(
-        self, loaded: Loaded, shaper: str, reason: str, since_ns: int, origin_ns: int | None
-    ) -> LinkState:
-        """Return the state after a change of profile or shaper; `loaded` is the present profile.
-
-        The other arguments are the fields of `LinkState` with the same names.
-        """
-        return LinkState(
-            shaper=shaper,
-            reason=reason,
-            mode=self._mode,
-            direction=self._direction,
-            profile=loaded.values,
-            since=datetime.now(UTC).isoformat(timespec="seconds"),
-            since_ns=since_ns,
-            changes=self.state.changes + 1 if self.state else 0,
-            change=loaded.change.number,
-            cause=loaded.change.cause if self.state else "",
-            asked=summary(loaded.direction),
-            origin_ns=origin_ns,
-        )
-
-    def publish(self, state: LinkState) -> None:
-        """Write a state to the file; raise an OSError if this fails."""
-        publish(self.path, to_text(state))
-        self.state = state
-
-    def refuse(self, number: str, refusal: str) -> None:
-        """Note in the file that change `number` was refused; `refusal` is the reason, in words."""
-        if self.state is not None:
-            self.publish(replace(self.state, refused=number, refusal=refusal))
 
 
 def to_text(state: LinkState) -> str:

@@ -80,7 +80,7 @@ def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
 
 
 def parse_trace(lines: Iterable[str], name: str) -> Trace:
-    """Parse the lines of the trace file `name`; raise the errors of `read_trace`.
+    """Parse the lines of the trace file `name`; raise a BadInputError if they are no trace.
 
     If the first row's time is above `START_MAX` [s], subtract this time from all times.
     """
@@ -206,7 +206,7 @@ def _cells(line: str, separator: str, where: str) -> list[str]:
 def looks_lost(values: Collection[float]) -> bool:
     """Return whether a 0 in `values`, delays in any unit, probably means a lost packet.
 
-    It does if all other delays are far from 0. Otherwise 0 may be a short delay that was rounded.
+    A 0 means loss if all other delays are far from 0. Otherwise it may be a rounded short delay.
     """
     decimals = max((len(f"{value:.12g}".partition(".")[2]) for value in values), default=0)
     shortest = min((value for value in values if value > 0.0), default=0.0)

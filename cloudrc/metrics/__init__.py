@@ -14,7 +14,7 @@ from math import isfinite
 from pathlib import Path
 
 from cloudrc import plugins
-from cloudrc.errors import BadInputError
+from cloudrc.errors import BadInputError, describe_error
 from cloudrc.metrics import control, link, mission, response
 from cloudrc.metrics.flight import SHIPPED, Flight, Metric
 
@@ -31,6 +31,16 @@ class Number:
     value: float  # finite
     unit: str  # SI unit as text; "1" for counts and shares
     meaning: str  # one sentence
+
+
+def scale(unit: str, largest: float) -> tuple[float, str]:
+    """Return a factor and a new unit for small values: 1000 and "mm" if the unit is "m".
+
+    `largest` [`unit`] is the largest of the values. If it is not small, the factor is 1.
+    """
+    if 0 < largest < {"m": 0.1, "s": 1.0}.get(unit, 0.0):
+        return 1e3, f"m{unit}"
+    return 1.0, "" if unit == "1" else unit
 
 
 def find(choice: str) -> Metric:
@@ -87,10 +97,11 @@ def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
 
 
 def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Number], list[str]]:
-    """Compute the metrics of cloudrc, of installed packages and of the user (`own`, as for `find`).
+    """Compute the metrics of cloudrc, of installed packages and of the user.
 
-    Return the known numbers by name, sorted, and a note for each metric that failed. An exception
-    in a user's metric affects only this metric.
+    `own` lists the user's metrics by name or file path. Return the known numbers by name, sorted,
+    and a note for each metric that failed. An exception in a user's metric affects only this
+    metric.
     """
     numbers: dict[str, Number] = {}
     notes: list[str] = []
@@ -104,5 +115,5 @@ def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Numb
             elif value is not None:
                 notes.append(f"{METRIC_NOTE}{name} gave {value}: left out")
         except Exception as error:
-            notes.append(f"{METRIC_NOTE}{name} failed: {type(error).__name__}: {error}")
+            notes.append(f"{METRIC_NOTE}{name} failed: {describe_error(error)}")
     return numbers, notes

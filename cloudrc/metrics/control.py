@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cloudrc.metrics.flight import Columns, Flight, add_metrics, mean, percentile, rms
+from cloudrc.metrics.flight import Columns, Flight, add_metrics, mean, percentile, rms, select
 
 
 def round_trips(flight: Flight) -> Columns:
@@ -16,7 +16,7 @@ def round_trips(flight: Flight) -> Columns:
     pair = np.stack([control["rtt"], control["loop_delay"]], axis=1)
     new = np.ones(len(pair), dtype=bool)
     new[1:] = (pair[1:] != pair[:-1]).any(axis=1)
-    return {name: column[new] for name, column in control.items()}
+    return select(control, new)
 
 
 def _age_of_information(flight: Flight) -> float | None:
@@ -29,7 +29,8 @@ def _age_of_information(flight: Flight) -> float | None:
 def _prediction_error(flight: Flight) -> float | None:
     """Compute the RMS distance from the predicted to the true position of the robot [m].
 
-    The true position is taken when the robot applies the command: delay errors contribute.
+    The true position is that at the time when the robot applies the command. So an error of the
+    estimated delay adds to the result.
     Source: docs/reference/control.md, "Predictors".
     """
     applied = flight.applied
@@ -59,8 +60,7 @@ def wakes(flight: Flight, end: str) -> Columns:
     There are no rows in virtual time.
     """
     columns = flight.during("/lateness")
-    rows = columns["end"] == end
-    return {name: column[rows] for name, column in columns.items()}
+    return select(columns, columns["end"] == end)
 
 
 def _slip(flight: Flight) -> float | None:

@@ -113,8 +113,7 @@ class Flight:
         stamps = reduce(np.intersect1d, [table["stamp_ns"] for table in tables])
         columns: Columns = {}
         for table in tables:
-            rows = np.searchsorted(table["stamp_ns"], stamps)
-            columns |= {name: column[rows] for name, column in table.items()}
+            columns |= select(table, np.searchsorted(table["stamp_ns"], stamps))
         return columns
 
     @cached_property
@@ -152,8 +151,7 @@ class Flight:
         keys = zip(commands["epoch"], commands["counter"], strict=True)
         joined = np.array([rows.get(key, -1) for key in keys], dtype=np.int64)
         known, source = joined >= 0, joined[joined >= 0]
-        columns = {name: column[source] for name, column in self._control.items()}
-        columns |= {name: column[known] for name, column in commands.items()}
+        columns = select(self._control, source) | select(commands, known)
         planned, stamp = columns["planned_ns"], columns["stamp_ns"]
         return columns | {"stamp_ns": np.where(planned >= 0, planned, stamp)}
 
@@ -163,11 +161,16 @@ class Flight:
             rows = np.zeros(len(stamps), dtype=bool)
         else:
             rows = (stamps >= self.start_ns) & (stamps <= self.end_ns)
-        return {name: column[rows] for name, column in columns.items()}
+        return select(columns, rows)
 
 
 def _columns(table: Table) -> Columns:
     return {name: table[name] for name in table.names}
+
+
+def select(columns: Columns, rows: Array) -> Columns:
+    """Select rows of all columns by `rows` [1]: an index, indices, or a truth value per row."""
+    return {name: column[rows] for name, column in columns.items()}
 
 
 Measure: TypeAlias = Callable[[Flight], float | None]

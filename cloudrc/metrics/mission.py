@@ -9,7 +9,7 @@ import numpy as np
 
 from cloudrc.config.schema import Waypoint
 from cloudrc.messages import GuardState
-from cloudrc.metrics.flight import Array, Flight, Measure, add_metrics, mean
+from cloudrc.metrics.flight import Array, Flight, Measure, add_metrics, mean, select
 
 BOARD = "board"
 """Name in the scene of the board that the arm must touch."""
@@ -34,7 +34,7 @@ def first_touch(flight: Flight) -> dict[str, Array] | None:
     """Return the first row of /contact in which the arm's tip touches the board, else None."""
     contact = flight.during("/contact")
     touches = np.flatnonzero((contact["body"] == BOARD) & contact["tip"].astype(bool))
-    return {name: column[touches[0]] for name, column in contact.items()} if len(touches) else None
+    return select(contact, touches[0]) if len(touches) else None
 
 
 def holds(flight: Flight) -> list[tuple[int, int]]:

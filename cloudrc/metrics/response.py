@@ -94,8 +94,8 @@ def _measure(flight: Flight, row: int, end_ns: int) -> Step | None:
 def _integral(values: Array, times: Array) -> float:
     """Integrate `values` over `times` [s] by the trapezoidal rule.
 
-    The function avoids `numpy.trapezoid`, which needs numpy 2, and `@`, because the last bit of
-    its result depends on the addresses of the arrays.
+    `numpy.trapezoid` needs numpy 2. The last bit of a product by `@` depends on the addresses of
+    the arrays. Therefore the function uses neither.
     """
     return float(((values[1:] + values[:-1]) / 2 * np.diff(times)).sum())
 

@@ -266,7 +266,7 @@ def _plugins(flight: Flight) -> Iterator[Failure]:
 
 
 def _responses(flight: Flight, settle: float) -> Iterator[Failure]:
-    """Yield a failure if a step's last error exceeds `settle` [m]; another for instability."""
+    """Yield a failure if a step did not settle to `settle` [m]; another for an unstable loop."""
     found, unit = steps(flight), "step" if flight.mission.steps else "waypoint"
     far = [step for step in found if step.last_error > settle]
     if far and flight.mission.steps:
@@ -300,9 +300,9 @@ def _not_real_time(numbers: Mapping[str, Number]) -> str:
 def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, Number]) -> Verdict:
     """Judge a recorded mission with only what the operator knows when the mission ends.
 
-    The operator judges waypoints by the measured position, and timing by the real-time factor. The
-    operator knows neither the report's time limit, nor contacts that telemetry reports only after
-    the end. All other facts are those of the report's `evidence`.
+    A waypoint is reached if teleop reported it, and timing is judged by the real-time factor alone.
+    Contacts count if telemetry reported them before the end. The time limit and violations other
+    than contacts with pipes do not count. All other facts are those of the report's `evidence`.
     """
     basis = flight.control["basis_stamp_ns"]
     seen_ns = int(basis[-1]) if len(basis) else 0
@@ -340,7 +340,7 @@ class Observations:
     def evidence(self, ending: Ending, elapsed: float, **known: Any) -> Evidence:
         """Return the evidence on a mission that ended at mission time `elapsed` [s].
 
-        `known` contains further fields of `Evidence`.
+        `known` sets further fields of the returned `Evidence`.
         """
         return Evidence(
             ending=ending,

@@ -77,7 +77,7 @@ def clock_offset(world: Recording, cloud: Recording) -> ClockOffset:
 
 
 def _smallest_difference(sent: Table, arrived: Table) -> int | None:
-    """Return the smallest delay plus clock offset of a packet [ns]; None if no packet arrived."""
+    """Return the least (arrival stamp - sending stamp) of a packet [ns]; None if none arrived."""
 
     def packets(table: Table) -> Iterator[tuple[tuple[int, int], int]]:
         numbers = zip(table["epoch"].tolist(), table["counter"].tolist(), strict=True)
@@ -159,8 +159,9 @@ def _join(world: Recording, cloud: Recording) -> Recording:
 def cut_to_last_mission(mission: Recording) -> bool:
     """Reduce a pod's recording of several missions to the mission that was started last.
 
-    Return whether the recording contains the end of that mission. If it does, nothing is missing:
-    remove from `mission.note` the remark that the file is cut short. The pod was still writing it.
+    Return whether the recording contains the end of that mission. If it does, remove the remark
+    that the file is cut short from `mission.note`: the pod was still writing the file, but the
+    mission is complete.
     """
     began, ended, earlier = _last_mission(mission)
     until = mission.messages[-1][1] if mission.messages else 0

@@ -184,7 +184,7 @@ class _File:
 
     @property
     def unread(self) -> int:
-        """Size of the part of the file that was not read [bytes]; 0 if only its index is bad."""
+        """Size of the unread part of the file [bytes]; 0 if only the file's index is damaged."""
         return 0 if self.data_ended and not self.ended else self.size - self.position
 
     @property

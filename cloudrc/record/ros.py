@@ -105,7 +105,7 @@ def encode(topic: Topic, stamp_ns: int, values: Values) -> bytes:
 
 
 def encode_view(topic: str, *values: Any) -> bytes:
-    """Encode a message of one of `VIEWS`, with the values of its fields, as little-endian CDR."""
+    """Encode the field values of a message for viewers (topic in `VIEWS`) as little-endian CDR."""
     message = _type[VIEWS[topic]](*values)
     return bytes(STORE.serialize_cdr(message, VIEWS[topic], little_endian=True))
 

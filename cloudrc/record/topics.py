@@ -197,7 +197,7 @@ _TABLE = (
         Field("cause", "string", "", "why it changed; empty before the first change"),
         Field("age", "float", "s", "time since these conditions took effect"),
         Field("time_line", "float", "s",
-            "time since the time line (changes, blackouts, trace) began; NaN: not restarted"),
+            "time since the time line (changes, blackouts, trace) began"),
         Field("delay", "float", "s", "profile's delay at the start of the time line, one way"),
         Field("jitter", "float", "s", "profile's jitter at the start of the time line"),
         Field("loss", "float", "1", "profile's mean loss at the start of the time line"),

@@ -51,7 +51,7 @@ reader detects messages that were removed or added."""
 
 
 class McapWriter:
-    """Writes the rows of world, of cloud, or of both to one MCAP file."""
+    """Writes the messages of world, of cloud, or of both to one MCAP file."""
 
     def __init__(
         self,

@@ -16,7 +16,7 @@ from typing import Any
 
 from cloudrc import __version__
 from cloudrc.config.load import ResolvedExperiment, dump
-from cloudrc.metrics import SHIPPED, Flight, Number
+from cloudrc.metrics import SHIPPED, Flight, Number, scale
 from cloudrc.metrics.verdict import Failure
 from cloudrc.record import wall_time
 from cloudrc.report.document import Assessment, Run
@@ -55,7 +55,7 @@ SHARES = ("loss_", "late_", "overshoot_")
 
 
 def main_numbers(numbers: Mapping[str, Number]) -> list[tuple[str, str, str]]:
-    """Return label, digits and unit of each number of a summary that was measured."""
+    """Return label, digits and unit of each number in `MAIN` that was measured."""
     return [
         (text, *readable(name, numbers[name])) for name, text in MAIN.items() if name in numbers
     ]
@@ -167,16 +167,14 @@ def _table_rows(numbers: Mapping[str, Number]) -> str:
 
 def readable(name: str, number: Number) -> tuple[str, str]:
     """Convert a value to a readable unit; return the digits and the unit as text."""
-    value, unit = number.value, number.unit
+    value, (factor, unit) = number.value, scale(number.unit, abs(number.value))
     if value == 0:
-        return "0", "" if unit == "1" else unit
-    if unit == "1":
-        if name.startswith(SHARES):
-            return f"{value * 100:.2f}", "%"
-        return (f"{value:.0f}" if value.is_integer() else f"{value:.4g}"), ""
-    if unit in ("s", "m") and abs(value) < (1.0 if unit == "s" else 0.1):
-        return _digits(value * 1e3), f"m{unit}"
-    return _digits(value), unit
+        return "0", unit
+    if unit:
+        return _digits(value * factor), unit
+    if name.startswith(SHARES):
+        return f"{value * 100:.2f}", "%"
+    return (f"{value:.0f}" if value.is_integer() else f"{value:.4g}"), ""
 
 
 def _digits(value: float) -> str:

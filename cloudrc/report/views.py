@@ -18,7 +18,7 @@ import numpy as np
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.geometry.scene import Pipe, load_scene
 from cloudrc.metrics import Flight
-from cloudrc.metrics.flight import Columns
+from cloudrc.metrics.flight import Columns, select
 from cloudrc.record.columns import Recording
 from cloudrc.record.ros import encode_view, header, part
 from cloudrc.report.solids import PATH, Face, board_faces, bore, robot_faces, strip
@@ -69,8 +69,7 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[View]:
 
 def _thin(columns: Columns) -> Columns:
     """Keep the first row of `columns` in each period of length `PERIOD_NS`."""
-    rows = np.flatnonzero(np.diff(columns["stamp_ns"] // PERIOD_NS, prepend=-1))
-    return {name: column[rows] for name, column in columns.items()}
+    return select(columns, np.flatnonzero(np.diff(columns["stamp_ns"] // PERIOD_NS, prepend=-1)))
 
 
 def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from statistics import median
@@ -60,9 +60,7 @@ def compare(
         why = f"each has {LEFT_OUT}: {bad[0]}" if bad else "none was found"
         raise BadInputError(f"no pair of flights to compare: {why}")
     known = sorted({n for _, a, b in flown for n in a["numbers"].keys() & b["numbers"].keys()})
-    for name in names:
-        if name not in known:
-            raise BadInputError(f"--number: {unknown_name_text('number', name, known)}")
+    check_names(names, known)
     chosen = names or [name for name in NUMBERS if name in known]
     return {
         "pairs": len(flown),
@@ -74,6 +72,13 @@ def compare(
             {**label, "a": _flight(a, chosen), "b": _flight(b, chosen)} for label, a, b in pairs
         ],
     }
+
+
+def check_names(names: Iterable[str], known: Collection[str]) -> None:
+    """Raise a BadInputError if one of the `names` that the user gave is no `known` metric."""
+    for name in names:
+        if name not in known:
+            raise BadInputError(f"--number: {unknown_name_text('number', name, sorted(known))}")
 
 
 def _number(pairs: Sequence[Pair], name: str, unit: str) -> dict[str, Any]:
@@ -105,16 +110,6 @@ def _success(pairs: Sequence[Pair]) -> dict[str, Any]:
 def _flight(row: Row, names: Sequence[str]) -> dict[str, Any]:
     numbers = {name: row["numbers"][name] for name in names if name in row["numbers"]}
     return {"verdict": row["verdict"], "numbers": numbers}
-
-
-def scale(unit: str, largest: float) -> tuple[float, str]:
-    """Return a factor and a new unit for small values: 1000 and "mm" if the unit is "m".
-
-    `largest` [`unit`] is the largest of the values. If it is not small, the factor is 1.
-    """
-    if 0 < largest < {"m": 0.1, "s": 1.0}.get(unit, 0.0):
-        return 1e3, f"m{unit}"
-    return 1.0, "" if unit == "1" else unit
 
 
 def of_sweep(folder: Path, a: str, b: str) -> Found:

@@ -8,10 +8,11 @@ from statistics import median
 from typing import Any
 
 from cloudrc.errors import BadInputError
+from cloudrc.metrics import scale
 from cloudrc.plugins import unknown_name_text
 from cloudrc.report.figures.bands import Panel, Point, draw
 from cloudrc.report.figures.style import Look
-from cloudrc.sweep.compare import NUMBERS, scale
+from cloudrc.sweep.compare import NUMBERS, check_names
 from cloudrc.sweep.flight import Row, counts
 from cloudrc.sweep.statistics import median_interval, wilson_interval
 from cloudrc.sweep.store import values_of
@@ -51,9 +52,7 @@ def draw_sweep(
         BadInputError: If the sweep lacks an axis or a metric.
     """
     known = sorted({name for row in rows if counts(row) for name in row["numbers"]})
-    for name in names:
-        if name not in known:
-            raise BadInputError(f"--number: {unknown_name_text('number', name, known)}")
+    check_names(names, known)
     values, x, by, pooled = _choose(rows, x, by)
     is_numeric = _is_numeric(values[x])
     along = sorted(values[x]) if is_numeric else values[x]
@@ -80,9 +79,9 @@ def draw_sweep(
 def _choose(
     rows: Sequence[Row], x: str | None, by: str | None
 ) -> tuple[dict[str, list[Any]], str, str | None, list[str]]:
-    """Choose which axis of the sweep is the figure's x axis, and which axis has a line per value.
+    """Choose the axis of the sweep for the figure's x axis, and the axis with one line per value.
 
-    `x` and `by` are the user's choices; None: choose here. Return the values of each axis, the x
+    `x` and `by` are the user's choices of these two, or None. Return the values of each axis, the x
     axis, the axis of the lines (None if no axis is left), and the other axes.
     """
     values = values_of(rows)

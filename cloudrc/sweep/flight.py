@@ -9,7 +9,6 @@ from cloudrc import assembly, metrics, plugins
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.errors import describe_error
 from cloudrc.record.columns import Recording, RecordStore
-from cloudrc.records import Record
 from cloudrc.report.document import Assessment, Run
 from cloudrc.report.write import assess
 
@@ -65,12 +64,6 @@ def units(own: Iterable[str]) -> dict[str, str]:
 def fly_in_memory(experiment: ResolvedExperiment) -> Assessment:
     """Fly an experiment in virtual time, and measure and judge it, without any file."""
     store = RecordStore()
-    _, cloud, flight = assembly.assemble(experiment)
-    limit_ns = round(assembly.flight_limit(experiment) * 1e9)
-
-    def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
-        store.add(from_world, flight.on_world_clock(from_cloud))
-
-    flight.fly(lambda: cloud.mission_over, limit_ns, sink)
+    assembly.fly(experiment, store.add)
     run = Run("virtual", "virtual", notes=assembly.virtual_notes(experiment))
     return assess(Recording(records=store), experiment, run, experiment.report.metrics)

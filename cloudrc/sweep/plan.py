@@ -28,6 +28,7 @@ from cloudrc.config.overrides import collect_settings
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError
+from cloudrc.sweep.flight import Row
 
 SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
 """Largest seed, and largest number of seeds."""
@@ -64,6 +65,10 @@ class Flight(NamedTuple):
     def experiment(self) -> ResolvedExperiment:
         """The experiment of the point, with the seed of this flight."""
         return self.resolved.model_copy(update={"seed": self.seed})
+
+    def row(self, flown: Row) -> Row:
+        """Return the flight's row in the sweep; `flown` has the results, such as the verdict."""
+        return {"key": self.key, "point": self.point, "seed": self.seed, **flown}
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,11 +114,6 @@ def read_plan(path: Path) -> Plan:
     return Plan(document.tree | {"folder": str(folder)}, labels, seeds, points, flights)
 
 
-def flight_key(point: ResolvedExperiment, seed: int) -> str:
-    """Return the key that identifies a flight: a hash of its experiment `point` and its seed."""
-    return _key(_everything(point), seed)
-
-
 def _everything(point: ResolvedExperiment) -> dict[str, Any]:
     values, cloud = point.model_dump(mode="json"), point.cloud
     chosen = ("estimators", cloud.estimator), ("predictors", cloud.predictor)
@@ -138,6 +138,7 @@ def _code(kind: str, name: str) -> str:
 
 
 def _key(everything: Mapping[str, Any], seed: int) -> str:
+    """Return the key of a flight: a hash of all that decides about it, and of its seed."""
     text = json.dumps({**everything, "seed": seed}, sort_keys=True)
     return sha256(text.encode()).hexdigest()[:16]
 
@@ -211,13 +212,14 @@ def unpack(path: Path) -> list[Flight]:
     """Read the flights from a file made by `pack`; raise a BadInputError if it is unusable."""
     try:
         content = json.loads(gzip.decompress(path.read_bytes()))
-        points = [
-            (point, ResolvedExperiment.model_validate_json(json.dumps(values)))
-            for point, values in content["points"]
-        ]
+        points = list[tuple[dict[str, Any], ResolvedExperiment, dict[str, Any]]]()
+        for point, values in content["points"]:
+            resolved = ResolvedExperiment.model_validate_json(json.dumps(values))
+            points.append((point, resolved, _everything(resolved)))
+        chosen = ((*points[index], seed) for index, seed in content["flights"])
         return [
-            Flight(flight_key(points[index][1], seed), points[index][0], seed, points[index][1])
-            for index, seed in content["flights"]
+            Flight(_key(everything, seed), point, seed, resolved)
+            for point, resolved, everything, seed in chosen
         ]
     except (OSError, EOFError, ValueError, LookupError, TypeError) as error:
         text = f"is not a file of flights of this version of cloudrc ({type(error).__name__})"

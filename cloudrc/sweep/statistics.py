@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from statistics import NormalDist
 from typing import Any
 
@@ -34,14 +35,15 @@ def median_interval(values: Sequence[float]) -> tuple[float, float] | None:
 
     Source: H. A. David, H. N. Nagaraja, Order Statistics, 3rd ed., 2003, section 7.1.
     """
-    ordered, n = sorted(values), len(values)
-    outside, k = 0.0, 0
-    while k < n // 2:
-        outside += 2 * math.comb(n, k) / 2**n
-        if 1 - outside < 1 - LEVEL:
-            break
-        k += 1
-    return (ordered[k - 1], ordered[n - k]) if k else None
+    ordered, k = sorted(values), _outermost(len(values))
+    return (ordered[k - 1], ordered[-k]) if k else None
+
+
+@cache  # the metrics of a sweep have the same number of values
+def _outermost(n: int) -> int:
+    """Return the k of `median_interval` for `n` values; 0 if there is none."""
+    chances = np.cumsum([math.comb(n, i) / 2**n for i in range(n // 2)])
+    return int(np.searchsorted(chances, LEVEL / 2, side="right"))
 
 
 def wilson_interval(successes: int, count: int) -> tuple[float, float]:
@@ -89,30 +91,23 @@ def signed_rank_test(differences: Sequence[float]) -> float:
     doubled = (2 * np.cumsum(counts) - counts + 1)[kinds]  # twice the rank: a whole number
     total = int(doubled[values > 0].sum())
     smaller = min(total, int(doubled.sum()) - total)
-    return min(1.0, 2 * _chance_at_most(smaller, doubled))
-
-
-def _chance_at_most(total: int, doubled: NDArray[Any]) -> float:
-    """Return the probability that the sum of the positive ranks, times 2, is at most `total`.
-
-    Each rank is positive or negative with probability 1/2. `doubled` contains each rank times 2, a
-    whole number even if differences are tied, shape (n,).
-    """
     if len(doubled) > EXACT_MAX:
         spread = math.sqrt(float((doubled.astype(float) ** 2).sum()) / 4)
-        return NormalDist().cdf((total + 1 - doubled.sum() / 2) / spread)
-    return float(_sums(doubled)[: total + 1].sum())
+        p = NormalDist().cdf((smaller + 1 - doubled.sum() / 2) / spread)
+    else:
+        p = float(_sums(doubled)[: smaller + 1].sum())
+    return min(1.0, 2 * p)
 
 
-def _sums(doubled: NDArray[Any]) -> NDArray[Any]:
-    """Return the distribution of S, the sum of the positive ranks times 2, if there is no effect.
+def _sums(ranks: NDArray[Any]) -> NDArray[Any]:
+    """Return the distribution of S, the sum of the positive ranks.
 
-    Element k is the probability that S = k. Each rank is positive or negative with probability 1/2.
-    `doubled` contains each rank times 2, shape (n,).
+    Element k is the probability that S = k, if each of `ranks`, whole numbers of shape (n,), is
+    positive or negative with probability 1/2.
     """
-    chances = np.zeros(int(doubled.sum()) + 1)
+    chances = np.zeros(int(ranks.sum()) + 1)
     chances[0] = 1.0
-    for rank in doubled:
+    for rank in ranks:
         chances /= 2
         chances[rank:] += chances[:-rank].copy()
     return chances
@@ -120,7 +115,7 @@ def _sums(doubled: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True, slots=True)
 class Paired:
-    """Evaluation of paired differences B - A of one metric; "u" is the unit of the metric."""
+    """Evaluation of paired differences B - A of one metric; [u] is the unit of the metric."""
 
     count: int
     lower: int  # pairs in which B is below A
@@ -164,7 +159,7 @@ def _cut(n: int) -> int:
     if n > EXACT_MAX:
         mean, spread = n * (n + 1) / 4, math.sqrt(n * (n + 1) * (2 * n + 1) / 24)
         return math.floor(mean - 0.5 - Z * spread)
-    chances = np.cumsum(_sums(np.arange(2, 2 * n + 1, 2))[::2])
+    chances = np.cumsum(_sums(np.arange(1, n + 1)))
     return int(np.searchsorted(chances, LEVEL / 2, side="right")) - 1
 
 

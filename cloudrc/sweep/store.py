@@ -21,17 +21,12 @@ from cloudrc.config.document import write_yaml
 from cloudrc.errors import BadInputError
 from cloudrc.files import write_atomically
 from cloudrc.sweep.flight import Row, units
-from cloudrc.sweep.plan import Flight, Plan
+from cloudrc.sweep.plan import Plan
 
 FILE, SUMMARY = "sweep.yaml", "sweep.json"
 FIELDS = {"key", "point", "seed", "verdict", "failures", "text", "numbers", "records_sha256"}
 """Fields of a row."""
 TABLE, PARQUET = "table.csv", "table.parquet"
-
-
-def make_row(flight: Flight, flown: Row) -> Row:
-    """Make the row of a flight in a sweep; `flown` has its results, such as the verdict."""
-    return {"key": flight.key, "point": flight.point, "seed": flight.seed, **flown}
 
 
 def read_rows(folder: Path) -> dict[str, Row]:
@@ -80,7 +75,7 @@ def append_rows(folder: Path, shard: int | None) -> Iterator[Callable[[Row], Non
 
 
 def begin(folder: Path, plan: Plan) -> dict[str, Row]:
-    """Write the description of a sweep into `folder`; return its earlier rows, key -> row.
+    """Write the file of a sweep into `folder`; return flight key -> row of earlier flights.
 
     Raises:
         BadInputError: If the folder has rows of another sweep.

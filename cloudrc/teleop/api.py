@@ -93,7 +93,7 @@ class Bridge:
         self._service: MissionService | None = None
 
     def open(self, service: MissionService) -> None:
-        """Begin to accept calls; they are made on `service`."""
+        """Accept all calls from now on; teleop's loop makes them on `service`."""
         self._service, self.closed = service, ""
 
     def close(self, why: str) -> None:
@@ -134,7 +134,7 @@ class Bridge:
             raise UnavailableError(text) from None
 
     async def move(self, call: Call) -> Any:
-        """Queue a call that may move the robot; a later stop or hold cancels the call."""
+        """Like `ask`, for a call that may move the robot; a later stop or hold cancels the call."""
         known = self.overtakings
 
         def checked(service: MissionService, now_ns: int) -> Any:

@@ -88,7 +88,8 @@ def steer(setpoint: Setpoint, velocity: Vector, now_ns: int) -> Setpoint:
 def _speed_within(distance: float) -> float:
     """Return the largest speed [m/s] from which a setpoint stops within `distance` [m].
 
-    The setpoint keeps this speed for HEARTBEAT_NS after the operator's last request, then brakes.
+    The distance is that after the operator's last request: the setpoint keeps its speed for
+    HEARTBEAT_NS, then brakes.
     """
     wait = HEARTBEAT_NS * 1e-9
     return ACCELERATION * (sqrt(wait * wait + 2.0 * max(distance, 0.0) / ACCELERATION) - wait)

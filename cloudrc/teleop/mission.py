@@ -125,7 +125,7 @@ class Teleop:
     """
 
     def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
-        """Begin without a mission; `ended` tells for a mission's number whether it has ended."""
+        """Begin without a mission; `ended(n)` tells whether the mission with number n has ended."""
         self.state = "idle"  # of the mission
         self.leg = 0  # index of the current waypoint; their number once all are reached
         self.outcome: MissionEvent | None = None  # event that ended the newest mission
@@ -201,9 +201,9 @@ class Teleop:
     def drive(self, now_ns: int, velocity: Vector) -> None:
         """Move the setpoint with `velocity` [m/s], world frame, for at most `HEARTBEAT_NS`.
 
-        The setpoint moves only while telemetry shows that the robot follows commands. While a
-        hand-driven mission starts, a call has no effect. Otherwise raise a BadInputError if no
-        mission is held.
+        The mission must be held; a hand-driven mission may also be starting. In other states,
+        raise a BadInputError. The call has no effect while the mission starts, or while telemetry
+        does not show that the robot follows commands.
         """
         if self._plan.by_hand and self.state == STARTING:
             return
@@ -471,7 +471,7 @@ class Teleop:
 
     @property
     def _may_move(self) -> bool:
-        """Whether a setpoint sent now would still move the robot before its reset to the spawn."""
+        """Whether the robot must be reset to its spawn, and would still follow a setpoint now."""
         return self._from_spawn and not self.requests.waits
 
     def _select_early(self, now_ns: int) -> None:

@@ -80,7 +80,7 @@ def next_step(guard: GuardState, age: float, cloud_age: float, mission: str | No
 
 
 class MissionService:
-    """Store and fly all missions of one robot, one after the other.
+    """Stores and flies all missions of one robot, one after the other.
 
     All times `now_ns` are on this process's monotonic clock [ns]. The methods for the operator's
     commands raise ConflictError if the state of mission or robot forbids the command. They raise
@@ -126,7 +126,7 @@ class MissionService:
     def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
         """Create a mission that starts at once or waits; return it, and whether it is new.
 
-        Two orders with the same key make only one mission: for the second, return that mission.
+        If an earlier order has the same `key`, return the mission of the earlier order.
         """
         known = self.book.with_key(order.key)
         if known is not None:
@@ -321,7 +321,7 @@ class MissionService:
     def _inherits_stop(self) -> Mission | None:
         """Mission that an emergency stop ended before teleop restarted; None without one.
 
-        The first telemetry shows whether the robot obeyed this stop; from then on, or while
+        Only the first telemetry shows whether the robot obeyed this stop. Afterwards, and while
         teleop repeats a stop, the value is None.
         """
         unknown = self.seen is None and not self._teleop.stopping

@@ -1,4 +1,4 @@
-"""Classify the datagrams of one stream by their counters as used, late or repeated."""
+"""Decide by the counter of each datagram whether it is to be used, is late, or is repeated."""
 
 from __future__ import annotations
 

@@ -236,5 +236,5 @@ def encode(kind: Kind, *fields: Any) -> bytes:
 
 
 def decode(kind: Kind, body: bytes) -> tuple[Any, ...]:
-    """Decode the body of a handshake datagram; return the fields that `encode` received."""
+    """Decode the body of a handshake datagram; return its fields, such as nonce or cookie."""
     return _BODIES[kind].unpack(body)

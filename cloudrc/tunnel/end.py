@@ -18,7 +18,7 @@ from cloudrc.tunnel.session import Session
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Ids of the clock and the process of one end of the tunnel, and its keys; set at the start."""
+    """What an end of the tunnel gets at its start: ids of its clock and its process, and keys."""
 
     clock_id: bytes  # 16 bytes that identify the monotonic clock of this machine
     nonce: bytes  # 16 random bytes that identify this process

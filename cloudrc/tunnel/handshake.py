@@ -43,7 +43,7 @@ def is_newer(epoch: int, than: int) -> bool:
 
 
 class HelloAnswer(NamedTuple):
-    """World's answer to a hello: its outcome, datagrams to send, whether a session has begun."""
+    """World's answer to a HELLO: its outcome, datagrams to send, whether a session has begun."""
 
     outcome: str
     datagrams: list[bytes]
@@ -91,7 +91,7 @@ class ServerHandshake:
         self.hear(now_ns)
 
     def receive_hello(self, hello: Hello, counter: int, now_ns: int) -> HelloAnswer:
-        """Answer a hello at `now_ns` [ns], after `Session.open` has verified the hello."""
+        """Answer a HELLO at `now_ns` [ns], after `Session.open` has verified the datagram."""
         session, key = self._session, self._session.greeting_key
         if not self._has_cookie(hello, now_ns):
             if now_ns - self._challenged_ns < CHALLENGE_NS:
@@ -128,9 +128,9 @@ class ServerHandshake:
     def _keeps_epoch(self, now_ns: int) -> bool:
         """Return whether the present epoch continues after a repeated HELLO of the session's cloud.
 
-        A HELLO with a newer key ends the epoch. Otherwise the first REPEATS_MAX repeats after an
-        encrypted datagram keep the epoch. Later repeats keep it if they have the epoch's key and
-        the session has not timed out.
+        A HELLO with a newer key ends the epoch. Otherwise the epoch survives REPEATS_MAX repeats
+        without an encrypted datagram in between. It survives further repeats only while they have
+        the epoch's key and the session has not timed out.
         """
         session, key = self._session, self._session.greeting_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current
@@ -161,7 +161,7 @@ class ServerHandshake:
 
 
 class ClientHandshake:
-    """Cloud's side of the handshake: make hellos, and decide which answers are valid."""
+    """Cloud's side of the handshake: make HELLOs, and decide which answers are valid."""
 
     def __init__(self, nonce: bytes, clock: bytes) -> None:
         """Start without a session; `nonce` identifies this process, `clock` the machine's clock."""
@@ -202,9 +202,9 @@ class ClientHandshake:
         """Process an ACCEPT; return cloud's and world's nonce if a new epoch begins, else None.
 
         `asks` is True while cloud asks for a session; only then does cloud accept a new world
-        process. An ACCEPT that the network delayed can make cloud accept a world process that has
-        ended. As soon as the running world process answers again, cloud changes its own nonce, so
-        that all delayed ACCEPTs become invalid.
+        process. A delayed ACCEPT can make cloud accept a world process that has ended. When the
+        running world process then answers, cloud changes its own nonce, so that all delayed
+        ACCEPTs become invalid.
         """
         known = accept.world_nonce == self._world
         if accept.nonce != self._nonce or (self._world and not known and not asks):

@@ -146,8 +146,8 @@ class WorldEndpoint(TunnelEnd):
         """Return world's time at `now_ns` [ns, monotonic clock]: `now_ns` minus the slip.
 
         If the simulation lags by more than CATCH_UP_NS, add the excess to the slip. If it lags by
-        more than the largest age of a command, world has stalled. Datagrams read at this `now_ns`
-        may have waited in the socket. So store `now_ns`, to refuse commands among them as stale.
+        more than the largest age of a command, world has stalled, and datagrams read at this
+        `now_ns` may have waited in the socket. Then store `now_ns`, to refuse them as stale.
         """
         world_ns = now_ns - self._slip_ns
         behind_ns = world_ns - self._tick_ns
@@ -162,10 +162,10 @@ class WorldEndpoint(TunnelEnd):
     def _advance(self, until_ns: int, *, samples: bool = False) -> None:
         """Simulate all steps that begin before `until_ns` [ns], world's clock.
 
-        With `samples`, also take the odometry sample that is due at `until_ns`.
+        With `samples`, also take the sample of the true state that is due at `until_ns`.
 
-        If an earlier call took the sample at `until_ns`, also simulate the step that begins at
-        this time. So a datagram that arrives at the time of a sample acts from the next step on.
+        If an earlier call has taken this sample, also simulate the step that begins at `until_ns`.
+        So a datagram that arrives at the time of a sample acts from the next step on.
         """
         tick_ns = self._tick_ns
         if until_ns == tick_ns == self._sample_ns - self._sample_period_ns:

@@ -61,8 +61,9 @@ class Simulator:
     ) -> None:
         """Compile `robot` in `scene` (names or paths) and put the robot at its spawn.
 
-        Without `plant`, the true robot equals the model. Raise a BadInputError if a file is missing
-        or does not fit the onboard controller.
+        `plant` tells how the true robot differs from its model; None: not at all. Without `wind`
+        the air is at rest. Raise a BadInputError if a file is missing or does not fit the onboard
+        controller.
         """
         self.model = model = compile_model(robot, scene, plant)
         self._wind = wind
@@ -133,8 +134,8 @@ class Simulator:
         """Take over the state after steps that `native/step.c` has run on `data`.
 
         `rotor_speeds` are the actual speeds [rad/s], shape (4,). `tip_force_peak` [N],
-        `tip_impulse` [N s], `contacts` and `steps` are the new values of the attributes. `before`
-        has the readings before the last step; None if no contacts of that step are to be stored.
+        `tip_impulse` [N s], `contacts` and `steps` are the new values of the attributes. If
+        `before`, the readings before the last step, is given, store the contacts of that step.
         """
         self._rotors.speeds, self._readings = rotor_speeds, None
         self.tip_force_peak, self.tip_impulse = tip_force_peak, tip_impulse

@@ -1,15 +1,69 @@
-"""`cloudrc faults`: what was flown before an interrupt is kept."""
+"""`cloudrc faults`: results are told, and what was flown before an interrupt is kept."""
 
 import json
+import os
+import pickle
+import re
+import signal
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import pytest
 
+from cloudrc.cli import faults as command
 from cloudrc.cli.pool import WorkerDiedError
+from cloudrc.faults.invariants import Breach
 from cloudrc.faults.scenario import Outcome
-from cloudrc.faults.schedule import Schedule
+from cloudrc.faults.scenarios import SCENARIOS
+from cloudrc.faults.schedule import Event, Schedule, dump, load
 from cloudrc.faults.trial import Finding
 
+NUMBERS = (*range(1, 14), 15, 17, *range(20, 26), 27, 28, 40)
 KILLED = WorkerDiedError("a worker was killed")
+
+
+def test_the_command_prints_json(call):
+    Path("F17").mkdir()  # a folder is no schedule
+    printed = json.loads(call("faults run F17 -o json").out)
+    assert (printed["schemaVersion"], printed["faults"][0]["result"]) == (1, "passed")
+    assert {check["unit"] for check in printed["faults"][0]["checks"]} == {"", "m", "m/s", "yes"}
+    assert pickle.dumps(command._run("F27", 1)), "a result comes back from another process"
+
+
+def test_a_failed_check_ends_in_exit_code_1(monkeypatch, call):
+    def run(outcome, seed, number):
+        outcome.same("collisions", 2.0 * (number == 1), 0)
+        if number == 2:
+            raise ValueError("broken")
+
+    fakes = [replace(each, inject=partial(run, number=each.number)) for each in SCENARIOS]
+    monkeypatch.setattr("cloudrc.faults.scenarios.SCENARIOS", fakes)
+    out = call("faults run --all", code=1).out
+    for said in ("x collisions: 2 (0)", "22 of 24 passed, 2 failed", "ValueError: broken"):
+        assert said in out
+
+
+def test_the_list_names_every_fault(call):
+    listed = re.findall(r"^F(\d+) +([\w-]+)", call("faults list").out, re.MULTILINE)
+    assert tuple(int(number) for number, _ in listed) == NUMBERS
+    assert len({name for _, name in listed}) == len(NUMBERS)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("", "the following arguments are required: ACTION"),
+        ("run F1 --seed 9007199254740992", "argument --seed: '9007199254740992' is not a whole"),
+        ("run /dev/null", "/dev/null: not a regular file"),
+        ("run cloud-kiled", "no fault 'cloud-kiled'; there are: F1 short-blackout, F2 "),
+        ("run cloud-kiled", "; did you mean cloud-killed?"),
+        ("search --minutes nan", "'nan' is not a number of minutes"),
+        ("search --store /dev/null/found", "cannot be written"),
+    ],
+)
+def test_bad_input_is_told_in_one_line(words, said, refused):
+    assert said in refused(f"faults {words}")
 
 
 @pytest.mark.parametrize(
@@ -22,8 +76,7 @@ KILLED = WorkerDiedError("a worker was killed")
 )
 def test_what_was_flown_before_an_interrupt_is_kept(line, error, code, said, monkeypatch, call):
     def flown(function, work, jobs):
-        seed = work[0][1] if "search" in line else 0
-        yield Finding(Schedule(seed), ()) if seed else Outcome()
+        yield Finding(Schedule(1), ()) if "search" in line else Outcome()
         raise error
 
     monkeypatch.setattr("cloudrc.cli.faults.map_in_order", flown)
@@ -32,3 +85,56 @@ def test_what_was_flown_before_an_interrupt_is_kept(line, error, code, said, mon
     assert document.get("count") == 1 or len(document["faults"]) == 1
     assert said in message
     assert message.count("\n") == 1
+
+
+BAD, INTERRUPTED = 5, 9
+"""Seeds whose schedule fails, and in whose flight the search is interrupted."""
+
+
+@pytest.fixture
+def find(monkeypatch, call):
+    """Search with a number of flights that take no time; return the document and stderr."""
+
+    def run(count, flags="", code=0):
+        def fly(schedule):
+            clock[0] += 60.0 / count
+            if schedule.seed == INTERRUPTED:
+                os.kill(os.getpid(), signal.SIGTERM)
+            breaches = (Breach(1.0, "stuck", "not flown"),) if schedule.seed == BAD else ()
+            return Finding(schedule, breaches, "", 1.0 / (1 + schedule.seed), 2.0, 2)
+
+        clock = [0.0]
+        monkeypatch.setattr("cloudrc.faults.trial.fly", fly)
+        monkeypatch.setattr("cloudrc.cli.faults.time.monotonic", lambda: clock[0])
+        out, error = call(f"faults search -o json {flags}", code=code)
+        return json.loads(out), error
+
+    return run
+
+
+def test_a_search_counts_stores_and_can_continue(find):
+    told, _ = find(3)
+    assert (told["kind"], told["first"], told["next"], told["count"]) == ("random", 1, 4, 3)
+    told, _ = find(3, "--first 4", code=1)
+    assert (told["first"], told["next"]) == (4, 7)
+    assert told["invariants"]["stuck"]["broken"] == 1
+    assert told["invariants"]["fence"] == {"judged": 3, "broken": 0}
+    assert told["smallest_margin_m"] == 1 / 7
+    (failure,) = told["failures"]
+    assert failure["seed"] == BAD
+    assert load(Path(failure["file"])).seed == BAD
+    assert Path(failure["file"]).read_text().startswith("# 1.000 s: stuck: not flown\n")
+    told, error = find(9, "--first 7", code=130)
+    assert told["count"] == 2
+    assert "continue with 'cloudrc faults search --first 9'" in error
+    told, _ = find(1, "--adversarial")
+    assert (told["kind"], told["count"]) == ("adversarial", 1)
+    assert [told["invariants"][name]["judged"] for name in ("collision", "fence")] == [0, 1]
+
+
+def test_a_search_and_its_schedule_are_flown_for_real(call):
+    assert "1 random schedules" in call("faults search --minutes 1e-9 --store new").out
+    schedule = Schedule(1, events=(Event("blackout", 2.0, 0.5),), duration=3.0)
+    Path("schedule.yaml").write_text(dump(schedule))
+    told = json.loads(call("faults run schedule.yaml -o json").out)
+    assert (told["breaches"], len(told["records_sha256"])) == ([], 64)

@@ -58,7 +58,7 @@ def test_the_only_run_is_used_and_of_several_one_is_named(tmp_path, elsewhere, s
 def test_no_command_steers_another_flight_after_yours_has_ended(tmp_path, elsewhere, said):
     latest = elsewhere / "runs" / "latest"
     latest.mkdir(parents=True)
-    (latest / "relay.log").touch()
+    (latest / "uplink.log").touch()
     for words in ("mission hold", "mission run pipes", SET):
         assert "runs/latest has ended; name another flight: --release" in said(2, words)
     assert "no cluster is configured" in said(3, "mission list"), "it may read in a cluster"
@@ -68,7 +68,7 @@ def test_no_command_steers_another_flight_after_yours_has_ended(tmp_path, elsewh
         assert f"has ended; name another flight: --run {tmp_path}/a; " in said(2, "mission estop")
         assert api.alarms == []
         assert said(0, "mission list") == using
-        (latest / "relay.log").unlink()  # as after a run in virtual time, which nobody steers
+        (latest / "uplink.log").unlink()  # as after a run in virtual time, which nobody steers
         assert said(0, "mission estop") == using
 
 

@@ -2,19 +2,17 @@
 
 import json
 from copy import deepcopy
-from types import SimpleNamespace
 
 import pytest
 
 from cloudrc.cli import link_set
-from cloudrc.cli.processes import RelayControl
+from cloudrc.cli.link_run import make_profile_loader
 from cloudrc.config.document import Document
 from cloudrc.config.load import edit_profile
 from cloudrc.drivers import local
 from cloudrc.errors import BadInputError
-from cloudrc.link.follow import Loaded
-from cloudrc.link.model import LinkDirection
-from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.follow import HANDED_FILE, Profiles
+from cloudrc.link.state import LinkState, publish, summary, to_text
 
 CHANGES = [{"at_s": 9.0, "delay_ms": 50.0, "jitter_ms": 20.0}, {"at_s": 12.0, "loss": 0.1}]
 TIMED = {"uplink": {"delay_ms": 40.0}, "downlink": {"delay_ms": 25.0, "changes": CHANGES}}
@@ -81,54 +79,54 @@ def test_invalid_settings_are_refused(settings, words):
 
 
 class Flight:
-    """A local run whose relay reads the change while the command waits."""
+    """A local run whose link reads the change while the command waits."""
 
     def __init__(self, folder):
-        direction, ways = DirectionProfile(0.045), ("uplink", "downlink")
-        self.links = {way: LinkDirection(direction, 1, way == "uplink") for way in ways}
-        first = {way: Loaded(direction, {way: {"delay_ms": 45.0} for way in ways}) for way in ways}
-        folder.mkdir(parents=True)
-        self.delays, self.folder = [], folder / "link"
-        lanes = dict.fromkeys(ways, SimpleNamespace(released=dict))
-        relay = SimpleNamespace(take_in=lambda: None, lanes=lanes)
-        note = lambda *noted: self.delays.append(noted)  # noqa: E731
-        self.control = RelayControl(self.folder, self.links, first, note, relay)
+        self.links = {}
+        for way in ("uplink", "downlink"):
+            (own := folder / way).mkdir(parents=True)
+            (own / "map.yaml").write_text("{uplink: {delay_ms: 45}, downlink: {delay_ms: 45}}")
+            paths = own / "map.yaml", own / HANDED_FILE
+            self.links[own] = Profiles(*paths, make_profile_loader(way), print)
+            self.apply(own, self.links[own].first())
+
+    def apply(self, own, loaded):
+        (_, values, change), asked = loaded, summary(loaded.direction)
+        about = {"change": change.number, "cause": change.cause, "asked": asked}
+        state = LinkState("relay", "", "relay", own.name, values, "", 1, **about)
+        publish(own / "link.json", to_text(state))
 
     def wait(self, _):
-        self.control.look()
-        self.control.swap()
-
-    def delay(self, way):
-        """Return the one-way delay of a packet sent now [s]."""
-        return self.links[way].send(1, 3, 0, 172, 0)[0] * 1e-9
+        for own, profiles in self.links.items():
+            if loaded := profiles.poll():
+                self.apply(own, loaded)
 
 
 @pytest.fixture
 def flight(tmp_path, monkeypatch):
-    found = Flight(tmp_path / "runs" / "latest")
+    found = Flight(tmp_path / "runs" / "latest" / "link")
     monkeypatch.setattr(link_set, "sleep", found.wait)
     with local.announced(tmp_path / "runs" / "latest"):
         yield found
 
 
-def test_a_run_here_is_found_changed_and_read_back(flight, call):
+@pytest.mark.usefixtures("flight")
+def test_a_run_here_is_found_changed_and_read_back(call):
     shown = call("link set downlink.delay_ms=120 uplink.loss=0.02").out.splitlines()
     assert shown[1].split()[:4] == ["uplink", "relay", "45", "ms"]
     assert shown[2].split()[:4] == ["downlink", "relay", "120", "ms"]
-    assert (flight.delay("uplink"), flight.delay("downlink")) == pytest.approx((0.045, 0.120))
-    assert flight.delays[-2:] == [("uplink", 0.045), ("downlink", 0.12)]
     out = call("link set --profile handover").out
     assert "2 blackouts" in out, "what has no column of its own"
     downlink = json.loads(call("link set --profile paper-p1 -o json").out)["links"]["downlink"]
     assert downlink["profile"]["downlink"]["delay_ms"] == 20.0
-    assert (downlink["cause"], downlink["changes"]) == ("profile paper-p1", 3)
+    assert downlink["cause"] == "profile paper-p1"
 
 
 @pytest.mark.usefixtures("flight")
-def test_a_relay_that_does_not_answer_is_an_error(monkeypatch, refused):
+def test_a_link_that_does_not_answer_is_an_error(monkeypatch, refused):
     monkeypatch.setattr(link_set, "LOCAL_TIMEOUT", 0.0)
     monkeypatch.setattr(link_set, "sleep", lambda _: None)
     assert refused("link set downlink.delay_ms=120", code=4) == (
         "cloudrc: error: the uplink and downlink did not apply the change within 0 s; "
-        "see runs/latest/relay.log\n"
+        "see runs/latest/uplink.log and runs/latest/downlink.log\n"
     )

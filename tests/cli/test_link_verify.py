@@ -24,7 +24,7 @@ class Release:
         self.ends = {end: open_exporter(end) for end in ("world", "cloud")}
         self.links = {way: open_exporter("link") for way in ("uplink", "downlink")}
         for way, link in self.links.items():
-            link.shaped("relay", way, "auto")
+            link.link.shaped("relay", way, "auto", 0.045)
             self.shapes(way, PAGE)
 
     def hears(self, *, stamp_ns=5, **verdicts):

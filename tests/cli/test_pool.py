@@ -36,7 +36,8 @@ def _kill_at_five(number):
 
 
 @pytest.mark.parametrize(("pieces", "jobs", "workers"), [(6, 100_000, 2), (1, 9, 0), (6, 1, 0)])
-def test_results_keep_the_order_of_the_work(pieces, jobs, workers):
+def test_results_keep_the_order_of_the_work(pieces, jobs, workers, monkeypatch):
+    monkeypatch.setattr("cloudrc.cli.pool.CHUNK", 4)
     done = map_in_order(_slow_first, range(pieces), jobs)
     first = next(done)
     assert len(multiprocessing.active_children()) == workers

@@ -1,4 +1,4 @@
-"""World, cloud and relay as commands: flags, addresses, recordings, sizes, stopping at start."""
+"""World and cloud as commands: flags, addresses, recordings, sizes, stopping at start."""
 
 import argparse
 import os
@@ -13,7 +13,6 @@ from cloudrc.cli import processes
 from cloudrc.cli.processes import (
     ipv4_addresses,
     open_recorder,
-    open_relay,
     read_address,
     read_size,
     resolve_address,
@@ -22,8 +21,6 @@ from cloudrc.cli.processes import (
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import BadInputError
-from cloudrc.link.model import LinkDirection
-from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.record.columns import Recording
 from tests.record.conftest import MS, counted, world_records
@@ -31,7 +28,6 @@ from tests.record.conftest import MS, counted, world_records
 FREE = "127.0.0.1:9"
 ENDS = ("world", "cloud")
 END = f"--listen {FREE} --peer {FREE}"
-RELAY = f"--world-side {FREE} --cloud-side {FREE} --world {FREE} --cloud {FREE}"
 
 
 @pytest.fixture
@@ -60,18 +56,14 @@ def test_an_end_has_a_peer_or_a_route(more, refused):
 # The process would close the socket at its end, but here the test process goes on.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize(
-    ("command", "flag", "code", "said"),
+    ("flag", "code", "said"),
     [
-        ("world", "--listen", 2, "--listen {}: cannot receive there: Address already in use; name"),
-        ("relay", "--world-side", 2, "--world-side {}: cannot receive there: Address already in"),
-        ("world", "--metrics", 3, "metrics cannot be served on {}: Address already in use; end"),
+        ("--listen", 2, "--listen {}: cannot receive there: Address already in use; name"),
+        ("--metrics", 3, "metrics cannot be served on {}: Address already in use; end"),
     ],
 )
-def test_an_address_in_use_is_reported_with_its_flag(
-    command, flag, code, said, taken, key, refused
-):
-    flags = RELAY if command == "relay" else f"{END} {key}"
-    line = refused(f"{command} --config hover {flags} {flag} {taken}", code=code)
+def test_an_address_in_use_is_reported_with_its_flag(flag, code, said, taken, key, refused):
+    line = refused(f"world --config hover {END} {key} {flag} {taken}", code=code)
     assert line.startswith(f"cloudrc: error: {said.format(taken)}")
 
 
@@ -194,11 +186,3 @@ def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch):
         load(trace=str(path))
     with pytest.raises(BadInputError, match="not a file; give a CSV file"):
         load(trace="/dev/null")  # an endless device would fill the memory
-
-
-def test_a_side_of_a_relay_that_cannot_reach_its_end_is_refused():
-    here = dict.fromkeys(("world_side", "cloud_side"), ("127.0.0.1", 0))
-    ends = {"world": ("198.51.100.7", 7400), "cloud": ("127.0.0.1", 7400)}
-    links = [LinkDirection(DirectionProfile(), 1, uplink) for uplink in (True, False)]
-    with pytest.raises(BadInputError, match="cannot reach --world from --world-side"):
-        open_relay(argparse.Namespace(**here, **ends), *links)

@@ -53,7 +53,7 @@ def test_down_ends_sessions_only_and_asks_which(folder, down):
         assert "a flight of 'cloudrc run' ends by Ctrl-C there" in down(3)
         assert "--run r: no session runs there" in down(2, "--run r")
     (folder / "runs/latest").mkdir(parents=True)
-    (folder / "runs/latest/relay.log").touch()
+    (folder / "runs/latest/uplink.log").touch()
     with local.announced(folder / "theirs", "", "session"):
         with local.announced(folder / "b", "", "session"):
             assert "2 runs are flying here; choose one: --run" in down(2)
@@ -140,7 +140,7 @@ def test_a_session_flies_missions_and_reports_the_last_one(folder, figure):
         figure("session: address after", (time.monotonic() - began) / busy, "<=", 5.0, "s")
         said = (folder / "said").read_text()
         ports = re.findall(r"(\w+) :(\d+)", said)
-        assert [name for name, _ in ports] == ["world", "cloud", "teleop", "relay"]
+        assert [name for name, _ in ports] == ["world", "cloud", "teleop", "uplink", "downlink"]
         for _, port in ports:
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as page:
                 assert b"cloudrc_build_info" in page.read()

@@ -1,4 +1,7 @@
-"""`cloudrc sweep`: the same table whether interrupted, in shards or at once; rows fly again."""
+"""`cloudrc sweep`: the same table whether interrupted, in shards, in pods or at once.
+
+`cloudrc run --seeds` prints one table of all seeds, or of the finished ones, and writes a sweep.
+"""
 
 import json
 import os
@@ -11,9 +14,12 @@ import pytest
 
 from cloudrc.assembly import assemble
 from cloudrc.cli.sweep import _shard
+from cloudrc.cli.sweep_run import as_table, fly_row, summarise
+from cloudrc.cluster import batch
+from cloudrc.sweep.plan import read_plan
 from cloudrc.sweep.store import read_rows
-from tests.cli.conftest import until
-from tests.sweep.conftest import write_sweep
+from tests.cli.conftest import KEYS, SHORT, until
+from tests.sweep.conftest import flown, write_sweep
 
 __all__ = ["write_sweep"]
 ONE = {"cloud.predictor": ["constant_velocity"]}
@@ -46,27 +52,25 @@ def test_shards_give_the_table_of_the_whole(write_sweep, call):
 
 def test_a_sweep_goes_on_where_it_ended(write_sweep, monkeypatch, call):
     """An interrupted one says how to go on; flights with a row are not flown again."""
-    flown = []
+    begun = []
 
-    def fly(job):
-        flown.append(job[0].seed)
-        if len(flown) == 2:
+    def fly(flight, **words):
+        begun.append(flight.seed)
+        if len(begun) == 2:
             raise KeyboardInterrupt
-        return real(job)
+        return fly_row(flight, **words)
 
-    from cloudrc.cli.sweep import fly_job as real
-
-    monkeypatch.setattr("cloudrc.cli.sweep.fly_job", fly)
+    monkeypatch.setattr("cloudrc.cli.sweep_run.fly_row", fly)
     said = call("sweep run", write_sweep(ONE, seeds=3), code=130)
     assert said.out.endswith("runs/sweep-grid-1/sweep.json\n")
     again = said.err.partition("to continue: cloudrc ")[2]
     assert Path("runs/latest-sweep").resolve() == Path("runs/sweep-grid-1").resolve()
     assert "1 points x 3 seeds: 3 flights, 1 done before" in call(again).out
-    assert flown == [1, 2, 2, 3]
+    assert begun == [1, 2, 2, 3]
 
 
 def test_alike_warnings_of_many_points_are_counted(write_sweep, monkeypatch, call):
-    monkeypatch.setattr("cloudrc.cli.sweep.advise", lambda point: [f"{point.uplink.delay_ms} ms"])
+    monkeypatch.setattr("cloudrc.cli.advice.advise", lambda point: [f"{point.uplink.delay_ms} ms"])
     grid = {"link.both.delay_ms": [0, 1, 2, 3, 4]}
     told = call("sweep run --out grid --shard 6/6", write_sweep(grid)).err.splitlines()
     assert told[0] == "cloudrc: warning: 0.0 ms"
@@ -166,3 +170,113 @@ def test_a_killed_sweep_continues_to_equal_bytes(write_sweep):
     assert subprocess.run([*command, "killed"], check=False).returncode == 0
     assert subprocess.run([*command, "whole"], check=False).returncode == 0
     assert Path("killed/table.csv").read_bytes() == Path("whole/table.csv").read_bytes()
+
+
+# Sweeps in pods: rows come from the lines of the pods' logs, each once.
+
+
+class Release:
+    where = "in namespace 'lab'"
+
+
+@pytest.fixture
+def fly_in_pods(write_sweep, monkeypatch, call):
+    """Return a function that flies a sweep in replaced pods, which print lines.
+
+    Each argument is a list of the lines of one Job. `make(rows)` returns such lists.
+    """
+    monkeypatch.setattr("cloudrc.cli.sweep_run.release_from_flags", lambda options: Release())
+    monkeypatch.setattr(batch, "start", lambda *given, **words: None)
+    path = write_sweep()
+
+    def run(make, code):
+        made = [flight.row(flown()) for flight in read_plan(path).flights.values()]
+        jobs = make([json.dumps(row) for row in made])
+        monkeypatch.setattr(batch, "read_lines", lambda *given: jobs.pop(0) if jobs else [])
+        error = call("sweep run --out grid --on kubernetes", path, code=code).err
+        return made, rows("grid"), error
+
+    return run
+
+
+def test_each_row_is_taken_once_and_other_lines_are_not(fly_in_pods):
+    others = ["", "a warning", '{"key": "x"}', "[1]", "2"]
+
+    def make(lines):
+        foreign = json.dumps(json.loads(lines[0]) | {"key": "0"})
+        return [[*others, foreign, *lines[::-1], *lines]]
+
+    made, read, _ = fly_in_pods(make, 0)
+    assert read == made[::-1]
+    assert len(Path("grid/rows.jsonl").read_text().splitlines()) == 4
+
+
+@pytest.mark.parametrize(
+    ("make", "code", "count", "said"),
+    [
+        (lambda lines: [lines[:3], lines[3:]], 0, 4, "rows of 1 flights were lost with their pods"),
+        (lambda lines: [lines[:1]], 5, 1, "the pods printed no row of 3 flights"),
+    ],
+)
+def test_lost_rows_are_flown_again_as_long_as_rows_arrive(make, code, count, said, fly_in_pods):
+    made, read, error = fly_in_pods(make, code)
+    assert read == made[:count]
+    assert said in error
+
+
+def test_files_that_no_pod_has_are_refused(write_sweep, tmp_path, call):
+    (tmp_path / "mine.py").write_text("def build():\n    return lambda *given: given[0]\n")
+    path = write_sweep({"cloud.predictor": ["./mine.py"]})
+    error = call("sweep run --out grid --on kubernetes", path, code=2).err
+    assert "mine.py: the pods do not have this file" in error
+    assert not Path("grid").exists()
+
+
+# `cloudrc run --seeds N`.
+
+
+@pytest.mark.usefixtures("no_page")
+def test_many_seeds_become_one_table_and_a_sweep(folder, call):
+    """A robot that touches nothing has failed, and so has the command."""
+    line = "run steps --seeds 2 --set criteria.contact=true"
+    lines = call(line, *SHORT, code=1).out.splitlines()
+    assert lines[-1] == "runs/steps-virtual-2seeds-1/sweep.json"
+    assert lines[0].startswith("    1/2  seed 1  failure: the arm never touched the board")
+    assert "done 0/2" in lines
+    assert any(line.startswith("prediction_error_rms") for line in lines)
+    assert not (folder / "runs/latest").exists()
+    summary = json.loads((folder / "runs/latest-sweep/sweep.json").read_text())
+    assert (summary["seeds"], summary["counts"]) == ([1, 2], {"failure": 2})
+    assert "criteria.contact=true" in summary["overrides"]
+    assert len((folder / "runs/latest-sweep/table.csv").read_text().splitlines()) == 3
+    key = json.loads((folder / "runs/latest-sweep/rows.jsonl").read_text().splitlines()[1])["key"]
+    assert "the records are those of the sweep" in call("sweep fly runs/latest-sweep", key).err
+
+
+def test_programs_get_a_document(call):
+    document = json.loads(call("run steps --seeds 1 -o json --out sweep", *SHORT).out)
+    assert (document["done"], document["count"], document["interrupted"]) == (1, 1, False)
+    assert document["overrides"] == list(KEYS)
+    assert [(run["seed"], run["verdict"]) for run in document["runs"]] == [(1, "success")]
+
+
+@pytest.mark.process
+def test_a_signal_ends_a_sweep_at_once(folder):
+    command = [sys.executable, "-m", "cloudrc", "run", "paper", "--seeds", "40", "--out", "sweep"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert "1/40" in process.stdout.readline()
+    process.terminate()
+    _, errors = process.communicate(timeout=20)  # returns only once no worker holds the pipes
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+    counts = json.loads((folder / "sweep/sweep.json").read_text())["counts"]
+    assert 1 <= sum(counts.values()) < 40
+
+
+def test_numbers_may_be_missing_and_failed_plugins_do_not_count():
+    failed = flown("failure", "plugin_failed", x=9.0)
+    rows = [flown(x=1.0), flown("failure", y=2.0), flown(x=3.0), failed]
+    summary = summarise(rows, {"x": "m", "y": "1"})
+    assert (summary["done"], summary["count"]) == (2, 4)
+    assert (summary["numbers"]["x"]["median"], summary["numbers"]["x"]["count"]) == (2.0, 2)
+    assert "(2 runs)" in as_table(summary)

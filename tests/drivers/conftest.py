@@ -90,7 +90,7 @@ def start(folder, *settings, dwell=20.0, command=FAST):
 
 
 def wait_until_flying(run):
-    """Return the process ids by role: relay, world, teleop, cloud."""
+    """Return the process ids by role: world, teleop, cloud, uplink, downlink."""
     for line in run.stdout:
         if "mission started" in line:
             break
@@ -105,7 +105,8 @@ def processes_of(run):
     for children in Path(f"/proc/{run.pid}/task").glob("*/children"):
         for pid in children.read_text().split():
             line = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
-            found[line[line.index("cloudrc") + 1]] = int(pid)
+            ways = [word.removeprefix("--direction=") for word in line if "--direction=" in word]
+            found[ways[0] if ways else line[line.index("cloudrc") + 1]] = int(pid)
     return found
 
 

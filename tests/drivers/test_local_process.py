@@ -53,7 +53,7 @@ def wait_until_ended(pids, limit):
 def test_ctrl_c_ends_all_processes_in_2_s_and_leaves_a_report(tmp_path, how):
     run = start(tmp_path / "run", command=COMMAND)
     pids = wait_until_flying(run)
-    assert set(pids) == {"relay", "world", "teleop", "cloud"}
+    assert set(pids) == {"world", "teleop", "cloud", "uplink", "downlink"}
     words = Path(f"/proc/{pids['world']}/cmdline").read_text().split("\0")
     (key,) = (Path(word.removeprefix("--key=")) for word in words if word.startswith("--key="))
     assert key.exists()
@@ -88,7 +88,7 @@ HANGS, DIES = signal.SIGSTOP, signal.SIGKILL
 @pytest.mark.parametrize(
     ("victim", "how"),
     [
-        ("relay", HANGS),
+        ("uplink", HANGS),
         ("cloud", DIES),
         pytest.param("teleop", HANGS, marks=pytest.mark.full),
         pytest.param("world", HANGS, marks=pytest.mark.full),

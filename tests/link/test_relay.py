@@ -1,4 +1,4 @@
-"""The relay over real sockets on 127.0.0.1: in this process, as a process, and as a pod's link."""
+"""The relay over real sockets on 127.0.0.1: in this process, and as a process."""
 
 import json
 import os
@@ -15,7 +15,7 @@ import pytest
 
 from cloudrc.cli.link_verify import find_experiment
 from cloudrc.drivers.realtime import free_ports
-from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.exposition.table import LINK_OUTCOMES, RELEASE_PERCENTILES
 from cloudrc.link import relay as module
 from cloudrc.link.model import LinkDirection
@@ -23,9 +23,7 @@ from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.relay import (
     AGE_MAX_NS,
     QUANTILES,
-    Lane,
     Relay,
-    RelayShaper,
     ReleaseErrors,
     Stamps,
     ask_for_stamps,
@@ -68,43 +66,35 @@ def until(condition):
 
 
 class Bench:
-    """A world, a cloud and a relay between them, each with a socket."""
+    """A relay in a thread, between two sockets."""
 
-    def __init__(self, up, down):
-        self.ends = self.world, self.cloud, self.world_side, self.cloud_side = [
-            bind_loopback() for _ in range(4)
-        ]
-        self.world_side.connect(self.world.getsockname())
-        self.cloud_side.connect(self.cloud.getsockname())
-        uplink, downlink = LinkDirection(up, 1, True), LinkDirection(down, 1, False)
-        lanes = {
-            "uplink": Lane(self.world_side, self.cloud_side.send, uplink, peek),
-            "downlink": Lane(self.cloud_side, self.world_side.send, downlink, peek),
-        }
-        self.relay = Relay(lanes)
+    def __init__(self, profile):
+        self.near, self.far = bind_loopback(), bind_loopback()
+        direction, end = LinkDirection(profile, 1, True), self.near.getsockname()
+        self.relay = Relay(("127.0.0.1", 0), direction, peek, end)
+        self.route = self.relay.follow_peer(self.far.getsockname())
         self._stop = Event()
-        self._thread = Thread(target=self.relay.run, args=(self._stop.is_set,))
+        self._thread = Thread(target=self._run)
         self._thread.start()
 
-    def up(self, data):
-        self.world.sendto(data, self.world_side.getsockname())
+    def _run(self):
+        while not self._stop.is_set():
+            self.relay.step(0.05)
 
-    def down(self, data):
-        self.cloud.sendto(data, self.cloud_side.getsockname())
+    def send(self, data):
+        self.near.sendto(data, self.route)
 
     def close(self):
         self._stop.set()
-        began = time.monotonic()
         self._thread.join(PATIENCE)
-        assert time.monotonic() < began + 1.0, "the relay ends soon"
-        for one in (*self.ends, self.cloud):
+        for one in (self.near, self.far, self.relay):
             one.close()
 
 
 @pytest.fixture
 def bench():
     with ExitStack() as opened:
-        yield lambda up=PLAIN, down=PLAIN: opened.enter_context(closing(Bench(up, down)))
+        yield lambda profile=PLAIN: opened.enter_context(closing(Bench(profile)))
 
 
 def test_a_packet_leaves_when_the_model_says_never_earlier(bench):
@@ -113,68 +103,55 @@ def test_a_packet_leaves_when_the_model_says_never_earlier(bench):
     errors = []
     for n in range(20):
         sent = time.monotonic_ns()
-        pair.up(packet(n))
-        assert pair.cloud.recv(100) == model.corrupted(1, 3, n, packet(n))
+        pair.send(packet(n))
+        assert pair.far.recv(100) == model.corrupted(1, 3, n, packet(n))
         (wanted,) = model.send(1, 3, n, 4, 0)
         errors.append(time.monotonic_ns() - sent - wanted)
     assert min(errors) >= 0
     assert sorted(errors)[10] < 50 * MS
-    until(lambda: pair.relay.lanes["uplink"].released().get("released") == 20)
+    until(lambda: pair.relay.released().get("released") == 20)
     assert 0 <= pair.relay.counts()["release_error_p99_ns"] < 100 * MS
 
 
 def test_every_datagram_is_counted_once(bench, monkeypatch):
     monkeypatch.setattr(module, "IN_FLIGHT_MAX", 3)
-    pair = bench(DirectionProfile(0.1), DirectionProfile(loss=1.0))
+    pair = bench(DirectionProfile(0.1))
     for data in (b"", b"xyz", bytes(1400), bytes(5000)):
-        pair.up(data)
+        pair.send(data)
     for n in range(5):
-        pair.up(packet(n))
-    pair.down(packet(1))
-    assert [pair.cloud.recv(100) for _ in range(3)] == [packet(n) for n in range(3)]
+        pair.send(packet(n))
+    assert [pair.far.recv(100) for _ in range(3)] == [packet(n) for n in range(3)]
+    pair.relay.follow_profile(DirectionProfile(loss=1.0))
+    pair.send(packet(1))
     counts = {"received": 10, "malformed": 4, "overflow": 2, "lost": 1, "forwarded": 3}
     expected = {**dict.fromkeys(LINK_OUTCOMES, 0), **counts}
     until(lambda: expected.items() <= pair.relay.counts().items())
 
 
-def test_strangers_reach_neither_end(bench):
-    pair = bench(PLAIN, DirectionProfile(duplicate=1.0))
+def test_a_stranger_does_not_reach_the_peer(bench):
+    pair = bench(DirectionProfile(duplicate=1.0))
     with bind_loopback() as stranger:
-        for side in (pair.world_side, pair.cloud_side):
-            stranger.sendto(packet(7), side.getsockname())
-    pair.up(packet(1))
-    pair.down(packet(2))
-    assert pair.cloud.recv(100) == packet(1)
-    assert [pair.world.recv(100) for _ in range(2)] == [packet(2)] * 2
-    until(lambda: pair.relay.counts()["forwarded"] == 3)
-    assert pair.relay.counts()["received"] == 2
+        stranger.sendto(packet(7), pair.route)
+    pair.send(packet(1))
+    assert [pair.far.recv(100) for _ in range(2)] == [packet(1)] * 2
+    until(lambda: pair.relay.counts()["forwarded"] == 2)
+    assert pair.relay.counts()["received"] == 1
 
 
-def test_an_end_that_restarts_is_served_again(bench):
+def test_the_peer_can_restart_and_can_change_in_flight(bench):
     pair = bench()
-    address = pair.cloud.getsockname()
-    pair.cloud.close()
+    address = pair.far.getsockname()
+    pair.far.close()
     for n in range(3):
-        pair.up(packet(n))
-    pair.cloud = bind_loopback(address[1])
-    pair.down(packet(9))
-    assert pair.world.recv(100) == packet(9)
-    pair.up(packet(3))
-    assert packet(3) in (pair.cloud.recv(100) for _ in range(4))
-
-
-def test_the_peer_can_change_in_flight():
-    ends = bind_loopback(), bind_loopback()
-    shaper = RelayShaper(("127.0.0.1", 0), LinkDirection(DirectionProfile(0.05), 1, True), peek)
-    with bind_loopback() as out, ends[0], ends[1]:
-        for number, end in enumerate(ends):
-            end.settimeout(0.0)
-            route = shaper.follow_peer(end.getsockname())
-            out.sendto(packet(number), route)
-            while shaper.counts()["forwarded"] <= number:
-                shaper.step(0.02)
-            assert end.recv(9) == packet(number)
-        shaper.close()
+        pair.send(packet(n))
+    until(lambda: pair.relay.counts()["received"] == 3)
+    pair.far = bind_loopback(address[1])
+    pair.send(packet(3))
+    assert pair.far.recv(100) == packet(3)
+    with bind_loopback() as other:
+        pair.relay.follow_peer(other.getsockname())
+        pair.send(packet(4))
+        assert other.recv(100) == packet(4)
 
 
 @pytest.mark.parametrize("scale", [50.0, 200e6])
@@ -236,6 +213,11 @@ def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(tmp_path):
     refused = subprocess.run([*command, "netem"], cwd=ROOT, capture_output=True, text=True)
     assert refused.returncode == MissingPrerequisiteError.exit_code
     assert "give it NET_ADMIN and uid 0, or use the relay" in refused.stderr
+    with bind_loopback(listen[1]):
+        taken = subprocess.run([*command, "relay"], cwd=ROOT, capture_output=True, text=True)
+    assert taken.returncode == BadInputError.exit_code
+    said = f"error: --listen 127.0.0.1:{listen[1]}: cannot receive there: Address already in use; "
+    assert said in taken.stderr
     with subprocess.Popen([*command, "auto"], cwd=ROOT) as process:
         killer = Timer(PATIENCE, process.kill)  # where this test fails, the process ends, too
         killer.start()

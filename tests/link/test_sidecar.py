@@ -111,7 +111,8 @@ class Bench:
 
 def test_relay_touches_no_netem_and_leaves_no_route(tmp_path):
     bench = Bench(tmp_path, "relay", refuses=AssertionError("touched"))
-    bench.at(3.0, lambda: bench.routes.append((tmp_path / "link.released").read_text()))
+    bench.at(3.0, bench.sidecar.publish_released)
+    bench.at(3.5, lambda: bench.routes.append((tmp_path / "link.released").read_text()))
     bench.run(5.05)
     assert bench.routes == ['{"released": 1, "overflow": 0}', "127.0.0.1:7401\n"]
     assert bench.did == ["relay 10.244.0.7", "metric relay", "relay closes"]

@@ -9,7 +9,10 @@ import pytest
 from cloudrc import plugins
 from cloudrc.cli.list import describe_all
 from cloudrc.cli.main import main
+from cloudrc.config.load import load_experiment
 from cloudrc.metrics import SHIPPED, measure_all
+from cloudrc.sweep.flight import fly_point
+from tests.cli.conftest import KEYS
 from tests.metrics.conftest import straight_flight
 
 OVERSHOOT = '''"""Largest distance by which the robot flies past the setpoint along x.
@@ -26,7 +29,7 @@ def measure(flight):
 FAILING = '"""A metric."""\nUNIT = "1"\ndef measure(flight):\n    '
 BODIES = {
     "overshoot": OVERSHOOT,
-    "raises": f"{FAILING}raise RuntimeError('no such column')",
+    "raises": f"{FAILING}raise RuntimeError('no such\\ncolumn')",
     "infinite": f"{FAILING}return float('inf')",
 }
 SHORT = ["steps", "--mode", "virtual", "--set", "mission.steps.count=1"]
@@ -106,3 +109,10 @@ def test_an_installed_metric_is_in_every_report(folder, monkeypatch):
     assert list(listed) == sorted({*SHIPPED, "past"})
     assert listed["past"].startswith("Largest distance by which")
     sys.modules.pop("overshoot", None)
+
+
+def test_a_row_tells_that_a_metric_failed():
+    keys = *KEYS, "report.metrics=[mine/raises.py]"
+    row = fly_point(load_experiment("steps", keys))
+    assert (row["verdict"], "raises" in row["numbers"]) == ("success", False)
+    assert row["text"] == "metric raises failed: RuntimeError: no such column"

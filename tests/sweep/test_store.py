@@ -21,7 +21,7 @@ def rows(plan):
     """Four rows in the order of the grid; the last one lacks a number."""
     numbers = [{"duration": n + 0.1} for n in range(3)]
     pairs = zip(plan.flights.values(), [*numbers, {}], strict=True)
-    return [store.make_row(flight, flown(**found)) for flight, found in pairs]
+    return [flight.row(flown(**found)) for flight, found in pairs]
 
 
 def write(folder, rows, shard=None):
@@ -92,7 +92,7 @@ def test_a_changed_plugin_is_not_mixed_with_rows_of_the_old_one(write_sweep, tmp
     mine.write_text(source)
     path = write_sweep({"cloud.predictor": ["./mine.py"]})
     (flight,) = read_plan(path).flights.values()
-    write(tmp_path, [store.make_row(flight, flown())])
+    write(tmp_path, [flight.row(flown())])
     assert list(store.begin(tmp_path, read_plan(path))) == [flight.key]
     mine.write_text(f"{source}# changed\n")
     with pytest.raises(BadInputError, match=r"has rows of .* changed plug-ins"):

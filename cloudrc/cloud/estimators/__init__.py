@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 
 class DelaySample(NamedTuple):
-    """The delays that one telemetry datagram shows, if its hold time is short.
+    """The delays that the echo in one telemetry datagram shows; a long hold time gives no sample.
 
     Attributes:
         loop_delay: Arrival of the echo minus the command's stamp [s]. The loop delay includes the

@@ -12,7 +12,7 @@ from cloudrc.config.schema import Count
 
 
 def build(count_max: Count = 500) -> RunningMean:
-    """Make the estimator in the published code of the paper's authors.
+    """Make the estimator that the paper's authors use in their published code.
 
     Args:
         count_max: Number of samples; after them, each new sample has the weight 1/count_max.

@@ -1,8 +1,8 @@
 """Base class of the predictors that replay the sent commands through a model of the robot.
 
 World follows the newest command that has arrived. On world's clock, a command begins at its stamp
-plus a shift. The shift is the downlink delay plus the clock offset; the echoes in telemetry show
-this sum.
+plus a shift. The shift is the downlink delay plus the clock offset. It follows from telemetry,
+which tells when world applied a command.
 """
 
 from __future__ import annotations
@@ -80,14 +80,18 @@ class History:
         self._applied.append((began_ns, stamp_ns))
 
     def is_silent(self, now_ns: int) -> bool:
-        """Whether the last echoed command began over FOLLOWED_NS before `now_ns`, world's clock."""
+        """Return whether the robot follows no command at `now_ns` [ns], world's clock.
+
+        It follows none if world applied the last echoed command over FOLLOWED_NS before `now_ns`.
+        """
         return bool(self._applied) and now_ns - self._applied[-1][0] > FOLLOWED_NS
 
     def shift_ns(self, odometry: Odometry, horizon: float) -> int:
         """Return the shift [ns]: the time from a command's stamp until world begins to follow it.
 
-        A command with a plan states when it begins. Without a plan, the shift comes from the
-        echoes. Before the first echo, it comes from the newest `odometry` and the `horizon` [s].
+        If the newest command has a plan, the shift ends when the plan begins. Otherwise the echoes
+        show the shift. Before the first echo, the shift comes from the newest `odometry` and the
+        `horizon` [s].
         """
         if self.commands and self.commands[-1].plan:
             return self.commands[-1].planned_ns - self.stamps[-1]

@@ -91,7 +91,7 @@ class Kalman(Predictor):
         return prediction if horizon else odometry
 
     def model(self) -> Model | None:
-        """Return the robot's model in the state of the last prediction; None before the first."""
+        """Return the robot's model in the last predicted state; None before any prediction."""
         return self._replay.model()
 
 

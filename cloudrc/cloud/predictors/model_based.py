@@ -191,7 +191,7 @@ class ModelBased(Replay):
         self._body: WhiteBox | None = None  # at the newest sample
 
     def forecast(self, stamp_ns: int) -> WhiteBox | None:
-        """Predict the model at `stamp_ns` [ns]; return None without recent odometry or command."""
+        """Predict the model's state at `stamp_ns` [ns]; None without recent odometry or command."""
         body = copy(self._body)
         if body is None or not 0 < stamp_ns - body.basis.stamp_ns < GAP_NS:
             return None

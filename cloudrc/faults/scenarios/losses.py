@@ -19,9 +19,9 @@ from cloudrc.messages import Cause, GuardState
     expects="stays in TRACK, no step above the acceleration cap",
 )
 def _short_silence(outcome: Outcome, seed: int) -> None:
-    """Interrupt both directions in one flight, only the uplink or only the downlink in two others.
+    """Fly three times: interrupt both directions, then only the uplink, then only the downlink.
 
-    In these two flights the link has no jitter, because jitter makes gaps of its own.
+    The last two flights have no jitter, because jitter, too, makes gaps between datagrams.
     """
     at = measures.instant(seed)
     both, steady = silent(at, 0.1), conditions(jitter=0.0)

@@ -131,10 +131,10 @@ measured to requested value, and text."""
 
 
 def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
-    """Yield code and text of at most two causes of the quantities that are "off".
+    """Yield code and text of at most two reasons why quantities have the verdict "off".
 
-    First comes the most certain cause that the machine's counters show. If they show none, or only
-    "throttled", the most certain cause that the measured values suggest comes next.
+    First comes the most certain cause that the machine's counters show. If there is no such cause,
+    or if its code is "throttled", the most certain cause by the measured values comes next.
     """
     off = {row.name: row for row in one.rows if row.verdict == "off"}
     lost = next((row.measured for row in one.rows if row.name == "loss"), 0.0)
@@ -149,10 +149,10 @@ def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
 
 
 def _of_machine(known: Evidence, off: Mapping[str, Row], lost: float) -> Iterator[tuple[str, str]]:
-    """Yield code and text of each cause why the link deviates, the most certain cause first.
+    """Yield code and text of each cause that this machine's counters show, the most certain first.
 
-    `known` has this machine's counters, which show the causes. `off` has the measurements outside
-    their limits, by name. `lost` is the share of lost packets.
+    `known` has the counters. `off` has the measurements outside their limits, by name. `lost` is
+    the share of lost packets.
     """
     where, elsewhere = known.interface or "the way out", " and ".join(known.elsewhere)
     sent, unshaped = known.sent or 0, known.shaper == "none"

@@ -85,14 +85,14 @@ class Expected(NamedTuple):
     def hidden(self, name: str) -> float:
         """Return how uncertain the expected value of quantity `name` is, relative to its tolerance.
 
-        The result is half the width of the value's band, divided by the tolerance [1]. Above
-        CHANCE_MAX the verdict "ok" is impossible, because the band would hide a deviation.
+        The result is half the width of the band of likely values, divided by the tolerance [1].
+        Above CHANCE_MAX the verdict "ok" is impossible: the band would hide a deviation.
         """
         mean, low, high = self.bands[name]
         return 0.5 * (high - low) / tolerance(name, mean)
 
     def judge(self, name: str, value: float) -> Row:
-        """Judge whether a correct link can give the measured `value` [any unit] of `name`."""
+        """Judge whether a correct link can give the `value` [any unit] of the quantity `name`."""
         mean, low, high = self.bands[name]
         slack, hidden = tolerance(name, mean), self.hidden(name)
         if self.known and name == "deviation":
@@ -110,7 +110,8 @@ class Plan:
 
     A train is a group of datagrams that are sent back to back to measure the rate. Before each
     train, the same number of datagrams is sent one by one to measure all other quantities.
-    `draw` calls `pause` every few hundred microseconds, so that other threads can run.
+    A simulation of the transfer calls `pause` every few hundred microseconds, so that other threads
+    can run.
     """
 
     profile: DirectionProfile  # requested conditions
@@ -122,7 +123,7 @@ class Plan:
     def draw(self, sent: Floats, epoch: int = 1, first: int = 0) -> Stream:
         """Simulate the transfer of datagrams that are sent at `sent` [s] since the link came up.
 
-        The datagrams have the numbers from `first` on in the session `epoch`.
+        The counters of the datagrams begin at `first`, in the session `epoch`.
         """
         seed, uplink, kind, size = self.flow
         link = LinkDirection(self.profile, seed, uplink)
@@ -134,7 +135,8 @@ class Plan:
     def links(self) -> list[Stream]:
         """Simulated streams through 200 netem links with different random numbers.
 
-        The streams are shorter if the conditions are constant.
+        They show how much correct links differ by chance. If the conditions are constant, a stream
+        has at most RUN_LENGTH datagrams.
         """
         few = RUN_LENGTH - RUN_LENGTH % max(1, 2 * self.train)
         sent = self.sent[:few] if Timeline(self.profile).only() else self.sent
@@ -144,7 +146,7 @@ class Plan:
 
     @cached_property
     def chance(self) -> Expected:
-        """Expected values of a netem link, with bands that contain most of the simulated links."""
+        """Expected quantities of a netem link; each band contains most of the simulated links."""
         return self._expect(self.links)
 
     def expected(self, measured: Stream, epoch: int = 1, first: int = 0) -> Expected:
@@ -242,7 +244,7 @@ class Plan:
         return Stream(*(one.reshape(-1, 2 * self.train)[:, : self.train].ravel() for one in parts))
 
     def _shape(self, stream: Stream) -> Floats:
-        """Return measured - requested delay of each arrived datagram [s], shifted to median 0."""
+        """Return measured minus requested delay of arrived datagrams [s], shifted to median 0."""
         delays = stream.delays - _requested_delay(self.profile, stream.sent)
         there: Floats = delays[np.isfinite(delays)]
         return there - np.median(there) if len(there) else there

@@ -134,7 +134,7 @@ class LinkMonitor:
             threading.Event().wait(FOLLOW_PERIOD)
 
     def _see(self, records: Sequence[Record], now_ns: int) -> list[Record]:
-        """Store records; every `CHECK_NS`, return verdicts on the present session and profile."""
+        """Store records; return new verdicts every `CHECK_NS`, an empty list in between."""
         for record in records:
             if isinstance(record, Arrival):
                 self._fresh |= record.epoch != self._epoch
@@ -164,7 +164,7 @@ class LinkMonitor:
             kept.clear()
 
     def _report(self, rows: list[Row], now_ns: int) -> list[Record]:
-        """Make records of the verdicts; report "off" as "open" until the next check confirms it."""
+        """Make records of the verdicts; a first "off" becomes "open", a second stays "off"."""
         count, off = len(self._arrivals), {row.name for row in rows if row.verdict == "off"}
         if off - self._suspects:
             rows = [row._replace(verdict="open") if row.name in off else row for row in rows]
@@ -183,7 +183,7 @@ class LinkMonitor:
         return found
 
     def _rows(self) -> list[Row]:
-        """Judge all quantities; add an unjudged row "time_line" if a profile changes over time."""
+        """Judge all quantities; the row "time_line" tells that a profile changes over time."""
         stream, first, timed = _in_order(self._arrivals, self._period)
         judged = timed and (self._uplink or not self._computes)
         rows, skipped = list[Row](), UNJUDGED if judged else UNJUDGED | DELAYS
@@ -211,8 +211,8 @@ class LinkMonitor:
         """Change a verdict "off" to "open" if late wakes of this machine may explain a long delay.
 
         If a loop wakes late by t, about t / period datagrams arrive meanwhile. The mean square of
-        their waits is t^2 / 3, so the sum of the squares is t^3 / (3 · period). Averaged over all
-        wakes, this is the mean square of the added delay.
+        their waits is t^2 / 3, so the sum of the squares is t^3 / (3 · period). The mean of
+        this sum over all wakes is the mean square of the delay that late wakes add.
         """
         late = np.array(self._lates or [0.0])
         added = 2.0 * max((late**2).mean(), (late**3).mean() / (3.0 * self._period)) ** 0.5

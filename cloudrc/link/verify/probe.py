@@ -99,7 +99,7 @@ class ProbeEnd:
             self.socket.sendto(self.probes[number], self.route)
 
     def receive(self, far: socket.socket) -> None:
-        """Read a datagram from the other end's socket `far`; record it if this end sent it."""
+        """Read a datagram from the other end's socket `far`; record this end's probes."""
         with suppress(OSError, ValueError):  # no receiver of an earlier probe; not a probe
             data, ancillary, _, _ = far.recvmsg(DATAGRAM_MAX, ANCILLARY_SIZE)
             at_ns, number = self._stamps.wall_ns(ancillary) or time.time_ns(), peek(data)[2]

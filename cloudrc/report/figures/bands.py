@@ -22,7 +22,7 @@ LOOKS = (
 
 
 class Point(NamedTuple):
-    """A value with its interval; NaN if unknown."""
+    """A point of a line: a value, and its interval from `low` to `high`; NaN if unknown."""
 
     x: float  # any unit, or the index of a name
     middle: float  # any unit

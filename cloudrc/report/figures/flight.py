@@ -41,7 +41,7 @@ CAPTION_FREE = "Flight. (a) Path from above, waypoints numbered. (b) Height alon
 
 
 def caption(subject: Subject) -> str:
-    """Return the caption; it mentions clearance only if the scene has pipes."""
+    """Return the figure's caption; it mentions clearance only if the scene has pipes."""
     return CAPTION_PIPES if subject.flight.scene.pipes else CAPTION_FREE
 
 

@@ -22,7 +22,7 @@ DOTS = 6000
 
 @dataclass(frozen=True, slots=True)
 class DirectionSample:
-    """One direction of a link: profile, packets to draw over time, and packets for statistics."""
+    """Simulated packets of one direction of a link, for the figure of `cloudrc link show`."""
 
     asked: Direction  # the link profile
     sent: Array  # time of sending each packet, since the start of the link [s], shape (n,)

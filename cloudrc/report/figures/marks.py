@@ -28,7 +28,7 @@ HELD = " Red: the guard was in HOLD."
 
 
 def delays_of(direction: Direction) -> Timeline | None:
-    """Return a direction's link conditions over time; None if its trace or table is unreadable."""
+    """Return a direction's link conditions over time; None if a file for them is unreadable."""
     try:
         return Timeline(link_profile(direction))
     except BadInputError:
@@ -74,7 +74,7 @@ def parts(subject: Subject, *, uplink: bool) -> list[Part]:
         except ValueError:  # another version of cloudrc has recorded this flight
             continue
         origin = seconds(table["stamp_ns"][row]) - table["time_line"][row]
-        origin = found[-1].origin if isnan(origin) else float(origin)
+        origin = found[-1].origin if isnan(origin) else float(origin)  # NaN: of an old version
         found.append(Part(float(begins[row]), origin, direction, str(table["cause"][row])))
     return found
 

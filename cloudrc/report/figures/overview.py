@@ -60,12 +60,12 @@ def _pipe(pipe: Pipe, view: _View) -> list[Face]:
 
 
 class _View:
-    """A parallel projection of the scene; the longer side of the scene is horizontal in it."""
+    """A parallel projection of the scene, with the scene's longer side as the horizontal."""
 
     def __init__(self, points: Array, front: Array) -> None:
-        """Look at `points` [m], world frame, shape (n, 3), from the side to which `front` points.
+        """Choose the direction of view for `points` [m], world frame, shape (n, 3).
 
-        `front` is a vector in the world frame, shape (3,).
+        The viewer is on the side in the direction `front`, a vector in the world frame, shape (3,).
         """
         level = points[:, :2] - points[:, :2].mean(axis=0)
         x, y = np.linalg.svd(level, full_matrices=False)[2][0]

@@ -97,7 +97,7 @@ class PositionHold:
         return step_towards(reference, (x, y, z - sink), BRAKE * dt)
 
     def _brake(self, reference: Vector, readings: Readings, sink: float, dt: float) -> Vector:
-        """Brake for one step of `dt` [s]; set the hold point once the robot is at rest."""
+        """Brake for one step of `dt` [s]; at the velocity of the descent, set the hold point."""
         if not self.brakes:
             reference, self.brakes = brake_start(reference, readings.velocity), True
         x, y, z = reference
@@ -132,7 +132,7 @@ def brake_rate(speed: float) -> float:
 
 
 class Descent:
-    """Detect the touch-down of a descent, and decide whether the robot may stop above the ground.
+    """Detects the touch-down of a descent, and decides whether the robot may stop in the air.
 
     After the operator's acknowledgement, the robot stops its descent and holds its position, if
     it sinks unhindered and is above the lowest z for a hold. Otherwise the robot descends to
@@ -174,12 +174,12 @@ class Descent:
 
 
 class TakeOff:
-    """Detect the end of the take-off, and decide whether the robot may take off.
+    """Detects the end of the take-off, and decides whether the robot may take off.
 
     `over` becomes True when the robot has left the ground. If the rotors stopped in the air, the
-    robot may still fall, or be outside the fence, when the operator acknowledges the stop. It may
-    then take off only after it has come to rest on the ground, at least TAKE_OFF_MARGIN inside the
-    fence.
+    robot may still fall, or be outside the fence, when the operator acknowledges the stop. Before
+    the robot may take off again, it has to come to rest on the ground, at least TAKE_OFF_MARGIN
+    inside the fence.
     """
 
     def __init__(self, low: Vector, high: Vector) -> None:
@@ -216,8 +216,8 @@ class TakeOff:
     def look(self, readings: Readings, flies: bool) -> None:
         """Process the sensor readings of a physics step; `flies` tells whether the rotors turn.
 
-        While they turn, set `over` if the robot has left the ground. While they stand still, update
-        the robot's height on the ground and its time at rest.
+        While the rotors turn, update `over`: whether the robot has left the ground. While they
+        stand still, update the robot's height on the ground and its time at rest.
         """
         height = readings.position[2]
         if flies:

@@ -212,8 +212,8 @@ class Limits:
         """Check the limits; raise a ValueError that names the first invalid limit.
 
         Each limit has to be finite and above 0; only `plan_max_ns` may be 0. From `speed_max` the
-        robot has to stop within `STOPPING_DISTANCE`. It starts to brake after the largest age of a
-        command, the longest plan and the reaction time.
+        robot has to stop within `STOPPING_DISTANCE`. Before it brakes, it flies on for the sum of
+        the largest age of a command, the longest plan and the reaction time.
         """
         for name in self.__slots__[2:-1]:
             value = getattr(self, name)
@@ -235,8 +235,8 @@ class Limits:
     def ramp_ns(self) -> int:
         """How long after a HOLD the acceleration of the reference is limited to BRAKE [ns].
 
-        In this time the robot can reach its highest speed. The time is fixed: the reference may
-        reach the command at once, because the first commands after a silence may be zero.
+        In this time the robot can reach its highest speed. The limit does not end earlier when the
+        reference reaches the command, because the first commands after a silence may be zero.
         Source: docs/reference/plant.md, "Leaving HOLD".
         """
         return round(max(RAMP_MIN, self.speed_max / BRAKE) * 1e9)

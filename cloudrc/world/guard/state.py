@@ -85,8 +85,9 @@ class Guard:
         reference: Velocity reference of the last step [m/s], world frame, shape (3,).
         yaw_rate: Limited yaw rate [rad/s]; unused, as the low-level controller keeps a yaw of 0.
         changes: Changes of the state since the last `take_changes`.
-        counts: How often each limit was applied: "limited_speed" to a command or to a velocity of a
-            plan, "limited_yaw_rate" to a command, "limited_fence" in a step.
+        counts: "limited_speed": number of shortened velocities of commands and plans;
+            "limited_yaw_rate": commands with a limited yaw rate; "limited_fence": steps in which
+            the fence limited the reference.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -242,9 +243,9 @@ class Guard:
     def _settled(self, now_ns: int, fresh_until_ns: int) -> bool:
         """Return whether TRACK may begin at `now_ns`; prevent fast changes between TRACK and HOLD.
 
-        Take-off must be allowed. At least SETTLE_NS must lie between the starts of two TRACKs, and
-        between the starts of two HOLDs. The next HOLD may start at `fresh_until_ns`, when the
-        present command is no longer fresh.
+        Take-off must be allowed, and the last TRACK must have begun at least SETTLE_NS ago. The
+        last HOLD must have begun at least SETTLE_NS before `fresh_until_ns`: at this time the
+        present command becomes too old, and the next HOLD may begin.
         """
         apart_ns = min(fresh_until_ns - self._held_ns, now_ns - self._tracked_ns)
         return self._take_off.allowed and apart_ns >= SETTLE_NS
@@ -294,7 +295,7 @@ class Guard:
         return self._next_ns, self.reference, self._wanted, self._track_until_ns
 
     def _follow(self, reference: Vector, now_ns: int, readings: Readings, dt: float) -> None:
-        """Limit a velocity reference to keep the robot upright and inside the fence; store it."""
+        """Store a velocity reference, limited to keep the robot upright and inside the fence."""
         climb, position = readings.velocity[2], readings.position
         if reference[2] < climb - rules.SINK_LEAD_MAX:
             reference = rules.limit_sink(reference, self.reference, climb, self._speed_max)

@@ -54,7 +54,7 @@ def library() -> Library:
 
 
 def built_file(folder: Path = FOLDER, compiler: str = "built") -> Path:
-    """Return the path of a library made by `compiler`; "built": the library in the package."""
+    """Return the path in `folder` of the library that `compiler` makes; default: the package's."""
     key = sha256(SOURCE.read_bytes() + " ".join(FLAGS).encode()).hexdigest()[:16]
     return folder / f"step-{key}-{compiler}-{platform.machine().lower()}.so"
 

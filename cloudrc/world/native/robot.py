@@ -83,10 +83,10 @@ class Flight(ctypes.Structure):
 
 
 def make_flight(simulator: Simulator, controller: LowLevel, limits: Limits) -> Flight:
-    """Make a `Flight` with all fields except the present state.
+    """Make the C structure `Flight`; fill all fields except the present state of the robot.
 
     Call `make_flight` after a reset of the simulator. Raise an OSError, AttributeError, KeyError or
-    ImportError if MuJoCo is not as expected.
+    ImportError if this version of MuJoCo lacks a part that `step.c` needs.
     """
     model, data = simulator.model, simulator.data
     turning, (low, high) = rotors.Rotors(simulator.dt), limits.inner_corners()
@@ -214,11 +214,10 @@ def usable() -> Library:
 
 
 class NativeRobot(Robot):
-    """A `Robot` whose usual steps run in C, in `step.c`.
+    """A `Robot` that simulates usual steps in C (`step.c`) and all others in Python.
 
-    In a usual step the robot follows a fresh command that the guard need not limit. Python runs all
-    other steps. It runs every step while the robot has observers, or while the simulator stores its
-    controls in a `tape`.
+    In a usual step the robot follows a fresh command that the guard need not limit. No step runs in
+    C while the robot has observers, or while `Simulator.tape` records the controls of each step.
     """
 
     def __init__(
@@ -240,8 +239,8 @@ class NativeRobot(Robot):
     def run(self, tick_ns: int, until_ns: int) -> int:
         """Run steps from `tick_ns` up to `until_ns`; return the time of the next step [ns].
 
-        C runs the steps in which the guard need not limit a fresh command. Python runs the first
-        other step, and all steps after it.
+        C runs the steps while the robot follows a fresh command that the guard need not limit.
+        Python runs the first other step, and all steps after it.
         """
         simulator, guard = self.simulator, self.guard
         in_c = not self.observers and simulator.tape is None
@@ -272,7 +271,7 @@ class NativeRobot(Robot):
         return super().run(tick_ns, until_ns)
 
     def _give(self, reference: Vector, wanted: Vector, track_ns: int) -> None:
-        """Copy the robot's state, and the values from `Guard.plain_track`, to the C structure."""
+        """Copy the robot's state and the arguments to the C structure, before steps in C."""
         simulator = self.simulator
         tip = simulator.tip_force_peak, simulator.tip_impulse
         counts = simulator.contacts, simulator.steps

@@ -1,0 +1,343 @@
+"""Carry out the actions of `cloudrc sweep`, and `cloudrc run --seeds N`: a sweep of one point."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import statistics
+import sys
+from collections import Counter
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from cloudrc.cli.advice import warn
+from cloudrc.cli.cluster_flags import release_from_flags
+from cloudrc.cli.extras import MODES, require
+from cloudrc.cli.output import (
+    escape,
+    format_number,
+    print_line,
+    print_or_drop,
+    print_result,
+    table,
+)
+from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
+from cloudrc.cli.progress import SweepView
+from cloudrc.cli.report import print_traceback, summary
+from cloudrc.cli.run import fly, load, new_folder
+from cloudrc.cluster import batch
+from cloudrc.cluster.client import ClusterError
+from cloudrc.cluster.pods import refuse_local_files
+from cloudrc.config.document import write_yaml
+from cloudrc.config.overrides import parse_settings
+from cloudrc.errors import BadInputError, InvalidRunError
+from cloudrc.files import write_atomically
+from cloudrc.metrics.verdict import EXIT_CODES
+from cloudrc.sweep import store
+from cloudrc.sweep.flight import Row, counts, fly_point, measure
+from cloudrc.sweep.plan import Flight, Plan, pack, read_plan, unpack
+from cloudrc.sweep.statistics import median_interval
+
+METHOD = "95 % interval of the median, by order statistics"
+
+
+def run(options: argparse.Namespace) -> int:
+    """Fly the flights of a sweep whose results or recordings are missing; return the exit code."""
+    interrupt_on_signals()
+    plan, folder, (shard, count) = _plan(options), options.out, options.shard or (None, 1)
+    if options.shard:
+        folder.mkdir(parents=True, exist_ok=True)  # another shard may be faster
+    elif folder is None or not (folder / store.FILE).is_file():
+        folder = new_folder(folder, f"sweep-{options.file.stem}", "latest-sweep")
+    before = store.begin(folder, plan)
+    mine = [*plan.flights.values()][(shard or 1) - 1 :: count]
+    missing = [
+        each
+        for each in mine
+        if each.key not in before or _to_record(before[each.key], options.record, folder)
+    ]
+    part = f", shard {shard} of {count}" if shard else ""
+    head = f"{len(plan.points)} points x {len(plan.seeds)} seeds{part}: {len(mine)} flights"
+    stream = sys.stdout if options.output == "table" else sys.stderr
+    head += f", {len(mine) - len(missing)} done before" if len(missing) < len(mine) else ""
+    view = SweepView(stream, f"{plan.points[0].name}: {head}", len(missing))
+    with closing(view):
+        flown = _fly(options, plan, missing, folder)
+        rows, stopped, code = _keep(flown, folder, plan, shard, before, view.see)
+    if stopped:
+        flags = " --on kubernetes, and its other flags" if options.on else ""
+        again = f"cloudrc sweep run {options.file} --out {folder}{flags}"
+        print_line(f"cloudrc: {stopped}; to continue: {again}", sys.stderr)
+    name = store.TABLE if len(rows) == len(plan.flights) else store.SUMMARY
+    text = f"\n{_verdicts(rows.values())}\n\n{escape(str(folder / name))}"
+    print_result(options.output, store.read_summary(folder), text)
+    return code or int(any(rows[each.key]["verdict"] != "success" for each in mine))
+
+
+def _plan(options: argparse.Namespace) -> Plan:
+    """Check the flags, read the plan, and print warnings; nothing is written yet."""
+    if not options.on:
+        require("a sweep", MODES["virtual"] if options.record else ("world",))
+    elif options.record or options.shard:
+        raise BadInputError("--on kubernetes has no --record and no --shard; see --shards")
+    if options.shard and options.out is None:
+        raise BadInputError("--shard needs --out, the folder that all shards share")
+    plan = read_plan(options.file)
+    if options.on:
+        for point in plan.points:
+            refuse_local_files(point.model_dump(mode="json"), "or fly without --on")
+    warn(*plan.points)
+    return plan
+
+
+def _keep(
+    flown: Generator[Row],
+    folder: Path,
+    plan: Plan,
+    shard: int | None,
+    before: Collection[str],
+    see: Callable[[Row], None],
+) -> tuple[dict[str, Row], str, int]:
+    """Append each new row to the sweep in `folder`, call `see` with it, and write the tables.
+
+    `before` has the keys of the rows that the folder already has. Return all rows, key -> row; why
+    the work ended early, or ""; and the exit code.
+    """
+    with store.append_rows(folder, shard) as append:
+
+        def take(row: Row) -> None:
+            if row["key"] not in before:
+                append(row)
+            see(row)
+
+        stopped, code = take_each(flown, take)
+    return store.finish(folder, plan), stopped, code
+
+
+def _fly(
+    options: argparse.Namespace, plan: Plan, flights: list[Flight], folder: Path
+) -> Generator[Row]:
+    """Fly on this machine or in pods; yield the row of each flight when it ends."""
+    if options.on:
+        return rows_from_pods(options, plan, flights)
+    fly = partial(fly_row, record=options.record, folder=folder)
+    return map_in_order(fly, flights, options.jobs, in_order=False)
+
+
+def fly_row(flight: Flight, record: str | None = None, folder: Path = Path()) -> Row:
+    """Fly a flight and return its row; if a recording is wanted, fly again to make it."""
+    row = flight.row(fly_point(flight.experiment))
+    if _to_record(row, record, folder):
+        _fly_into(folder / flight.key, flight, page=False)
+    return row
+
+
+def _to_record(row: Row, record: str | None, folder: Path) -> bool:
+    """Return whether a flight still needs a recording.
+
+    `record` names the flights to record: "failed", "all" or None for no flights.
+    """
+    wanted = record == "all" or (record == "failed" and row["verdict"] != "success")
+    has = (folder / row["key"] / "report.json").is_file()
+    return wanted and row["verdict"] != "error" and not has
+
+
+def _fly_into(folder: Path, flight: Flight, *, page: bool) -> dict[str, Any]:
+    folder.mkdir(exist_ok=True)
+    return fly(flight.experiment, "virtual", folder, page=page)
+
+
+def fly_again(options: argparse.Namespace) -> int:
+    """Repeat a flight of a sweep with recording and report; exit with 6 if its records changed."""
+    require("a report", MODES["virtual"])
+    store.read_summary(options.folder)
+    rows = [row for key, row in store.read_rows(options.folder).items()
+            if key.startswith(options.key)]  # fmt: skip
+    if len(rows) != 1:
+        text = f"{len(rows)} rows have a key that begins like this; give one key"
+        raise BadInputError(f"{options.folder}: {options.key}: {text}")
+    key, flights = rows[0]["key"], read_plan(options.folder / store.FILE).flights
+    changed = f"{key}: a plug-in, the processor or a package has changed since; fly the sweep again"
+    if key not in flights:
+        raise InvalidRunError(changed)
+    report = _fly_into(options.folder / key, flights[key], page=True)
+    print_traceback(options, report)
+    print_or_drop(summary(report, options.folder / key))
+    if rows[0]["records_sha256"] != report["records_sha256"]:
+        raise InvalidRunError(changed)
+    print_or_drop("\nthe records are those of the sweep", sys.stderr)
+    return 0
+
+
+def print_status(options: argparse.Namespace) -> int:
+    """Print how many flights of a sweep are done, and how many succeeded per value of an axis."""
+    summary = store.read_summary(options.folder)
+    rows, values = store.read_rows(options.folder).values(), []
+    for axis, choices in summary["axes"].items():
+        for value in choices:
+            found = [row["verdict"] for row in rows if row["point"][axis] == value]
+            counts = {"flights": len(found), "success": found.count("success")}
+            values.append({"axis": axis, "value": value, **counts})
+    text = f"{len(rows)} of {summary['flights']} flights are done: {_verdicts(rows)}"
+    cells = [(each["axis"], store.as_text(each["value"]), f"{each['success']}/{each['flights']}")
+             for each in values]  # fmt: skip
+    if cells:
+        text += f"\n\n{table([('axis', 'value', 'success'), *cells], right=(2,))}"
+    document = {"flights": summary["flights"], "rows": len(rows), "axes": values}
+    print_result(options.output, document, text)
+    return 0
+
+
+def draw_figure(options: argparse.Namespace) -> int:
+    """Draw a sweep and write the figure as PDF, PNG and SVG; print the caption and the paths."""
+    require("a figure", ("report",))
+    from cloudrc.report.figures.style import Look
+    from cloudrc.sweep.figure import draw_sweep
+
+    rows, units, missing = store.read_flights(options.folder)
+    look = Look(options.width, options.font_size)
+    files, caption = draw_sweep(rows, units, options.number, options.x, options.by, look)
+    out = options.out or options.folder / "figure"
+    stem = out.stem if out.suffix.removeprefix(".") in files else out.name
+    print_or_drop(caption + (f" {missing}." if missing else "") + "\n")
+    for kind, data in files.items():
+        path = out.with_name(f"{stem}.{kind}")
+        write_atomically(path, data)
+        print_or_drop(escape(str(path)))
+    return 0
+
+
+def _verdicts(rows: Iterable[Row]) -> str:
+    counts = Counter(row["verdict"] for row in rows)
+    return ", ".join(f"{count} {name}" for name, count in sorted(counts.items())[::-1]) or "none"
+
+
+# Sweeps in pods, which run `cloudrc sweep rows`.
+
+
+def rows_from_pods(
+    options: argparse.Namespace, plan: Plan, flights: Sequence[Flight]
+) -> Generator[Row]:
+    """Fly flights of a plan on a cluster, and yield each row once.
+
+    Each pod of a Job flies a share (shard) of the flights and logs their rows. If a pod is deleted
+    just after its last flight, its log is lost, but Kubernetes counts its shard as complete.
+    Therefore further Jobs fly the flights without a row.
+
+    Raises:
+        ClusterError: If a Job fails or yields no row, or if a pod will never run.
+    """
+
+    def tell(text: str) -> None:
+        print_line(f"  {text}", sys.stderr)
+
+    release = release_from_flags(options)
+    every = "".join(plan.flights).encode() + str(options.shards).encode()
+    name = f"sweep-{hashlib.sha256(every).hexdigest()[:12]}"
+    words = {"image": options.image, "cpu": options.cpu, "queue": options.queue}
+    missing = {flight.key: flight for flight in flights}
+    while missing:
+        before = len(missing)
+        batch.start(release, name, pack(missing.values()), options.shards, **words)
+        tell(
+            f"Job '{name}' {release.where}, {options.shards} pods; it goes on without this command"
+        )
+        for line in batch.read_lines(release, name, tell):
+            row = store.parse_row(line)
+            if row is not None and missing.pop(row["key"], None) is not None:
+                yield row
+        if len(missing) == before:
+            text = "the same command flies them; is the image of this version of cloudrc?"
+            raise ClusterError(f"the pods printed no row of {before} flights; {text}")
+        if missing:
+            tell(f"the rows of {len(missing)} flights were lost with their pods")
+
+
+def print_rows(options: argparse.Namespace) -> int:
+    """Fly one shard (part) of the flights in a file; print the result of each flight as a row."""
+    interrupt_on_signals()  # the first process of a container ignores signals by default
+    shard, count = options.shard
+    for flight in unpack(options.file)[shard - 1 :: count]:
+        print(json.dumps(fly_row(flight), allow_nan=False), flush=True)
+    return 0
+
+
+# `cloudrc run --seeds N`.
+
+
+def summarise(rows: Sequence[Row], units: Mapping[str, str]) -> dict[str, Any]:
+    """Count all runs and successful runs; compute the median of each measurement.
+
+    Each median has a confidence interval. A run whose plug-in failed is counted, but its
+    measurements are left out. `units`: metric -> unit.
+    """
+    numbers, measured = {}, [row["numbers"] for row in rows if counts(row)]
+    for name in dict.fromkeys(name for each in measured for name in each):
+        found = [each[name] for each in measured if name in each]
+        middle = {"median": statistics.median(found), "interval": median_interval(found)}
+        numbers[name] = {**middle, "unit": units[name], "count": len(found)}
+    done = sum(row["verdict"] == "success" for row in rows)
+    return {"done": done, "count": len(rows), "method": METHOD, "numbers": numbers}
+
+
+def as_table(summary: Mapping[str, Any]) -> str:
+    """Format the result of `summarise` as a table; the last line counts the successful runs."""
+    rows = [("number", "median", "95 % interval", "unit")]
+    for name, entry in summary["numbers"].items():
+        between = " .. ".join(map(format_number, entry["interval"] or ())) or "-"
+        unit = "" if entry["unit"] == "1" else entry["unit"]
+        note = "" if entry["count"] == summary["count"] else f"  ({entry['count']} runs)"
+        rows.append((name, format_number(entry["median"]), between, unit + note))
+    method = METHOD if summary["count"] >= 6 else "an interval needs 6 seeds or more"
+    return f"{table(rows, right=(1, 2))}\n\n{method}\ndone {summary['done']}/{summary['count']}"
+
+
+def fly_seeds(options: argparse.Namespace) -> int:
+    """Fly seeds 1 to N and print one table; return 0 if all runs succeed.
+
+    If Ctrl-C or a killed worker ends the command early, the table shows the finished seeds only.
+    """
+    experiment = load(options.experiment, options.set)
+    warn(experiment)
+    name = experiment.name
+    folder = new_folder(options.out, f"{name}-virtual-{options.seeds}seeds", "latest-sweep")
+    settings = {".".join(path): each.value for path, each in parse_settings(options.set).items()}
+    settings.pop("seed", None)
+    file = {"experiment": options.experiment, "set": settings, "seeds": options.seeds}
+    (folder / store.FILE).write_text(write_yaml(file | {"folder": str(Path.cwd())}), "utf-8")
+    plan, seen = read_plan(folder / store.FILE), list[Row]()
+    for_people, work = options.output == "table", [*plan.flights.values()]
+
+    def see(row: Row) -> None:
+        seen.append(row)
+        failure = f": {row['text']}" if row["failures"] else ""
+        count = f"{len(seen)}/{len(work)}"
+        line = f"{count:>7}  seed {row['seed']}  {row['verdict']}{failure}"
+        if for_people or sys.stderr.isatty():
+            print_or_drop(escape(line), sys.stdout if for_people else sys.stderr)
+        if not any("traceback" in earlier for earlier in seen[:-1]):
+            print_traceback(options, row)
+
+    flown = map_in_order(fly_seed, work, len(work))
+    _, stopped, code = _keep(flown, folder, plan, None, store.begin(folder, plan), see)
+    if stopped:
+        text = f"\ncloudrc: {stopped}: {len(seen)} of {len(work)} seeds are finished"
+        print_or_drop(text, sys.stderr)
+    document = {
+        **{"experiment": name, "mode": "virtual", "interrupted": bool(stopped)},
+        "overrides": list(options.set),
+        **summarise(seen, store.read_summary(folder)["units"]),
+        "runs": [{key: row[key] for key in ("seed", "verdict", "key")} for row in seen],
+    }
+    text = f"\n{as_table(document)}\n\n{folder / store.SUMMARY}"
+    print_result(options.output, document, text)
+    return code or max(EXIT_CODES[row["verdict"]] for row in seen)
+
+
+def fly_seed(flight: Flight) -> Row:
+    """Fly once; return the row of results, such as the verdict. An exception ends the command."""
+    return flight.row(measure(flight.experiment))

@@ -1,0 +1,43 @@
+"""Schedules of faults: in files, and random ones."""
+
+import pytest
+
+from cloudrc.errors import BadInputError
+from cloudrc.faults.adversary import POLICIES, choose
+from cloudrc.faults.schedule import CALM, KINDS, compose, dump, load
+
+
+@pytest.mark.parametrize("draw", [compose, choose])
+def test_a_drawn_schedule_is_what_its_file_says(draw, tmp_path):
+    path = tmp_path / "schedule.yaml"
+    for seed in range(100):
+        path.write_text(dump(draw(seed), "a note\nof two lines"))
+        assert load(path) == draw(seed)
+
+
+def test_random_schedules_have_all_faults_and_calm_at_the_end():
+    drawn = [compose(seed) for seed in range(400)]
+    events = [event for schedule in drawn for event in schedule.events]
+    assert {event.kind for event in events} == set(KINDS)
+    assert max(event.end for event in events) <= CALM
+    assert 10 < sum(not schedule.events for schedule in drawn) < 60
+    assert 70 < sum(schedule.hold_max < 60.0 for schedule in drawn) < 180
+    # A hostile cloud flies alone or amid faults.
+    hostile = {(chosen.policy, not chosen.events) for chosen in map(choose, range(200))}
+    assert hostile == {(policy, alone) for policy in POLICIES for alone in (True, False)}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "[1, 2]", "{{", "[" * 2000, "seed: one", "seed: 1\nwind: 3", "seed: 1\nreorder: 2"),
+        "seed: 1\nevents: [{kind: rain, at: 1}]",
+        "seed: 1\nevents: [{kind: blackout, at: .nan}]",
+        "seed: 1\nevents: [{kind: loss, at: 1, duration: 3, value: 1.5}]",
+    ],
+)
+def test_a_file_that_is_no_schedule_is_bad_input(tmp_path, text):
+    path = tmp_path / "schedule.yaml"
+    path.write_text(text)
+    with pytest.raises(BadInputError, match=r"schedule\.yaml: is no schedule of faults"):
+        load(path)
