@@ -91,7 +91,8 @@ def _column(kind: Kind, values: Iterable[Any]) -> Column:
 class Recording:
     """The tables of a flight by topic, and what else a file contains.
 
-    A topic is decoded when its table is read for the first time.
+    A topic is decoded when its table is read for the first time. This raises a BadInputError if a
+    message of the topic is not readable.
     """
 
     messages: list[Message] = field(default_factory=list)  # in the order of log times
@@ -182,7 +183,7 @@ class Recording:
             stamps_ns, rows = zip(*[decode(TOPICS[topic], data) for data in messages], strict=True)
         except Exception as error:  # rosbags may raise anything on malformed bytes
             raise BadInputError(
-                f"{self.source}: a message on {topic} is not readable; use the file of cloudrc"
+                f"{self.source}: a message on {topic} is not readable; use the original file"
             ) from error
         return Table(TOPICS[topic], stamps_ns, zip(*rows, strict=True))
 
