@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 DURATION_NS = 20_000_000_000
 """Simulated time of the link [ns]."""
 WARNINGS_MAX = 3
-"""Largest number of warnings about several experiments that are printed."""
+"""Largest number of warnings that are printed about more than two experiments."""
 SAG_MAX = 0.05
 """Largest steady error of the position that needs no warning [m]."""
 WIND_FORCE = 0.24

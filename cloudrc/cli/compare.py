@@ -96,7 +96,7 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
     """
     from cloudrc.cli.advice import warn
     from cloudrc.cli.progress import SweepView
-    from cloudrc.cli.run import load
+    from cloudrc.cli.run import load, refuse_seed
     from cloudrc.sweep.compare import Found, Pair, check_names
     from cloudrc.sweep.flight import fly_point, units
 
@@ -107,6 +107,8 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
     require("compare", MODES["virtual"])
     # A comma separates settings only before KEY=: a list may contain commas.
     texts = [re.split(r",(?=[\w.]+=)", text) for text in (options.a, options.b)]
+    for each in texts:
+        refuse_seed([*options.set, *each])
     sides = [load(options.experiment, [*options.set, *each]) for each in texts]
     if sides[0] == sides[1]:
         raise BadInputError("A and B are the same experiment; change one of them")

@@ -20,7 +20,7 @@ from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
-    from cloudrc.faults.scenario import Outcome, Scenario
+    from cloudrc.faults.measures import Outcome, Scenario
     from cloudrc.faults.trial import Finding
 
 EPILOG = """\

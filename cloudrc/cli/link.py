@@ -90,7 +90,7 @@ KINDS = ("png", "svg", "pdf")
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", title="actions")
     here = {
         "show": (SHOW_EPILOG, show_arguments, show),
         "verify": (VERIFY_EPILOG, verify_arguments, _verify),
@@ -117,8 +117,6 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the action that the user has chosen, such as `set`; return the exit code."""
-    if options.action is None:
-        raise BadInputError("an action is missing; see 'cloudrc link --help'")
     code: int = options.act(options)
     return code
 

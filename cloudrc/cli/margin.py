@@ -52,11 +52,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Print the largest value of KEY at which all flights succeed; return 0, or 1 if none."""
-    from cloudrc.cli.run import load
+    from cloudrc.cli.run import load, refuse_seed
 
     interrupt_on_signals()
     require("margin", MODES["virtual"])
     key, size, limit = options.key, options.resolution, options.max
+    refuse_seed([*options.set, f"{key}=0"])
     if size is None:
         size = 10.0 if key.endswith("_ms") else 0.01
     present = _present(load(options.experiment, options.set), key)

@@ -12,6 +12,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, TextIO
 
+from cloudrc.errors import DISK_FULL
+
 _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1"}
 
 
@@ -34,10 +36,16 @@ def format_document(document: object, form: str) -> str:
 def print_result(form: str, document: Mapping[str, Any], text: str) -> None:
     """Print the result of a command: `text` if `form` is "table", else the document in this form.
 
-    The document begins with the version of its schema.
+    The document begins with the version of its schema. Print nothing if the reader closed the pipe;
+    raise an OSError if the disk is full, because the file has no result then.
     """
-    for_people = form == "table"
-    print_or_drop(text if for_people else format_document({"schemaVersion": 1, **document}, form))
+    shown = text if form == "table" else format_document({"schemaVersion": 1, **document}, form)
+    try:
+        print(shown, flush=True)
+    except OSError as error:
+        discard_output(sys.stdout)
+        if error.errno in DISK_FULL:
+            raise
 
 
 def is_live(stream: TextIO) -> bool:

@@ -121,6 +121,17 @@ def load(name: str, overrides: Iterable[str], seed: int | None = None) -> Resolv
     return experiment
 
 
+def refuse_seed(texts: Iterable[str]) -> None:
+    """Raise a BadInputError if one of the settings `texts` (KEY=VALUE) sets the seed.
+
+    Commands with --seeds replace the seed in every flight.
+    """
+    from cloudrc.config.overrides import parse_settings
+
+    if ("seed",) in parse_settings(texts):
+        raise BadInputError("seed: each flight has its own seed; give their number with --seeds")
+
+
 def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None) -> int:
     """Fly as `options` say, print the summary, and return the exit code.
 

@@ -28,7 +28,7 @@ from cloudrc.cli.output import (
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.cli.progress import SweepView
 from cloudrc.cli.report import print_traceback, summary
-from cloudrc.cli.run import fly, load, new_folder
+from cloudrc.cli.run import fly, load, new_folder, refuse_seed
 from cloudrc.cluster import batch
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.pods import refuse_local_files
@@ -301,12 +301,12 @@ def fly_seeds(options: argparse.Namespace) -> int:
 
     If Ctrl-C or a killed worker ends the command early, the table shows the finished seeds only.
     """
+    refuse_seed(options.set)
     experiment = load(options.experiment, options.set)
     warn(experiment)
     name = experiment.name
     folder = new_folder(options.out, f"{name}-virtual-{options.seeds}seeds", "latest-sweep")
     settings = {".".join(path): each.value for path, each in parse_settings(options.set).items()}
-    settings.pop("seed", None)
     file = {"experiment": options.experiment, "set": settings, "seeds": options.seeds}
     (folder / store.FILE).write_text(write_yaml(file | {"folder": str(Path.cwd())}), "utf-8")
     plan, seen = read_plan(folder / store.FILE), list[Row]()

@@ -18,8 +18,7 @@ import numpy as np
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
 from cloudrc.errors import BadInputError
-from cloudrc.faults.scenario import generator
-from cloudrc.faults.schedule import DURATION, PAPER, Schedule, compose
+from cloudrc.faults.schedule import DURATION, PAPER, Schedule, compose, generator
 from cloudrc.geometry.fence import HIGH, LOW
 from cloudrc.messages import (
     MISSION_OVER,
@@ -162,21 +161,23 @@ def _faces(position: Vector) -> list[tuple[float, int, float]]:
     return [(HIGH[n] - p, n, 1.0) for n, p in enumerate(position)] + walls
 
 
-def dishonesty(schedule: Schedule) -> tuple[Lie, Words | None]:
-    """Return the two functions by which the dishonest cloud of a schedule attacks.
+def dishonesty(schedule: Schedule) -> tuple[list[Lie], Words | None]:
+    """Return the functions by which the cloud of a schedule attacks; an honest cloud has none.
 
-    The first changes commands. The second forges operator requests; it is None if the policy
-    forges none.
+    Those in the list change commands. The last one forges operator requests; it is None if the
+    policy forges none.
 
     Raises:
         BadInputError: If the policy does not exist; the message lists all policies.
     """
+    if not schedule.policy:
+        return [], None
     if schedule.policy not in POLICIES:
         names = ", ".join(POLICIES)
         raise BadInputError(f"no policy '{schedule.policy}' of a cloud; there are: {names}")
-    lie = POLICIES[schedule.policy](generator(schedule.seed, 666))
+    lies = [POLICIES[schedule.policy](generator(schedule.seed, 666))]
     speaks = schedule.policy in SPEAKING
-    return lie, at_bad_moments(generator(schedule.seed, 667)) if speaks else None
+    return lies, at_bad_moments(generator(schedule.seed, 667)) if speaks else None
 
 
 def choose(seed: int) -> Schedule:

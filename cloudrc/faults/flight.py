@@ -6,9 +6,7 @@ World, cloud and their driver are those of production; processes and teleop are 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
-from typing import TypeAlias
 
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudEndpoint
@@ -18,39 +16,23 @@ from cloudrc.config.load import load_experiment
 from cloudrc.drivers.teleop import PERIOD_NS as WAKE_NS
 from cloudrc.drivers.virtual import Clock, VirtualRun
 from cloudrc.endpoint import Endpoint
-from cloudrc.faults.adversary import DishonestLoop, HostileOperator, Lie, Words
+from cloudrc.faults.adversary import DishonestLoop, HostileOperator, Lie, dishonesty
+from cloudrc.faults.inject import BUGS, SECRET, bugs, inject, shaped
 from cloudrc.faults.invariants import Watch
-from cloudrc.faults.models import EndpointGroup, RestartableEndpoint, TeleopModel
-from cloudrc.faults.scenario import generator
+from cloudrc.faults.models import RestartableEndpoint, TeleopModel
+from cloudrc.faults.schedule import OFFSET_MAX, Schedule, generator
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.profile import Blackout, DirectionProfile
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.records import Counted, GroundTruth, GuardChange, MissionEvent, Record
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import Mission, Order
 from cloudrc.tunnel.end import Identity
-from cloudrc.tunnel.keys import Key, KeyRing, KeySet
+from cloudrc.tunnel.keys import KeyRing, KeySet
 from cloudrc.world.endpoint import WorldEndpoint
 from cloudrc.world.robot import Robot
 
-Shape: TypeAlias = Callable[[DirectionProfile], DirectionProfile]
-"""Function that changes the conditions of one direction of the link."""
-SECRET = KeySet(Key(b"a key of the fault suite, 32 b.."))
 SHARED, OTHER = b"one clock for all".ljust(16)[:16], b"another clock..."
-
-
-def conditions(**changes: object) -> Shape:
-    """Return a function that sets the fields `changes` in the profile of one direction."""
-    return lambda profile: replace(profile, **changes)  # type: ignore[arg-type]
-
-
-def silent(start: float, duration: float, **changes: object) -> Shape:
-    """Return a function that makes a direction silent from `start` [s] for `duration` [s].
-
-    The function also replaces other fields of the direction's profile by `changes`.
-    """
-    return conditions(blackouts=(Blackout(start, duration),), **changes)
 
 
 class Flight:
@@ -63,24 +45,34 @@ class Flight:
 
     def __init__(
         self,
+        schedule: Schedule,  # faults of the flight, and the link's profile
         *settings: str,  # settings of the experiment `paper`, as for `--set`
-        seed: int = 1,
-        cloud_clock: Clock | None = None,  # None if world and cloud share a clock
-        link: Shape = replace,  # changes both directions of the link; by default nothing
-        uplink: Shape | None = None,  # replaces `link` from world to cloud
-        downlink: Shape | None = None,  # replaces `link` from cloud to world
-        honest: bool = True,  # whether cloud is honest; then a contact is a breach
+        honest: bool = True,  # whether a contact is a breach; not if `schedule` has a policy
         keep: bool = True,  # whether all records are kept and hashed
         start: bool = True,  # whether the experiment's mission is ordered at once
         life: int = 1,  # makes the nonces differ from those of another flight
-        lies: Sequence[Lie] = (),  # change cloud's commands, one after the other
-        words: Words | None = None,  # makes requests in place of the operator
-        second: float | None = None,  # when a second cloud connects [s]
+        lies: Sequence[Lie] = (),  # change cloud's commands after those of the schedule
     ) -> None:
-        self.experiment = load_experiment("paper", [*settings, f"seed={seed}"])
-        self._honest, self._keep = honest, keep
-        self._life, self._second, self._lies, self._words = life, second, lies, words
-        self._clock, self._clock_id = cloud_clock or Clock(), OTHER if cloud_clock else SHARED
+        """Prepare a flight; a comment beside each argument describes it.
+
+        Raises:
+            BadInputError: If the schedule names an unknown link profile, or an unknown policy of a
+                dishonest cloud.
+        """
+        self.schedule = schedule
+        plans = ["guard.plan_max_s=0.8"] if "plans" in schedule.policy else []
+        faults = f"link.profile={schedule.profile}", f"guard.hold_max_s={schedule.hold_max:g}"
+        settings = (*plans, *faults, *settings, f"seed={schedule.seed}")
+        self.experiment = load_experiment("paper", list(settings))
+        has_own_clock = bool(schedule.cloud_offset or schedule.cloud_drift)
+        offset = schedule.cloud_offset % OFFSET_MAX  # no clock shows a negative time
+        self._clock = Clock(round(offset * 1e9), schedule.cloud_drift)
+        self._clock_id = OTHER if has_own_clock else SHARED
+        policy, self._words = dishonesty(schedule)
+        mistakes = [bugs(schedule, self._clock)] if schedule.of(*BUGS) else []
+        self._lies = [*policy, *mistakes, *lies]
+        self._honest, self._keep, self._life = honest and not schedule.policy, keep, life
+        self._rival_at = min((event.at for event in schedule.of("second_cloud")), default=None)
         self.secrets, self.rings = {"world": SECRET, "cloud": SECRET}, dict[str, KeyRing]()
         self.generations = {"world": 0, "cloud": 0}
         self.of_world, self.of_cloud = list[Record](), list[Record]()
@@ -96,9 +88,9 @@ class Flight:
         self.world = RestartableEndpoint(self._build_world, Clock())
         self.cloud = RestartableEndpoint(self._build_cloud, self._clock)
         self.teleop.run_on(self.cloud)
-        self.uplink = self._make_link(uplink or link, up=True)
-        self.downlink = self._make_link(downlink or link, up=False)
+        self.uplink, self.downlink = self._make_link("up"), self._make_link("down")
         self.run = VirtualRun(self.world, self.cloud, self.uplink, self.downlink)
+        inject(self)
 
     @property
     def robot(self) -> Robot:
@@ -148,9 +140,8 @@ class Flight:
 
     def end_rival(self) -> None:
         """Stop the second cloud, so that the first cloud can control the robot again."""
-        if isinstance(self.cloud.inner, EndpointGroup):
-            self.cloud.inner.members = self.cloud.inner.members[:1]
-        self._second = None
+        self.cloud.members = self.cloud.members[:1]
+        self._rival_at = None
 
     def sha256(self) -> str:
         """Return the hash of all records so far; the flight must have been made with `keep`."""
@@ -178,13 +169,13 @@ class Flight:
             return GuardState.GROUND, "the world is down"
         return self.robot.guard.state, self.robot.guard.cause.words
 
-    def _build_world(self, start_ns: int) -> WorldEndpoint:
+    def _build_world(self, start_ns: int) -> list[Endpoint]:
         identity = self._begin("world", SHARED)
         world = assembly.build_world(self.experiment, identity, lambda: start_ns)
         self.watch.attach(world.robot, start_ns, honest=self._honest)
-        return world
+        return [world]
 
-    def _build_cloud(self, start_ns: int) -> Endpoint:
+    def _build_cloud(self, start_ns: int) -> list[Endpoint]:
         identity = self._begin("cloud", self._clock_id)
         teleop: Operator = self.teleop.join(start_ns)
         if self._words is not None:
@@ -193,10 +184,10 @@ class Flight:
         cloud = assembly.build_cloud(
             self.experiment, identity, lambda: start_ns, teleop, make_loop=make_loop
         )
-        if self._second is None:
-            return cloud
-        joins_ns = max(self._clock.at(round(self._second * 1e9)), start_ns)
-        return EndpointGroup([cloud, self._build_rival(joins_ns)])
+        if self._rival_at is None:
+            return [cloud]
+        joins_ns = max(self._clock.at(round(self._rival_at * 1e9)), start_ns)
+        return [cloud, self._build_rival(joins_ns)]
 
     def _build_rival(self, start_ns: int) -> CloudEndpoint:
         """Build a second cloud with the same key; it has its own teleop and the same mission."""
@@ -205,9 +196,10 @@ class Flight:
         identity = Identity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
         return assembly.build_cloud(self.experiment, identity, lambda: start_ns, teleop)
 
-    def _make_link(self, shape: Shape, *, up: bool) -> LinkDirection:
-        profile = assembly.link_profile(self.experiment.uplink if up else self.experiment.downlink)
-        return LinkDirection(shape(profile), self.experiment.seed, uplink=up)
+    def _make_link(self, way: str) -> LinkDirection:
+        ends = {"up": self.experiment.uplink, "down": self.experiment.downlink}
+        profile = shaped(self.schedule, assembly.link_profile(ends[way]), way)
+        return LinkDirection(profile, self.experiment.seed, uplink=way == "up")
 
     def _begin(self, end: str, clock_id: bytes) -> Identity:
         """Make key ring and identity of a new process of `end`, "world" or "cloud"."""

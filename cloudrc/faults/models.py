@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from heapq import heappop, heappush
@@ -41,20 +41,32 @@ Call: TypeAlias = Callable[[MissionService, int], object]
 
 
 class RestartableEndpoint:
-    """An `Endpoint`: world or cloud in a process that a scenario can kill, freeze and start."""
+    """An `Endpoint`: world or cloud in a process that a scenario can kill, freeze and start.
+
+    A second cloud runs in the process of the first one; each of them receives all datagrams.
+
+    Attributes:
+        members: World, the cloud, or both clouds; empty while there is no process.
+        others: Records of the second cloud, oldest first.
+    """
 
     sealed = True  # world and cloud have keys
 
-    def __init__(self, build: Callable[[int], Endpoint], clock: Clock) -> None:
-        """Start a process; `build` makes world or cloud, given the time on `clock` [ns]."""
+    def __init__(self, build: Callable[[int], list[Endpoint]], clock: Clock) -> None:
+        """Start a process; `build` makes its members, given the time on `clock` [ns]."""
         self._build, self.clock = build, clock
         self.tamper: Tamper | None = None  # changes the datagrams that arrive
         self._scheduled, self._frozen_until_ns = 0, -1
         self._waiting: list[bytes] = []
         self._left: list[Record] = []
         self._actions: list[tuple[int, int, Action]] = []
-        self.inner: Endpoint | None = build(clock.at(0))  # None while there is no process
+        self.members, self.others = build(clock.at(0)), list[Record]()
         self._set_deadline()
+
+    @property
+    def inner(self) -> Endpoint | None:
+        """World or the first cloud; None while there is no process."""
+        return self.members[0] if self.members else None
 
     def at(self, seconds: float, action: Action) -> None:
         """Schedule an action at the virtual time `seconds` [s]."""
@@ -65,12 +77,12 @@ class RestartableEndpoint:
     def kill(self, now_ns: int) -> None:
         """Kill the process as with SIGKILL; its records so far are kept."""
         self._left = self.take_records()
-        self.inner, self._waiting, self._frozen_until_ns = None, [], -1
+        self.members, self._waiting, self._frozen_until_ns = [], [], -1
         self._set_deadline()
 
     def start(self, now_ns: int) -> None:
         """Start a new process of world or cloud at `now_ns` [ns, virtual time]."""
-        self.inner = self._build(self.clock.at(now_ns))
+        self.members = self._build(self.clock.at(now_ns))
         self._set_deadline()
 
     def restart(self, now_ns: int, down: float) -> None:
@@ -94,11 +106,10 @@ class RestartableEndpoint:
 
     def receive_now(self, data: bytes, now_ns: int) -> None:
         """Pass a datagram to the process unchanged; keep it while the process is frozen."""
-        if self.inner is None:
-            return
         if self._frozen_until_ns <= now_ns:
-            self.inner.receive_datagram(data, self.clock.at(now_ns))
-        elif len(self._waiting) < SOCKET_MAX:
+            for member in self.members:
+                member.receive_datagram(data, self.clock.at(now_ns))
+        elif self.members and len(self._waiting) < SOCKET_MAX:
             self._waiting.append(data)
 
     def receive_datagram(self, data: bytes, now_ns: int) -> None:
@@ -115,71 +126,40 @@ class RestartableEndpoint:
         """Implement `Endpoint.handle_deadline`: inject due faults, then run the process."""
         while self._actions and self._actions[0][0] <= now_ns:
             heappop(self._actions)[2](now_ns)
-        inner = self.inner
         if 0 <= self._frozen_until_ns <= now_ns:
             self._frozen_until_ns = -1
             waiting, self._waiting = self._waiting, []
             for data in waiting:
                 self.receive_now(data, now_ns)
-        if inner is not None and self._frozen_until_ns < 0:
-            if (own_ns := self.clock.at(now_ns)) >= inner.next_deadline_ns():
-                inner.handle_deadline(own_ns)
+        own_ns = self.clock.at(now_ns)
+        for member in self.members if self._frozen_until_ns < 0 else ():
+            if own_ns >= member.next_deadline_ns():
+                member.handle_deadline(own_ns)
         self._set_deadline()
 
     def take_datagrams(self) -> list[bytes]:
         """Return the datagrams of the process; none while it is frozen or does not run."""
-        if self.inner is None or self._frozen_until_ns >= 0:
+        if self._frozen_until_ns >= 0:
             return []
-        return self.inner.take_datagrams()
-
-    def take_records(self) -> list[Record]:
-        """Return and remove the records since the last call, also those of a killed process."""
-        left, self._left = self._left, []
-        return left + self.inner.take_records() if self.inner is not None else left
-
-    def _set_deadline(self) -> None:
-        due_ns = self._actions[0][0] if self._actions else FAR_NS
-        if self.inner is not None:
-            frozen = self._frozen_until_ns >= 0
-            wake_ns = self.inner.next_deadline_ns()
-            due_ns = min(due_ns, self._frozen_until_ns if frozen else self.clock.when(wake_ns))
-        self._due_ns = due_ns
-
-
-class EndpointGroup:
-    """Makes one `Endpoint` of several clouds; each cloud receives all datagrams from world."""
-
-    sealed = True
-
-    def __init__(self, members: Sequence[Endpoint]) -> None:
-        self.members = members
-        self.others: list[Record] = []  # records of all clouds but the first, oldest first
-
-    def receive_datagram(self, data: bytes, now_ns: int) -> None:
-        """Pass a datagram to all members at `now_ns` [ns]."""
-        for member in self.members:
-            member.receive_datagram(data, now_ns)
-
-    def next_deadline_ns(self) -> int:
-        """Return the earliest deadline of all clouds [ns]."""
-        return min(member.next_deadline_ns() for member in self.members)
-
-    def handle_deadline(self, now_ns: int) -> None:
-        """Call `handle_deadline` of each cloud whose deadline has come at `now_ns` [ns]."""
-        for member in self.members:
-            if now_ns >= member.next_deadline_ns():
-                member.handle_deadline(now_ns)
-
-    def take_datagrams(self) -> list[bytes]:
-        """Return the new outgoing datagrams of all clouds."""
         return [data for member in self.members for data in member.take_datagrams()]
 
     def take_records(self) -> list[Record]:
-        """Return the first cloud's new records; append those of the other clouds to `others`."""
-        first, *others = (member.take_records() for member in self.members)
-        for records in others:
-            self.others += records
-        return first
+        """Return and remove the records since the last call, also those of a killed process.
+
+        The records of a second cloud go to `others`.
+        """
+        records, self._left = self._left, []
+        for n, member in enumerate(self.members):
+            (self.others if n else records).extend(member.take_records())
+        return records
+
+    def _set_deadline(self) -> None:
+        due_ns = self._actions[0][0] if self._actions else FAR_NS
+        if self.members:
+            frozen = self._frozen_until_ns >= 0
+            wake_ns = min(member.next_deadline_ns() for member in self.members)
+            due_ns = min(due_ns, self._frozen_until_ns if frozen else self.clock.when(wake_ns))
+        self._due_ns = due_ns
 
 
 class _Peer(UnixPeer):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
@@ -11,8 +11,11 @@ import yaml
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from cloudrc.errors import BadInputError, to_one_line
-from cloudrc.faults.scenario import generator
-from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
+
+
+def generator(seed: int, use: int) -> np.random.Generator:
+    """Make a random generator from a seed; different `use` give independent sequences."""
+    return np.random.Generator(np.random.PCG64([seed, use]))
 
 
 class Kind(NamedTuple):
@@ -103,7 +106,7 @@ class Schedule:
     duplicate: Share = 0.0  # share of datagrams that arrive twice
     reorder: Share = 0.0  # share of datagrams that overtake others
     cloud_offset: Annotated[float, Field(ge=-OFFSET_MAX, le=OFFSET_MAX)] = 0.0
-    """Cloud's clock minus world's clock [s]; 0 if they share one clock."""
+    """Cloud's clock minus world's clock [s], plus `OFFSET_MAX` if negative; 0 if they share one."""
     cloud_drift: Annotated[int, Field(ge=-100_000, le=100_000)] = 0  # drift of cloud's clock [ppm]
     policy: str = ""  # policy of a dishonest cloud; "" for an honest cloud
     duration: Annotated[float, Field(ge=0.1, le=DURATION_MAX)] = 60.0  # [s]
@@ -117,46 +120,6 @@ class Schedule:
     def of(self, *kinds: str) -> list[Event]:
         """List the faults of these kinds in the order of time."""
         return sorted((e for e in self.events if e.kind in kinds), key=lambda e: e.at)
-
-
-def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> DirectionProfile:
-    """Return the profile of one direction ("up" or "down") with the link faults of a schedule.
-
-    Raises:
-        BadInputError: If both the profile and a fault change the conditions over time.
-    """
-    mine = [event for event in schedule.events if event.way in ("both", way)]
-    blackouts = [Blackout(e.at, e.duration) for e in mine if e.kind == "blackout"]
-    waves = [e for e in mine if e.kind in ("delay", "jitter", "loss", "bursts")]
-    if waves and (profile.changes or profile.trace is not None):
-        raise BadInputError(
-            f"the link's profile {schedule.profile} changes over time, so that the fault "
-            f"{waves[0].kind} cannot be added; choose a profile without changes"
-        )
-    edges = sorted({instant for event in waves for instant in (event.at, event.end)})
-    changes = tuple(_change(profile, [e for e in waves if e.at <= t < e.end], t) for t in edges)
-    return replace(
-        profile,
-        blackouts=(*profile.blackouts, *blackouts),
-        changes=changes or profile.changes,
-        duplicate=max(profile.duplicate, schedule.duplicate),
-        reorder=max(profile.reorder, schedule.reorder),
-    )
-
-
-def _change(profile: DirectionProfile, active: list[Event], at: float) -> Change:
-    """Return the link's conditions from `at` [s] on: the profile with the `active` faults."""
-    delay, jitter, loss = profile.delay, profile.jitter, profile.loss
-    for event in active:
-        if event.kind == "delay":
-            delay += event.value
-        elif event.kind == "jitter":
-            jitter = max(jitter, event.value)
-        elif event.kind == "loss":
-            loss = event.value
-        else:
-            loss = GilbertElliott(bad_start=0.01, bad_end=1.0 / max(event.value, 1.0))
-    return Change(at, delay=delay, jitter=jitter, loss=loss)
 
 
 _SCHEDULE = TypeAdapter(Schedule)

@@ -15,12 +15,10 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from datetime import datetime
-from itertools import pairwise
 from math import isnan, nan
-from statistics import median
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -416,6 +414,9 @@ _ROUND_TRIP = re.compile(r"(?:[=<] ?|, )(\d+(?:[.,]\d+)?) ?(?:ms|msec|msek|мс|
 _REPLY = re.compile(r"ttl=|hlim=|bytes from", re.IGNORECASE)
 _SUMMARY = re.compile(r"xmt/rcv/%loss = (\d+)/(\d+)/|^(?!.*xmt/)\D*(\d+)\D+(\d+)\D.*%")
 """Summary at the end: packets sent, packets received."""
+_HEADS = "PING ", "PING6("
+_EXPECTED = re.compile(r"\s*$|---|.*min/avg/")
+"""Lines around the summary, which are not reported as left out."""
 _STAMPS_BY = (
     "Linux: ping -D; macOS: ping --apple-time (-D does not print times there); fping: -D; "
     "BusyBox, BSD: ping HOST | ts '[%.s]'"
@@ -443,117 +444,99 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
     log = Log(name, halved=True)
     if not halve:
         raise log.error(f"ping measures round trips; {HALVE}")
-    ping = _Ping(lines, log)
-    if not ping.replies:
+    packets = list(_ping_packets(lines, log))
+    number, stamp, trip = np.array(packets or [(0, nan, nan)]).T
+    replied = np.isfinite(trip)
+    if not replied.any():
         raise BadInputError(
             [*log.unusable, f"{name}: has no replies; give the output of: ping -D -O HOST"][0]
         )
-    first, last = ping.check_range()
-    known = np.array(sorted(ping.replies))
-    sent = np.array([ping.replies[number][0] for number in known])
-    numbers = np.arange(first, last + 1)
+    known, index, times = np.unique(number[replied], return_index=True, return_counts=True)
+    if times.max() > 1:
+        raise _sessions(f"number {known[times.argmax()]:.0f} comes twice", log)
+    late = replied & (number < np.maximum.accumulate(number))
+    log.counts["out of order, sorted"] += int(late.sum())
+    others = [line for line in lines if not _NUMBER.search(line)]
+    first, last = _ping_range(int(number.min()), int(number.max()), len(known), others, log)
+    sent, delays = (stamp - trip)[replied][index], np.full(last - first + 1, nan)
+    delays[known.astype(int) - first] = trip[replied][index] / 2
+    n, at = known, sent
+    if len(known) < 2:  # the lines about lost packets then give the time between two packets
+        n, at = np.array(sorted({n: at for n, at, _ in packets if not isnan(at)}.items())).T
+    period = max(float(np.median(np.diff(at) / np.diff(n))), 1e-6) if len(n) > 1 else 1.0
     # Without a reply, the time of sending is interpolated between the neighbouring replies.
+    numbers = np.arange(first, last + 1)
     outside = np.minimum(numbers - known[0], 0) + np.maximum(numbers - known[-1], 0)
-    times = np.interp(numbers, known, sent) + outside * ping.period()
-    for number, at in zip(numbers.tolist(), times.tolist(), strict=True):
-        reply = ping.replies.get(number)
-        log.entries.append((at, reply[1] / 2 if reply else nan))
+    sends = np.interp(numbers, known, sent) + outside * period
+    log.entries = list(zip(sends.tolist(), delays.tolist(), strict=True))
     return log.packets()
 
 
-class _Ping:
-    """Collects the packets of a log of ping by their sequence numbers.
+def _ping_range(
+    first: int, last: int, replies: int, others: list[str], log: Log
+) -> tuple[int, int]:
+    """Return the first and last sequence number of a log; without a summary, `first` and `last`.
 
-    Attributes:
-        replies: Sequence number -> time of sending and round trip [s].
+    These are the first and the last number in the lines of packets; `others` are the other lines.
+    Raise a BadInputError if the log has several sessions, if the number of `replies` does not match
+    ping's own summary, or if there are too many packets.
     """
+    heads = [line for line in others if line.startswith(_HEADS)]
+    ends = [line for line in others if not line.startswith(_HEADS)]
+    totals = [found for line in ends if (found := _SUMMARY.search(line))]
+    unknown = [line for line in ends if not (_EXPECTED.match(line) or _SUMMARY.search(line))]
+    log.counts["other lines left out"] += len(unknown)
+    if (beginnings := max(len(heads), len(totals))) > 1:
+        raise _sessions(f"{beginnings} beginnings or ends", log)
+    for total in totals:
+        sent, received = (int(word) for word in total.groups() if word)
+        # fping begins with 0, and so does a ping whose header has "data bytes".
+        from_0 = first == 0 or "xmt/" in total.string or " data bytes" in "".join(heads)
+        base = 0 if from_0 else 1
+        if received != replies or sent < last - base + 1:
+            raise log.error(
+                f"its summary counts {sent} sent and {received} received, but it has {replies} "
+                f"replies up to number {last}; give the whole log"
+            )
+        first, last = base, base + sent - 1
+    if last - first >= PACKETS_MAX:
+        raise log.error(
+            f"its sequence numbers span {last - first + 1} packets, more than {PACKETS_MAX}; "
+            "give the output of one ping"
+        )
+    return first, last
 
-    def __init__(self, lines: list[str], log: Log) -> None:
-        self.replies: dict[int, tuple[float, float]] = {}
-        self._log = log
-        self._told: dict[int, float] = {}  # number -> time stamp of its line, or 0 [s]
-        self._summaries: list[tuple[int, int]] = []  # packets sent and received
-        self._headers, self._base = 0, 1  # lines that begin a log; first number of this ping
-        self._newest = 0
-        for line in lines:
-            if (number := _NUMBER.search(line)) is not None:
-                self._read_packet(line, number)
-            else:
-                self._read_other(line)
 
-    def _read_packet(self, line: str, number: re.Match[str]) -> None:
-        log, trip, stamp = self._log, _ROUND_TRIP.search(line), _STAMP.match(line)
+def _sessions(sign: str, log: Log) -> BadInputError:
+    return log.error(f"has more than one session of ping ({sign}); give the lines of one session")
+
+
+def _ping_packets(lines: list[str], log: Log) -> Iterator[tuple[int, float, float]]:
+    """Yield each packet's number, time stamp [s] and round trip [s]; NaN for what is missing."""
+    newest = 0
+    for line in lines:
+        number, trip, stamp = _NUMBER.search(line), _ROUND_TRIP.search(line), _STAMP.match(line)
+        if number is None:
+            continue
         if trip is None and _REPLY.search(line):
             reason = f"a reply without a time that can be read: {line.strip()[:60]!r}"
             log.unusable.append(f"{log.name}: {reason}; run: LC_ALL=C ping -D -O HOST")
-            return
-        if trip and stamp is None:
+        elif trip and stamp is None:
             raise log.error(f"its lines have no time stamps; {_STAMPS_BY}")
-        if "DUP!" in line:
+        elif "DUP!" in line:
             log.counts["duplicates left out"] += 1
-            return
-        count = int(number[1] or number[2])
-        # After 65535 ping goes on with 0. A late reply may have a number from before that.
-        count += _WRAP * max(0, round((self._newest - count) / _WRAP))
-        if count == 0 or number[2]:
-            self._base = 0
-        self._told[count] = at = self._time(stamp) if stamp else 0.0
-        if trip:
-            log.counts["out of order, sorted"] += count < self._newest
-            if count in self.replies:
-                self._refuse_sessions(f"number {count} comes twice")
-            round_trip = float(trip[1].replace(",", ".")) * 1e-3
-            self.replies[count] = at - round_trip, round_trip
-        self._newest = max(self._newest, count)
+        else:
+            count = int(number[1] or number[2])
+            # After 65535 ping goes on with 0. A late reply may have a number from before that.
+            count += _WRAP * max(0, round((newest - count) / _WRAP))
+            newest = max(newest, count)
+            found = float(trip[1].replace(",", ".")) * 1e-3 if trip else nan
+            yield count, _ping_time(stamp) if stamp else nan, found
 
-    def _time(self, stamp: re.Match[str]) -> float:
-        """Convert a time stamp to the time since 1970 or, without a date, since midnight [s]."""
-        if stamp["unix"]:
-            return float(stamp["unix"])
-        hours, minutes, seconds = map(float, stamp["clock"].split(":"))
-        return hours * 3600 + minutes * 60 + seconds
 
-    def _read_other(self, line: str) -> None:
-        if line.startswith(("PING ", "PING6(")):
-            self._headers += 1
-            self._base = 0 if " data bytes" in line else self._base
-        elif summary := _SUMMARY.search(line):
-            sent, received = (int(word) for word in summary.groups() if word)
-            self._summaries.append((sent, received))
-        elif line.strip() and not line.startswith("---") and "min/avg/" not in line:
-            self._log.counts["other lines left out"] += 1
-
-    def check_range(self) -> tuple[int, int]:
-        """Return the first and last sequence number of the log.
-
-        Raise a BadInputError if the replies do not match ping's own summary at the end of the log.
-        """
-        beginnings = max(self._headers, len(self._summaries))
-        if beginnings > 1:
-            self._refuse_sessions(f"{beginnings} beginnings or ends")
-        first, last = min(self._told), max(self._told)
-        for sent, received in self._summaries:
-            if received != len(self.replies) or sent < last - self._base + 1:
-                raise self._log.error(
-                    f"its summary counts {sent} sent and {received} received, but it has "
-                    f"{len(self.replies)} replies up to number {last}; give the whole log"
-                )
-            first, last = self._base, self._base + sent - 1
-        if last - first >= PACKETS_MAX:
-            raise self._log.error(
-                f"its sequence numbers span {last - first + 1} packets, more than {PACKETS_MAX}; "
-                "give the output of one ping"
-            )
-        return first, last
-
-    def period(self) -> float:
-        """Return the median time between two packets [s]."""
-        sent = {number: at for number, (at, _) in self.replies.items()}
-        times = sent if len(sent) > 1 else {number: at for number, at in self._told.items() if at}
-        pairs = pairwise(sorted(times.items()))
-        return max(median([(b - a) / (m - n) for (n, a), (m, b) in pairs] or [1.0]), 1e-6)
-
-    def _refuse_sessions(self, sign: str) -> None:
-        raise self._log.error(
-            f"has more than one session of ping ({sign}); give the lines of one session"
-        )
+def _ping_time(stamp: re.Match[str]) -> float:
+    """Convert a time stamp to the time since 1970 or, without a date, since midnight [s]."""
+    if stamp["unix"]:
+        return float(stamp["unix"])
+    hours, minutes, seconds = map(float, stamp["clock"].split(":"))
+    return hours * 3600 + minutes * 60 + seconds

@@ -57,12 +57,13 @@ def test_the_last_lines_are_the_answer(seeds, measure, answer, fly_with, call):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        ("seed=1 seed=1", "A and B are the same experiment"),
+        (f"{A} {A}", "A and B are the same experiment"),
+        (f"seed=1 {B}", "seed: each flight has its own seed; give their number with --seeds"),
         (f"{A} cloud.predicter=kalman", "cloud.predicter"),
         ("link.profile=paper-p1 link.profile=wifi --set link.profile=x", "set twice"),
         ("last_sample nonsense",
          "last_sample: is not KEY=VALUE; for a value of a sweep, add --in DIR"),
-        ("seed=1 seed=2 --number iae_men", "--number: no number named 'iae_men'"),
+        (f"{A} {B} --number iae_men", "--number: no number named 'iae_men'"),
         ("a b --in nowhere", "nowhere"),
         ("a b --in nowhere --set seed=1", "--set seed=1: these flights are"),
     ],

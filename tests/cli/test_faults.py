@@ -14,7 +14,7 @@ import pytest
 from cloudrc.cli import faults as command
 from cloudrc.cli.pool import WorkerDiedError
 from cloudrc.faults.invariants import Breach
-from cloudrc.faults.scenario import Outcome
+from cloudrc.faults.measures import Outcome
 from cloudrc.faults.scenarios import SCENARIOS
 from cloudrc.faults.schedule import Event, Schedule, dump, load
 from cloudrc.faults.trial import Finding

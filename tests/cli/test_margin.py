@@ -75,6 +75,8 @@ def test_the_limits_of_cloud_and_guard_follow_the_delay(fly_with, call):
     ("arguments", "text"),
     [
         ("link.uplink.delay", "unknown key; did you mean delay_ms"),
+        ("seed", "seed: each flight has its own seed"),
+        (f"{KEY} --set seed=2", "seed: each flight has its own seed"),
         ("link.profile", "is no number; name a key such as"),
         (f"{KEY} --max 5", "--resolution 10 must be above 0, --max 5 not below it"),
         *((f"{KEY} --resolution {text}", f"--resolution {text} must") for text in ("-1", "nan")),

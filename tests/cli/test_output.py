@@ -2,6 +2,8 @@
 
 import io
 import json
+import subprocess
+import sys
 
 import pytest
 import yaml
@@ -75,3 +77,11 @@ def test_events_are_plain_lines_or_wrapped_on_a_terminal():
     ]
     assert max(map(len, terminal.getvalue().splitlines())) <= 90
     assert terminal.getvalue().endswith("\x1b[2K"), "the status line is erased"
+
+
+def test_a_full_disk_is_told(folder):
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "cloudrc", "list", "-o", "json"]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+    assert "disk_full: this folder" in done.stderr

@@ -13,6 +13,7 @@ from cloudrc.exposition.parts import Histogram
 from cloudrc.exposition.table import METRICS
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.scenarios import SCENARIOS
+from cloudrc.faults.schedule import Schedule
 from cloudrc.records import Counted
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -138,7 +139,7 @@ def test_a_fault_fires_its_alerts_and_no_others(scenario, flights, tmp_path):
 
 @pytest.mark.parametrize("profile", ["paper-p1", "paper-p3", "wifi"])
 def test_a_clean_flight_fires_none(profile, flights, tmp_path):
-    flight = Flight(f"link.profile={profile}").fly_mission()
+    flight = Flight(Schedule(1, profile)).fly_mission()
     assert flight.mission.state == "done"
     assert flights == [flight]
     assert fired(flight, tmp_path) == set()

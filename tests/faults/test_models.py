@@ -6,7 +6,6 @@ from hypothesis import strategies as st
 from cloudrc.drivers.virtual import Clock
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.schedule import Event, Schedule
-from cloudrc.faults.trial import inject
 from cloudrc.messages import GuardState
 
 
@@ -19,9 +18,7 @@ def test_a_clock_reaches_a_time_exactly_when_it_says(offset_ns, drift_ppm, now_n
 
 
 def faulty(*events, start=True):
-    flight = Flight("link.profile=ideal", seed=3, start=start)
-    inject(flight, Schedule(3, events=events))
-    return flight
+    return Flight(Schedule(3, "ideal", events), start=start)
 
 
 def test_teleop_pauses_and_its_successor_resumes():

@@ -3,11 +3,12 @@
 import pytest
 
 from cloudrc.faults.flight import Flight
+from cloudrc.faults.schedule import Schedule
 from cloudrc.tunnel.codec import Kind, peek
 
 HOVER = (
     "mission.waypoints=[{position_m: [0.5, 0, 0.8], dwell_s: 1}]",
-    *("criteria.contact=false", "link.profile=ideal"),
+    "criteria.contact=false",
 )
 
 
@@ -15,7 +16,7 @@ class Tapped(Flight):
     """Capture the datagrams to world and to cloud."""
 
     def __init__(self, life=1):
-        super().__init__(*HOVER, life=life)
+        super().__init__(Schedule(1, "ideal"), *HOVER, life=life)
         self.heard: dict[str, list[bytes]] = {"world": [], "cloud": []}
         self.ends = {"world": self.world, "cloud": self.cloud}
         for name, end in self.ends.items():

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cloudrc.faults.flight import Flight, conditions
-from cloudrc.faults.scenario import generator
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.schedule import Schedule, generator
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.records import Arrival, CommandApplied, Control, TelemetrySent
@@ -21,9 +21,8 @@ ESTOP, GROUND = GuardState.ESTOP, GuardState.GROUND
 class Drive:
     """A flight whose operator drives; it takes off at 0.5 s."""
 
-    def __init__(self, profile="paper-p3", seed=1, **link):
-        settings = f"link.profile={profile}", "world.scene=empty"
-        self.flight = Flight(*settings, start=False, seed=seed, **link)
+    def __init__(self, profile="paper-p3", seed=1, link=()):
+        self.flight = Flight(Schedule(seed, profile), "world.scene=empty", *link, start=False)
         ways = self.flight.experiment.uplink, self.flight.experiment.downlink
         self.rtt = sum(way.delay_ms for way in ways) * 1e-3
         self.random = generator(seed, 46).uniform
@@ -123,7 +122,7 @@ def test_a_drive_can_be_flown_again(tmp_path):
 def test_a_stop_gets_through_thirty_percent_loss(count, figure):
     took = []
     for seed in range(1, count + 1):
-        drive = Drive(seed=seed, link=conditions(loss=0.3))
+        drive = Drive(seed=seed, link=["link.both.loss=0.3"])
         flight, at = drive.flight, 2.0 + drive.random(0.0, 0.1)
         drive.press(1.6, 2.0, EAST)  # the operator who drives does not let go
         flight.cloud.at(at, lambda now_ns, flight=flight: flight.teleop.stop_rotors(now_ns))

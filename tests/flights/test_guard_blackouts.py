@@ -1,27 +1,28 @@
 """Cloud is silent or killed while the robot is in a pipe: it holds, then finishes the mission."""
 
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 import pytest
 
 from cloudrc.faults import measures
-from cloudrc.faults.flight import Flight, silent
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.schedule import Event, Schedule
 from cloudrc.geometry.clearance import pipe_index
 from cloudrc.geometry.scene import load_scene
 from tests.conftest import nightly
 
 COUNT = 200
 SLOW = ("cloud.controller.speed_max=1.5",)
-LONG = ("guard.hold_max_s=100", "criteria.time_limit_s=200")
-PATIENCE = (*LONG, *(f"mission.waypoints.{k}.time_limit_s=200" for k in range(7)))
+LONG = "criteria.time_limit_s=200"
+PATIENCE = (LONG, *(f"mission.waypoints.{k}.time_limit_s=200" for k in range(7)))
 KILLED, SILENT = 3.0, 60.5
 """Time until a new process starts, or the link returns [s]."""
 
 
 @cache
 def undisturbed(*settings):
-    return Flight(*PATIENCE, *settings).fly_mission()
+    return Flight(Schedule(1, hold_max=100.0), *PATIENCE, *settings).fly_mission()
 
 
 @cache
@@ -39,9 +40,8 @@ def mid_pipe(*settings):
 def interrupt(figure, kill, at, *settings, calm=1.0):
     """Kill cloud's process, of which the new one knows nothing; or silence the link."""
     back = at + (KILLED if kill else SILENT)
-    flight = Flight(*PATIENCE, *settings, link=silent(at, 0.0 if kill else SILENT))
-    if kill:
-        flight.cloud.at(at, partial(flight.cloud.restart, down=KILLED))
+    event = Event("cloud_killed", at, KILLED) if kill else Event("blackout", at, SILENT)
+    flight = Flight(Schedule(1, events=(event,), hold_max=100.0), *PATIENCE, *settings)
     flight.fly_mission(200.0)
     waypoints = range(len(flight.mission.order.plan.legs))
     assert [event.waypoint for event in flight.events("reached")] == list(waypoints)

@@ -4,11 +4,12 @@ from itertools import pairwise
 
 import pytest
 
-from cloudrc.faults.flight import SECRET, Flight
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.inject import SECRET
 from cloudrc.faults.measures import epochs
+from cloudrc.faults.schedule import Schedule
 from cloudrc.messages import GuardState
 from cloudrc.tunnel.keys import Key, KeySet
-from tests.flights.conftest import both_ways
 
 NEW = KeySet(Key(b"n" * 32), SECRET.current)
 ONLY = KeySet(NEW.current)
@@ -18,8 +19,7 @@ HOLD_MAX = 2 * DELAY + 1.1
 """Longest HOLD of a change of keys [s]: a round trip, and the guard's settling time."""
 HOVER = (
     "mission.waypoints=[{position_m: [0.5, 0, 0.8], dwell_s: 400, time_limit_s: 500}]",
-    *("criteria.time_limit_s=500", "criteria.contact=false", "link.profile=ideal"),
-    *both_ways(delay_ms=DELAY * 1e3),
+    *("criteria.time_limit_s=500", "criteria.contact=false", f"link.both.delay_ms={DELAY * 1e3}"),
 )
 ENDS = ("world", "cloud")
 
@@ -40,7 +40,7 @@ def held(flight):
 
 def rotated(*steps):
     """Fly 5 s; then an end reads keys and the flight goes on for some seconds, again and again."""
-    flight = Flight(*HOVER).fly(5.0)
+    flight = Flight(Schedule(1, "ideal"), *HOVER).fly(5.0)
     for end, keys, seconds in steps:
         flight.replace_key(end, keys)
         flight.fly(flight.now + seconds)

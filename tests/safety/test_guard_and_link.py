@@ -2,9 +2,8 @@
 
 import pytest
 
-from cloudrc.faults.adversary import POLICIES, at_bad_moments
 from cloudrc.faults.flight import Flight
-from cloudrc.faults.scenario import generator
+from cloudrc.faults.schedule import Schedule
 from cloudrc.messages import GuardState
 from cloudrc.world.guard.state import Guard
 
@@ -24,8 +23,7 @@ def bounds(guard):
 def test_nothing_in_the_tunnel_changes_the_limits():
     states = set()
     for policy, seed in HOSTILE.items():
-        lie, words = POLICIES[policy](generator(seed, 666)), at_bad_moments(generator(seed, 667))
-        flight = Flight(seed=seed, honest=False, lies=[lie], words=words)
+        flight = Flight(Schedule(seed, policy=policy))
         guard, before = flight.robot.guard, bounds(flight.robot.guard)
         flight.fly(8.0)
         assert bounds(flight.robot.guard) == before == bounds(Guard(guard._limits))

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from cloudrc.errors import BadInputError
-from cloudrc.faults.scenario import Scenario
-from cloudrc.faults.scenarios import ends, intruder, losses, missions, timing
+from cloudrc.faults.measures import Scenario
+from cloudrc.faults.scenarios import ends, intruder, links
 from cloudrc.plugins import suggest_name
 
-MODULES = (ends, intruder, losses, missions, timing)
+MODULES = (ends, intruder, links)
 _FOUND = [each for part in MODULES for each in vars(part).values() if isinstance(each, Scenario)]
 SCENARIOS = tuple(sorted(_FOUND, key=lambda each: each.number))  # all scenarios, by number
 

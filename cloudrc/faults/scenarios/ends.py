@@ -1,19 +1,36 @@
-"""Faults F13, F15, F17, F25 and F40: processes are killed or frozen, or a second cloud appears."""
+"""Faults F13, F15, F17, F23, F25, F27, F28 and F40: faults of processes, commands and missions."""
 
 from __future__ import annotations
 
-from functools import partial
-from math import hypot, nan
+from math import hypot, inf, nan
+from typing import Any
 
 import numpy as np
 
+from cloudrc import assembly
+from cloudrc.config.mission_check import check_mission
+from cloudrc.config.schema import Mission
 from cloudrc.faults import measures
-from cloudrc.faults.flight import Flight, silent
-from cloudrc.faults.measures import fly_safely, refused
-from cloudrc.faults.models import EndpointGroup
-from cloudrc.faults.scenario import Outcome, generator, scenario
-from cloudrc.records import CommandApplied, Fault
+from cloudrc.faults.adversary import Lie
+from cloudrc.faults.flight import Flight
+from cloudrc.faults.measures import Outcome, fly_safely, refused, scenario
+from cloudrc.faults.schedule import Event, Schedule, Way, generator
+from cloudrc.geometry import fence
+from cloudrc.geometry.scene import Pipe, load_scene
+from cloudrc.messages import Command, GuardState, Vector
+from cloudrc.records import CommandApplied, Control, Fault
 from cloudrc.tunnel.handshake import BUSY_TEXT
+
+IMPOSSIBLE: dict[str, dict[str, Any]] = {
+    "NaN": {"velocity": (nan, 0.0, 0.0)},
+    "yaw infinite": {"yaw_rate": inf},
+    "1e308": {"velocity": (1e308, -1e308, 1e308)},
+}
+EXCESSIVE: dict[str, dict[str, Any]] = {
+    "speed": {"velocity": (100.0, 0.0, 0.0)},
+    "yaw_rate": {"yaw_rate": 100.0},
+}
+"""Limit of the guard -> command that exceeds the limit."""
 
 
 @scenario(
@@ -24,8 +41,7 @@ from cloudrc.tunnel.handshake import BUSY_TEXT
 )
 def _cloud_killed(outcome: Outcome, seed: int) -> None:
     at, down = measures.instant(seed), 0.8
-    flight = Flight(seed=seed)
-    flight.cloud.at(at, partial(flight.cloud.restart, down=down))
+    flight = Flight(Schedule(seed, events=(Event("cloud_killed", at, down),)))
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
     commands = [r.stamp_ns * 1e-9 - at for r in flight.of_world if isinstance(r, CommandApplied)]
@@ -42,9 +58,8 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
     expects="HOLD; world applies no command that is too old",
 )
 def _cloud_paused(outcome: Outcome, seed: int) -> None:
-    at = measures.instant(seed)
-    flight = Flight(seed=seed)
-    flight.cloud.at(at, partial(flight.cloud.freeze, duration=5.0))
+    paused = Event("cloud_paused", measures.instant(seed), 5.0)
+    flight = Flight(Schedule(seed, events=(paused,)))
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
@@ -61,8 +76,7 @@ def _cloud_paused(outcome: Outcome, seed: int) -> None:
 )
 def _world_restarted(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
-    flight = Flight(seed=seed)
-    flight.world.at(at, partial(flight.world.restart, down=2.0))
+    flight = Flight(Schedule(seed, events=(Event("world_killed", at, 2.0),)))
     flight.fly(at + 12.0)
     measures.safe(outcome, flight)
     after = [c for c in flight.changes if c.stamp_ns * 1e-9 > at]
@@ -87,9 +101,7 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
 )
 def _two_clouds(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed, 4.0, 12.0)
-    flight = Flight(seed=seed, second=at)
-    group = flight.cloud.inner
-    assert isinstance(group, EndpointGroup)
+    flight = Flight(Schedule(seed, events=(Event("second_cloud", at, 60.0),)))
     flight.fly(at + 5.0)
     opened = max(measures.epochs(flight), default=-1)
     outcome.same("epochs while both clouds run", opened, 2)
@@ -97,11 +109,11 @@ def _two_clouds(outcome: Outcome, seed: int) -> None:
     outcome.same("HOLDs while both clouds run", len(measures.held(flight)), 0)
     faults = [record for record in flight.of_cloud if isinstance(record, Fault)]
     outcome.same("faults that the first cloud reports", len(faults), 0)
-    group.members = group.members[1:]  # the first leaves
+    flight.cloud.members = flight.cloud.members[1:]  # the first leaves
     flight.fly(at + 14.0)
     measures.safe(outcome, flight)
     refused(outcome, flight, "busy")
-    told = measures.told(group.others, "busy")
+    told = measures.told(flight.cloud.others, "busy")
     outcome.true("the second reports once why it waits", [r.text for r in told] == [BUSY_TEXT])
     said = min((r.stamp_ns * 1e-9 for r in told), default=nan)
     outcome.most("the second cloud reports it after", said - at, 1.0, "s")
@@ -126,16 +138,132 @@ def _swizzle(outcome: Outcome, seed: int) -> None:
     starts = measures.instant(seed) + np.cumsum(rng.uniform(0.1, 1.0, 5))
     ends = rng.permutation(starts[-1] + np.cumsum(rng.uniform(0.1, 1.5, 5)))
     spans = zip(starts.tolist(), (ends - starts).tolist(), strict=True)
-    uplink, downlink, cloud, world, teleop = spans
-    limit, links = "criteria.time_limit_s=120", (silent(*uplink), silent(*downlink))
-    flight = Flight(limit, seed=seed, uplink=links[0], downlink=links[1])
-    for process, (start, duration) in ((flight.cloud, cloud), (flight.world, world)):
-        process.at(start, partial(process.freeze, duration=duration))
-    flight.cloud.at(teleop[0], flight.teleop.kill)
-    flight.cloud.at(sum(teleop), flight.teleop.start)
+    ways: tuple[Way, ...] = ("up", "down", "both", "both", "both")
+    kinds = ("blackout", "blackout", "cloud_paused", "world_paused", "teleop_killed")
+    faults = zip(kinds, spans, ways, strict=True)
+    events = tuple(Event(kind, *span, way=way) for kind, span, way in faults)
+    flight = Flight(Schedule(seed, events=events), "criteria.time_limit_s=120")
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
     for end, records in (("cloud", flight.of_cloud), ("world", flight.of_world)):
         outcome.least(f"times that {end} reports: late", len(measures.told(records, "late")), 1)
     restarted = measures.events_of_missions(flight, "restarted")
     outcome.least("events restarted in teleop's log", len(restarted), 1)
+
+
+@scenario(
+    23,
+    "invalid-values",
+    injects="NaN, infinite, huge and excessive values in authentic commands",
+    expects="rejected or limited; 5 rejected commands in 1 s cause LAND until acknowledged",
+)
+def _invalid_values(outcome: Outcome, seed: int) -> None:
+    at = measures.instant(seed)
+    for name, changes in IMPOSSIBLE.items():
+        flight = Flight(Schedule(seed), lies=[_for_a_while(at, 1.0, changes)]).fly(40.0)
+        measures.safe(outcome, flight)
+        landed = measures.first_into(flight, GuardState.LAND)
+        outcome.most(f"{name}: LAND after", landed - at, 1.0, "s")
+        tracked = measures.changes_into(flight, GuardState.TRACK)
+        again = [change for change in tracked if change.stamp_ns * 1e-9 > landed]
+        outcome.same(f"{name}: flown again without the operator", len(again), 0)
+        causes = [change.cause for change in measures.changes_into(flight, GuardState.LAND)]
+        outcome.true(f"{name}: the cause is reported", "impossible commands" in " ".join(causes))
+        measures.refused(outcome, flight, "range")
+    for limit, changes in EXCESSIVE.items():
+        lie, harmless = _for_a_while(at, 1.0, changes), limit != "speed"  # it may hit a pipe
+        flight = Flight(Schedule(seed), honest=harmless, lies=[lie]).fly(40.0)
+        measures.safe(outcome, flight)
+        refused = sum("impossible" in change.cause for change in flight.changes)
+        outcome.same(f"100 times {limit}: rejected as impossible", refused, 0)
+        outcome.least(f"100 times {limit}: limited", flight.count(f"limited_{limit}"), 20)
+    one = Flight(Schedule(seed), lies=[_for_a_while(at, 0.005, IMPOSSIBLE["NaN"])]).fly(40.0)
+    measures.safe(outcome, one)
+    measures.done(outcome, one)
+    outcome.same("a single NaN: LAND", len(measures.changes_into(one, GuardState.LAND)), 0)
+
+
+def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
+    """Return a function that applies `changes` to commands from `at` [s] on, for `duration` [s]."""
+
+    def lie(command: Command, control: Control) -> Command:
+        now = control.stamp_ns * 1e-9
+        return command._replace(**changes) if at <= now < at + duration else command
+
+    return lie
+
+
+@scenario(
+    27,
+    "impossible-mission",
+    injects="waypoints of NaN, in a wall, behind a wall, beyond the fence; 10,001 waypoints",
+    expects="the whole mission is refused before the flight",
+)
+def _impossible(outcome: Outcome, seed: int) -> None:
+    scene, first = load_scene("pipes"), (0.5, 0.0, 0.8)
+    points: dict[str, Vector] = {
+        "1 m behind a wall of the fence": (fence.HIGH[0] + 1.0, 0.0, 1.0),
+        "far below the floor": (0.0, 0.0, -5.0),
+        "in a pipe's wall": _wall_of(scene.pipes[0]),
+    }
+    others: dict[str, list[Any]] = {
+        "NaN": [(0.0, 0.0, nan)],
+        "a word": [(0.0, 0.0, "high")],
+        "behind a wall": [scene.pipes[0].centre, first],
+        "none at all": [],
+        "10,001 waypoints": [first] * 10_001,
+    }
+    for name, way in ({name: [first, point] for name, point in points.items()} | others).items():
+        try:
+            waypoints = tuple({"position_m": point} for point in way)
+            mission = Mission.model_validate({"waypoints": waypoints})
+            problems = [str(each) for each in check_mission(mission, scene)]
+        except ValueError as error:
+            problems = [str(error)]
+        outcome.true(f"{name}: refused", bool(problems))
+        if name in points:
+            values = (f"{value:g}" in problems[0] for value in points[name])
+            told = "waypoints.1" in problems[0] and all(values)
+            outcome.true(f"{name}: names the waypoint's index and value", told)
+            offered = "nearest legal point found: [" in problems[0]
+            outcome.true(f"{name}: offers another point", offered)
+
+
+def _wall_of(pipe: Pipe) -> Vector:
+    """Return a point inside the wall of a horizontal pipe, at half of its length."""
+    (x, y, z), (ax, ay, _), radius = pipe.centre, pipe.axis, 0.5 * (pipe.inner + pipe.outer)
+    return (x - ay * radius, y + ax * radius, z)
+
+
+@scenario(
+    28,
+    "waypoint-not-reached",
+    injects="cloud commands the robot to stay where it is",
+    expects="the leg ends at its time limit, and HOLD begins",
+)
+def _unreachable(outcome: Outcome, seed: int) -> None:
+    at, stays = measures.instant(seed, 12.0, 20.0), list[Vector]()
+
+    def stalled(command: Command, control: Control) -> Command:
+        if control.stamp_ns * 1e-9 < at:
+            return command
+        stays.append(control.measured)
+        x, y, z = (a - b for a, b in zip(stays[0], control.measured, strict=True))
+        return command._replace(velocity=(x, y, z))
+
+    flight = Flight(Schedule(seed), "criteria.time_limit_s=300", lies=[stalled])
+    flight.fly_mission(200.0)
+    measures.safe(outcome, flight)
+    outcome.true("the mission ends", flight.mission.state == "failed")
+    verdict = str(flight.mission.verdict)
+    outcome.true("with the code leg_timed_out", "leg_timed_out" in verdict)
+    outcome.true("it says which waypoint", "waypoint" in verdict and "not reached" in verdict)
+    ended = max(event.stamp_ns for event in flight.events("leg_timed_out")) * 1e-9
+    reached = flight.events("reached")
+    leg, began = assembly.build_plan(flight.experiment).legs[len(reached)], reached[-1].stamp_ns
+    off = abs(ended - began * 1e-9 - leg.time_limit)
+    outcome.most("deviation of the leg's end from its limit", off, 0.05, "s")
+    flight.fly(flight.now + 10.0)
+    outcome.true("the robot holds", flight.guard_now()[0] is GuardState.HOLD)
+    drift = measures.drift(flight, ended, flight.now)
+    outcome.most("drift from where the leg ended", drift, 0.10, "m")

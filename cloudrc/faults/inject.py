@@ -1,0 +1,184 @@
+"""Inject the faults of a schedule into the link, into commands and into the parts of a flight."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+from functools import partial
+from itertools import islice
+from math import inf, nan
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cloudrc.drivers.virtual import Clock
+from cloudrc.errors import BadInputError
+from cloudrc.faults.adversary import Lie
+from cloudrc.faults.models import Action, Call, RestartableEndpoint, Tamper
+from cloudrc.faults.schedule import Event, Schedule, generator
+from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
+from cloudrc.messages import Command
+from cloudrc.records import Control
+from cloudrc.teleop.service import MissionService
+from cloudrc.tunnel.keys import Key, KeySet
+
+if TYPE_CHECKING:
+    from cloudrc.faults.flight import Flight
+
+SECRET = KeySet(Key(b"a key of the fault suite, 32 b.."))
+CAPTURED = 2_000  # number of datagrams that an intruder keeps
+NEXT_KEY = KeySet(Key(b"the next key of the fault suite!"), SECRET.current)
+WRONG_KEY = KeySet(Key(b"a key that world has never read!"))
+BUGS = ("values_invalid", "values_huge")  # faults of an honest cloud whose controller has a bug
+IMPOSSIBLE = (nan, inf, -inf)
+
+
+def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> DirectionProfile:
+    """Return the profile of one direction ("up" or "down") with the link faults of a schedule.
+
+    Raises:
+        BadInputError: If both the profile and a fault change the conditions over time.
+    """
+    mine = [event for event in schedule.events if event.way in ("both", way)]
+    blackouts = [Blackout(e.at, e.duration) for e in mine if e.kind == "blackout"]
+    waves = [e for e in mine if e.kind in ("delay", "jitter", "loss", "bursts")]
+    if waves and (profile.changes or profile.trace is not None):
+        raise BadInputError(
+            f"the link's profile {schedule.profile} changes over time, so that the fault "
+            f"{waves[0].kind} cannot be added; choose a profile without changes"
+        )
+    edges = sorted({instant for event in waves for instant in (event.at, event.end)})
+    changes = tuple(_change(profile, [e for e in waves if e.at <= t < e.end], t) for t in edges)
+    return replace(
+        profile,
+        blackouts=(*profile.blackouts, *blackouts),
+        changes=changes or profile.changes,
+        duplicate=max(profile.duplicate, schedule.duplicate),
+        reorder=max(profile.reorder, schedule.reorder),
+    )
+
+
+def _change(profile: DirectionProfile, active: list[Event], at: float) -> Change:
+    """Return the link's conditions from `at` [s] on: the profile with the `active` faults."""
+    delay, jitter, loss = profile.delay, profile.jitter, profile.loss
+    for event in active:
+        if event.kind == "delay":
+            delay += event.value
+        elif event.kind == "jitter":
+            jitter = max(jitter, event.value)
+        elif event.kind == "loss":
+            loss = event.value
+        else:
+            loss = GilbertElliott(bad_start=0.01, bad_end=1.0 / max(event.value, 1.0))
+    return Change(at, delay=delay, jitter=jitter, loss=loss)
+
+
+def inject(flight: Flight) -> None:
+    """Schedule the faults of processes, keys, datagrams, teleop and the operator in a flight."""
+    schedule = flight.schedule
+    for event in schedule.events:
+        process = flight.world if event.kind.startswith("world") else flight.cloud
+        if event.kind.endswith("throttled"):
+            process.throttle(event.at, event.duration, event.value)
+        for time, action in _actions(flight, process, event).get(event.kind, ()):
+            process.at(time, action)
+    intrusions, rng = schedule.of("corruption", "garbage", "replay"), generator(schedule.seed, 41)
+    for way, process in (("down", flight.world), ("up", flight.cloud)):
+        if mine := [event for event in intrusions if event.way in ("both", way)]:
+            process.tamper = _tamper(mine, rng)
+
+
+def _actions(
+    flight: Flight, process: RestartableEndpoint, event: Event
+) -> dict[str, tuple[tuple[float, Action], ...]]:
+    """Return how to inject `event`: kind of fault -> pairs of time [s] and action.
+
+    The mapping is the same for all kinds of event; the caller selects the entry of the event's
+    kind. `process`, world or cloud, is the one that the event kills or freezes.
+    """
+    at, lasts, end, teleop = event.at, event.duration, event.end, flight.teleop
+    gone = at + event.value * lasts  # end of teleop after it was asked to end
+
+    def ask(call: Call) -> Action:
+        return lambda now_ns: teleop.ask(call)
+
+    def read(end: str, keys: KeySet | None = None) -> Action:
+        return lambda now_ns: flight.replace_key(end, keys or flight.secrets["world"])
+
+    restart, freeze = partial(process.restart, down=lasts), partial(process.freeze, duration=lasts)
+    pause = ask(MissionService.pause)
+    return {
+        **dict.fromkeys(("cloud_killed", "world_killed"), ((at, restart),)),
+        **dict.fromkeys(("cloud_paused", "world_paused"), ((at, freeze),)),
+        "pod_killed": ((at, partial(flight.restart_pod, down=lasts)),),
+        "pod_shut_down": ((at, pause), (gone, partial(flight.restart_pod, down=end - gone))),
+        "teleop_killed": ((at, teleop.kill), (end, teleop.start)),
+        "teleop_shut_down": ((at, pause), (gone, teleop.kill), (end, teleop.start)),
+        "teleop_paused": ((at, partial(teleop.freeze, duration=lasts)),),
+        "second_cloud": ((end, lambda now_ns: flight.end_rival()),),
+        "key_rotated": ((at, read("world", NEXT_KEY)), (end, read("cloud", NEXT_KEY))),
+        "key_wrong": ((at, read("cloud", WRONG_KEY)), (end, read("cloud"))),
+        "second_order": ((at, flight.order_if_possible),),
+        "stopped": ((at, teleop.stop_rotors),),
+        "held": ((at, ask(MissionService.hold)), (end, ask(MissionService.resume))),
+    }
+
+
+def _tamper(events: list[Event], rng: np.random.Generator) -> Tamper:
+    captured: deque[bytes] = deque(maxlen=CAPTURED)
+
+    def tamper(data: bytes, now_ns: int) -> list[bytes]:
+        captured.append(data)
+        hostile = list[bytes]()
+        for event in events:
+            if not event.at <= now_ns * 1e-9 < event.end:
+                continue
+            if event.kind == "corruption":
+                if rng.random() < event.value:
+                    data = flipped(data, rng, int(rng.integers(1, 9)))
+            elif event.kind == "garbage":
+                hostile += [rng.bytes(int(rng.integers(0, 200))) for _ in range(int(event.value))]
+            else:
+                start = int(rng.integers(0, len(captured)))
+                hostile += islice(captured, start, start + int(event.value))
+        return [*hostile, data]
+
+    return tamper
+
+
+def flipped(data: bytes, rng: np.random.Generator, flips: int) -> bytes:
+    """Return a datagram with `flips` flipped bits."""
+    bits = bytearray(data)
+    for place in rng.choice(8 * len(data), min(flips, 8 * len(data)), replace=False).tolist():
+        bits[place >> 3] ^= 1 << (place & 7)
+    return bytes(bits)
+
+
+def bugs(schedule: Schedule, clock: Clock) -> Lie:
+    """Return a function that replaces some commands by commands with impossible values.
+
+    While an event lasts, the function replaces `Event.value` commands per second.
+    """
+    rng, events = generator(schedule.seed, 43), schedule.of(*BUGS)
+    due = [event.at for event in events]
+
+    def lie(command: Command, control: Control) -> Command:
+        now = clock.when(control.stamp_ns) * 1e-9
+        for n, event in enumerate(events):
+            if due[n] <= now < event.end:
+                due[n] = now + 1.0 / max(event.value, 1e-3)
+                command = _ruined(command, event, rng)
+        return command
+
+    return lie
+
+
+def _ruined(command: Command, event: Event, rng: np.random.Generator) -> Command:
+    """Return the command with one number replaced by NaN or infinity, or with a huge velocity."""
+    if event.kind == "values_huge":
+        x, y, z = rng.choice([1e308, -1e308], 3).tolist()
+        return command._replace(velocity=(x, y, z))
+    numbers = [*command.velocity, command.yaw_rate]
+    numbers[int(rng.integers(4))] = IMPOSSIBLE[int(rng.integers(len(IMPOSSIBLE)))]
+    x, y, z, yaw_rate = numbers
+    return command._replace(velocity=(x, y, z), yaw_rate=yaw_rate)
