@@ -102,7 +102,7 @@ def fly(
         units={name: number.unit for name, number in found.numbers.items()},
         notes=found.notes,
         config=dump(resolved),
-        records_sha256=found.run.records_sha256 or "",
+        records_sha256=found.records_sha256 or "",
         flight=found.flight,
     )
 

@@ -24,9 +24,9 @@ from cloudrc.files import warn_if_readable
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
+    from cloudrc.drivers.recording import Recorder
     from cloudrc.link.profile import DirectionProfile
     from cloudrc.link.verify.monitor import LinkMonitor
-    from cloudrc.record.recorder import Recorder
     from cloudrc.tunnel.end import Identity
 
 TRACE_MAX = 2 << 20
@@ -287,7 +287,7 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     "cloud", the clock of the stamps; `clock_id` identifies this machine's monotonic clock.
     """
     require("a recording", ("record",))
-    from cloudrc.record.recorder import Recorder
+    from cloudrc.drivers.recording import Recorder
     from cloudrc.record.writer import McapWriter
 
     path: Path = options.record or Path(os.devnull)

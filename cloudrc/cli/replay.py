@@ -61,12 +61,12 @@ def execute(options: argparse.Namespace) -> int:
 def _read(run: Path) -> tuple[Recording, ResolvedExperiment]:
     """Read a run's recording and its experiment, which an MCAP file contains as an attachment."""
     from cloudrc.config.load import read_experiment
-    from cloudrc.record.reader import read_contents
+    from cloudrc.record.columns import Recording
     from cloudrc.report.folder import read_run
 
     if run.is_dir():
         return read_run(run)[:2]
-    recording = read_contents(run).recording()
+    recording = Recording.read(run)
     if (config := recording.attachments.get("config.yaml")) is None:
         raise BadInputError(f"{run}: has no config.yaml attached; name the folder of the run")
     with tempfile.TemporaryDirectory() as folder:

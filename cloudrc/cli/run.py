@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import heapq
 import itertools
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from math import inf
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -298,7 +300,7 @@ def _record_virtual(
     of the report to mission.mcap.
     """
     from cloudrc import assembly
-    from cloudrc.record.columns import RecordStore, merged
+    from cloudrc.record.columns import Recording, RecordStore
     from cloudrc.record.writer import McapWriter
     from cloudrc.report.document import Run
     from cloudrc.report.views import views
@@ -310,8 +312,7 @@ def _record_virtual(
     with McapWriter(folder / "mission.mcap", clock="world") as writer:
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
-            for log_time_ns, row in merged(from_world, from_cloud):
-                writer.write_row(row, log_time_ns)
+            writer.write(heapq.merge(from_world, from_cloud, key=attrgetter("stamp_ns")))
             store.add(from_world, from_cloud)
             see(from_cloud)
             see(from_world)
@@ -321,10 +322,10 @@ def _record_virtual(
         except KeyboardInterrupt:
             interrupted = True
         try:
-            facts = store.hexdigest(), interrupted, assembly.virtual_notes(experiment)
             steps = usable().text if experiment.world.is_nominal else NO_C
-            run = Run("virtual", "virtual", *facts, steps)
-            recording = store.recording()
+            run = Run("virtual", "virtual", interrupted, assembly.virtual_notes(experiment), steps)
+            writer.note(run.metadata)
+            recording = Recording(records=store)
             writer.write_views(views(recording, experiment))
             yield recording, experiment, run
         finally:
@@ -367,10 +368,9 @@ def _record_local(
     from cloudrc.assembly import flight_limit
     from cloudrc.cli.session import read_last_mission
     from cloudrc.drivers.local import LocalRun
-    from cloudrc.record.hash import messages_sha256
     from cloudrc.record.merge import merge
     from cloudrc.report.document import Run
-    from cloudrc.report.views import add_views
+    from cloudrc.report.views import views
     from cloudrc.report.write import attachments
     from cloudrc.world.native.library import library
 
@@ -394,10 +394,12 @@ def _record_local(
             raise broken or nothing from None
         raise error
     notes = (*local.notes, *([str(broken)] if broken else ()))
-    facts = messages_sha256(mission.messages), interrupted, notes
-    run = Run("local", "relay", *facts, library().text if experiment.world.is_nominal else NO_C)
+    steps = library().text if experiment.world.is_nominal else NO_C
+    run = Run("local", "relay", interrupted, notes, steps)
+    mission.metadata |= run.metadata
     try:
-        yield add_views(mission, experiment), experiment, run
+        mission.views = views(mission, experiment)
+        yield mission, experiment, run
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))
         local.announcement.close()

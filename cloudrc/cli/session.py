@@ -25,7 +25,7 @@ from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
-    from cloudrc.record.reader import Contents
+    from cloudrc.record.columns import Recording
     from cloudrc.teleop.store import Mission
 
 Say = Callable[[str], None]
@@ -125,7 +125,7 @@ def _last_mission(folder: Path) -> Mission | None:
     return flown[-1] if flown else None
 
 
-def read_last_mission(folder: Path) -> tuple[Contents, ResolvedExperiment, bool]:
+def read_last_mission(folder: Path) -> tuple[Recording, ResolvedExperiment, bool]:
     """Read the last mission of a session that has ended; write its experiment to config.yaml.
 
     Returns:

@@ -20,7 +20,7 @@ from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
-    from cloudrc.record.reader import Contents
+    from cloudrc.record.columns import Recording
 
 Tell = Callable[[str], None]
 Ask = Callable[[str, str], Any]
@@ -215,7 +215,7 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
         raise ClusterError(f"Job {job} did not fly its mission: {ended.message}")
 
 
-def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Contents:
+def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Recording:
     """Fetch recordings and logs into a folder; return the merged recording.
 
     If logs cannot be fetched, `tell` receives the error. With `want_end`, fetch the recordings
@@ -261,18 +261,18 @@ def _fetch_previous(release: Release, component: str, path: Path, tell: Tell) ->
 
 
 def _report(
-    experiment: ResolvedExperiment, folder: Path, mission: Contents, interrupted: bool
+    experiment: ResolvedExperiment, folder: Path, mission: Recording, interrupted: bool
 ) -> dict[str, Any]:
-    from cloudrc.record.hash import messages_sha256
     from cloudrc.report.document import Run
-    from cloudrc.report.views import add_views
+    from cloudrc.report.views import views
     from cloudrc.report.write import attachments, write_report
 
     try:
-        recording = add_views(mission, experiment)
-        shaper = "+".join(sorted(set(recording["/link"]["shaper"]))) or "unknown"
-        run = Run("cluster", shaper, messages_sha256(mission.messages), interrupted)
+        shaper = "+".join(sorted(set(mission["/link"]["shaper"]))) or "unknown"
+        run = Run("cluster", shaper, interrupted)
+        mission.metadata |= run.metadata
+        mission.views = views(mission, experiment)
         own = experiment.report.metrics  # evaluated here, so the pods do not need the file
-        return write_report(folder, recording, experiment, run, own=own)
+        return write_report(folder, mission, experiment, run, own=own)
     finally:
         mission.write(folder / "mission.mcap", attachments(folder))

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
 from cloudrc import records as kinds
 from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.realtime import Peer, serve
-from cloudrc.drivers.recording import FlightsOnly, RecordingThread
+from cloudrc.drivers.recording import FlightsOnly, Recorder
 from cloudrc.endpoint import Endpoint
 from cloudrc.errors import to_one_line
 from cloudrc.exposition.live import CLOCK_SET
@@ -43,7 +43,6 @@ from cloudrc.records import (
 if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.link.verify.monitor import LinkMonitor
-    from cloudrc.record.recorder import Recorder
 
 PARENT = "CLOUDRC_PARENT"
 """Environment variable with the process id of the supervisor."""
@@ -304,24 +303,23 @@ class EndProcess:
         `flies` returns whether the robot follows cloud; `slip_ns` returns the lag of the endpoint's
         clock behind the machine's monotonic clock [ns].
         """
-        thread = RecordingThread(self.recorder)
         choose = FlightsOnly(flies) if self.flights_only else list
         if self.exporter is not None:
-            self.exporter.recording(thread.sync_age)
+            self.exporter.recording(self.recorder.sync_age)
 
         def sink(records: list[Record]) -> None:
             records = records + self.look_around(records, slip_ns())
             self.recorder.put(choose(records))
             self.tell(records)
 
-        thread.start()
+        self.recorder.start()
         self.feed.ready()
         try:
             ends = self.feed.alive_while(stop)
             serve(endpoint, self.peer, end=self.end, sink=sink, stop=ends, slip_ns=slip_ns)
         finally:
             self.recorder.put([self._count_losses(time.monotonic_ns() - slip_ns())])
-            thread.stop()
+            self.recorder.stop()
 
     def tell(self, records: list[Record]) -> None:
         """Send records, and problems of the recorder, to supervisor and metrics."""

@@ -1,17 +1,23 @@
-"""Write a process's recording to its file from a background thread.
+"""Record the flight of a real-time process without delaying its control loop.
 
-The thread writes a few records at a time and sleeps in between; thus it delays the control loop by
-less than a millisecond. A second thread syncs the file to the disk, which may take seconds. If the
-process is killed meanwhile, the operating system still writes the data to the disk.
+The loop puts records into a queue of limited length. A thread writes a few records at a time to the
+file and sleeps in between; thus it delays the loop by less than a millisecond. A second thread
+syncs the file to the disk, which may take seconds. If the process is killed meanwhile, the
+operating system still writes the data to the disk.
 """
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import threading
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cloudrc.errors import DISK_FULL
 from cloudrc.records import (
     Arrival,
     CommandApplied,
@@ -23,11 +29,14 @@ from cloudrc.records import (
 )
 
 if TYPE_CHECKING:
-    from cloudrc.record.recorder import Recorder
+    from cloudrc.record.writer import McapWriter
 
 AFTERWARDS_NS = 90_000_000_000
 """Time for which all records are still kept after the robot has stopped following cloud [ns]; a
 landing after a loss of the link takes less."""
+TROUBLE = {**DISK_FULL, errno.EROFS: "disk is read-only"}
+CAPACITY = 20_000
+"""Largest number of records in the queue; world or cloud makes this number in about 30 s."""
 PERIODIC = (Arrival, CommandApplied, Control, GroundTruth, Lateness, TelemetrySent)
 """Types of records that world and cloud make all the time, even between flights."""
 BATCH = 16
@@ -62,16 +71,54 @@ class FlightsOnly:
         return [record for record in records if not isinstance(record, PERIODIC)]
 
 
-class RecordingThread:
-    """Runs a recorder in the background from `start` to `stop`."""
+class Recorder:
+    """Writes records to a file in the background, from `start` to `stop`.
 
-    def __init__(self, recorder: Recorder) -> None:
-        self._recorder = recorder
-        self._stopping, self._flushed, self._over = threading.Event(), threading.Event(), False
-        # Daemon threads: the process can end even if the disk hangs.
-        self._writing = threading.Thread(target=self._write, name="recording", daemon=True)
-        self._syncing = threading.Thread(target=self._sync, name="recording-sync", daemon=True)
+    If the queue is full, the oldest record is dropped and counted. A file error must not stop the
+    flight, so no method raises an exception.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        open_sink: Callable[[Path], McapWriter],
+        capacity: int = CAPACITY,
+        size_max: int | None = None,
+    ) -> None:
+        """Create the queue of `capacity` records; after `start`, a thread opens the file.
+
+        When the file reaches `size_max` [bytes], recording ends; None means no limit.
+        """
+        self.error = ""  # why records are missing from the file, in words
+        self._path = path
+        self._open_sink = open_sink
+        self._capacity = capacity
+        self._size_max = size_max
+        self._queue: deque[Record] = deque()
+        self._sink: McapWriter | None = None
+        self._ended = False
+        self._overflowed = self._unwritten = 0
+        self._sync_error: OSError | None = None
         self._safe_since: float | None = None
+        self._stopping, self._flushed = threading.Event(), threading.Event()
+        # Daemon threads: the process can end even if the disk hangs.
+        self._writing = threading.Thread(target=self._write_all, name="recording", daemon=True)
+        self._syncing = threading.Thread(target=self._sync_all, name="recording-sync", daemon=True)
+
+    @property
+    def dropped(self) -> int:
+        """Number of records that did not reach the file."""
+        return self._overflowed + self._unwritten
+
+    def put(self, records: Iterable[Record]) -> None:
+        """Queue records, oldest first; never wait."""
+        queue = self._queue
+        queue.extend(records)
+        while len(queue) > self._capacity:
+            # The other thread may have emptied the queue in the meantime.
+            with contextlib.suppress(IndexError):
+                queue.popleft()
+                self._overflowed += 1
 
     def start(self) -> None:
         """Start the threads that write the file and sync it to the disk."""
@@ -88,24 +135,93 @@ class RecordingThread:
         self._writing.join(timeout)
         return not self._writing.is_alive()
 
-    def _write(self) -> None:
-        recorder, rest, flushed = self._recorder, IDLE, time.monotonic()
+    def _write_all(self) -> None:
+        rest, flushed = IDLE, time.monotonic()
         while not self._stopping.wait(rest):
-            rest = BUSY if recorder.drain(BATCH) == BATCH else IDLE
+            rest = BUSY if self._drain() == BATCH else IDLE
             if time.monotonic() - flushed >= FLUSH:
-                recorder.flush()
+                self._flush()
                 self._flushed.set()
                 flushed = time.monotonic()
-        recorder.close()
-        self._over = True
+        self._close()
         self._flushed.set()
 
-    def _sync(self) -> None:
-        while True:
-            self._flushed.wait()
+    def _sync_all(self) -> None:
+        while self._flushed.wait() and not self._ended:
             self._flushed.clear()
-            if self._over:
-                return
-            began = time.monotonic()
-            if self._recorder.sync():
-                self._safe_since = began
+            self._sync()
+
+    def _drain(self) -> int:
+        """Write at most `BATCH` records of the queue; return how many were taken."""
+        if self._sink is None and not self._ended:
+            try:
+                self._sink = self._open_sink(self._path)
+            except OSError as error:
+                self._end(error)
+        taken = 0
+        with contextlib.suppress(IndexError):
+            while taken < BATCH:
+                record = self._queue.popleft()
+                taken += 1
+                self._write(record)
+        return taken
+
+    def _flush(self) -> None:
+        """Pass data to the operating system; close the file if it is full or a sync has failed."""
+        if self._sink and not self._ended:
+            try:
+                self._sink.flush()
+                if self._sync_error is not None:
+                    raise self._sync_error
+                if self._size_max is not None and self._path.stat().st_size >= self._size_max:
+                    raise OSError(errno.EFBIG, "the file has reached its size limit")
+            except OSError as error:
+                self._end(error)
+
+    def _sync(self) -> None:
+        """Write flushed data to the disk, however long that takes."""
+        began, sink = time.monotonic(), self._sink
+        if sink is not None:
+            try:
+                sink.sync()
+                if self._path.is_file():
+                    self._safe_since = began
+            except OSError as error:  # the next flush, in the other thread, ends the file
+                self._sync_error = error
+            except ValueError:  # the file was closed in the meantime
+                pass
+
+    def _close(self) -> None:
+        """Write the remaining records and close the file."""
+        while self._drain():
+            pass
+        if self._sink and not self._ended:
+            self._ended = True
+            try:
+                self._sink.close()
+            except OSError as error:
+                self._end(error)
+
+    def _write(self, record: Record) -> None:
+        if self._sink is None or self._ended:
+            self._unwritten += 1
+            return
+        try:
+            self._sink.write((record,))
+        except OSError as error:
+            self._unwritten += 1
+            self._end(error)
+        except Exception as error:  # one record that cannot be encoded must not stop the others
+            self._unwritten += 1
+            kind = type(record).__name__
+            self.error = f"{self._path}: a record of type {kind} cannot be written: {error}"
+
+    def _end(self, error: OSError) -> None:
+        """Close the file after an error, so that it stays readable; drop all later records."""
+        self._ended = True
+        reason = f"recording stopped: {TROUBLE.get(error.errno or 0, error.strerror or error)}"
+        self.error = (
+            f"{self._path}: {reason}; make room or choose another folder; the flight goes on"
+        )
+        if self._sink:
+            self._unwritten += self._sink.abandon(reason)

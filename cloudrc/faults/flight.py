@@ -23,7 +23,7 @@ from cloudrc.faults.models import RestartableEndpoint, TeleopModel
 from cloudrc.faults.schedule import OFFSET_MAX, Schedule, generator
 from cloudrc.link.model import LinkDirection
 from cloudrc.messages import GuardState
-from cloudrc.record.hash import RecordHash
+from cloudrc.record.columns import Recording
 from cloudrc.records import Counted, GroundTruth, GuardChange, MissionEvent, Record
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import Mission, Order
@@ -77,7 +77,7 @@ class Flight:
         self.generations = {"world": 0, "cloud": 0}
         self.of_world, self.of_cloud = list[Record](), list[Record]()
         self.changes = list[GuardChange]()
-        self._hash, self.watch = RecordHash(), Watch(self.experiment.guard)
+        self.watch = Watch(self.experiment.guard)
         self.listeners: list[Callable[[list[Record], int], None]] = [self.watch.see]
         self.teleop = TeleopModel(
             self.experiment.criteria.contact_speed_max_mps,
@@ -145,7 +145,7 @@ class Flight:
 
     def sha256(self) -> str:
         """Return the hash of all records so far; the flight must have been made with `keep`."""
-        return self._hash.hexdigest()
+        return Recording.from_records(self.of_world, self.of_cloud).sha256
 
     def trajectory(self) -> list[GroundTruth]:
         """Return the records of the ground truth, one every 10 ms."""
@@ -212,7 +212,6 @@ class Flight:
         if self._keep:
             self.of_world += of_world
             self.of_cloud += of_cloud
-            self._hash.update([*of_world, *of_cloud])
         self.changes += [record for record in of_world if isinstance(record, GuardChange)]
         for listen in self.listeners:
             listen(of_world, self.run.now_ns)

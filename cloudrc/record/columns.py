@@ -9,24 +9,36 @@ records has a table without rows.
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import hashlib
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum
+from functools import cache
 from itertools import chain, repeat
-from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeAlias
+from typing import Any, TypeAlias, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.record.hash import Columns, RecordHash
-from cloudrc.record.topics import TOPICS, Kind, Row, Topic, Values, rows
+from cloudrc.errors import BadInputError
+from cloudrc.record.topics import TOPICS, Kind, Topic
 from cloudrc.records import Arrival, Record
 
-if TYPE_CHECKING:
-    from cloudrc.record.reader import Contents
-
 Column: TypeAlias = NDArray[Any]
+Columns: TypeAlias = dict[str, Any]
+"""Dotted path of a plain value in a record -> its column: an array of shape (n,), for vectors of
+shape (n, k), or a tuple of n strings."""
+Message: TypeAlias = tuple[str, int, bytes]
+"""Topic, log time [ns] and CDR bytes of a message."""
+_Fields: TypeAlias = tuple[tuple[str, Any, int], ...]
+
+BLOCK = 200
+"""Number of records that are converted to columns together."""
+ROTATED = ("nav_msgs/msg/Odometry", "velocity")
+"""ROS type and column of a value that a file stores in another frame, and thus rounds."""
+_CODES = {int: "<i8", float: "<f8", bool: "?", str: "s"}
 _TYPES: dict[Kind, tuple[type, tuple[int, ...]]] = {
     "int": (np.int64, ()),
     "float": (np.float64, ()),
@@ -35,26 +47,6 @@ _TYPES: dict[Kind, tuple[type, tuple[int, ...]]] = {
     "vector": (np.float64, (3,)),
     "quaternion": (np.float64, (4,)),
 }
-
-
-def merged(
-    world_records: Iterable[Record], cloud_records: Iterable[Record]
-) -> Iterator[tuple[int, Row]]:
-    """Merge the records of world and cloud, each oldest first and all on one clock, into rows.
-
-    Yield the log time [ns] and the row, in order of log time. If two log times are equal, world's
-    row comes first. The log time of a row is its stamp, or the log time of the previous row of the
-    same end (world or cloud) if that is later.
-    """
-    return heapq.merge(_logged(world_records), _logged(cloud_records), key=itemgetter(0))
-
-
-def _logged(records: Iterable[Record]) -> Iterator[tuple[int, Row]]:
-    latest = 0
-    for record in records:
-        for row in rows(record):
-            latest = max(latest, row[1])
-            yield latest, row
 
 
 class Table:
@@ -70,15 +62,9 @@ class Table:
         Without columns, the table has no rows.
         """
         self._columns = {"stamp_ns": _column("int", stamps_ns)}
-        for field, values in zip(topic.fields, chain(columns, repeat(())), strict=False):
-            self._columns[field.name] = _column(field.kind, values)
+        for each, values in zip(topic.fields, chain(columns, repeat(())), strict=False):
+            self._columns[each.name] = _column(each.kind, values)
         self.topic = topic
-
-    @classmethod
-    def from_rows(cls, topic: Topic, rows: list[tuple[int, Values]]) -> Self:
-        """Convert rows, each with a stamp [ns] and values."""
-        values = zip(*[values for _, values in rows], strict=True)
-        return cls(topic, [stamp_ns for stamp_ns, _ in rows], values)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -96,39 +82,39 @@ class Table:
             raise KeyError(f"no column {name!r} in {self.topic.name}; it has: {known}") from None
 
 
-class Recording:
-    """The tables of a flight by topic.
+def _column(kind: Kind, values: Iterable[Any]) -> Column:
+    dtype, shape = _TYPES[kind]
+    return np.asarray(values, dtype=dtype).reshape(-1, *shape)
 
-    A recording from a file also has metadata, attachments, a note and remarks; `Contents` describes
-    them.
+
+@dataclass(eq=False)
+class Recording:
+    """The tables of a flight by topic, and what else a file contains.
+
+    A topic is decoded when its table is read for the first time. This raises a BadInputError if a
+    message of the topic is not readable.
     """
 
-    def __init__(
-        self, make_table: Callable[[Topic], Table], contents: Contents | None = None
-    ) -> None:
-        """Set `make_table`, which makes the table of a topic; `contents` give the other attributes.
+    messages: list[Message] = field(default_factory=list)  # in the order of log times
+    records: RecordStore | None = None  # in place of messages
+    metadata: dict[str, str] = field(default_factory=dict)  # of a repeated key, the last value
+    attachments: dict[str, bytes] = field(default_factory=dict)  # name -> content of a file
+    views: list[Message] = field(default_factory=list)  # messages of `VIEWS`
+    source: str = ""  # the file, for errors
+    torn: str = ""  # that a killed process has not written the end of the file, in words
+    lacking: str = ""  # what was damaged or changed in the file, in words
+    told: str = ""  # what the writer of the file missed, in words
+    remarks: tuple[str, ...] = ()  # what was ignored or sorted; "The recording" precedes each
 
-        Outside this package, call `read` or `from_records` instead.
-        """
-        self._make_table = make_table
+    def __post_init__(self) -> None:
         self._tables: dict[str, Table] = {}
-        self.metadata: Mapping[str, str] = contents.metadata if contents else {}
-        self.attachments: Mapping[str, bytes] = contents.attachments if contents else {}
-        self.note = contents.note if contents else ""
-        self.lacking = contents.lacking if contents else ""
-        self.remarks = contents.remarks if contents else ()
-
-    @property
-    def complete(self) -> bool:
-        """Whether no message of the flight is missing."""
-        return not self.note
 
     @staticmethod
     def from_records(world: Iterable[Record], cloud: Iterable[Record] = ()) -> Recording:
         """Make a recording from records of world and cloud, each oldest first, all on one clock."""
         store = RecordStore()
         store.add(world, cloud)
-        return store.recording()
+        return Recording(records=store)
 
     @staticmethod
     def read(path: Path) -> Recording:
@@ -136,48 +122,100 @@ class Recording:
 
         Raise a BadInputError if nothing in the file can be read.
         """
-        from cloudrc.record.reader import read_contents
+        from cloudrc.record.reader import read
 
-        return read_contents(path).recording()
+        return read(path)
+
+    def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
+        """Write the messages and further `attachments` to a file, atomically; may raise OSError."""
+        from cloudrc.record.writer import write
+
+        write(self, target, attachments or {})
+
+    @property
+    def note(self) -> str:
+        """What is missing or wrong, in words; "" if no message of the flight is missing."""
+        lacking = "" if self.lacking in self.told else self.lacking
+        return "; ".join(filter(None, (self.torn, lacking, self.told)))
+
+    @property
+    def sha256(self) -> str:
+        """Hash of all tables, as 64 hexadecimal digits; records and their file have the same hash.
+
+        The topics are hashed column by column. If both ends write a topic, its rows are hashed in
+        the order of their stamps. Numbers are little-endian. The hash omits the column `ROTATED`.
+        """
+        total = hashlib.sha256()
+        for topic in TOPICS.values():
+            table = self[topic.name]
+            mixed = topic.end == "either"
+            rows = np.argsort(table["stamp_ns"], kind="stable") if mixed else slice(None)
+            total.update(f"{topic.name} {len(table)}\n".encode())
+            for name in table.names:
+                column = table[name][rows]
+                if column.dtype == object:
+                    texts = [text.encode("utf-8", "replace") for text in column]
+                    total.update(repr(texts).encode())
+                elif (topic.ros_type, name) != ROTATED:
+                    total.update(column.data)
+        return total.hexdigest()
+
+    def keep(self, first_ns: int, last_ns: int) -> None:
+        """Remove the messages with a log time [ns] before `first_ns` or after `last_ns`."""
+        self.messages = [each for each in self.messages if first_ns <= each[1] <= last_ns]
+        self._tables.clear()
 
     def __getitem__(self, topic: str) -> Table:
         if topic not in self._tables:
             if topic not in TOPICS:
                 raise KeyError(f"no topic {topic!r}; there are: {', '.join(TOPICS)}")
-            self._tables[topic] = self._make_table(TOPICS[topic])
+            known = self.records.table(TOPICS[topic]) if self.records else self._decode(topic)
+            self._tables[topic] = known
         return self._tables[topic]
 
+    def _decode(self, topic: str) -> Table:
+        messages = [data for name, _, data in self.messages if name == topic]
+        if not messages:
+            return Table(TOPICS[topic], (), ())
+        from cloudrc.record.ros import decode
 
-def _column(kind: Kind, values: Iterable[Any]) -> Column:
-    dtype, shape = _TYPES[kind]
-    return np.asarray(values, dtype=dtype).reshape(-1, *shape)
+        try:
+            stamps_ns, rows = zip(*[decode(TOPICS[topic], data) for data in messages], strict=True)
+        except Exception as error:  # rosbags may raise anything on malformed bytes
+            raise BadInputError(
+                f"{self.source}: a message on {topic} is not readable; use the original file"
+            ) from error
+        return Table(TOPICS[topic], stamps_ns, zip(*rows, strict=True))
 
 
-class RecordStore(RecordHash):
-    """Keeps the records of a flight as columns, hashes them, and makes recordings of them."""
+class RecordStore:
+    """Keeps the records of a flight as columns, which take less memory than the records."""
+
+    def __init__(self) -> None:
+        self._waiting: defaultdict[type, list[Record]] = defaultdict(list)
+        self._blocks: defaultdict[type, list[Columns]] = defaultdict(list)
 
     def add(self, from_world: Iterable[Record], from_cloud: Iterable[Record]) -> None:
         """Add the new records of world and of cloud, each oldest first."""
-        self.update(from_world)
-        self.update(from_cloud)
+        for record in chain(from_world, from_cloud):
+            self._waiting[type(record)].append(record)
+        for kind, block in self._waiting.items():
+            while len(block) >= BLOCK:
+                self._blocks[kind].append(_to_columns(kind, block[:BLOCK]))
+                del block[:BLOCK]
 
-    def recording(self) -> Recording:
-        """Return a recording of the records so far; their stamps must be on one clock."""
-        blocks = self.blocks()
-        return Recording(lambda topic: _table(topic, blocks.get(topic.source, [])))
-
-
-def _table(topic: Topic, blocks: list[Columns]) -> Table:
-    if not blocks:
-        return Table(topic, (), ())
-    stamps_ns, *columns = (_joined(blocks, path) for path in (topic.stamp_path, *topic.paths()))
-    if topic.source is Arrival:
-        rows = _joined(blocks, "uplink") == (topic.end == "cloud")
-    elif topic.end == "either":  # in the order of time, world's row first
-        rows = np.argsort(stamps_ns, kind="stable")
-    else:
-        return Table(topic, stamps_ns, columns)
-    return Table(topic, stamps_ns[rows], [column[rows] for column in columns])
+    def table(self, topic: Topic) -> Table:
+        """Make the table of a topic; the stamps of all records must be on one clock."""
+        kind = topic.source
+        blocks = [*self._blocks[kind], _to_columns(kind, self._waiting[kind])]
+        stamps_ns, *columns = (_joined(blocks, path) for path in (topic.stamp_path, *topic.paths()))
+        if kind is Arrival:
+            rows = _joined(blocks, "uplink") == (topic.end == "cloud")
+        elif topic.end == "either":  # in the order of time, world's row first
+            rows = np.argsort(stamps_ns, kind="stable")
+        else:
+            return Table(topic, stamps_ns, columns)
+        return Table(topic, stamps_ns[rows], [column[rows] for column in columns])
 
 
 def _joined(blocks: list[Columns], path: str) -> Column:
@@ -185,3 +223,39 @@ def _joined(blocks: list[Columns], path: str) -> Column:
     if isinstance(parts[0], tuple):  # of strings
         return np.array([*chain.from_iterable(parts)], dtype=object)
     return np.concatenate(parts)
+
+
+def _to_columns(kind: type, records: Sequence[Record]) -> Columns:
+    """Convert n >= 0 records of one type to columns, in the order of the type's fields."""
+    found: Columns = {}
+    _convert(_fields(kind), "", records, found)
+    return found
+
+
+def _convert(
+    fields: _Fields, prefix: str, records: Sequence[tuple[Any, ...]], found: Columns
+) -> None:
+    count = len(records)
+    columns = zip(*records, strict=True) if count else repeat(())
+    for (name, kind, size), values in zip(fields, columns, strict=False):
+        if isinstance(kind, tuple):
+            _convert(kind, f"{prefix}{name}.", values, found)
+        elif size:
+            numbers = np.fromiter(chain.from_iterable(values), kind, size * count)
+            found[prefix + name] = numbers.reshape(count, size)
+        else:
+            found[prefix + name] = values if kind == "s" else np.fromiter(values, kind, count)
+
+
+@cache
+def _fields(cls: type) -> _Fields:
+    """List each field of a record: name, type, size of a vector (0 for other types)."""
+    found = list[tuple[str, Any, int]]()
+    for name, kind in get_type_hints(cls).items():
+        if hasattr(kind, "_fields"):
+            found.append((name, _fields(kind), 0))
+        elif get_origin(kind) is tuple:
+            found.append((name, "<f8", len(get_args(kind))))
+        else:
+            found.append((name, "<i8" if issubclass(kind, IntEnum) else _CODES[kind], 0))
+    return tuple(found)

@@ -26,17 +26,14 @@ from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording, Table
-from cloudrc.record.reader import Contents, read_contents
+from cloudrc.record.reader import read
 from cloudrc.record.ros import shifted
 from cloudrc.record.topics import TOPICS
-from cloudrc.record.writer import MISSING
 from cloudrc.records import UNDER_WAY
 
 BEFORE_NS, AFTER_NS = 1_000_000_000, 2_000_000_000
 """A cut recording begins BEFORE_NS before the mission's start and ends AFTER_NS after its end [ns].
 It thus includes the start of the session and the guard's first change of state."""
-CUT_SHORT = "cut short"
-"""Beginning of the reader's note about a file whose end is missing."""
 
 
 class ClockOffset(NamedTuple):
@@ -113,56 +110,53 @@ def world_time_ns(telemetry: Table, machine_ns: NDArray[np.int64]) -> NDArray[np
     return at_ns
 
 
-def merge(world: Path, cloud: Path) -> Contents:
+def merge(world: Path, cloud: Path) -> Recording:
     """Merge the files of world and cloud, complete or torn, into one mission on world's clock.
 
     If one file cannot be read, the result contains only the other file, on that file's own clock,
     and a note. Raise a BadInputError if neither file can be read.
     """
-    read: dict[str, Contents] = {}
+    found: dict[str, Recording] = {}
     failures = []
     for end, path in (("world", world), ("cloud", cloud)):
         try:
-            read[end] = read_contents(path)
+            found[end] = read(path)
         except BadInputError as error:
             failures.append(error)
-    if not read:
+    if not found:
         raise failures[0]
-    notes = [f"{end}: {contents.note}" for end, contents in read.items() if contents.note]
-    mission = next(iter(read.values())) if failures else _join(read["world"], read["cloud"])
-    _set_note(mission, [*notes, *map(str, failures)])
-    mission.lacking = "; ".join(f"{end}: {one.lacking}" for end, one in read.items() if one.lacking)
+    mission = next(iter(found.values())) if failures else _join(found["world"], found["cloud"])
+    torn, lacking, told = (
+        [f"{end}: {text}" for end, one in found.items() if (text := getattr(one, name))]
+        for name in ("torn", "lacking", "told")
+    )
+    mission.torn, mission.lacking = "; ".join(torn), "; ".join(lacking)
+    mission.told = "; ".join([*told, *map(str, failures)])
     return mission
 
 
-def _set_note(mission: Contents, notes: list[str]) -> None:
-    mission.note = "; ".join(notes)
-    mission.metadata.pop(MISSING, None)
-    if mission.note:
-        mission.metadata[MISSING] = mission.note
-
-
-def _join(world: Contents, cloud: Contents) -> Contents:
+def _join(world: Recording, cloud: Recording) -> Recording:
     logged_ns = np.array([message[1] for message in cloud.messages], dtype=np.int64)
     clock_id = world.metadata.get("clock_id")
     if clock_id and clock_id == cloud.metadata.get("clock_id"):
-        offset, moved_ns = SAME_CLOCK, world_time_ns(_table(world, "/telemetry"), logged_ns)
+        offset, moved_ns = SAME_CLOCK, world_time_ns(world["/telemetry"], logged_ns)
     else:
-        offset = clock_offset(world.recording(), cloud.recording())
+        offset = clock_offset(world, cloud)
         moved_ns = logged_ns + offset.offset_ns
     moved = [
         (topic, to_ns, shifted(data, to_ns - from_ns))
         for (topic, from_ns, data), to_ns in zip(cloud.messages, moved_ns.tolist(), strict=True)
     ]
     in_order = heapq.merge(world.messages, moved, key=itemgetter(1))
-    return Contents(
+    return Recording(
         messages=[(topic, max(ns, 0), data) for topic, ns, data in in_order],  # MCAP's least time
         metadata={**cloud.metadata, **world.metadata, **offset.metadata()},
         attachments={**cloud.attachments, **world.attachments},
+        source=f"{world.source} or {cloud.source}",
     )
 
 
-def cut_to_last_mission(mission: Contents) -> bool:
+def cut_to_last_mission(mission: Recording) -> bool:
     """Reduce a pod's recording of several missions to the mission that was started last.
 
     Return whether the recording contains the end of that mission. If it does, remove the remark
@@ -173,20 +167,21 @@ def cut_to_last_mission(mission: Contents) -> bool:
     until = mission.messages[-1][1] if mission.messages else 0
     whole = ended is not None and until > ended
     first = max(began - BEFORE_NS, earlier + 1) if began is not None else 0
-    last = ended + AFTER_NS if ended is not None else until
-    mission.messages = [message for message in mission.messages if first <= message[1] <= last]
+    mission.keep(first, ended + AFTER_NS if ended is not None else until)
     if whole:
-        _set_note(mission, [n for n in mission.note.split("; ") if n and CUT_SHORT not in n])
+        mission.torn = ""
     return whole
 
 
-def _last_mission(contents: Contents) -> tuple[int | None, int | None, int]:
+def _last_mission(mission: Recording) -> tuple[int | None, int | None, int]:
     """Return start and end [ns] of the last mission, and end [ns] of the mission before.
 
     Start or end is None if its event is missing; the last value is -1 without an earlier mission.
     """
     began, ended, earlier = None, None, -1
-    for time_ns, event in _mission_events(contents):
+    # The log time of an event is later than its stamp.
+    logged_ns = [message[1] for message in mission.messages if message[0] == "/mission"]
+    for time_ns, event in zip(logged_ns, mission["/mission"]["event"], strict=True):
         if event == "started":
             began, ended, earlier = time_ns, None, earlier if ended is None else ended
         elif event not in UNDER_WAY and ended is None:
@@ -196,20 +191,3 @@ def _last_mission(contents: Contents) -> tuple[int | None, int | None, int]:
             began, earlier = ended + 1, ended
             ended = None
     return began, ended, earlier
-
-
-def _mission_events(contents: Contents) -> Iterator[tuple[int, str]]:
-    """Yield the log time [ns] of each readable mission message, and its event.
-
-    The log time is later than the stamp in the message.
-    """
-    for message in contents.messages:
-        if message[0] == "/mission":
-            for event in _table(Contents([message]), "/mission")["event"].tolist():
-                yield message[1], event
-
-
-def _table(contents: Contents, topic: str) -> Table:
-    """Decode only the messages of `topic`, because decoding all topics takes long."""
-    messages = [message for message in contents.messages if message[0] == topic]
-    return Contents(messages).recording()[topic]

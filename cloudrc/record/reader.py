@@ -12,9 +12,9 @@ import os
 import zlib
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from io import BufferedReader, BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -27,19 +27,11 @@ from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from cloudrc.errors import BadInputError, to_one_line
-from cloudrc.files import atomic_file, open_file
-from cloudrc.record import wall_time
-from cloudrc.record.columns import Recording, Table
-from cloudrc.record.ros import decode, is_known
-from cloudrc.record.topics import TOPICS, VIEWS, Values
-from cloudrc.record.writer import (
-    CHANGED,
-    CLOCK,
-    COUNTS,
-    MISSING,
-    STARTED,
-    McapWriter,
-)
+from cloudrc.files import open_file
+from cloudrc.record.columns import Recording
+from cloudrc.record.ros import is_known
+from cloudrc.record.topics import TOPICS, VIEWS
+from cloudrc.record.writer import CHANGED, CLOCK, COUNTS, MISSING
 
 UNPACKED_MAX = 64
 """Largest ratio of a recording's size in memory to its size in the file; a file below 1 MiB counts
@@ -77,62 +69,12 @@ _UNPACK: dict[str, Callable[[bytes, int], bytes]] = {
 used, because they allocate whatever size the file claims."""
 
 
-@dataclass(slots=True)
-class Contents:
-    """The contents of a recording's file.
-
-    `note` says what is missing or wrong, for example that the process was killed before it had
-    written all messages. `lacking` says only how the file was damaged or changed; "" if it was not.
-    """
-
-    # Topic, log time [ns] and CDR bytes of each message, in the order of log times.
-    messages: list[tuple[str, int, bytes]] = field(default_factory=list)
-    metadata: dict[str, str] = field(default_factory=dict)  # of a repeated key, the last value
-    attachments: dict[str, bytes] = field(default_factory=dict)  # name -> content of a file
-    views: list[tuple[str, int, bytes]] = field(default_factory=list)  # messages of `VIEWS`
-    note: str = ""  # what is missing, in words; "" if nothing is missing
-    lacking: str = ""
-    remarks: tuple[str, ...] = ()  # what was ignored or sorted; "The recording" precedes each
-
-    def recording(self) -> Recording:
-        """Convert the messages to tables; unreadable messages are left out and noted."""
-        rows: dict[str, list[tuple[int, Values]]] = {name: [] for name in TOPICS}
-        unreadable = 0
-        for topic, _, data in self.messages:
-            try:
-                rows[topic].append(decode(TOPICS[topic], data))
-            except Exception:  # rosbags may raise anything on malformed bytes
-                unreadable += 1
-        recording = Recording(lambda topic: Table.from_rows(topic, rows[topic.name]), self)
-        if unreadable:
-            text = f"{unreadable} messages are not readable"
-            recording.note = f"{recording.note}; {text}".removeprefix("; ")
-            recording.lacking = f"{recording.lacking}; {text}".removeprefix("; ")
-        return recording
-
-    def write(self, target: Path, attachments: Mapping[str, bytes] | None = None) -> None:
-        """Write the contents and further `attachments` to a file, atomically; may raise OSError."""
-        clock, machine = self.metadata.get(CLOCK, ""), self.metadata.get("clock_id", "")
-        with (
-            atomic_file(target) as file,
-            McapWriter(file, clock=clock, clock_id=machine) as writer,
-        ):
-            writer.note(self.metadata)
-            if self.messages and (began := wall_time(self.metadata, self.messages[0][1])):
-                writer.note({STARTED: began.isoformat(timespec="milliseconds")})
-            for message in self.messages:
-                writer.write_message(*message)
-            writer.write_views(self.views)
-            for name, data in {**self.attachments, **(attachments or {})}.items():
-                writer.attach(name, data)
-
-
 class _File:
     """Reads one MCAP file, including its chunks, up to the first damaged part."""
 
     def __init__(self, path: Path) -> None:
         """Read a file; raise a BadInputError if it cannot be read or is not MCAP."""
-        self.contents = Contents()
+        self.recording = Recording(source=str(path))
         self.position = 0  # end of the last intact record in the file [bytes]
         self.data_ended = False  # whether all messages were read; only the index follows
         self.ended = False  # whether the whole file was read
@@ -159,7 +101,7 @@ class _File:
                 text = KINDS.get(kind, "is not an MCAP file; name a recording (.mcap)")
                 raise (BadInputError if kind else NothingReadableError)(f"{path}: {text}")
             self._read()
-        if not self.data_ended and not self.contents.messages:
+        if not self.data_ended and not self.recording.messages:
             raise NothingReadableError(
                 f"{path}: holds no readable message: {self.fault}; name another recording"
             )
@@ -203,7 +145,7 @@ class _File:
 
     def _store(self, record: mcap.McapRecord) -> None:
         """Store a record; raise a KeyError for a message whose channel is not defined."""
-        contents = self.contents
+        recording = self.recording
         if isinstance(record, mcap.Message):
             self._take_room(MESSAGE_COST)
             self.total += 1
@@ -211,18 +153,18 @@ class _File:
             if record.channel_id not in self.ours:
                 self.ours[record.channel_id] = self._is_ours(self.channels[record.channel_id])
             if self.ours[record.channel_id] and topic in VIEWS:
-                contents.views.append((topic, record.log_time, record.data))
+                recording.views.append((topic, record.log_time, record.data))
             elif self.ours[record.channel_id]:
-                contents.messages.append((topic, record.log_time, record.data))
+                recording.messages.append((topic, record.log_time, record.data))
                 self._sequences.append(record.sequence)
         elif isinstance(record, mcap.Schema):
             self._schemas[record.id] = record
         elif isinstance(record, mcap.Channel):
             self.channels[record.id] = record
         elif isinstance(record, mcap.Metadata):
-            contents.metadata.update(record.metadata)
+            recording.metadata.update(record.metadata)
         elif isinstance(record, mcap.Attachment):
-            contents.attachments[record.name] = record.data
+            recording.attachments[record.name] = record.data
 
     def _is_ours(self, channel: mcap.Channel) -> bool:
         """Check whether a channel's topic and layout are those that cloudrc records."""
@@ -233,12 +175,12 @@ class _File:
         return is_known(ros_type, schema.data.decode("utf-8", "replace"))
 
     def _sort(self) -> None:
-        messages = self.contents.messages
+        messages = self.recording.messages
         if late := sum(after[1] < before[1] for before, after in pairwise(messages)):
             keys = zip((message[1] for message in messages), self._sequences, strict=True)
             order = [row for _, row in sorted(zip(keys, range(len(messages)), strict=True))]
-            self.contents.messages = [messages[row] for row in order]
-            self.contents.remarks += (f"was not in order of time: {late} messages were sorted",)
+            self.recording.messages = [messages[row] for row in order]
+            self.recording.remarks += (f"was not in order of time: {late} messages were sorted",)
 
     @property
     def unread(self) -> int:
@@ -247,8 +189,8 @@ class _File:
 
     @property
     def lost(self) -> int:
-        """Number of messages in the file that are not in `contents`."""
-        return self.total - len(self.contents.messages) - len(self.contents.views)
+        """Number of messages in the file that are not in `recording`."""
+        return self.total - len(self.recording.messages) - len(self.recording.views)
 
     def _take_room(self, size: int) -> None:
         self._room -= size
@@ -278,29 +220,26 @@ class _File:
             raise ValueError("a record is not as long as it states") from error
 
 
-def read_contents(path: Path) -> Contents:
-    """Read cloudrc's topics from a file, up to its end or to its first damaged part.
-
-    Raise a BadInputError if nothing in the file can be read.
-    """
-    return _File(path).contents
+def read(path: Path) -> Recording:
+    """Do what `Recording.read` does."""
+    return _File(path).recording
 
 
 def _note(file: _File) -> None:
-    """Describe in words what a file lacks; store the texts in the file's `contents`."""
-    contents, fault = file.contents, file.fault
-    changed, metadata = list[str](), contents.metadata
+    """Describe in words what a file lacks; store the texts in the file's `recording`."""
+    recording, fault, metadata = file.recording, file.fault, file.recording.metadata
+    changed = list[str]()
     if file.data_ended and file.cut:
-        contents.remarks += ("had a torn index: all its messages were read",)
+        recording.remarks += ("had a torn index: all its messages were read",)
         fault = ""
     elif fault and not file.data_ended:
-        count, until = len(contents.messages), contents.messages[-1][1] * 1e-9
+        count, until = len(recording.messages), recording.messages[-1][1] * 1e-9
         fault += f": {count} messages were read, the last at {until:.2f} s"
     channels = Counter((file.channels[number].topic, known) for number, known in file.ours.items())
     others = {name for name, known in channels if not known}
     if foreign := sorted(others - TOPICS.keys()):
         told = f"has topics that cloudrc does not record: {_list(foreign)}"
-        contents.remarks += (to_one_line(told),)
+        recording.remarks += (to_one_line(told),)
     if other := sorted(others & TOPICS.keys()):
         changed.append(f"topics of another layout were left out: {', '.join(other)}")
     twice = [name for (name, known), n in channels.items() if known and n > 1 and name in TOPICS]
@@ -309,20 +248,19 @@ def _note(file: _File) -> None:
     if not metadata.get(CLOCK):
         changed.append("the metadata of cloudrc, which names the clock, is not there")
     if file.data_ended:
-        changed += _changed(contents)
+        changed += _changed(recording)
     if before := to_one_line(metadata.get(CHANGED, "")):  # known when the file was written
         changed.append(before)
     if changed:
         metadata[CHANGED] = "; ".join(changed)
-    told = to_one_line(metadata.get(MISSING, ""))
-    contents.lacking = "; ".join(filter(None, ["" if file.cut else fault, *changed]))
-    anew = [text for text in changed if text not in told]
-    contents.note = "; ".join(filter(None, [fault, *anew, told]))
+    recording.torn, damage = (fault, "") if file.cut else ("", fault)
+    recording.lacking = "; ".join(filter(None, [damage, *changed]))
+    recording.told = to_one_line(metadata.get(MISSING, ""))
 
 
-def _changed(contents: Contents) -> Iterator[str]:
+def _changed(recording: Recording) -> Iterator[str]:
     """Describe how the messages of a complete file differ from the counts stored by its writer."""
-    metadata, read = contents.metadata, Counter(message[0] for message in contents.messages)
+    metadata, read = recording.metadata, Counter(message[0] for message in recording.messages)
     counts: dict[str, int] = {}
     with suppress(ValueError):
         counts = json.loads(metadata.get(COUNTS) or "{}")
@@ -360,25 +298,25 @@ def recover(source: Path, target: Path) -> Recovery:
     has no readable message, or an OSError if the new file cannot be written.
     """
     file = _File(source)
-    contents, lost = file.contents, file.lost
-    if not contents.messages:
-        reason = contents.note or "none is in it"
+    recording, lost = file.recording, file.lost
+    if not recording.messages:
+        reason = recording.note or "none is in it"
         raise BadInputError(f"{source}: holds no readable message: {reason}; nothing is written")
-    notes = [contents.note] if contents.note else []
+    missed = list[str]()
     if file.unread:
-        notes.append(f"{file.unread} bytes after the last intact part were not read")
+        missed.append(f"{file.unread} bytes after the last intact part were not read")
     if lost:
-        notes.append(f"{lost} messages are lost, or of topics that cloudrc does not record")
-    if notes:
-        contents.metadata[MISSING] = "; ".join(notes)
-    contents.write(target)
-    count, topics = len(contents.messages), {topic for topic, _, _ in contents.messages}
+        missed.append(f"{lost} messages are lost, or of topics that cloudrc does not record")
+    notes = [*filter(None, [recording.note]), *missed]
+    recording.told = "; ".join(filter(None, [recording.told, *missed]))
+    recording.write(target)
+    count, topics = len(recording.messages), {topic for topic, _, _ in recording.messages}
     share = count / (count + lost) if lost else 1.0 - file.unread / file.size
     return Recovery(
         complete=not notes,
         share=min(share, LOSSY_SHARE_MAX) if notes else 1.0,
         size=file.size,
-        kept={"messages": count, "attachments": len(contents.attachments), "topics": len(topics)},
+        kept={"messages": count, "attachments": len(recording.attachments), "topics": len(topics)},
         dropped={"messages": lost} if lost else {},
         bytes_lost=file.unread,
         notes=notes,

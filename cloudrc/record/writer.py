@@ -3,13 +3,12 @@
 The file has the MCAP profile `ros2`, schemas in `ros2msg`, messages in `cdr`, and chunks compressed
 with zstd. A chunk goes to the operating system after at most half a second of recording, so a
 killed process loses at most half a second. Checksums of the chunks and of the data section reveal
-every wrong byte outside the index. A complete file has the number and the hash of its messages.
+every wrong byte outside the index. A complete file has the number of its messages.
 """
 
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
 import os
 from collections import Counter
@@ -18,18 +17,21 @@ from contextlib import suppress
 from io import FileIO
 from operator import itemgetter
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import IO, TYPE_CHECKING, Any, Self
 
 from mcap.data_stream import RecordBuilder
 from mcap.records import DataEnd, Footer, Metadata
 from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
 
 from cloudrc import __version__
-from cloudrc.record import WALL_OFFSET
-from cloudrc.record.hash import add_message
+from cloudrc.files import atomic_file
+from cloudrc.record import WALL_OFFSET, wall_time
 from cloudrc.record.ros import definition, encode, type_hash
-from cloudrc.record.topics import TOPICS, VIEWS, Row, rows
+from cloudrc.record.topics import TOPICS, VIEWS, rows
 from cloudrc.records import Record
+
+if TYPE_CHECKING:
+    from cloudrc.record.columns import Recording
 
 CHUNK_NS = 500_000_000
 """Longest time between the first and the last message of a chunk [ns]."""
@@ -43,10 +45,9 @@ CHANGED = "changed"
 """Metadata key: what another program removed from the file or added to the file, in words."""
 STARTED = "started"
 """Metadata key, only in real time: wall time of a mission's first message, in UTC (ISO 8601)."""
-COUNTS, SHA256 = "counts", "messages_sha256"
-"""Metadata keys: number of messages by topic as JSON, and hash of the messages, computed as by
-`messages_sha256`. From them a reader detects messages that were removed, added or changed. The
-value of `COUNTS` is "" until the file is complete."""
+COUNTS = "counts"
+"""Metadata key: number of messages by topic as JSON, "" until the file is complete. From it a
+reader detects messages that were removed or added."""
 
 
 class McapWriter:
@@ -90,23 +91,17 @@ class McapWriter:
         self._chunk_start_ns: int | None = None
         self._number = 0  # sequence number of the last message
         self._counts: Counter[str] = Counter()
-        self._sha256 = hashlib.sha256()
         self._mcap.start(profile="ros2", library=f"cloudrc {__version__}")
         self.note({CLOCK: clock, "clock_id": clock_id, "version": __version__, COUNTS: ""})
         if wall_offset_ns is not None:
             self.note({WALL_OFFSET: str(wall_offset_ns)})
 
     def write(self, records: Iterable[Record]) -> None:
-        """Write all rows of `records`, oldest first; all are from world, or all from cloud."""
+        """Write all rows of `records`, oldest first; the log time of a row is its stamp."""
         for record in records:
-            for row in rows(record):
-                self.write_row(row, row[1])
+            for topic, stamp_ns, values in rows(record):
+                self.write_message(topic, stamp_ns, encode(TOPICS[topic], stamp_ns, values))
             self._open_records += 1
-
-    def write_row(self, row: Row, log_time_ns: int) -> None:
-        """Write one row at `log_time_ns` [ns], or at the previous log time if that is later."""
-        topic, stamp_ns, values = row
-        self.write_message(topic, log_time_ns, encode(TOPICS[topic], stamp_ns, values))
 
     def write_message(self, topic: str, log_time_ns: int, data: bytes) -> None:
         """Write the CDR bytes of one message.
@@ -117,13 +112,12 @@ class McapWriter:
         now_ns = self._latest_ns = max(self._latest_ns, log_time_ns)
         self._add_message(topic, now_ns, data)
         self._counts[topic] += 1
-        add_message(self._sha256, topic, now_ns, data)
 
     def write_views(self, views: Iterable[tuple[str, int, bytes]]) -> None:
         """Write the messages for viewers, each with topic and log time [ns], after all others.
 
         These messages have separate chunks; readers sort the chunks by the file's index. The
-        messages are neither counted nor hashed, because they repeat other messages.
+        messages are not counted, because they repeat other messages.
         """
         self.flush()
         for topic, log_time_ns, data in sorted(views, key=itemgetter(1)):
@@ -194,7 +188,7 @@ class McapWriter:
     def close(self) -> None:
         """Write the index and close the file. After an error, call `abandon` instead."""
         self.flush()  # keeps the last chunk even if there is no space for the index
-        self.note({COUNTS: json.dumps(self._counts), SHA256: self._sha256.hexdigest()})
+        self.note({COUNTS: json.dumps(self._counts)})
         self._mcap.finish()
         self._mcap.flush()
         self._stream.flush()
@@ -222,3 +216,18 @@ class McapWriter:
         channel = int(self._mcap.register_channel(topic, "cdr", schema, metadata))
         self._channels[topic] = channel
         return channel
+
+
+def write(recording: Recording, target: Path, attachments: Mapping[str, bytes]) -> None:
+    """Write the messages of a recording and further `attachments` to a file, atomically."""
+    metadata, messages = recording.metadata, recording.messages
+    clock, machine = metadata.get(CLOCK, ""), metadata.get("clock_id", "")
+    with atomic_file(target) as file, McapWriter(file, clock=clock, clock_id=machine) as writer:
+        writer.note({**metadata, **({MISSING: recording.note} if recording.note else {})})
+        if messages and (began := wall_time(metadata, messages[0][1])):
+            writer.note({STARTED: began.isoformat(timespec="milliseconds")})
+        for message in messages:
+            writer.write_message(*message)
+        writer.write_views(recording.views)
+        for name, data in {**recording.attachments, **attachments}.items():
+            writer.attach(name, data)

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from cloudrc.config.load import ResolvedExperiment, fingerprint
 from cloudrc.files import write_atomically
@@ -18,6 +18,8 @@ from cloudrc.metrics.response import steps
 from cloudrc.metrics.verdict import Verdict
 
 SCHEMA_VERSION = 1
+RUN = "run"
+"""Metadata key of mission.mcap: facts about the run, as JSON."""
 PACKAGES = (
     *("cloudrc", "mujoco", "numpy", "pydantic", "pyyaml", "cryptography", "mcap", "rosbags"),
     "matplotlib",
@@ -27,18 +29,18 @@ PACKAGES = (
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Facts about a run that are not in its recording.
+    """Facts about a run that are not in its records."""
 
-    `records_sha256` is a hash from `cloudrc.record.hash`: in virtual time of all records, in real
-    time of all recorded messages. It is None if the recording is incomplete.
-    """
-
-    mode: str  # "virtual", "local" or "cluster"
+    mode: Literal["virtual", "local", "cluster"]
     shaper: str  # what emulated the link: "virtual", "relay" or "netem"
-    records_sha256: str | None = None
     interrupted: bool = False  # whether the user stopped the run
     notes: tuple[str, ...] = ()  # sentences for the reader of the report
     physics_steps: str = ""  # code of the physics steps, such as "C (compiled by cc)"; "": unknown
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """The entry for the metadata of the run's recording."""
+        return {RUN: json.dumps(asdict(self))}
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,7 @@ class Assessment:
     verdict: Verdict
     operator: Verdict | None  # what telemetry told the operator at the end, if it differs
     notes: tuple[str, ...]  # sentences for the reader of the report
+    records_sha256: str | None  # hash of the recording; None if the recording is incomplete
 
     @property
     def traceback(self) -> str | None:
@@ -73,13 +76,13 @@ class Assessment:
                 "mode": self.run.mode,
                 "seed": self.experiment.seed,
                 "shaper": self.run.shaper,
-                "records_sha256": self.run.records_sha256,
+                "records_sha256": self.records_sha256,
                 "numbers": values,
                 "steps": [_known(step._asdict()) for step in steps(self.flight)]
                 if self.experiment.mission.steps
                 else None,
                 "clock_offset": clock_offset_document(recording.metadata),
-                "complete": recording.complete,
+                "complete": not recording.note,
                 "traceback": self.traceback,
                 "notes": list(self.notes),
             }

@@ -6,44 +6,31 @@ file, cloudrc writes no report, and the old report stays unchanged.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
+from pydantic import TypeAdapter
 
 from cloudrc.config.document import parse_yaml
 from cloudrc.config.load import ResolvedExperiment, read_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.files import read
-from cloudrc.metrics import METRIC_NOTE
 from cloudrc.metrics.flight import CONTROL_TOPICS
 from cloudrc.record.columns import Recording
-from cloudrc.record.hash import messages_sha256
 from cloudrc.record.merge import merge
-from cloudrc.record.reader import Contents, NothingReadableError, read_contents
+from cloudrc.record.reader import NothingReadableError
 from cloudrc.record.topics import TOPICS
-from cloudrc.record.writer import SHA256
-from cloudrc.report.document import Run
+from cloudrc.report.document import RUN, Run
 from cloudrc.report.views import views
-from cloudrc.report.write import DIFFERS, RECORDING_NOTE
 
 REPORT_BYTES_MAX = 16 << 20
 """Largest size of a report.json that cloudrc reads [bytes]; large enough for many notes."""
 JUDGEMENT = ("criteria", "description", "name", "report")
 """Keys of an experiment that affect the report, but not the flight."""
-
-
-class _EarlierReport(BaseModel):
-    """Values of an earlier report.json that cannot be computed from the recording."""
-
-    mode: Literal["virtual", "local", "cluster"]
-    shaper: str
-    records_sha256: str | None = None
-    verdict: str = ""
-    complete: bool = False
-    notes: tuple[str, ...] = ()
 
 
 def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
@@ -56,20 +43,18 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     if not config.is_file():
         raise BadInputError(f"{folder}: has no config.yaml; name the folder of a run")
     experiment = read_experiment(config)
-    contents = before = _read_merged(folder)
-    if contents is None:
-        contents = merge(folder / "world.mcap", folder / "cloud.mcap")
-    recording = contents.recording()
-    earlier = _earlier_report(folder / "report.json")
-    for lack in _lacking(recording, config, whole=earlier is not None and earlier.complete):
+    before = _read_merged(folder)
+    recording = before or merge(folder / "world.mcap", folder / "cloud.mcap")
+    whole = _is_of_whole_recording(folder / "report.json")
+    for lack in _lacking(recording, config, whole=whole):
         raise BadInputError(f"{merged}: {lack}; no report is written")
     if before is None:
-        contents.views = views(recording, experiment)
-        contents.write(merged)
-    return recording, experiment, _describe(recording, earlier, contents)
+        recording.views = views(recording, experiment)
+        recording.write(merged)
+    return recording, experiment, _read_facts(recording)
 
 
-def _read_merged(folder: Path) -> Contents | None:
+def _read_merged(folder: Path) -> Recording | None:
     """Read mission.mcap; return None if it has to be made from world.mcap and cloud.mcap."""
     ends = [(folder / f"{end}.mcap").is_file() for end in ("world", "cloud")]
     if not (folder / "mission.mcap").exists():
@@ -77,13 +62,13 @@ def _read_merged(folder: Path) -> Contents | None:
             raise BadInputError(f"{folder}: has no mission.mcap; name the folder of a run")
         return None
     try:
-        contents = read_contents(folder / "mission.mcap")
+        recording = Recording.read(folder / "mission.mcap")
     except NothingReadableError:
         if any(ends):
             return None
         raise
-    torn = contents.note and not contents.lacking
-    return None if torn and all(ends) else contents
+    torn = recording.note and not recording.lacking
+    return None if torn and all(ends) else recording
 
 
 def _lacking(recording: Recording, config: Path, *, whole: bool) -> Iterator[str]:
@@ -92,7 +77,7 @@ def _lacking(recording: Recording, config: Path, *, whole: bool) -> Iterator[str
     `config` is the path of the run's config.yaml. `whole` tells whether the run already has a
     report, made from a complete recording.
     """
-    if not any(len(recording[topic]) for topic in TOPICS):
+    if not sum(len(recording[topic]) for topic in TOPICS):  # all topics: each must be readable
         yield "; ".join(["holds no message of cloudrc", *recording.remarks])
     if recording.lacking:
         yield recording.lacking
@@ -119,38 +104,20 @@ def _flown(data: bytes, name: str) -> dict[str, Any]:
     return {key: value for key, value in values.items() if key not in JUDGEMENT}
 
 
-def _earlier_report(source: Path | bytes | None) -> _EarlierReport | None:
-    try:
-        data = read(source, REPORT_BYTES_MAX) if isinstance(source, Path) else source or b""
-        return _EarlierReport.model_validate_json(data)
-    except (OSError, ValueError):
-        return None
+def _is_of_whole_recording(report: Path) -> bool:
+    """Return whether a report.json exists and was made from a complete recording."""
+    with suppress(OSError, ValueError, RecursionError):
+        document = json.loads(read(report, REPORT_BYTES_MAX))
+        return isinstance(document, dict) and document.get("complete") is True
+    return False
 
 
-def _describe(recording: Recording, earlier: _EarlierReport | None, contents: Contents) -> Run:
-    """Describe a run; take its mode, shaper and notes from its earlier report.
+def _read_facts(recording: Recording) -> Run:
+    """Return the facts about a run that its recording contains.
 
-    Without an earlier report, assume a local run if the recording has rows on /lateness, else a
-    virtual run.
+    A torn recording may not contain them. Then assume a local run if the recording has rows on
+    /lateness, else a virtual run.
     """
-    if earlier is None:
-        real_time = len(recording["/lateness"]) > 0
-        mode, shaper = ("local", "relay") if real_time else ("virtual", "virtual")
-        earlier = _EarlierReport.model_validate({"mode": mode, "shaper": shaper})
-    # The new report makes its own notes with these beginnings.
-    anew = (METRIC_NOTE, RECORDING_NOTE, DIFFERS)
-    notes = [note for note in earlier.notes if not note.startswith(anew)]
-    digest: str | None = messages_sha256(contents.messages)
-    if earlier.mode == "virtual":  # the report in the recording has the hash of all records
-        unchanged = recording.metadata.get(SHA256, digest) == digest
-        kept = _earlier_report(recording.attachments.get("report.json"))
-        digest = kept.records_sha256 if kept and unchanged else None
-        if not unchanged:
-            notes.append(f"{RECORDING_NOTE}was changed after the run: its hash is left out.")
-    return Run(
-        earlier.mode,
-        earlier.shaper,
-        digest if recording.complete else None,
-        earlier.verdict == "interrupted",
-        tuple(notes),
-    )
+    with suppress(ValueError):
+        return TypeAdapter(Run).validate_json(recording.metadata.get(RUN, ""))
+    return Run("local", "relay") if len(recording["/lateness"]) else Run("virtual", "virtual")

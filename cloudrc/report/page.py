@@ -74,7 +74,7 @@ def render(
     """
     run, experiment, verdict = assessment.run, assessment.experiment, assessment.verdict
     headline, accent = HEADLINES[verdict.outcome]
-    digest = run.records_sha256
+    digest = assessment.records_sha256
     kicker = f"cloudrc run report · {experiment.name} · {run.mode} · seed {experiment.seed}"
     return Template(files(__package__).joinpath("page.html").read_text("utf-8")).substitute(
         version=escape(__version__),

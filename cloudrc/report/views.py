@@ -20,7 +20,6 @@ from cloudrc.geometry.scene import Pipe, load_scene
 from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Columns, select
 from cloudrc.record.columns import Recording
-from cloudrc.record.reader import Contents
 from cloudrc.record.ros import encode_view, header, part
 from cloudrc.report.solids import PATH, Face, board_faces, bore, robot_faces, strip
 
@@ -37,16 +36,6 @@ SPHERE, LINE_STRIP, TRIANGLE_LIST = 2, 4, 11
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 GOAL, GHOST, GLASS = (0.84, 0.37, 0.0), (0.34, 0.71, 0.91), (0.70, 0.74, 0.78)
 """Colours of setpoint, predicted robot and pipes: red, green, blue in [0, 1]."""
-
-
-def add_views(mission: Contents, experiment: ResolvedExperiment) -> Recording:
-    """Add messages for viewers such as Foxglove to the recording `mission`; return its tables.
-
-    Raise a BadInputError if the scene of the experiment cannot be read.
-    """
-    recording = mission.recording()
-    mission.views = views(recording, experiment)
-    return recording
 
 
 def views(recording: Recording, experiment: ResolvedExperiment) -> list[View]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
+from contextlib import suppress
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +14,7 @@ import numpy as np
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
-from cloudrc.files import write_atomically
+from cloudrc.files import read, write_atomically
 from cloudrc.geometry.scene import load_scene
 from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
@@ -21,11 +23,6 @@ from cloudrc.report.document import Assessment, Run, environment_document, write
 
 if TYPE_CHECKING:
     from cloudrc.report.figures.style import Look
-
-DIFFERS = "From telemetry at the end of the mission, the operator's verdict was "
-"""First words of a note: the operator's verdict differs from the verdict of the report."""
-RECORDING_NOTE = "The recording "
-"""First words of each note about a recording; a new report drops old notes with these words."""
 
 
 def assess(
@@ -39,21 +36,25 @@ def assess(
     scene = load_scene(experiment.world.scene)
     flight = Flight(recording, experiment.criteria, experiment.mission, scene)
     numbers, metric_notes = measure_all(flight, own)
-    real_time, stopped = run.mode != "virtual", run.interrupted or not recording.complete
+    real_time, stopped = run.mode != "virtual", run.interrupted or bool(recording.note)
     evidence = flight_evidence(flight, numbers, real_time=real_time, interrupted=stopped)
     verdict, operator = judge(evidence), None
     notes = list(run.notes)
-    if not recording.complete:
-        notes.append(f"{RECORDING_NOTE}is incomplete: {recording.note}.")
-    notes += [f"{RECORDING_NOTE}{remark}." for remark in recording.remarks]
+    if recording.note:
+        notes.append(f"The recording is incomplete: {recording.note}.")
+    notes += [f"The recording {remark}." for remark in recording.remarks]
     notes += [f"{text[0].upper()}{text[1:]}." for text in recording["/fault"]["text"] if text]
     if flight.ending is not None:
         seen = operator_verdict(flight, evidence, numbers)
         if seen.outcome != verdict.outcome:
             operator = seen
-            notes.append(f"{DIFFERS}{seen.outcome}. The verdict of this report counts.")
+            notes.append(
+                "From telemetry at the end of the mission, the operator's verdict was "
+                f"{seen.outcome}. The verdict of this report counts."
+            )
     kept = tuple(dict.fromkeys([*notes, *metric_notes]))
-    return Assessment(run, experiment, flight, numbers, verdict, operator, kept)
+    digest = None if recording.note else recording.sha256
+    return Assessment(run, experiment, flight, numbers, verdict, operator, kept, digest)
 
 
 def write_report(
@@ -66,20 +67,32 @@ def write_report(
     page: bool = True,
     look: Look | None = None,
 ) -> dict[str, Any]:
-    """Write report.json and environment.json and, if `page`, report.html with its figures.
+    """Write report.json and, if `page`, report.html with its figures.
+
+    Also write environment.json, if the flight has left none.
 
     `folder` is the folder of the run; files of an earlier report in it are replaced. `look` is the
     size of the figures. `own` are names or paths of the user's metrics, whose files are executed.
     Return the content of report.json.
     """
     assessment = assess(recording, experiment, run, own)
-    document, environment = assessment.document, environment_document(run.physics_steps)
+    document = assessment.document
     write_json(folder / "report.json", document)
-    write_json(folder / "environment.json", environment)
+    environment = _environment(folder / "environment.json", run)
     if driven := _driven(assessment.flight):
         write_atomically(folder / DRIVE_FILE, driven.encode())
     if page:
         _write_page(folder, assessment, environment, look)
+    return document
+
+
+def _environment(path: Path, run: Run) -> dict[str, Any]:
+    """Return the description of the machine that flew; without its file, describe this machine."""
+    with suppress(OSError, ValueError, RecursionError):
+        if not path.is_symlink() and isinstance(known := json.loads(read(path)), dict):
+            return known
+    document = environment_document(run.physics_steps)
+    write_json(path, document)
     return document
 
 

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 from cloudrc import assembly, metrics, plugins
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.errors import describe_error
-from cloudrc.record.columns import RecordStore
+from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.report.document import Assessment, Run
 from cloudrc.report.write import assess
 
@@ -39,7 +39,7 @@ def measure(experiment: ResolvedExperiment) -> Row:
         "failures": [failure.code for failure in failures],
         "text": failures[0].text if failures else next(notes, ""),
         "numbers": {name: number.value for name, number in found.numbers.items()},
-        "records_sha256": found.run.records_sha256,
+        "records_sha256": found.records_sha256,
         **({"traceback": found.traceback} if found.traceback else {}),
     }
 
@@ -65,6 +65,5 @@ def fly_in_memory(experiment: ResolvedExperiment) -> Assessment:
     """Fly an experiment in virtual time, and measure and judge it, without any file."""
     store = RecordStore()
     assembly.fly(experiment, store.add)
-    notes = assembly.virtual_notes(experiment)
-    run = Run("virtual", "virtual", store.hexdigest(), notes=notes)
-    return assess(store.recording(), experiment, run, experiment.report.metrics)
+    run = Run("virtual", "virtual", notes=assembly.virtual_notes(experiment))
+    return assess(Recording(records=store), experiment, run, experiment.report.metrics)

@@ -126,9 +126,9 @@ def started(path, size_max=None):
 
 def write_down(recorder, records):
     recorder.put(records)
-    while recorder.drain():
+    while recorder._drain():
         pass
-    recorder.flush()
+    recorder._flush()
 
 
 def test_both_recordings_together_stay_within_the_limit(tmp_path):
@@ -136,7 +136,7 @@ def test_both_recordings_together_stay_within_the_limit(tmp_path):
         recorder = started(tmp_path / "world.mcap", 200_000)
         for start in range(0, 30_000, 500):
             write_down(recorder, world_records(50, start * MS))
-        recorder.close()
+        recorder._close()
         assert "the file has reached its size limit" in recorder.error
     sizes = [each.stat().st_size for each in tmp_path.iterdir()]
     assert (len(sizes), sum(sizes) < 232_000) == (2, True), "each ends with its open chunk"
@@ -150,13 +150,13 @@ def test_a_restart_keeps_the_recording_of_a_crash(tmp_path):
     left = path.read_bytes()
     again = started(path)
     again.put(counted(3))
-    again.close()
+    again._close()
     assert before.read_bytes() == left
     assert len(Recording.read(before)["/odometry"]) == 100
     assert len(Recording.read(path)["/count"]) == 3
-    killed.close()
+    killed._close()
     left = path.read_bytes()
-    started(path).close()
+    started(path)._close()
     assert before.read_bytes() == left, "only the previous one is kept"
     assert len(list(tmp_path.iterdir())) == 2
 

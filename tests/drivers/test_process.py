@@ -185,9 +185,8 @@ def end(path, pipe):
     """World's process with a key that has just changed; `put` is what it has recorded."""
     put = []
     recorder = SimpleNamespace(
-        **{"put": put.extend, "drain": lambda most: 0, "close": lambda: None},
-        **dict.fromkeys(("flush", "sync"), lambda **_: None),
-        **{"error": "", "dropped": 0},
+        **{"put": put.extend, "error": "", "dropped": 0},
+        **dict.fromkeys(("start", "stop", "sync_age"), lambda: None),
     )
     keys = SimpleNamespace(follow=lambda now_ns: [Fault(now_ns, "key", "new key")])
     feed = Feed(pipe[1], watched=False)

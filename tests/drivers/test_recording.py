@@ -1,13 +1,155 @@
-"""The recorder with its threads, and what a pod records."""
+"""The recorder never blocks and survives all disk errors; what a pod records."""
 
+import errno
+import io
+import os
+import signal
+import subprocess
+import sys
 import threading
 import time
+from contextlib import suppress
+from pathlib import Path
+from unittest.mock import Mock
 
-from cloudrc.drivers.recording import AFTERWARDS_NS, FlightsOnly, RecordingThread
+import pytest
+
+from cloudrc.drivers.recording import AFTERWARDS_NS, TROUBLE, FlightsOnly, Recorder
+from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState
-from cloudrc.record.recorder import Recorder
-from cloudrc.records import GuardChange, Lateness
-from tests.record.conftest import Shelf, counted
+from cloudrc.record.columns import Recording
+from cloudrc.record.reader import recover
+from cloudrc.record.writer import McapWriter
+from cloudrc.records import Counted, GuardChange, Lateness
+from tests.record.conftest import Shelf, assert_equal, counted, open_mcap, world_records
+
+
+class Disk(io.BytesIO):
+    """A file on a disk with space for `room` bytes."""
+
+    def __init__(self, room):
+        super().__init__()
+        self.room = room
+
+    def write(self, data):
+        if self.tell() + len(data) > self.room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return super().write(data)
+
+
+def record_all(recorder, records, every):
+    """Write all records; flush after `every` records."""
+    for start in range(0, len(records), every):
+        recorder.put(records[start : start + every])
+        while recorder._drain():
+            pass
+        recorder._sync()
+        recorder._flush()
+    recorder._close()
+
+
+def test_the_oldest_are_dropped_and_counted(monkeypatch):
+    shelf, records = Shelf(), counted(25)
+    recorder = Recorder(Path("x"), lambda path: shelf, capacity=10)
+    for record in records:
+        recorder.put([record])
+    assert recorder.dropped == 15
+    monkeypatch.setattr("cloudrc.drivers.recording.BATCH", 4)
+    assert recorder._drain() == 4
+    recorder.put(records[:5])
+    assert recorder.dropped == 16
+    recorder._close()
+    assert shelf.closed
+    assert shelf.records == [*records[15:19], *records[20:], *records[:5]]
+    assert recorder.error == ""
+
+
+def test_what_is_recorded_can_be_read(tmp_path):
+    path, records = tmp_path / "world.mcap", world_records(160)
+    for target in (path, Path(os.devnull)):  # a device has neither sync nor positions
+        recorder = Recorder(target, open_mcap)
+        record_all(recorder, records, 1000)
+        assert (recorder.dropped, recorder.error) == (0, "")
+    assert_equal(Recording.read(path), Recording.from_records(records))
+
+
+@pytest.mark.promise("a-bad-disk-spares-the-flight")
+@pytest.mark.parametrize("room", [0, 100, 1500, *range(20_000, 60_800, 8_160)])
+def test_on_a_full_disk_all_is_kept_or_counted(tmp_path, room):
+    path, records = tmp_path / "w.mcap", counted(3000)
+    disk = Disk(room)
+    recorder = Recorder(path, lambda _: McapWriter(disk, clock="world"))
+    record_all(recorder, records, 30)
+    path.write_bytes(disk.getvalue())
+    assert recorder.error.startswith(f"{path}: recording stopped: disk full; make room or choose")
+    kept = 0
+    with suppress(BadInputError):
+        recording = Recording.read(path)
+        kept = len(recording["/count"])
+        recovery = recover(path, tmp_path / "clean.mcap")
+        assert recovery.bytes_lost == 0, "the file ends with a whole chunk"
+        noted = "disk full" in recording.note
+        assert noted or room - path.stat().st_size < 200, "noted, if there is room for a note"
+    assert kept + recorder.dropped == len(records)
+    assert kept < len(records)
+
+
+def failing(step, error):
+    """Make a sink whose `step` fails."""
+    shelf = Shelf()
+    setattr(shelf, step, Mock(side_effect=error))
+    return shelf
+
+
+@pytest.mark.promise("a-bad-disk-spares-the-flight")
+@pytest.mark.parametrize("step", ["flush", "sync", "close"])
+@pytest.mark.parametrize(("code", "words"), [*TROUBLE.items(), (errno.EIO, "Input/output error")])
+def test_disk_errors_are_reported_and_never_raised(step, code, words):
+    shelf = failing(step, OSError(code, "Input/output error"))
+    recorder = Recorder(Path("w.mcap"), lambda path: shelf)
+    recorder.put(counted(3))
+    recorder._drain()
+    recorder._sync()
+    recorder._flush()
+    recorder.put(counted(2))
+    recorder._close()
+    assert f"w.mcap: recording stopped: {words};" in recorder.error
+    assert recorder.dropped == (0 if step == "close" else 2)
+
+
+def test_only_a_record_that_cannot_be_encoded_is_lost(tmp_path):
+    path, bad = tmp_path / "w.mcap", Counted(1, "world", "sent", 2**70)
+    recorder = Recorder(path, open_mcap)
+    record_all(recorder, [*counted(1), bad, *counted(3)], 64)
+    assert recorder.dropped == 1
+    assert "a record of type Counted cannot be written" in recorder.error
+    assert len(Recording.read(path)["/count"]) == 4
+
+
+def test_a_recording_at_its_size_limit_ends_complete(tmp_path):
+    recorder = Recorder(path := tmp_path / "w.mcap", open_mcap, size_max=20_000)
+    record_all(recorder, world_records(1000), 200)
+    assert (said := "recording stopped: the file has reached its size limit") in recorder.error
+    assert recorder.dropped > 0
+    assert 20_000 <= path.stat().st_size < 100_000
+    assert Recording.read(path).note == said
+
+
+@pytest.mark.parametrize("error", [None, OSError(errno.EIO, "broken"), ValueError("closed file")])
+def test_a_sync_by_another_thread_reports_its_error_later(tmp_path, error):
+    path, shelf = tmp_path / "w.mcap", failing("sync", error)
+    recorder = Recorder(path, lambda path: shelf)
+    recorder.put(counted(1))
+    recorder._drain()
+    recorder._sync()
+    assert recorder.sync_age() is None, "without a file nothing is on the disk"
+    path.touch()
+    recorder._sync()
+    assert (recorder.sync_age() is None) == (error is not None)
+    assert not shelf.closed
+    recorder._flush()
+    failed = isinstance(error, OSError)  # the other one means that the file was closed meanwhile
+    assert (shelf.closed, recorder.error != "") == (failed, failed)
 
 
 class Slow(Shelf):
@@ -33,19 +175,18 @@ def test_a_hanging_sync_delays_nobody_and_is_told(tmp_path):
     path, shelf = tmp_path / "w.mcap", Slow()
     path.touch()
     recorder = Recorder(path, lambda path: shelf)
-    thread = RecordingThread(recorder)
-    assert thread.sync_age() is None
-    thread.start()
+    assert recorder.sync_age() is None
+    recorder.start()
     for _ in range(3):
         assert shelf.begun.acquire(timeout=5.0)
-    ages = [thread.sync_age(), thread.sync_age()]
+    ages = [recorder.sync_age(), recorder.sync_age()]
     assert shelf.began[2] - shelf.began[1] <= ages[0] < ages[1], "it rises while the disk hangs"
     recorder.put(counted(500))
     while shelf.flushed.acquire(blocking=False):
         pass
     for _ in range(2):
         assert shelf.flushed.acquire(timeout=5.0)
-    assert thread.stop(timeout=10.0)
+    assert recorder.stop(timeout=10.0)
     assert (len(shelf.records), recorder.dropped) == (500, 0)
     shelf.release.set()
 
@@ -62,3 +203,54 @@ def test_a_pod_records_flights_whole_and_events_between_them():
     assert whole == set(range(100, 102 + AFTERWARDS_NS // 1_000_000_000 + 1))
     assert {kept[index] for index in kept.keys() - whole} == {1}
     assert choose([]) == []
+
+
+FLIGHT = """
+import sys, time
+from pathlib import Path
+from cloudrc.drivers.recording import Recorder
+from cloudrc.record.writer import McapWriter
+from cloudrc.records import Counted
+
+class Writer(McapWriter):
+    def sync(self):
+        time.sleep(float(sys.argv[2]))  # the disk is slow
+        super().sync()
+
+
+recorder = Recorder(Path(sys.argv[1]), lambda path: Writer(path, clock="world"))
+recorder.start()
+start = time.monotonic_ns()
+for n in range(10_000):
+    now = time.monotonic_ns() - start
+    recorder.put([Counted(now, "world", "sent", n)])
+    print(now, flush=True)
+    time.sleep(0.005)
+"""
+
+
+INSTANTS = [pytest.param(0.6 + 0.031 * n, 0.0, marks=pytest.mark.full) for n in range(50)]
+
+
+@pytest.mark.promise("a-kill-loses-half-a-second")
+@pytest.mark.process
+@pytest.mark.parametrize(("after", "sync"), [(0.9, 0.0), (2.1, 0.4), (2.1, 60.0), *INSTANTS])
+def test_sigkill_loses_at_most_half_a_second(tmp_path, after, sync, figure):
+    """`after` is the time of the kill [s], `sync` the duration of one sync to a slow disk [s]."""
+    path, clean = tmp_path / "world.mcap", tmp_path / "clean.mcap"
+    command = [sys.executable, "-c", FLIGHT, str(path), str(sync)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        for line in process.stdout:
+            last_ns = int(line)
+            if last_ns * 1e-9 >= after:
+                break
+        process.send_signal(signal.SIGKILL)
+        rest = process.stdout.read().split()
+    last_ns = int(rest[-1]) if rest else last_ns
+    assert not recover(path, clean).complete
+    recording = Recording.read(clean)
+    assert "cut short" in recording.note
+    counts = recording["/count"]["total"]
+    assert counts.tolist() == list(range(len(counts)))
+    lost = (last_ns - recording["/count"]["stamp_ns"][-1]) * 1e-9
+    figure("recorder killed by SIGKILL: recording lost", lost, "<=", 0.5, "s")

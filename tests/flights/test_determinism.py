@@ -13,7 +13,7 @@ from cloudrc.assembly import assemble, build_cloud, build_links, build_world
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.messages import Passed
-from cloudrc.record.columns import RecordStore
+from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.sweep.flight import fly_in_memory
 from cloudrc.tunnel.codec import DecodeError
 from cloudrc.tunnel.end import Identity
@@ -29,7 +29,7 @@ print(digest(short()))
 
 
 def digest(experiment):
-    return fly_in_memory(experiment).run.records_sha256
+    return fly_in_memory(experiment).records_sha256
 
 
 def short(*settings):
@@ -60,7 +60,7 @@ def test_objects_and_encrypted_bytes_make_the_same_records(settings):
     world, cloud = build_world(experiment, identity), build_cloud(experiment, identity)
     run, records = VirtualRun(world, cloud, *build_links(experiment)), RecordStore()
     run.fly(lambda: cloud.mission_over, 150_000_000_000, records.add)
-    assert records.hexdigest() == digest(experiment)
+    assert Recording(records=records).sha256 == digest(experiment)
 
 
 def test_a_link_that_damages_datagrams_gets_bytes():

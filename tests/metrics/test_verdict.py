@@ -191,7 +191,7 @@ def test_a_plug_in_may_fail_in_one_percent_of_the_periods(failures, found):
 @pytest.mark.parametrize("words", DISK_FULL.values())
 def test_a_recording_cut_off_by_a_full_disk_is_no_failed_mission(words):
     flight = without_end(good()).flight(ONE_PIPE)
-    flight.recording.note = f"world: recording stopped: {words}"
+    flight.recording.told = f"world: recording stopped: {words}"
     verdict = judged(flight, interrupted=True)
     assert codes(verdict)[0] == "disk_full"
     report = {"verdict": verdict.outcome, "failures": [{"code": code} for code in codes(verdict)]}

@@ -1,5 +1,6 @@
 """Helpers: random records, records of a short flight, and files written by other programs."""
 
+import heapq
 import math
 from enum import IntEnum
 from operator import attrgetter
@@ -12,7 +13,6 @@ from mcap.writer import CompressionType, Writer
 
 from cloudrc import records as rec
 from cloudrc.messages import GuardState, Odometry, Telemetry
-from cloudrc.record.columns import merged
 from cloudrc.record.topics import TOPICS
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Record
@@ -109,11 +109,11 @@ def write(path, records, clock="world", clock_id=""):
     return path
 
 
-def write_mission(path, world, cloud, attachments=None):
+def write_mission(path, world, cloud, attachments=None, metadata=None):
     """Write the records of world and cloud to one file, as a run in virtual time does."""
     with McapWriter(path, clock="world") as writer:
-        for log_time_ns, row in merged(world, cloud):
-            writer.write_row(row, log_time_ns)
+        writer.write(heapq.merge(world, cloud, key=attrgetter("stamp_ns")))
+        writer.note(metadata or {})
         for name, data in (attachments or {}).items():
             writer.attach(name, data)
 

@@ -1,6 +1,7 @@
 """The folder of a run gives the same report again, or an error, and then stays unchanged."""
 
 import json
+import os
 import re
 import shutil
 from pathlib import Path
@@ -19,7 +20,7 @@ from cloudrc.report.write import write_report
 from tests.metrics.conftest import at, good, paper
 from tests.record.conftest import rewrite, write_mission
 
-RUN = Run("virtual", "virtual", "f" * 64)
+RUN = Run("virtual", "virtual", notes=("seen",), physics_steps="C")
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +30,7 @@ def flown_once(tmp_path_factory):
     (folder / "config.yaml").write_text(dump(paper()[0]))
     write_report(folder, Recording.from_records(world, cloud), paper()[0], RUN, page=False)
     kept = {name: (folder / name).read_bytes() for name in ("config.yaml", "report.json")}
-    write_mission(folder / "mission.mcap", world, cloud, attachments=kept)
+    write_mission(folder / "mission.mcap", world, cloud, attachments=kept, metadata=RUN.metadata)
     return folder
 
 
@@ -44,10 +45,22 @@ def report(folder):
 
 def test_a_run_gives_the_same_report_again(run):
     first = report(run)
-    assert first["records_sha256"] == "f" * 64
+    assert (first["notes"], len(first["records_sha256"])) == (["seen"], 64)
+    assert read_run(run)[2] == RUN
     assert write_report(run, *read_run(run), page=False) == first
     (run / "report.json").unlink()
     assert write_report(run, *read_run(run), page=False) == first
+
+
+def test_a_new_report_keeps_the_description_of_the_machine_that_flew(run):
+    environment = run / "environment.json"
+    environment.write_text(flown := '{"cores": 3, "physics_steps": "C (compiled by cc)"}')
+    write_report(run, *read_run(run), page=False)
+    assert environment.read_text() == flown
+    for unusable in ("{", "[1]", "[" * 10_000):
+        environment.write_text(unusable)
+        write_report(run, *read_run(run), page=False)
+        assert json.loads(environment.read_text())["cores"] == os.cpu_count()
 
 
 def filtered(**options):
@@ -109,24 +122,28 @@ def test_a_torn_recording_still_gives_a_report(run):
     assert write_report(run, *read_run(run), page=False) == found
 
 
-def test_the_hash_is_left_out_if_the_recording_was_changed(run):
-    world, cloud = good().ends()
+def test_the_hash_is_of_the_recording_beside_the_report(run):
+    before, (world, cloud) = report(run), good().ends()
     longer = [*world, Counted(world[-1].stamp_ns, "world", "sent", 1)]
     write_mission(run / "mission.mcap", longer, cloud)
     found = write_report(run, *read_run(run), page=False)
-    assert "records_sha256" not in found
+    assert found["records_sha256"] == Recording.from_records(longer, cloud).sha256
+    assert found["records_sha256"] != before["records_sha256"]
 
 
 def test_an_interrupted_run_stays_interrupted(run):
     world, cloud = ([r for r in part if r.stamp_ns < at(4)] for part in good().ends())
-    write_mission(run / "mission.mcap", world, cloud)
-    recording = Recording.from_records(world, cloud)
     stopped = Run("local", "relay", interrupted=True, notes=("the relay died",))
-    found = write_report(run, recording, paper()[0], stopped, page=False)
-    assert found["verdict"] == "interrupted"
-    found = read_run(run)[2]
-    assert (found.mode, found.shaper, found.interrupted) == ("local", "relay", True)
-    assert (found.notes, len(found.records_sha256 or "")) == (stopped.notes, 64)
+    write_mission(run / "mission.mcap", world, cloud, metadata=stopped.metadata)
+    found = write_report(run, *read_run(run), page=False)
+    assert (found["verdict"], found["mode"]) == ("interrupted", "local")
+    assert found["notes"][0] == "the relay died"
+
+
+def test_a_recording_of_an_earlier_version_gives_a_report(run):
+    write_mission(run / "mission.mcap", *good().ends())
+    found = write_report(run, *read_run(run), page=False)
+    assert (found["mode"], found["shaper"], found["notes"]) == ("virtual", "virtual", [])
 
 
 def test_the_recordings_are_merged_if_they_are_not_yet(run):
@@ -138,7 +155,7 @@ def test_the_recordings_are_merged_if_they_are_not_yet(run):
     for what in (Path.unlink, lambda path: path.write_bytes(b"")):
         what(run / "mission.mcap")
         assert write_report(run, *read_run(run), page=False)["numbers"] == first
-        assert Recording.read(run / "mission.mcap").complete
+        assert Recording.read(run / "mission.mcap").note == ""
 
 
 def test_a_folder_without_a_run_is_refused(run):

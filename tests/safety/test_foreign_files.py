@@ -16,8 +16,9 @@ from cloudrc.errors import BadInputError
 from cloudrc.files import atomic_file, write_atomically
 from cloudrc.link.state import publish
 from cloudrc.link.traces import read_trace
+from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
-from cloudrc.record.reader import read_contents, recover
+from cloudrc.record.reader import recover
 from cloudrc.report.document import write_json
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
@@ -35,7 +36,7 @@ def no_waiting():
     signal.signal(signal.SIGALRM, before)
 
 
-@pytest.mark.parametrize("read", [read_experiment, load_profile, read_trace, read_contents])
+@pytest.mark.parametrize("read", [read_experiment, load_profile, read_trace, Recording.read])
 def test_a_pipe_or_device_is_refused_at_once(tmp_path, read):
     os.mkfifo(tmp_path / "pipe")
     before = os.listdir("/proc/self/fd")
@@ -70,15 +71,26 @@ def run(tmp_path):
     return tmp_path
 
 
-def test_an_old_report_is_used_completely_or_not_at_all(run):
+def test_the_facts_in_a_recording_are_used_completely_or_not_at_all(run):
     _, _, anew = read_run(run)
-    good = {"mode": "local", "shaper": "netem", "notes": ["seen"], "records_sha256": "f" * 64}
-    wrong = {"notes": [1]}, {"mode": "elsewhere"}, {"records_sha256": {"a": 1}}
-    for before in (*(json.dumps(good | changed) for changed in wrong), "null", '{"mode":'):
-        (run / "report.json").write_text(before)
-        assert read_run(run)[2] == anew, before[:99]
-    (run / "report.json").write_text(json.dumps(good))
+    good = {"mode": "local", "shaper": "netem", "notes": ["seen"]}
+    wrong = {"notes": [1]}, {"mode": "elsewhere"}, {"interrupted": {"a": 1}}
+    for facts in (
+        *(json.dumps(good | changed) for changed in wrong),
+        "null",
+        '{"mode":',
+        "[" * 10**5,
+    ):
+        write_mission(run / "mission.mcap", *flown().ends(), metadata={"run": facts})
+        assert read_run(run)[2] == anew, facts[:99]
+    write_mission(run / "mission.mcap", *flown().ends(), metadata={"run": json.dumps(good)})
     assert read_run(run)[2].notes == ("seen",)
+
+
+def test_a_report_of_others_does_not_matter(run):
+    for report in ("null", "[1]", '{"complete":', "[" * 10**5):
+        (run / "report.json").write_text(report)
+        write_report(run, *read_run(run), page=False)
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")

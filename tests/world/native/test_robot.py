@@ -207,9 +207,9 @@ def test_in_air_that_acts_on_geoms_c_uses_the_whole_model(setting):
 def test_an_experiment_has_the_same_records_in_c(name, settings, monkeypatch):
     experiment, identity = load_experiment(name, settings), Identity(CLOCK, bytes(16), ring())
     assert isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
-    in_c = fly_in_memory(experiment).run.records_sha256
+    in_c = fly_in_memory(experiment).records_sha256
     monkeypatch.setenv(SWITCH, "0")
-    assert fly_in_memory(experiment).run.records_sha256 == in_c
+    assert fly_in_memory(experiment).records_sha256 == in_c
     assert not isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
 
 
