@@ -388,11 +388,10 @@ def _record_local(
             mission, experiment, interrupted = read_last_mission(folder)
         else:
             mission = merge(folder / "world.mcap", folder / "cloud.mcap")
-    except CloudrcError as error:
+    except CloudrcError:
         if broken or (interrupted and not session):
-            nothing = InterruptedRunError("interrupted, nothing was recorded")
-            raise broken or nothing from None
-        raise error
+            raise broken or InterruptedRunError("interrupted, nothing was recorded") from None
+        raise
     notes = (*local.notes, *([str(broken)] if broken else ()))
     steps = library().text if experiment.world.is_nominal else NO_C
     run = Run("local", "relay", interrupted, notes, steps)

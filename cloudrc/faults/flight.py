@@ -56,8 +56,8 @@ class Flight:
         """Prepare a flight; a comment beside each argument describes it.
 
         Raises:
-            BadInputError: If the schedule names an unknown link profile, or an unknown policy of a
-                dishonest cloud.
+            BadInputError: If the schedule names an unknown link profile or an unknown policy of a
+                dishonest cloud, if its faults do not fit the profile, or if a setting is wrong.
         """
         self.schedule = schedule
         plans = ["guard.plan_max_s=0.8"] if "plans" in schedule.policy else []

@@ -66,8 +66,8 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
     With `keep` the records are kept and hashed, which doubles the time.
 
     Raises:
-        BadInputError: If the schedule names an unknown link profile, or an unknown policy of a
-            dishonest cloud.
+        BadInputError: If the schedule names an unknown link profile or an unknown policy of a
+            dishonest cloud, or if its faults do not fit the profile.
     """
     flight = Flight(schedule, keep=keep)
     watch, operator = flight.watch, Operator(flight)

@@ -475,11 +475,12 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
 def _ping_range(
     first: int, last: int, replies: int, others: list[str], log: Log
 ) -> tuple[int, int]:
-    """Return the first and last sequence number of a log; without a summary, `first` and `last`.
+    """Return the first and last sequence number of a log according to ping's own summary.
 
-    These are the first and the last number in the lines of packets; `others` are the other lines.
-    Raise a BadInputError if the log has several sessions, if the number of `replies` does not match
-    ping's own summary, or if there are too many packets.
+    Without a summary, return `first` and `last`, the smallest and largest number in the lines of
+    packets. `others` are the other lines; unknown ones are counted in `log`. Raise a BadInputError
+    if they begin or end several sessions, if the summary does not match the number of `replies`,
+    or if there are too many packets.
     """
     heads = [line for line in others if line.startswith(_HEADS)]
     ends = [line for line in others if not line.startswith(_HEADS)]

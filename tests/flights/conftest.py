@@ -211,5 +211,4 @@ def numbers(assessment):
 
 def both_ways(**keys):
     """Return settings for both directions of the link."""
-    ways = ("uplink", "downlink")
-    return [f"link.{way}.{key}={value}" for way in ways for key, value in keys.items()]
+    return [f"link.both.{key}={value}" for key, value in keys.items()]

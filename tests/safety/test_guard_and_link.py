@@ -2,6 +2,7 @@
 
 import pytest
 
+from cloudrc.faults import adversary
 from cloudrc.faults.flight import Flight
 from cloudrc.faults.schedule import Schedule
 from cloudrc.messages import GuardState
@@ -23,7 +24,8 @@ def bounds(guard):
 
 
 @pytest.mark.promise("commands-within-caps")
-def test_nothing_in_the_tunnel_changes_the_limits():
+def test_nothing_in_the_tunnel_changes_the_limits(monkeypatch):
+    monkeypatch.setattr(adversary, "SPEAKING", (*HOSTILE,))  # all of them also forge requests
     states = set()
     for policy, seed in HOSTILE.items():
         flight = Flight(Schedule(seed, policy=policy))
