@@ -68,6 +68,8 @@ def execute(options: argparse.Namespace) -> int:
     if options.cluster or options.context or options.namespace or options.release:
         return _show_release(options)
     require("the console", ("console", "world"))
+    if options.config and not (options.api and options.profile):
+        raise BadInputError("--config is for the chart's container: give --api and --profile, too")
     flight = _in_pod(options) if options.config else _local(options)
     _serve(options.port, flight, with_browser=not (options.no_open or options.config))
     print_line("the flight has ended", sys.stderr)
@@ -95,6 +97,8 @@ def _serve(port: int, flight: Flight, *, with_browser: bool) -> None:
         except BlockingIOError:
             text = "this run has a console already; open its page, or end it first"
             raise BadInputError(text) from None
+        except OSError:  # a network file system may refuse the lock: then nothing is checked
+            pass
         print_line(f"console: {page.url}")
         if with_browser:
             open_page(page.url)
@@ -109,11 +113,15 @@ def _serve(port: int, flight: Flight, *, with_browser: bool) -> None:
         steering.watch()
         steering.start()
         page.fill(experiment, feed, steering)
+        due = 0.0
         while not flight.has_ended():
             with suppress(CloudrcError):  # teleop starts or ends; the page says what is wrong
                 for status in flight.api.robot():
-                    feed.take(status, time.monotonic())
-                    page.update(time.monotonic())
+                    now = time.monotonic()
+                    feed.take(status, now)
+                    if now >= due:  # for half of the time at most: else old statuses queue up
+                        page.update(now)
+                        due = 2 * time.monotonic() - now
             page.update(time.monotonic())
             time.sleep(RETRY_PERIOD)
 

@@ -205,7 +205,7 @@ def create_app(
 
     @app.exception_handler(Exception)
     async def fail(request: Request, error: Exception) -> JSONResponse:
-        if not isinstance(error, ClientDisconnect):
+        if not isinstance(error, (ClientDisconnect, TimeoutError)):
             complain(f"the API failed at {request.url.path}: {error!r}")
         return JSONResponse({"detail": "the API failed; see teleop's log"}, 500)
 
@@ -389,15 +389,16 @@ async def stream_robot(request: Request, bridge: Bridged) -> StreamingResponse:
 
     A line is an object with the fields of `RobotStatus` in cloudrc/teleop/wire.py: pose, velocity
     and guard of the robot, and in `control` the last command. It is null before the first
-    telemetry. Unknown values are null. A slow client misses lines. The stream ends like that of
-    the events.
+    telemetry. Unknown values are null. A client that reads too slowly gets old lines, up to minutes
+    old, and then misses some. The stream ends like that of the events.
     """
     await bridge.ask(lambda service, now_ns: None)  # raises an error if teleop cannot answer
 
     async def stream() -> AsyncIterator[bytes]:
         while not bridge.closed and await request.scope["caller"]() is not None:
-            yield write_line(bridge.seen)
-            await asyncio.sleep(ROBOT_PERIOD)
+            for _ in range(3):  # `caller` reads files: call it as often as for events
+                yield write_line(bridge.seen)
+                await asyncio.sleep(ROBOT_PERIOD)
 
     headers = {"Cache-Control": "no-store"}
     return StreamingResponse(stream(), media_type="application/jsonl", headers=headers)

@@ -5,6 +5,7 @@ A caller with an operator's token may do everything; a caller with a reader's to
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 import logging
@@ -48,6 +49,8 @@ REFUSED = {
 }
 """HTTP status of a refused request -> name of the counter, and text of the answer."""
 HEADERS = {401: {"WWW-Authenticate": "Bearer"}, 429: {"Retry-After": "1"}}
+SEND_LIMIT = 30.0
+"""Time for a client to read before its request ends [s]; a client that stalls keeps no slot."""
 IN_FLIGHT_MAX = 32
 """Largest number of requests of one role that are answered at the same time, streams included."""
 AUDIT_MAX = 8 << 20
@@ -173,7 +176,7 @@ class Gate:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse a request, or pass it on to the application; remove a slash at the path's end."""
         path = scope["path"] = scope["path"].rstrip("/") or "/"
-        # An event stream calls `caller` again, because the stream can outlast its token.
+        # A stream calls `caller` again, because it can outlast its token.
         caller, scope["caller"] = await self.caller(scope), lambda: self.caller(scope)
         status = self._refusal(caller, scope)
         if caller is None or status:
@@ -186,7 +189,8 @@ class Gate:
 
         async def keep(message: Message) -> None:
             answer.update(message)
-            await send(message)
+            async with asyncio.timeout(SEND_LIMIT):
+                await send(message)
 
         self._in_flight[caller.role] += 1
         try:

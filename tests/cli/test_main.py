@@ -50,6 +50,7 @@ def test_help_fits_80_columns(command, capsys):
         ("doctor --mode vitual", "did you mean 'virtual'"),
         ("doctor --nonsense", "--nonsense"),
         ("list predictor", "did you mean 'predictors'"),
+        ("console --config hover", "give --api and --profile"),
         ("run steps --seeds 2 --set seed=5", "seed: each flight has its own seed"),
         ("bench --repeats 0", "'0' is not a whole number from 1 to 10000"),
         (f"faults search --first {2**63}", f"is not a whole number from 0 to {SEED_MAX}"),

@@ -16,8 +16,8 @@ the cloud is hostile.
 
 The *basis* of a command is the odometry from which cloud computed the command. A command is fresh
 while its basis is at most `command_age_max_ns` old. A command with a plan stays fresh until the
-plan ends, at most for `plan_max_ns` after its arrival. The guard does not trust a plan: in each
-step it limits the plan's velocity for the present time like the velocity of a new command.
+plan ends, at most for `guard.plan_max_s` after its arrival. The guard does not trust a plan: in
+each step it limits the plan's velocity for the present time like the velocity of a new command.
 
 - Every state can change to ESTOP: by the operator's request, or when the robot has turned over,
   because its rotors would then push it in any direction. An acknowledgement leads to GROUND.

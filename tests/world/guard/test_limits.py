@@ -29,6 +29,8 @@ def test_a_limit_cannot_be_switched_off_or_changed(name):
 @pytest.mark.parametrize(("age_ms", "fastest"), [(250, 6.0), (400, 5.645805), (800, 4.823043)])
 def test_a_speed_beyond_the_stop_rule_is_refused(age_ms, fastest):
     # v (T + 0.2) + v^2 / 6 = 8.7 m, solved by hand.
+    way = fastest * (age_ms / 1000 + rules.REACTION + fastest * rules.STOP_COEFFICIENT)
+    assert way == pytest.approx(8.7, abs=1e-4), "the guard brakes as the cap assumes"
     for plan_ms in (0, age_ms // 2):
         times = {"command_age_max_ms": age_ms - plan_ms, "plan_max_s": plan_ms / 1000}
         ResolvedGuard(**times, speed_max_mps=fastest)
