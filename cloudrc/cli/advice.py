@@ -30,7 +30,10 @@ rotors, one third comes from the tilt that this drag causes."""
 
 
 def warn(*experiments: ResolvedExperiment) -> None:
-    """Print the texts of `advise` as warnings on stderr, each once; of a grid, the first ones."""
+    """Print the warnings of `advise` on stderr, each once.
+
+    For three or more experiments, such as the points of a sweep, print at most `WARNINGS_MAX`.
+    """
     advice = list(dict.fromkeys(text for each in experiments for text in advise(each)))
     if len(experiments) > 2 and len(advice) > WARNINGS_MAX:
         advice[WARNINGS_MAX:] = [f"{len(advice)} warnings; the others are alike"]

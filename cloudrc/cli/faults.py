@@ -227,7 +227,7 @@ def fly_seed(seed: int, adversarial: bool) -> Finding:
 
 
 def _count(found: dict[str, Any], finding: Finding) -> None:
-    """Add the finding of the next seed to the document of a search."""
+    """Add the finding of the next seed to `found`, the document of a search."""
     from cloudrc.faults.trial import checked_in
 
     for name in ("next", "count"):

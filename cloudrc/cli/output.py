@@ -36,8 +36,8 @@ def format_document(document: object, form: str) -> str:
 def print_result(form: str, document: Mapping[str, Any], text: str) -> None:
     """Print the result of a command: `text` if `form` is "table", else the document in this form.
 
-    The document begins with the version of its schema. Print nothing if the reader closed the pipe;
-    raise an OSError if the disk is full, because the file has no result then.
+    The document begins with the version of its schema. Print nothing if the reader closed the pipe.
+    Raise an OSError if stdout is a file on a full disk, because the result is then incomplete.
     """
     shown = text if form == "table" else format_document({"schemaVersion": 1, **document}, form)
     try:

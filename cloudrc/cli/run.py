@@ -336,7 +336,7 @@ def _record_virtual(
 def _prepare(experiment: ResolvedExperiment, folder: Path) -> bool:
     """Check the user's robot and scene, and write the link's profile into the run's `folder`.
 
-    Return whether the packages of the API are installed.
+    Return whether the packages of the operator's API are installed; if not, warn on stderr.
     """
     from cloudrc.cli.link_run import prepare_link
     from cloudrc.drivers.local import LINK_FOLDER

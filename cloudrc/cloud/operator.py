@@ -68,8 +68,8 @@ def make_robot_status(
 ) -> RobotStatus:
     """Make the status message for teleop from new telemetry.
 
-    `world` identifies world's process. `control` is the last command of the session, and `delay`
-    the delay of the telemetry before it [s], NaN if unknown.
+    `world` identifies world's process. `control` is the last command of the session; it is older
+    than `telemetry`. `delay` is the uplink delay of the previous telemetry [s], NaN if unknown.
     """
     # fmt: off
     stamp_ns, odometry, _, echo_ns, hold_ns, slip_ns, mission, guard, *rest = telemetry

@@ -52,7 +52,7 @@ DELETE_LIMIT = 40.0
 
 
 class Ended(NamedTuple):
-    """End of a mission's Job."""
+    """How a mission's Job ended."""
 
     exit_code: int | None  # of the container; None if the container has not ended
     message: str  # verdict in words, or why the Job failed
@@ -101,7 +101,10 @@ def run_job(
 def create_job(
     release: Release, job: Any, files: Any, labels: Mapping[str, str], component: str
 ) -> None:
-    """Create a Job, and `files` as a ConfigMap of the same name."""
+    """Create a Job, and `files` as a ConfigMap of the same name.
+
+    If the ConfigMap cannot be created, delete the Job. `component` is the Job's component label.
+    """
     name, created = job["metadata"]["name"], release.request("create", "jobs", body=job)
     owner = owner_of("batch/v1", "Job", created)
     files["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}

@@ -396,7 +396,7 @@ class World(Section):
 
     @property
     def is_nominal(self) -> bool:
-        """Whether there is no wind and the true robot equals its model, as C steps assume."""
+        """Whether there is no wind and the true robot equals its model; step.c needs both."""
         return self.plant == Plant() and not self.wind.blows
 
 

@@ -182,9 +182,9 @@ class LocalRun:
     ) -> None:
         """Prepare a run in `folder`; start no process yet.
 
-        It contains config.yaml and the folder `LINK_FOLDER`, as `link_words` needs it. The run
-        writes world.mcap, cloud.mcap and five logs there. It calls `see` with the records that the
-        processes print. With `api`, teleop serves the operator's API.
+        `folder` contains config.yaml and, in `LINK_FOLDER`, profile.yaml and one folder per
+        direction. The run writes world.mcap, cloud.mcap and five logs to `folder`. It calls `see`
+        with the records that the processes print. With `api`, teleop serves the operator's API.
 
         If `session` is given, the run is a session: teleop waits for missions, all processes serve
         metrics, and the recordings contain only the flights. When all processes are ready,
@@ -356,9 +356,10 @@ def start_process(
 
 
 def link_words(folder: Path, way: str) -> list[str]:
-    """Return the words to start the process of a direction, "uplink" or "downlink", of a link.
+    """Return the arguments of `cloudrc` for the process that shapes the direction `way` of a link.
 
-    `folder` contains profile.yaml and, for route and state, a folder per direction.
+    `way` is "uplink" or "downlink". `folder` contains profile.yaml and a folder per direction, in
+    which the process writes its route file and its state.
     """
     files = [f"--profile={folder / PROFILE}", f"--route={folder / way / 'route'}"]
     return ["link", "run", f"--direction={way}", *files]

@@ -273,9 +273,10 @@ class Link:
         self._values = values
 
     def shaped(self, shaper: str, direction: str, mode: str, delay: float) -> None:
-        """Store which `shaper` ("relay" or "netem") shapes the direction, and the key `link.mode`.
+        """Store which `shaper` ("relay" or "netem") shapes the direction.
 
-        `delay` is the mean delay that the profile now requests [s].
+        `mode` is the value of the key `link.mode`. `delay` is the mean delay that the profile now
+        requests [s].
         """
         self._values["cloudrc_link_info"] = {shaper: {direction: {mode: 1.0}}}
         self._values["cloudrc_link_delay_seconds"] = {direction: delay}
@@ -324,7 +325,7 @@ def _beginning(metric: Metric) -> Any:
 
 
 def _places(metrics: Iterable[Metric], values: Values) -> dict[str, list[tuple[Values, str]]]:
-    """Map the name of each count to the dicts and keys under which its total is stored."""
+    """Map the name of each `Counted` record to the dicts and keys that store its total."""
     counted = [("*", outcomes) for outcomes in values.get("cloudrc_datagrams_total", {}).values()]
     places = defaultdict(list)
     for metric in metrics:

@@ -47,7 +47,7 @@ Readings: TypeAlias = dict[str, "dict[Labels, float] | Histogram"]
 
 
 def samples(value: Any, labels: Labels = ()) -> dict[Labels, float]:
-    """Convert the value of a metric to its values by tuple of label values; leave out NaN.
+    """Return the numbers in the value of a metric by tuple of label values; leave out NaN.
 
     `value` is a number, a vector with the label `axis`, or a dict: value of a label -> number,
     vector or dict. `labels` are the label values that are already known.

@@ -162,10 +162,10 @@ def _faces(position: Vector) -> list[tuple[float, int, float]]:
 
 
 def dishonesty(schedule: Schedule) -> tuple[list[Lie], Words | None]:
-    """Return the functions by which the cloud of a schedule attacks; an honest cloud has none.
+    """Return the functions by which the cloud of a schedule attacks: ([], None) if it is honest.
 
-    Those in the list change commands. The last one forges operator requests; it is None if the
-    policy forges none.
+    The functions in the list change commands. The function after the list forges operator requests;
+    it is None if the policy forges no requests.
 
     Raises:
         BadInputError: If the policy does not exist; the message lists all policies.

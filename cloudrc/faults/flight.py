@@ -53,7 +53,7 @@ class Flight:
         life: int = 1,  # makes the nonces differ from those of another flight
         lies: Sequence[Lie] = (),  # change cloud's commands after those of the schedule
     ) -> None:
-        """Prepare a flight; a comment beside each argument describes it.
+        """Prepare a flight; comments in the signature describe the arguments.
 
         Raises:
             BadInputError: If the schedule names an unknown link profile or an unknown policy of a

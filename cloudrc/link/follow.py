@@ -86,9 +86,9 @@ class Profiles:
     def __init__(
         self, profile: Path, document: Path, load: Load, log: Callable[[str], None]
     ) -> None:
-        """Watch `profile` and `document`; a document that exists already is ignored.
+        """Watch the file `profile`, and `document`, the file that `cloudrc link set` writes.
 
-        In a pod the ConfigMap already contains the change of this document.
+        A document that exists already is ignored: in a pod, the ConfigMap contains its change.
         """
         self._profile, self._load, self._log = profile, load, log
         self._readers = {document: self._read_document, profile: self._read_profile}

@@ -478,9 +478,9 @@ def _ping_range(
     """Return the first and last sequence number of a log according to ping's own summary.
 
     Without a summary, return `first` and `last`, the smallest and largest number in the lines of
-    packets. `others` are the other lines; unknown ones are counted in `log`. Raise a BadInputError
-    if they begin or end several sessions, if the summary does not match the number of `replies`,
-    or if there are too many packets.
+    packets. `others` are the other lines; unknown lines are counted in `log`. Raise a BadInputError
+    if the log has several sessions of ping or too many packets, or if the summary does not match
+    the number of `replies`.
     """
     heads = [line for line in others if line.startswith(_HEADS)]
     ends = [line for line in others if not line.startswith(_HEADS)]

@@ -187,15 +187,14 @@ class Relay:
             self._step_once(rest_ns * 1e-9)
 
     def counts(self) -> dict[str, int]:
-        """Return the number of datagrams by outcome, and the recent lateness.
+        """Return the number of datagrams by outcome, and percentiles of their lateness [ns].
 
         The outcomes are `received`; `forwarded` (including copies); `lost` on the link; `malformed`
         (not from the tunnel); `overflow` (too many in flight, see `IN_FLIGHT_MAX`); `unread` (the
         socket's buffer was full); `unsent` (the receiver is unknown or the kernel refused).
 
-        Call this method once a second; the percentiles of the lateness [ns] then cover the last
-        10 s. `released_early` is the number of datagrams that left before they were due, since the
-        start.
+        If this method is called once a second, the percentiles cover the last 10 s.
+        `released_early` is the number of datagrams since the start that left before they were due.
         """
         errors = ReleaseErrors(self._errors)
         recent = ReleaseErrors(errors - self._past[0]).in_ns()

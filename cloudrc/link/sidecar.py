@@ -69,7 +69,8 @@ class Sidecar:
 
         The state file is in the same folder. `direction` is "uplink" or "downlink". `tell` exports
         each new state of the link as metrics. `count` exports the numbers of datagrams by outcome,
-        once a second. `origin_ns` is the start of the time line [ns]; 0: when the link comes up.
+        once a second. `origin_ns` is the time at which the time line of the profile starts [ns];
+        0 means the time at which the peer becomes known.
         """
         self.peer: Address | None = None
         self.profile = profile

@@ -221,7 +221,7 @@ class _File:
 
 
 def read(path: Path) -> Recording:
-    """Do what `Recording.read` does."""
+    """Read an MCAP file up to its end or to its first damaged part, for `Recording.read`."""
     return _File(path).recording
 
 

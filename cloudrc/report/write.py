@@ -87,7 +87,7 @@ def write_report(
 
 
 def _environment(path: Path, run: Run) -> dict[str, Any]:
-    """Return the description of the machine that flew; without its file, describe this machine."""
+    """Read from `path` which machine flew; without a valid file, write one for this machine."""
     with suppress(OSError, ValueError, RecursionError):
         if not path.is_symlink() and isinstance(known := json.loads(read(path)), dict):
             return known

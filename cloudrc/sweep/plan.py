@@ -138,7 +138,7 @@ def _code(kind: str, name: str) -> str:
 
 
 def _key(everything: Mapping[str, Any], seed: int) -> str:
-    """Return the key of a flight: a hash of all that decides about it, and of its seed."""
+    """Return the key of a flight: a hash of its seed and of everything else that decides it."""
     text = json.dumps({**everything, "seed": seed}, sort_keys=True)
     return sha256(text.encode()).hexdigest()[:16]
 

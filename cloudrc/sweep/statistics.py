@@ -41,7 +41,7 @@ def median_interval(values: Sequence[float]) -> tuple[float, float] | None:
 
 @cache  # the metrics of a sweep have the same number of values
 def _outermost(n: int) -> int:
-    """Return the k of `median_interval` for `n` values; 0 if there is none."""
+    """Return k: the interval ends at the k-th smallest and largest of `n` values; 0 if none."""
     chances = np.cumsum([math.comb(n, i) / 2**n for i in range(n // 2)])
     return int(np.searchsorted(chances, LEVEL / 2, side="right"))
 

@@ -96,7 +96,7 @@ class Bridge:
 
     @property
     def seen(self) -> RobotStatus | None:
-        """The robot's newest status; unlike a call, this does not wait for teleop's loop."""
+        """The robot's newest status, read at once, without waiting for teleop's loop."""
         return self._service.seen if self._service else None
 
     def open(self, service: MissionService) -> None:
@@ -388,9 +388,10 @@ async def stream_robot(request: Request, bridge: Bridged) -> StreamingResponse:
     """Stream the robot's newest status, about 30 times a second, as lines of JSON.
 
     A line is an object with the fields of `RobotStatus` in cloudrc/teleop/wire.py: pose, velocity
-    and guard of the robot, and in `control` the last command. It is null before the first
-    telemetry. Unknown values are null. A client that reads too slowly gets old lines, up to minutes
-    old, and then misses some. The stream ends like that of the events.
+    and guard of the robot, and in `control` the last command. Before the first telemetry, a line is
+    null. Unknown values are null. A client that reads too slowly gets lines up to minutes old, and
+    then misses some. The stream ends when the client leaves, its token becomes invalid, or teleop
+    ends.
     """
     await bridge.ask(lambda service, now_ns: None)  # raises an error if teleop cannot answer
 

@@ -19,10 +19,14 @@ while its basis is at most `command_age_max_ns` old. A command with a plan stays
 plan ends, at most for `guard.plan_max_s` after its arrival. The guard does not trust a plan: in
 each step it limits the plan's velocity for the present time like the velocity of a new command.
 
+A command is impossible if a number in it is NaN or too large, or if a time in it is wrong, such as
+the stamp of a basis in the future.
+
 - Every state can change to ESTOP: by the operator's request, or when the robot has turned over,
-  because its rotors would then push it in any direction. An acknowledgement leads to GROUND.
-- In LAND, an acknowledgement in the air leads to HOLD. An acknowledgement near the ground or on an
-  obstacle leads to GROUND at touch-down.
+  because its rotors would then push it in any direction. The operator's acknowledgement leads to
+  GROUND.
+- In LAND, the operator's acknowledgement leads to HOLD if the robot is in the air. Near the ground
+  or on an obstacle, it leads to GROUND at touch-down.
 - LAND and ESTOP end the mission. Afterwards only a new start arms the robot again.
 - If HOLD begins before the robot has left the ground, GROUND follows at once: the rotors stop, and
   the mission continues. The robot then waits 60 s for cloud's commands.
