@@ -157,12 +157,14 @@ def read_last_mission(folder: Path) -> tuple[Recording, ResolvedExperiment, bool
 def restore_mission(folder: Path) -> None:
     """Write the mission.mcap of a session that was killed before it wrote this file."""
     from cloudrc.drivers.local import JOURNAL_FILE, under_way
+    from cloudrc.report.document import Run
     from cloudrc.report.write import attachments
 
     if (folder / JOURNAL_FILE).is_file() and not (folder / "mission.mcap").exists():
         if folder.resolve() in under_way():
             raise BadInputError(f"{folder}: the session has not ended; end it: cloudrc down")
-        recording, _, _ = read_last_mission(folder)
+        recording, _, interrupted = read_last_mission(folder)
+        recording.metadata |= Run("local", "relay", interrupted).metadata
         recording.write(folder / "mission.mcap", attachments(folder))
 
 

@@ -148,6 +148,7 @@ def _to_record(row: Row, record: str | None, folder: Path) -> bool:
 
 def _fly_into(folder: Path, flight: Flight, *, page: bool) -> dict[str, Any]:
     folder.mkdir(exist_ok=True)
+    (folder / "environment.json").unlink(missing_ok=True)  # it describes an earlier flight
     return fly(flight.experiment, "virtual", folder, page=page)
 
 

@@ -262,8 +262,9 @@ def _changed(recording: Recording) -> Iterator[str]:
     """Describe how the messages of a complete file differ from the counts stored by its writer."""
     metadata, read = recording.metadata, Counter(message[0] for message in recording.messages)
     counts: dict[str, int] = {}
-    with suppress(ValueError):
-        counts = json.loads(metadata.get(COUNTS) or "{}")
+    with suppress(ValueError, RecursionError):
+        if isinstance(stored := json.loads(metadata.get(COUNTS) or "{}"), dict):
+            counts = stored
     pairs = [(topic, read[topic], counts.get(topic, 0)) for topic in TOPICS if counts]
     if wrong := [f"{found} of {n} on {topic}" for topic, found, n in pairs if found != n]:
         yield f"messages were removed or added: it holds {_list(wrong)}"

@@ -6,6 +6,7 @@ import json
 import os
 import platform
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
@@ -94,8 +95,9 @@ def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
     method = metadata.get("clock_offset_method", "same clock")
     if method == "same clock":
         return None
-    uncertainty_ns = metadata.get("clock_offset_uncertainty_ns")
-    known = None if uncertainty_ns is None else {"value": int(uncertainty_ns) * 1e-9, "unit": "s"}
+    known = None
+    with suppress(KeyError, ValueError, OverflowError):  # the file may come from somebody else
+        known = {"value": int(metadata["clock_offset_uncertainty_ns"]) * 1e-9, "unit": "s"}
     return _known({"method": method, "uncertainty": known})
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +49,13 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     whole = _is_of_whole_recording(folder / "report.json")
     for lack in _lacking(recording, config, whole=whole):
         raise BadInputError(f"{merged}: {lack}; no report is written")
+    run = _read_facts(recording)
     if before is None:
+        run = replace(run, interrupted=True)  # the command was killed before it wrote mission.mcap
+        recording.metadata |= run.metadata
         recording.views = views(recording, experiment)
         recording.write(merged)
-    return recording, experiment, _read_facts(recording)
+    return recording, experiment, run
 
 
 def _read_merged(folder: Path) -> Recording | None:
@@ -67,7 +71,8 @@ def _read_merged(folder: Path) -> Recording | None:
         if any(ends):
             return None
         raise
-    torn = recording.note and not recording.lacking
+    # A mission.mcap that is whole has the facts about the run, even if the file of an end was torn.
+    torn = recording.torn and not recording.lacking
     return None if torn and all(ends) else recording
 
 

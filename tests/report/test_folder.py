@@ -12,6 +12,7 @@ from cloudrc.cli.main import main
 from cloudrc.config.load import dump
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
+from cloudrc.record.merge import merge
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted
 from cloudrc.report.document import Run
@@ -140,6 +141,20 @@ def test_an_interrupted_run_stays_interrupted(run):
     assert found["notes"][0] == "the relay died"
 
 
+def test_a_run_with_a_torn_end_keeps_its_facts(run):
+    world, cloud = good().ends()
+    for end, part in (("world", world), ("cloud", cloud)):
+        with McapWriter(run / f"{end}.mcap", clock=end, clock_id="same") as writer:
+            writer.write(part)
+    cut(run / "world.mcap", run / "world.mcap")
+    mission = merge(run / "world.mcap", run / "cloud.mcap")
+    facts = Run("cluster", "netem", interrupted=True, notes=("the world process died",))
+    mission.metadata |= facts.metadata
+    mission.write(run / "mission.mcap", {})
+    (run / "report.json").unlink()
+    assert read_run(run)[2] == facts
+
+
 def test_a_recording_of_an_earlier_version_gives_a_report(run):
     write_mission(run / "mission.mcap", *good().ends())
     found = write_report(run, *read_run(run), page=False)
@@ -156,6 +171,7 @@ def test_the_recordings_are_merged_if_they_are_not_yet(run):
         what(run / "mission.mcap")
         assert write_report(run, *read_run(run), page=False)["numbers"] == first
         assert Recording.read(run / "mission.mcap").note == ""
+        assert read_run(run)[2].interrupted, "the command was killed before it wrote mission.mcap"
 
 
 def test_a_folder_without_a_run_is_refused(run):

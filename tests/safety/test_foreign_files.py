@@ -19,11 +19,12 @@ from cloudrc.link.traces import read_trace
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
 from cloudrc.record.reader import recover
-from cloudrc.report.document import write_json
+from cloudrc.record.writer import COUNTS
+from cloudrc.report.document import clock_offset_document, write_json
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
 from tests.metrics.conftest import flown
-from tests.record.conftest import cloud_records, world_records, write, write_mission
+from tests.record.conftest import cloud_records, rewrite, world_records, write, write_mission
 
 
 @pytest.fixture(autouse=True)
@@ -85,6 +86,18 @@ def test_the_facts_in_a_recording_are_used_completely_or_not_at_all(run):
         assert read_run(run)[2] == anew, facts[:99]
     write_mission(run / "mission.mcap", *flown().ends(), metadata={"run": json.dumps(good)})
     assert read_run(run)[2].notes == ("seen",)
+
+
+@pytest.mark.parametrize("counts", ["[1]", "7", '"x"', "[" * 10**5])
+def test_counts_of_others_do_not_matter(run, counts):
+    foreign = rewrite(run / "mission.mcap", run / "foreign.mcap", noted={COUNTS: counts})
+    assert Recording.read(foreign).note == ""
+
+
+@pytest.mark.parametrize("uncertainty", ["abc", "1" * 400])
+def test_an_offset_of_others_does_not_matter(uncertainty):
+    noted = {"clock_offset_method": "packets", "clock_offset_uncertainty_ns": uncertainty}
+    assert clock_offset_document(noted) == {"method": "packets"}
 
 
 def test_a_report_of_others_does_not_matter(run):
