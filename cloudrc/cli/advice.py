@@ -60,9 +60,9 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
 def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]:
     """Simulate telemetry and commands over the experiment's link, without its blackouts.
 
-    Return two lists of ages [s], measured just before each datagram is sent: the ages of the
-    odometry from which cloud computed the command that world follows, and the ages of the newest
-    command that telemetry has confirmed.
+    Return two lists of ages [s]: of the odometry from which cloud computed the command that world
+    follows, and of the newest command that telemetry has confirmed. Both have an age for each
+    datagram that is sent, at its departure.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection

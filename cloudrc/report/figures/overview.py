@@ -65,7 +65,7 @@ class _View:
     def __init__(self, points: Array, front: Array) -> None:
         """Choose the direction of view for `points` [m], world frame, shape (n, 3).
 
-        The viewer is on the side in the direction `front`, a vector in the world frame, shape (3,).
+        The vector `front`, world frame, shape (3,), points from the scene towards the viewer.
         """
         level = points[:, :2] - points[:, :2].mean(axis=0)
         x, y = np.linalg.svd(level, full_matrices=False)[2][0]
