@@ -53,7 +53,7 @@ def test_a_run_gives_the_same_report_again(run):
     assert write_report(run, *read_run(run), page=False) == first
 
 
-def test_a_new_report_keeps_the_description_of_the_machine_that_flew(run):
+def test_a_new_report_keeps_the_machine_that_flew(run):
     environment = run / "environment.json"
     environment.write_text(flown := '{"cores": 3, "physics_steps": "C (compiled by cc)"}')
     write_report(run, *read_run(run), page=False)

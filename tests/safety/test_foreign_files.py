@@ -72,7 +72,7 @@ def run(tmp_path):
     return tmp_path
 
 
-def test_the_facts_in_a_recording_are_used_completely_or_not_at_all(run):
+def test_facts_in_a_recording_are_used_completely_or_not_at_all(run):
     _, _, anew = read_run(run)
     good = {"mode": "local", "shaper": "netem", "notes": ["seen"]}
     wrong = {"notes": [1]}, {"mode": "elsewhere"}, {"interrupted": {"a": 1}}

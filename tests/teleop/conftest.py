@@ -313,7 +313,7 @@ A_MISSION = {"waypoints": [{"position_m": [0.5, 0.0, 1.0]}]}
 class Running:
     """API, service and robot; `flight.position` is where the robot is."""
 
-    def __init__(self, *, ready=True, unix=False, host="127.0.0.1"):
+    def __init__(self, *, ready=True, unix=False, host="127.0.0.1", uplink=True):
         self.folder = TemporaryDirectory(prefix="cloudrc-")
         folder = Path(self.folder.name)
         for role, token in (("operator", OPERATOR), ("reader", READER)):
@@ -322,6 +322,7 @@ class Running:
         self.token_file, self.audit_file = folder / "operator", folder / "audit.jsonl"
         self.scene, self.bridge = load_scene("pipes"), Bridge()
         self.flight = ServiceFlight(self.scene)
+        self.flight.uplink = uplink
         self.alarms, self.complaints = [], []
         self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
         how = {"time_limit": 60.0, "contact": True, "plan": assembly.mission_plan}

@@ -165,9 +165,7 @@ def test_a_stream_shows_its_life_until_its_token_is_withdrawn(monkeypatch):
 
 
 def test_a_reader_follows_the_robot_until_teleop_ends():
-    with running(ready=False) as api:
-        api.flight.uplink = False
-        api.bridge.open(api.flight.teleop)
+    with running(uplink=False) as api:
         statuses = Api(api.url, lambda: READER).robot()
         assert next(statuses) is None, "no telemetry yet"
         api.flight.uplink, api.flight.position = True, A
