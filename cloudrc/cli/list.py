@@ -31,6 +31,8 @@ def execute(options: argparse.Namespace) -> int:
     blocks = []
     for kind, lines in found.items():
         rows = [(f"  {name}", text) for name, text in lines.items()]
+        if kind == "metrics":
+            rows.append(("  ./FILE.py", "Your own: --set report.metrics=./FILE.py"))
         blocks.append(f"{paint(kind, 'bold')}\n{table(rows)}")
     entries = {
         kind: [{"name": name, "description": text} for name, text in lines.items()]
