@@ -119,7 +119,7 @@ def _serve(port: int, flight: Flight, *, with_browser: bool) -> None:
                 for status in flight.api.robot():
                     now = time.monotonic()
                     feed.take(status, now)
-                    if now >= due:  # for half of the time at most: else old statuses queue up
+                    if now >= due:  # drawing takes half of the time: no old statuses queue up
                         page.update(now)
                         due = 2 * time.monotonic() - now
             page.update(time.monotonic())

@@ -166,7 +166,7 @@ def _machine(options: argparse.Namespace, seed: int, programs: Programs, tables:
 
     def relay(profile: DirectionProfile, origin_ns: int) -> Relay:
         settle()
-        if ask_for_fifo():  # most pods lack the permission and do not need it
+        if ask_for_fifo():  # refused in most pods, which do not need it
             log("the relay runs under SCHED_FIFO")
         direction = LinkDirection(profile, seed, options.direction == "uplink", origin_ns)
         with listening("--listen", options.listen):

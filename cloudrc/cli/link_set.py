@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
-from cloudrc.cli.output import format_document, output_argument, print_line, table
+from cloudrc.cli.output import escape, output_argument, print_line, print_result, table
 from cloudrc.cluster.client import DEFAULT_RELEASE, ClusterError, Release
 from cloudrc.errors import BadInputError, MissingPrerequisiteError, TimedOutError
 
@@ -81,14 +81,11 @@ def execute(options: argparse.Namespace) -> int:
         edit, states = sent.edit, sent.states
     for text in edit.notes:
         print_line(f"cloudrc: note: {text}", sys.stderr)
-    if options.output != "table":
-        links = {state.direction: asdict(state) for state in states}
-        about = {"schemaVersion": 1, "change": number, "seconds": round(took, 3), "links": links}
-        print(format_document(about, options.output))
-        return 0
+    links = {state.direction: asdict(state) for state in states}
+    document = {"change": number, "seconds": round(took, 3), "links": links}
     heads = ("DIRECTION", "SHAPER", "DELAY", "JITTER", "LOSS", "RATE", "OTHER")
-    print(table([heads, *map(_row, states)]))
-    print_line(f"{where}: in force after {took:.1f} s")
+    said = escape(f"{where}: in force after {took:.1f} s")
+    print_result(options.output, document, f"{table([heads, *map(_row, states)])}\n{said}")
     return 0
 
 

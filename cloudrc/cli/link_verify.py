@@ -28,7 +28,7 @@ from cloudrc.assembly import link_profile
 from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.link import VERIFY_DEFAULT
 from cloudrc.cli.link_run import prepare_link, run_tool
-from cloudrc.cli.output import escape, format_document, paint, table
+from cloudrc.cli.output import escape, paint, print_result, table
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.cli.processes import show_address
 from cloudrc.cluster.client import end_process
@@ -98,8 +98,7 @@ def execute(options: argparse.Namespace) -> int:
     else:
         experiment = find_experiment(options.target, options.settings)
         report = verify(options.target, experiment, options.shaper, options.seconds)
-    is_table = options.output == "table"
-    print(as_text(report) if is_table else format_document(report, options.output))
+    print_result(options.output, report, as_text(report))
     return 0 if report["verdict"] == "believed" else 1
 
 
@@ -386,7 +385,6 @@ def make_report(title: str, findings: Mapping[str, Findings], probes: Mapping[st
     shapers = {one.evidence.shaper or "an unknown shaper" for one in findings.values()}
     verdicts = {verdict_of(one.rows) for one in findings.values()}
     return {
-        "schemaVersion": 1,
         "verdict": next(one[0] for verdict, one in VERDICTS.items() if verdict in verdicts),
         "link": title,
         "shaper": f"shaped by {' and '.join(sorted(shapers))}",

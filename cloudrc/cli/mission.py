@@ -17,7 +17,7 @@ from cloudrc.cli import client
 from cloudrc.cli.client import Api, UnreachableError, mission_path, token_file, token_reader
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
-from cloudrc.cli.output import escape, format_document, output_argument, print_line, table
+from cloudrc.cli.output import escape, output_argument, print_line, print_result, table
 from cloudrc.cli.parser import number
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.drivers.machine import Deadline
@@ -247,7 +247,7 @@ def _fly(options: argparse.Namespace, api: Api) -> int:
 def _list(options: argparse.Namespace, api: Api) -> int:
     missions = api.get("/v1/missions")["missions"]
     if options.output != "table":
-        print(format_document({"schemaVersion": 1, "missions": missions}, options.output))
+        print_result(options.output, {"missions": missions}, "")
         return 0
     rows = [("ID", "NAME", "STATE", "WAYPOINTS", "VERDICT")]
     for each in missions:
@@ -264,7 +264,7 @@ def _list(options: argparse.Namespace, api: Api) -> int:
 def _status(options: argparse.Namespace, api: Api) -> int:
     state = api.get(mission_path(options.id) if options.id else "/v1/state")
     if options.output != "table":
-        print(format_document({"schemaVersion": 1, **state}, options.output))
+        print_result(options.output, state, "")
         return 0
     mission = state if options.id else state["mission"]
     api.say(describe_mission(mission) if mission else "no mission is under way")

@@ -362,8 +362,7 @@ def _record_local(
 ) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
     """Fly in real time; yield the merged recording, the experiment and facts about the run.
 
-    If `session` is given, fly a session, and yield recording, experiment and facts of its last
-    mission. `session` is called with the API's address and the metrics' addresses by process.
+    With `session`, as in `fly`, yield those of the session's last mission.
     """
     from cloudrc.assembly import flight_limit
     from cloudrc.cli.session import read_last_mission

@@ -66,7 +66,11 @@ def run(options: argparse.Namespace) -> int:
     head += f", {len(mine) - len(missing)} done before" if len(missing) < len(mine) else ""
     view = SweepView(stream, f"{plan.points[0].name}: {head}", len(missing))
     with closing(view):
-        flown = _fly(options, plan, missing, folder)
+        if options.on:
+            flown = rows_from_pods(options, plan, missing)
+        else:
+            job = partial(fly_row, record=options.record, folder=folder)
+            flown = map_in_order(job, missing, options.jobs, in_order=False)
         rows, stopped, code = _keep(flown, folder, plan, shard, before, view.see)
     if stopped:
         flags = " --on kubernetes, and its other flags" if options.on else ""
@@ -116,16 +120,6 @@ def _keep(
 
         stopped, code = take_each(flown, take)
     return store.finish(folder, plan), stopped, code
-
-
-def _fly(
-    options: argparse.Namespace, plan: Plan, flights: list[Flight], folder: Path
-) -> Generator[Row]:
-    """Fly on this machine or in pods; yield the row of each flight when it ends."""
-    if options.on:
-        return rows_from_pods(options, plan, flights)
-    fly = partial(fly_row, record=options.record, folder=folder)
-    return map_in_order(fly, flights, options.jobs, in_order=False)
 
 
 def fly_row(flight: Flight, record: str | None = None, folder: Path = Path()) -> Row:

@@ -48,7 +48,7 @@ class Flight:
         schedule: Schedule,  # faults of the flight, and the link's profile
         *settings: str,  # settings of the experiment `paper`, as for `--set`
         honest: bool = True,  # whether a contact is a breach; not if `schedule` has a policy
-        keep: bool = True,  # whether all records are kept and hashed
+        keep: bool = True,  # whether all records are kept; sha256() needs them
         start: bool = True,  # whether the experiment's mission is ordered at once
         life: int = 1,  # makes the nonces differ from those of another flight
         lies: Sequence[Lie] = (),  # change cloud's commands after those of the schedule

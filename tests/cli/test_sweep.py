@@ -85,8 +85,11 @@ def test_a_row_flies_again_to_the_same_hash(write_sweep, call):
     report = json.loads(Path(f"grid/{row['key']}/report.json").read_text())
     assert report["records_sha256"] == row["records_sha256"]
     Path("grid/rows.jsonl").write_text(json.dumps(row | {"records_sha256": "f"}) + "\n")
+    environment = Path(f"grid/{row['key']}/environment.json")
+    environment.write_text("{}")
     for folder, key, code in (("grid", row["key"], 6), ("grid", "x", 2), (".", row["key"], 2)):
         call("sweep fly", folder, key, code=code)
+    assert json.loads(environment.read_text()), "it describes the newest flight"
 
 
 @pytest.mark.usefixtures("no_page")

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from cloudrc.cloud.operator import EmergencyStopRepeater
+from cloudrc.errors import BadInputError
 from cloudrc.faults.adversary import POLICIES, choose
 from cloudrc.faults.invariants import Watch
 from cloudrc.faults.schedule import Event, Schedule, compose, load
@@ -145,3 +146,9 @@ def test_a_waypoint_is_reached_once_and_in_order(waypoints, kinds):
     flight = SimpleNamespace(listeners=[], watch=Watch(guard()), teleop=teleop, run=run)
     _check_waypoints(flight)
     assert set(flight.watch.counts) == kinds
+
+
+def test_a_fault_of_the_link_needs_a_profile_without_changes():
+    schedule = Schedule(1, "handover", (Event("delay", 1.0, 1.0, 0.1),))
+    with pytest.raises(BadInputError, match="handover changes over time, .* delay cannot be"):
+        fly(schedule)

@@ -1,4 +1,4 @@
-"""Faults that are injected in virtual time, one module for each part of the system."""
+"""Faults that are injected in virtual time, in modules for links, ends and intruders."""
 
 from __future__ import annotations
 

@@ -59,8 +59,7 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
 )
 def _cloud_paused(outcome: Outcome, seed: int) -> None:
     paused = Event("cloud_paused", measures.instant(seed), 5.0)
-    flight = Flight(Schedule(seed, events=(paused,)))
-    fly_safely(outcome, flight)
+    flight = fly_safely(outcome, Flight(Schedule(seed, events=(paused,))))
     measures.held_in_time(outcome, flight)
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
     old = [r for r in applied if r.stamp_ns - r.basis_stamp_ns > measures.AGE_MAX * 1e9]
@@ -169,13 +168,13 @@ def _invalid_values(outcome: Outcome, seed: int) -> None:
         outcome.same(f"{name}: flown again without the operator", len(again), 0)
         causes = [change.cause for change in measures.changes_into(flight, GuardState.LAND)]
         outcome.true(f"{name}: the cause is reported", "impossible commands" in " ".join(causes))
-        measures.refused(outcome, flight, "range")
+        refused(outcome, flight, "range")
     for limit, changes in EXCESSIVE.items():
         lie, harmless = _for_a_while(at, 1.0, changes), limit != "speed"  # it may hit a pipe
         flight = Flight(Schedule(seed), honest=harmless, lies=[lie]).fly(40.0)
         measures.safe(outcome, flight)
-        refused = sum("impossible" in change.cause for change in flight.changes)
-        outcome.same(f"100 times {limit}: rejected as impossible", refused, 0)
+        rejected = sum("impossible" in change.cause for change in flight.changes)
+        outcome.same(f"100 times {limit}: rejected as impossible", rejected, 0)
         outcome.least(f"100 times {limit}: limited", flight.count(f"limited_{limit}"), 20)
     one = Flight(Schedule(seed), lies=[_for_a_while(at, 0.005, IMPOSSIBLE["NaN"])]).fly(40.0)
     measures.safe(outcome, one)

@@ -50,8 +50,7 @@ def _silence(outcome: Outcome, seed: int) -> None:
         back, what = at + duration, f"{duration:g} s of silence"
         slow = ("guard.speed_max_mps=1.5", "criteria.time_limit_s=150")
         cut = Schedule(seed, events=(Event("blackout", at, duration),))
-        flight = Flight(cut, *slow)
-        fly_safely(outcome, flight, 150.0)
+        flight = fly_safely(outcome, Flight(cut, *slow), 150.0)
         measures.held_in_time(outcome, flight, f"{what}: HOLD after")
         if duration >= 3.0:
             began = measures.first_into(flight, GuardState.HOLD)

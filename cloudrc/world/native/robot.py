@@ -188,8 +188,8 @@ _unpack_before = Struct("13d").unpack_from
 def make_robot(simulator: Simulator, low_level: LowLevel, guard: Guard) -> Robot:
     """Make a robot that uses C if this machine can.
 
-    `step.c` simulates neither wind nor a true robot that differs from its model: in these cases,
-    make a `Robot`.
+    Call it only if `World.is_nominal`: `step.c` simulates neither wind nor a true robot that
+    differs from its model.
     """
     kind = Robot if usable().run is None else NativeRobot
     return kind(simulator, low_level, guard)

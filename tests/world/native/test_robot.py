@@ -132,11 +132,8 @@ def test_plans_fly_the_same_in_c(seed):
 
 def test_a_micrometre_of_room_means_that_no_fence_limits():
     """`ROOM` in `step.c`: velocities with which the robot can just stop that far from a face."""
-    rng, found, (low, high) = (
-        np.random.default_rng(1),
-        0,
-        np.array((fence.INNER_LOW, fence.INNER_HIGH)),
-    )
+    rng, found = np.random.default_rng(1), 0
+    low, high = np.array((fence.INNER_LOW, fence.INNER_HIGH))
     for _ in range(20_000):
         velocity, place, axis = rng.uniform(-6.0, 6.0, 3), rng.uniform(low, high), rng.integers(3)
         slow = (velocity < 0.0) & ([False, False, True])
