@@ -22,7 +22,7 @@ from cloudrc.teleop.wire import RobotStatus
 WINDOW = 25.0
 """Time that the charts show [s]."""
 STALE = 0.5
-"""Age above which a record is too old to be shown [s]."""
+"""Age above which a value is too old to be shown [s]."""
 TRAIL_STEP = 0.02
 """Shortest distance between two points of the trail [m]."""
 TRAIL_MAX = 4000
@@ -53,7 +53,7 @@ class FlightFeed:
     """
 
     def __init__(self, scene: Scene) -> None:
-        """Begin without records; measure the clearance from the pipes of `scene`."""
+        """Begin without a status; measure the clearance from the pipes of `scene`."""
         self._scene, self._judge = scene, PredictionJudge()
         self.status: RobotStatus | None = None
         self.samples: deque[Sample] = deque()

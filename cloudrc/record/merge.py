@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording, Table
-from cloudrc.record.reader import read
 from cloudrc.record.ros import shifted
 from cloudrc.record.topics import TOPICS
 from cloudrc.records import UNDER_WAY
@@ -120,7 +119,7 @@ def merge(world: Path, cloud: Path) -> Recording:
     failures = []
     for end, path in (("world", world), ("cloud", cloud)):
         try:
-            found[end] = read(path)
+            found[end] = Recording.read(path)
         except BadInputError as error:
             failures.append(error)
     if not found:

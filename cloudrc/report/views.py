@@ -19,12 +19,10 @@ from cloudrc.config.load import ResolvedExperiment
 from cloudrc.geometry.scene import Pipe, load_scene
 from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Columns, select
-from cloudrc.record.columns import Recording
+from cloudrc.record.columns import Message, Recording
 from cloudrc.record.ros import encode_view, header, part
 from cloudrc.report.solids import PATH, Face, board_faces, bore, robot_faces, strip
 
-View: TypeAlias = tuple[str, int, bytes]
-"""Topic, log time [ns] on world's clock, CDR bytes of a message."""
 _Colour: TypeAlias = tuple[float, float, float, float]
 _Shape: TypeAlias = tuple[Any, ...]  # arguments of `_marker`, from `name` on
 
@@ -38,7 +36,7 @@ GOAL, GHOST, GLASS = (0.84, 0.37, 0.0), (0.34, 0.71, 0.91), (0.70, 0.74, 0.78)
 """Colours of setpoint, predicted robot and pipes: red, green, blue in [0, 1]."""
 
 
-def views(recording: Recording, experiment: ResolvedExperiment) -> list[View]:
+def views(recording: Recording, experiment: ResolvedExperiment) -> list[Message]:
     """Convert a recording to messages that viewers such as Foxglove can show.
 
     Raises:
@@ -72,7 +70,7 @@ def _thin(columns: Columns) -> Columns:
     return select(columns, np.flatnonzero(np.diff(columns["stamp_ns"] // PERIOD_NS, prepend=-1)))
 
 
-def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:
+def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[Message]:
     """Yield a /tf message with all `frames` for each row of `columns`.
 
     `frames`: frame -> names of its position column and of its orientation column. If the latter is
@@ -95,7 +93,7 @@ def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[View]:
         yield "/tf", stamp_ns, encode_view("/tf", parts)
 
 
-def _errors(topic: str, flight: Flight, columns: Columns, name: str) -> Iterator[View]:
+def _errors(topic: str, flight: Flight, columns: Columns, name: str) -> Iterator[Message]:
     """Yield messages of `topic`: the distance from a position to the robot's true position [m].
 
     `name` is the column of `columns` with the positions. At most one message per PERIOD_NS.

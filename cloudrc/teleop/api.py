@@ -389,9 +389,9 @@ async def stream_robot(request: Request, bridge: Bridged) -> StreamingResponse:
 
     A line is an object with the fields of `RobotStatus` in cloudrc/teleop/wire.py: pose, velocity
     and guard of the robot, and in `control` the last command. Before the first telemetry, a line is
-    null. Unknown values are null. A client that reads too slowly gets lines up to minutes old, and
-    then misses some. The stream ends when the client leaves, its token becomes invalid, or teleop
-    ends.
+    null. Unknown values are null. A client that reads too slowly gets old lines, and misses some.
+    The stream ends when the client leaves or reads nothing for 30 s, its token becomes invalid, or
+    teleop ends.
     """
     await bridge.ask(lambda service, now_ns: None)  # raises an error if teleop cannot answer
 

@@ -150,5 +150,5 @@ def test_a_waypoint_is_reached_once_and_in_order(waypoints, kinds):
 
 def test_a_fault_of_the_link_needs_a_profile_without_changes():
     schedule = Schedule(1, "handover", (Event("delay", 1.0, 1.0, 0.1),))
-    with pytest.raises(BadInputError, match="handover changes over time, .* delay cannot be"):
+    with pytest.raises(BadInputError, match=r"handover changes over time, .* delay cannot be"):
         fly(schedule)
