@@ -3,7 +3,8 @@
     python api_flood.py URL TOKEN SECONDS RATE
 
 Half of the requests read with a token, a quarter has none, a quarter sends commands that are
-refused. It prints the number of requests and of the answers by status, as JSON.
+refused. Each request is sent when it is due, even if earlier ones have no answer yet. It prints the
+number of requests, how long it sent them [s], and the number of answers by status, as JSON.
 """
 
 import asyncio
@@ -22,28 +23,38 @@ def request(method, path, token=""):
     return ("\r\n".join(lines) + "\r\n\r\n").encode()
 
 
-async def ask(address, requests, due, answers):
-    """Send the requests one after the other, each when it is due [s], and read the answers."""
-    reader, writer = await asyncio.open_connection(*address)
+async def send(writer, requests, due, found):
+    """Send the requests one after the other, each when it is due [s]."""
     for instant in due:
         await asyncio.sleep(instant - time.monotonic())
-        answers["sent"] += 1
-        writer.write(requests[answers["sent"] % len(requests)])
+        found["sent"] += 1
+        writer.write(requests[found["sent"] % len(requests)])
+
+
+async def receive(reader, count, found):
+    """Read `count` answers."""
+    for _ in range(count):
         head = await reader.readuntil(b"\r\n\r\n")
         await reader.readexactly(int(head.lower().partition(b"content-length: ")[2].split()[0]))
-        answers[head[9:12].decode()] += 1
-    writer.close()
+        found[head[9:12].decode()] += 1
 
 
 async def flood(url, token, seconds, rate):
     host, _, port = url.removeprefix("http://").partition(":")
     look, order = request("GET", "/v1/state", token), request("POST", "/v1/resume", token)
-    mixed, answers = [look, request("GET", "/v1/state"), look, order], Counter()
+    mixed, found = [look, request("GET", "/v1/state"), look, order], Counter()
+    opened = [await asyncio.open_connection(host, int(port)) for _ in range(CONNECTIONS)]
     began = time.monotonic()
     due = [began + number / rate for number in range(int(seconds * rate))]
-    each = (due[number::CONNECTIONS] for number in range(CONNECTIONS))
-    await asyncio.gather(*(ask((host, int(port)), mixed, own, answers) for own in each))
-    return answers | {"seconds": time.monotonic() - began}
+    each = [due[number::CONNECTIONS] for number in range(CONNECTIONS)]
+    pairs = list(zip(opened, each, strict=True))
+    answers = [asyncio.create_task(receive(reader, len(own), found)) for (reader, _), own in pairs]
+    await asyncio.gather(*(send(writer, mixed, own, found) for (_, writer), own in pairs))
+    took = time.monotonic() - began
+    await asyncio.gather(*answers)
+    for _, writer in opened:
+        writer.close()
+    return found | {"seconds": took}
 
 
 if __name__ == "__main__":

@@ -17,29 +17,29 @@ POINT = {"position_m": [0.5, 0.0, 0.7], "tolerance_m": 0.2, "dwell_s": 55.0, "ti
 HOVER = {"start": "spawn", "waypoints": [POINT]}
 RATE = 1000
 """Requests in a second [1/s]."""
-TRIES = 3
-"""Number of attempts, of which the best counts: the machine may be busy."""
+PAIRS = 5
+"""Number of calm windows, each of them followed by a flooded window."""
 PERIOD = 0.010
 """Period of the control loop [s]."""
+SCRIPT = str(Path(__file__).with_name("api_flood.py"))
 
 
-def flood(folder, seconds):
-    """Fly a calm and a flooded interval [s]; return the answers.
+def fly(folder, seconds):
+    """Fly calm and flooded windows of `seconds` each, in turn.
 
-    Also the 99 % quantiles of the control period's error in both [ms].
+    Return what the floods counted, and of each window the 99 % quantile of the control period's
+    error [ms].
     """
-    folder.mkdir()
-    release = Release(folder, "cloud")
-    script = str(Path(__file__).with_name("api_flood.py"))
+    release, floods, edges = Release(folder, "cloud"), [], []
     try:
         release.post("/v1/missions", HOVER)
         release.until(lambda: release.mission()["state"] == "flying")
-        time.sleep(2.0)
-        edges = [time.monotonic_ns()]
-        time.sleep(seconds)
-        edges.append(time.monotonic_ns())
-        command = [sys.executable, script, release.url, TOKEN, str(seconds), str(RATE)]
-        answers = json.loads(subprocess.check_output(command))
+        for _ in range(PAIRS):
+            edges.append(time.monotonic_ns())
+            time.sleep(seconds)
+            edges.append(time.monotonic_ns())
+            command = [sys.executable, SCRIPT, release.url, TOKEN, str(seconds), str(RATE)]
+            floods.append(json.loads(subprocess.check_output(command)))
         edges.append(time.monotonic_ns())
         release.post("/v1/estop")
         release.until_guard("ESTOP")
@@ -49,23 +49,21 @@ def flood(folder, seconds):
     stamps = Recording.read(folder / "cloud.mcap")["/cmd_vel"]["stamp_ns"]
     periods = [np.diff(stamps[(stamps >= a) & (stamps < b)]) * 1e-9 for a, b in pairwise(edges)]
     assert min(map(len, periods)) > 0.5 * seconds / PERIOD
-    return answers, [np.percentile(np.abs(each - PERIOD), 99) * 1e3 for each in periods]
+    return floods, [np.percentile(np.abs(each - PERIOD), 99) * 1e3 for each in periods]
 
 
 @pytest.mark.process
 @pytest.mark.promise("api-load-spares-the-loop")
-@pytest.mark.parametrize(
-    ("seconds", "tries"), [(3.0, TRIES), pytest.param(20.0, 1, marks=pytest.mark.full)]
-)
-def test_a_flood_of_requests_does_not_disturb_the_loop(tmp_path, figure, seconds, tries):
-    for number in range(tries):
-        answers, (calm, loud) = flood(tmp_path / str(number), seconds)
-        took, sent = answers.pop("seconds"), answers.pop("sent")
+@pytest.mark.parametrize("seconds", [1.0, pytest.param(4.0, marks=pytest.mark.full)])
+def test_a_flood_of_requests_does_not_disturb_the_loop(tmp_path, figure, seconds):
+    """Other programs disturb calm and flooded windows alike, and the median leaves out a burst."""
+    floods, errors = fly(tmp_path, seconds)
+    rates = [flood["sent"] / flood.pop("seconds") for flood in floods]
+    for answers in floods:
+        sent = answers.pop("sent")
         assert sum(answers.values()) == sent == seconds * RATE
         assert not [status for status in answers if status.startswith("5")]
-        rate, grown = sent / took, loud - calm
-        if rate >= 0.9 * RATE and grown <= 2.0:
-            break
-    kind = f"API flood of {seconds:g} s, best of {tries}"
-    figure(f"{kind}: answers", rate, ">=", 0.9 * RATE, "1/s", count=sent)
-    figure(f"{kind}: control period error p99 grows by", grown, "<=", 2.0, "ms")
+    rate, calm, loud = map(np.median, (rates, errors[::2], errors[1::2]))
+    kind = f"API flood of {PAIRS} times {seconds:g} s"
+    figure(f"{kind}: requests", rate, ">=", 0.9 * RATE, "1/s", count=PAIRS)
+    figure(f"{kind}: control period error p99 grows by", loud - calm, "<=", 2.0, "ms", count=PAIRS)

@@ -39,8 +39,10 @@ def test_an_image_is_small_and_holds_no_more_than_its_role_needs(cluster, note, 
 def test_an_image_that_is_not_loaded_is_named(cluster):
     helm("install", "no-image", str(CHART), "--set=image.tag=0.0.0-missing")
     line = ["run", "hover", "--mode", "cluster", "-n", NAMESPACE, "--release", "no-image"]
-    done = cloudrc(*line, "--timeout", "60")
-    helm("uninstall", "no-image")
+    try:
+        done = cloudrc(*line, "--timeout", "60")
+    finally:
+        helm("uninstall", "no-image")
     (said,) = [each for each in done.stderr.splitlines() if each.startswith("cloudrc: error:")]
     assert done.returncode == 5
     assert ":0.0.0-missing" in said
