@@ -109,12 +109,10 @@ def test_a_console_is_shown_and_a_missing_one_is_explained(folder, monkeypatch):
 PYTHON = [sys.executable, "-c"]
 
 
-def command(line, code=0):
-    """Run a command in its own process; return its output and errors."""
-    words = line.split()
-    done = subprocess.run([*FAST, *words], capture_output=True, text=True)
-    assert done.returncode == code, done.stdout + done.stderr
-    return done.stdout + done.stderr
+@pytest.fixture
+def command(call, no_page):
+    """Return a function that runs a command beside the session; it returns output and errors."""
+    return lambda line, code=0: "".join(call(line, code=code))
 
 
 @contextmanager
@@ -133,7 +131,7 @@ def up(folder, *words):
 
 
 @pytest.mark.process
-def test_a_session_flies_missions_and_reports_the_last_one(folder, figure):
+def test_a_session_flies_missions_and_reports_the_last_one(folder, command, figure):
     began = time.monotonic()
     with up(folder) as process:
         busy = max(1.0, os.getloadavg()[0] / usable_cores())  # tests may share the machine
@@ -144,7 +142,7 @@ def test_a_session_flies_missions_and_reports_the_last_one(folder, figure):
         for _, port in ports:
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as page:
                 assert b"cloudrc_build_info" in page.read()
-        assert "guard GROUND" in command("mission status --run s")
+        until(lambda: "guard GROUND" in command("mission status --run s"))
         (folder / "m.yaml").write_text("waypoints: [{position_m: [0.2, 0, 0.6]}]")
         assert "SUCCESS" in command("mission run m.yaml --run s")
         assert "s: flying to (0.5, 0, 1.2); mission m2" in command("mission goto 0.5 0 1.2")
@@ -168,7 +166,7 @@ def test_a_session_flies_missions_and_reports_the_last_one(folder, figure):
 
 @pytest.mark.process
 @pytest.mark.parametrize("ended", [True, False])
-def test_a_session_that_ends_with_a_drive_has_its_report(folder, ended):
+def test_a_session_that_ends_with_a_drive_has_its_report(folder, command, ended):
     with up(folder) as process:
         api = Api(local.under_way()[folder / "s"])
         for velocity in [(0.0, 0.0, 0.5)] * 30 + [(0.0, 0.0, 0.0)]:
@@ -191,7 +189,7 @@ def test_a_session_that_ends_with_a_drive_has_its_report(folder, ended):
 
 @pytest.mark.process
 @pytest.mark.parametrize(("victim", "code"), [("cloud", 6), ("", -signal.SIGKILL)])
-def test_a_session_that_dies_in_flight_can_be_reported(folder, victim, code):
+def test_a_session_that_dies_in_flight_can_be_reported(folder, command, victim, code):
     with up(folder) as process:
         command("mission goto 0.5 0 1.2")
         until(lambda: "mission started" in (folder / "said").read_text())
@@ -211,7 +209,7 @@ def test_a_session_that_dies_in_flight_can_be_reported(folder, victim, code):
 
 
 @pytest.mark.process
-def test_a_session_without_a_mission_has_no_report(folder):
+def test_a_session_without_a_mission_has_no_report(folder, command):
     with up(folder) as process:
         assert "s: the session has not ended; end it: cloudrc down" in command("report s", code=2)
         assert command("down") == f"s: ended; no mission flew\n{USING}"
