@@ -130,7 +130,8 @@ def browse(chromium):
 
     At the end of the test, no page may have had an error or a request to another server.
     """
-    context = chromium.new_context(viewport={"width": 1280, "height": 800})
+    size = {"viewport": {"width": 1280, "height": 800}, "device_scale_factor": 0.5}
+    context = chromium.new_context(**size)  # a quarter of the pixels: a processor draws them
     errors, requests, own = [], [], []
 
     def open_page(url: str, **options: object):

@@ -94,7 +94,7 @@ def button(page, name):
 
 @pytest.fixture
 def page(browse, flight):
-    opened = browse(f"{flight[1]}/?fixedDpr=0.5")
+    opened = browse(f"{flight[1]}/?fixedDpr=0.25")
     opened.set_default_timeout(LIMIT * 1e3)
     button(opened, "STOP").wait_for()
     return opened
@@ -103,7 +103,7 @@ def page(browse, flight):
 def z_arrow(page):
     """Return the middle of the gizmo's blue arrow on the page [px]."""
     for _ in range(20):  # the scene appears slowly
-        picture = Image.open(io.BytesIO(page.screenshot(timeout=LIMIT * 1e3))).convert("RGB")
+        picture = Image.open(io.BytesIO(page.screenshot(timeout=LIMIT * 1e3, scale="css"))).convert("RGB")
         red, green, blue = np.moveaxis(np.asarray(picture, dtype=int)[:, 350:930], -1, 0)
         rows, columns = np.nonzero((blue > 200) & (red < 100) & (blue - green > 60))
         if len(rows) > 20:
@@ -173,7 +173,7 @@ def test_keys_drive_and_sliders_change_the_delay(flight, page, figure):
 def test_the_second_browser_reads_and_stop_works_under_load(browse, flight, page, figure):
     api, address, _ = flight
     api.post("/v1/goto", {"position_m": (0.0, 0.0, 0.8)})
-    second = browse(f"{address}/?fixedDpr=0.5")
+    second = browse(f"{address}/?fixedDpr=0.25")
     second.get_by_text("Read only").wait_for(timeout=LIMIT * 1e3)
     assert button(second, "STOP").count() == 0
     over = threading.Event()
