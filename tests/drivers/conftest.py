@@ -114,7 +114,7 @@ LIMIT = 30.0
 TOKEN = "operator-token-of-the-tests"
 KEY = bytes(range(100, 132))
 WAYPOINT = "  - {position_m: [0.5, %s, 0.7], tolerance_m: 0.2, dwell_s: 0.0}\n"
-MISSION = "waypoints:\n" + "".join(WAYPOINT % y for y in ("0.0", "3.6", "0.0"))
+MISSION = "waypoints:\n" + "".join(WAYPOINT % y for y in ("0.0", "3.6", "3.0"))
 
 
 class Release:

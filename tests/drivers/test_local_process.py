@@ -17,7 +17,7 @@ import pytest
 from cloudrc.drivers import local
 from cloudrc.record.columns import Recording
 from tests.conftest import nightly
-from tests.drivers.conftest import WITHOUT_PAGE, start, wait_until_flying
+from tests.drivers.conftest import FAST, WITHOUT_PAGE, start, wait_until_flying
 
 pytestmark = pytest.mark.process
 
@@ -77,7 +77,7 @@ def test_a_killed_supervisor_ends_all_and_leaves_a_recording(tmp_path):
     run.communicate()
     wait_until_ended(pids, 5.0)
     assert local.under_way() == {}, "nor does a file say that it flies"
-    subprocess.run([*COMMAND, "report", str(folder)], check=False, capture_output=True)
+    subprocess.run([*FAST, "report", str(folder)], check=False, capture_output=True)
     assert report(folder)["numbers"]["commands_applied"]["value"] > 10
     assert (folder / "mission.mcap").exists()
 
@@ -137,11 +137,11 @@ def test_an_operator_sets_the_link_of_a_run_and_cancels_it(tmp_path, figure):
     run = start(folder, dwell=30.0, command=COMMAND)
     wait_until_flying(run)
     assert json.loads((folder / "api.json").read_text())["url"] == local.under_way()[folder]
-    time.sleep(2.0)
+    time.sleep(1.0)
     for words in (CAUSE.split(", "), ["--profile", "handover"]):
         made = call(folder, "link", "set", *words, "-o", "json")
         took.append(json.loads(made.stdout)["seconds"])
-        time.sleep(2.0)
+        time.sleep(1.0)
     assert "INTERRUPTED" in call(folder, "mission", "cancel").stdout
     output, _ = run.communicate(timeout=60)
     assert run.returncode == 130

@@ -24,7 +24,7 @@ def release(tmp_path):
 def test_the_mission_goes_on_at_the_same_waypoint(release, killed):
     """Before, cloud stands still: nothing that it has computed before is flown."""
     release.fly()
-    release.freeze("cloud", 1.0)
+    release.freeze("cloud", 0.5)
     release.kill(*killed)
     for name in killed:
         release.start(name)

@@ -54,12 +54,12 @@ def test_whatever_a_file_does_the_other_parts_are_scored(tmp_path):
     (tmp_path / "delay_estimator.py").write_text("while True:\n    print('on and on')\n")
     (tmp_path / "predictor.py").write_text("import sys\nsys.exit('no')\n")
     (tmp_path / "controller.py").write_text("import os\nos._exit(0)\n")
-    rows = class_.check(tmp_path, limit=15.0)
+    rows = class_.check(tmp_path, limit=10.0)
     seen = {row["part"]: row["seen"] for row in rows}
     assert [row["test"] for row in rows] == [
         each[0] for part in checks.CHECKS.values() for each in part
     ]
-    assert seen["estimator"] == "delay_estimator.py: no end after 15 s"
+    assert seen["estimator"] == "delay_estimator.py: no end after 10 s"
     assert seen["predictor"] == "predictor.py:2: SystemExit: no"
     assert seen["controller"] == "controller.py: ended the process of the check"
     assert {row["points"] for row in rows} == {0.0}

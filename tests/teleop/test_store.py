@@ -131,8 +131,8 @@ from pathlib import Path
 from cloudrc.teleop.store import Order, open_store
 from cloudrc.teleop.wire import Leg, Plan
 store = open_store(Path(sys.argv[1]), b"")
-mission = store.add(Order(Plan(tuple(Leg((float(n), 0.0, 1.0)) for n in range(100_000)))))
-for n in range(100_000):
+mission = store.add(Order(Plan(tuple(Leg((float(n), 0.0, 1.0)) for n in range(10_000)))))
+for n in range(10_000):
     store.note(mission, "reached", "r", waypoint=n, elapsed=n / 2, world="w")
     print(n, flush=True)
 """

@@ -24,7 +24,7 @@ LINK += ["link.downlink.jitter_ms=30"]
 def test_an_honest_link_is_believed_unless_the_machine_delays_it():
     experiment = find_experiment("paper-p1", LINK)
     with run_link(experiment, "relay") as ways:
-        found = probe_link(ways, make_plans(experiment, 4.0, "relay"))
+        found = probe_link(ways, make_plans(experiment, 2.0, "relay"))
     codes = {cause.code for cause in find_causes(found)}
     for rows, known in found.values():
         if "throttled" not in codes:  # the suite runs on machines that do other things, too
@@ -37,7 +37,7 @@ def test_a_fault_is_named_on_the_command_line(capsys, monkeypatch):
     twice = {"delay_ms": 200.0, "jitter_ms": 40.0}, {"delay_ms": 160.0, "jitter_ms": 30.0}
     wrong = Profile.model_validate(dict(zip(("uplink", "downlink"), twice, strict=True)))
     monkeypatch.setattr(link_verify, "run_link", partial(run_link, applied=wrong))
-    words = ["link", "verify", "paper-p1", "--seconds", "4", "-o", "json"]
+    words = ["link", "verify", "paper-p1", "--seconds", "2", "-o", "json"]
     words += [word for value in LINK for word in ("--set", value)]
     assert main(words) == 1
     report = json.loads(capsys.readouterr().out)
