@@ -36,7 +36,7 @@ COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python
 DRAWING := glfw pyopengl mujoco-studio
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process e2e e2e-full test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types audit bench bench-link pictures results docs images kind-load lock clean
+.PHONY: help demo test process process-shared process-alone e2e e2e-full test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types audit bench bench-link pictures results docs images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -47,9 +47,15 @@ demo: $(VENV)/all ## fly the paper's mission in real time and write its report
 test: $(VENV)/dev ## run the default tests on all cores; of one part: make test T=tunnel
 	$(bin)/pytest -n auto $(PART)
 
-# Of the files that have such tests alone: to collect all tests takes a quarter of a minute.
-process: $(VENV)/dev ## run the tests that start processes and take real time
-	$(bin)/pytest -m 'process and not full' $(shell grep -rl --include='test_*.py' 'mark\.process' tests)
+# Only the files with such tests: to collect all tests takes a quarter of a minute.
+PROCESS = $(shell grep -rl --include='test_*.py' 'mark\.process' tests)
+process: process-shared process-alone ## run the tests that start processes and take real time
+
+process-shared: $(VENV)/dev
+	$(bin)/pytest -n 2 -m 'process and not alone and not full' $(PROCESS)
+
+process-alone: $(VENV)/dev
+	$(bin)/pytest -m 'process and alone and not full' $(PROCESS)
 
 # With KUBECONFIG set, the tests use that cluster and make and remove only their own objects.
 e2e: $(VENV)/dev ## fly on a new kind cluster, or on that of KUBECONFIG (KEEP=1 keeps it)

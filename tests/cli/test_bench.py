@@ -7,7 +7,8 @@ import sys
 import pytest
 
 
-@pytest.mark.process  # runs alone: other processes would take its caches
+@pytest.mark.process
+@pytest.mark.alone  # other processes would take its caches
 @pytest.mark.full
 def test_the_closed_loop_is_fast_enough_beside_raw_physics():
     command = [sys.executable, "-m", "cloudrc", "bench", "-o", "json", "--repeats", "5"]

@@ -131,6 +131,7 @@ def up(folder, *words):
 
 
 @pytest.mark.process
+@pytest.mark.alone
 def test_a_session_flies_missions_and_reports_the_last_one(folder, command, figure):
     began = time.monotonic()
     with up(folder) as process:

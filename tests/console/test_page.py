@@ -103,7 +103,8 @@ def page(browse, flight):
 def z_arrow(page):
     """Return the middle of the gizmo's blue arrow on the page [px]."""
     for _ in range(20):  # the scene appears slowly
-        picture = Image.open(io.BytesIO(page.screenshot(timeout=LIMIT * 1e3, scale="css"))).convert("RGB")
+        shot = page.screenshot(timeout=LIMIT * 1e3, scale="css")
+        picture = Image.open(io.BytesIO(shot)).convert("RGB")
         red, green, blue = np.moveaxis(np.asarray(picture, dtype=int)[:, 350:930], -1, 0)
         rows, columns = np.nonzero((blue > 200) & (red < 100) & (blue - green > 60))
         if len(rows) > 20:
@@ -113,6 +114,7 @@ def z_arrow(page):
 
 
 @pytest.mark.process
+@pytest.mark.alone
 def test_drag_and_send_moves_the_setpoint(flight, page):
     api, _, run = flight
     numbers = page.get_by_role("textbox")
@@ -147,6 +149,7 @@ def test_drag_and_send_moves_the_setpoint(flight, page):
 
 
 @pytest.mark.process
+@pytest.mark.alone
 def test_keys_drive_and_sliders_change_the_delay(flight, page, figure):
     api, _, _ = flight
     page.keyboard.down("KeyW")
@@ -170,6 +173,7 @@ def test_keys_drive_and_sliders_change_the_delay(flight, page, figure):
 
 
 @pytest.mark.process
+@pytest.mark.alone
 def test_the_second_browser_reads_and_stop_works_under_load(browse, flight, page, figure):
     api, address, _ = flight
     api.post("/v1/goto", {"position_m": (0.0, 0.0, 0.8)})

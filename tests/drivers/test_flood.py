@@ -56,6 +56,7 @@ def fly(folder, seconds):
 
 
 @pytest.mark.process
+@pytest.mark.alone
 @pytest.mark.promise("api-load-spares-the-loop")
 @pytest.mark.parametrize(
     ("seconds", "tries"), [(1.0, TRIES), pytest.param(4.0, 1, marks=pytest.mark.full)]

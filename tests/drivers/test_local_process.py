@@ -49,6 +49,7 @@ def wait_until_ended(pids, limit):
         time.sleep(0.02)
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("how", [signal.SIGINT, *nightly(signal.SIGTERM, signal.SIGHUP)])
 def test_ctrl_c_ends_all_processes_in_2_s_and_leaves_a_report(tmp_path, how):
     run = start(tmp_path / "run", command=COMMAND)
@@ -132,6 +133,7 @@ def call(folder, *words):
 CAUSE = "downlink.delay_ms=120, downlink.jitter_ms=0"
 
 
+@pytest.mark.alone
 def test_an_operator_sets_the_link_of_a_run_and_cancels_it(tmp_path, figure):
     folder, took = tmp_path / "run", []
     run = start(folder, dwell=30.0, command=COMMAND)

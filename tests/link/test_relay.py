@@ -186,6 +186,7 @@ def test_stamps_give_ages_and_a_drop_count_beyond_32_bits():
 
 
 @pytest.mark.process
+@pytest.mark.alone
 @pytest.mark.promise("link-follows-the-seed")
 @pytest.mark.parametrize("profile", ["lossy", "lte"])
 def test_a_relay_draws_the_virtual_sequence(profile):
@@ -198,6 +199,7 @@ def test_a_relay_draws_the_virtual_sequence(profile):
 
 
 @pytest.mark.process
+@pytest.mark.alone
 @pytest.mark.promise("link-changes-in-flight")
 def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(tmp_path):
     profile, draft = tmp_path / "profile.yaml", tmp_path / "draft"

@@ -21,6 +21,7 @@ LINK += ["link.downlink.jitter_ms=30"]
 
 
 @pytest.mark.process
+@pytest.mark.alone
 def test_an_honest_link_is_believed_unless_the_machine_delays_it():
     experiment = find_experiment("paper-p1", LINK)
     with run_link(experiment, "relay") as ways:
@@ -33,6 +34,7 @@ def test_an_honest_link_is_believed_unless_the_machine_delays_it():
 
 
 @pytest.mark.process
+@pytest.mark.alone
 def test_a_fault_is_named_on_the_command_line(capsys, monkeypatch):
     twice = {"delay_ms": 200.0, "jitter_ms": 40.0}, {"delay_ms": 160.0, "jitter_ms": 30.0}
     wrong = Profile.model_validate(dict(zip(("uplink", "downlink"), twice, strict=True)))
