@@ -285,6 +285,7 @@ class LocalRun:
         heard_from = time.monotonic()
         while teleop.process.poll() is None:
             self._see(self._listen())
+            now = time.monotonic()  # before the deadline looks for a pause: `now` contains none
             if deadline.passed():
                 raise TimedOutError(f"the flight was ended after {limit:g} s, its limit")
             if deadline.pause > paused:
@@ -294,7 +295,7 @@ class LocalRun:
                 heard_from, paused = time.monotonic(), deadline.pause
             self._check_alive()
             for child in self._children:
-                if time.monotonic() - max(child.heard, heard_from) > SILENCE_LIMIT:
+                if now - max(child.heard, heard_from) > SILENCE_LIMIT:
                     raise TimedOutError(
                         f"the {child.name} process was silent for {SILENCE_LIMIT:g} s and was "
                         f"ended; see {child.log}"
