@@ -21,10 +21,10 @@ TIMED = Direction(
 )
 
 
-def changed(time, direction, cause, age=0.0, *, time_line=None, uplink=True):
+def changed(time, direction, cause, age=0.0, *, uplink=True):
     conditions = json.dumps(direction.model_dump(mode="json", exclude_defaults=True))
-    line, measured = age if time_line is None else time_line, (0.0, 0.0, 0.0, math.nan)
-    return LinkChanged(at(time), uplink, "relay", cause, age, line, *measured, conditions)
+    measured = (0.0, 0.0, 0.0, math.nan)
+    return LinkChanged(at(time), uplink, "relay", cause, age, age, *measured, conditions)
 
 
 def subject_of(*changes, uplink=CALM, log=None):

@@ -6,7 +6,7 @@ profile in flight.
 
 from __future__ import annotations
 
-from math import inf, isnan, nan
+from math import inf, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -72,8 +72,7 @@ def parts(subject: Subject, *, uplink: bool) -> list[Part]:
             direction = Direction.model_validate_json(str(table["conditions"][row]))
         except ValueError:  # another version of cloudrc has recorded this flight
             continue
-        origin = seconds(table["stamp_ns"][row]) - table["time_line"][row]
-        origin = found[-1].origin if isnan(origin) else float(origin)  # NaN: of an old version
+        origin = float(seconds(table["stamp_ns"][row]) - table["time_line"][row])
         found.append(Part(float(begins[row]), origin, direction, str(table["cause"][row])))
     return found
 
