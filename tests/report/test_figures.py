@@ -37,7 +37,7 @@ def test_a_flight_without_data_is_drawn(name, end_ns):
 
 def test_figures_ignore_the_users_matplotlib_settings(monkeypatch):
     """matplotlib reads settings in the working folder, which may be a run from somebody else."""
-    monkeypatch.setattr("cloudrc.report.figures.NAMES", ("error",))
+    monkeypatch.setattr("cloudrc.report.figures.FIGURES", {"error": FIGURES["error"]})
     (picture,) = draw_all(subject_of(flown()))
     theirs = {"text.usetex": True, "axes.facecolor": "red", "lines.linestyle": ":"}
     with matplotlib.rc_context(theirs):
@@ -106,7 +106,7 @@ def test_the_largest_step_is_enlarged_in_its_own_panel():
 
 
 def test_text_stays_text_and_a_flight_in_real_time_has_a_date(monkeypatch):
-    monkeypatch.setattr("cloudrc.report.figures.NAMES", ("error",))
+    monkeypatch.setattr("cloudrc.report.figures.FIGURES", {"error": FIGURES["error"]})
     subject = replace(subject_of(flown()), look=Look(3.5, 8.0))
     (picture,) = draw_all(subject)
     assert b"<text" in picture.files["svg"]
