@@ -7,13 +7,15 @@ Messages are named tuples in SI units; creating a frozen dataclass would take fo
 - Frames: REP-103 (x forward, y left, z up). A vector is in the world frame unless its name ends in
   ``_body``.
 - Quaternions: ``wxyz``, as in MuJoCo.
+- ``Annotated[float, "s", "text"]``: a value in a topic of the recording, with its unit ("": none)
+  and its meaning.
 """
 
 from __future__ import annotations
 
 from enum import IntEnum
 from math import nan
-from typing import Any, NamedTuple, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 Vector: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -68,6 +70,14 @@ class Cause(IntEnum):
     NOT_OFF = 14, "not off the ground yet, rotors stopped"
 
 
+STATES = ", ".join(f"{state:d} {state.name}" for state in GuardState)
+CAUSES = "of the guard's state: " + "; ".join(f"{cause:d} {cause.words}" for cause in Cause)
+"""The values of `GuardState` and of `Cause`, in words."""
+Slip: TypeAlias = Annotated[int, "ns", "lag of world's clock behind the machine's monotonic clock"]
+MISSION_OVER = 0xFFFF
+"""Value of `reached` for a mission that has ended, above the largest number of waypoints."""
+
+
 class Start(IntEnum):
     """Place where a mission starts."""
 
@@ -96,10 +106,10 @@ class Odometry(NamedTuple):
     """Measured or true pose and twist of the robot's base at one time."""
 
     stamp_ns: int  # time of the measurement [ns], world's clock
-    position: Vector  # position of the base [m]
-    orientation_wxyz: Quaternion  # orientation of the base, unit quaternion, body to world
-    velocity: Vector  # velocity of the base [m/s]
-    angular_velocity_body: Vector  # angular velocity of the base [rad/s]
+    position: Annotated[Vector, "m", "of the base, world frame"]
+    orientation_wxyz: Annotated[Quaternion, "1", "of the base, body to world"]
+    velocity: Annotated[Vector, "m/s", "of the base, world frame"]
+    angular_velocity_body: Annotated[Vector, "rad/s", "of the base, body frame"]
 
 
 class Telemetry(NamedTuple):
@@ -109,19 +119,21 @@ class Telemetry(NamedTuple):
     time since world first applied it.
     """
 
-    stamp_ns: int  # stamp of the odometry [ns], world's clock
+    stamp_ns: Annotated[int, "ns", "stamp of its odometry, world's clock"]
     odometry: Odometry  # measured pose and twist, with sensor noise if configured
-    tip_force: float  # force on the touch sensor at the arm's tip [N]
-    echo_stamp_ns: int  # stamp of the newest applied command [ns], cloud's clock; else `NEVER_NS`
-    echo_hold_ns: int  # time since world first applied this command [ns]
-    slip_ns: int  # lag of world's clock behind its machine's monotonic clock [ns]
-    mission: int  # number of the last operator request that world carried out; 0 if none
-    guard: GuardState
-    pipe_contacts: int = 0  # number of contacts with pipes in this mission
-    touch_speed: float = nan  # of the tip at its first contact with the board [m/s]; else NaN
-    mission_id: int = 0  # mission that was started last, as in `OperatorRequest`; 0 if none
-    reached: int = 0  # waypoints reached in this mission, as far as world knows, or `MISSION_OVER`
-    cause: Cause = Cause.SPAWN  # of the guard's state; after touch-down in LAND, of the landing
+    tip_force: Annotated[float, "N", "on the arm's tip"]
+    echo_stamp_ns: Annotated[
+        int, "ns", "stamp of the newest command applied, cloud's clock; -1 if none"
+    ]
+    echo_hold_ns: Annotated[int, "ns", "time since world applied that command; 0 if none"]
+    slip_ns: Slip
+    mission: Annotated[int, "", "number of the last operator's request that world obeyed"]
+    guard: Annotated[GuardState, "", STATES]
+    pipe_contacts: Annotated[int, "", "contacts with a pipe that began in this mission"] = 0
+    touch_speed: Annotated[float, "m/s", "of the tip's first contact with the board, or NaN"] = nan
+    mission_id: Annotated[int, "", "identity of the mission started last; 0 if none"] = 0
+    reached: Annotated[int, "", f"waypoints reached; {MISSION_OVER} if the mission is over"] = 0
+    cause: Annotated[Cause, "", CAUSES] = Cause.SPAWN  # after touch-down in LAND, of the landing
 
 
 PLAN_STEP_NS = 10_000_000
@@ -157,10 +169,6 @@ class Command(NamedTuple):
         if step <= 0 or not self.plan:
             return self.velocity
         return self.plan[min(step, len(self.plan)) - 1]
-
-
-MISSION_OVER = 0xFFFF
-"""Value of `reached` for a mission that has ended, above the largest number of waypoints."""
 
 
 class OperatorRequest(NamedTuple):

@@ -3,13 +3,31 @@
 A record is a named tuple. `stamp_ns` is the time at which the record was made [ns], on the clock of
 world or cloud, whichever made it. `epoch` and `counter` identify a datagram, as in its header. Each
 docstring begins with the maker: world, cloud, or the driver, which runs one of them.
+
+Each value is a column of a topic (`cloudrc/record/topics.py`). Its annotation names the type, the
+unit ("" if it has none) and the meaning.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from typing import Annotated, NamedTuple, TypeAlias
 
-from cloudrc.messages import NEVER_NS, GuardState, Odometry, Quaternion, Telemetry, Vector
+from cloudrc.messages import (
+    NEVER_NS,
+    STATES,
+    GuardState,
+    Odometry,
+    Quaternion,
+    Slip,
+    Telemetry,
+    Vector,
+)
+
+Way: TypeAlias = Annotated[bool, "", "true for the uplink, false for the downlink"]
+Epoch: TypeAlias = Annotated[int, "", "epoch of its session"]
+Number: TypeAlias = Annotated[int, "", "counter in the datagram's header"]
+Basis: TypeAlias = Annotated[int, "ns", "stamp of the odometry used, world's clock"]
+End: TypeAlias = Annotated[str, "", "process that recorded the row: world, cloud or link"]
 
 
 class LinkChanged(NamedTuple):
@@ -21,16 +39,16 @@ class LinkChanged(NamedTuple):
     """
 
     stamp_ns: int
-    uplink: bool  # True for the uplink, False for the downlink
-    shaper: str  # "relay" or "netem"
-    cause: str  # why the conditions changed, in words; "" at the start
-    age: float  # time since these conditions took effect [s]
-    time_line: float  # time since the time line began [s]
-    delay: float  # requested one-way delay [s]
-    jitter: float  # requested jitter, as in the profile [s]
-    loss: float  # requested long-run loss, in [0, 1]
-    rate: float  # requested rate [bit/s]; NaN without a bottleneck
-    conditions: str  # all requested values as JSON, with the keys of a profile's file
+    uplink: Way
+    shaper: Annotated[str, "", "relay or netem"]
+    cause: Annotated[str, "", "why it changed; empty before the first change"]
+    age: Annotated[float, "s", "time since these conditions took effect"]
+    time_line: Annotated[float, "s", "time since the time line (changes, blackouts, trace) began"]
+    delay: Annotated[float, "s", "profile's delay at the start of the time line, one way"]
+    jitter: Annotated[float, "s", "profile's jitter at the start of the time line"]
+    loss: Annotated[float, "1", "profile's mean loss at the start of the time line"]
+    rate: Annotated[float, "bit/s", "profile's rate at the start of the time line, or NaN"]
+    conditions: Annotated[str, "", "the profile as JSON"]
 
 
 class LinkChecked(NamedTuple):
@@ -46,14 +64,14 @@ class LinkChecked(NamedTuple):
     """
 
     stamp_ns: int
-    uplink: bool  # True for the uplink, False for the downlink
-    quantity: str
-    asked: float  # value expected from the profile: a delay [s] or a share in [0, 1]
-    measured: float  # measured value [s] or [1], as `asked`
-    low: float  # lowest accepted value [s] or [1]
-    high: float  # highest accepted value [s] or [1]
-    verdict: str
-    datagrams: int  # number of datagrams behind the measurement
+    uplink: Way
+    quantity: Annotated[str, "", "mean, deviation, round_trip, loss, ..."]
+    asked: Annotated[float, "s or 1", "value expected from the profile: a delay or a share"]
+    measured: Annotated[float, "s or 1", "measured value: a delay or a share"]
+    low: Annotated[float, "s or 1", "lowest accepted value"]
+    high: Annotated[float, "s or 1", "highest accepted value"]
+    verdict: Annotated[str, "", "ok, off, or open (undecided); told: not judged"]
+    datagrams: Annotated[int, "", "number of datagrams measured"]
 
 
 REAL_TIME_FACTOR_MIN = 0.95
@@ -65,8 +83,8 @@ class TelemetrySent(NamedTuple):
     """Made by world: telemetry was sent. Topics /odometry and /telemetry."""
 
     stamp_ns: int
-    epoch: int
-    counter: int
+    epoch: Epoch
+    counter: Number
     telemetry: Telemetry
 
 
@@ -75,10 +93,10 @@ class GroundTruth(NamedTuple):
 
     stamp_ns: int
     odometry: Odometry  # true pose and twist
-    tip_force: float  # force on the touch sensor [N]
-    tip_force_peak: float  # largest force of all physics steps since the previous record [N]
-    tip_impulse: float  # integral of the force over time since the previous record [N s]
-    reference: Vector  # velocity that the guard gives to the low-level controller [m/s]
+    tip_force: Annotated[float, "N", "on the arm's tip"]
+    tip_force_peak: Annotated[float, "N", "largest of all physics steps since the row before"]
+    tip_impulse: Annotated[float, "N s", "force times time since the row before"]
+    reference: Annotated[Vector, "m/s", "after the guard's caps, world frame"]
 
 
 class Arrival(NamedTuple):
@@ -91,10 +109,10 @@ class Arrival(NamedTuple):
 
     stamp_ns: int
     uplink: bool  # True for telemetry at cloud, False for commands at world
-    epoch: int
-    counter: int
-    delay: float  # one-way delay [s]; NaN unless world and cloud can prove that they share a clock
-    used: bool  # True if the content was used; False if late, stale, repeated or rejected
+    epoch: Epoch
+    counter: Number
+    delay: Annotated[float, "s", "one way; NaN unless the ends share a clock"]
+    used: Annotated[bool, "", "true if it became the newest, false if late, repeated or refused"]
 
 
 class CommandApplied(NamedTuple):
@@ -104,19 +122,21 @@ class CommandApplied(NamedTuple):
     """
 
     stamp_ns: int
-    epoch: int
-    counter: int
-    basis_stamp_ns: int  # stamp of the odometry that the command is based on [ns], world's clock
-    velocity: Vector  # commanded velocity before the guard limits it [m/s]
-    planned_ns: int = NEVER_NS  # start of the command's plan [ns], world's clock
+    epoch: Epoch
+    counter: Number
+    basis_stamp_ns: Basis
+    velocity: Annotated[Vector, "m/s", "before the guard's caps, world frame"]
+    planned_ns: Annotated[
+        int, "ns", "time at which the plan begins, world's clock; -1 without a plan"
+    ] = NEVER_NS
 
 
 class GuardChange(NamedTuple):
     """Made by world: the guard changed its state. Topic /guard."""
 
     stamp_ns: int
-    state: GuardState  # the new state
-    cause: str  # why it changed, such as "command age 0.252 s above 0.250 s"
+    state: Annotated[GuardState, "", STATES]
+    cause: Annotated[str, "", "why, in words"]
 
 
 class Contact(NamedTuple):
@@ -126,47 +146,48 @@ class Contact(NamedTuple):
     """
 
     stamp_ns: int
-    body: str  # touched body of the scene, such as pipe_1, board, floor
-    position: Vector  # of the base [m]
-    velocity: Vector  # of the base [m/s]
-    tip_velocity: Vector  # of the arm's tip [m/s]
-    tip: bool  # True if the arm's tip touched the body, False if another part of the robot did
+    body: Annotated[str, "", "touched body of the scene: pipe_1, board, floor"]
+    position: Annotated[Vector, "m", "of the base, world frame"]
+    velocity: Annotated[Vector, "m/s", "of the base just before the contact, world frame"]
+    tip_velocity: Annotated[Vector, "m/s", "of the tip just before the contact, world frame"]
+    tip: Annotated[bool, "", "true if the arm's tip touched, false for any other part"]
 
 
 class SessionOpened(NamedTuple):
     """Made by world or cloud: a session began, and `epoch` is its number. Topic /session."""
 
     stamp_ns: int
-    end: str  # "world" or "cloud"
-    epoch: int  # the new epoch
-    cause: str  # why the session began: "cloud said hello", "mission starts from spawn"
+    end: End
+    epoch: Epoch
+    cause: Annotated[str, "", "why, in words"]
 
 
 class Control(NamedTuple):
     """Made by cloud: one period of the control loop.
 
-    Topics /estimated_odometry, /setpoint_position, /cmd_vel, /delay_estimate and /pid. Vectors are
-    in the world frame; the terms of the controller are per axis.
+    Topics /estimated_odometry, /setpoint_position, /cmd_vel, /delay_estimate and /pid. Position,
+    orientation and velocity are the prediction for the time `basis_stamp_ns + horizon`. The horizon
+    is the estimated delay, clamped.
     """
 
     stamp_ns: int
-    epoch: int
-    counter: int
-    basis_stamp_ns: int  # stamp of the odometry used [ns], world's clock
-    horizon: float  # prediction horizon [s]: the estimated delay, clamped
-    rtt: float  # round trip without the time that world held the command [s]; NaN before the first
-    loop_delay: float  # whole round trip, the paper's tau_n [s]; NaN before the first
-    measured: Vector  # position in the odometry used [m]
-    position: Vector  # predicted position for `basis_stamp_ns + horizon` [m]
-    orientation_wxyz: Quaternion  # predicted orientation, unit quaternion
-    velocity: Vector  # predicted velocity [m/s]
-    setpoint: Vector  # position of the setpoint [m]
-    waypoint: int  # index of the current waypoint; -1 if none
-    command: Vector  # commanded velocity [m/s]
-    yaw_rate: float  # commanded yaw rate [rad/s]
-    proportional: Vector  # proportional term [m/s]
-    integral: Vector  # integral term [m/s]
-    derivative: Vector  # derivative term [m/s]
+    epoch: Epoch
+    counter: Number
+    basis_stamp_ns: Basis
+    horizon: Annotated[float, "s", "time by which the odometry was predicted ahead"]
+    rtt: Annotated[float, "s", "last round trip without the time in world, or NaN"]
+    loop_delay: Annotated[float, "s", "round trip with the time in world: the paper's tau_n"]
+    measured: Annotated[Vector, "m", "position in the odometry used, world frame"]
+    position: Annotated[Vector, "m", "of the base, world frame"]
+    orientation_wxyz: Annotated[Quaternion, "1", "of the base, body to world"]
+    velocity: Annotated[Vector, "m/s", "of the base, world frame"]
+    setpoint: Annotated[Vector, "m", "position to fly to, world frame"]
+    waypoint: Annotated[int, "", "index of the waypoint flown to; -1 if none"]
+    command: Annotated[Vector, "m/s", "world frame"]
+    yaw_rate: Annotated[float, "rad/s", "about the world's z axis"]
+    proportional: Annotated[Vector, "m/s", "term per axis, world frame"]
+    integral: Annotated[Vector, "m/s", "term per axis, world frame"]
+    derivative: Annotated[Vector, "m/s", "term per axis, world frame"]
 
 
 BY_HAND = ("goto", "driving", "operator_lost")
@@ -189,9 +210,14 @@ class MissionEvent(NamedTuple):
     """
 
     stamp_ns: int
-    event: str
-    waypoint: int  # index of the waypoint that the event is about; -1 if none
-    text: str  # the event in words
+    event: Annotated[
+        str,
+        "",
+        "started, reached, held, resumed, goto, driving, operator_lost; at the end the outcome: "
+        f"done, cancelled, {', '.join(FAILURES)}",
+    ]
+    waypoint: Annotated[int, "", "index of the waypoint concerned; -1 if none"]
+    text: Annotated[str, "", "the event in words"]
 
 
 class Fault(NamedTuple):
@@ -202,28 +228,38 @@ class Fault(NamedTuple):
     """
 
     stamp_ns: int
-    code: str
-    text: str  # what is wrong, where, and what to do
-    traceback: str = ""  # of a plug-in's first failure; "" for another fault
+    code: Annotated[
+        str,
+        "",
+        "one word, for example estimator_failed, predictor_failed, controller_failed, recorder,"
+        " link_check, wall_clock, late",
+    ]
+    text: Annotated[str, "", "what is wrong, where, what to do"]
+    traceback: Annotated[str, "", "of a plug-in's first failure, else empty"] = ""
 
 
 class Counted(NamedTuple):
     """Made by world or cloud: the value of a counter, once a second. Topic /count."""
 
     stamp_ns: int
-    end: str  # "world", "cloud" or "link"
-    name: str  # such as "sent", "malformed", "late", "stale", "range"
-    total: int  # value since the start
+    end: End
+    name: Annotated[
+        str,
+        "",
+        "what is counted, for example received, sent, malformed, late, stale, repeated, old_epoch,"
+        " range, recorder_dropped",
+    ]
+    total: Annotated[int, "", "count since the start"]
 
 
 class Lateness(NamedTuple):
     """Made by the driver, in real time only: how late it handled a deadline. Topic /lateness."""
 
     stamp_ns: int
-    end: str  # "world" or "cloud"
-    lateness: float  # time from the deadline to the start of its handling [s]
-    busy: float  # duration of the handling [s]
-    slip_ns: int  # lag of world's clock behind its machine's clock [ns]; 0 for cloud
+    end: End
+    lateness: Annotated[float, "s", "time from the deadline to its handling"]
+    busy: Annotated[float, "s", "duration of the handling"]
+    slip_ns: Slip
 
 
 Record: TypeAlias = (

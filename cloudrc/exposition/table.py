@@ -12,7 +12,7 @@ from enum import Enum
 from types import MappingProxyType
 from typing import NamedTuple
 
-from cloudrc.messages import Cause
+from cloudrc.messages import Cause, GuardState
 from cloudrc.records import FAILURES
 
 WORLD, CLOUD, TELEOP, LINK = "world", "cloud", "teleop", "link"
@@ -33,8 +33,7 @@ ONLY_CLOUD = {"accept_ignored"}
 """Outcomes that only cloud counts."""
 LIMITS = ("speed", "yaw_rate", "fence")
 """Limits to which the guard restricts commands."""
-GUARD_STATES = ("ground", "track", "hold", "land", "estop")
-"""States of the guard, in the order of `cloudrc.messages.GuardState`."""
+GUARD_STATES = tuple(state.name.lower() for state in GuardState)
 GUARD_CAUSES = {cause: cause.words.partition(",")[0] for cause in Cause}
 """Cause of a guard's state -> value of the label `cause`, the first words of the cause."""
 MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cancelled")

@@ -11,34 +11,27 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from enum import IntEnum
-from functools import cache
 from itertools import chain, repeat
 from pathlib import Path
-from typing import Any, TypeAlias, get_args, get_origin, get_type_hints
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError
-from cloudrc.record.topics import TOPICS, Kind, Topic
+from cloudrc.record.topics import BY_SOURCE, TOPICS, Kind, Topic
 from cloudrc.records import Arrival, Record
 
 Column: TypeAlias = NDArray[Any]
-Columns: TypeAlias = dict[str, Any]
-"""Dotted path of a plain value in a record -> its column: an array of shape (n,), for vectors of
-shape (n, k), or a tuple of n strings."""
 Message: TypeAlias = tuple[str, int, bytes]
 """Topic, log time [ns] and CDR bytes of a message."""
-_Fields: TypeAlias = tuple[tuple[str, Any, int], ...]
 
 BLOCK = 200
-"""Number of records that are converted to columns together."""
+"""Number of waiting rows of a topic that are converted to columns together."""
 ROTATED = ("nav_msgs/msg/Odometry", "velocity")
 """ROS type and column of a value that a file stores in another frame, and thus rounds."""
-_CODES = {int: "<i8", float: "<f8", bool: "?", str: "s"}
 _TYPES: dict[Kind, tuple[type, tuple[int, ...]]] = {
     "int": (np.int64, ()),
     "float": (np.float64, ()),
@@ -56,14 +49,15 @@ class Table:
     object. The shape is (n, 3) for vectors, (n, 4) for quaternions, and (n,) for other columns.
     """
 
-    def __init__(self, topic: Topic, stamps_ns: Iterable[int], columns: Iterable[Any]) -> None:
-        """Store the rows' stamps [ns] and, for each field of the topic, the column of its values.
+    def __init__(self, topic: Topic, columns: Iterable[Any]) -> None:
+        """Store the column of the rows' stamps [ns], then a column for each field of the topic.
 
         Without columns, the table has no rows.
         """
-        self._columns = {"stamp_ns": _column("int", stamps_ns)}
-        for each, values in zip(topic.fields, chain(columns, repeat(())), strict=False):
-            self._columns[each.name] = _column(each.kind, values)
+        kinds = [("stamp_ns", "int"), *((field.name, field.kind) for field in topic.fields)]
+        self._columns = {}
+        for (name, kind), values in zip(kinds, chain(columns, repeat(())), strict=False):
+            self._columns[name] = _column(kind, values)
         self.topic = topic
 
     @property
@@ -82,8 +76,10 @@ class Table:
             raise KeyError(f"no column {name!r} in {self.topic.name}; it has: {known}") from None
 
 
-def _column(kind: Kind, values: Iterable[Any]) -> Column:
+def _column(kind: Kind, values: Any) -> Column:
     dtype, shape = _TYPES[kind]
+    if shape and not isinstance(values, np.ndarray):  # asarray takes three times as long
+        values = np.fromiter(chain.from_iterable(values), dtype)
     return np.asarray(values, dtype=dtype).reshape(-1, *shape)
 
 
@@ -176,86 +172,46 @@ class Recording:
     def _decode(self, topic: str) -> Table:
         messages = [data for name, _, data in self.messages if name == topic]
         if not messages:
-            return Table(TOPICS[topic], (), ())
+            return Table(TOPICS[topic], ())
         from cloudrc.record.ros import decode
 
         try:
-            stamps_ns, rows = zip(*[decode(TOPICS[topic], data) for data in messages], strict=True)
+            rows = [decode(TOPICS[topic], data) for data in messages]
         except Exception as error:  # rosbags may raise anything on malformed bytes
             raise BadInputError(
                 f"{self.source}: a message on {topic} is not readable; use the original file"
             ) from error
-        return Table(TOPICS[topic], stamps_ns, zip(*rows, strict=True))
+        return Table(TOPICS[topic], zip(*rows, strict=True))
 
 
 class RecordStore:
     """Keeps the records of a flight as columns, which take less memory than the records."""
 
     def __init__(self) -> None:
-        self._waiting: defaultdict[type, list[Record]] = defaultdict(list)
-        self._blocks: defaultdict[type, list[Columns]] = defaultdict(list)
+        self._waiting: defaultdict[type[Record], list[Record]] = defaultdict(list)
+        self._blocks: defaultdict[str, list[Table]] = defaultdict(list)  # by topic
 
     def add(self, from_world: Iterable[Record], from_cloud: Iterable[Record]) -> None:
         """Add the new records of world and of cloud, each oldest first."""
         for record in chain(from_world, from_cloud):
             self._waiting[type(record)].append(record)
-        for kind, block in self._waiting.items():
-            while len(block) >= BLOCK:
-                self._blocks[kind].append(_to_columns(kind, block[:BLOCK]))
-                del block[:BLOCK]
+        for kind in [kind for kind, waiting in self._waiting.items() if len(waiting) >= BLOCK]:
+            self._convert(kind)
+
+    def _convert(self, kind: type[Record]) -> None:
+        """Convert the waiting records of one class to a block for each of their topics."""
+        records = self._waiting.pop(kind, [])
+        for topic in BY_SOURCE[kind]:
+            chosen = filter(topic.contains, records) if kind is Arrival else records
+            columns = zip(*map(topic.row, chosen), strict=True)
+            self._blocks[topic.name].append(Table(topic, columns))
 
     def table(self, topic: Topic) -> Table:
         """Make the table of a topic; the stamps of all records must be on one clock."""
-        kind = topic.source
-        blocks = [*self._blocks[kind], _to_columns(kind, self._waiting[kind])]
-        stamps_ns, *columns = (_joined(blocks, path) for path in (topic.stamp_path, *topic.paths()))
-        if kind is Arrival:
-            rows = _joined(blocks, "uplink") == (topic.end == "cloud")
-        elif topic.end == "either":  # in the order of time, world's row first
-            rows = np.argsort(stamps_ns, kind="stable")
-        else:
-            return Table(topic, stamps_ns, columns)
-        return Table(topic, stamps_ns[rows], [column[rows] for column in columns])
-
-
-def _joined(blocks: list[Columns], path: str) -> Column:
-    parts = [block[path] for block in blocks]
-    if isinstance(parts[0], tuple):  # of strings
-        return np.array([*chain.from_iterable(parts)], dtype=object)
-    return np.concatenate(parts)
-
-
-def _to_columns(kind: type, records: Sequence[Record]) -> Columns:
-    """Convert n >= 0 records of one type to columns, in the order of the type's fields."""
-    found: Columns = {}
-    _convert(_fields(kind), "", records, found)
-    return found
-
-
-def _convert(
-    fields: _Fields, prefix: str, records: Sequence[tuple[Any, ...]], found: Columns
-) -> None:
-    count = len(records)
-    columns = zip(*records, strict=True) if count else repeat(())
-    for (name, kind, size), values in zip(fields, columns, strict=False):
-        if isinstance(kind, tuple):
-            _convert(kind, f"{prefix}{name}.", values, found)
-        elif size:
-            numbers = np.fromiter(chain.from_iterable(values), kind, size * count)
-            found[prefix + name] = numbers.reshape(count, size)
-        else:
-            found[prefix + name] = values if kind == "s" else np.fromiter(values, kind, count)
-
-
-@cache
-def _fields(cls: type) -> _Fields:
-    """List each field of a record: name, type, size of a vector (0 for other types)."""
-    found = list[tuple[str, Any, int]]()
-    for name, kind in get_type_hints(cls).items():
-        if hasattr(kind, "_fields"):
-            found.append((name, _fields(kind), 0))
-        elif get_origin(kind) is tuple:
-            found.append((name, "<f8", len(get_args(kind))))
-        else:
-            found.append((name, "<i8" if issubclass(kind, IntEnum) else _CODES[kind], 0))
-    return tuple(found)
+        self._convert(topic.source)
+        blocks = self._blocks[topic.name]
+        columns = [np.concatenate([block[name] for block in blocks]) for name in blocks[0].names]
+        if topic.end == "either":  # in the order of time, world's row first
+            order = np.argsort(columns[0], kind="stable")
+            columns = [column[order] for column in columns]
+        return Table(topic, columns)

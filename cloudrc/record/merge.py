@@ -162,31 +162,28 @@ def cut_to_last_mission(mission: Recording) -> bool:
     that the file is cut short from `mission.note`: the pod was still writing the file, but the
     mission is complete.
     """
-    began, ended, earlier = _last_mission(mission)
+    *before, (began, ended) = _missions(mission) or [(None, None)]
+    earlier = max((end for _, end in before if end is not None), default=-1)
     until = mission.messages[-1][1] if mission.messages else 0
-    whole = ended is not None and until > ended
-    first = max(began - BEFORE_NS, earlier + 1) if began is not None else 0
+    first = max((began or 0) - BEFORE_NS, earlier + 1)
     mission.keep(first, ended + AFTER_NS if ended is not None else until)
-    if whole:
-        mission.torn = ""
-    return whole
+    if ended is None or until <= ended:
+        return False
+    mission.torn = ""
+    return True
 
 
-def _last_mission(mission: Recording) -> tuple[int | None, int | None, int]:
-    """Return start and end [ns] of the last mission, and end [ns] of the mission before.
-
-    Start or end is None if its event is missing; the last value is -1 without an earlier mission.
-    """
-    began, ended, earlier = None, None, -1
+def _missions(mission: Recording) -> list[tuple[int | None, int | None]]:
+    """List start and end of each mission by log time [ns]; None if the event is missing."""
+    found = list[tuple[int | None, int | None]]()
     # The log time of an event is later than its stamp.
     logged_ns = [message[1] for message in mission.messages if message[0] == "/mission"]
     for time_ns, event in zip(logged_ns, mission["/mission"]["event"], strict=True):
+        over = event not in UNDER_WAY
         if event == "started":
-            began, ended, earlier = time_ns, None, earlier if ended is None else ended
-        elif event not in UNDER_WAY and ended is None:
-            ended = time_ns
-        elif event in UNDER_WAY and ended is not None:
-            # The start of this mission is lost: keep all that is after the earlier mission's end.
-            began, earlier = ended + 1, ended
-            ended = None
-    return began, ended, earlier
+            found.append((time_ns, None))
+        elif not found or (found[-1][1] is not None and not over):  # its start is lost
+            found.append((None, None))
+        if over and found[-1][1] is None:
+            found[-1] = found[-1][0], time_ns
+    return found

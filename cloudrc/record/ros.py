@@ -20,7 +20,7 @@ import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from cloudrc.messages import Quaternion, Vector
-from cloudrc.record.topics import TOPICS, VIEWS, Kind, Topic, Values
+from cloudrc.record.topics import TOPICS, VIEWS, Kind, Row, Topic, Values
 
 _OURS = "cloudrc_msgs/"
 _ROS_NAMES: dict[Kind, str] = {
@@ -98,9 +98,9 @@ _PointStamped = _type["geometry_msgs/msg/PointStamped"]
 _NO_COVARIANCE = np.zeros(36)
 
 
-def encode(topic: Topic, stamp_ns: int, values: Values) -> bytes:
-    """Encode stamp [ns] and values of a row as little-endian CDR with encapsulation header."""
-    message = _CODECS[topic.name][0](header(stamp_ns), values)
+def encode(topic: Topic, row: Row) -> bytes:
+    """Encode a row as little-endian CDR with encapsulation header."""
+    message = _CODECS[topic.name][0](header(row[0]), row[1:])
     return bytes(STORE.serialize_cdr(message, topic.ros_type, little_endian=True))
 
 
@@ -120,11 +120,11 @@ def header(stamp_ns: int, frame: str = "world") -> Any:
     return _Header(_Time(*divmod(stamp_ns, _SECOND_NS)), frame)
 
 
-def decode(topic: Topic, data: bytes) -> tuple[int, Values]:
-    """Decode CDR bytes with encapsulation header to stamp [ns] and values of a row."""
+def decode(topic: Topic, data: bytes) -> Row:
+    """Decode CDR bytes with encapsulation header to a row."""
     message: Any = STORE.deserialize_cdr(data, topic.ros_type)
     stamp = message.header.stamp
-    return stamp.sec * _SECOND_NS + stamp.nanosec, _CODECS[topic.name][1](message)
+    return stamp.sec * _SECOND_NS + stamp.nanosec, *_CODECS[topic.name][1](message)
 
 
 def shifted(data: bytes, offset_ns: int) -> bytes:

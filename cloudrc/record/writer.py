@@ -27,7 +27,7 @@ from cloudrc import __version__
 from cloudrc.files import atomic_file
 from cloudrc.record import WALL_OFFSET, wall_time
 from cloudrc.record.ros import definition, encode, type_hash
-from cloudrc.record.topics import TOPICS, VIEWS, rows
+from cloudrc.record.topics import TOPICS, VIEWS, topics_of
 from cloudrc.records import Record
 
 if TYPE_CHECKING:
@@ -99,8 +99,9 @@ class McapWriter:
     def write(self, records: Iterable[Record]) -> None:
         """Write all rows of `records`, oldest first; the log time of a row is its stamp."""
         for record in records:
-            for topic, stamp_ns, values in rows(record):
-                self.write_message(topic, stamp_ns, encode(TOPICS[topic], stamp_ns, values))
+            for topic in topics_of(record):
+                row = topic.row(record)
+                self.write_message(topic.name, row[0], encode(topic, row))
             self._open_records += 1
 
     def write_message(self, topic: str, log_time_ns: int, data: bytes) -> None:

@@ -7,7 +7,6 @@ import pytest
 
 from cloudrc.exposition import table
 from cloudrc.exposition.table import METRICS, Kind
-from cloudrc.messages import GuardState
 from cloudrc.teleop.wire import QUEUED, STATES
 from tools.docs import OPEN
 
@@ -28,7 +27,6 @@ def test_a_metric_keeps_the_rules(metric):
 
 
 def test_states_and_bodies_are_those_of_the_robot():
-    assert tuple(state.name.lower() for state in GuardState) == table.GUARD_STATES
     assert {"idle", *STATES.values()} == {QUEUED, *table.MISSION_STATES}
     scenes = (ROOT / "cloudrc" / "world" / "scenes").glob("*.xml")
     bodies = {

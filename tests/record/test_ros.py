@@ -11,7 +11,7 @@ from cloudrc.record.topics import TOPICS
 
 def standard(topic, stamp_ns, values):
     """Encode a row, and decode it as a ROS 2 tool that knows only the standard types."""
-    data = encode(TOPICS[topic], stamp_ns, values)
+    data = encode(TOPICS[topic], (stamp_ns, *values))
     return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(data, TOPICS[topic].ros_type)
 
 
@@ -34,7 +34,7 @@ def test_rows_are_converted_to_the_conventions_of_ros():
     predicted = standard("/estimated_odometry", 0, values[:3]).twist.twist
     assert math.isnan(predicted.angular.z), "it is not predicted"
     fault = TOPICS["/fault"]
-    assert decode(fault, encode(fault, 0, ("bad_name", "file \udcff", "")))[1][1] == "file ?"
+    assert decode(fault, encode(fault, (0, "bad_name", "file \udcff", "")))[2] == "file ?"
     twist = standard("/cmd_vel", 1, ((1.0, 2.0, 3.0), 0.4)).twist
     assert (xyz(twist.linear), xyz(twist.angular)) == ((1.0, 2.0, 3.0), (0.0, 0.0, 0.4))
 

@@ -21,10 +21,10 @@ TIMED = Direction(
 )
 
 
-def changed(time, direction, cause, age=0.0, *, time_line=None, uplink=True):
+def changed(time, direction, cause, age=0.0, *, uplink=True):
     conditions = json.dumps(direction.model_dump(mode="json", exclude_defaults=True))
-    line, measured = age if time_line is None else time_line, (0.0, 0.0, 0.0, math.nan)
-    return LinkChanged(at(time), uplink, "relay", cause, age, line, *measured, conditions)
+    measured = (0.0, 0.0, 0.0, math.nan)
+    return LinkChanged(at(time), uplink, "relay", cause, age, age, *measured, conditions)
 
 
 def subject_of(*changes, uplink=CALM, log=None):
@@ -67,7 +67,7 @@ def test_a_time_line_starts_at_its_change_and_ends_at_the_next():
     assert band(subject, 1.5, uplink=False)[0] == pytest.approx(0.05), "the other way stays"
     assert low(subject, 0.5, 1.5, 4.5) == pytest.approx([0.05, 0.02, 0.05])
     assert bounds(subject, np.array([2.5]), uplink=True) is None, "in its blackout"
-    said = "set in flight (1: profile timed, at 1.0 s; 2: profile calm, at 4.0 s)."
+    said = "set in flight (profile timed, at 1.0 s; profile calm, at 4.0 s)."
     assert said in legend(subject)
 
 

@@ -21,6 +21,7 @@ from cloudrc.record.merge import merge
 from cloudrc.record.reader import recover
 from cloudrc.record.writer import COUNTS
 from cloudrc.report.document import clock_offset_document, write_json
+from cloudrc.report.figures import FIGURES
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
 from tests.metrics.conftest import flown
@@ -174,7 +175,7 @@ def test_a_failed_write_leaves_no_trace(theirs):
 
 
 def test_a_report_follows_no_link(theirs, mine, tmp_path, monkeypatch):
-    monkeypatch.setattr("cloudrc.report.figures.NAMES", ("error",))
+    monkeypatch.setattr("cloudrc.report.figures.FIGURES", {"error": FIGURES["error"]})
     (theirs / "config.yaml").write_text("seed: 1")
     write(theirs / "world.mcap", world_records(20))
     write(theirs / "cloud.mcap", cloud_records(20))

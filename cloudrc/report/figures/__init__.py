@@ -29,7 +29,6 @@ FIGURES: dict[str, tuple[Draw, Write, str]] = {
 }
 """Name of a figure -> function that draws the figure, function that returns the caption, text for
 readers who cannot see the figure. The figures of the paper are delay, odom and error."""
-NAMES = tuple(FIGURES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +52,7 @@ def draw_all(subject: Subject) -> list[Picture]:
     flown = wall_time(subject.flight.recording.metadata, subject.flight.start_ns or 0)
     pictures = []
     with own_settings(subject.look):
-        for name in NAMES:
-            draw, caption, alt = FIGURES[name]
+        for name, (draw, caption, alt) in FIGURES.items():
             figure = draw(subject)
             place_labels(figure)
             files = {kind: save(figure, kind, flown) for kind in ("pdf", "png", "svg")}

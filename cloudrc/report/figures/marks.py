@@ -6,7 +6,7 @@ profile in flight.
 
 from __future__ import annotations
 
-from math import inf, isnan, nan
+from math import inf, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +19,6 @@ from cloudrc.link.profile import Timeline
 from cloudrc.metrics.flight import Array
 from cloudrc.metrics.mission import holds
 from cloudrc.report.figures import style
-from cloudrc.report.figures.labels import free_label
 from cloudrc.report.figures.style import Subject
 
 SAME_CAUSE = 1.0
@@ -73,8 +72,7 @@ def parts(subject: Subject, *, uplink: bool) -> list[Part]:
             direction = Direction.model_validate_json(str(table["conditions"][row]))
         except ValueError:  # another version of cloudrc has recorded this flight
             continue
-        origin = seconds(table["stamp_ns"][row]) - table["time_line"][row]
-        origin = found[-1].origin if isnan(origin) else float(origin)  # NaN: of an old version
+        origin = float(seconds(table["stamp_ns"][row]) - table["time_line"][row])
         found.append(Part(float(begins[row]), origin, direction, str(table["cause"][row])))
     return found
 
@@ -109,22 +107,16 @@ def set_in_flight(subject: Subject) -> list[tuple[float, str]]:
 
 def legend(subject: Subject) -> str:
     """Explain the marks in a flight's figures (HOLD, changes of the link); "" if none."""
-    changes = [
-        f"{number}: {cause}, at {begin:.1f} s"
-        for number, (begin, cause) in enumerate(set_in_flight(subject), start=1)
-    ]
+    changes = [f"{cause}, at {begin:.1f} s" for begin, cause in set_in_flight(subject)]
     text = HELD if holds(subject.flight) else ""
     if changes:
-        text += f" Triangles: the link was set in flight ({'; '.join(changes)})."
+        text += f" Vertical lines: the link was set in flight ({'; '.join(changes)})."
     return text
 
 
 def mark_events(axes: Axes, subject: Subject) -> None:
-    """Draw the marks: HOLD shaded, and a triangle with a line for each change of the link."""
+    """Draw the marks: HOLD shaded, and a vertical line for each change of the link."""
     for begin, end in map(subject.flight.seconds, np.reshape(holds(subject.flight), (-1, 2))):
         axes.axvspan(begin, end, color=style.VERMILION, alpha=0.15, lw=0, zorder=0.5)
-    place, colour = axes.get_xaxis_transform(), style.PURPLE
-    for number, (instant, _) in enumerate(set_in_flight(subject)):
-        axes.axvline(instant, color=colour, lw=0.8, zorder=2.5)
-        axes.plot(instant, 1.0, "v", ms=6.5, mew=0, color=colour, transform=place, clip_on=False)
-        free_label(axes, str(number + 1), (instant, 1.0), xycoords=place, color=colour)
+    for instant, _ in set_in_flight(subject):
+        axes.axvline(instant, color=style.PURPLE, lw=1.2, zorder=2.5)
