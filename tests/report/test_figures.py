@@ -87,22 +87,25 @@ def test_no_label_of_a_figure_lies_on_a_curve(name, width):
         assert covered(figure) == []
 
 
-def test_the_largest_step_is_enlarged_in_its_own_panel():
-    log, step = flown(), 2_000_000_000
+@pytest.mark.parametrize("every", [2_000, 150], ids=["one step", "no room"])
+def test_the_inset_of_a_step_has_a_place_without_curves(every):
+    log, step = flown(), every * 1_000_000
     for n, record in enumerate(log.cloud):
         if isinstance(record, Control):
             to = (5.0 * ((record.stamp_ns - START) // step % 2), 0.0, 0.7)
             log.cloud[n] = record._replace(setpoint=to)
+    subject = subject_of(log)
     with own_settings(Look()):
-        *rows, zoom = FIGURES["odom"][0](subject_of(log)).axes
-    assert len(rows) == 3
-    (setpoint, measured, _) = zoom.lines
-    begin, end = zoom.get_xlim()
-    time, values = setpoint.get_data()
-    assert np.ptp(values[(time >= begin) & (time <= end)]) == 5.0
-    low, high = zoom.get_ylim()
-    shown = measured.get_ydata()[(time >= begin) & (time <= end)]
-    assert low < shown.min() <= shown.max() < high
+        figure = FIGURES["odom"][0](subject)
+        place_labels(figure)
+        ((axes, inset),) = [(a, i) for a in figure.axes for i in a.child_axes]
+    points, box = samples(figure, axes), inset.get_tightbbox()
+    assert not ((points > box.min) & (points < box.max)).all(axis=1).any()
+    begin, end = inset.get_xlim()
+    control = subject.flight.control
+    time = subject.flight.seconds(control["stamp_ns"])
+    shown = control["setpoint"][(time >= begin) & (time <= end)]
+    assert np.abs(np.diff(shown, axis=0)).max() > 0.2, "a step is in it"
 
 
 def test_text_stays_text_and_a_flight_in_real_time_has_a_date(monkeypatch):

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
 from cloudrc.metrics.control import round_trips
-from cloudrc.metrics.flight import Array, Columns, rms
+from cloudrc.metrics.flight import Array, rms
 from cloudrc.report.figures import style
+from cloudrc.report.figures.labels import is_free
 from cloudrc.report.figures.marks import bounds, mark_events
 from cloudrc.report.figures.style import Subject, dots, legend_above, new_figure, panel
 
@@ -98,17 +101,18 @@ def _time_axis(axes: Axes, subject: Subject) -> None:
     axes.set_xlabel(TIME)
 
 
-ODOM_ALT = "Line plots of the x, y and z position over time: reference, measured, estimated."
+ODOM_ALT = "Three line plots of the x, y and z position over time: reference, measured, estimated."
 ODOM = (
     "Position per axis, as cloud knew it. Reference: the setpoint that the controller tracks. "
     "Measured: the newest odometry that had arrived. Estimated: the prediction from which the "
-    "command was computed. Panel (d), if any, enlarges the grey part of the panel above: the "
-    "largest step."
+    "command was computed. The inset enlarges the part in the grey box: one step."
 )
 ZOOM, BEFORE = 1.2, 0.1
-"""Duration that panel (d) shows, and how long before the step it begins [s]."""
+"""Duration that the inset shows enlarged, and how long before the step it begins [s]."""
 STEP_MIN = 0.2
-"""Smallest step of the setpoint that panel (d) enlarges [m]."""
+"""Smallest step of the setpoint that the inset enlarges [m]."""
+HEIGHTS = (0.85, 0.7, 0.55)
+"""Heights of the inset, as shares of a panel; the first that fits is used."""
 LINES: dict[str, dict[str, Any]] = {
     "setpoint": {
         **{"label": "reference", "color": style.REFERENCE},
@@ -121,45 +125,75 @@ LINES: dict[str, dict[str, Any]] = {
 
 
 def draw_odom(subject: Subject) -> Figure:
-    """Draw reference, measured and estimated position, one panel per axis, and the largest step."""
-    flight, control = subject.flight, subject.flight.control
-    time, jumps = flight.seconds(control["stamp_ns"]), np.abs(np.diff(control["setpoint"], axis=0))
-    has_step = bool(jumps.max(initial=0.0) > STEP_MIN)
-    figure = new_figure(4.2 + 1.5 * has_step, subject.look.width)
-    rows = figure.subplots(3 + has_step, 1)
-    for index, (axes, name) in enumerate(zip(rows, "xyz", strict=False)):
+    """Draw reference, measured and estimated position, one panel per axis."""
+    figure, control = new_figure(4.2, subject.look.width), subject.flight.control
+    time = subject.flight.seconds(control["stamp_ns"])
+    rows = figure.subplots(3, 1, sharex=True)
+    for index, (axes, name) in enumerate(zip(rows, "xyz", strict=True)):
         panel(axes, "abc"[index])
         for column, look in LINES.items():
             axes.plot(time, control[column][:, index], **look)
         mark_events(axes, subject)
         axes.set_ylabel(f"${name}$ (m)")
         axes.margins(y=0.12)
-        _time_axis(axes, subject)
-    for axes in rows[:2]:
-        axes.sharex(rows[2])
-        axes.set_xlabel("")
-        axes.tick_params(labelbottom=False)
+    _time_axis(rows[-1], subject)
     legend_above(rows[0], 3)
-    if has_step:
-        row, axis = np.unravel_index(jumps.argmax(), jumps.shape)
-        begin = time[row + 1] - BEFORE
-        rows[axis].axvspan(begin, begin + ZOOM, color=style.LIGHT, lw=0, zorder=0)
-        _draw_step(rows[3], time - time[row + 1], {c: control[c][:, axis] for c in LINES})
-        rows[3].set_ylabel(f"${'xyz'[axis]}$ (m)")
     figure.align_ylabels(rows)
+    _draw_inset(rows, subject)
     return figure
 
 
-def _draw_step(axes: Axes, time: Array, columns: Columns) -> None:
-    """Enlarge one step in `columns`, positions [m]; `time` is the time since the step [s]."""
-    panel(axes, "d", "largest step")
-    inside = (time >= -BEFORE) & (time <= ZOOM - BEFORE)
-    for column, look in LINES.items():
-        axes.plot(time, columns[column], **look)
-    shown = np.concatenate([columns[name][inside] for name in ("measured", "position")])
+def _draw_inset(rows: Any, subject: Subject) -> None:
+    """Draw an inset that enlarges a large step of the setpoint, in a free place of its panel."""
+    control = subject.flight.control
+    time, jumps = subject.flight.seconds(control["stamp_ns"]), np.diff(control["setpoint"], axis=0)
+    largest = np.argsort(-np.abs(jumps), axis=None)[:9]
+    steps = np.transpose(np.unravel_index(largest, jumps.shape)).tolist()
+    steps = [(row, axis) for row, axis in steps if abs(jumps[row, axis]) > STEP_MIN]
+    if not steps:
+        return
+    width = 0.34 if subject.look.width < style.NARROW else 0.24
+    for height, (row, axis) in product(HEIGHTS, steps):
+        box = _free_box(rows[axis], time[row], width, height)
+        if box is not None:
+            break
+    else:
+        row, axis = steps[0]
+        low, high = rows[axis].get_ylim()
+        rows[axis].set_ylim(low, high + 1.2 * (high - low))
+        box = Bbox.from_bounds(0.3, 0.48, width, 0.5)
+    begin = time[row] - BEFORE
+    inside = (time >= begin) & (time <= begin + ZOOM)
+    shown = np.concatenate([control[name][inside, axis] for name in ("measured", "position")])
     room = 0.1 * np.ptp(shown) + 1e-3
-    axes.set(xlim=(-BEFORE, ZOOM - BEFORE), ylim=(shown.min() - room, shown.max() + room))
-    axes.set_xlabel("time since the step (s)")
+    # The numbers of the inset are inside the box, too.
+    left, low = box.x0 + 0.2 * width, box.y0 + 0.14
+    inset = rows[axis].inset_axes((left, low, box.x1 - left, box.y1 - low))
+    for name, look in LINES.items():
+        inset.plot(time, control[name][:, axis], **look)
+    inset.set(xlim=(begin, begin + ZOOM), ylim=(shown.min() - room, shown.max() + room))
+    inset.locator_params(nbins=3)
+    inset.tick_params(labelsize="x-small", pad=1.5, length=2.0)
+    inset.spines[:].set_visible(True)
+    mark = rows[axis].indicate_inset_zoom(inset, edgecolor=style.GREY, lw=0.8)
+    for connector in mark.connectors:  # they would cross the curves
+        connector.set_visible(False)
+
+
+def _free_box(axes: Axes, time: float, width: float, height: float) -> Bbox | None:
+    """Find a place near `time` [s] for a box that no curve crosses; return None if there is none.
+
+    `width` and `height` of the box are shares of the panel.
+    """
+    to_axes = axes.transData - axes.transAxes
+    paths = [to_axes.transform_path(line.get_path()) for line in axes.lines]
+    at = to_axes.transform((time, 0.0))[0]
+    lefts = sorted(np.linspace(0.01, 0.99 - width, 60), key=lambda x: abs(x + width / 2 - at))
+    for x, y in product(lefts, np.linspace(0.98 - height, 0.02, 6)):
+        box = Bbox.from_bounds(x, y, width, height)
+        if is_free(box, paths, np.zeros((0, 2))):
+            return box
+    return None
 
 
 ERROR_ALT = "Two line plots over time: distance to the setpoint, and the error of the estimate."
