@@ -12,11 +12,13 @@ docs/python.md describes the API; other modules may change without notice.
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from cloudrc import metrics
+from cloudrc.advice import advise
 from cloudrc.config.load import dump, load_experiment
 from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Columns
@@ -81,6 +83,9 @@ def fly(
             A value may be a list or a mapping.
         seed: Random seed; with None, the seed in the experiment.
 
+    Settings that do not fit together, such as a delay that the guard does not allow, cause a Python
+    warning before the flight.
+
     Returns:
         The result, also if the mission failed.
 
@@ -94,6 +99,8 @@ def fly(
     ]
     resolved = load_experiment(experiment, texts)
     metrics.check(resolved.report.metrics)
+    for text in advise(resolved):
+        warnings.warn(text, stacklevel=2)
     found = fly_in_memory(resolved)
     return Result(
         verdict=found.verdict.outcome,

@@ -6,14 +6,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cloudrc import plugins
 from cloudrc.sweep.statistics import median_interval
 from tests.conftest import nightly
-from tests.flights.conftest import fly
+from tests.flights.conftest import both_ways, fly, numbers
 from tools.results import fly as fly_sweep
 from tools.results import results
 
 LINKS = "paper-p1", "paper-p2", "paper-p3"
-PREDICTORS = "constant_acceleration", "constant_velocity", "commanded_velocity", "last_sample"
+PREDICTORS = plugins.names("predictors")
+STEPPED = (
+    "link.profile=ideal",
+    *both_ways(
+        delay_ms=20,
+        changes="[{at_s: 10, delay_ms: 70}, {at_s: 20, delay_ms: 20}, {at_s: 30, delay_ms: 70}]",
+    ),
+)
 
 
 @pytest.mark.full
@@ -38,6 +46,22 @@ def test_the_mission_over_a_satellite_needs_a_predictor(predictor, done):
 
 @pytest.mark.full
 @pytest.mark.parametrize("profile", LINKS)
+def test_the_mission_with_low_gains_needs_no_predictor(profile):
+    settings = f"link.profile={profile}", "cloud.predictor=last_sample"
+    flights = [fly("paper", *settings, f"seed={n}") for n in range(1, 11)]
+    assert [flight.verdict.outcome for flight in flights] == ["success"] * 10
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("limit", "error_mm"), [(0.10, 32.5), (0.30, 0.07)])
+def test_the_hover_is_as_far_from_its_setpoint_as_the_readme_says(limit, error_mm):
+    flight = fly("hover", f"world.low_level.integral_limit_xy={limit}")
+    error = numbers(flight)["steady_error_x"] * 1e3
+    assert error == pytest.approx(error_mm, abs=0.005 if error_mm < 1 else 0.05)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("profile", LINKS)
 @pytest.mark.parametrize("predictor", PREDICTORS)
 def test_the_steps_succeed_with_every_predictor(profile, predictor):
     settings = f"link.profile={profile}", f"cloud.predictor={predictor}"
@@ -55,17 +79,18 @@ def test_high_gains_without_a_predictor_are_unstable(seed):
 @pytest.mark.parametrize(
     "case",
     nightly(
-        ("steps", "running_mean", 1.0, 21.0),
-        ("steps", "split", 2.0, 15.3),
-        ("paper-verbatim", "running_mean", 1.0, 34.0),
+        ("steps", "running_mean", ("link.profile=paper-p3",), 1.0, 21.0),
+        ("steps", "split", ("link.profile=paper-p3",), 2.0, 15.25),
+        ("steps", "split", STEPPED, 2.0, 9.4),
+        ("paper-verbatim", "running_mean", ("link.profile=paper-p3",), 1.0, 34.0),
     ),
 )
 def test_the_delay_estimate_has_no_bias(case):
     """Check mean and RMS of the estimate's error [ms], over seeds 1 to 3, after the first echo."""
-    experiment, estimator, bias_max, rms_max = case
+    experiment, estimator, link, bias_max, rms_max = case
     biases, squares = [], []
     for seed in (1, 2, 3):
-        settings = ("link.profile=paper-p3", f"cloud.estimator={estimator}", f"seed={seed}")
+        settings = (*link, f"cloud.estimator={estimator}", f"seed={seed}")
         applied = fly(experiment, *settings).flight.applied
         delay_ms = (applied["stamp_ns"] - applied["basis_stamp_ns"]) * 1e-6
         errors = (applied["horizon"] * 1e3 - delay_ms)[np.isfinite(applied["rtt"])]

@@ -35,6 +35,8 @@ examples:
     cloud.predictor=constant_acceleration --set link.profile=paper-p3
   cloudrc compare cloud.predictor=last_sample \\
     cloud.predictor=constant_velocity,cloud.estimator=split --number iae_mean
+  cloudrc compare cloud.estimator=running_mean cloud.estimator=split \\
+    --set link.profile=handover --number delay_estimate_error_rms
   cloudrc compare last_sample constant_velocity --in runs/sweep-steps-1"""
 TITLES = (
     *("number", "A median", "B median", "B - A", "95 % interval", "B lower in", "p", "decided"),
@@ -94,9 +96,8 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
 
     Return the pairs of flights; why the work ended early, or ""; and the exit code.
     """
-    from cloudrc.cli.advice import warn
     from cloudrc.cli.progress import SweepView
-    from cloudrc.cli.run import load, refuse_seed
+    from cloudrc.cli.run import load, refuse_seed, warn
     from cloudrc.sweep.compare import Found, Pair, check_names
     from cloudrc.sweep.flight import fly_point, units
 

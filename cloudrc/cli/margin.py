@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import closing
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from cloudrc.cli.advice import simulate_ages
+from cloudrc.advice import simulate_ages
 from cloudrc.cli.compare import flight_arguments
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.output import output_argument, print_or_drop, print_result

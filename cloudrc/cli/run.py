@@ -14,7 +14,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from cloudrc.cli.advice import warn
+from cloudrc.advice import advise
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
 from cloudrc.cli.extras import MODES, missing, require
 from cloudrc.cli.find_run import RUNS
@@ -51,6 +51,8 @@ Ready = Callable[[Path, Callable[[str], None], contextlib.ExitStack, str, dict[s
 """Function that a session calls when it is ready. Arguments: the run's folder, a function that
 prints a line, a stack that closes at the end, the API's URL, process -> HOST:PORT of metrics."""
 
+WARNINGS_MAX = 3
+"""Largest number of warnings that are printed about more than two experiments."""
 NO_C = "Python (wind, or a robot that differs from its model)"
 """Where the physics steps run if the C code does not cover the experiment."""
 EPILOG = """\
@@ -119,6 +121,18 @@ def load(name: str, overrides: Iterable[str], seed: int | None = None) -> Resolv
     experiment = load_experiment(name, [*overrides, *seeds])
     metrics.check(experiment.report.metrics)
     return experiment
+
+
+def warn(*experiments: ResolvedExperiment) -> None:
+    """Print the warnings of `advise` on stderr, each once.
+
+    For three or more experiments, such as the points of a sweep, print at most `WARNINGS_MAX`.
+    """
+    advice = list(dict.fromkeys(text for each in experiments for text in advise(each)))
+    if len(experiments) > 2 and len(advice) > WARNINGS_MAX:
+        advice[WARNINGS_MAX:] = [f"{len(advice)} warnings; the others are alike"]
+    for text in advice:
+        print_line(f"cloudrc: warning: {text}", sys.stderr)
 
 
 def refuse_seed(texts: Iterable[str]) -> None:

@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cloudrc.cli.advice import warn
 from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.output import (
@@ -28,7 +27,7 @@ from cloudrc.cli.output import (
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.cli.progress import SweepView
 from cloudrc.cli.report import print_traceback, summary
-from cloudrc.cli.run import fly, load, new_folder, refuse_seed
+from cloudrc.cli.run import fly, load, new_folder, refuse_seed, warn
 from cloudrc.cluster import batch
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.pods import refuse_local_files

@@ -5,19 +5,13 @@ import pytest
 from tests.conftest import nightly
 from tests.flights.conftest import both_ways, fly, numbers
 
-LIMITS = {200: (500, 0.4), 400: (800, 0.5), 600: (1000, 0.6)}
-"""Round trip [ms] -> guard.command_age_max_ms, cloud.freeze_after_s."""
-SHARES = {200: 0.01, 400: 0.015, 600: 0.02}
-"""Round trip [ms] -> largest change of the contact time [1]."""
 WAYS = {"both": ("up", "down"), "up": ("up",), "down": ("down",)}
 SILENT = 20.0  # [s]
 
 
 def link(rtt):
     """Return settings for a round trip [ms] with jitter and 10 % loss each way."""
-    age, freeze = LIMITS[rtt]
-    both = both_ways(delay_ms=rtt // 2, jitter_ms=60 if rtt == 600 else 40, loss=0.1)
-    return [*both, f"guard.command_age_max_ms={age}", f"cloud.freeze_after_s={freeze}"]
+    return both_ways(delay_ms=rtt // 2, jitter_ms=60 if rtt == 600 else 40, loss=0.1)
 
 
 @pytest.mark.parametrize("rtt", [*nightly(200, 400), 600])
@@ -26,7 +20,7 @@ def test_the_contact_comes_when_it_comes_without_delay(rtt, seed):
     flight = fly("fast", *link(rtt), f"seed={seed}")
     assert flight.verdict.failures == ()
     n, still = numbers(flight), numbers(fly("fast", "link.profile=ideal"))
-    assert n["contact_time"] / still["contact_time"] == pytest.approx(1.0, abs=SHARES[rtt])
+    assert n["contact_time"] / still["contact_time"] == pytest.approx(1.0, abs=0.01)
     assert n["min_clearance"] >= 0.9 * still["min_clearance"]
     assert n["hold_count"] == 0
 
@@ -39,11 +33,14 @@ def test_plans_predict_to_4_mm_with_fast_gains():
     assert numbers(flight)["delay_estimate_error_rms"] <= 1e-9
 
 
+@pytest.mark.parametrize("speed", [2.0, *nightly(4.0)])
 @pytest.mark.parametrize("at", [10.5, *nightly(*(6.0 + 0.5 * k for k in range(24)))])
 @pytest.mark.parametrize("way", [*nightly("both", "up"), "down"])
-def test_a_silence_of_20_s_in_a_pipe_touches_nothing(at, way):
+def test_a_silence_of_20_s_in_a_pipe_touches_nothing(at, way, speed):
+    """The guard does not allow more than 4 m/s with commands of 500 ms and plans of 0.8 s."""
     silence = f"[{{start_s: {at}, duration_s: {SILENT}}}]"
     dark = [f"link.{each}link.blackouts={silence}" for each in WAYS[way]]
-    flight = fly("fast", *link(200), *dark, "criteria.time_limit_s=90")
+    limits = "criteria.time_limit_s=90", "guard.command_age_max_ms=500"
+    flight = fly("fast", *link(200), *dark, *limits, f"mission.carrot.speed_mps={speed}")
     assert flight.verdict.failures == ()
     assert numbers(flight)["pipe_contacts"] == 0

@@ -6,39 +6,22 @@ A warning never prevents the flight.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from heapq import heappop, heappush
 from itertools import pairwise
 from math import ceil
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.output import print_line
-
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
 
 DURATION_NS = 20_000_000_000
 """Simulated time of the link [ns]."""
-WARNINGS_MAX = 3
-"""Largest number of warnings that are printed about more than two experiments."""
 SAG_MAX = 0.05
 """Largest steady error of the position that needs no warning [m]."""
 WIND_FORCE = 0.24
 """Horizontal force on a hovering robot per wind speed [N s/m]: two thirds are the drag of the
 rotors, one third comes from the tilt that this drag causes."""
-
-
-def warn(*experiments: ResolvedExperiment) -> None:
-    """Print the warnings of `advise` on stderr, each once.
-
-    For three or more experiments, such as the points of a sweep, print at most `WARNINGS_MAX`.
-    """
-    advice = list(dict.fromkeys(text for each in experiments for text in advise(each)))
-    if len(experiments) > 2 and len(advice) > WARNINGS_MAX:
-        advice[WARNINGS_MAX:] = [f"{len(advice)} warnings; the others are alike"]
-    for text in advice:
-        print_line(f"cloudrc: warning: {text}", sys.stderr)
 
 
 def advise(experiment: ResolvedExperiment) -> Iterator[str]:

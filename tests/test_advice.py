@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from cloudrc.cli.advice import advise
+from cloudrc.advice import advise
 from cloudrc.config import shipped
 from cloudrc.config.load import load_experiment
 from tests.conftest import nightly
