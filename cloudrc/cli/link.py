@@ -219,8 +219,8 @@ def _way(
     profile = link_profile(asked)
     timeline, send = Timeline(profile), partial(_send, profile, name == "uplink", options.seed)
     period_ns = round(1e9 / options.rate)
-    if profile.trace is not None and options.seconds is None:
-        shown = send(_row_times(profile.trace))
+    if profile.rows is not None and options.seconds is None:
+        shown = send(_row_times(profile.rows))
     else:
         seconds = options.seconds or max(SECONDS, 1.1e-9 * timeline.last_ns)
         if seconds * options.rate > PACKETS_MAX:

@@ -14,8 +14,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from cloudrc.config.schema import Loss
 from cloudrc.link.draws import BLOCK, OVERTAKES, Fate, bit_flips, impairments, stream_key
-from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
+from cloudrc.link.profile import Conditions, DirectionProfile, Timeline
 
 HEADER_BYTES = 28  # size of the IPv4 and UDP headers (RFC 791, RFC 768), also on the wire [bytes]
 _TABLES = 64  # number of blocks of impairments that are kept in memory

@@ -179,8 +179,8 @@ def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch):
         return loads[0]({"uplink": uplink})[0]
 
     path.write_text("time_s,delay_ms\n0,45\n1,50\n")
-    assert load(trace=str(path)).trace
-    assert load(table=str(path), distribution="table").table
+    assert load(trace=str(path)).rows
+    assert load(table=str(path), distribution="table").quantiles
     path.write_text(path.read_text() + "\n" * processes.TRACE_MAX)
     with pytest.raises(BadInputError, match="longer than 2097152 bytes; give a CSV file"):
         load(trace=str(path))
