@@ -260,7 +260,7 @@ def open_end(
         exporter=exporter,
         flights_only=options.record_flights,
         link=link,
-        check=link_monitor(experiment, link, uplink=name == "cloud", trusted=bool(options.link)),
+        check=link_monitor(experiment, uplink=name == "cloud", trusted=bool(options.link)),
     )
     return experiment, Identity(clock, os.urandom(16), keys.ring), end
 
@@ -308,14 +308,11 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     )
 
 
-def link_monitor(
-    experiment: ResolvedExperiment, state: Path | None, *, uplink: bool, trusted: bool
-) -> LinkMonitor:
+def link_monitor(experiment: ResolvedExperiment, *, uplink: bool, trusted: bool) -> LinkMonitor:
     """Make the monitor that compares the received datagrams with the link profile.
 
-    `uplink` is True in cloud, False in world. In flight, the monitor reads changes of the profile
-    from the link's file `state`; with None, the experiment's profile stays in force. If the link is
-    not `trusted`, the monitor refuses trace files that are larger than TRACE_MAX.
+    `uplink` is True in cloud, False in world. If the link is not `trusted`, the monitor refuses
+    trace files that are larger than TRACE_MAX.
     """
     from cloudrc.assembly import link_profile
     from cloudrc.config.schema import Profile
@@ -335,10 +332,9 @@ def link_monitor(
     rate = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz
     size = SIZES[kind] if uplink else COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
     flow = Flow(experiment.seed, uplink, kind, size)
-    computes = experiment.cloud.compute_ms > 0
-    check = LinkMonitor(uplink=uplink, flow=flow, period=1.0 / rate, computes=computes)
-    requested = link_profile(experiment.uplink), link_profile(experiment.downlink)
-    check.begin(requested, state, load)
+    computes, period = experiment.cloud.compute_ms > 0, 1.0 / rate
+    check = LinkMonitor(uplink=uplink, flow=flow, load=load, period=period, computes=computes)
+    check.begin((link_profile(experiment.uplink), link_profile(experiment.downlink)))
     return check
 
 

@@ -68,10 +68,10 @@ def arrivals(profile, seconds=60.0, *, seed=SEED, overhead=5e-4, uplink=False):
     return sorted(found)
 
 
-def hearing(up, down, *, uplink=False, **options):
+def hearing(up, down, *, uplink=False, load=None, **options):
     """Return the monitor of the end that receives a direction."""
     flow = Flow(SEED, uplink, KINDS[uplink], SIZES[KINDS[uplink]])
-    monitor = LinkMonitor(uplink=uplink, flow=flow, **options)
+    monitor = LinkMonitor(uplink=uplink, flow=flow, load=load, **options)
     monitor.follow((up, down))
     return monitor
 

@@ -1,6 +1,5 @@
 """The monitor of a link in flight, with simulated arrivals of the tunnel's datagrams."""
 
-import json
 import time
 from math import nan
 from unittest.mock import Mock
@@ -8,7 +7,6 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.config.shipped import names
-from cloudrc.link.state import STATE_MAX
 from cloudrc.link.verify.judge import netem_makes
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
@@ -141,7 +139,7 @@ def test_a_counter_that_jumps_costs_no_memory():
 def threaded(records):
     """Pass records to a monitor with a thread; return what it says first."""
     monitor = hearing(PAPER, PAPER)
-    monitor.begin((PAPER, PAPER), None, lambda values: (PAPER, PAPER))
+    monitor.begin((PAPER, PAPER))
     told, deadline = list[Record](), time.monotonic() + 20.0
     for one in records:
         told += monitor.after([one], one.stamp_ns)
@@ -151,27 +149,20 @@ def threaded(records):
     return told
 
 
-def state(profile):
-    found = dict.fromkeys(("reason", "mode", "direction", "since"), "")
-    return json.dumps(found | {"shaper": "relay", "since_ns": 0, "profile": profile})
-
-
-def test_the_monitor_follows_the_state_file_and_ignores_nonsense(tmp_path):
-    path, slow = tmp_path / "link.json", profile_of(0.070)
+def test_the_monitor_follows_the_link_and_ignores_nonsense():
+    slow = profile_of(0.070)
 
     def load(values):
         if "nonsense" in values:
             raise OverflowError
         return slow, slow
 
-    monitor = hearing(PAPER, PAPER)
-    for text in ("", "nonsense", state({"nonsense": 1}), state({})):
-        assert monitor._asked == (PAPER, PAPER)
-        path.write_text(text)
-        monitor.look(path, load)
-    assert monitor._asked == (slow, slow)
-    path.write_text("x" * (STATE_MAX + 1))
-    monitor.look(path, load)
+    monitor = hearing(PAPER, PAPER, load=load)
+    for values, followed in (({"nonsense": 1}, PAPER), ({}, slow)):
+        monitor.request(values)
+        assert monitor.after([], 0) == []
+        assert monitor._asked == (followed, followed)
+    monitor.request(None)
     assert checked(monitor, arrivals(FAULTS["mean"], 20.0)) == ([], []), "nothing is known"
 
 
