@@ -21,8 +21,7 @@ from cloudrc.config.overrides import build_plugin
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
 from cloudrc.geometry import fence
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.traces import SIZE_MAX, read_table, read_trace
+from cloudrc.link.traces import link_profile
 from cloudrc.messages import Start
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.wire import Leg, Plan
@@ -238,19 +237,6 @@ def with_order(
     criteria = experiment.criteria.model_copy(update=judged)
     changed = {"mission": mission, "criteria": criteria, "description": description}
     return experiment.model_copy(update=changed)
-
-
-def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> DirectionProfile:
-    """Read the files that one direction of a link profile names.
-
-    Raise a BadInputError if a file cannot be read or is longer than `file_max` bytes.
-    """
-    table = direction.distribution == "table" and direction.table
-    return DirectionProfile.model_construct(
-        **dict(direction),
-        rows=read_trace(Path(direction.trace), file_max) if direction.trace else None,
-        quantiles=read_table(Path(table), file_max) if table else (),
-    )
 
 
 def _leg(

@@ -211,9 +211,9 @@ def _way(
 
     If the conditions are constant, the statistics come from more packets than the figure shows.
     """
-    from cloudrc.assembly import link_profile
     from cloudrc.link.model import numbers
     from cloudrc.link.profile import Timeline
+    from cloudrc.link.traces import link_profile
     from cloudrc.report.figures.link import DirectionSample
 
     profile = link_profile(asked)

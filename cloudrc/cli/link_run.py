@@ -129,9 +129,9 @@ def log(line: str) -> None:
 
 def make_profile_loader(direction: str) -> Load:
     """Return a function that reads one direction of a link profile from a file."""
-    from cloudrc.assembly import link_profile
     from cloudrc.config.load import load_profile
     from cloudrc.link.follow import Loaded
+    from cloudrc.link.traces import link_profile
 
     def load(path: Path) -> Loaded:
         profile = load_profile(path.absolute())  # absolute: not a shipped name

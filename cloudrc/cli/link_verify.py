@@ -24,7 +24,6 @@ from math import inf, nan
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from cloudrc.assembly import link_profile
 from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.link import VERIFY_DEFAULT
 from cloudrc.cli.link_run import prepare_link, run_tool
@@ -48,6 +47,7 @@ from cloudrc.errors import (
 from cloudrc.link.model import Stream
 from cloudrc.link.netem import check, find_netems
 from cloudrc.link.state import STATE_FILE, from_text
+from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.causes import (
     Findings,
     find_causes,

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.assembly import link_profile
 from cloudrc.config import document, shipped
 from cloudrc.config.document import parse_value
 from cloudrc.config.load import dump, fingerprint, load_experiment, load_profile, read_experiment
 from cloudrc.geometry.scene import load_scene
+from cloudrc.link.traces import link_profile
 
 PROFILES = shipped.names("profile")
 

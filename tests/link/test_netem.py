@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
@@ -22,6 +21,7 @@ from cloudrc.link.netem import (
     write_table,
 )
 from cloudrc.link.profile import Timeline, Trace
+from cloudrc.link.traces import link_profile
 from tests.link.profiles import blackout, change, in_bursts, profile_of
 
 PEER = ("10.244.0.7", 7400)

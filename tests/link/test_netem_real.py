@@ -12,7 +12,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from cloudrc.assembly import link_profile
 from cloudrc.cli.link_run import Programs
 from cloudrc.cli.link_verify import DEVICE, HOSTS, _namespaces, inside
 from cloudrc.config.load import load_profile
@@ -21,6 +20,7 @@ from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.link.model import LinkDirection, numbers, sample
 from cloudrc.link.netem import STRETCH, Netem, table
 from cloudrc.link.profile import Trace
+from cloudrc.link.traces import link_profile
 from cloudrc.tunnel.codec import Kind
 from tests.link.profiles import blackout, changed, in_bursts, profile_of
 

@@ -6,6 +6,7 @@ trips. A separate thread does the work, so that the control loop is not delayed.
 
 from __future__ import annotations
 
+import json
 import queue
 import threading
 import time
@@ -17,9 +18,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from cloudrc.config.schema import Profile
 from cloudrc.errors import describe_error
 from cloudrc.link.model import Stream
 from cloudrc.link.profile import DirectionProfile, Timeline, settled
+from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.causes import describe
 from cloudrc.link.verify.judge import (
     FEWEST,
@@ -34,7 +37,6 @@ from cloudrc.link.verify.judge import (
 )
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 
-PERIOD = 0.01  # default period of telemetry and of commands [s]
 CHECK_NS = 5_000_000_000  # time between two verdicts [ns]
 SETTLE_NS = 2_000_000_000  # time after a change in which nothing is judged [ns]
 KEPT = 6000  # largest number of datagrams that one verdict uses
@@ -46,37 +48,27 @@ DELAYS = {"mean", "deviation"}  # measurable only if world and cloud share a clo
 
 Asked: TypeAlias = tuple[DirectionProfile, DirectionProfile]
 """Requested profiles of uplink and downlink."""
-Values: TypeAlias = dict[str, Any] | None
-"""Values of a profile's file; None if they are unknown."""
-Load: TypeAlias = Callable[[dict[str, Any]], Asked]
-"""Function that converts the values of a profile's file, or raises an error."""
 
 
 class LinkMonitor:
     """Judges one direction of the link from the records of the program that receives it."""
 
     def __init__(
-        self,
-        *,
-        uplink: bool,
-        flow: Flow,
-        load: Load,
-        period: float = PERIOD,
-        computes: bool = False,
+        self, uplink: bool, flow: Flow, *, period: float, computes: bool, file_max: int
     ) -> None:
         """Monitor the received `flow`: telemetry in cloud if `uplink`, else commands in world.
 
-        `load` converts the values of a profile's file to the profiles of both directions.
         `period` is the time between two datagrams of the flow [s]. `computes` tells whether cloud
-        simulates a computing time; delays that contain this time are not judged.
+        simulates a computing time; delays that contain this time are not judged. `file_max` is the
+        size limit of a file that a profile names [bytes].
         """
-        self._uplink, self._flow, self._load = uplink, flow, load
+        self._uplink, self._flow, self._file_max = uplink, flow, file_max
         self._period, self._computes = period, computes
         self._arrivals = deque[Arrival](maxlen=KEPT)
         self._trips, self._lates = (deque[float](maxlen=KEPT) for _ in range(2))
         self._asked: Asked | None = None
         self._plans: list[Plan] = []  # for the received flow, and for the other direction
-        self._news = deque[Values](maxlen=1)  # the newest profile, if it is not followed yet
+        self._news = deque[dict[str, Any] | None](maxlen=1)  # the newest profile, if not used yet
         self._epoch, self._fresh = -1, True
         self._since_ns, self._due_ns = 0.0, 0
         self._suspects, self._complained = set[str](), False
@@ -90,10 +82,10 @@ class LinkMonitor:
         self.follow(asked)
         threading.Thread(target=self._run, args=(self._inbox,), name="link", daemon=True).start()
 
-    def request(self, values: Values) -> None:
-        """Judge the link by the profile whose file has these `values`; None: by no profile.
+    def request(self, values: dict[str, Any] | None) -> None:
+        """Judge the link by a profile with the `values` of its file; None: they are unknown.
 
-        The profile is loaded later, by the thread. If it is invalid, the old profile stays.
+        The thread loads the profile later. If the profile is invalid, the old one stays.
         """
         self._news.append(values)
 
@@ -106,6 +98,13 @@ class LinkMonitor:
             self._plans = [
                 Plan(settled(profile), self._flow, sent, pause=self._pause) for profile in ways
             ]
+
+    def _load(self, values: dict[str, Any] | None) -> Asked | None:
+        if values is None:
+            return None
+        profile = Profile.model_validate_json(json.dumps(values))
+        uplink, downlink = profile.uplink, profile.downlink
+        return link_profile(uplink, self._file_max), link_profile(downlink, self._file_max)
 
     def after(self, records: Sequence[Record], now_ns: int) -> list[Record]:
         """Process this end's new records at `now_ns` [ns]; return `LinkChecked`s and `Fault`s."""
@@ -132,9 +131,8 @@ class LinkMonitor:
     def _see(self, records: Sequence[Record], now_ns: int) -> list[Record]:
         """Store records; return new verdicts every `CHECK_NS`, an empty list in between."""
         while self._news:
-            values = self._news.popleft()
-            with suppress(Exception):  # the link's process, which may be hostile, wrote the values
-                self.follow(None if values is None else self._load(values))
+            with suppress(Exception):  # an invalid profile; the link's process may be hostile
+                self.follow(self._load(self._news.popleft()))
         for record in records:
             if isinstance(record, Arrival):
                 self._fresh |= record.epoch != self._epoch

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
 from cloudrc.link.model import LinkDirection
+from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.causes import Findings
 from cloudrc.link.verify.judge import Flow, netem_makes
 from cloudrc.link.verify.monitor import LinkMonitor
@@ -68,10 +68,10 @@ def arrivals(profile, seconds=60.0, *, seed=SEED, overhead=5e-4, uplink=False):
     return sorted(found)
 
 
-def hearing(up, down, *, uplink=False, load=None, **options):
+def hearing(up, down, *, uplink=False, period=0.01, computes=False):
     """Return the monitor of the end that receives a direction."""
     flow = Flow(SEED, uplink, KINDS[uplink], SIZES[KINDS[uplink]])
-    monitor = LinkMonitor(uplink=uplink, flow=flow, load=load, **options)
+    monitor = LinkMonitor(uplink, flow, period=period, computes=computes, file_max=1000)
     monitor.follow((up, down))
     return monitor
 
