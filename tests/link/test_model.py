@@ -195,7 +195,6 @@ def test_damage_flips_one_bit_and_changes_no_other_draw():
     assert len(hit) / COUNT == pytest.approx(0.2, abs=5 * sqrt(0.2 * 0.8 / COUNT))
     shares, _ = np.histogram(hit, bins=8, range=(0, 8 * SIZE))
     assert shares.min() > 0.8 * len(hit) / 8
-    assert one.counts()["corrupted"] == len(hit)
     assert damaged[:600] == [other.corrupted(1, 3, n, data) for n in reversed(range(600))][::-1]
     assert {one.corrupted(1, 3, n, b"") for n in range(50)} == {b""}
     assert flow(profile, 600) == flow(LIVELY, 600)
@@ -203,16 +202,12 @@ def test_damage_flips_one_bit_and_changes_no_other_draw():
 
 @given(profile=profiles, seed=st.integers(0, 2**63 - 1))
 @settings(max_examples=40, deadline=None)
-def test_nothing_is_early_and_every_packet_is_counted_once(profile, seed):
+def test_nothing_arrives_before_it_is_sent(profile, seed):
     direction = link(profile, seed)
     fates = [direction.send(1, 3, n, SIZE, n * 5 * MS) for n in range(400)]
     for n, releases in enumerate(fates):
         assert len(releases) <= 2
         assert all(type(r) is int and r >= n * 5 * MS for r in releases)
-    counts = direction.counts()
-    assert counts.pop("duplicated") == sum(len(releases) == 2 for releases in fates)
-    assert sum(counts.values()) == 400
-    assert counts["passed"] == sum(bool(releases) for releases in fates)
     if profile.keep_order:
         arrivals = [r for releases in fates for r in releases]
         assert arrivals == sorted(arrivals)
@@ -240,7 +235,6 @@ def test_the_bottleneck_serialises_and_drops_from_the_tail():
     arrivals = [direction.send(1, 3, n, 972, now * MS) for n, now in enumerate(times)]
     at = (20,), (1028,), (1036,), (), (1044,), (1068,)
     assert arrivals == [tuple(one * MS for one in copies) for copies in at]
-    assert direction.counts()["queue"] == 1
 
 
 def test_the_time_line_counts_from_the_origin():
@@ -252,7 +246,7 @@ def test_the_time_line_counts_from_the_origin():
         now_ns = 7 * SECOND + round(elapsed * 1e9)
         at = () if delay is None else (now_ns + delay * MS,)
         assert direction.send(1, 3, 0, SIZE, now_ns) == at
-    assert direction.counts()["blackout"] == 2
+    assert direction.blackouts == 2
 
 
 @pytest.mark.parametrize("loop", [False, True])
@@ -266,7 +260,7 @@ def test_a_trace_holds_each_row_until_the_next(loop):
         assert direction.send(1, 3, 0, SIZE, t * SECOND) == at
 
 
-def test_a_new_profile_keeps_seed_origin_and_counts():
+def test_a_new_profile_keeps_seed_and_origin():
     changes = (change(5.0, delay=0.2),)
     after = profile_of(0.02, 0.01, distribution="normal", loss=0.1, changes=changes)
     direction, always = LinkDirection(LIVELY, 1, True, 100), LinkDirection(after, 1, True, 100)
@@ -275,7 +269,6 @@ def test_a_new_profile_keeps_seed_origin_and_counts():
     direction.replace_profile(after)
     for n, now_ns in ((299, 400), (300, 500), (900, 5_000_000_200)):
         assert direction.send(1, 3, n, 172, now_ns) == always.send(1, 3, n, 172, now_ns)
-    assert sum(direction.counts().values()) >= 300
     direction.replace_profile(profile_of(0.02, changes=changes), restart=True)
     for now, delay in ((7.0, 0.02), (11.9, 0.02), (12.1, 0.2)):
         (arrival_ns,) = direction.send(1, 3, 0, 172, round(now * 1e9))
