@@ -95,6 +95,11 @@ def from_text(text: bytes | str) -> LinkState:
     return parse(LinkState, text)
 
 
+def write_change(change: Change) -> str:
+    """Format a change as the content of change.json."""
+    return json.dumps(asdict(change)) + "\n"
+
+
 def read_change(text: str) -> Change:
     """Parse the content of change.json; return an empty `Change` if the text is invalid."""
     try:

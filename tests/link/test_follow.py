@@ -10,11 +10,8 @@ from cloudrc.errors import BadInputError
 from cloudrc.link.follow import (
     HANDED_FILE,
     SIZE_MAX,
-    Handed,
     PeerName,
     Profiles,
-    read_handed,
-    write_handed,
 )
 from cloudrc.link.state import Change, publish
 
@@ -49,8 +46,9 @@ class Pod:
         os.utime(self.map / "profile.yaml", ns=(0, 0))  # the time alone tells nothing
 
     def hand(self, delay_ms, number):
-        document = Handed(note(number), {"profile.yaml": f"uplink: {{delay_ms: {delay_ms}}}\n"})
-        publish(self.run / HANDED_FILE, write_handed(document))
+        profile = f"uplink: {{delay_ms: {delay_ms}}}\n"
+        document = json.dumps({"change.json": note(number), "profile.yaml": profile})
+        publish(self.run / HANDED_FILE, document)
 
     def first(self):
         return self.profiles.first().direction.delay_ms
@@ -125,9 +123,7 @@ def test_an_upgrade_after_a_change_by_hand_takes_effect(pod):
 def test_a_change_can_contain_a_trace(pod):
     pod.first()
     files = {"profile.yaml": "uplink: {trace: t.csv}\n", "t.csv": "time_s,delay_ms\n0,40\n1,60\n"}
-    document = Handed(note("a1"), files)
-    assert read_handed(write_handed(document)) == document
-    publish(pod.run / HANDED_FILE, write_handed(document))
+    publish(pod.run / HANDED_FILE, json.dumps(files))
     assert pod.profiles.poll().direction.rows.delays == (0.04, 0.06)
 
 
@@ -135,10 +131,11 @@ def test_a_change_can_contain_a_trace(pod):
     "text",
     [
         "{",
-        '{"change": "", "files": {}}',
-        '{"change": "", "files": {"profile.yaml": "", "../route": "1.2.3.4:5"}}',
-        '{"change": "", "files": {"profile.yaml": "uplink: {delay_ms: -1}"}}',
-        '{"change": "", "files": {"profile.yaml": ""}}' + " " * SIZE_MAX,
+        "{}",
+        '{"profile.yaml": 1}',
+        '{"profile.yaml": "", "../route": "1.2.3.4:5"}',
+        '{"profile.yaml": "uplink: {delay_ms: -1}"}',
+        '{"profile.yaml": ""}' + " " * SIZE_MAX,
         "of another user",
     ],
 )

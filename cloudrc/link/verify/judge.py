@@ -64,16 +64,20 @@ class Row(NamedTuple):
     """Verdict on one quantity of one direction of a link; an unknown value is NaN.
 
     A `measured` value from `low` to `high` is accepted. `asked`, `measured`, `low` and `high` have
-    the unit `unit` (any unit).
+    the unit of the quantity (any unit).
     """
 
     name: str  # as in `Plan.quantities`, or "round_trip"
-    unit: str  # "s", "1" or "bit/s"
     asked: float  # mean value of links with the requested profile
     measured: float
     low: float  # lowest accepted value
     high: float  # highest accepted value
     verdict: str  # "ok", "off", "open" or "told"
+
+    @property
+    def unit(self) -> str:
+        """Unit of the quantity: "s", "1" or "bit/s"."""
+        return UNITS.get(self.name, "1")
 
 
 class Expected(NamedTuple):
@@ -102,7 +106,7 @@ class Expected(NamedTuple):
         verdict = "ok" if low <= value <= high else "off"
         if isnan(value) or (verdict == "ok" and hidden > CHANCE_MAX):
             verdict = "open"
-        return Row(name, UNITS.get(name, "1"), mean, value, low, high, verdict)
+        return Row(name, mean, value, low, high, verdict)
 
 
 @dataclass(frozen=True)
@@ -290,7 +294,7 @@ def netem_makes(profile: DirectionProfile) -> DirectionProfile:
 
 def told(name: str, asked: float) -> Row:
     """Make a row that shows the requested value `asked` [unit of `name`] without a judgement."""
-    return Row(name, UNITS.get(name, "1"), asked, nan, nan, nan, "told")
+    return Row(name, asked, nan, nan, nan, "told")
 
 
 def tolerance(name: str, asked: float) -> float:

@@ -168,10 +168,7 @@ class LinkMonitor:
             rows = [row._replace(verdict="open") if row.name in off else row for row in rows]
             self._forget()
         self._suspects = off
-        found: list[Record] = [
-            LinkChecked(now_ns, self._uplink, name, asked, measured, low, high, verdict, count)
-            for name, _, asked, measured, low, high, verdict in rows
-        ]
+        found: list[Record] = [LinkChecked(now_ns, self._uplink, *row, count) for row in rows]
         before, self._complained = self._complained, verdict_of(rows) == "off"
         if self._complained and not before:
             way = "uplink" if self._uplink else "downlink"

@@ -25,7 +25,7 @@ ASKED = ("delay_ms=400", "jitter_ms=80")  # far above what an emulated machine a
 
 
 def verify(ways, plans):
-    report = make_report("netem", probe_link(ways, plans), dict.fromkeys(HOSTS, ""))
+    report = make_report("netem", probe_link(ways, plans))
     print(as_text(report))
     return report
 
