@@ -34,7 +34,6 @@ from cloudrc.records import Counted
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
-    from cloudrc.config.schema import Profile
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.link.follow import Load
     from cloudrc.link.netem import Netem
@@ -141,7 +140,7 @@ def make_profile_loader(direction: str) -> Load:
     return load
 
 
-def prepare_link(folder: Path, link: Profile | ResolvedExperiment) -> None:
+def prepare_link(folder: Path, link: ResolvedExperiment) -> None:
     """Make the folder of a link on this machine, with its profile and a folder per direction."""
     from cloudrc.config.document import write_yaml
     from cloudrc.config.load import DIRECTIONS

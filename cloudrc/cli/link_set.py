@@ -113,8 +113,9 @@ def set_here(
     """
     from cloudrc.config.document import Document, write_yaml
     from cloudrc.config.load import edit_profile
+    from cloudrc.files import write_atomically
     from cloudrc.link.follow import HANDED_FILE, PROFILE
-    from cloudrc.link.state import CHANGE_FILE, Change, publish, write_change
+    from cloudrc.link.state import CHANGE_FILE, Change, write_change
 
     states = read_states(folder)
     if not states:
@@ -123,7 +124,7 @@ def set_here(
     note = write_change(Change(number, edit.cause, edit.restart))
     document = json.dumps({CHANGE_FILE: note, PROFILE: write_yaml(edit.values)})
     for state in states:
-        publish(folder / state.direction / HANDED_FILE, document)
+        write_atomically(folder / state.direction / HANDED_FILE, document.encode())
     deadline = monotonic() + LOCAL_TIMEOUT
     while late := [state.direction for state in states if state.change != number]:
         if monotonic() > deadline:

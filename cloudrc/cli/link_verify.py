@@ -198,14 +198,10 @@ def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, 
 
 
 @contextlib.contextmanager
-def run_link(
-    experiment: ResolvedExperiment, shaper: str, applied: Profile | None = None
-) -> Iterator[dict[str, Way]]:
+def run_link(experiment: ResolvedExperiment, shaper: str) -> Iterator[dict[str, Way]]:
     """Run both directions of a link during a `with` block; yield a mapping: direction -> `Way`.
 
     The relay runs on loopback; netem runs in two network namespaces.
-
-    `applied` is for tests: the profile of the link's processes if it differs from the experiment's.
 
     Raises:
         CloudrcError: If a process of the link ends early or starts too slowly.
@@ -213,7 +209,7 @@ def run_link(
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cloudrc-verify-")))
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
-        prepare_link(folder, applied or experiment)
+        prepare_link(folder, experiment)
         names, hosts = dict.fromkeys(WAYS, ""), dict.fromkeys(WAYS, LOOPBACK)
         if shaper == "netem":
             names, hosts = stack.enter_context(_namespaces()), HOSTS

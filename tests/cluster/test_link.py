@@ -16,8 +16,9 @@ from cloudrc.cli.main import main
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.link import APPLY_LIMIT, APPLY_SCRIPT, with_files
 from cloudrc.errors import BadInputError
+from cloudrc.files import write_atomically
 from cloudrc.link.follow import HANDED_FILE, read_handed
-from cloudrc.link.state import STATE_FILE, LinkState, publish, to_text
+from cloudrc.link.state import STATE_FILE, LinkState, to_text
 
 PROFILE = "uplink: {delay_ms: 45, jitter_ms: 25}\ndownlink: {delay_ms: 45, jitter_ms: 25}\n"
 TRACE = "time_s,delay_ms\n0,40\n1,60\n"
@@ -191,7 +192,7 @@ def start(folder, script=APPLY_SCRIPT):
 
 def tell(folder, **state):
     text = to_text(LinkState("relay", "", "relay", "uplink", {}, "", 1, **state))
-    publish(folder / STATE_FILE, text)
+    write_atomically(folder / STATE_FILE, text.encode())
     return text
 
 

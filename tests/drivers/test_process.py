@@ -22,7 +22,8 @@ from cloudrc.drivers.process import (
     in_words,
 )
 from cloudrc.drivers.teleop import LAST_WORD_NS, LastWord
-from cloudrc.link.state import STATE_MAX, LinkState, publish, to_text
+from cloudrc.files import write_atomically
+from cloudrc.link.state import STATE_MAX, LinkState, to_text
 from cloudrc.messages import GuardState
 from cloudrc.records import (
     Fault,
@@ -134,7 +135,7 @@ def path(tmp_path):
 
 
 def tell(path, state):
-    publish(path, to_text(state))
+    write_atomically(path, to_text(state).encode())
 
 
 def test_a_change_is_recorded_once_and_again_at_a_mission_start(path):

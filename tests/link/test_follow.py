@@ -7,13 +7,14 @@ import pytest
 
 from cloudrc.cli.link_run import make_profile_loader
 from cloudrc.errors import BadInputError
+from cloudrc.files import write_atomically
 from cloudrc.link.follow import (
     HANDED_FILE,
     SIZE_MAX,
     PeerName,
     Profiles,
 )
-from cloudrc.link.state import Change, publish
+from cloudrc.link.state import Change
 
 LOAD = make_profile_loader("uplink")
 
@@ -38,17 +39,17 @@ class Pod:
 
     def put(self, delay_ms, number):
         if number:
-            publish(self.map / "change.json", note(number))
+            write_atomically(self.map / "change.json", note(number).encode())
         self.write(f"uplink: {{delay_ms: {delay_ms}}}\n")
 
     def write(self, text):
-        publish(self.map / "profile.yaml", text)
+        write_atomically(self.map / "profile.yaml", text.encode())
         os.utime(self.map / "profile.yaml", ns=(0, 0))  # the time alone tells nothing
 
     def hand(self, delay_ms, number):
         profile = f"uplink: {{delay_ms: {delay_ms}}}\n"
         document = json.dumps({"change.json": note(number), "profile.yaml": profile})
-        publish(self.run / HANDED_FILE, document)
+        write_atomically(self.run / HANDED_FILE, document.encode())
 
     def first(self):
         return self.profiles.first().direction.delay_ms
@@ -115,7 +116,7 @@ def test_an_upgrade_after_a_change_by_hand_takes_effect(pod):
     assert pod.poll() == (120.0, "a1")
     pod.put(45.0, "")
     assert pod.poll() == (45.0, "")
-    publish(pod.map / "change.json", '{"number": "a2"}')
+    write_atomically(pod.map / "change.json", b'{"number": "a2"}')
     pod.put(50.0, "")
     assert pod.poll() == (50.0, "")
 
@@ -123,7 +124,7 @@ def test_an_upgrade_after_a_change_by_hand_takes_effect(pod):
 def test_a_change_can_contain_a_trace(pod):
     pod.first()
     files = {"profile.yaml": "uplink: {trace: t.csv}\n", "t.csv": "time_s,delay_ms\n0,40\n1,60\n"}
-    publish(pod.run / HANDED_FILE, json.dumps(files))
+    write_atomically(pod.run / HANDED_FILE, json.dumps(files).encode())
     assert pod.profiles.poll().direction.rows.delays == (0.04, 0.06)
 
 
@@ -141,7 +142,7 @@ def test_a_change_can_contain_a_trace(pod):
 )
 def test_an_invalid_document_is_refused_in_one_line(pod, monkeypatch, text):
     assert pod.first() == 40.0
-    publish(pod.run / HANDED_FILE, text)
+    write_atomically(pod.run / HANDED_FILE, text.encode())
     if text == "of another user":
         pod.hand(120.0, "a1")
         monkeypatch.setattr(os, "geteuid", lambda: 12345)
