@@ -47,8 +47,8 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
     follows, and of the newest command that telemetry has confirmed. Both have an age for each
     datagram that is sent, at its departure.
     """
-    from cloudrc.assembly import link_profile
     from cloudrc.link.model import LinkDirection
+    from cloudrc.link.traces import link_profile
     from cloudrc.messages import plan_length
     from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
 

@@ -6,7 +6,6 @@ World and cloud do not import each other. Drivers use them only through `cloudrc
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from math import degrees, dist, inf, radians
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,8 +21,7 @@ from cloudrc.config.overrides import build_plugin
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
 from cloudrc.geometry import fence
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Loss
-from cloudrc.link.traces import SIZE_MAX, read_table, read_trace
+from cloudrc.link.traces import link_profile
 from cloudrc.messages import Start
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.wire import Leg, Plan
@@ -56,11 +54,6 @@ VIRTUAL_CLOCK = bytes(16)
 """Identity of the virtual clock, which world and cloud share."""
 VIRTUAL_RING = KeyRing(KeySet(Key(b"nothing is secret in one process")))
 """Keys of world and cloud in virtual time; with them both ends refuse damaged datagrams."""
-SAME_KEYS = {
-    *("distribution", "correlation", "duplicate", "reorder", "corrupt", "keep_order"),
-    "queue_packets",
-}
-"""Keys of a direction of a link profile whose values need no conversion."""
 FENCE_SPAN = dist(fence.LOW, fence.HIGH)
 """Length of the longest straight line inside the fence [m]."""
 
@@ -246,27 +239,6 @@ def with_order(
     return experiment.model_copy(update=changed)
 
 
-def link_profile(direction: schema.Direction, file_max: int = SIZE_MAX) -> DirectionProfile:
-    """Convert one direction of a link profile to SI units; read the files that it names.
-
-    Raise a BadInputError if a file cannot be read or is longer than `file_max` bytes.
-    """
-    trace = read_trace(Path(direction.trace), file_max) if direction.trace else None
-    table = direction.distribution == "table" and direction.table
-    same = direction.model_dump(include=SAME_KEYS)
-    return DirectionProfile(
-        **same,
-        delay=direction.delay_ms * 1e-3,
-        jitter=direction.jitter_ms * 1e-3,
-        loss=_loss(direction.loss),
-        rate=_scaled(direction.rate_kbit, 1e3),
-        changes=tuple(_change(change) for change in direction.changes),
-        trace=None if trace is None else replace(trace, loop=direction.loop),
-        blackouts=tuple(Blackout(b.start_s, b.duration_s) for b in direction.blackouts),
-        table=read_table(Path(table), file_max) if table else (),
-    )
-
-
 def _leg(
     start: schema.Waypoint | None,
     waypoint: schema.Waypoint,
@@ -297,27 +269,6 @@ def _step_legs(steps: schema.Steps, seed: int) -> tuple[Leg, ...]:
         Leg((x, y, z), tolerance=inf, dwell=steps.period_s, time_limit=limit)
         for x, y, z in offsets.tolist()
     )
-
-
-def _change(change: schema.Change) -> Change:
-    return Change(
-        change.at_s,
-        _scaled(change.delay_ms, 1e-3),
-        _scaled(change.jitter_ms, 1e-3),
-        None if change.loss is None else _loss(change.loss),
-        _scaled(change.rate_kbit, 1e3),
-    )
-
-
-def _loss(loss: float | schema.GilbertElliott) -> Loss:
-    if not isinstance(loss, schema.GilbertElliott):
-        return loss
-    shares = (loss.bad_start, loss.bad_end, loss.loss_bad, loss.loss_good)
-    return GilbertElliott(*shares, loss.delay_bad_ms * 1e-3)
-
-
-def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else value * factor
 
 
 def _generator(seed: int, stream: str) -> np.random.Generator:

@@ -23,7 +23,6 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.assembly import link_profile
 from cloudrc.cli.link_verify import WAYS, find_experiment, measure, run_link
 from cloudrc.cli.output import table
 from cloudrc.config.load import ResolvedExperiment
@@ -31,6 +30,7 @@ from cloudrc.config.shipped import names
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.link.profile import Timeline
 from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE
+from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.judge import Flow, Plan
 from cloudrc.link.verify.probe import FIRST_PROBE, PROBE
 from cloudrc.tunnel.codec import SIZES

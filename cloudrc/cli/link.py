@@ -211,16 +211,16 @@ def _way(
 
     If the conditions are constant, the statistics come from more packets than the figure shows.
     """
-    from cloudrc.assembly import link_profile
     from cloudrc.link.model import numbers
     from cloudrc.link.profile import Timeline
+    from cloudrc.link.traces import link_profile
     from cloudrc.report.figures.link import DirectionSample
 
     profile = link_profile(asked)
     timeline, send = Timeline(profile), partial(_send, profile, name == "uplink", options.seed)
     period_ns = round(1e9 / options.rate)
-    if profile.trace is not None and options.seconds is None:
-        shown = send(_row_times(profile.trace))
+    if profile.rows is not None and options.seconds is None:
+        shown = send(_row_times(profile.rows))
     else:
         seconds = options.seconds or max(SECONDS, 1.1e-9 * timeline.last_ns)
         if seconds * options.rate > PACKETS_MAX:

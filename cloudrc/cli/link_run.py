@@ -34,7 +34,6 @@ from cloudrc.records import Counted
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
-    from cloudrc.config.schema import Profile
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.link.follow import Load
     from cloudrc.link.netem import Netem
@@ -129,9 +128,9 @@ def log(line: str) -> None:
 
 def make_profile_loader(direction: str) -> Load:
     """Return a function that reads one direction of a link profile from a file."""
-    from cloudrc.assembly import link_profile
     from cloudrc.config.load import load_profile
     from cloudrc.link.follow import Loaded
+    from cloudrc.link.traces import link_profile
 
     def load(path: Path) -> Loaded:
         profile = load_profile(path.absolute())  # absolute: not a shipped name
@@ -141,7 +140,7 @@ def make_profile_loader(direction: str) -> Load:
     return load
 
 
-def prepare_link(folder: Path, link: Profile | ResolvedExperiment) -> None:
+def prepare_link(folder: Path, link: ResolvedExperiment) -> None:
     """Make the folder of a link on this machine, with its profile and a folder per direction."""
     from cloudrc.config.document import write_yaml
     from cloudrc.config.load import DIRECTIONS

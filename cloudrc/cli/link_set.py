@@ -8,7 +8,6 @@ import secrets
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any
@@ -73,8 +72,8 @@ def execute(options: argparse.Namespace) -> int:
         from cloudrc.cluster.link import keep, send
 
         place = Release(options.context, options.namespace, options.release or DEFAULT_RELEASE)
-        link, note = _link_of(options, place), partial(note_of, number=number)
-        sent = send(place, link, options.profile, options.settings, note)
+        link = _link_of(options, place)
+        sent = send(place, link, options.profile, options.settings, number)
         took = monotonic() - began
         keep(place, link, sent)
         where = f"release '{place.name}'{f' {place.where}' if place.namespace else ''}"
@@ -114,16 +113,18 @@ def set_here(
     """
     from cloudrc.config.document import Document, write_yaml
     from cloudrc.config.load import edit_profile
-    from cloudrc.link.follow import HANDED_FILE, PROFILE, Handed, write_handed
-    from cloudrc.link.state import publish
+    from cloudrc.files import write_atomically
+    from cloudrc.link.follow import HANDED_FILE, PROFILE
+    from cloudrc.link.state import CHANGE_FILE, Change, write_change
 
     states = read_states(folder)
     if not states:
         raise BadInputError(f"{folder.parent}: no link is up there (yet); wait for the start")
     edit = edit_profile(Document(states[0].profile), profile, settings)
-    handed = Handed(note_of(edit, number), {PROFILE: write_yaml(edit.values)})
+    note = write_change(Change(number, edit.cause, edit.restart))
+    document = json.dumps({CHANGE_FILE: note, PROFILE: write_yaml(edit.values)})
     for state in states:
-        publish(folder / state.direction / HANDED_FILE, write_handed(handed))
+        write_atomically(folder / state.direction / HANDED_FILE, document.encode())
     deadline = monotonic() + LOCAL_TIMEOUT
     while late := [state.direction for state in states if state.change != number]:
         if monotonic() > deadline:
@@ -151,11 +152,6 @@ def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
         except MissingPrerequisiteError as error:
             raise no_run_error(options, error, "--run") from None
         raise
-
-
-def note_of(edit: Edit, number: str) -> str:
-    """Return change.json as text: number, cause, and whether the time line restarts."""
-    return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
 
 
 def _row(state: LinkState) -> tuple[str, ...]:

@@ -24,7 +24,6 @@ from math import inf, nan
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from cloudrc.assembly import link_profile
 from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.link import VERIFY_DEFAULT
 from cloudrc.cli.link_run import prepare_link, run_tool
@@ -48,6 +47,7 @@ from cloudrc.errors import (
 from cloudrc.link.model import Stream
 from cloudrc.link.netem import check, find_netems
 from cloudrc.link.state import STATE_FILE, from_text
+from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.causes import (
     Findings,
     find_causes,
@@ -55,7 +55,7 @@ from cloudrc.link.verify.causes import (
     read_evidence,
     read_metrics,
 )
-from cloudrc.link.verify.judge import UNITS, Flow, Plan, Row, look_twice, verdict_of
+from cloudrc.link.verify.judge import Flow, Plan, Row, look_twice, verdict_of
 from cloudrc.link.verify.probe import PROBE, ProbeEnd, plan_probes, send_probes
 from cloudrc.tunnel.codec import SIZES, Kind
 
@@ -147,8 +147,7 @@ def verify(
         found = {way: now[way]._replace(rows=rows[way]) for way in now}
         if "off" not in {verdict_of(one.rows) for one in found.values()}:
             break
-    counts = {way: f"{len(p.sent)} probes of {p.flow.size} bytes" for way, p in plans.items()}
-    return make_report(title, found, counts)
+    return make_report(title, found)
 
 
 def make_plans(
@@ -191,20 +190,18 @@ def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, 
         with inside(way.namespace):  # the process of the link may be stopped: ask the kernel
             page |= find_netems(run_tool, way.peer[0])
             metrics = read_metrics(fetch(f"http://{LOOPBACK}:{way.ports[1]}/metrics"))
-        known = read_evidence(page, metrics, len(streams[name].sent))
-        found[name] = Findings(plans[name].judge(streams[name]), known)
+        plan, count = plans[name], len(streams[name].sent)
+        probes = f"{count} probes of {plan.flow.size} bytes"
+        known = read_evidence(page, metrics, count)
+        found[name] = Findings(plan.judge(streams[name]), known, probes)
     return found
 
 
 @contextlib.contextmanager
-def run_link(
-    experiment: ResolvedExperiment, shaper: str, applied: Profile | None = None
-) -> Iterator[dict[str, Way]]:
+def run_link(experiment: ResolvedExperiment, shaper: str) -> Iterator[dict[str, Way]]:
     """Run both directions of a link during a `with` block; yield a mapping: direction -> `Way`.
 
     The relay runs on loopback; netem runs in two network namespaces.
-
-    `applied` is for tests: the profile of the link's processes if it differs from the experiment's.
 
     Raises:
         CloudrcError: If a process of the link ends early or starts too slowly.
@@ -212,7 +209,7 @@ def run_link(
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cloudrc-verify-")))
         (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
-        prepare_link(folder, applied or experiment)
+        prepare_link(folder, experiment)
         names, hosts = dict.fromkeys(WAYS, ""), dict.fromkeys(WAYS, LOOPBACK)
         if shaper == "netem":
             names, hosts = stack.enter_context(_namespaces()), HOSTS
@@ -339,10 +336,7 @@ def verify_release(title: str, pods: Pods, limit: float) -> Report:
     if silent := [receiver for way, (_, receiver, _) in WAYS.items() if way not in seen]:
         text = f"{' and '.join(silent)} did not answer within {limit:g} s: are the pods ready?"
         raise TimedOutError(text)
-    findings = {way: _findings(seen[way], pods[WAYS[way][0]][1]) for way in WAYS}
-    counts = {way: max([row["datagrams"] for row in seen[way]["rows"]], default=0) for way in WAYS}
-    probes = {way: f"{counts[way]} of the tunnel's own datagrams" for way in WAYS}
-    return make_report(title, findings, probes)
+    return make_report(title, {way: _findings(seen[way], pods[WAYS[way][0]][1]) for way in WAYS})
 
 
 def fetch(url: str) -> str:
@@ -358,11 +352,11 @@ def _findings(found: Mapping[str, Any], link: str) -> Findings:
     """Combine the receiver's verdict `found` with the link container's report at the URL `link`."""
     page, rows = json.loads(fetch(f"{link}/link.json") or "{}"), []
     for one in found["rows"]:
-        name, values = one["quantity"], (one.get(key, nan) for key in KEYS)
-        asked, measured, low, high = map(float, values)
-        unit = UNITS.get(name, "1")
-        rows.append(Row(name, unit, asked, measured, low, high, one["verdict"]))
-    return Findings(rows, read_evidence(page, read_metrics(fetch(f"{link}/metrics"))))
+        asked, measured, low, high = (float(one.get(key, nan)) for key in KEYS)
+        rows.append(Row(one["quantity"], asked, measured, low, high, one["verdict"]))
+    count = max((one["datagrams"] for one in found["rows"]), default=0)
+    known = read_evidence(page, read_metrics(fetch(f"{link}/metrics")))
+    return Findings(rows, known, f"{count} of the tunnel's own datagrams")
 
 
 def _notes(way: str, rows: Sequence[Row]) -> Iterator[str]:
@@ -376,11 +370,11 @@ def _notes(way: str, rows: Sequence[Row]) -> Iterator[str]:
             yield f"{way}: {row.name} {NOT_JUDGED}; docs/link.md says why"
 
 
-def make_report(title: str, findings: Mapping[str, Findings], probes: Mapping[str, str]) -> Report:
+def make_report(title: str, findings: Mapping[str, Findings]) -> Report:
     """Make the report as values for JSON, in SI units; leave out unknown values.
 
-    Losses and other shares are in [0, 1]. `title` names the link. `findings` and `probes` have an
-    entry per direction; `probes` says which datagrams were measured.
+    Losses and other shares are in [0, 1]. `title` names the link. `findings` has an entry per
+    direction.
     """
     shapers = {one.evidence.shaper or "an unknown shaper" for one in findings.values()}
     verdicts = {verdict_of(one.rows) for one in findings.values()}
@@ -392,13 +386,17 @@ def make_report(title: str, findings: Mapping[str, Findings], probes: Mapping[st
         "notes": [note for way, one in findings.items() for note in _notes(way, one.rows)],
         "directions": {
             way: {
-                "probes": probes[way],
-                "rows": [_known(row._asdict()) for row in found.rows if row.verdict != "told"],
+                "probes": found.probes,
+                "rows": [_as_json(row) for row in found.rows if row.verdict != "told"],
                 "evidence": _known(found.evidence._asdict()),
             }
             for way, found in findings.items()
         },
     }
+
+
+def _as_json(row: Row) -> dict[str, Any]:
+    return {"name": row.name, "unit": row.unit} | _known(row._asdict())
 
 
 def _known(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import re
 import socket
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.drivers.recording import Recorder
-    from cloudrc.link.profile import DirectionProfile
     from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.tunnel.end import Identity
 
@@ -260,7 +258,7 @@ def open_end(
         exporter=exporter,
         flights_only=options.record_flights,
         link=link,
-        check=link_monitor(experiment, link, uplink=name == "cloud", trusted=bool(options.link)),
+        check=link_monitor(experiment, uplink=name == "cloud", trusted=bool(options.link)),
     )
     return experiment, Identity(clock, os.urandom(16), keys.ring), end
 
@@ -308,37 +306,25 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     )
 
 
-def link_monitor(
-    experiment: ResolvedExperiment, state: Path | None, *, uplink: bool, trusted: bool
-) -> LinkMonitor:
+def link_monitor(experiment: ResolvedExperiment, *, uplink: bool, trusted: bool) -> LinkMonitor:
     """Make the monitor that compares the received datagrams with the link profile.
 
-    `uplink` is True in cloud, False in world. In flight, the monitor reads changes of the profile
-    from the link's file `state`; with None, the experiment's profile stays in force. If the link is
-    not `trusted`, the monitor refuses trace files that are larger than TRACE_MAX.
+    `uplink` is True in cloud, False in world. If the link is not `trusted`, the monitor refuses
+    trace files that are larger than TRACE_MAX.
     """
-    from cloudrc.assembly import link_profile
-    from cloudrc.config.schema import Profile
-    from cloudrc.link.traces import SIZE_MAX
+    from cloudrc.link.traces import SIZE_MAX, link_profile
     from cloudrc.link.verify.judge import Flow
     from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.messages import plan_length
     from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
 
-    file_max = SIZE_MAX if trusted else TRACE_MAX
-
-    def load(values: object) -> tuple[DirectionProfile, DirectionProfile]:
-        profile = Profile.model_validate_json(json.dumps(values))
-        return link_profile(profile.uplink, file_max), link_profile(profile.downlink, file_max)
-
     kind = Kind.TELEMETRY if uplink else Kind.COMMAND
     rate = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz
     size = SIZES[kind] if uplink else COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
     flow = Flow(experiment.seed, uplink, kind, size)
-    computes = experiment.cloud.compute_ms > 0
-    check = LinkMonitor(uplink=uplink, flow=flow, period=1.0 / rate, computes=computes)
-    requested = link_profile(experiment.uplink), link_profile(experiment.downlink)
-    check.begin(requested, state, load)
+    file_max, computes = SIZE_MAX if trusted else TRACE_MAX, experiment.cloud.compute_ms > 0
+    check = LinkMonitor(uplink, flow, period=1.0 / rate, computes=computes, file_max=file_max)
+    check.begin((link_profile(experiment.uplink), link_profile(experiment.downlink)))
     return check
 
 

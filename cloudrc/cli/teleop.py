@@ -106,7 +106,7 @@ def serve_api(
 ) -> ApiServer:
     """Start the API; until the mission service runs, the API answers that teleop is starting."""
     from cloudrc import assembly
-    from cloudrc.link.state import publish
+    from cloudrc.files import write_atomically
     from cloudrc.teleop.api import ApiServer, Bridge, create_app
     from cloudrc.teleop.auth import Audit, Gate, Tokens
     from cloudrc.teleop.models import read_goto, read_order
@@ -127,7 +127,8 @@ def serve_api(
     resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))
     server.start()
     if options.api_file is not None:
-        publish(options.api_file, json.dumps({"schemaVersion": 1, "url": server.url}) + "\n")
+        document = {"schemaVersion": 1, "url": server.url}
+        write_atomically(options.api_file, f"{json.dumps(document)}\n".encode())
     return server
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +24,15 @@ from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, run
 from cloudrc.config.document import read_document, write_yaml
 from cloudrc.config.load import DIRECTIONS, FILE_READERS, Edit, edit_profile
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
-from cloudrc.link.follow import HANDED_FILE, PROFILE, Handed, write_handed
-from cloudrc.link.state import CHANGE_FILE, STATE_FILE, LinkState, from_text, read_change
+from cloudrc.link.follow import HANDED_FILE, PROFILE
+from cloudrc.link.state import (
+    CHANGE_FILE,
+    STATE_FILE,
+    Change,
+    LinkState,
+    from_text,
+    write_change,
+)
 
 FOLDER = "/run/cloudrc"
 """Folder in a link container with the files of the link: route, state, received change."""
@@ -92,9 +99,11 @@ container reads. Then it waits until the container has accepted or refused the c
 the container's state."""
 
 
-def send_change(release: Release, pod: str, handed: Handed) -> str:
-    """Send a change to a pod's link container; return the container's state as JSON."""
-    document, number = write_handed(handed), read_change(handed.change).number
+def send_change(release: Release, pod: str, document: str, number: str) -> str:
+    """Send a change to a pod's link container; return the container's state as JSON.
+
+    `document` is the content for `HANDED_FILE`, `number` that of the change.
+    """
     words = ["sh", "-c", APPLY_SCRIPT, "sh", FOLDER, number, str(len(document.encode()))]
     command = [*release.flags, "exec", "--stdin", pod, "--container=link", "--", *words]
     return run("kubectl", command, given=document)
@@ -114,7 +123,7 @@ def send(
     link: LinkParts,
     profile: str | None,
     settings: Sequence[str],
-    note: Callable[[Edit], str],
+    number: str,
 ) -> Sent:
     """Change the profile in both link containers, and wait until both have applied the change.
 
@@ -123,20 +132,18 @@ def send(
         link: The link of the release before the change.
         profile: New profile, as in `cloudrc.config.load.edit_profile`.
         settings: Values to set, as in `cloudrc.config.load.edit_profile`.
-        note: Function that describes the change from the edited profile, as the text of
-            change.json.
+        number: Identifies the change.
 
     Raises:
         BadInputError: If the request is not valid, or if a container refuses the change.
     """
     edit, files = with_files(link.files, profile, settings)
-    files[CHANGE_FILE] = note(edit)
-    number = read_change(files[CHANGE_FILE]).number
-    handed = Handed(files[CHANGE_FILE], _needed_files(edit.values, {**link.files, **files}))
+    files[CHANGE_FILE] = write_change(Change(number, edit.cause, edit.restart))
+    document = json.dumps(_needed_files(edit.values, {**link.files, **files}))
 
     def ask(component: str) -> LinkState | CloudrcError:
         try:
-            state = from_text(send_change(release, link.pods[component], handed))
+            state = from_text(send_change(release, link.pods[component], document, number))
         except CloudrcError as error:
             return error
         except ValueError as error:
@@ -183,7 +190,8 @@ def keep(release: Release, link: LinkParts, sent: Sent) -> None:
 def _needed_files(values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, str]:
     ways = [value for value in values.values() if isinstance(value, dict)]
     named = {Path(str(way[key])).name for way in ways for key in FILE_READERS if way.get(key)}
-    return {name: text for name, text in files.items() if name == PROFILE or name in named}
+    named |= {PROFILE, CHANGE_FILE}
+    return {name: text for name, text in files.items() if name in named}
 
 
 def with_files(

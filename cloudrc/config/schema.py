@@ -1,8 +1,9 @@
 """Define every key of experiments, missions and link profiles, with its unit, range and default.
 
-The name of a key ends with its unit (`delay_ms`); `cloudrc/assembly.py` converts the values to SI
-units. Unknown keys are refused. The defaults are the control scheme and the gains of the paper.
-`Experiment` describes a file. `config.load.ResolvedExperiment` is the result of loading the file.
+The name of a key ends with its unit (`delay_ms`); `cloudrc/assembly.py` and `cloudrc/link/` convert
+the values to SI units. Unknown keys are refused. The defaults are the control scheme and the gains
+of the paper. `Experiment` describes a file. `config.load.ResolvedExperiment` is the result of
+loading the file.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from cloudrc.drivers.recording import FlightsOnly, Recorder
 from cloudrc.endpoint import Endpoint
 from cloudrc.errors import to_one_line
 from cloudrc.exposition.live import CLOCK_SET
-from cloudrc.files import read, version
+from cloudrc.files import TooLongError, read, version
 from cloudrc.link.state import RELEASED, RELEASED_SUFFIX, STATE_MAX, from_text
 from cloudrc.records import (
     Control,
@@ -219,9 +219,12 @@ class LinkNotes:
     second file. World and cloud do not trust the content of these files.
     """
 
-    def __init__(self, path: Path, *, uplink: bool) -> None:
-        """Follow the state file at `path`, which may not exist yet; `uplink` is True in world."""
-        self._path, self._uplink = path, uplink
+    def __init__(self, path: Path, *, uplink: bool, check: LinkMonitor | None = None) -> None:
+        """Follow the state file at `path`, which may not exist yet; `uplink` is True in world.
+
+        `check` gets each new profile.
+        """
+        self._path, self._uplink, self._check = path, uplink, check
         self._seen: tuple[int, int, int] | None = None
         self._since_ns: int | None = None
         self._due_ns = self._released_ns = 0
@@ -256,7 +259,15 @@ class LinkNotes:
 
     def _read_state(self, begins: bool, now_ns: int, slip_ns: int) -> list[LinkChanged]:
         """Return the link's state as a record if it is new or a mission `begins`, else []."""
-        state = from_text(read(self._path, STATE_MAX).decode())
+        try:
+            state = from_text(read(self._path, STATE_MAX).decode())
+        except TooLongError:  # a long time line
+            self._since_ns = None
+            self._request(None)
+            return []
+        since_ns, self._since_ns = self._since_ns, state.since_ns
+        if since_ns != state.since_ns:
+            self._request(state.profile)
         asked = {key: nan if value is None else float(value) for key, value in state.asked.items()}
         changed = LinkChanged(
             stamp_ns=now_ns - slip_ns,
@@ -268,8 +279,11 @@ class LinkNotes:
             **{name: asked.get(name, nan) for name in ("delay", "jitter", "loss", "rate")},
             conditions=json.dumps(state.profile.get(state.direction, {})),
         )
-        since_ns, self._since_ns = self._since_ns, state.since_ns
         return [changed] if begins or since_ns != state.since_ns else []
+
+    def _request(self, profile: dict[str, Any] | None) -> None:
+        if self._check is not None:
+            self._check.request(profile)
 
 
 @dataclass
@@ -287,7 +301,8 @@ class EndProcess:
     check: LinkMonitor | None = None  # compares the received datagrams with the link profile
 
     def __post_init__(self) -> None:
-        self._notes = LinkNotes(self.link, uplink=self.end == "world") if self.link else None
+        world = self.end == "world"
+        self._notes = LinkNotes(self.link, uplink=world, check=self.check) if self.link else None
         self._trouble, self._dropped = "", 0
         self._clock_offset = time.time() - time.clock_gettime(SINCE_BOOT)
 

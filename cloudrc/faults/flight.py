@@ -22,6 +22,7 @@ from cloudrc.faults.invariants import Watch
 from cloudrc.faults.models import RestartableEndpoint, TeleopModel
 from cloudrc.faults.schedule import OFFSET_MAX, Schedule, generator
 from cloudrc.link.model import LinkDirection
+from cloudrc.link.traces import link_profile
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.records import Counted, GroundTruth, GuardChange, MissionEvent, Record
@@ -198,7 +199,7 @@ class Flight:
 
     def _make_link(self, way: str) -> LinkDirection:
         ends = {"up": self.experiment.uplink, "down": self.experiment.downlink}
-        profile = shaped(self.schedule, assembly.link_profile(ends[way]), way)
+        profile = shaped(self.schedule, link_profile(ends[way]), way)
         return LinkDirection(profile, self.experiment.seed, uplink=way == "up")
 
     def _begin(self, end: str, clock_id: bytes) -> Identity:

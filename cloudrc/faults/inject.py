@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
 from functools import partial
 from itertools import islice
 from math import inf, nan
@@ -11,12 +10,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cloudrc.config.schema import Blackout, Change, GilbertElliott
 from cloudrc.drivers.virtual import Clock
 from cloudrc.errors import BadInputError
 from cloudrc.faults.adversary import Lie
 from cloudrc.faults.models import Action, Call, RestartableEndpoint, Tamper
 from cloudrc.faults.schedule import Event, Schedule, generator
-from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott
+from cloudrc.link.profile import DirectionProfile
 from cloudrc.messages import Command
 from cloudrc.records import Control
 from cloudrc.teleop.service import MissionService
@@ -40,37 +40,38 @@ def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> Direction
         BadInputError: If both the profile and a fault change the conditions over time.
     """
     mine = [event for event in schedule.events if event.way in ("both", way)]
-    blackouts = [Blackout(e.at, e.duration) for e in mine if e.kind == "blackout"]
+    lasting = [event for event in mine if event.kind == "blackout" and event.duration > 0.0]
+    blackouts = [Blackout(start_s=one.at, duration_s=one.duration) for one in lasting]
     waves = [e for e in mine if e.kind in ("delay", "jitter", "loss", "bursts")]
-    if waves and (profile.changes or profile.trace is not None):
+    if waves and (profile.changes or profile.rows is not None):
         raise BadInputError(
             f"the link's profile {schedule.profile} changes over time, so that the fault "
             f"{waves[0].kind} cannot be added; choose a profile without changes"
         )
     edges = sorted({instant for event in waves for instant in (event.at, event.end)})
     changes = tuple(_change(profile, [e for e in waves if e.at <= t < e.end], t) for t in edges)
-    return replace(
-        profile,
-        blackouts=(*profile.blackouts, *blackouts),
-        changes=changes or profile.changes,
-        duplicate=max(profile.duplicate, schedule.duplicate),
-        reorder=max(profile.reorder, schedule.reorder),
-    )
+    with_faults = {
+        "blackouts": (*profile.blackouts, *blackouts),
+        "changes": changes or profile.changes,
+        "duplicate": max(profile.duplicate, schedule.duplicate),
+        "reorder": max(profile.reorder, schedule.reorder),
+    }
+    return profile.model_copy(update=with_faults)
 
 
 def _change(profile: DirectionProfile, active: list[Event], at: float) -> Change:
     """Return the link's conditions from `at` [s] on: the profile with the `active` faults."""
-    delay, jitter, loss = profile.delay, profile.jitter, profile.loss
+    delay_ms, jitter_ms, loss = profile.delay_ms, profile.jitter_ms, profile.loss
     for event in active:
         if event.kind == "delay":
-            delay += event.value
+            delay_ms += event.value * 1e3
         elif event.kind == "jitter":
-            jitter = max(jitter, event.value)
+            jitter_ms = max(jitter_ms, event.value * 1e3)
         elif event.kind == "loss":
             loss = event.value
         else:
             loss = GilbertElliott(bad_start=0.01, bad_end=1.0 / max(event.value, 1.0))
-    return Change(at, delay=delay, jitter=jitter, loss=loss)
+    return Change(at_s=at, delay_ms=delay_ms, jitter_ms=jitter_ms, loss=loss)
 
 
 def inject(flight: Flight) -> None:

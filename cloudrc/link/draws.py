@@ -25,7 +25,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.link.profile import DirectionProfile, GilbertElliott, Loss
+from cloudrc.config.schema import GilbertElliott, Loss
+from cloudrc.link.profile import DirectionProfile
 
 BLOCK = 256  # number of packets whose random numbers are generated together
 CHAIN_BLOCKS = 64  # number of blocks after which bursts and correlated jitter restart
@@ -191,8 +192,8 @@ def shape(key: StreamKey, purpose: Purpose, block: int, profile: DirectionProfil
         return [erf(_HALF_ROOT * one) for one in z] or [2.0 * one - 1.0 for one in u]
     if profile.distribution == "table":
         shares = [0.5 * erfc(-_HALF_ROOT * one) for one in z] or u
-        count = len(profile.table)
-        return [profile.table[min(int(share * count), count - 1)] for share in shares]
+        count = len(profile.quantiles)
+        return [profile.quantiles[min(int(share * count), count - 1)] for share in shares]
     survival = [0.5 * erfc(_HALF_ROOT * one) for one in z] or [1.0 - one for one in u]
     kept = 1.0 - PARETO_CUT
     return [
@@ -217,8 +218,8 @@ def _packets_hit(key: StreamKey, purpose: Purpose, block: int, chance: float) ->
 
 
 def _lose_in_bursts(table: list[Fate], key: StreamKey, block: int, loss: GilbertElliott) -> None:
-    """Lose packets of a block in bursts; add `delay_bad` to packets that pass in the bad state."""
-    extra = round(loss.delay_bad * 1e9)
+    """Lose packets of a block in bursts; delay packets longer that pass in the bad state."""
+    extra = round(loss.delay_bad_ms * 1e-3 * 1e9)
     draws = uniforms(key, Purpose.LOSS, block).tolist()
     for n, bad in enumerate(bad_states(key, block, loss.bad_start, loss.bad_end)):
         if draws[n] < (loss.loss_bad if bad else loss.loss_good):

@@ -8,11 +8,9 @@ applies the one that arrives first and ignores the other.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -30,7 +28,9 @@ PEER_PAUSE = (0.5, 1.0)
 """Shortest and longest pause before the peer's name is resolved again [s]. The pause is random, so
 that the links of many releases do not query their name server at the same time.
 Source: docs/reference/faults.md, "F19"."""
-HANDED_FILE = "asked.json"  # JSON document of `cloudrc link set`, beside the route file
+HANDED_FILE = "asked.json"
+"""JSON document of `cloudrc link set`, beside the route file: the files of a change, name -> text.
+The files are `PROFILE`, the traces that it names, and `CHANGE_FILE`."""
 SIZE_MAX = 1_200_000  # size limit of the JSON document [bytes]: room for the content of a ConfigMap
 PROFILE = "profile.yaml"
 _NAME = re.compile(r"[a-zA-Z0-9_][-._a-zA-Z0-9]{0,252}")
@@ -48,29 +48,16 @@ Load = Callable[[Path], Loaded]
 """Function that reads and checks a profile's file; raises a BadInputError if it is invalid."""
 
 
-@dataclass(frozen=True)
-class Handed:
-    """A change of the link that `cloudrc link set` writes into a pod, as a JSON document."""
-
-    change: str  # number and cause of the change, as the text of `CHANGE_FILE`
-    files: dict[str, str]  # file name -> text: `profile.yaml` and the traces that it names
-
-
-def write_handed(handed: Handed) -> str:
-    """Format a change as the JSON document that `cloudrc link set` writes into a pod."""
-    return json.dumps(asdict(handed))
-
-
-def read_handed(text: bytes | str) -> Handed:
-    """Parse a change of the link from the JSON document that `write_handed` made.
+def read_handed(text: bytes | str) -> dict[str, str]:
+    """Parse the JSON document of a change: name -> text of each file beside the new profile.
 
     Raises:
         ValueError: If the text is invalid, or if a file name could lead to another folder.
     """
-    handed = parse(Handed, text)
-    if PROFILE not in handed.files or not all(map(_NAME.fullmatch, handed.files)):
-        raise ValueError(f"not a profile's files: {', '.join(sorted(handed.files))}")
-    return handed
+    files = parse(dict[str, str], text)
+    if PROFILE not in files or not all(map(_NAME.fullmatch, files)):
+        raise ValueError(f"not a profile's files: {', '.join(sorted(files))}")
+    return files
 
 
 class Profiles:
@@ -141,12 +128,11 @@ class Profiles:
         """
         if path.lstat().st_uid != os.geteuid():
             raise ValueError(f"{path} belongs to another user")
-        handed = read_handed(read(path, SIZE_MAX))
+        files = read_handed(read(path, SIZE_MAX))
         with TemporaryDirectory(prefix="handed-", dir=path.parent) as folder:
-            for name, text in handed.files.items():
+            for name, text in files.items():
                 (Path(folder) / name).write_text(text, encoding="utf-8")
-            loaded = self._load(Path(folder) / PROFILE)
-        return loaded._replace(change=read_change(handed.change))
+            return self._read_profile(Path(folder) / PROFILE)
 
 
 class PeerName:

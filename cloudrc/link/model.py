@@ -14,8 +14,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from cloudrc.config.schema import Loss
 from cloudrc.link.draws import BLOCK, OVERTAKES, Fate, bit_flips, impairments, stream_key
-from cloudrc.link.profile import Conditions, DirectionProfile, Loss, Timeline
+from cloudrc.link.profile import Conditions, DirectionProfile, Timeline
 
 HEADER_BYTES = 28  # size of the IPv4 and UDP headers (RFC 791, RFC 768), also on the wire [bytes]
 _TABLES = 64  # number of blocks of impairments that are kept in memory
@@ -32,6 +33,7 @@ class LinkDirection:
 
     Attributes:
         corrupts: Whether the link may damage datagrams; if true, call `corrupted` for each.
+        blackouts: Number of packets that were lost because they were sent in a blackout.
     """
 
     def __init__(
@@ -45,14 +47,13 @@ class LinkDirection:
         self._origin_ns: int | None = origin_ns
         self._departures: deque[int] = deque()
         self._last_release_ns = 0
-        outcomes = ("passed", "lost", "blackout", "queue", "duplicated", "corrupted")
-        self._counts = dict.fromkeys(outcomes, 0)
+        self.blackouts = 0
         self.replace_profile(profile)
 
     def replace_profile(self, profile: DirectionProfile, *, restart: bool = False) -> None:
         """Replace the profile from the next packet on.
 
-        Seed, counts and the bottleneck's queue are kept. The random impairments are the same as if
+        Seed and the bottleneck's queue are kept. The random impairments are the same as if
         the link had used this profile from the start. With `restart`, the new time line starts at
         the next packet; otherwise it starts at the same time as the old time line.
         """
@@ -80,21 +81,17 @@ class LinkDirection:
             self._origin_ns = now_ns
         conditions = self._only or self._timeline.at(now_ns - self._origin_ns)
         if conditions.blackout:
-            self._counts["blackout"] += 1
+            self.blackouts += 1
             return ()
         place = (epoch, kind, counter // BLOCK, conditions)
         if place != self._place:  # comparing takes less time than a look into the dictionary
             self._place, self._table = place, self._find_table(*place)
         fate = self._table[counter % BLOCK]
         if len(fate) == 1 and self._plain:  # nearly all packets: save time
-            self._counts["passed"] += 1
             delay_ns = conditions.delay_ns + fate[0]
             return (now_ns + delay_ns if delay_ns > 0 else now_ns,)
         arrivals = [self._arrival(entry, conditions, size, now_ns) for entry in fate]
-        found = tuple([arrival for arrival in arrivals if arrival is not None])
-        self._counts["passed" if found else "queue" if fate else "lost"] += 1
-        self._counts["duplicated"] += len(found) == 2
-        return found
+        return tuple([arrival for arrival in arrivals if arrival is not None])
 
     def corrupted(self, epoch: int, kind: int, counter: int, data: bytes) -> bytes:
         """Return the content of a datagram as it arrives: unchanged, or with one bit flipped.
@@ -110,20 +107,10 @@ class LinkDirection:
         place = bit_flips(key, block, self._profile.corrupt).get(index)
         if place is None or not data:
             return data
-        self._counts["corrupted"] += 1
         bit = int(place * 8 * len(data))
         damaged = bytearray(data)
         damaged[bit >> 3] ^= 1 << (bit & 7)
         return bytes(damaged)
-
-    def counts(self) -> dict[str, int]:
-        """Return the number of packets by outcome, since the start.
-
-        The outcomes are `passed` (at least one copy arrives), `duplicated` (two copies arrive) and
-        `corrupted` (a bit is flipped). Packets that do not arrive count as `lost` (at random),
-        `blackout` or `queue` (the queue was full).
-        """
-        return dict(self._counts)
 
     def _arrival(self, entry: int, conditions: Conditions, size: int, now_ns: int) -> int | None:
         """Compute when one copy of a packet arrives [ns]; None if the queue is full.

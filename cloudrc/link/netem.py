@@ -29,9 +29,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from cloudrc.config.schema import GilbertElliott, Loss
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
 from cloudrc.link.draws import PARETO_CUT, Floats
-from cloudrc.link.profile import Conditions, DirectionProfile, GilbertElliott, Loss, Timeline
+from cloudrc.link.profile import Conditions, DirectionProfile, Timeline
 from cloudrc.link.relay import Address
 
 USE_RELAY = "use the relay (link.mode=relay, or --shaper relay)"
@@ -124,7 +125,7 @@ def stretch(profile: DirectionProfile) -> int:
     """
     if profile.distribution != "table":
         return STRETCH[profile.distribution]
-    return ceil(max(map(abs, profile.table)) / _END_OF_TABLE) or 1
+    return ceil(max(map(abs, profile.quantiles)) / _END_OF_TABLE) or 1
 
 
 def table(profile: DirectionProfile) -> list[int]:
@@ -136,8 +137,8 @@ def table(profile: DirectionProfile) -> list[int]:
         them within 16 bits.
     """
     if profile.distribution == "table":
-        places = (2 * np.arange(ENTRIES) + 1) * len(profile.table) // (2 * ENTRIES)
-        values = np.sort(profile.table)[places]
+        places = (2 * np.arange(ENTRIES) + 1) * len(profile.quantiles) // (2 * ENTRIES)
+        values = np.sort(profile.quantiles)[places]
     else:
         values = _QUANTILES[profile.distribution]((np.arange(ENTRIES) + 0.5) / ENTRIES)
         if profile.distribution != "uniform":  # mean 0, standard deviation 1
@@ -151,7 +152,7 @@ def distribution_name(profile: DirectionProfile) -> str:
     if profile.distribution != "table":
         return profile.distribution
     # tc makes a file name of it: only letters and digits, and another name for each table.
-    return "table" + blake2b(repr(profile.table).encode(), digest_size=8).hexdigest()
+    return "table" + blake2b(repr(profile.quantiles).encode(), digest_size=8).hexdigest()
 
 
 def write_table(folder: Path, profile: DirectionProfile) -> None:
@@ -166,9 +167,9 @@ def check(profile: DirectionProfile) -> None:
     """Raise a BadInputError with the reason if netem cannot realise a profile."""
     pieces = Timeline(profile).pieces
     refused = {
-        "a trace with loop": profile.trace is not None and profile.trace.loop,
+        "a trace with loop": profile.rows is not None and profile.loop,
         "loss.delay_bad_ms (more delay while a burst of losses lasts)": any(
-            isinstance(piece.loss, GilbertElliott) and piece.loss.delay_bad for piece in pieces
+            isinstance(piece.loss, GilbertElliott) and piece.loss.delay_bad_ms for piece in pieces
         ),
         "rate_kbit with jitter_ms but without keep_order": not profile.keep_order
         and any(piece.rate and piece.jitter for piece in pieces),
@@ -176,7 +177,7 @@ def check(profile: DirectionProfile) -> None:
             piece.delay_ns > DELAY_MAX_MS * 1e6 for piece in pieces
         ),
         f"blackouts shorter than {STEP_NS * 1e-6:g} ms": any(
-            one.duration * 1e9 < STEP_NS for one in profile.blackouts
+            one.duration_s * 1e9 < STEP_NS for one in profile.blackouts
         ),
     }
     for what, holds in refused.items():

@@ -1,34 +1,16 @@
-"""Define the conditions of a link direction and how they change over time, in SI units.
+"""Compute the conditions of a link direction over time, in SI units, from its profile.
 
-All delays are ONE WAY. The classes mirror `config/schema.py`, which reads files in milliseconds.
-`config` and `link/traces.py` check the values; this module does not.
+All delays are ONE WAY. `config` and `link/traces.py` check the values; this module does not.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple
 
-
-@dataclass(frozen=True, slots=True)
-class GilbertElliott:
-    """Loss in bursts: a two-state Markov chain with one step per packet.
-
-    Source: E. N. Gilbert, Bell Syst. Tech. J. 39, 1960; E. O. Elliott, ibid. 42, 1963. In the terms
-    of tc-netem's `gemodel`: p = bad_start, r = bad_end, 1-h = loss_bad, 1-k = loss_good.
-    """
-
-    bad_start: float  # probability per packet to go from the good to the bad state, in [0, 1]
-    bad_end: float  # probability per packet to go from the bad to the good state, in [0, 1]
-    loss_bad: float = 1.0  # loss in the bad state, in [0, 1]
-    loss_good: float = 0.0  # loss in the good state, in [0, 1]
-    delay_bad: float = 0.0  # extra delay in the bad state, one way [s]
-
-
-Loss: TypeAlias = float | GilbertElliott
-"""Probability of an independent loss in [0, 1], or model of loss in bursts."""
+from cloudrc.config.schema import Direction, GilbertElliott, Loss
 
 
 def mean_loss(loss: Loss) -> float:
@@ -40,72 +22,40 @@ def mean_loss(loss: Loss) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
-    """A change of a link's conditions at one time; None leaves a value unchanged."""
-
-    at: float  # time since the link came up [s]
-    delay: float | None = None  # mean one-way delay [s]
-    jitter: float | None = None  # [s]
-    loss: Loss | None = None
-    rate: float | None = None  # [bit/s]
-
-
-@dataclass(frozen=True, slots=True)
-class Blackout:
-    """An interval in which all packets are lost; `start` is the time since the link came up [s]."""
-
-    start: float
-    duration: float  # [s]
-
-
-@dataclass(frozen=True, slots=True)
 class Trace:
     """Measured conditions over time: each row applies until the time of the next row.
 
-    The delays replace the profile's `delay`; the profile's jitter is added to them. If the trace
+    The delays replace the profile's `delay_ms`; the profile's jitter is added to them. If the trace
     has losses, they replace the profile's `loss`. The first row also applies before its time.
 
-    The last row applies forever. In a trace that loops, the last row lasts as long as the other
+    The last row applies forever. With the profile's `loop`, the last row lasts as long as the other
     rows on average; then the trace begins again.
     """
 
     times: tuple[float, ...]  # since the link came up, strictly rising [s], shape (n,), n >= 1
     delays: tuple[float, ...]  # one-way delay of each row [s], shape (n,)
     losses: tuple[float, ...] | None = None  # loss of each row in [0, 1], shape (n,)
-    loop: bool = False  # whether the trace begins again after its end
 
     @property
     def period(self) -> float | None:
-        """Return the time after which the trace begins again [s]; None if it never begins again."""
-        if not self.loop or len(self.times) < 2:
+        """Return the period with which the trace can loop [s]; None if it has only one row."""
+        if len(self.times) < 2:
             return None
         return self.times[-1] + (self.times[-1] - self.times[0]) / (len(self.times) - 1)
 
 
-@dataclass(frozen=True, slots=True)
-class DirectionProfile:
-    """Requested conditions of one direction.
+class DirectionProfile(Direction):
+    """One direction of a link profile, with the contents of the files that it names.
 
     A negative sum of delay and jitter counts as 0. `keep_order` disables `reorder`. A packet that
-    finds the bottleneck's queue full is dropped. If `distribution` is "table", `table` has equally
-    probable values: mean 0, standard deviation 1, rising, shape (n,).
+    finds the bottleneck's queue full is dropped.
     """
 
-    delay: float = 0.0  # mean one-way delay [s]
-    jitter: float = 0.0  # half width (uniform) or standard deviation (others) of the delay [s]
-    distribution: Literal["uniform", "normal", "pareto", "table"] = "uniform"
-    correlation: float = 0.0  # correlation of the jitter of successive packets, in [0, 1]
-    loss: Loss = 0.0
-    duplicate: float = 0.0  # probability of a copy with its own delay, in [0, 1]
-    reorder: float = 0.0  # probability that a packet has no delay and skips the queue, in [0, 1]
-    corrupt: float = 0.0  # probability of a flipped bit, the same in all copies, in [0, 1]
-    keep_order: bool = False  # whether packets arrive in the order of sending
-    rate: float | None = None  # rate of the bottleneck [bit/s]; None without a bottleneck
-    queue_packets: int = 1000  # capacity of the bottleneck, including the packet on the wire
-    changes: tuple[Change, ...] = ()  # strictly rising in `at`
-    trace: Trace | None = None
-    blackouts: tuple[Blackout, ...] = ()  # in any order; they may overlap
-    table: tuple[float, ...] = ()  # values of the distribution "table", in units of `jitter` [1]
+    rows: Trace | None = None
+    """Contents of the file `trace`; None without this file"""
+    quantiles: tuple[float, ...] = ()
+    """Delays in the file `table`, which are equally probable: mean 0, standard deviation 1, rising,
+    shape (n,), in units of the jitter [1]"""
 
 
 class Conditions(NamedTuple):
@@ -129,11 +79,11 @@ class Timeline:
     """
 
     def __init__(self, profile: DirectionProfile) -> None:
-        instants = {0.0, *(change.at for change in profile.changes)}
-        instants.update(profile.trace.times if profile.trace else ())
+        instants = {0.0, *(change.at_s for change in profile.changes)}
+        instants.update(profile.rows.times if profile.rows else ())
         for blackout in profile.blackouts:
-            instants.update((blackout.start, blackout.start + blackout.duration))
-        period = profile.trace.period if profile.trace else None
+            instants.update((blackout.start_s, blackout.start_s + blackout.duration_s))
+        period = profile.rows.period if profile.rows and profile.loop else None
         self.period_ns = None if period is None else round(period * 1e9)
         end_ns = inf if self.period_ns is None else self.period_ns
         ordered = [instant for instant in sorted(instants) if round(instant * 1e9) < end_ns]
@@ -159,30 +109,32 @@ class Timeline:
 def settled(profile: DirectionProfile) -> DirectionProfile:
     """Return the profile with constant conditions: those of the last piece of its time line."""
     last = Timeline(profile).pieces[-1]
-    return replace(
-        profile,
-        delay=last.delay_ns * 1e-9,
-        jitter=last.jitter,
-        loss=1.0 if last.blackout else last.loss,
-        rate=last.rate,
-        changes=(),
-        trace=None,
-        blackouts=(),
-    )
+    constant = {
+        "delay_ms": last.delay_ns * 1e-6,
+        "jitter_ms": last.jitter * 1e3,
+        "loss": 1.0 if last.blackout else last.loss,
+        "rate_kbit": None if last.rate is None else last.rate * 1e-3,
+        "changes": (),
+        "rows": None,
+        "blackouts": (),
+    }
+    return profile.model_copy(update=constant)
 
 
 def _conditions(profile: DirectionProfile, instant: float) -> Conditions:
-    delay, jitter, loss, rate = profile.delay, profile.jitter, profile.loss, profile.rate
+    delay, jitter, loss = profile.delay_ms * 1e-3, profile.jitter_ms, profile.loss
+    rate = profile.rate_kbit
     for change in profile.changes:
-        if change.at > instant:
+        if change.at_s > instant:
             break
-        delay = delay if change.delay is None else change.delay
-        jitter = jitter if change.jitter is None else change.jitter
+        delay = delay if change.delay_ms is None else change.delay_ms * 1e-3
+        jitter = jitter if change.jitter_ms is None else change.jitter_ms
         loss = loss if change.loss is None else change.loss
-        rate = rate if change.rate is None else change.rate
-    if (trace := profile.trace) is not None:
+        rate = rate if change.rate_kbit is None else change.rate_kbit
+    if (trace := profile.rows) is not None:
         row = max(bisect_right(trace.times, instant) - 1, 0)
         delay = trace.delays[row]
         loss = loss if trace.losses is None else trace.losses[row]
-    blackout = any(b.start <= instant < b.start + b.duration for b in profile.blackouts)
-    return Conditions(round(delay * 1e9), jitter, loss, rate, blackout)
+    blackout = any(b.start_s <= instant < b.start_s + b.duration_s for b in profile.blackouts)
+    rate = None if rate is None else rate * 1e3
+    return Conditions(round(delay * 1e9), jitter * 1e-3, loss, rate, blackout)

@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 from cloudrc.errors import CloudrcError
+from cloudrc.files import write_atomically
 from cloudrc.link.follow import Loaded
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.relay import Address, Relay
-from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, publish, summary, to_text
+from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, summary, to_text
 
 if TYPE_CHECKING:
     from cloudrc.link.netem import Netem
@@ -107,7 +108,7 @@ class Sidecar:
         shaper = self._shaper  # another thread may replace it
         if shaper and (released := shaper.released()):
             with suppress(OSError):
-                publish(self._released_file, json.dumps(released))
+                write_atomically(self._released_file, json.dumps(released).encode())
 
     def _shape(self, peer: Address, stop: Callable[[], bool]) -> None:
         """Run netem or the relay until `stop()` is true, or until a profile needs the other."""
@@ -194,11 +195,11 @@ class Sidecar:
     def _publish_state(self, state: LinkState) -> LinkState:
         self.state = state
         with suppress(OSError):  # shaping continues even if the disk is full
-            publish(self._state_file, to_text(state))
+            write_atomically(self._state_file, to_text(state).encode())
         return state
 
     def _publish_route(self, route: Address) -> None:
-        publish(self._route, f"{route[0]}:{route[1]}\n")
+        write_atomically(self._route, f"{route[0]}:{route[1]}\n".encode())
 
 
 def _cause(error: CloudrcError) -> str:

@@ -9,10 +9,8 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field
 from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from cloudrc.files import write_atomically
 from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
 
 if TYPE_CHECKING:
@@ -95,6 +93,11 @@ def from_text(text: bytes | str) -> LinkState:
     return parse(LinkState, text)
 
 
+def write_change(change: Change) -> str:
+    """Format a change as the content of change.json."""
+    return json.dumps(asdict(change)) + "\n"
+
+
 def read_change(text: str) -> Change:
     """Parse the content of change.json; return an empty `Change` if the text is invalid."""
     try:
@@ -115,8 +118,3 @@ def summary(profile: DirectionProfile) -> dict[str, float | None]:
     loss = 1.0 if first.blackout else mean_loss(first.loss)
     delay = round(first.delay_ns * 1e-9, 9)
     return {"delay": delay, "jitter": first.jitter, "loss": loss, "rate": first.rate}
-
-
-def publish(path: Path, text: str) -> None:
-    """Write a text file atomically."""
-    write_atomically(path, text.encode("utf-8"))

@@ -14,9 +14,10 @@ from math import fsum, inf, sqrt
 from pathlib import Path
 from typing import NamedTuple
 
+from cloudrc.config.schema import Direction
 from cloudrc.errors import BadInputError
 from cloudrc.files import read
-from cloudrc.link.profile import Trace
+from cloudrc.link.profile import DirectionProfile, Trace
 
 SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a second
 START_MAX = 600.0  # if the first row is later, times count from the first row [s]
@@ -34,6 +35,19 @@ def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
     """
     remedy = "give a CSV file with the columns time_s,delay_ms"
     return parse_trace(read_lines(path, f"trace {path}", remedy, size_max), str(path))
+
+
+def link_profile(direction: Direction, file_max: int = SIZE_MAX) -> DirectionProfile:
+    """Read the files that one direction of a link profile names.
+
+    Raise a BadInputError if a file cannot be used or is longer than `file_max` bytes.
+    """
+    table = direction.distribution == "table" and direction.table
+    return DirectionProfile.model_construct(
+        **dict(direction),
+        rows=read_trace(Path(direction.trace), file_max) if direction.trace else None,
+        quantiles=read_table(Path(table), file_max) if table else (),
+    )
 
 
 def read_lines(path: Path, name: str, remedy: str, size_max: int = SIZE_MAX) -> list[str]:

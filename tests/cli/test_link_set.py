@@ -11,8 +11,9 @@ from cloudrc.config.document import Document
 from cloudrc.config.load import edit_profile
 from cloudrc.drivers import local
 from cloudrc.errors import BadInputError
+from cloudrc.files import write_atomically
 from cloudrc.link.follow import HANDED_FILE, Profiles
-from cloudrc.link.state import LinkState, publish, summary, to_text
+from cloudrc.link.state import LinkState, summary, to_text
 
 CHANGES = [{"at_s": 9.0, "delay_ms": 50.0, "jitter_ms": 20.0}, {"at_s": 12.0, "loss": 0.1}]
 TIMED = {"uplink": {"delay_ms": 40.0}, "downlink": {"delay_ms": 25.0, "changes": CHANGES}}
@@ -94,7 +95,7 @@ class Flight:
         (_, values, change), asked = loaded, summary(loaded.direction)
         about = {"change": change.number, "cause": change.cause, "asked": asked}
         state = LinkState("relay", "", "relay", own.name, values, "", 1, **about)
-        publish(own / "link.json", to_text(state))
+        write_atomically(own / "link.json", to_text(state).encode())
 
     def wait(self, _):
         for own, profiles in self.links.items():

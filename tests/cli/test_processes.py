@@ -19,9 +19,10 @@ from cloudrc.cli.processes import (
     show_address,
 )
 from cloudrc.config.load import load_experiment
+from cloudrc.config.schema import Direction
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import BadInputError
-from cloudrc.link.verify.monitor import LinkMonitor
+from cloudrc.link.traces import link_profile
 from cloudrc.record.columns import Recording
 from tests.record.conftest import MS, counted, world_records
 
@@ -166,21 +167,21 @@ def test_the_link_is_expected_to_carry_the_plans(plan_s, size, monkeypatch):
     monitor = Mock()
     monkeypatch.setattr("cloudrc.link.verify.monitor.LinkMonitor", monitor)
     experiment = load_experiment("fast", [f"cloud.plan_s={plan_s}"])
-    processes.link_monitor(experiment, None, uplink=False, trusted=False)
-    assert monitor.call_args.kwargs["flow"].size == size
+    processes.link_monitor(experiment, uplink=False, trusted=False)
+    assert monitor.call_args.args[1].size == size
 
 
 def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch):
-    loads, path = [], tmp_path / "trace.csv"
-    monkeypatch.setattr(LinkMonitor, "begin", lambda self, asked, path, load: loads.append(load))
-    processes.link_monitor(load_experiment("paper"), None, uplink=False, trusted=False)
+    monitor, path = Mock(), tmp_path / "trace.csv"
+    monkeypatch.setattr("cloudrc.link.verify.monitor.LinkMonitor", monitor)
+    processes.link_monitor(load_experiment("paper"), uplink=False, trusted=False)
 
     def load(**uplink):
-        return loads[0]({"uplink": uplink})[0]
+        return link_profile(Direction(**uplink), monitor.call_args.kwargs["file_max"])
 
     path.write_text("time_s,delay_ms\n0,45\n1,50\n")
-    assert load(trace=str(path)).trace
-    assert load(table=str(path), distribution="table").table
+    assert load(trace=str(path)).rows
+    assert load(table=str(path), distribution="table").quantiles
     path.write_text(path.read_text() + "\n" * processes.TRACE_MAX)
     with pytest.raises(BadInputError, match="longer than 2097152 bytes; give a CSV file"):
         load(trace=str(path))

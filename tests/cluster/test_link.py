@@ -16,8 +16,9 @@ from cloudrc.cli.main import main
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.link import APPLY_LIMIT, APPLY_SCRIPT, with_files
 from cloudrc.errors import BadInputError
-from cloudrc.link.follow import HANDED_FILE, Handed, read_handed, write_handed
-from cloudrc.link.state import STATE_FILE, LinkState, publish, to_text
+from cloudrc.files import write_atomically
+from cloudrc.link.follow import HANDED_FILE, read_handed
+from cloudrc.link.state import STATE_FILE, LinkState, to_text
 
 PROFILE = "uplink: {delay_ms: 45, jitter_ms: 25}\ndownlink: {delay_ms: 45, jitter_ms: 25}\n"
 TRACE = "time_s,delay_ms\n0,40\n1,60\n"
@@ -65,8 +66,8 @@ class Cluster:
         if pod in self.broken:
             raise ClusterError("the pod is gone")
         document, state = json.loads(given), self.states[pod]
-        change, self.handed[pod] = json.loads(document["change"]), document
-        if pod in self.cannot and self.cannot[pod] in document["files"]["profile.yaml"]:
+        change, self.handed[pod] = json.loads(document["change.json"]), document
+        if pod in self.cannot and self.cannot[pod] in document["profile.yaml"]:
             state |= {"refused": change["number"], "refusal": "netem cannot do that"}
         elif pod not in self.deaf:
             state |= {"change": change["number"], "cause": change["cause"]}
@@ -89,8 +90,7 @@ def test_a_change_reaches_both_pods_and_the_configmap(cluster, capsys):
     assert (change["cause"], change["restart"]) == ("downlink.delay_ms=120", False)
     for name in ("world-1", "cloud-1"):
         handed = cluster.handed[name]
-        assert handed["files"] == {"profile.yaml": cluster.kept["profile.yaml"]}
-        assert json.loads(handed["change"]) == change
+        assert handed == {name: cluster.kept[name] for name in ("profile.yaml", "change.json")}
     asked = cluster.asked
     verbs = [word for line in asked for word in line if word in ("get", "exec", "patch")]
     assert verbs == ["get", "exec", "exec", "patch"], "in force first, then for good"
@@ -104,8 +104,8 @@ def test_a_local_trace_is_stored_beside_the_profile(cluster, tmp_path, monkeypat
     cluster.items[0]["data"] |= {"old.csv": "of a profile before"}
     assert main(["link", "set", *setting, "-n", "demo"]) == 0
     handed = cluster.handed["world-1"]
-    assert set(handed["files"]) == {"profile.yaml", "uplink-my_trace.csv"}
-    assert handed["files"]["uplink-my_trace.csv"] == cluster.kept["uplink-my_trace.csv"] == TRACE
+    assert set(handed) == {"profile.yaml", "change.json", "uplink-my_trace.csv"}
+    assert handed["uplink-my_trace.csv"] == cluster.kept["uplink-my_trace.csv"] == TRACE
     made, new = with_files({"profile.yaml": PROFILE}, None, setting)
     assert made.restart
     assert yaml.safe_load(new["profile.yaml"])["uplink"]["trace"] == "uplink-my_trace.csv"
@@ -179,7 +179,8 @@ def test_a_missing_pod_is_named(cluster, running, capsys):
 
 NOTE = json.dumps({"number": "b2", "cause": "zwölf", "restart": False})
 LONG = "time_s,delay_ms\n" + "0,40\n" * 20_000
-DOCUMENT = write_handed(Handed(NOTE, {"profile.yaml": "uplink: {trace: t.csv}\n", "t": LONG}))
+FILES = {"change.json": NOTE, "profile.yaml": "uplink: {trace: t.csv}\n", "t": LONG}
+DOCUMENT = json.dumps(FILES)
 
 
 def start(folder, script=APPLY_SCRIPT):
@@ -191,7 +192,7 @@ def start(folder, script=APPLY_SCRIPT):
 
 def tell(folder, **state):
     text = to_text(LinkState("relay", "", "relay", "uplink", {}, "", 1, **state))
-    publish(folder / STATE_FILE, text)
+    write_atomically(folder / STATE_FILE, text.encode())
     return text
 
 
@@ -211,7 +212,7 @@ def test_the_script_writes_a_change_and_prints_the_state(tmp_path, state):
     out, err = running.communicate(DOCUMENT, timeout=2 * APPLY_LIMIT)
     thread.join()
     assert (running.returncode, out, err) == (0, decided[0], "")
-    assert read_handed((tmp_path / HANDED_FILE).read_text()).change == NOTE
+    assert read_handed((tmp_path / HANDED_FILE).read_text()) == FILES
     assert sorted(os.listdir(tmp_path)) == [HANDED_FILE, STATE_FILE], "no draft is left"
 
 

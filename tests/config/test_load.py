@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.assembly import link_profile
 from cloudrc.config import document, shipped
 from cloudrc.config.document import parse_value
 from cloudrc.config.load import dump, fingerprint, load_experiment, load_profile, read_experiment
 from cloudrc.geometry.scene import load_scene
+from cloudrc.link.traces import link_profile
 
 PROFILES = shipped.names("profile")
 
@@ -146,7 +146,7 @@ def test_paths_start_at_the_file_that_names_them(tmp_path, monkeypatch):
     monkeypatch.chdir(links)
     experiment = load_experiment(tmp_path / "mine.yaml", ["report.metrics.2=./b.py"])
     assert experiment.uplink.trace == experiment.downlink.table == str(links / "trace.csv")
-    assert link_profile(experiment.downlink).table == pytest.approx((-1.0, 1.0))
+    assert link_profile(experiment.downlink).quantiles == pytest.approx((-1.0, 1.0))
     assert experiment.link.profile == str(links / "traced.yaml")
     assert experiment.cloud.predictor.name == str(tmp_path / "still.py")
     assert experiment.mission.waypoints[0].position_m == (0.5, 0, 0.7)

@@ -5,6 +5,7 @@ import os
 import time
 from dataclasses import asdict, replace
 from types import SimpleNamespace
+from unittest.mock import Mock, call
 
 import pytest
 
@@ -21,7 +22,8 @@ from cloudrc.drivers.process import (
     in_words,
 )
 from cloudrc.drivers.teleop import LAST_WORD_NS, LastWord
-from cloudrc.link.state import STATE_MAX, LinkState, publish, to_text
+from cloudrc.files import write_atomically
+from cloudrc.link.state import STATE_MAX, LinkState, to_text
 from cloudrc.messages import GuardState
 from cloudrc.records import (
     Fault,
@@ -133,11 +135,12 @@ def path(tmp_path):
 
 
 def tell(path, state):
-    publish(path, to_text(state))
+    write_atomically(path, to_text(state).encode())
 
 
 def test_a_change_is_recorded_once_and_again_at_a_mission_start(path):
-    notes = LinkNotes(path, uplink=False)
+    check = Mock()
+    notes = LinkNotes(path, uplink=False, check=check)
     assert notes.after(BEGINS, 0) == []
     tell(path, STATE)
     (first,) = notes.after([], 200 * MS)
@@ -159,6 +162,10 @@ def test_a_change_is_recorded_once_and_again_at_a_mission_start(path):
     (again,) = notes.after([SessionOpened(0, "cloud", 1, "")], 1010 * MS)
     later = {"age": pytest.approx(0.06), "time_line": pytest.approx(0.41)}
     assert again == changed._replace(stamp_ns=1010 * MS, **later)
+    assert check.request.mock_calls == [call(STATE.profile), call(SET.profile)]
+    path.write_text("x" * (STATE_MAX + 1))
+    assert notes.after([], 2000 * MS) == []
+    check.request.assert_called_with(None)  # the profile is unknown
 
 
 @pytest.mark.parametrize(

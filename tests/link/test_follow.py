@@ -7,16 +7,14 @@ import pytest
 
 from cloudrc.cli.link_run import make_profile_loader
 from cloudrc.errors import BadInputError
+from cloudrc.files import write_atomically
 from cloudrc.link.follow import (
     HANDED_FILE,
     SIZE_MAX,
-    Handed,
     PeerName,
     Profiles,
-    read_handed,
-    write_handed,
 )
-from cloudrc.link.state import Change, publish
+from cloudrc.link.state import Change
 
 LOAD = make_profile_loader("uplink")
 
@@ -41,23 +39,24 @@ class Pod:
 
     def put(self, delay_ms, number):
         if number:
-            publish(self.map / "change.json", note(number))
+            write_atomically(self.map / "change.json", note(number).encode())
         self.write(f"uplink: {{delay_ms: {delay_ms}}}\n")
 
     def write(self, text):
-        publish(self.map / "profile.yaml", text)
+        write_atomically(self.map / "profile.yaml", text.encode())
         os.utime(self.map / "profile.yaml", ns=(0, 0))  # the time alone tells nothing
 
     def hand(self, delay_ms, number):
-        document = Handed(note(number), {"profile.yaml": f"uplink: {{delay_ms: {delay_ms}}}\n"})
-        publish(self.run / HANDED_FILE, write_handed(document))
+        profile = f"uplink: {{delay_ms: {delay_ms}}}\n"
+        document = json.dumps({"change.json": note(number), "profile.yaml": profile})
+        write_atomically(self.run / HANDED_FILE, document.encode())
 
     def first(self):
-        return self.profiles.first().direction.delay
+        return self.profiles.first().direction.delay_ms
 
     def poll(self):
         loaded = self.profiles.poll()
-        return None if loaded is None else (loaded.direction.delay, loaded.change.number)
+        return None if loaded is None else (loaded.direction.delay_ms, loaded.change.number)
 
 
 @pytest.fixture
@@ -66,10 +65,10 @@ def pod(tmp_path):
 
 
 def test_a_new_file_is_read_once_and_refused_until_fixed(pod):
-    assert pod.first() == 0.04
+    assert pod.first() == 40.0
     assert pod.poll() is None
     pod.put(70.0, "")
-    assert pod.poll() == (0.07, "")
+    assert pod.poll() == (70.0, "")
     for text in ("uplink: {delay: 40}\n", "uplink: {delay_ms: -1}\n", "a: [\n"):
         pod.write(text)
         assert pod.poll() is pod.poll() is None
@@ -80,16 +79,16 @@ def test_a_new_file_is_read_once_and_refused_until_fixed(pod):
     with pytest.raises(BadInputError, match="no such file"):
         pod.profiles.first()
     pod.put(50.0, "")
-    assert pod.poll() == (0.05, "")
+    assert pod.poll() == (50.0, "")
 
 
 @pytest.mark.parametrize("faster", ["hand", "put"])
 def test_a_change_that_comes_both_ways_takes_effect_once(pod, faster):
-    assert pod.first() == 0.04
+    assert pod.first() == 40.0
     ways = [pod.hand, pod.put] if faster == "hand" else [pod.put, pod.hand]
     ways[0](120.0, "a1")
     loaded = pod.profiles.poll()
-    assert (loaded.direction.delay, loaded.change) == (0.12, Change("a1", "cause a1", False))
+    assert (loaded.direction.delay_ms, loaded.change) == (120.0, Change("a1", "cause a1", False))
     assert pod.poll() is None
     ways[1](120.0, "a1")
     assert pod.poll() is None
@@ -100,13 +99,13 @@ def test_a_late_config_map_does_not_bring_an_older_change_back(pod):
     pod.first()
     for delay_ms, number in ((120.0, "a1"), (20.0, "b2")):
         pod.hand(delay_ms, number)
-        assert pod.poll() == (delay_ms * 1e-3, number)
+        assert pod.poll() == (delay_ms, number)
     for delay_ms, number in ((120.0, "a1"), (20.0, "b2")):
         pod.put(delay_ms, number)
         assert pod.poll() is None
     pod.hand(9.0, "refused by netem")
     pod.start()  # a container that restarts takes the ConfigMap
-    assert pod.first() == 0.02
+    assert pod.first() == 20.0
     assert pod.poll() is None
 
 
@@ -114,37 +113,36 @@ def test_an_upgrade_after_a_change_by_hand_takes_effect(pod):
     """Helm restores the profile and leaves the file of the last change, which may be invalid."""
     pod.first()
     pod.put(120.0, "a1")
-    assert pod.poll() == (0.12, "a1")
+    assert pod.poll() == (120.0, "a1")
     pod.put(45.0, "")
-    assert pod.poll() == (0.045, "")
-    publish(pod.map / "change.json", '{"number": "a2"}')
+    assert pod.poll() == (45.0, "")
+    write_atomically(pod.map / "change.json", b'{"number": "a2"}')
     pod.put(50.0, "")
-    assert pod.poll() == (0.05, "")
+    assert pod.poll() == (50.0, "")
 
 
 def test_a_change_can_contain_a_trace(pod):
     pod.first()
     files = {"profile.yaml": "uplink: {trace: t.csv}\n", "t.csv": "time_s,delay_ms\n0,40\n1,60\n"}
-    document = Handed(note("a1"), files)
-    assert read_handed(write_handed(document)) == document
-    publish(pod.run / HANDED_FILE, write_handed(document))
-    assert pod.profiles.poll().direction.trace.delays == (0.04, 0.06)
+    write_atomically(pod.run / HANDED_FILE, json.dumps(files).encode())
+    assert pod.profiles.poll().direction.rows.delays == (0.04, 0.06)
 
 
 @pytest.mark.parametrize(
     "text",
     [
         "{",
-        '{"change": "", "files": {}}',
-        '{"change": "", "files": {"profile.yaml": "", "../route": "1.2.3.4:5"}}',
-        '{"change": "", "files": {"profile.yaml": "uplink: {delay_ms: -1}"}}',
-        '{"change": "", "files": {"profile.yaml": ""}}' + " " * SIZE_MAX,
+        "{}",
+        '{"profile.yaml": 1}',
+        '{"profile.yaml": "", "../route": "1.2.3.4:5"}',
+        '{"profile.yaml": "uplink: {delay_ms: -1}"}',
+        '{"profile.yaml": ""}' + " " * SIZE_MAX,
         "of another user",
     ],
 )
 def test_an_invalid_document_is_refused_in_one_line(pod, monkeypatch, text):
-    assert pod.first() == 0.04
-    publish(pod.run / HANDED_FILE, text)
+    assert pod.first() == 40.0
+    write_atomically(pod.run / HANDED_FILE, text.encode())
     if text == "of another user":
         pod.hand(120.0, "a1")
         monkeypatch.setattr(os, "geteuid", lambda: 12345)

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
@@ -21,7 +20,9 @@ from cloudrc.link.netem import (
     table,
     write_table,
 )
-from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Timeline, Trace
+from cloudrc.link.profile import Timeline, Trace
+from cloudrc.link.traces import link_profile
+from tests.link.profiles import blackout, change, in_bursts, profile_of
 
 PEER = ("10.244.0.7", 7400)
 
@@ -110,18 +111,18 @@ def shaped(profile, until=0.0, log=print):
     return kernel, shaper
 
 
-PLAIN = DirectionProfile(0.04)
-EVERYTHING = DirectionProfile(
+PLAIN = profile_of(0.04)
+EVERYTHING = profile_of(
     0.045, 0.0255, "normal", 0.25, loss=0.015, duplicate=0.02, reorder=0.1, corrupt=0.005
 )
-TIMED = DirectionProfile(
+TIMED = profile_of(
     0.02,
     duplicate=0.1,
-    changes=(Change(1.0, delay=0.1, loss=0.5),),
-    blackouts=(Blackout(2.0, 0.3),),
+    changes=(change(1.0, delay=0.1, loss=0.5),),
+    blackouts=(blackout(2.0, 0.3),),
 )
-BURSTS = GilbertElliott(0.1, 0.5, delay_bad=0.04)
-SLOW = DirectionProfile(0.3, rate=2e6, queue_packets=100)
+BURSTS = in_bursts(0.1, 0.5, delay_bad=0.04)
+SLOW = profile_of(0.3, rate=2e6, queue_packets=100)
 
 
 def text(profile, at=0.0):
@@ -138,12 +139,12 @@ def text(profile, at=0.0):
             "limit 10000 delay 45000.000us 25500.000us 25% distribution normal loss random 1.5% "
             "duplicate 2% corrupt 0.5% reorder 10% rate 0bit",
         ),
-        (DirectionProfile(0.045, 0.002, "pareto"), 0.0, "45000.000us 8000.000us 0% distribution p"),
-        (DirectionProfile(loss=GilbertElliott(0.01, 0.1, 0.6, 0.005)), 0.0, "gemodel 1% 10% 60% 0"),
+        (profile_of(0.045, 0.002, "pareto"), 0.0, "45000.000us 8000.000us 0% distribution p"),
+        (profile_of(loss=in_bursts(0.01, 0.1, 0.6, 0.005)), 0.0, "gemodel 1% 10% 60% 0"),
         (SLOW, 0.0, "limit 747 "),  # 100 + 0.3 s * 2 Mbit/s / (8 * 116 bit)
         (SLOW, 0.0, "rate 2000000bit -14"),
-        (DirectionProfile(0.04, 0.03, reorder=0.2, keep_order=True), 0.0, "% rate 100gbit"),
-        (DirectionProfile(reorder=0.2), 0.0, "corrupt 0% rate"),  # without a delay tc refuses it
+        (profile_of(0.04, 0.03, reorder=0.2, keep_order=True), 0.0, "% rate 100gbit"),
+        (profile_of(reorder=0.2), 0.0, "corrupt 0% rate"),  # without a delay tc refuses it
         (TIMED, 1.0, "delay 100000.000us loss random 50% duplicate 10%"),
         (TIMED, 2.1, "delay 100000.000us loss random 100% duplicate 0%"),  # no copy arrives
     ],
@@ -155,11 +156,11 @@ def test_a_profile_becomes_arguments_of_tc(profile, at, words):
 @pytest.mark.parametrize(
     ("profile", "key"),
     [
-        (DirectionProfile(trace=Trace((0.0, 9.0), (0.1, 300.0))), "delay_ms above 274000"),
-        (DirectionProfile(trace=Trace((0.0, 9.0), (0.1, 0.3), loop=True)), "a trace with loop"),
-        (DirectionProfile(changes=(Change(1.0, loss=BURSTS),)), "loss.delay_bad_ms"),
-        (DirectionProfile(rate=1e6, changes=(Change(1.0, jitter=0.1),)), "without keep_order"),
-        (DirectionProfile(blackouts=(Blackout(1.0, 0.004),)), "blackouts shorter than 5 ms"),
+        (profile_of(rows=Trace((0.0, 9.0), (0.1, 300.0))), "delay_ms above 274000"),
+        (profile_of(rows=Trace((0.0, 9.0), (0.1, 0.3)), loop=True), "a trace with loop"),
+        (profile_of(changes=(change(1.0, loss=BURSTS),)), "loss.delay_bad_ms"),
+        (profile_of(rate=1e6, changes=(change(1.0, jitter=0.1),)), "without keep_order"),
+        (profile_of(blackouts=(blackout(1.0, 0.004),)), "blackouts shorter than 5 ms"),
     ],
 )
 def test_a_profile_beyond_netem_is_refused_by_key(profile, key):
@@ -177,7 +178,7 @@ def test_only_lossy_of_the_shipped_profiles_needs_the_relay():
 
 @pytest.mark.parametrize("distribution", sorted(STRETCH))
 def test_tables_are_the_models_distributions(distribution, tmp_path):
-    profile = DirectionProfile(jitter=1.0, distribution=distribution)
+    profile = profile_of(jitter=1.0, distribution=distribution)
     write_table(tmp_path, profile)
     _, *rows = (tmp_path / f"{distribution}.dist").read_text().splitlines()
     entries = np.array(table(profile))
@@ -224,14 +225,14 @@ def test_only_tunnel_datagrams_go_to_netem_and_close_removes_all():
 def test_qdiscs_of_a_killed_process_are_taken_over():
     kernel, _ = shaped(PLAIN)
     kernel.said.clear()
-    netem(kernel, DirectionProfile(0.07)).follow_peer(PEER)
+    netem(kernel, profile_of(0.07)).follow_peer(PEER)
     assert [line[:12] for line in kernel.said] == ["qdisc change", "filter add p", "filter del p"]
     assert len(kernel.filters) == 1
 
 
 def test_a_smaller_limit_waits_until_queued_packets_have_left():
-    kernel, shaper = shaped(DirectionProfile(1.0, rate=1e6, queue_packets=10))
-    small = DirectionProfile(0.02, rate=1e6, queue_packets=10)
+    kernel, shaper = shaped(profile_of(1.0, rate=1e6, queue_packets=10))
+    small = profile_of(0.02, rate=1e6, queue_packets=10)
     for held, seconds, room in ((100, 1.5, limit(small) + 100), (3, 2.0, limit(small))):
         kernel.held = held
         shaper.follow_profile(small)
@@ -247,7 +248,7 @@ def test_a_refused_profile_leaves_the_old_one_in_force(delay):
     kernel, shaper = shaped(PLAIN)
     before, kernel.refuses = kernel.netem, "100000.000us"
     with pytest.raises((BadInputError, MissingPrerequisiteError), match="delay"):
-        shaper.follow_profile(DirectionProfile(delay))
+        shaper.follow_profile(profile_of(delay))
     shaper.step(0.1)
     assert kernel.netem == before
 
@@ -277,7 +278,7 @@ def test_a_kernel_that_lacks_a_module_is_left_as_it_was(lacks):
 )
 def test_a_foreign_change_of_the_qdisc_is_an_error(harm, said):
     log = []
-    profile = DirectionProfile(0.04, changes=(Change(5.0, loss=0.1),))
+    profile = profile_of(0.04, changes=(change(5.0, loss=0.1),))
     kernel, shaper = shaped(profile, 1.5, log.append)
     assert (log, shaper.counts()["restored"]) == ([], 0)
     harm(kernel)
@@ -288,12 +289,12 @@ def test_a_foreign_change_of_the_qdisc_is_an_error(harm, said):
     assert line.startswith(f"error: the qdisc of eth0 {said}")
     assert (kernel.said, shaper.counts()["restored"]) == ([], 1)
     with pytest.raises(MissingPrerequisiteError, match="restart this pod"):
-        shaper.follow_profile(DirectionProfile(0.07))
+        shaper.follow_profile(profile_of(0.07))
 
 
 def test_a_step_is_taken_when_it_is_due():
-    profile = DirectionProfile(
-        delay=0.02, changes=(Change(1.003, delay=0.1),), blackouts=(Blackout(1.511, 0.05),)
+    profile = profile_of(
+        delay=0.02, changes=(change(1.003, delay=0.1),), blackouts=(blackout(1.511, 0.05),)
     )
     kernel, shaper = shaped(profile, 2.0)
     assert kernel.history == [
@@ -308,7 +309,7 @@ def test_a_step_is_taken_when_it_is_due():
 def test_changes_faster_than_the_step_are_skipped():
     times = tuple(0.001 * n for n in range(1000))
     trace = Trace(times, tuple(0.03 + 1e-5 * n for n in range(1000)))
-    kernel, _ = shaped(DirectionProfile(trace=trace), 1.2)
+    kernel, _ = shaped(profile_of(rows=trace), 1.2)
     assert np.diff([at for at, _, _ in kernel.history]).min() >= 4.999
     assert len(kernel.history) >= 199
     assert kernel.history[-1][1] == "39990.000us"

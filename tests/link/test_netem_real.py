@@ -7,13 +7,11 @@ import subprocess
 import threading
 import time
 from contextlib import suppress
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from cloudrc.assembly import link_profile
 from cloudrc.cli.link_run import Programs
 from cloudrc.cli.link_verify import DEVICE, HOSTS, _namespaces, inside
 from cloudrc.config.load import load_profile
@@ -21,8 +19,10 @@ from cloudrc.config.shipped import names
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.link.model import LinkDirection, numbers, sample
 from cloudrc.link.netem import STRETCH, Netem, table
-from cloudrc.link.profile import Blackout, DirectionProfile, GilbertElliott, Trace
+from cloudrc.link.profile import Trace
+from cloudrc.link.traces import link_profile
 from cloudrc.tunnel.codec import Kind
+from tests.link.profiles import blackout, changed, in_bursts, profile_of
 
 MINUTES = [
     (name, way)
@@ -153,7 +153,7 @@ def make(tmp_path_factory):
 @pytest.fixture
 def shaped(make):
     """Install netem without conditions."""
-    netem = make(DirectionProfile())
+    netem = make(profile_of())
     assert netem.follow_peer(FAR_PEER) == FAR_PEER
     yield netem
     netem.close()
@@ -161,7 +161,7 @@ def shaped(make):
 
 @pytest.mark.smoke
 def test_the_delay_is_applied_to_the_tunnels_flow_alone(shaped):
-    shaped.follow_profile(DirectionProfile(delay=0.060))
+    shaped.follow_profile(profile_of(delay=0.060))
 
     def off():
         tunnel, stranger = Flow(), Flow(port=7402)
@@ -177,8 +177,8 @@ def test_the_delay_is_applied_to_the_tunnels_flow_alone(shaped):
 def test_jitter_is_distributed_as_asked(shaped, distribution):
     drawn = np.sort(np.random.default_rng(5).gamma(2.0, size=2000))
     measured = (drawn - drawn.mean()) / drawn.std()
-    profile = DirectionProfile(0.080, 0.020, distribution, table=tuple(measured.tolist()))
-    shaped.follow_profile(replace(profile, distribution="normal"))
+    profile = profile_of(0.080, 0.020, distribution, quantiles=tuple(measured.tolist()))
+    shaped.follow_profile(changed(profile, distribution="normal"))
     shaped.follow_profile(profile)
     shares = [0.05, 0.25, 0.5, 0.75, 0.95]
     if distribution != "table":
@@ -193,10 +193,10 @@ def test_jitter_is_distributed_as_asked(shaped, distribution):
 
 
 @pytest.mark.parametrize(
-    ("asked", "share", "burst"), [(0.2, 0.2, 1.25), (GilbertElliott(0.05, 0.25), 1 / 6, 4.0)]
+    ("asked", "share", "burst"), [(0.2, 0.2, 1.25), (in_bursts(0.05, 0.25), 1 / 6, 4.0)]
 )
 def test_losses_are_as_many_as_asked_and_counted(shaped, asked, share, burst):
-    shaped.follow_profile(DirectionProfile(loss=asked))
+    shaped.follow_profile(profile_of(loss=asked))
     arrived, counts = set(measure(2000, 0.002).numbers()), shaped.counts()
     lost = [n for n in range(2000) if n not in arrived]
     mean = len(lost) / (1 + sum(after - before > 1 for before, after in pairwise(lost)))
@@ -244,10 +244,10 @@ def drawn_for(flow, profile, seed):
 
 
 def test_a_change_in_flight_loses_nothing(shaped):
-    asked = [DirectionProfile(delay) for delay in (0.3, 0.02, 0.15, 0.05, 0.2)]
-    asked[1] = replace(asked[1], rate=1e6, queue_packets=5)  # less room than what is under way
-    asked[2] = replace(asked[2], jitter=0.02, distribution="normal")
-    asked[3] = replace(asked[3], rate=2e6)
+    asked = [profile_of(delay) for delay in (0.3, 0.02, 0.15, 0.05, 0.2)]
+    asked[1] = changed(asked[1], rate=1e6, queue_packets=5)  # less room than what is under way
+    asked[2] = changed(asked[2], jitter=0.02, distribution="normal")
+    asked[3] = changed(asked[3], rate=2e6)
     flow = Flow()
     for profile in asked:
         flow.send(60, 0.005)
@@ -260,7 +260,7 @@ def test_a_change_in_flight_loses_nothing(shaped):
 
 
 def test_a_bottleneck_has_its_rate(shaped):
-    shaped.follow_profile(DirectionProfile(rate=400e3, queue_packets=1000))
+    shaped.follow_profile(profile_of(rate=400e3, queue_packets=1000))
 
     def off():
         (flow := Flow()).send(100, 0.0)
@@ -273,10 +273,10 @@ def test_a_bottleneck_has_its_rate(shaped):
 
 def test_it_is_set_up_once_and_removed_without_a_trace(make):
     before = qdiscs()
-    first = make(DirectionProfile(0.02))
+    first = make(profile_of(0.02))
     first.follow_peer(("10.79.7.9", 7400))  # killed here: its qdiscs stay
     left = qdiscs()
-    second = make(DirectionProfile(0.05))
+    second = make(profile_of(0.05))
     for peer in (FAR_PEER, FAR_PEER, ("10.79.7.7", 7400), FAR_PEER):
         second.follow_peer(peer)
     assert qdiscs().count("netem") == left.count("netem") == 1
@@ -293,7 +293,7 @@ def test_a_time_line_is_followed(make):
     times = 0.02 * np.arange(400)
     rows = 0.1 + 0.04 * np.sin(0.5 * np.pi * times)
     trace = Trace(tuple(times.tolist()), tuple(rows.tolist()))
-    profile = DirectionProfile(trace=trace, blackouts=(Blackout(3.51, 0.3),))
+    profile = profile_of(rows=trace, blackouts=(blackout(3.51, 0.3),))
 
     def off():
         origin_ns = time.monotonic_ns() + 5_000_000_000  # by then it is set up

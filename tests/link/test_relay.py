@@ -19,7 +19,6 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.exposition.table import LINK_OUTCOMES, RELEASE_PERCENTILES
 from cloudrc.link import relay as module
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.relay import (
     AGE_MAX_NS,
     QUANTILES,
@@ -31,12 +30,13 @@ from cloudrc.link.relay import (
 from cloudrc.link.verify.judge import Flow, Plan
 from cloudrc.link.verify.probe import PROBE, ProbeEnd
 from cloudrc.tunnel.codec import Kind, encode_header
+from tests.link.profiles import profile_of
 from tools.bench_link import compare
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE = 20.0
 MS, SECOND = 1_000_000, 1_000_000_000
-PLAIN = DirectionProfile()
+PLAIN = profile_of()
 
 
 def bind_loopback(port=0):
@@ -98,7 +98,7 @@ def bench():
 
 
 def test_a_packet_leaves_when_the_model_says_never_earlier(bench):
-    profile = DirectionProfile(0.020, 0.010, corrupt=0.5)
+    profile = profile_of(0.020, 0.010, corrupt=0.5)
     pair, model = bench(profile), LinkDirection(profile, 1, True)
     errors = []
     for n in range(20):
@@ -115,13 +115,13 @@ def test_a_packet_leaves_when_the_model_says_never_earlier(bench):
 
 def test_every_datagram_is_counted_once(bench, monkeypatch):
     monkeypatch.setattr(module, "IN_FLIGHT_MAX", 3)
-    pair = bench(DirectionProfile(0.1))
+    pair = bench(profile_of(0.1))
     for data in (b"", b"xyz", bytes(1400), bytes(5000)):
         pair.send(data)
     for n in range(5):
         pair.send(packet(n))
     assert [pair.far.recv(100) for _ in range(3)] == [packet(n) for n in range(3)]
-    pair.relay.follow_profile(DirectionProfile(loss=1.0))
+    pair.relay.follow_profile(profile_of(loss=1.0))
     pair.send(packet(1))
     counts = {"received": 10, "malformed": 4, "overflow": 2, "lost": 1, "forwarded": 3}
     expected = {**dict.fromkeys(LINK_OUTCOMES, 0), **counts}
@@ -129,7 +129,7 @@ def test_every_datagram_is_counted_once(bench, monkeypatch):
 
 
 def test_a_stranger_does_not_reach_the_peer(bench):
-    pair = bench(DirectionProfile(duplicate=1.0))
+    pair = bench(profile_of(duplicate=1.0))
     with bind_loopback() as stranger:
         stranger.sendto(packet(7), pair.route)
     pair.send(packet(1))

@@ -9,9 +9,9 @@ import pytest
 
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.follow import Loaded
-from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.sidecar import Machine, Sidecar
 from cloudrc.link.state import Change
+from tests.link.profiles import profile_of
 
 PEER, NEXT = ("10.244.0.7", 7400), ("10.244.0.9", 7400)
 REFUSED = BadInputError("netem cannot do delay_ms above 274000 (far); set link.mode=relay")
@@ -29,9 +29,11 @@ class Shaper:
         return peer if self.name == "netem" else ("127.0.0.1", 7401)
 
     def follow_profile(self, profile, *, restart=False):
-        if self.name == "netem" and profile.delay == 9.0:
+        if self.name == "netem" and profile.delay_ms == 9e3:
             raise REFUSED
-        self._bench.did.append(f"{self.name} {profile.delay:g} s{' from now' if restart else ''}")
+        self._bench.did.append(
+            f"{self.name} {1e-3 * profile.delay_ms:g} s{' from now' if restart else ''}"
+        )
 
     def step(self, timeout):
         assert timeout <= 0.1
@@ -61,7 +63,7 @@ class Bench:
 
         def netem(asked, origin_ns):
             self.origins_ns.append(origin_ns)
-            return Shaper(self, "netem", REFUSED if asked.delay == 9.0 else refuses)
+            return Shaper(self, "netem", REFUSED if asked.delay_ms == 9e3 else refuses)
 
         machine = Machine(
             relay=relay,
@@ -70,7 +72,7 @@ class Bench:
             wait=self.wait,
             log=self.log.append,
         )
-        loaded = Loaded(DirectionProfile(), {"description": "nothing"})
+        loaded = Loaded(profile_of(), {"description": "nothing"})
         self.sidecar = Sidecar(
             machine,
             loaded,
@@ -103,7 +105,7 @@ class Bench:
 
     def replace(self, delay, change=Change()):  # noqa: B008
         values = {"description": f"{delay:g} s"}
-        self.sidecar.profile = Loaded(DirectionProfile(delay), values, change)
+        self.sidecar.profile = Loaded(profile_of(delay), values, change)
 
     def told(self):
         return json.loads(self.state.read_text())

@@ -92,6 +92,7 @@ class Findings(NamedTuple):
 
     rows: Sequence[Row]
     evidence: Evidence
+    probes: str = ""  # which datagrams were measured, in words
 
 
 def find_causes(findings: Mapping[str, Findings]) -> list[Cause]:

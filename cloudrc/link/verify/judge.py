@@ -19,9 +19,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cloudrc.config.schema import GilbertElliott
 from cloudrc.link.draws import Floats
 from cloudrc.link.model import HEADER_BYTES, LinkDirection, Stream, numbers, sample
-from cloudrc.link.profile import DirectionProfile, GilbertElliott, Timeline, mean_loss
+from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
 
 RUNS, RUN_LENGTH = 200, 1000
 """Number of simulated links for a band, and number of datagrams on each simulated link. The band is
@@ -63,16 +64,20 @@ class Row(NamedTuple):
     """Verdict on one quantity of one direction of a link; an unknown value is NaN.
 
     A `measured` value from `low` to `high` is accepted. `asked`, `measured`, `low` and `high` have
-    the unit `unit` (any unit).
+    the unit of the quantity (any unit).
     """
 
     name: str  # as in `Plan.quantities`, or "round_trip"
-    unit: str  # "s", "1" or "bit/s"
     asked: float  # mean value of links with the requested profile
     measured: float
     low: float  # lowest accepted value
     high: float  # highest accepted value
     verdict: str  # "ok", "off", "open" or "told"
+
+    @property
+    def unit(self) -> str:
+        """Unit of the quantity: "s", "1" or "bit/s"."""
+        return UNITS.get(self.name, "1")
 
 
 class Expected(NamedTuple):
@@ -101,7 +106,7 @@ class Expected(NamedTuple):
         verdict = "ok" if low <= value <= high else "off"
         if isnan(value) or (verdict == "ok" and hidden > CHANCE_MAX):
             verdict = "open"
-        return Row(name, UNITS.get(name, "1"), mean, value, low, high, verdict)
+        return Row(name, mean, value, low, high, verdict)
 
 
 @dataclass(frozen=True)
@@ -178,10 +183,10 @@ class Plan:
         rows = [expected.judge(name, found[name]) for name in found if name in expected.bands]
         if len(measured.sent) < FEWEST:
             rows = [row._replace(verdict="open") for row in rows]
-        if not expected.known and self.profile.jitter and self.profile.correlation:
+        if not expected.known and self.profile.jitter_ms and self.profile.correlation:
             rows.append(told("correlation", self.profile.correlation))
-        if not self.train and self.profile.rate:
-            rows.append(told("rate", self.profile.rate))
+        if not self.train and self.profile.rate_kbit:
+            rows.append(told("rate", self.profile.rate_kbit * 1e3))
         return rows
 
     def needed(self) -> int:
@@ -280,15 +285,16 @@ def netem_makes(profile: DirectionProfile) -> DirectionProfile:
     loss, lost, single = profile.loss, mean_loss(profile.loss), 1.0 - profile.duplicate
     twice = profile.duplicate * (1.0 - lost) ** 2 / max(1e-9, 1.0 - single * lost)
     if isinstance(loss, GilbertElliott):
-        loss = replace(loss, loss_bad=single * loss.loss_bad, loss_good=single * loss.loss_good)
+        kept = {"loss_bad": single * loss.loss_bad, "loss_good": single * loss.loss_good}
+        loss = loss.model_copy(update=kept)
     else:
         loss *= single
-    return replace(profile, correlation=0.0, loss=loss, duplicate=twice)
+    return profile.model_copy(update={"correlation": 0.0, "loss": loss, "duplicate": twice})
 
 
 def told(name: str, asked: float) -> Row:
     """Make a row that shows the requested value `asked` [unit of `name`] without a judgement."""
-    return Row(name, UNITS.get(name, "1"), asked, nan, nan, nan, "told")
+    return Row(name, asked, nan, nan, nan, "told")
 
 
 def tolerance(name: str, asked: float) -> float:

@@ -6,22 +6,23 @@ trips. A separate thread does the work, so that the control loop is not delayed.
 
 from __future__ import annotations
 
+import json
 import queue
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from math import inf, isnan, nan
-from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
+from cloudrc.config.schema import Profile
 from cloudrc.errors import describe_error
-from cloudrc.files import TooLongError, read
 from cloudrc.link.model import Stream
 from cloudrc.link.profile import DirectionProfile, Timeline, settled
-from cloudrc.link.state import STATE_MAX, from_text
+from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.causes import describe
 from cloudrc.link.verify.judge import (
     FEWEST,
@@ -36,55 +37,57 @@ from cloudrc.link.verify.judge import (
 )
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 
-PERIOD = 0.01  # default period of telemetry and of commands [s]
 CHECK_NS = 5_000_000_000  # time between two verdicts [ns]
 SETTLE_NS = 2_000_000_000  # time after a change in which nothing is judged [ns]
 KEPT = 6000  # largest number of datagrams that one verdict uses
 FINAL = 128  # a missing datagram counts as lost if the newest counter is higher by this number
 ENDS = 2e-3  # largest delay that world and cloud add to a round trip if they wake on time [s]
-FOLLOW_PERIOD = 0.1  # period at which the thread reads new records and the link's state file [s]
+FOLLOW_PERIOD = 0.1  # period at which the thread reads new records [s]
 UNJUDGED = {"distribution"}  # not judged in flight: late wakes of world and cloud change it
 DELAYS = {"mean", "deviation"}  # measurable only if world and cloud share a clock
 
 Asked: TypeAlias = tuple[DirectionProfile, DirectionProfile]
 """Requested profiles of uplink and downlink."""
-Load: TypeAlias = Callable[[object], Asked]
-"""Function that converts the values of a profile's file, or raises a CloudrcError."""
 
 
 class LinkMonitor:
     """Judges one direction of the link from the records of the program that receives it."""
 
     def __init__(
-        self, *, uplink: bool, flow: Flow, period: float = PERIOD, computes: bool = False
+        self, uplink: bool, flow: Flow, *, period: float, computes: bool, file_max: int
     ) -> None:
         """Monitor the received `flow`: telemetry in cloud if `uplink`, else commands in world.
 
         `period` is the time between two datagrams of the flow [s]. `computes` tells whether cloud
-        simulates a computing time; delays that contain this time are not judged.
+        simulates a computing time; delays that contain this time are not judged. `file_max` is the
+        size limit of a file that a profile names [bytes].
         """
-        self._uplink, self._flow = uplink, flow
+        self._uplink, self._flow, self._file_max = uplink, flow, file_max
         self._period, self._computes = period, computes
         self._arrivals = deque[Arrival](maxlen=KEPT)
         self._trips, self._lates = (deque[float](maxlen=KEPT) for _ in range(2))
         self._asked: Asked | None = None
         self._plans: list[Plan] = []  # for the received flow, and for the other direction
-        self._epoch, self._fresh, self._seen = -1, True, ""
+        self._news = deque[dict[str, Any] | None](maxlen=1)  # the newest profile, if not used yet
+        self._epoch, self._fresh = -1, True
         self._since_ns, self._due_ns = 0.0, 0
         self._suspects, self._complained = set[str](), False
         self._pause: Callable[[], None] = lambda: None
         self._inbox: queue.SimpleQueue[tuple[Sequence[Record], int]] | None = None
         self._outbox = queue.SimpleQueue[Record]()
 
-    def begin(self, asked: Asked, path: Path | None, load: Load) -> None:
-        """Start the thread, which judges the link by the requested profiles `asked`.
-
-        If there is a `path`, the thread reads the link's state file there. The profiles in this
-        file replace `asked`; `load` converts them from the values in the file.
-        """
+    def begin(self, asked: Asked) -> None:
+        """Start the thread, which judges the link by the requested profiles `asked`."""
         self._inbox, self._pause = queue.SimpleQueue(), lambda: time.sleep(1e-4)
         self.follow(asked)
-        threading.Thread(target=self._run, args=(path, load), name="link", daemon=True).start()
+        threading.Thread(target=self._run, args=(self._inbox,), name="link", daemon=True).start()
+
+    def request(self, values: dict[str, Any] | None) -> None:
+        """Judge the link by a profile with the `values` of its file; None: they are unknown.
+
+        The thread loads the profile later. If the profile is invalid, the old one stays.
+        """
+        self._news.append(values)
 
     def follow(self, asked: Asked | None) -> None:
         """Set the profiles to judge the link by; None: they are unknown, so judge nothing."""
@@ -96,6 +99,13 @@ class LinkMonitor:
                 Plan(settled(profile), self._flow, sent, pause=self._pause) for profile in ways
             ]
 
+    def _load(self, values: dict[str, Any] | None) -> Asked | None:
+        if values is None:
+            return None
+        profile = Profile.model_validate_json(json.dumps(values))
+        uplink, downlink = profile.uplink, profile.downlink
+        return link_profile(uplink, self._file_max), link_profile(downlink, self._file_max)
+
     def after(self, records: Sequence[Record], now_ns: int) -> list[Record]:
         """Process this end's new records at `now_ns` [ns]; return `LinkChecked`s and `Fault`s."""
         if self._inbox is None:
@@ -103,26 +113,11 @@ class LinkMonitor:
         self._inbox.put((records, now_ns))
         return [self._outbox.get_nowait() for _ in range(self._outbox.qsize())]
 
-    def look(self, path: Path, load: Load) -> None:
-        """Read the requested profiles from the link's state file; `load` parses them."""
-        try:
-            text = read(path, STATE_MAX).decode()
-            if text != self._seen:
-                self._seen = text
-                self.follow(load(from_text(text).profile))
-        except TooLongError:  # a long time line: the profiles are unknown
-            self._seen = ""
-            self.follow(None)
-        except Exception:  # no file yet, or an invalid one: the profiles stay
-            pass
-
-    def _run(self, path: Path | None, load: Load) -> None:
+    def _run(self, inbox: queue.SimpleQueue[tuple[Sequence[Record], int]]) -> None:
         failed = False
-        while self._inbox is not None:
-            if path is not None:
-                self.look(path, load)
-            for _ in range(self._inbox.qsize()):
-                records, now_ns = self._inbox.get()
+        while True:
+            for _ in range(inbox.qsize()):
+                records, now_ns = inbox.get()
                 try:
                     found = self._see(records, now_ns)
                 except Exception as error:  # the next attempt may succeed
@@ -135,6 +130,9 @@ class LinkMonitor:
 
     def _see(self, records: Sequence[Record], now_ns: int) -> list[Record]:
         """Store records; return new verdicts every `CHECK_NS`, an empty list in between."""
+        while self._news:
+            with suppress(Exception):  # an invalid profile; the link's process may be hostile
+                self.follow(self._load(self._news.popleft()))
         for record in records:
             if isinstance(record, Arrival):
                 self._fresh |= record.epoch != self._epoch
@@ -170,10 +168,7 @@ class LinkMonitor:
             rows = [row._replace(verdict="open") if row.name in off else row for row in rows]
             self._forget()
         self._suspects = off
-        found: list[Record] = [
-            LinkChecked(now_ns, self._uplink, name, asked, measured, low, high, verdict, count)
-            for name, _, asked, measured, low, high, verdict in rows
-        ]
+        found: list[Record] = [LinkChecked(now_ns, self._uplink, *row, count) for row in rows]
         before, self._complained = self._complained, verdict_of(rows) == "off"
         if self._complained and not before:
             way = "uplink" if self._uplink else "downlink"

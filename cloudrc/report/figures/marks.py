@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 
-from cloudrc.assembly import link_profile
 from cloudrc.config.schema import Direction
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import Timeline
+from cloudrc.link.traces import link_profile
 from cloudrc.metrics.flight import Array
 from cloudrc.metrics.mission import holds
 from cloudrc.report.figures import style

@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from cloudrc.assembly import link_profile
 from cloudrc.config.load import load_profile
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.profile import DirectionProfile, GilbertElliott
+from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.causes import Findings
 from cloudrc.link.verify.judge import Flow, netem_makes
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.link.verify.probe import PROBE, plan_probes
 from cloudrc.records import Arrival, Fault, LinkChecked
 from cloudrc.tunnel.codec import SIZES, Kind
+from tests.link.profiles import changed, in_bursts, profile_of
 
 
 def asked(name, way):
@@ -68,10 +68,10 @@ def arrivals(profile, seconds=60.0, *, seed=SEED, overhead=5e-4, uplink=False):
     return sorted(found)
 
 
-def hearing(up, down, *, uplink=False, **options):
+def hearing(up, down, *, uplink=False, period=0.01, computes=False):
     """Return the monitor of the end that receives a direction."""
     flow = Flow(SEED, uplink, KINDS[uplink], SIZES[KINDS[uplink]])
-    monitor = LinkMonitor(uplink=uplink, flow=flow, **options)
+    monitor = LinkMonitor(uplink, flow, period=period, computes=computes, file_max=1000)
     monitor.follow((up, down))
     return monitor
 
@@ -94,27 +94,27 @@ def is_believed(moment):
 def random_profile(rng):
     """Draw a profile that a user might write."""
     delay = float(rng.uniform(5e-3, 0.15))
-    profile = DirectionProfile(
+    profile = profile_of(
         delay,
         min(0.03, float(rng.uniform(0.0, 0.4)) * delay),
         str(rng.choice(["uniform", "normal", "pareto"])),
     )
     if rng.random() < 0.3:
-        profile = replace(profile, correlation=float(rng.uniform(0.1, 0.6)))
+        profile = changed(profile, correlation=float(rng.uniform(0.1, 0.6)))
     if rng.random() < 0.3:
-        profile = replace(profile, keep_order=True, jitter=min(0.01, profile.jitter))
+        profile = changed(profile, keep_order=True, jitter_ms=min(10.0, profile.jitter_ms))
     elif rng.random() < 0.3:
-        profile = replace(profile, reorder=float(rng.uniform(0.01, 0.3)))
+        profile = changed(profile, reorder=float(rng.uniform(0.01, 0.3)))
     if rng.random() < 0.2:
-        profile = replace(profile, duplicate=float(rng.uniform(0.01, 0.1)))
+        profile = changed(profile, duplicate=float(rng.uniform(0.01, 0.1)))
     if rng.random() < 0.2:
-        profile = replace(profile, corrupt=float(rng.uniform(0.001, 0.2)))
+        profile = changed(profile, corrupt=float(rng.uniform(0.001, 0.2)))
     if rng.random() < 0.2:
         rate = float(rng.uniform(1e6, 2e7))
-        return replace(profile, rate=rate, keep_order=True, jitter=min(0.01, profile.jitter))
+        return changed(profile, rate=rate, keep_order=True, jitter_ms=min(10.0, profile.jitter_ms))
     if rng.random() < 0.3:
-        bursts = GilbertElliott(float(rng.uniform(1e-3, 0.01)), float(rng.uniform(0.2, 0.6)))
-        return replace(profile, loss=bursts)
+        bursts = in_bursts(float(rng.uniform(1e-3, 0.01)), float(rng.uniform(0.2, 0.6)))
+        return changed(profile, loss=bursts)
     if rng.random() < 0.6:
-        return replace(profile, loss=float(rng.uniform(0.0, 0.1)))
+        return changed(profile, loss=float(rng.uniform(0.0, 0.1)))
     return profile

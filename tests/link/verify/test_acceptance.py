@@ -1,14 +1,13 @@
 """Verdicts and named causes for whole links in virtual time."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from cloudrc.config.shipped import names
-from cloudrc.link.profile import DirectionProfile, GilbertElliott, mean_loss
+from cloudrc.link.profile import mean_loss
 from cloudrc.link.verify.causes import Evidence, Findings, find_causes
 from cloudrc.link.verify.judge import look_twice, netem_makes, verdict_of
+from tests.link.profiles import changed, in_bursts, profile_of
 from tests.link.verify.conftest import (
     asked,
     random_profile,
@@ -17,9 +16,9 @@ from tests.link.verify.conftest import (
 )
 
 PAPER = asked("paper-p2", "uplink")
-LOSING = DirectionProfile(0.045, 0.025, loss=0.05)
-NARROW = DirectionProfile(0.020, 0.002, rate=2e6, queue_packets=200, keep_order=True)
-NOTHING = DirectionProfile()
+LOSING = profile_of(0.045, 0.025, loss=0.05)
+NARROW = profile_of(0.020, 0.002, rate=2e6, queue_packets=200, keep_order=True)
+NOTHING = profile_of()
 
 
 def doubts(rows):
@@ -45,19 +44,19 @@ def netem(**facts):
 FAULTS = {
     "no_qdisc": (PAPER, NOTHING, NOTHING, Evidence("none", interface="eth0")),
     "wrong_interface": (PAPER, NOTHING, NOTHING, Evidence("none", elsewhere=("eth1",))),
-    "doubled_delay": (PAPER, *[replace(PAPER, delay=0.090)] * 2, netem()),
-    "halved_delay": (PAPER, *[replace(PAPER, delay=0.0225, jitter=0.0125)] * 2, netem()),
+    "doubled_delay": (PAPER, *[changed(PAPER, delay=0.090)] * 2, netem()),
+    "halved_delay": (PAPER, *[changed(PAPER, delay=0.0225, jitter=0.0125)] * 2, netem()),
     "one_direction": (PAPER, PAPER, NOTHING, netem()),
-    "wrong_jitter": (PAPER, *[replace(PAPER, jitter=0.0225)] * 2, netem()),
-    "no_loss": (LOSING, *[replace(LOSING, loss=0.0)] * 2, netem()),
-    "more_loss": (LOSING, *[replace(LOSING, loss=0.15)] * 2, netem()),
+    "wrong_jitter": (PAPER, *[changed(PAPER, jitter=0.0225)] * 2, netem()),
+    "no_loss": (LOSING, *[changed(LOSING, loss=0.0)] * 2, netem()),
+    "more_loss": (LOSING, *[changed(LOSING, loss=0.15)] * 2, netem()),
     "bypassed": (PAPER, NOTHING, NOTHING, netem(sent=3000, passed=3)),
-    "order_kept": (PAPER, *[replace(PAPER, keep_order=True)] * 2, netem()),
-    "rate_ignored": (NARROW, *[replace(NARROW, rate=None)] * 2, netem()),
+    "order_kept": (PAPER, *[changed(PAPER, keep_order=True)] * 2, netem()),
+    "rate_ignored": (NARROW, *[changed(NARROW, rate=None)] * 2, netem()),
     "no_sch_netem": (PAPER, NOTHING, NOTHING, Evidence("none", "this kernel has no sch_netem")),
-    "shaped_twice": (PAPER, *[replace(PAPER, delay=0.090)] * 2, netem(layers=2)),
-    "order_broken": (NARROW, *[replace(NARROW, keep_order=False, jitter=0.015)] * 2, netem()),
-    "wrong_duplicates": (PAPER, *[replace(PAPER, duplicate=0.1)] * 2, netem()),
+    "shaped_twice": (PAPER, *[changed(PAPER, delay=0.090)] * 2, netem(layers=2)),
+    "order_broken": (NARROW, *[changed(NARROW, keep_order=False, jitter=0.015)] * 2, netem()),
+    "wrong_duplicates": (PAPER, *[changed(PAPER, duplicate=0.1)] * 2, netem()),
 }
 
 
@@ -70,8 +69,8 @@ def test_a_seeded_fault_is_named(fault, figure):
 
 
 OFF = {
-    "slower": (PAPER, {"delay": 1.06 * PAPER.delay}, "mean"),
-    "less jitter": (PAPER, {"jitter": 0.9 * PAPER.jitter}, "deviation"),
+    "slower": (PAPER, {"delay_ms": 1.06 * PAPER.delay_ms}, "mean"),
+    "less jitter": (PAPER, {"jitter_ms": 0.9 * PAPER.jitter_ms}, "deviation"),
     "damaged": (PAPER, {"corrupt": 0.05}, "loss"),
     "other jitter": (PAPER, {"distribution": "normal", "jitter": 0.0144}, "distribution"),
     "faster": (NARROW, {"rate": 2.6e6}, "rate"),
@@ -81,23 +80,23 @@ OFF = {
 @pytest.mark.parametrize("name", OFF)
 def test_a_link_beyond_its_tolerance_is_off(name):
     profile, values, quantity = OFF[name]
-    assert (quantity, "off") in doubts(rows_of(profile, replace(profile, **values)))
+    assert (quantity, "off") in doubts(rows_of(profile, changed(profile, **values)))
 
 
 def test_netem_is_believed_unless_it_delays_twice_as_long():
-    profile = DirectionProfile(0.08, 0.02, correlation=0.9)
+    profile = profile_of(0.08, 0.02, correlation=0.9)
     assert doubts(rows_of(profile, profile, netem=True)) == []
-    assert ("mean", "off") in doubts(rows_of(profile, replace(profile, delay=0.16), netem=True))
+    assert ("mean", "off") in doubts(rows_of(profile, changed(profile, delay=0.16), netem=True))
 
 
-@pytest.mark.parametrize("loss", [0.2, GilbertElliott(0.1, 0.4, 0.8, 0.05)])
+@pytest.mark.parametrize("loss", [0.2, in_bursts(0.1, 0.4, 0.8, 0.05)])
 def test_netem_loses_either_a_packet_or_its_copy(loss):
     """A packet selected for loss and duplication arrives once; a copy can be lost, too.
 
     Source: Linux, net/sched/sch_netem.c: netem_enqueue; get_crandom for the correlation.
     """
     lost = mean_loss(loss)
-    made = netem_makes(DirectionProfile(0.08, 0.02, correlation=0.9, loss=loss, duplicate=0.3))
+    made = netem_makes(profile_of(0.08, 0.02, correlation=0.9, loss=loss, duplicate=0.3))
     assert (lost, made.correlation) == (pytest.approx(0.2), 0.0)
     assert mean_loss(made.loss) == pytest.approx(0.7 * lost)
     assert made.duplicate * (1 - 0.7 * lost) == pytest.approx(0.3 * (1 - lost) ** 2)
@@ -107,27 +106,27 @@ def test_netem_loses_either_a_packet_or_its_copy(loss):
     ("real", "causes"),
     [
         ({}, ["throttled", "wrong_delay"]),
-        ({"delay": 1.06 * PAPER.delay, "loss": 0.3}, ["throttled", "wrong_delay"]),
-        ({"delay": PAPER.delay / 3, "keep_order": True}, ["order_kept"]),
+        ({"delay_ms": 1.06 * PAPER.delay_ms, "loss": 0.3}, ["throttled", "wrong_delay"]),
+        ({"delay_ms": PAPER.delay_ms / 3, "keep_order": True}, ["order_kept"]),
     ],
 )
 def test_a_lack_of_cpu_is_named_beside_other_faults(real, causes):
     known = Evidence("relay", starved="500 datagrams not read in time")
     stall = 0.0 if "keep_order" in real else 0.04
-    rows = rows_of(PAPER, replace(PAPER, **real), stall=stall)
+    rows = rows_of(PAPER, changed(PAPER, **real), stall=stall)
     assert [one.code for one in find_causes({"uplink": Findings(rows, known)})] == causes
 
 
-SLOW = replace(PAPER, delay=0.090)
+SLOW = changed(PAPER, delay=0.090)
 
 
 @pytest.mark.parametrize(
     ("up", "down", "known", "causes"),
     [
-        (PAPER, replace(PAPER, loss=0.2), netem(), [("more_loss", "downlink")]),
+        (PAPER, changed(PAPER, loss=0.2), netem(), [("more_loss", "downlink")]),
         (SLOW, SLOW, netem(), [("doubled_delay", "both")]),
         (NOTHING, PAPER, netem(restored=1), [("no_qdisc", "uplink")]),
-        (*[replace(PAPER, loss=1.0)] * 2, Evidence(), [("nothing_arrives", "both")]),
+        (*[changed(PAPER, loss=1.0)] * 2, Evidence(), [("nothing_arrives", "both")]),
     ],
 )
 def test_directions_are_told_apart(up, down, known, causes):
@@ -137,12 +136,12 @@ def test_directions_are_told_apart(up, down, known, causes):
 
 def test_too_few_or_dead_probes_decide_nothing():
     assert verdict_of(rows_of(PAPER, PAPER, seconds=1.0)) == "open"
-    assert ("mean", "open") in doubts(rows_of(PAPER, replace(PAPER, loss=1.0)))
+    assert ("mean", "open") in doubts(rows_of(PAPER, changed(PAPER, loss=1.0)))
 
 
 def test_a_quantity_is_off_only_after_two_measurements():
     good, slow, lossy = (
-        rows_of(PAPER, replace(PAPER, **values))
+        rows_of(PAPER, changed(PAPER, **values))
         for values in ({}, {"delay": 0.09}, {"delay": 0.09, "loss": 0.5})
     )
     assert verdict_of(look_twice(slow, good)) == verdict_of(look_twice(good, slow)) == "ok"

@@ -43,5 +43,5 @@ def test_metrics_report_lateness_counts_and_stops():
 )
 def test_qdiscs_on_the_way_of_the_flow_are_the_cause(shaper, netems, code):
     known = read_evidence({"shaper": shaper, "interface": "eth0", "netems": netems}, {})
-    row = Row("mean", "s", 0.045, 0.09, 0.043, 0.047, "off")
+    row = Row("mean", 0.045, 0.09, 0.043, 0.047, "off")
     assert [one.code for one in find_causes({"uplink": Findings([row], known)})] == [code]

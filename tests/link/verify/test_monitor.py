@@ -1,19 +1,16 @@
 """The monitor of a link in flight, with simulated arrivals of the tunnel's datagrams."""
 
-import json
 import time
-from dataclasses import replace
 from math import nan
 from unittest.mock import Mock
 
 import pytest
 
 from cloudrc.config.shipped import names
-from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.state import STATE_MAX
 from cloudrc.link.verify.judge import netem_makes
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
+from tests.link.profiles import changed, profile_of
 from tests.link.verify.conftest import (
     PERIOD_NS,
     arrivals,
@@ -39,16 +36,16 @@ def test_an_honest_link_is_believed_and_never_faulted(name, netem):
     assert faults == []
     assert is_believed(moments[-1]), moments[-1]
     assert ("correlation" in moments[-1]) == (netem and profile.correlation > 0.0)
-    assert ("rate" in moments[-1]) == (profile.rate is not None)
+    assert ("rate" in moments[-1]) == (profile.rate_kbit is not None)
     assert ("time_line" in moments[-1]) == (name == "handover")
 
 
 FAULTS = {
-    "mean": replace(PAPER, delay=PAPER.delay * 1.1),
-    "deviation": replace(PAPER, jitter=PAPER.jitter * 1.15),
-    "loss": replace(PAPER, loss=0.1),
-    "reordered": replace(PAPER, keep_order=True),
-    "duplicated": replace(PAPER, duplicate=0.2),
+    "mean": changed(PAPER, delay_ms=PAPER.delay_ms * 1.1),
+    "deviation": changed(PAPER, jitter_ms=PAPER.jitter_ms * 1.15),
+    "loss": changed(PAPER, loss=0.1),
+    "reordered": changed(PAPER, keep_order=True),
+    "duplicated": changed(PAPER, duplicate=0.2),
 }
 
 
@@ -63,7 +60,7 @@ def test_a_wrong_link_is_a_fault_after_a_second_look(quantity):
 
 
 def test_without_a_common_clock_one_way_delays_are_not_judged():
-    heard = arrivals(replace(FAULTS["mean"], loss=0.1), overhead=nan)
+    heard = arrivals(changed(FAULTS["mean"], loss=0.1), overhead=nan)
     moments, faults = checked(hearing(PAPER, PAPER), heard)
     assert moments[-1]["loss"].verdict == "off"
     assert not {"mean", "deviation"} & moments[-1].keys()
@@ -103,7 +100,7 @@ def test_a_new_session_starts_undecided():
 
 
 def test_late_wakes_of_the_ends_are_no_fault_of_the_link():
-    slow = arrivals(replace(PAPER, delay=PAPER.delay + 0.0045))
+    slow = arrivals(changed(PAPER, delay_ms=PAPER.delay_ms + 4.5))
     assert checked(hearing(PAPER, PAPER), slow)[1], "of punctual ends it is"
     heard = []
     for arrival in slow:
@@ -122,7 +119,7 @@ def control(stamp_ns, rtt):
 
 @pytest.mark.parametrize(("slower", "verdict"), [(0.001, "ok"), (0.030, "off")])
 def test_cloud_judges_round_trips_without_a_common_clock(slower, verdict):
-    up, down = DirectionProfile(0.040), DirectionProfile(0.080)
+    up, down = profile_of(0.040), profile_of(0.080)
     heard = []
     for arrival in arrivals(up, overhead=nan, uplink=True):
         heard += [arrival, control(arrival.stamp_ns, 0.120 + slower + arrival.counter * 1e-9)]
@@ -135,14 +132,14 @@ def test_a_counter_that_jumps_costs_no_memory():
     heard = [
         Arrival(n * PERIOD_NS, False, 1, n + 10**18 * (n >= 1500), 0.070, True) for n in range(3000)
     ]
-    moments, _ = checked(hearing(*[DirectionProfile(0.070)] * 2), heard)
+    moments, _ = checked(hearing(*[profile_of(0.070)] * 2), heard)
     assert is_believed(moments[-1]), "only what came after the jump counts"
 
 
 def threaded(records):
     """Pass records to a monitor with a thread; return what it says first."""
     monitor = hearing(PAPER, PAPER)
-    monitor.begin((PAPER, PAPER), None, lambda values: (PAPER, PAPER))
+    monitor.begin((PAPER, PAPER))
     told, deadline = list[Record](), time.monotonic() + 20.0
     for one in records:
         told += monitor.after([one], one.stamp_ns)
@@ -152,27 +149,13 @@ def threaded(records):
     return told
 
 
-def state(profile):
-    found = dict.fromkeys(("reason", "mode", "direction", "since"), "")
-    return json.dumps(found | {"shaper": "relay", "since_ns": 0, "profile": profile})
-
-
-def test_the_monitor_follows_the_state_file_and_ignores_nonsense(tmp_path):
-    path, slow = tmp_path / "link.json", DirectionProfile(0.070)
-
-    def load(values):
-        if "nonsense" in values:
-            raise OverflowError
-        return slow, slow
-
+def test_the_monitor_follows_the_link_and_ignores_nonsense():
     monitor = hearing(PAPER, PAPER)
-    for text in ("", "nonsense", state({"nonsense": 1}), state({})):
-        assert monitor._asked == (PAPER, PAPER)
-        path.write_text(text)
-        monitor.look(path, load)
-    assert monitor._asked == (slow, slow)
-    path.write_text("x" * (STATE_MAX + 1))
-    monitor.look(path, load)
+    for values, delay_ms in (({"nonsense": 1}, PAPER.delay_ms), ({"uplink": {"delay_ms": 9}}, 9)):
+        monitor.request(values)
+        assert monitor.after([], 0) == []
+        assert monitor._asked[0].delay_ms == delay_ms
+    monitor.request(None)
     assert checked(monitor, arrivals(FAULTS["mean"], 20.0)) == ([], []), "nothing is known"
 
 

@@ -3,14 +3,12 @@
 import json
 import os
 import subprocess
-from functools import partial
 
 import pytest
 
 from cloudrc.cli import link_verify
 from cloudrc.cli.link_verify import find_experiment, make_plans, probe_link, run_link
 from cloudrc.cli.main import main
-from cloudrc.config.schema import Profile
 from cloudrc.errors import CloudrcError
 from cloudrc.link.verify.causes import find_causes
 from cloudrc.link.verify.judge import verdict_of
@@ -27,7 +25,7 @@ def test_an_honest_link_is_believed_unless_the_machine_delays_it():
     with run_link(experiment, "relay") as ways:
         found = probe_link(ways, make_plans(experiment, 2.0, "relay"))
     codes = {cause.code for cause in find_causes(found)}
-    for rows, known in found.values():
+    for rows, known, _ in found.values():
         if "throttled" not in codes:  # the suite runs on machines that do other things, too
             assert verdict_of(rows) == "ok"
         assert (known.shaper, known.layers, known.passed) == ("relay", 1, known.sent)
@@ -36,9 +34,9 @@ def test_an_honest_link_is_believed_unless_the_machine_delays_it():
 @pytest.mark.process
 @pytest.mark.alone
 def test_a_fault_is_named_on_the_command_line(capsys, monkeypatch):
-    twice = {"delay_ms": 200.0, "jitter_ms": 40.0}, {"delay_ms": 160.0, "jitter_ms": 30.0}
-    wrong = Profile.model_validate(dict(zip(("uplink", "downlink"), twice, strict=True)))
-    monkeypatch.setattr(link_verify, "run_link", partial(run_link, applied=wrong))
+    twice = [one.replace("=100", "=200").replace("=80", "=160") for one in LINK]
+    wrong = find_experiment("paper-p1", twice)
+    monkeypatch.setattr(link_verify, "run_link", lambda _, shaper: run_link(wrong, shaper))
     words = ["link", "verify", "paper-p1", "--seconds", "2", "-o", "json"]
     words += [word for value in LINK for word in ("--set", value)]
     assert main(words) == 1

@@ -1,0 +1,53 @@
+"""Profiles in SI units, for short tests. Nothing checks the values."""
+
+from cloudrc.config.schema import Blackout, Change, GilbertElliott
+from cloudrc.link.profile import DirectionProfile
+
+IN_FILES = {
+    "at": ("at_s", 1.0),
+    "delay": ("delay_ms", 1e3),
+    "jitter": ("jitter_ms", 1e3),
+    "rate": ("rate_kbit", 1e-3),
+}
+"""Name of a quantity -> its key in a profile, and factor from SI units to the key's unit."""
+
+
+def keys(names, values, more):
+    """Return keys and values of a file; `names` are those of the positional `values`."""
+    found = {}
+    for name, value in {**dict(zip(names, values, strict=False)), **more}.items():
+        key, scale = IN_FILES.get(name, (name, None))
+        found[key] = value * scale if scale and value is not None else value
+    return found
+
+
+def profile_of(*values, **more):
+    """Make the profile of a direction: delay [s], jitter [s], distribution, correlation, loss."""
+    names = ("delay", "jitter", "distribution", "correlation", "loss")
+    return DirectionProfile.model_construct(**keys(names, values, more))
+
+
+def changed(profile, **values):
+    """Return a profile with other values."""
+    return profile.model_copy(update=keys((), (), values))
+
+
+def change(*values, **more):
+    """Make a change: time [s], delay [s], jitter [s], loss, rate [bit/s]."""
+    return Change(**keys(("at", "delay", "jitter", "loss", "rate"), values, more))
+
+
+def blackout(start, duration):
+    """Make an interval without packets [s]."""
+    return Blackout(start_s=start, duration_s=duration)
+
+
+def in_bursts(bad_start, bad_end, loss_bad=1.0, loss_good=0.0, delay_bad=0.0):
+    """Make losses in bursts, also bursts that never end; `delay_bad` is an extra delay [s]."""
+    return GilbertElliott.model_construct(
+        bad_start=bad_start,
+        bad_end=bad_end,
+        loss_bad=loss_bad,
+        loss_good=loss_good,
+        delay_bad_ms=delay_bad * 1e3,
+    )
