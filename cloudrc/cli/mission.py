@@ -451,7 +451,7 @@ def _run_job(options: argparse.Namespace) -> int:
     try:
         ended = follow(release, job, print_line)
     except KeyboardInterrupt:
-        command = f"kubectl {' '.join(release.flags)} delete job {job}"
+        command = f"{release.kubectl} delete job {job}"
         print_line(f"Job {job} is still running; cancel its mission: {command}", sys.stderr)
         raise
     if ended.exit_code is None:
