@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import escape, output_argument, paint, print_line, print_result, table
-from cloudrc.cli.parser import add_verbs, input_file, number, read_count, whole_number
+from cloudrc.cli.parser import add_verbs, number, read_count, whole_number
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.errors import BadInputError
 
@@ -73,7 +73,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def _name_or_file(text: str) -> str | Path:
     is_path = "/" in text or text.endswith((".yaml", ".yml")) or os.path.isfile(text)
-    return input_file(text) if is_path else text
+    return Path(text) if is_path else text
 
 
 def _folder(text: str) -> Path:

@@ -48,10 +48,7 @@ def execute(options: argparse.Namespace) -> int:
         for axis, name in enumerate("xyz")
     ]
     document = _document(fits, len(given) * DT, (INPUT, OUTPUT))
-    try:
-        out.write_text(format_document(document, "yaml") + "\n", encoding="utf-8")
-    except OSError as error:
-        raise BadInputError(f"{out}: {error.strerror}; name another file with --out") from error
+    out.write_text(format_document(document, "yaml") + "\n", encoding="utf-8")
     if options.output != "table":
         print(format_document(document, options.output))
         return 0

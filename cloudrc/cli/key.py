@@ -9,7 +9,6 @@ from pathlib import Path
 
 from cloudrc.cli.output import print_line
 from cloudrc.cli.parser import add_verbs
-from cloudrc.errors import BadInputError
 
 VERBS = {
     "new": "make a key file, or rotate the key in one",
@@ -53,10 +52,6 @@ def execute(options: argparse.Namespace) -> int:
     else:
         keys, said = KeySet(old.current), " is the only key"
     target = Path(os.path.realpath(path))  # keep a symbolic link: replace the file it points to
-    try:
-        write_atomically(target, write(keys).encode("ascii"), 0o600)
-    except OSError as error:
-        remedy = "name a file in an existing, writable folder"
-        raise BadInputError(f"{path}: {error.strerror or error}; {remedy}") from None
+    write_atomically(target, write(keys).encode("ascii"), 0o600)
     print_line(f"key {keys.current.name}{said}: {path}")
     return 0

@@ -5,10 +5,8 @@ from __future__ import annotations
 import argparse
 import difflib
 import importlib
-import os
 from collections.abc import Callable, Iterable, Mapping
 from math import nan
-from pathlib import Path
 from typing import Any, NoReturn
 
 from cloudrc import __version__
@@ -130,13 +128,6 @@ def figure_arguments(parser: argparse.ArgumentParser, width: float) -> None:
     add("--width", type=number(2, 20, "inches"), default=width, metavar="IN", help=about)
     about = "size of the text of figures in points (default: 9)"
     add("--font-size", type=number(5, 24, "points"), default=9.0, metavar="PT", help=about)
-
-
-def input_file(text: str) -> Path:
-    """Parse the path of an input file for argparse; refuse pipes and devices, which could block."""
-    if os.path.exists(text) and not os.path.isfile(text):
-        raise argparse.ArgumentTypeError(f"{text}: not a regular file")
-    return Path(text)
 
 
 def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:

@@ -9,7 +9,7 @@ from pathlib import Path
 from cloudrc import __version__
 from cloudrc.cli.cluster_flags import release_arguments
 from cloudrc.cli.output import output_argument
-from cloudrc.cli.parser import COUNT_MAX, add_verbs, figure_arguments, input_file, read_count
+from cloudrc.cli.parser import COUNT_MAX, add_verbs, figure_arguments, read_count
 
 VERBS = {
     "run": "fly all points of a grid, or those that are missing in --out",
@@ -40,7 +40,7 @@ IMAGE = f"cloudrc/world:{__version__}"
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     run, status, fly, figure, rows = add_verbs(parser, VERBS).values()
-    run.add_argument("file", type=input_file, metavar="FILE", help="file of the sweep (.yaml)")
+    run.add_argument("file", type=Path, metavar="FILE", help="file of the sweep (.yaml)")
     about = "folder of the sweep (default: a new one in runs/); if it has rows, fly the others"
     run.add_argument("--out", type=Path, metavar="DIR", help=about)
     about = "number of parallel processes (default: one per usable core)"
@@ -49,7 +49,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument("--record", choices=("failed", "all"), help=about)
     about = "fly only part I of N; 'auto' takes I and N from Slurm or Kubernetes"
     run.add_argument("--shard", type=_shard, metavar="I/N", help=about)
-    rows.add_argument("file", type=input_file, metavar="FILE", help="file of flights, of a Job")
+    rows.add_argument("file", type=Path, metavar="FILE", help="file of flights, of a Job")
     rows.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N", help=about)
     add = release_arguments(run)
     about = "fly in the pods of a Job instead of on this machine"

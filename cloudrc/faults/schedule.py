@@ -10,6 +10,7 @@ import numpy as np
 import yaml
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
+from cloudrc import files
 from cloudrc.errors import BadInputError, to_one_line
 
 
@@ -140,12 +141,12 @@ def load(path: Path) -> Schedule:
         BadInputError: If the file is no valid schedule.
     """
     try:
-        return _SCHEDULE.validate_python(yaml.safe_load(path.read_text(encoding="utf-8")))
+        return _SCHEDULE.validate_python(yaml.safe_load(files.read(path)))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         text = ": ".join(filter(None, [".".join(map(str, first["loc"])), first["msg"]]))
     except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
-        text = getattr(error, "strerror", None) or to_one_line(str(error))
+        text = getattr(error, "strerror", None) or to_one_line(str(error).removeprefix(f"{path}: "))
     raise BadInputError(f"{path}: is no schedule of faults: {text}")
 
 

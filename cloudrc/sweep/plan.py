@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from pydantic import Field
 
-from cloudrc import __version__, metrics, plugins
+from cloudrc import __version__, files, metrics, plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, Source, read_document
 from cloudrc.config.load import ResolvedExperiment, load_experiment, local_files, validate
@@ -118,10 +118,10 @@ def _everything(point: ResolvedExperiment) -> dict[str, Any]:
     values, cloud = point.model_dump(mode="json"), point.cloud
     chosen = ("estimators", cloud.estimator), ("predictors", cloud.predictor)
     code = [_code(kind, each.name) for kind, each in (*chosen, ("controllers", cloud.controller))]
-    files = {
+    hashes = {
         file: sha256(Path(file).read_bytes()).hexdigest() for file in local_files(values).values()
     }
-    return {**values, "cloudrc": __version__, "code": code, "files": files}
+    return {**values, "cloudrc": __version__, "code": code, "files": hashes}
 
 
 @cache
@@ -211,7 +211,7 @@ def pack(flights: Iterable[Flight]) -> bytes:
 def unpack(path: Path) -> list[Flight]:
     """Read the flights from a file made by `pack`; raise a BadInputError if it is unusable."""
     try:
-        content = json.loads(gzip.decompress(path.read_bytes()))
+        content = json.loads(gzip.decompress(files.read(path)))
         points = list[tuple[dict[str, Any], ResolvedExperiment, dict[str, Any]]]()
         for point, values in content["points"]:
             resolved = ResolvedExperiment.model_validate_json(json.dumps(values))
