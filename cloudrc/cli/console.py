@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from functools import partial
 from pathlib import Path
 from secrets import token_hex
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -179,7 +178,6 @@ def _show_release(options: argparse.Namespace) -> int:
     if options.run:
         raise BadInputError("RUN names a run here, the other flags a cluster; give one")
     release = release_from_flags(options)
-    from cloudrc.cli.link_set import note_of
     from cloudrc.cluster.link import keep, read_link, send
     from cloudrc.cluster.pods import follow_page
 
@@ -193,8 +191,7 @@ def _show_release(options: argparse.Namespace) -> int:
             continue
         try:
             link, settings = read_link(release), line.removeprefix(LINK_SET).split()
-            note = partial(note_of, number=token_hex(4))
-            keep(release, link, send(release, link, None, settings, note))
+            keep(release, link, send(release, link, None, settings, token_hex(4)))
             print_line(line)
         except CloudrcError as error:
             print_line(f"cloudrc: {line}: {error}", sys.stderr)

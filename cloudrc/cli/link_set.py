@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 import secrets
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any
@@ -73,8 +71,8 @@ def execute(options: argparse.Namespace) -> int:
         from cloudrc.cluster.link import keep, send
 
         place = Release(options.context, options.namespace, options.release or DEFAULT_RELEASE)
-        link, note = _link_of(options, place), partial(note_of, number=number)
-        sent = send(place, link, options.profile, options.settings, note)
+        link = _link_of(options, place)
+        sent = send(place, link, options.profile, options.settings, number)
         took = monotonic() - began
         keep(place, link, sent)
         where = f"release '{place.name}'{f' {place.where}' if place.namespace else ''}"
@@ -121,7 +119,7 @@ def set_here(
     if not states:
         raise BadInputError(f"{folder.parent}: no link is up there (yet); wait for the start")
     edit = edit_profile(Document(states[0].profile), profile, settings)
-    handed = Handed(note_of(edit, number), {PROFILE: write_yaml(edit.values)})
+    handed = Handed(edit.change(number), {PROFILE: write_yaml(edit.values)})
     for state in states:
         publish(folder / state.direction / HANDED_FILE, write_handed(handed))
     deadline = monotonic() + LOCAL_TIMEOUT
@@ -151,11 +149,6 @@ def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
         except MissingPrerequisiteError as error:
             raise no_run_error(options, error, "--run") from None
         raise
-
-
-def note_of(edit: Edit, number: str) -> str:
-    """Return change.json as text: number, cause, and whether the time line restarts."""
-    return json.dumps({"number": number, "cause": edit.cause, "restart": edit.restart}) + "\n"
 
 
 def _row(state: LinkState) -> tuple[str, ...]:

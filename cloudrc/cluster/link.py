@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,28 +110,16 @@ class Sent(NamedTuple):
 
 
 def send(
-    release: Release,
-    link: LinkParts,
-    profile: str | None,
-    settings: Sequence[str],
-    note: Callable[[Edit], str],
+    release: Release, link: LinkParts, profile: str | None, settings: Sequence[str], number: str
 ) -> Sent:
     """Change the profile in both link containers, and wait until both have applied the change.
 
-    Args:
-        release: The release.
-        link: The link of the release before the change.
-        profile: New profile, as in `cloudrc.config.load.edit_profile`.
-        settings: Values to set, as in `cloudrc.config.load.edit_profile`.
-        note: Function that describes the change from the edited profile, as the text of
-            change.json.
-
-    Raises:
-        BadInputError: If the request is not valid, or if a container refuses the change.
+    `profile` and `settings` are those of `cloudrc.config.load.edit_profile`. `number` identifies
+    the change. Raise a BadInputError if the request is not valid, or if a container refuses the
+    change.
     """
     edit, files = with_files(link.files, profile, settings)
-    files[CHANGE_FILE] = note(edit)
-    number = read_change(files[CHANGE_FILE]).number
+    files[CHANGE_FILE] = edit.change(number)
     handed = Handed(files[CHANGE_FILE], _needed_files(edit.values, {**link.files, **files}))
 
     def ask(component: str) -> LinkState | CloudrcError:

@@ -385,6 +385,11 @@ class Edit(NamedTuple):
     restart: bool  # whether the time line starts again when the profile takes effect
     notes: list[str]  # sentences for the user about side effects
 
+    def change(self, number: str) -> str:
+        """Return the text of change.json, which tells a link about the change `number`."""
+        document = {"number": number, "cause": self.cause, "restart": self.restart}
+        return json.dumps(document) + "\n"
+
 
 def edit_profile(before: Document, profile: str | None, settings: Sequence[str]) -> Edit:
     """Set values in the link profile `before`, or in the profile named `profile` if it is given.
