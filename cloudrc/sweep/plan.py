@@ -24,7 +24,7 @@ from cloudrc import __version__, files, metrics, plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, Source, read_document
 from cloudrc.config.load import ResolvedExperiment, load_experiment, local_files, validate
-from cloudrc.config.overrides import collect_settings
+from cloudrc.config.overrides import KINDS, collect_settings
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError
@@ -115,9 +115,8 @@ def read_plan(path: Path) -> Plan:
 
 
 def _everything(point: ResolvedExperiment) -> dict[str, Any]:
-    values, cloud = point.model_dump(mode="json"), point.cloud
-    chosen = ("estimators", cloud.estimator), ("predictors", cloud.predictor)
-    code = [_code(kind, each.name) for kind, each in (*chosen, ("controllers", cloud.controller))]
+    values = point.model_dump(mode="json")
+    code = [_code(kind, getattr(point.cloud, key).name) for key, kind in KINDS.items()]
     hashes = {
         file: sha256(Path(file).read_bytes()).hexdigest() for file in local_files(values).values()
     }
