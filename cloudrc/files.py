@@ -95,17 +95,19 @@ def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
 
     `mode` is the file's permissions, minus the umask. Other users may write to the folder, so a
     symbolic link at `path` is replaced, and the temporary name is random. If writing fails, the
-    existing file stays unchanged, and an OSError is raised.
+    existing file stays unchanged, and an OSError that names `path` is raised.
     """
     new = path.with_name(f".{path.name}.{os.urandom(8).hex()}")
     alone = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-    file = open(os.open(new, alone, mode), "wb")
     try:
-        with file:
+        with open(os.open(new, alone, mode), "wb") as file:
             yield file
         new.replace(path)
-    except BaseException:
-        new.unlink(missing_ok=True)
+    except BaseException as error:
+        with suppress(OSError):
+            new.unlink()
+        if isinstance(error, OSError) and error.filename in (None, str(new)):
+            error.filename = str(path)  # the user knows no temporary name
         raise
 
 

@@ -15,11 +15,13 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from cloudrc.cli.output import format_document, print_or_drop, print_result, table
+from cloudrc.cli.parser import add_verbs
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.errors import BadInputError
 
 TIME_LIMIT = 120.0
 """Time limit of all parts together [s]; the solution needs 5 s."""
+VERBS = {"new": "write the files that students fill in", "check": "score a student's files"}
 FORMS = ("table", "json", "yaml", "gradescope")
 EPILOG = """\
 examples:
@@ -32,10 +34,8 @@ examples:
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    new = verbs.add_parser("new", help="write the files that students fill in")
+    new, check = add_verbs(parser, VERBS).values()
     new.add_argument("folder", type=Path, metavar="DIR", help="folder for the files")
-    check = verbs.add_parser("check", help="score a student's files")
     check.add_argument("folder", type=Path, metavar="DIR", help="folder with the files")
     about = "output format (default: table)"
     check.add_argument("-o", "--output", choices=FORMS, default="table", help=about)

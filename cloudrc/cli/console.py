@@ -53,11 +53,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--no-open", action="store_true", help="print the page's address, open no browser")
     release_arguments(parser)
     pod = parser.add_argument_group("in the container of the chart")
-    for flag, metavar, text in (
-        ("--config", "FILE", "experiment file"),
-        ("--profile", "FILE", "file of the link profile"),
-    ):
-        pod.add_argument(flag, type=Path, metavar=metavar, help=text)
+    pod.add_argument("--config", type=Path, metavar="FILE", help="experiment file")
+    pod.add_argument("--profile", type=Path, metavar="FILE", help="file of the link profile")
     pod.add_argument("--api", metavar="URL", help="the API of teleop")
     token_argument(pod)
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import escape, output_argument, paint, print_line, print_result, table
-from cloudrc.cli.parser import input_file, number, read_count, whole_number
+from cloudrc.cli.parser import add_verbs, number, read_count, whole_number
 from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
 from cloudrc.errors import BadInputError
 
@@ -39,7 +39,7 @@ SEED_MAX = 2**52
 """Largest value of --seed and --first. A search counts up from --first, and seeds end at 2^53."""
 MINUTES_MAX = 10_000
 """Longest duration of a search [min]: about a week."""
-ACTIONS = {
+VERBS = {
     "list": "list all faults with their injection and the expected reaction",
     "run": "inject faults, or those of a schedule's file, and check the reaction",
     "search": "fly random combinations of faults and check the invariants in every step",
@@ -50,12 +50,9 @@ FAILED = 1
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", title="actions")
-    parsers = {}
-    for name, text in ACTIONS.items():
-        description = f"{text[0].upper()}{text[1:]}."
-        parsers[name] = actions.add_parser(name, help=text, description=description)
-        output_argument(parsers[name])
+    parsers = add_verbs(parser, VERBS)
+    for verb in parsers.values():
+        output_argument(verb)
     what = parsers["run"].add_mutually_exclusive_group(required=True)
     text = "name of the fault, its number: F13, or a schedule's file (.yaml)"
     what.add_argument("name", nargs="?", type=_name_or_file, metavar="NAME", help=text)
@@ -76,7 +73,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def _name_or_file(text: str) -> str | Path:
     is_path = "/" in text or text.endswith((".yaml", ".yml")) or os.path.isfile(text)
-    return input_file(text) if is_path else text
+    return Path(text) if is_path else text
 
 
 def _folder(text: str) -> Path:
@@ -88,10 +85,10 @@ def _folder(text: str) -> Path:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Run the chosen action; return 1 if a check failed, 130 after an interrupt signal."""
+    """Run the chosen verb; return 1 if a check failed, 130 after an interrupt signal."""
     require("the fault suite", ("world", "record"))
     interrupt_on_signals()
-    return {"list": print_faults, "run": run, "search": search}[options.action](options)
+    return {"list": print_faults, "run": run, "search": search}[options.verb](options)
 
 
 def print_faults(options: argparse.Namespace) -> int:

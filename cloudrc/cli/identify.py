@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import format_document, output_argument, print_line, table
+from cloudrc.cli.output import escape, format_document, output_argument, print_result, table
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -48,23 +48,17 @@ def execute(options: argparse.Namespace) -> int:
         for axis, name in enumerate("xyz")
     ]
     document = _document(fits, len(given) * DT, (INPUT, OUTPUT))
-    try:
-        out.write_text(format_document(document, "yaml") + "\n", encoding="utf-8")
-    except OSError as error:
-        raise BadInputError(f"{out}: {error.strerror}; name another file with --out") from error
-    if options.output != "table":
-        print(format_document(document, options.output))
-        return 0
-    print(f"velocity loop from {document['seconds']} s, input {INPUT}, output {OUTPUT}\n")
+    out.write_text(format_document(document, "yaml") + "\n", encoding="utf-8")
+    head = f"velocity loop from {document['seconds']} s, input {INPUT}, output {OUTPUT}"
     rows: list[Sequence[str]] = [
         ("axis", "time constant [s]", "dead time [s]", "gain", "explained")
     ]
     for name, fit in zip("xyz", fits, strict=True):
         cells = [f"{v:.3f} ± {h:.3f}" for v, h in zip(*fit[:2], strict=True)]
         rows.append((name, *cells, f"{fit.share:.1%}"))
-    print(table(rows, right=(1, 2, 3, 4)))
-    print("\n± : 95 % interval")
-    print_line(str(out))
+    shown = table(rows, right=(1, 2, 3, 4))
+    text = f"{head}\n\n{shown}\n\n± : 95 % interval\n{escape(str(out))}"
+    print_result(options.output, document, text)
     return 0
 
 

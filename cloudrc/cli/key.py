@@ -8,8 +8,12 @@ import sys
 from pathlib import Path
 
 from cloudrc.cli.output import print_line
-from cloudrc.errors import BadInputError
+from cloudrc.cli.parser import add_verbs
 
+VERBS = {
+    "new": "make a key file, or rotate the key in one",
+    "drop": "remove the old key of a rotation",
+}
 EPILOG = """\
 World and cloud read the same key file ('--key FILE'; in a cluster, a Secret)
 and read it again when it changes. 'new' on an existing file rotates the key:
@@ -25,11 +29,9 @@ each of them:
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    new = verbs.add_parser("new", help="make a key file, or rotate the key in one")
+    new, drop = add_verbs(parser, VERBS).values()
     new.add_argument("file", type=Path, metavar="FILE", help="key file to write, with mode 0600")
     new.add_argument("--overlap", metavar="SECONDS", help="ignored: see 'drop'")
-    drop = verbs.add_parser("drop", help="remove the old key of a rotation")
     drop.add_argument("file", type=Path, metavar="FILE", help="key file made by 'new'")
 
 
@@ -50,10 +52,6 @@ def execute(options: argparse.Namespace) -> int:
     else:
         keys, said = KeySet(old.current), " is the only key"
     target = Path(os.path.realpath(path))  # keep a symbolic link: replace the file it points to
-    try:
-        write_atomically(target, write(keys).encode("ascii"), 0o600)
-    except OSError as error:
-        remedy = "name a file in an existing, writable folder"
-        raise BadInputError(f"{path}: {error.strerror or error}; {remedy}") from None
+    write_atomically(target, write(keys).encode("ascii"), 0o600)
     print_line(f"key {keys.current.name}{said}: {path}")
     return 0

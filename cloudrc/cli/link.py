@@ -1,6 +1,6 @@
-"""Run `cloudrc link ACTION`. This module has the action `show` and the arguments of `verify`.
+"""Run `cloudrc link VERB`. This module has the verb `show` and the arguments of `verify`.
 
-The modules `cli/link_<action>.py` contain the other actions. The module of `verify` imports large
+The modules `cli/link_<verb>.py` contain the other verbs. The module of `verify` imports large
 packages, which would slow down `cloudrc link --help`.
 """
 
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 from cloudrc.cli.cluster_flags import release_arguments
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import escape, output_argument, print_line, table
+from cloudrc.cli.parser import add_verbs
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -37,14 +38,14 @@ All delays are one way. 'cloudrc run --mode local' starts 'cloudrc link run' for
 each direction, the chart starts it in each pod: the uplink beside world, the
 downlink beside cloud. It watches its profile file and the address of its peer,
 and ends on SIGTERM."""
-ACTIONS = {
+VERBS = {
     "show": "draw a profile and print its delay and loss statistics",
     "record": "turn measured delays into a trace that a profile can replay",
     "verify": "check by measurement that a link does what its profile says",
     "set": "change the link during a flight",
     "run": "shape one direction of the link until SIGTERM",
 }
-"""Action -> its line in the help."""
+"""Verb -> its line in the help."""
 SHOW_EPILOG = """\
 examples:
   cloudrc link show lossy
@@ -90,33 +91,23 @@ KINDS = ("png", "svg", "pdf")
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", title="actions")
     here = {
         "show": (SHOW_EPILOG, show_arguments, show),
         "verify": (VERIFY_EPILOG, verify_arguments, _verify),
     }
-    for name, line in ACTIONS.items():
+    for name, verb in add_verbs(parser, VERBS).items():
         if name in here:
             epilog, declare, act = here[name]
         else:
             module = importlib.import_module(f"cloudrc.cli.link_{name}")
             epilog, declare, act = module.EPILOG, module.arguments, module.execute
-        action = actions.add_parser(
-            name,
-            help=line,
-            description=line[0].upper() + line[1:] + ".",
-            epilog=epilog,
-            formatter_class=parser.formatter_class,
-            allow_abbrev=False,
-        )
-        debug = "show the traceback of an error"
-        action.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=debug)
-        declare(action)
-        action.set_defaults(act=act)
+        verb.epilog = epilog
+        declare(verb)
+        verb.set_defaults(act=act)
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Run the action that the user has chosen, such as `set`; return the exit code."""
+    """Run the verb that the user has chosen, such as `set`; return the exit code."""
     code: int = options.act(options)
     return code
 

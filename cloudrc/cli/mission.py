@@ -18,7 +18,7 @@ from cloudrc.cli.client import Api, UnreachableError, mission_path, token_file, 
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
 from cloudrc.cli.output import escape, output_argument, print_line, print_result, table
-from cloudrc.cli.parser import number
+from cloudrc.cli.parser import add_verbs, number
 from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.drivers.machine import Deadline
 from cloudrc.errors import (
@@ -78,18 +78,8 @@ Json = dict[str, Any]
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parsers = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
-    verbs = {}
-    for name, (line, _) in VERBS.items():
-        verbs[name] = verb = parsers.add_parser(
-            name,
-            help=line,
-            description=line[0].upper() + line[1:] + ".",
-            formatter_class=parser.formatter_class,
-            allow_abbrev=False,
-        )
-        debug = "show the traceback of an error"
-        verb.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=debug)
+    verbs = add_verbs(parser, {name: line for name, (line, _) in VERBS.items()})
+    for name, verb in verbs.items():
         url = "http://HOST:PORT or unix:PATH of a run or release"
         verb.add_argument("--api", metavar="URL", help=url)
         client.token_argument(verb)
@@ -451,7 +441,7 @@ def _run_job(options: argparse.Namespace) -> int:
     try:
         ended = follow(release, job, print_line)
     except KeyboardInterrupt:
-        command = f"kubectl {' '.join(release.flags)} delete job {job}"
+        command = f"{release.kubectl} delete job {job}"
         print_line(f"Job {job} is still running; cancel its mission: {command}", sys.stderr)
         raise
     if ended.exit_code is None:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import argparse
 import difflib
 import importlib
-import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from math import nan
-from pathlib import Path
 from typing import Any, NoReturn
 
 from cloudrc import __version__
@@ -72,6 +70,12 @@ exit codes: 0 done, 1 mission failed its criteria, 2 usage or bad input,
 class Parser(argparse.ArgumentParser):
     """Parse a command line; raise errors as BadInputError, which `main` prints in one line."""
 
+    def __init__(self, **given: Any) -> None:
+        """Take the arguments of argparse; declare `--debug`, which every command and verb has."""
+        super().__init__(formatter_class=_formatter, allow_abbrev=False, **given)
+        about = "show the traceback of an error"
+        self.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=about)
+
     def error(self, message: str) -> NoReturn:
         """Raise an error with the message of argparse and the command that prints the help."""
         raise BadInputError(f"{message}; see '{self.prog} --help'")
@@ -126,48 +130,47 @@ def figure_arguments(parser: argparse.ArgumentParser, width: float) -> None:
     add("--font-size", type=number(5, 24, "points"), default=9.0, metavar="PT", help=about)
 
 
-def input_file(text: str) -> Path:
-    """Parse the path of an input file for argparse; refuse pipes and devices, which could block."""
-    if os.path.exists(text) and not os.path.isfile(text):
-        raise argparse.ArgumentTypeError(f"{text}: not a regular file")
-    return Path(text)
-
-
 def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:
     """Build the parser of all commands, with the arguments of the `wanted` commands only.
 
     The function imports only the modules of these commands. With `for_completion`, the help also
     contains argparse's list of commands, which the completion script needs.
     """
-    common, about = Parser(add_help=False), "show the traceback of an error"
-    common.add_argument("--debug", action="store_true", default=argparse.SUPPRESS, help=about)
     parser = Parser(
         prog="cloudrc",
         usage="cloudrc [-h] [--version] [--debug] COMMAND ...",
         description="\n\n".join([ABOUT, *map(_lines, GROUPS)]),
         epilog=EXAMPLES,
-        formatter_class=_formatter,
-        allow_abbrev=False,
-        parents=[common],
     )
     parser.add_argument("--version", action="version", version=f"cloudrc {__version__}")
     shown = "what to do" if for_completion else argparse.SUPPRESS
     commands = parser.add_subparsers(dest="command", help=shown, prog="cloudrc")
     for name, line in COMMANDS.items():
         module = _find_command(name) if name in set(wanted) else None
-        command = commands.add_parser(
-            name,
-            help=line,
-            description=line[0].upper() + line[1:] + ".",
-            epilog=getattr(module, "EPILOG", None),
-            formatter_class=_formatter,
-            allow_abbrev=False,
-            parents=[common],
-        )
+        command = commands.add_parser(name, help=line, description=_sentence(line))
         if module is not None:
+            command.epilog = getattr(module, "EPILOG", None)
             module.arguments(command)
             command.set_defaults(execute=module.execute)
     return parser
+
+
+def add_verbs(
+    parser: argparse.ArgumentParser, lines: Mapping[str, str]
+) -> dict[str, argparse.ArgumentParser]:
+    """Declare the verbs of a command; `lines` maps each verb to its line in the help.
+
+    Return verb -> its parser. When the command runs, `options.verb` is the user's choice.
+    """
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB", title="verbs")
+    return {
+        name: verbs.add_parser(name, help=line, description=_sentence(line))
+        for name, line in lines.items()
+    }
+
+
+def _sentence(line: str) -> str:
+    return f"{line[0].upper()}{line[1:]}."
 
 
 def _find_command(name: str) -> Any:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import escape, output_argument, print_result
-from cloudrc.cli.parser import input_file
 from cloudrc.errors import BadInputError
 
 LOSSY = 1
@@ -24,7 +23,7 @@ exit codes: 0 complete, 1 some data is lost (printed), 2 nothing readable"""
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("file", type=input_file, metavar="FILE", help="a recording (.mcap)")
+    parser.add_argument("file", type=Path, metavar="FILE", help="a recording (.mcap)")
     about = "file for the clean copy (default: FILE with '.recovered' before its ending)"
     parser.add_argument("-t", "--to", type=Path, metavar="NEW", help=about)
     output_argument(parser)
@@ -39,11 +38,7 @@ def execute(options: argparse.Namespace) -> int:
     target = options.to or source.with_name(f"{source.stem}.recovered{source.suffix}")
     if os.path.lexists(target):
         raise BadInputError(f"{target}: already there; name another file with --to")
-    try:
-        recovery = recover(source, target)
-    except OSError as error:  # this error names a temporary file, not `target`
-        reason = error.strerror or error
-        raise BadInputError(f"{target}: {reason}; name another file with --to") from error
+    recovery = recover(source, target)
     kept = ", ".join(f"{count} {kind}" for kind, count in recovery.kept.items() if count)
     lines = [f"kept {recovery.share:.1%}: {kept}", *(f"lossy: {note}" for note in recovery.notes)]
     if recovery.complete and recovery.index_is_new:

@@ -50,8 +50,6 @@ def execute(options: argparse.Namespace) -> int:
         write_atomically(out, write_page(flight, experiment).encode())
     except BadInputError as error:
         raise BadInputError(f"{run}: no replay: {error}") from error
-    except OSError as error:
-        raise BadInputError(f"{out}: {error.strerror}; name another file with --out") from error
     if not options.no_open and not open_page(out.absolute().as_uri()):
         print_line("cloudrc: found no browser here; open the page yourself", sys.stderr)
     print_line(str(out))

@@ -9,9 +9,9 @@ from pathlib import Path
 from cloudrc import __version__
 from cloudrc.cli.cluster_flags import release_arguments
 from cloudrc.cli.output import output_argument
-from cloudrc.cli.parser import COUNT_MAX, figure_arguments, input_file, read_count
+from cloudrc.cli.parser import COUNT_MAX, add_verbs, figure_arguments, read_count
 
-ACTIONS = {
+VERBS = {
     "run": "fly all points of a grid, or those that are missing in --out",
     "status": "count the rows and the successful flights of a sweep",
     "fly": "fly one row again with a recording and a report, and compare the hashes",
@@ -39,12 +39,8 @@ IMAGE = f"cloudrc/world:{__version__}"
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION", title="actions")
-    run, status, fly, figure, rows = (
-        actions.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
-        for name, text in ACTIONS.items()
-    )
-    run.add_argument("file", type=input_file, metavar="FILE", help="file of the sweep (.yaml)")
+    run, status, fly, figure, rows = add_verbs(parser, VERBS).values()
+    run.add_argument("file", type=Path, metavar="FILE", help="file of the sweep (.yaml)")
     about = "folder of the sweep (default: a new one in runs/); if it has rows, fly the others"
     run.add_argument("--out", type=Path, metavar="DIR", help=about)
     about = "number of parallel processes (default: one per usable core)"
@@ -53,7 +49,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument("--record", choices=("failed", "all"), help=about)
     about = "fly only part I of N; 'auto' takes I and N from Slurm or Kubernetes"
     run.add_argument("--shard", type=_shard, metavar="I/N", help=about)
-    rows.add_argument("file", type=input_file, metavar="FILE", help="file of flights, of a Job")
+    rows.add_argument("file", type=Path, metavar="FILE", help="file of flights, of a Job")
     rows.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N", help=about)
     add = release_arguments(run)
     about = "fly in the pods of a Job instead of on this machine"
@@ -102,9 +98,9 @@ def _shard(text: str) -> tuple[int, int]:
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Run the chosen action; return the exit code."""
+    """Run the chosen verb; return the exit code."""
     from cloudrc.cli import sweep_run as actions
 
     functions = (actions.run, actions.print_status, actions.fly_again, actions.draw_figure,
                  actions.print_rows)  # fmt: skip
-    return dict(zip(ACTIONS, functions, strict=True))[options.action](options)
+    return dict(zip(VERBS, functions, strict=True))[options.verb](options)

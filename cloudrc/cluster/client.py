@@ -74,6 +74,11 @@ class Release:
         return [f"--{name}={value}" for name, value in given.items() if value]
 
     @property
+    def kubectl(self) -> str:
+        """The beginning of a command of kubectl for messages: "kubectl" and its flags."""
+        return " ".join(["kubectl", *self.flags])
+
+    @property
     def helm_flags(self) -> list[str]:
         """Flags that select context and namespace in helm."""
         return [flag.replace("--context", "--kube-context") for flag in self.flags]

@@ -73,7 +73,7 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
         TimedOutError: If the pods are not ready within `timeout` [s].
     """
     selector = f"app.kubernetes.io/instance={release.name}"
-    see = f"see: kubectl {' '.join(release.flags)} describe pods -l {selector}"
+    see = f"see: {release.kubectl} describe pods -l {selector}"
     until, failing_since, last = time.monotonic() + timeout, None, ""
     while True:
         states = {each: _state(release, each) for each in COMPONENTS}
@@ -123,7 +123,7 @@ def refuse_second_flight(release: Release, ask: Ask) -> None:
     """
     for job in release.find("jobs", "mission"):
         if failure_of(job) is None:
-            name, end = job.metadata.name, f"kubectl {' '.join(release.flags)} delete job"
+            name, end = job.metadata.name, f"{release.kubectl} delete job"
             raise ClusterError(
                 f"Job '{name}' is under way on release '{release.name}' {release.where}; wait for "
                 f"it, end it: {end} {name}, or fly on a release of your own: --release NAME"

@@ -1,8 +1,8 @@
-"""Fly missions as Kubernetes Jobs: create, follow and delete a mission's Job.
+"""Run Kubernetes Jobs: create, follow and delete them; fly a mission as a Job.
 
-The container of the Job posts the mission to the release's API, follows the mission, and ends with
-the exit code of the mission's verdict. The Job has the form of the chart's
-`examples/mission-job.yaml`.
+A Job has the form of an example of the chart, such as `examples/mission-job.yaml`. The container of
+a mission's Job posts the mission to the release's API, follows the mission, and ends with the exit
+code of the mission's verdict.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import secrets
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from math import ceil
 from typing import Any, NamedTuple
@@ -19,23 +19,21 @@ import yaml
 
 from cloudrc.cluster.client import ClusterError, Release, chart_folder
 from cloudrc.cluster.pods import (
+    UNSCHEDULED,
     container_statuses,
     find_deployment,
-    list_pods,
     pod_failure,
     pod_log,
     tokens_secret,
 )
 from cloudrc.errors import CloudrcError, TimedOutError, to_one_line
 
-EXAMPLE = "examples/mission-job.yaml"
-"""File in the chart with the Job and the ConfigMap of a mission, the template for `run_job`."""
 COMPONENT = "mission"
-"""Label `component` of the Jobs, pods and ConfigMaps of missions."""
+"""Label `component` of the Jobs, pods and ConfigMaps of missions, and name of their container."""
 FILE = "mission.yaml"
 """Key in the ConfigMap under which the mission is stored."""
 UID_LABEL = "batch.kubernetes.io/controller-uid"
-"""Label with the Job's UID, which Kubernetes sets on the Job's pod."""
+"""Label with the Job's UID, which Kubernetes sets on the Job's pods."""
 FROM_POD = ("nodeSelector", "tolerations", "affinity", "imagePullSecrets", "securityContext")
 FROM_CONTAINER = ("image", "imagePullPolicy", "securityContext")
 """Keys that the pod and the container of a mission take from teleop's pod and container."""
@@ -44,11 +42,13 @@ START_ALLOWANCE = 120
 QUEUE_ALLOWANCE = 3600
 """Time for earlier missions to end, added to the time limit of a Job that may wait [s]."""
 KEEP_FINISHED = 3600
-"""Time for which Kubernetes keeps a finished Job [s]."""
-LOOK_PERIOD = 0.5
-"""Time between two requests for the state of a Job [s]."""
+"""Time for which Kubernetes keeps the finished Job of a mission [s]."""
+LOOK_PERIOD = 1.0
+"""Time between two requests for the state of a Job and its pods [s]."""
+OVERLAP = 10
+"""Age of the oldest lines that are read from the log of a running pod [s]."""
 DELETE_LIMIT = 40.0
-"""Time limit for a deleted Job to end [s]; Kubernetes gives the Job's pod 30 s."""
+"""Time limit for a deleted Job to end [s]; Kubernetes gives the Job's pods 30 s."""
 
 
 class Ended(NamedTuple):
@@ -80,39 +80,49 @@ def run_job(
     """
     # A Job's pod has a longer name than the Job; the limit is 63 characters.
     name = name or f"{release.name[:40].rstrip('-.')}-mission-{secrets.token_hex(3)}"
-    plan, job = yaml.safe_load_all((chart_folder() / EXAMPLE).read_text("utf-8"))
-    labels = {
-        **release.labels(COMPONENT),  # used by the NetworkPolicies
-        "app.kubernetes.io/part-of": "cloudrc",
-        "app.kubernetes.io/managed-by": "cloudrc",
-    }
+    plan, job = read_example(release, COMPONENT, name)
     deployment = find_deployment(release, "cloud")
-    owner = owner_of("apps/v1", "Deployment", deployment)
-    job["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
+    job["metadata"]["ownerReferences"] = [owner_of("apps/v1", "Deployment", deployment)]
     deadline = ceil(limit) + START_ALLOWANCE + queue * QUEUE_ALLOWANCE
     job["spec"] |= {"activeDeadlineSeconds": deadline, "ttlSecondsAfterFinished": KEEP_FINISHED}
-    job["spec"]["template"]["metadata"]["labels"] = labels
-    _fill_pod(job["spec"]["template"]["spec"], release, deployment, name, queue)
+    _fill_pod(job["spec"]["template"]["spec"], release, deployment, queue)
     plan["data"] = {FILE: json.dumps(mission, indent=2) + "\n"}
-    create_job(release, job, plan, labels, COMPONENT)
+    create_job(release, job, plan)
     return name
 
 
-def create_job(
-    release: Release, job: Any, files: Any, labels: Mapping[str, str], component: str
-) -> None:
+def read_example(release: Release, component: str, name: str) -> tuple[Any, Any]:
+    """Read ConfigMap and Job from the chart's example for a component, "mission" or "sweep".
+
+    Both get the name `name`, and the Job gets the labels of the release.
+    """
+    text = (chart_folder() / f"examples/{component}-job.yaml").read_text("utf-8")
+    files, job = yaml.safe_load_all(text)
+    template, labels = job["spec"]["template"], job["metadata"]["labels"]
+    # The NetworkPolicies select pods by the labels of the release.
+    labels |= {**release.labels(component), "app.kubernetes.io/managed-by": "cloudrc"}
+    template["metadata"]["labels"] = labels
+    for volume in template["spec"]["volumes"]:
+        if "configMap" in volume:
+            volume["configMap"]["name"] = name
+    job["metadata"]["name"] = name
+    return files, job
+
+
+def create_job(release: Release, job: Any, files: Any) -> None:
     """Create a Job, and `files` as a ConfigMap of the same name.
 
-    If the ConfigMap cannot be created, delete the Job. `component` is the Job's component label.
+    If the ConfigMap cannot be created, delete the Job.
     """
     name, created = job["metadata"]["name"], release.request("create", "jobs", body=job)
     owner = owner_of("batch/v1", "Job", created)
+    labels = job["metadata"]["labels"]
     files["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
     try:
         release.request("create", "configmaps", body=files)
     except BaseException:  # Ctrl-C too: without its files the Job would wait forever
         with suppress(CloudrcError):
-            delete_job(release, name, component)
+            delete_job(release, name)
         raise
 
 
@@ -122,12 +132,9 @@ def owner_of(version: str, kind: str, owner: Any) -> dict[str, Any]:
     return {"apiVersion": version, "kind": kind, "name": metadata.name, "uid": metadata.uid}
 
 
-def _fill_pod(
-    pod: dict[str, Any], release: Release, deployment: Any, name: str, queue: bool
-) -> None:
-    volumes = {volume["name"]: volume for volume in pod["volumes"]}
-    volumes["mission"]["configMap"]["name"] = name
-    volumes["tokens"]["secret"]["secretName"] = tokens_secret(release)
+def _fill_pod(pod: dict[str, Any], release: Release, deployment: Any, queue: bool) -> None:
+    (tokens,) = (volume for volume in pod["volumes"] if volume["name"] == "tokens")
+    tokens["secret"]["secretName"] = tokens_secret(release)
     cloud = release.client.sanitize_for_serialization(deployment.spec.template.spec)
     (teleop,) = (each for each in cloud["containers"] if each["name"] == "teleop")
     (container,) = pod["containers"]
@@ -152,15 +159,21 @@ def _api_address(release: Release) -> str:
     )
 
 
-def delete_job(release: Release, name: str, component: str = COMPONENT) -> None:
+def find_job(release: Release, name: str) -> Any:
+    """Return the Job `name`; None if there is no such Job."""
+    found = release.request("list", "jobs", field_selector=f"metadata.name={name}")
+    return next(iter(found), None)
+
+
+def delete_job(release: Release, name: str) -> None:
     """Delete a Job with its pods and ConfigMap; the pod of a mission first cancels the mission."""
     release.request("delete", "jobs", name=name, propagation_policy="Foreground")
     until = time.monotonic() + DELETE_LIMIT
-    while any(job.metadata.name == name for job in release.find("jobs", component)):
+    while find_job(release, name) is not None:
         if time.monotonic() > until:
             raise TimedOutError(
                 f"Job '{name}' has not ended {DELETE_LIMIT:g} s after its deletion; "
-                f"see: kubectl {' '.join(release.flags)} describe job {name}"
+                f"see: {release.kubectl} describe job {name}"
             )
         time.sleep(LOOK_PERIOD)
 
@@ -177,42 +190,74 @@ def failure_of(job: Any) -> str | None:
 
 
 def follow(release: Release, name: str, write: Callable[[str], None]) -> Ended:
-    """Follow a Job until it has ended; `write` receives each line of the Job's log.
+    """Follow a mission's Job until it has ended; `write` receives each line of the Job's log.
 
     Kubernetes ends the Job after the Job's time limit. Raise a ClusterError if the Job's pod cannot
     run; the message names the cause.
     """
-    written = 0
+    states = list[Any]()
+    for line in read_log(release, name, write, states.append):
+        write(line)
+    code, message = (states[-1].exit_code, states[-1].message) if states else (None, "")
+    cause = failure_of(release.request("get", "jobs", name=name))
+    return Ended(code, to_one_line(message) or cause or "")
+
+
+def read_log(
+    release: Release, name: str, tell: Callable[[str], None], see_end: Callable[[Any], None]
+) -> Iterator[str]:
+    """Yield each different line of the logs of a Job's pods, until the Job has ended.
+
+    `tell` receives a sentence if a pod waits for a node. `see_end` receives the final state of the
+    container of each pod that ends. Raise a ClusterError if a pod will never run.
+    """
+    told, read, seen = set[str](), set[str](), set[int]()  # seen: hashes of lines
     while True:
         job = release.request("get", "jobs", name=name)
-        uids = ((pod, pod.metadata.labels.get(UID_LABEL)) for pod in list_pods(release, COMPONENT))
-        pod = next((pod for pod, uid in uids if uid == job.metadata.uid), None)
-        # A service mesh may add containers.
-        states = [c.state for c in container_statuses(pod) if c.name == COMPONENT] if pod else []
-        ended = next((state.terminated for state in states if state.terminated), None)
-        cause = failure_of(job)
-        if cause is None and not ended and not any(state.running for state in states):
-            _check_can_start(release, name, pod)
-        elif pod is not None and pod.status.phase != "Pending":
-            lines = pod_log(release, pod.metadata.name, COMPONENT).splitlines()
-            for line in lines[written:]:
-                write(line)
-            written = max(written, len(lines))
-        if cause is not None:
-            return Ended(ended and ended.exit_code, to_one_line(ended and ended.message) or cause)
+        (container,) = job.spec.template.spec.containers
+        has_ended, selector = failure_of(job) is not None, f"{UID_LABEL}={job.metadata.uid}"
+        pods = release.request("list", "pods", label_selector=selector)
+        why = "" if has_ended else _why_waiting(release, job, pods)
+        if why and why not in told:
+            told.add(why)
+            tell(f"waiting: {why}")
+        for pod in pods:
+            if pod.status.phase == "Pending" or pod.metadata.uid in read:
+                continue
+            # A service mesh may add containers, which end later.
+            own = (each for each in container_statuses(pod) if each.name == container.name)
+            ended = next((each.state.terminated for each in own), None)
+            is_done = ended is not None or pod.status.phase in ("Succeeded", "Failed")
+            if is_done:
+                read.add(pod.metadata.uid)
+            if ended is not None:
+                see_end(ended)
+            last = None if is_done else OVERLAP
+            with suppress(ClusterError):  # the pod may be gone
+                for line in pod_log(release, pod.metadata.name, container.name, last).splitlines():
+                    if hash(line) not in seen:
+                        seen.add(hash(line))
+                        yield line
+        if has_ended:
+            return
         time.sleep(LOOK_PERIOD)
 
 
-def _check_can_start(release: Release, name: str, pod: Any) -> None:
-    """Raise a ClusterError if the pod of a Job will never run; `pod` is None if there is none."""
-    if pod is not None:
-        why = pod_failure(pod)
-    else:  # the cluster may refuse the pod, for example for a quota
-        selector = f"involvedObject.kind=Job,involvedObject.name={name}"
-        found = release.request("list", "events", field_selector=selector)
-        why = next((event.message for event in found if event.reason == "FailedCreate"), "")
-    if why:
-        raise ClusterError(
-            f"Job '{name}' cannot start: {why}; fix this, then delete the Job: "
-            f"kubectl {' '.join(release.flags)} delete job {name}"
-        )
+def _why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
+    """Return why pods of a Job wait for a node, "" if none waits.
+
+    Raise a ClusterError if a pod will never run, or if the cluster refuses to make the pods.
+    """
+    found = [pod_failure(pod) for pod in pods if pod.status.phase == "Pending"]
+    if not pods:  # the cluster may refuse them, for example for a quota
+        selector = f"involvedObject.uid={job.metadata.uid}"
+        events = release.request("list", "events", field_selector=selector)
+        found = [event.message for event in events if event.reason == "FailedCreate"]
+    name = job.metadata.name
+    for why in found:
+        if why and not why.startswith(UNSCHEDULED):
+            raise ClusterError(
+                f"Job '{name}' cannot start: {why}; fix this, then delete the Job: "
+                f"{release.kubectl} delete job {name}"
+            )
+    return next(filter(None, found), "")

@@ -119,23 +119,13 @@ class Sent(NamedTuple):
 
 
 def send(
-    release: Release,
-    link: LinkParts,
-    profile: str | None,
-    settings: Sequence[str],
-    number: str,
+    release: Release, link: LinkParts, profile: str | None, settings: Sequence[str], number: str
 ) -> Sent:
     """Change the profile in both link containers, and wait until both have applied the change.
 
-    Args:
-        release: The release.
-        link: The link of the release before the change.
-        profile: New profile, as in `cloudrc.config.load.edit_profile`.
-        settings: Values to set, as in `cloudrc.config.load.edit_profile`.
-        number: Identifies the change.
-
-    Raises:
-        BadInputError: If the request is not valid, or if a container refuses the change.
+    `profile` and `settings` are those of `cloudrc.config.load.edit_profile`. `number` identifies
+    the change. Raise a BadInputError if the request is not valid, or if a container refuses the
+    change.
     """
     edit, files = with_files(link.files, profile, settings)
     files[CHANGE_FILE] = write_change(Change(number, edit.cause, edit.restart))

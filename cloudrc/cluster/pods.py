@@ -35,6 +35,8 @@ FATAL = {
     **dict.fromkeys(("CrashLoopBackOff", "Error"), "container '{name}' ends repeatedly{end}"),
 }
 """Kubernetes' reason why a container will never run -> text of the error message."""
+UNSCHEDULED = "no node takes it"
+"""Beginning of the text about a pod that waits for a node."""
 RESTARTS_MAX = 2
 """Largest number of restarts after which a container is still expected to start."""
 TOKENS, OPERATOR = "tokens", "operator"
@@ -77,7 +79,7 @@ def find_pod(release: Release, component: str) -> Any:
         why = pod_failure(pods[0]) or f"it is {pods[0].status.phase}"
         raise ClusterError(
             f"the {component} pod of release '{release.name}' does not run: {why}; "
-            f"see: kubectl {' '.join(release.flags)} describe pod {pods[0].metadata.name}"
+            f"see: {release.kubectl} describe pod {pods[0].metadata.name}"
         )
     return running[0]
 
@@ -115,7 +117,7 @@ def pod_failure(pod: Any) -> str:
         # Kubernetes makes some volumes only on first use.
         waits_for_volume = "volume" in message and "unbound" in message
         if (condition.type, condition.status) == ("PodScheduled", "False") and not waits_for_volume:
-            return f"no node takes it: {message}"
+            return f"{UNSCHEDULED}: {message}"
     return ""
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
-import yaml
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
-from cloudrc.errors import BadInputError, to_one_line
+from cloudrc.config.document import read_document, write_yaml
+from cloudrc.errors import BadInputError
 
 
 def generator(seed: int, use: int) -> np.random.Generator:
@@ -129,8 +129,7 @@ def dump(schedule: Schedule, note: str = "") -> str:
     """Format a schedule as YAML, with `note` as a comment at the top."""
     document = _SCHEDULE.dump_python(schedule, mode="json", exclude_defaults=True)
     head = "".join(f"# {line}\n" for line in note.splitlines())
-    text: str = yaml.safe_dump(document, sort_keys=False, width=100)
-    return head + text
+    return head + write_yaml(document)
 
 
 def load(path: Path) -> Schedule:
@@ -139,14 +138,13 @@ def load(path: Path) -> Schedule:
     Raises:
         BadInputError: If the file is no valid schedule.
     """
+    document = read_document(path, str(path))
     try:
-        return _SCHEDULE.validate_python(yaml.safe_load(path.read_text(encoding="utf-8")))
+        return _SCHEDULE.validate_python(document.tree)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         text = ": ".join(filter(None, [".".join(map(str, first["loc"])), first["msg"]]))
-    except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
-        text = getattr(error, "strerror", None) or to_one_line(str(error))
-    raise BadInputError(f"{path}: is no schedule of faults: {text}")
+        raise BadInputError(f"{path}: is no schedule of faults: {text}") from error
 
 
 CALM = 45.0  # time after which there are no faults and the robot must recover [s]

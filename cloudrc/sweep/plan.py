@@ -20,11 +20,11 @@ from typing import Any, NamedTuple, TypeAlias
 
 from pydantic import Field
 
-from cloudrc import __version__, metrics, plugins
+from cloudrc import __version__, files, metrics, plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, Source, read_document
 from cloudrc.config.load import ResolvedExperiment, load_experiment, local_files, validate
-from cloudrc.config.overrides import collect_settings
+from cloudrc.config.overrides import KINDS, collect_settings
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError
@@ -115,13 +115,12 @@ def read_plan(path: Path) -> Plan:
 
 
 def _everything(point: ResolvedExperiment) -> dict[str, Any]:
-    values, cloud = point.model_dump(mode="json"), point.cloud
-    chosen = ("estimators", cloud.estimator), ("predictors", cloud.predictor)
-    code = [_code(kind, each.name) for kind, each in (*chosen, ("controllers", cloud.controller))]
-    files = {
+    values = point.model_dump(mode="json")
+    code = [_code(kind, getattr(point.cloud, key).name) for key, kind in KINDS.items()]
+    hashes = {
         file: sha256(Path(file).read_bytes()).hexdigest() for file in local_files(values).values()
     }
-    return {**values, "cloudrc": __version__, "code": code, "files": files}
+    return {**values, "cloudrc": __version__, "code": code, "files": hashes}
 
 
 @cache
@@ -211,7 +210,7 @@ def pack(flights: Iterable[Flight]) -> bytes:
 def unpack(path: Path) -> list[Flight]:
     """Read the flights from a file made by `pack`; raise a BadInputError if it is unusable."""
     try:
-        content = json.loads(gzip.decompress(path.read_bytes()))
+        content = json.loads(gzip.decompress(files.read(path)))
         points = list[tuple[dict[str, Any], ResolvedExperiment, dict[str, Any]]]()
         for point, values in content["points"]:
             resolved = ResolvedExperiment.model_validate_json(json.dumps(values))

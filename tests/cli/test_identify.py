@@ -116,4 +116,5 @@ def test_the_command_writes_a_model_that_a_predictor_takes(tmp_path, call):
         assert predictor.model_extra[key] == str(tmp_path / "model.yaml")
     error = call("identify", tmp_path, code=2).err
     assert "model.yaml: already there; name another file with --out" in error
-    assert json.loads(call("identify --out second.yaml -o json", tmp_path).out) == model
+    document = json.loads(call("identify --out second.yaml -o json", tmp_path).out)
+    assert document == {"schemaVersion": 1, **model}

@@ -62,7 +62,7 @@ def test_an_unusable_source_is_refused_in_one_line(name, data, says, folder, ref
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("", "required: ACTION"),
+        ("", "required: VERB"),
         ("show ideal -o ideal.gif", "end its name in .png, .svg or .pdf"),
         ("show ideal --seconds 0", "--seconds 0: give a number from 0.001 to 86400"),
         ("show ideal --seconds nan", "--seconds nan: give a number from"),

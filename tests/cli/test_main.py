@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.cli.faults import SEED_MAX
-from cloudrc.cli.link import ACTIONS
+from cloudrc.cli.link import VERBS
 from cloudrc.cli.main import INTERNAL, main
 from cloudrc.cli.parser import COMMANDS
 from cloudrc.errors import BadInputError, InvalidRunError
@@ -30,7 +30,7 @@ def test_help_imports_nothing_heavy(command):
     assert subprocess.run(words, capture_output=True, text=True).stderr.strip() == "[]"
 
 
-@pytest.mark.parametrize("command", ["", *COMMANDS, *(f"link {action}" for action in ACTIONS)])
+@pytest.mark.parametrize("command", ["", *COMMANDS, *(f"link {verb}" for verb in VERBS)])
 def test_help_fits_80_columns(command, capsys):
     with pytest.raises(SystemExit) as end:
         main([*command.split(), "--help"])

@@ -1,6 +1,7 @@
 """A fake Kubernetes API server with objects in memory, a fake teleop, and fake programs."""
 
 import base64
+import functools
 import itertools
 import json
 import os
@@ -14,6 +15,14 @@ import pytest
 from cloudrc.cluster import client, flight, jobs
 from cloudrc.cluster.client import connect
 from cloudrc.cluster.jobs import UID_LABEL
+
+
+def _terms(selector):
+    return dict(term.split("=") for term in selector.split(",") if term)
+
+
+def _value(body, path):
+    return functools.reduce(dict.__getitem__, path.split("."), body)
 
 
 class FakeApi:
@@ -61,12 +70,17 @@ class FakeApi:
             if method == "POST":
                 return 201, self.put(plural, body)
             if not name:
-                selector = parse_qs(address.query).get("labelSelector", [""])[0]
-                wanted = dict(term.split("=") for term in selector.split(",") if term)
-                found = [body for (kind, _), body in self.objects.items() if kind == plural]
-                labels = [body["metadata"].get("labels", {}).items() for body in found]
-                pairs = zip(found, labels, strict=True)
-                return 200, {"items": [body for body, own in pairs if wanted.items() <= own]}
+                query = parse_qs(address.query)
+                labels = _terms(query.get("labelSelector", [""])[0])
+                fields = _terms(query.get("fieldSelector", [""])[0])
+                found = [
+                    body
+                    for (kind, _), body in self.objects.items()
+                    if kind == plural
+                    and labels.items() <= body["metadata"].get("labels", {}).items()
+                    and all(_value(body, path) == value for path, value in fields.items())
+                ]
+                return 200, {"items": found}
             if (plural, name) not in self.objects:
                 return 404, {"message": f'{plural} "{name}" not found', "code": 404}
             if subresource == "log":

@@ -6,14 +6,10 @@ import pytest
 
 from cloudrc.cluster import batch
 from cloudrc.cluster.client import ClusterError
+from cloudrc.cluster.jobs import UID_LABEL
 from tests.cluster.conftest import pod, terminated
 
 WORDS = {"image": "cloudrc/world:0.1.0", "cpu": "1", "queue": None}
-
-
-@pytest.fixture(autouse=True)
-def no_pauses(monkeypatch):
-    monkeypatch.setattr(batch, "LOOK_PERIOD", 0.0)
 
 
 @pytest.fixture
@@ -23,7 +19,7 @@ def started(api, release):
 
 
 def add_pod(api, name, phase, log="", **given):
-    labels = {batch.JOB_LABEL: "sweep-1"}
+    labels = {UID_LABEL: api.get("jobs", "sweep-1")["metadata"]["uid"]}
     api.put("pods", pod(name, "sweep", labels=labels, phase=phase, **given))
     api.logs[name] = log
 
@@ -87,5 +83,5 @@ def test_pods_may_wait_for_a_node_but_not_for_an_image(started, api, release):
     assert "Insufficient cpu" in lines(release)[1][0]
     batch.start(release, "sweep-1", b"flights", 4, **WORDS)
     add_pod(api, "b", "Pending", state={"waiting": {"reason": "ImagePullBackOff"}})
-    with pytest.raises(ClusterError, match="cannot run"):
+    with pytest.raises(ClusterError, match="cannot start"):
         lines(release)

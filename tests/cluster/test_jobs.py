@@ -86,12 +86,13 @@ def test_follow_writes_each_line_once_and_returns_the_verdict(running, release):
 
 def test_follow_ends_when_the_pod_cannot_run(running, release):
     run_job(release, MISSION, name="first")
-    about = {"involvedObject": {"kind": "Job", "name": "first"}, "type": "Warning"}
+    about = {"involvedObject": {"uid": running.get("jobs", "first")["metadata"]["uid"]}}
     said = {"reason": "FailedCreate", "message": "violates PodSecurity"}
     running.put("events", {"metadata": {"name": "first.1"}, **about, **said})
     with pytest.raises(ClusterError, match="violates PodSecurity"):
         follow(release, "first", print)
-    running.start_pod("first", state={"waiting": {"reason": "ErrImagePull"}}, ready=False)
+    waits = {"state": {"waiting": {"reason": "ErrImagePull"}}, "ready": False}
+    running.start_pod("first", phase="Pending", **waits)
     with pytest.raises(ClusterError, match=r"cannot start: the image.*make kind-load"):
         follow(release, "first", print)
 

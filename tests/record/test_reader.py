@@ -312,7 +312,7 @@ def test_the_command_says_what_is_kept_and_lost(path, capsys):
     assert 0 < account["bytes_lost"] <= 100
     for target, reason in (
         (new, "already there; name another file with --to"),
-        (new / "none", "Not a directory; name another"),
+        (new / "none", "Not a directory; check the path"),
     ):
         assert main(["recover", str(path), "-t", str(target)]) == 2
         assert f"{target}: {reason}" in capsys.readouterr().err

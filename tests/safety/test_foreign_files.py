@@ -23,6 +23,7 @@ from cloudrc.report.document import clock_offset_document, write_json
 from cloudrc.report.figures import FIGURES
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
+from cloudrc.sweep.plan import read_plan
 from tests.metrics.conftest import flown
 from tests.record.conftest import cloud_records, rewrite, world_records, write, write_mission
 
@@ -37,7 +38,10 @@ def no_waiting():
     signal.signal(signal.SIGALRM, before)
 
 
-@pytest.mark.parametrize("read", [read_experiment, load_profile, read_trace, Recording.read])
+READERS = (read_experiment, load_profile, read_trace, read_plan, Recording.read)
+
+
+@pytest.mark.parametrize("read", READERS)
 def test_a_pipe_or_device_is_refused_at_once(tmp_path, read):
     os.mkfifo(tmp_path / "pipe")
     before = os.listdir("/proc/self/fd")
