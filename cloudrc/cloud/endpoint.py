@@ -54,8 +54,6 @@ HELLO_PERIOD_NS = 100_000_000
 KEY_PERIOD_NS = 5_000_000_000
 """Time between two hellos with a new pre-shared key while the session uses the old key [ns]. Until
 world has the new key, world counts the hellos as forged; 12 hellos a minute raise no alert."""
-GIVE_UP_NS = 5_000_000_000
-"""Longest time for which cloud tries to tell the robot that the mission has ended [ns]."""
 SILENCE_NS = 500_000_000
 """Time without telemetry after which cloud asks for a session again [ns]."""
 ALIVE_PERIOD_NS = 100_000_000
@@ -153,7 +151,6 @@ class CloudEndpoint(TunnelEnd):
         self._hello_ns = start_ns - KEY_PERIOD_NS  # time of the last periodic hello
         self._alive_ns = start_ns
         self._heard_ns = start_ns
-        self._flying_ns = start_ns
         self._commanded_ns = NEVER_NS
         self._count_ns = start_ns + COUNT_PERIOD_NS
 
@@ -166,16 +163,6 @@ class CloudEndpoint(TunnelEnd):
     def guard(self) -> GuardState:
         """State of the guard in the newest telemetry."""
         return GuardState.GROUND if self.telemetry is None else self.telemetry.guard
-
-    @property
-    def mission_over(self) -> bool:
-        """Whether the mission has ended, so that cloud may stop.
-
-        Telemetry must show that the robot has acted on the last request, or the mission must have
-        ended more than `GIVE_UP_NS` ago.
-        """
-        done = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
-        return done and self.teleop.outcome is not None
 
     def next_deadline_ns(self) -> int:
         """Return when cloud has to send a computed command or to compute the next command [ns]."""
@@ -208,8 +195,6 @@ class CloudEndpoint(TunnelEnd):
         if self._alarm.sounds and self._session.epoch:
             if (alarm := self._alarm.due(self._asked, now_ns)) is not None:
                 self._relay(alarm)
-        if self.teleop.outcome is None:
-            self._flying_ns = now_ns
         if self._session.epoch and self._loop.ready and self._setpoint is not None:
             self._send_command(self._setpoint, now_ns)
         elif self._session.epoch and now_ns >= self._alive_ns:

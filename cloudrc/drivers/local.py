@@ -33,7 +33,6 @@ from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.teleop import PATH_MAX
 from cloudrc.errors import InvalidRunError, TimedOutError
 from cloudrc.link.follow import PROFILE
-from cloudrc.link.state import STATE_FILE
 from cloudrc.records import Fault, Record
 from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
 
@@ -51,9 +50,10 @@ SOCKET_NAME = "/cloudrc-12345678/teleop.sock"
 """Longest path of a socket, relative to the folder for temporary files."""
 API_FILE, AUDIT_FILE = "api.json", "audit.jsonl"
 """Files in a run's folder: the API's address, and the log of the API's commands."""
-LINK_FOLDER = "link"
+LINK_FOLDER, ROUTE_FILE = "link", "route"
 """Folder in a run's folder, during the flight: the link's profile, and a folder per direction with
-the state of the link and the change from `cloudrc link set`."""
+the address of the relay (`ROUTE_FILE`), the state of the link and the change from `cloudrc link
+set`."""
 JOURNAL_FILE = "missions.journal"
 """File in a session's folder: teleop's store of the missions."""
 LINK_LOG = "uplink.log"
@@ -231,9 +231,8 @@ class LocalRun:
         self._metrics = dict(zip(names, ports[4:], strict=False))
 
         def start_end(name: str, way: str, **more: object) -> None:
-            more |= {"listen": at[name], "peer": at[way], "key": sockets / "key"}
-            more |= {"record": folder / f"{name}.mcap"}
-            more |= {"link": folder / LINK_FOLDER / way / STATE_FILE}
+            more |= {"listen": at[name], "route": folder / LINK_FOLDER / way / ROUTE_FILE}
+            more |= {"key": sockets / "key", "record": folder / f"{name}.mcap"}
             self._start(name, name, *(("--record-flights",) if session else ()), **more)
 
         def start_link(way: str, end: str, peer: str) -> None:
@@ -361,7 +360,7 @@ def link_words(folder: Path, way: str) -> list[str]:
     `way` is "uplink" or "downlink". `folder` contains profile.yaml and a folder per direction, in
     which the process writes its route file and its state.
     """
-    files = [f"--profile={folder / PROFILE}", f"--route={folder / way / 'route'}"]
+    files = [f"--profile={folder / PROFILE}", f"--route={folder / way / ROUTE_FILE}"]
     return ["link", "run", f"--direction={way}", *files]
 
 

@@ -281,13 +281,13 @@ class EndProcess:
     recorder: Recorder
     keys: KeyFile  # reloaded when it changes
     feed: Feed  # sends records to the supervisor
+    link: Path  # file with the state of the link
+    check: LinkMonitor  # compares the received datagrams with the link profile
     exporter: Exporter | None = None  # turns records into metrics
     flights_only: bool = False  # whether to record no samples while the robot does not fly
-    link: Path | None = None  # file with the state of the link
-    check: LinkMonitor | None = None  # compares the received datagrams with the link profile
 
     def __post_init__(self) -> None:
-        self._notes = LinkNotes(self.link, uplink=self.end == "world") if self.link else None
+        self._notes = LinkNotes(self.link, uplink=self.end == "world")
         self._trouble, self._dropped = "", 0
         self._clock_offset = time.time() - time.clock_gettime(SINCE_BOOT)
 
@@ -346,11 +346,8 @@ class EndProcess:
             text = f"wall clock stepped by {step:+.1f} s: the flight is not affected"
             noted.append(Fault(now_ns - slip_ns, CLOCK_SET, text))
         noted += self.keys.follow(now_ns)
-        if self._notes is not None:
-            noted += self._notes.after(records, now_ns, slip_ns)
-        if self.check is not None:
-            noted += self.check.after([*records, *noted], now_ns - slip_ns)
-        return noted
+        noted += self._notes.after(records, now_ns, slip_ns)
+        return noted + self.check.after([*records, *noted], now_ns - slip_ns)
 
     def _clock_step(self) -> float:
         """Return the step of the wall clock since the last call [s]; 0 without a step."""

@@ -111,9 +111,6 @@ class RemoteTeleop:
         outputs: Requests, setpoints and events from teleop since the last call of `take_outputs`.
     """
 
-    outcome = None  # cloud does not end when a mission ends
-    settled = True
-
     def __init__(self, peer: UnixPeer, start_ns: int) -> None:
         self._peer = peer
         # Time of teleop's last datagram; before one, time of the first telemetry sent to teleop.

@@ -73,6 +73,8 @@ PROMPT_NS = 100_000_000
 after the planned time, the carrot leaves as planned, else when telemetry shows the robot there."""
 UNSEEN_MAX_NS = 2_000_000_000
 """Longest time without telemetry after which the dwell time at a waypoint continues [ns]."""
+GIVE_UP_NS = 5_000_000_000
+"""Longest time for which teleop tries to tell the robot that the mission has ended [ns]."""
 JUMP_SPEED = 6.0
 """Highest speed of the setpoint on a track [m/s]; along a faster part the setpoint jumps."""
 GROUND, TRACK, HOLD, _, ESTOP = GuardState  # to look up a member takes time
@@ -142,7 +144,7 @@ class Teleop:
         self._setpoint: Setpoint | None = None
         self._is_pending = False  # whether the mission's first setpoint has not been sent yet
         self._stays = False  # whether waypoints are ignored
-        self._seen_ns = NEVER_NS
+        self._seen_ns, self._now_ns = NEVER_NS, 0  # times of newest telemetry and deadline
         # Whether the robot has followed commands in this mission, and whether the carrot waits.
         self._followed = self._waits = False
         self._released_ns = NEVER_NS  # end of the wait for a request to drive; or NEVER_NS
@@ -152,6 +154,14 @@ class Teleop:
     def settled(self) -> bool:
         """Whether telemetry shows that the robot has acted on the last request."""
         return self.requests.settled and not self.stopping
+
+    @property
+    def over(self) -> bool:
+        """Whether the mission has ended, and the robot knows it or has not confirmed it for 5 s."""
+        ended = self.outcome
+        if ended is None:
+            return False
+        return self.settled or self._now_ns - ended.stamp_ns > GIVE_UP_NS
 
     def elapsed(self, now_ns: int) -> float:
         """Return the time since the mission began [s]."""
@@ -288,6 +298,7 @@ class Teleop:
 
     def handle_deadline(self, now_ns: int) -> None:
         """Check the time limits, move the setpoint along a track, and repeat a request if due."""
+        self._now_ns = now_ns
         if self.state in UNDER_WAY and (timeout := self._find_timeout(now_ns)):
             self._end(*timeout, now_ns)
         if self.state == FLYING and self._plan.track:

@@ -128,9 +128,11 @@ class Release:
         (folder / "mission.yaml").write_text(MISSION)
         (folder / "operator").write_text(TOKEN)
         (folder / "operator").chmod(0o600)
+        for end, peer in (("world", cloud), ("cloud", world)):
+            (folder / f"{end}.route").write_text(peer)
         self.flags = {
-            "world": ["--listen", world, "--peer", cloud, "--key", "key"],
-            "cloud": ["--listen", cloud, "--peer", world, "--key", "key", "--teleop", "."],
+            "world": ["--listen", world, "--route", "world.route", "--key", "key"],
+            "cloud": ["--listen", cloud, "--route", "cloud.route", "--key", "key", "--teleop", "."],
             "teleop": ["--socket", ".", "--api", "0", "--api-file", "api.json", "--tokens", ".",
                        "--audit", "audit.jsonl", "--journal", "journal/missions"],
         }  # fmt: skip

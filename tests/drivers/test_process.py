@@ -190,7 +190,8 @@ def end(path, pipe):
     )
     keys = SimpleNamespace(follow=lambda now_ns: [Fault(now_ns, "key", "new key")])
     feed = Feed(pipe[1], watched=False)
-    made = EndProcess("world", None, recorder, keys, feed, Exporter("world"), link=path)
+    check = SimpleNamespace(after=lambda records, now_ns: [])
+    made = EndProcess("world", None, recorder, keys, feed, path, check, Exporter("world"))
     made.recorded = put
     return made
 

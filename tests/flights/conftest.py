@@ -194,9 +194,9 @@ def fly_on(run, until_ns, over=lambda: False):
 
 def records(experiment):
     """Fly and return the records of world and of cloud."""
-    _, cloud, run = assembly.assemble(experiment)
+    _, _, teleop, run = assembly.assemble(experiment)
     limit_ns = round(assembly.flight_limit(experiment) * 1e9)
-    return fly_on(run, limit_ns, lambda: cloud.mission_over)
+    return fly_on(run, limit_ns, lambda: teleop.over)
 
 
 @lru_cache(maxsize=8)

@@ -19,7 +19,7 @@ ESTOP = GuardState.ESTOP
 
 def join(experiment=HOVER):
     """Assemble both ends and their flight."""
-    _, cloud, run = assembly.assemble(experiment)
+    _, cloud, _, run = assembly.assemble(experiment)
     return SimpleNamespace(cloud=cloud, run=run)
 
 

@@ -29,6 +29,15 @@ def test_the_old_world_does_not_confirm_a_start_from_spawn():
     assert (flight.state, flight.epoch) == ("FLYING", 2)
 
 
+@pytest.mark.parametrize(("downlink", "after"), [(True, 0.02), (False, 5.02)])
+def test_a_mission_is_over_once_the_robot_knows_or_after_5_s(downlink, after):
+    flight = flying()
+    flight.downlink = downlink
+    flight.operate("cancel")
+    over = [(flight.step(), flight.teleop.over)[1] for _ in range(600)]
+    assert over.index(True) * 0.01 == pytest.approx(after, abs=0.02)
+
+
 def test_dwell_starts_again_outside_of_the_tolerance():
     flight = flying()
     flight.step(position=A, seconds=0.45)

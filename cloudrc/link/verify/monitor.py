@@ -76,11 +76,11 @@ class LinkMonitor:
         self._inbox: queue.SimpleQueue[tuple[Sequence[Record], int]] | None = None
         self._outbox = queue.SimpleQueue[Record]()
 
-    def begin(self, asked: Asked, path: Path | None, load: Load) -> None:
+    def begin(self, asked: Asked, path: Path, load: Load) -> None:
         """Start the thread, which judges the link by the requested profiles `asked`.
 
-        If there is a `path`, the thread reads the link's state file there. The profiles in this
-        file replace `asked`; `load` converts them from the values in the file.
+        The thread reads the link's state file at `path`. The profiles in this file replace `asked`;
+        `load` converts them from the values in the file.
         """
         self._inbox, self._pause = queue.SimpleQueue(), lambda: time.sleep(1e-4)
         self.follow(asked)
@@ -116,11 +116,10 @@ class LinkMonitor:
         except Exception:  # no file yet, or an invalid one: the profiles stay
             pass
 
-    def _run(self, path: Path | None, load: Load) -> None:
+    def _run(self, path: Path, load: Load) -> None:
         failed = False
         while self._inbox is not None:
-            if path is not None:
-                self.look(path, load)
+            self.look(path, load)
             for _ in range(self._inbox.qsize()):
                 records, now_ns = self._inbox.get()
                 try:

@@ -4,6 +4,7 @@ import json
 import time
 from dataclasses import replace
 from math import nan
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -142,7 +143,7 @@ def test_a_counter_that_jumps_costs_no_memory():
 def threaded(records):
     """Pass records to a monitor with a thread; return what it says first."""
     monitor = hearing(PAPER, PAPER)
-    monitor.begin((PAPER, PAPER), None, lambda values: (PAPER, PAPER))
+    monitor.begin((PAPER, PAPER), Path("absent"), lambda values: (PAPER, PAPER))
     told, deadline = list[Record](), time.monotonic() + 20.0
     for one in records:
         told += monitor.after([one], one.stamp_ns)
