@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import print_line
-from cloudrc.drivers.process import EndProcess, Feed, StopSignal
+from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
 from cloudrc.drivers.realtime import Address, Peer, bind, split_address
 from cloudrc.errors import BadInputError
 from cloudrc.files import warn_if_readable
@@ -33,6 +33,10 @@ if TYPE_CHECKING:
 TRACE_MAX = 2 << 20
 """Maximum size of a trace file whose name comes from the link process [bytes]. World and cloud do
 not trust this process. In a cluster, traces come from a ConfigMap, which holds at most 1 MiB."""
+
+FORWARD_LIMIT_NS = 800_000_000
+"""Longest time for which cloud, when asked to end, still forwards teleop's request to hold [ns]. A
+process has 1.5 s to end."""
 
 
 class Command(NamedTuple):
@@ -190,7 +194,7 @@ def _run_world(options: argparse.Namespace) -> int:
 def _run_cloud(options: argparse.Namespace) -> int:
     stop = StopSignal()
     from cloudrc import assembly
-    from cloudrc.drivers.teleop import LastWord, RemoteTeleop, UnixPeer
+    from cloudrc.drivers.teleop import RemoteTeleop, UnixPeer
     from cloudrc.messages import GuardState
     from cloudrc.teleop import wire
 
@@ -203,7 +207,8 @@ def _run_cloud(options: argparse.Namespace) -> int:
         def flies() -> bool:
             return cloud.guard is GuardState.TRACK
 
-        end.run(cloud, LastWord(stop, flies), flies)
+        ends = GracefulStop(stop, lambda: not flies(), FORWARD_LIMIT_NS)
+        end.run(cloud, ends, flies)
     return 0
 
 

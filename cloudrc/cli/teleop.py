@@ -79,7 +79,7 @@ def api_address(text: str) -> Address | Path:
 def execute(options: argparse.Namespace) -> int:
     """Run teleop until a signal stops the process or, with --start, the mission has ended."""
     from cloudrc.config.load import read_experiment
-    from cloudrc.drivers.process import StopSignal
+    from cloudrc.drivers.process import GracefulStop, StopSignal
     from cloudrc.geometry.scene import load_scene
     from cloudrc.teleop.service import MissionService
 
@@ -96,8 +96,14 @@ def execute(options: argparse.Namespace) -> int:
         if book is not None:  # None: stopped while another teleop process locked the journal
             opened.callback(book.close)
             service = MissionService(experiment.criteria.contact_speed_max_mps, book, scene)
-            over = ending(service, stop, single=_start(options, experiment, service))
-            _fly(options, service, server, exporter, over)
+            single = _start(options, experiment, service)
+            pause = GracefulStop(
+                stop,
+                lambda: service.settled,
+                PAUSE_LIMIT_NS,
+                lambda: service.pause(time.monotonic_ns()),
+            )
+            _fly(options, service, server, exporter, lambda: pause() or (single and service.over))
     return 0
 
 
@@ -134,29 +140,6 @@ def serve_api(
 def log_line(text: str) -> None:
     """Write a line to stderr, from any thread."""
     print_line(f"cloudrc teleop: {text}", sys.stderr)
-
-
-def ending(
-    service: MissionService, asked: Callable[[], bool], *, single: bool = False
-) -> Callable[[], bool]:
-    """Return a function that tells whether teleop's process may end.
-
-    After `asked()` has become true, the returned function pauses the mission. It returns True as
-    soon as the robot holds its position, or after `PAUSE_LIMIT_NS`. While `asked()` is false, it
-    returns True only if `single` is True and all missions are over.
-    """
-    until_ns = 0
-
-    def may_end() -> bool:
-        nonlocal until_ns
-        if not asked():
-            return single and service.over
-        if not until_ns:
-            service.pause(time.monotonic_ns())
-            until_ns = time.monotonic_ns() + PAUSE_LIMIT_NS  # pause() may take long
-        return service.settled or time.monotonic_ns() > until_ns
-
-    return may_end
 
 
 def _fly(
@@ -236,12 +219,11 @@ def _start(
 
     if not options.start:
         return False
-    criteria = experiment.criteria
-    plan = assembly.mission_plan(experiment.mission, criteria.time_limit_s, experiment.seed)
+    plan = assembly.build_plan(experiment)
     if any(each.order.plan == plan for each in service.book.open()):
         return True  # a previous process started this mission: it resumes
     try:
-        order = Order(plan, experiment.name, contact=bool(criteria.contact))
+        order = Order(plan, experiment.name, contact=bool(experiment.criteria.contact))
         service.create(order, time.monotonic_ns())
     except ConflictError as error:
         if not options.api:

@@ -89,6 +89,34 @@ class StopSignal:
         self._asked = True
 
 
+class GracefulStop:
+    """Delays the end of a process until it has done its last work, for a limited time."""
+
+    def __init__(
+        self,
+        asked: Callable[[], bool],
+        done: Callable[[], bool],
+        limit_ns: int,
+        begin: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Set the functions that give the state of the process.
+
+        After `asked()` has become true, `begin` is called once. The process may end as soon as
+        `done()` is true, or `limit_ns` [ns] later.
+        """
+        self._asked, self._done, self._limit_ns, self._begin = asked, done, limit_ns, begin
+        self._until_ns: int | None = None
+
+    def __call__(self) -> bool:
+        """Return whether the process has to end now; its loop calls this repeatedly."""
+        if not self._asked():
+            return False
+        if self._until_ns is None:
+            self._begin()  # may take long
+            self._until_ns = time.monotonic_ns() + self._limit_ns
+        return self._done() or time.monotonic_ns() >= self._until_ns
+
+
 class Feed:
     """Writes all event records and some of the periodic records to a pipe, one record per line.
 

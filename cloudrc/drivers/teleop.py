@@ -39,9 +39,6 @@ SILENCE_NS = 1_000_000_000
 """Time without a datagram from teleop after which cloud reports a fault [ns]."""
 EVENTS_KEPT = 256
 """Largest number of mission events that teleop stores while cloud does not accept them."""
-LAST_WORD_NS = 800_000_000
-"""Time for which cloud, when it has to end, still forwards teleop's request to hold [ns]. A process
-has 1.5 s to end."""
 Make = Callable[[int], None]
 """Function that makes the calls that other threads have queued, at a time [ns], monotonic clock."""
 
@@ -158,35 +155,6 @@ def _moves_robot(output: Any) -> bool:
     if isinstance(output, OperatorRequest):
         return output.request is Request.START
     return isinstance(output, Setpoint) and output.waypoint >= 0
-
-
-class LastWord:
-    """Delays the end of cloud's process until the robot stops following commands, at most 0.8 s.
-
-    Meanwhile cloud forwards teleop's request that the robot holds its position.
-    """
-
-    def __init__(
-        self,
-        asked: Callable[[], bool],
-        flies: Callable[[], bool],
-        clock: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
-        """Set the functions that give the state of cloud and robot.
-
-        `asked` returns True after cloud has been asked to end. `flies` returns True while the guard
-        is in TRACK. `clock` returns the time [ns].
-        """
-        self._asked, self._flies, self._clock = asked, flies, clock
-        self._until_ns: int | None = None
-
-    def __call__(self) -> bool:
-        """Return whether cloud's process has to end now; cloud's loop calls this repeatedly."""
-        if not self._asked():
-            return False
-        if self._until_ns is None:
-            self._until_ns = self._clock() + LAST_WORD_NS
-        return not self._flies() or self._clock() >= self._until_ns
 
 
 class TeleopLoop:

@@ -15,12 +15,12 @@ from cloudrc.drivers.process import (
     PERIOD_NS,
     EndProcess,
     Feed,
+    GracefulStop,
     LinkNotes,
     StopSignal,
     from_line,
     in_words,
 )
-from cloudrc.drivers.teleop import LAST_WORD_NS, LastWord
 from cloudrc.link.state import STATE_MAX, LinkState, publish, to_text
 from cloudrc.messages import GuardState
 from cloudrc.records import (
@@ -42,18 +42,20 @@ def test_it_ends_if_it_is_not_the_child_of_who_has_started_it(monkeypatch):
     assert StopSignal()() is False, "nothing was told"
 
 
-def test_cloud_ends_once_nothing_flies_or_after_its_last_word():
-    asked, flies, now_ns = False, True, 0
-    ends = LastWord(lambda: asked, lambda: flies, lambda: now_ns)
+def test_a_process_ends_once_its_work_is_done_or_after_its_limit(monkeypatch):
+    asked, done, begun, now_ns = False, False, [], 0
+    monkeypatch.setattr(time, "monotonic_ns", lambda: now_ns)
+    ends = GracefulStop(lambda: asked, lambda: done, 800, lambda: begun.append(now_ns))
     assert not ends()
-    now_ns, asked = 10_000_000_000, True
+    now_ns, asked = 10_000, True
     assert not ends()
-    flies = False
+    done = True
     assert ends()
-    flies = True
-    for passed_ns, ended in ((LAST_WORD_NS - 1, False), (LAST_WORD_NS, True)):
-        now_ns = 10_000_000_000 + passed_ns
+    done = False
+    for passed_ns, ended in ((799, False), (800, True)):
+        now_ns = 10_000 + passed_ns
         assert ends() is ended
+    assert begun == [10_000]
 
 
 EVENT = MissionEvent(5, "reached", 1, 'waypoint "2" of 7 \u2013 reached')

@@ -7,6 +7,7 @@ from unittest.mock import Mock
 
 import pytest
 
+from cloudrc.assembly import build_plan
 from cloudrc.cli.teleop import _start
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.teleop import STALL_NS, TeleopLoop
@@ -209,11 +210,14 @@ def test_an_event_says_what_happened_once(script, said):
 
 def test_a_restart_with_the_same_options_continues_the_mission():
     flight, flags = ServiceFlight(), Namespace(start=True, api=None)
+    slow = load_experiment("hover", ["guard.speed_max_mps=0.2"])
     flight.step()
     for _ in range(2):
-        assert _start(flags, load_experiment("hover"), flight.teleop)
+        assert _start(flags, slow, flight.teleop)
         assert list(flight.teleop.book.missions) == ["m1"]
         flight.restart_teleop()
+    limit = build_plan(slow).legs[0].time_limit
+    assert flight.teleop.book.missions["m1"].order.plan.legs[0].time_limit == limit > 60.0
     with pytest.raises(ConflictError, match="mission m1 is"):
         _start(flags, load_experiment("paper"), flight.teleop)
 
