@@ -196,11 +196,10 @@ def _run_cloud(options: argparse.Namespace) -> int:
     from cloudrc import assembly
     from cloudrc.drivers.teleop import RemoteTeleop, UnixPeer
     from cloudrc.messages import GuardState
-    from cloudrc.teleop import wire
 
     experiment, identity, end = open_end(options, "cloud")
     paths = options.teleop / "cloud.sock", options.teleop / "teleop.sock"
-    with closing(UnixPeer(*paths, wire.encode, wire.decode)) as peer:
+    with closing(UnixPeer(*paths)) as peer:
         teleop = RemoteTeleop(peer, time.monotonic_ns())
         cloud = assembly.build_cloud(experiment, identity, teleop, time.monotonic_ns)
 

@@ -153,14 +153,14 @@ def _fly(
     from cloudrc.drivers.process import Feed
     from cloudrc.drivers.teleop import TeleopLoop, UnixPeer
     from cloudrc.records import Counted, Fault
-    from cloudrc.teleop import wire
+    from cloudrc.teleop.wire import ALARM
 
     feed = Feed.on_stdout(watched=options.feed)
     paths = options.socket / "teleop.sock", options.socket / "cloud.sock"
-    peer = UnixPeer(*paths, wire.encode, wire.decode)
+    peer = UnixPeer(*paths)
     queued: dict[str, Any] = {}
     if server is not None:
-        server.bridge.alarm = lambda: peer.send(wire.ALARM)
+        server.bridge.alarm = lambda: peer.send(ALARM)
         server.bridge.open(service)
         queued = {"calls": server.bridge.make_calls, "stops": server.bridge.make_stops}
     feed.ready()

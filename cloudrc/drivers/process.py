@@ -13,13 +13,14 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
-from enum import IntEnum
+from functools import cache
 from math import nan
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, get_args
 
-from cloudrc import records as kinds
+from pydantic import TypeAdapter
+
 from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.realtime import Peer, serve
 from cloudrc.drivers.recording import FlightsOnly, Recorder
@@ -221,23 +222,14 @@ def from_line(line: str) -> Record:
     """Parse a line from `to_line`; raise a ValueError if the line is not a record."""
     try:
         name, values = json.loads(line)
-        kind = getattr(kinds, name)
-        if kind not in get_args(Record):
-            raise ValueError(name)
-        record: Record = _from_json(kind, values)
-    except (TypeError, AttributeError, ValueError, RecursionError) as error:
+        return _kind(name).validate_python(values)
+    except (TypeError, KeyError, ValueError, RecursionError) as error:
         raise ValueError(f"not a record: {line!r}") from error
-    return record
 
 
-def _from_json(kind: Any, value: Any) -> Any:
-    if hasattr(kind, "_fields"):
-        hints = get_type_hints(kind)
-        fields = zip(kind._fields, value, strict=True)
-        return kind(*[_from_json(hints[name], item) for name, item in fields])
-    if get_origin(kind) is tuple:
-        return tuple(value)
-    return kind(value) if isinstance(kind, type) and issubclass(kind, IntEnum) else value
+@cache
+def _kind(name: str) -> TypeAdapter[Record]:
+    return TypeAdapter({kind.__name__: kind for kind in get_args(Record)}[name])
 
 
 class LinkNotes:

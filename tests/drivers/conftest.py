@@ -16,18 +16,13 @@ from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.errors import CloudrcError
 from cloudrc.messages import GuardState
-from cloudrc.teleop.wire import decode, encode
-
-
-def as_bytes(message):
-    return message if isinstance(message, bytes) else encode(message)
 
 
 @pytest.fixture
 def peers(tmp_path):
-    """Make teleop's and cloud's socket, in the order that a test chooses; bytes are sent as is."""
+    """Make teleop's and cloud's socket, in the order that a test chooses."""
     paths = tmp_path / "a.sock", tmp_path / "b.sock"
-    pair = [UnixPeer(*each, as_bytes, decode) for each in (paths, paths[::-1])]
+    pair = [UnixPeer(*each) for each in (paths, paths[::-1])]
     yield pair
     for peer in pair:
         peer.close()
