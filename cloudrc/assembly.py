@@ -87,8 +87,10 @@ def assemble(
 
 def start_mission(experiment: ResolvedExperiment, now_ns: int = 0) -> Teleop:
     """Make a teleop that flies the experiment's mission from `now_ns` [ns] on, cloud's clock."""
+    from cloudrc.teleop.store import Mission, Order
+
     teleop = Teleop()
-    teleop.start(now_ns, build_plan(experiment), ONLY_MISSION)
+    teleop.start(now_ns, Mission("m1", Order(build_plan(experiment)), ONLY_MISSION))
     return teleop
 
 

@@ -192,7 +192,7 @@ class Flight:
     def _build_rival(self, start_ns: int) -> CloudEndpoint:
         """Build a second cloud with the same key; it has its own teleop and the same mission."""
         teleop = Teleop()
-        teleop.start(start_ns, assembly.build_plan(self.experiment))
+        teleop.start(start_ns, Mission("rival", self.make_order(), 0))
         identity = Identity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
         return assembly.build_cloud(self.experiment, identity, teleop, lambda: start_ns)
 

@@ -50,7 +50,6 @@ from cloudrc.teleop.wire import (
     STATES,
     Leg,
     Output,
-    Plan,
     RobotStatus,
 )
 
@@ -172,28 +171,28 @@ class Teleop:
         outputs, self.outputs = self.outputs, []
         return outputs
 
-    def start(self, now_ns: int, plan: Plan, mission_id: int = 0) -> None:
-        """Fly a plan; the robot stores the progress under `mission_id`, unless this number is 0."""
-        self._order(plan, mission_id, now_ns)
-        here = None if plan.start is Start.SPAWN else self.seen
-        self._world = here.world if here else ""
-        self._expected = (here.mission_id, mission_id) if here else ()
-        self.requests.report(mission_id, 0)
-        self.requests.ask(Request.START, plan.start, after=True)
-        self._is_pending = True
-        if self.seen:
-            self.see(self.seen, now_ns)  # an earlier teleop may have flown the mission
+    def start(self, now_ns: int, mission: Mission) -> None:
+        """Fly a mission; if an earlier teleop process has begun it, continue at its waypoint.
 
-    def continue_mission(self, now_ns: int, mission: Mission) -> None:
-        """Continue the mission of an earlier teleop process at the current waypoint."""
-        self._order(mission.order.plan, mission.number, now_ns - round(mission.elapsed * 1e9))
-        self.leg, self._world, self._expected = mission.waypoint, mission.world, (mission.number,)
-        self._continued, self._was_held = True, mission.state == "held"
+        The robot stores the progress under the mission's number, unless this number is 0.
+        """
+        self._plan, self._mission_id, self._began_ns = mission.order.plan, mission.number, now_ns
+        self.state, self.outcome, self.leg = STARTING, None, mission.waypoint
+        self._continued, self._was_held = bool(mission.world), mission.state == HELD
+        self._followed = self._waits = False
+        self._knot, self._is_pending = -1, not self._was_held
         self.requests.report(mission.number, self.leg)
-        self.requests.ask(Request.START, Start.HERE)
-        self._is_pending = not self._was_held
-        if self.seen:
-            self.see(self.seen, now_ns)  # the mission may be over, or world restarted
+        if self._continued:
+            self._began_ns -= round(mission.elapsed * 1e9)
+            self._world, self._expected = mission.world, (mission.number,)
+            self.requests.ask(Request.START, Start.HERE)
+        else:
+            here = None if self._plan.start is Start.SPAWN else self.seen
+            self._world = here.world if here else ""
+            self._expected = (here.mission_id, mission.number) if here else ()
+            self.requests.ask(Request.START, self._plan.start, after=True)
+        if self.seen:  # an earlier teleop may have flown the mission, or world has restarted
+            self.see(self.seen, now_ns)
 
     def go_to(self, now_ns: int, leg: Leg) -> None:
         """Fly to a point; raise BadInputError if the mission is not in the state `HELD`."""
@@ -353,12 +352,6 @@ class Teleop:
         if mission_id != self._mission_id and over and not self.stopping:
             self.requests.ask(Request.END, after=True)
         self._select_here()
-
-    def _order(self, plan: Plan, mission_id: int, began_ns: int) -> None:
-        self.state, self.outcome, self.leg = STARTING, None, 0
-        self._plan, self._mission_id, self._began_ns = plan, mission_id, began_ns
-        self._continued = self._was_held = self._followed = self._waits = False
-        self._knot = -1
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
         """Begin the mission, now that telemetry shows that the robot has started."""

@@ -96,7 +96,7 @@ def test_a_robot_seen_to_hold_gets_the_first_waypoint_at_once():
 def started():
     flight = Flight()
     flight.step(position=AWAY)
-    flight.operate("start", THREE, ID)
+    flight.operate("start", THREE, number=ID)
     flight.step(seconds=0.05)
     return flight
 
@@ -125,7 +125,7 @@ def test_a_robot_that_waits_during_its_mission_is_started_again(guard):
 def test_each_copy_of_a_request_names_the_current_session():
     flight, said = Flight(), []
     flight.step()
-    flight.operate("start", FROM_SPAWN, ID)
+    flight.operate("start", FROM_SPAWN, number=ID)
     for epoch in (1, 1, 2):
         flight.epoch = epoch
         flight.now_ns += REPEAT_NS
