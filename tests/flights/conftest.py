@@ -1,5 +1,6 @@
 """Endpoints without robot and loop; flights in virtual time; a world and the test's own cloud."""
 
+from collections import Counter
 from functools import lru_cache
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -35,7 +36,7 @@ KEY = Key(b"k" * 32)
 def bare_robot():
     """A robot that flies every accepted command."""
     guard = Mock(state=GuardState.TRACK, cause=Cause.COMMAND, latched=False, armed=True)
-    guard.configure_mock(command_age_max_ns=250 * MS, counts={}, changes=[], reference=ZERO)
+    guard.configure_mock(command_age_max_ns=250 * MS, counts=Counter(), changes=[], reference=ZERO)
     guard.accept_command.return_value = None
     truth = lambda now_ns: Odometry(now_ns, ZERO, UPRIGHT, ZERO, ZERO)  # noqa: E731
     simulator = Mock(tip_force=lambda: 0.0, truth=truth, touches=[])

@@ -72,7 +72,7 @@ class Target:
         accepted = "used late repeated stale hello busy accept_ignored unanswered".split()
         ends = (self.world, self.cloud)
         return (
-            [[end._counts[name] for name in accepted] for end in ends],
+            [[end.counts[name] for name in accepted] for end in ends],
             [end._session.epoch for end in ends],
             *(self.world._door._fresh_until_ns, self.cloud._heard_ns),
             *(self.world._number, self.world._waiting),
