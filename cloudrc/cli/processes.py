@@ -70,7 +70,8 @@ def process_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _end_arguments(parser: argparse.ArgumentParser) -> None:
     process_arguments(parser)
-    _add(parser, "--record", "FILE", "MCAP file; an existing one becomes NAME.before.mcap")
+    file = "MCAP file to record to; an existing one becomes NAME.before.mcap"
+    _add(parser, "--record", "FILE", file, required=True)
     _add(parser, "--record-flights", "", "no periodic records while the robot does not fly")
     size = "limit of both recordings, such as 500M or 1Gi; at 90 %% the recording ends"
     _add(parser, "--record-max", "SIZE", size)
@@ -249,7 +250,7 @@ def open_end(
 
 
 def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> Recorder:
-    """Make the recorder of world or cloud; without `--record` the recorder writes to /dev/null.
+    """Make the recorder of world or cloud, which writes to the file of `--record`.
 
     The recording of a previous process is kept as NAME.before.mcap, because it may show why that
     process ended. `--record-max` limits the size of both recordings together. `clock` is "world" or
@@ -259,7 +260,7 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     from cloudrc.drivers.recording import Recorder
     from cloudrc.record.writer import McapWriter
 
-    path: Path = options.record or Path(os.devnull)
+    path: Path = options.record
     kept, size_max = 0, None
     with suppress(OSError):  # the recorder will meet the same error and report it
         if path.is_file() and (kept := path.stat().st_size):

@@ -163,7 +163,6 @@ def _fly(
         server.bridge.alarm = lambda: peer.send(ALARM)
         server.bridge.open(service)
         queued = {"calls": server.bridge.make_calls, "stops": server.bridge.make_stops}
-    feed.ready()
 
     def tell(records: Sequence[Record]) -> None:
         feed.tell(record for record in records if isinstance(record, Fault))  # cloud feeds events

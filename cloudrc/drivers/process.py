@@ -146,15 +146,11 @@ class Feed:
         os.dup2(2, 1)
         return feed
 
-    def ready(self) -> None:
-        """Tell the supervisor that this process can receive datagrams."""
-        self._write(READY)
-
     def alive_while(self, stop: Callable[[], bool]) -> Callable[[], bool]:
         """Return a function that returns `stop()` and, every `ALIVE_PERIOD`, prints `READY`.
 
-        `READY` shows a supervisor that this process is alive; without a supervisor, the function
-        does not print.
+        `READY` tells a supervisor that this process can receive datagrams, and that it is alive.
+        Without a supervisor, the function does not print.
         """
         due = 0.0
 
@@ -333,7 +329,6 @@ class EndProcess:
             self.tell(records)
 
         self.recorder.start()
-        self.feed.ready()
         try:
             ends = self.feed.alive_while(stop)
             serve(endpoint, self.peer, end=self.end, sink=sink, stop=ends, slip_ns=slip_ns)

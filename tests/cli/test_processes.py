@@ -27,7 +27,7 @@ from tests.record.conftest import MS, counted, world_records
 
 FREE = "127.0.0.1:9"
 ENDS = ("world", "cloud")
-END = f"--listen {FREE} --route route"
+END = f"--listen {FREE} --route route --record end.mcap"
 
 
 @pytest.fixture

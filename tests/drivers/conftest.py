@@ -113,9 +113,9 @@ MISSION = "waypoints:\n" + "".join(WAYPOINT % y for y in ("0.0", "3.6", "0.0"))
 
 
 class Release:
-    """A release without its link: three processes, a journal, an API; some ends record."""
+    """A release without its link: three processes, a journal, an API, two recordings."""
 
-    def __init__(self, folder, *recorded):
+    def __init__(self, folder):
         self.folder, self.running, self.all = folder, {}, []
         world, cloud = (f"127.0.0.1:{port}" for port in free_ports(2))
         (folder / "config.yaml").write_text(dump(load_experiment("paper")))
@@ -131,8 +131,8 @@ class Release:
             "teleop": ["--socket", ".", "--api", "0", "--api-file", "api.json", "--tokens", ".",
                        "--audit", "audit.jsonl", "--journal", "journal/missions"],
         }  # fmt: skip
-        for name in recorded:
-            self.flags[name] += ["--record", f"{name}.mcap"]
+        for end in ("world", "cloud"):
+            self.flags[end] += ["--record", f"{end}.mcap"]
         for name in self.flags:
             self.start(name)
         self.until(lambda: self.ask("/v1/state")["seen"] is not None)

@@ -29,7 +29,7 @@ def flood(folder, seconds):
     Also the 99 % quantiles of the control period's error in both [ms].
     """
     folder.mkdir()
-    release = Release(folder, "cloud")
+    release = Release(folder)
     script = str(Path(__file__).with_name("api_flood.py"))
     try:
         release.post("/v1/missions", HOVER)
