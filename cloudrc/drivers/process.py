@@ -19,8 +19,6 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, get_args
 
-from pydantic import TypeAdapter
-
 from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.realtime import Peer, serve
 from cloudrc.drivers.recording import FlightsOnly, Recorder
@@ -42,6 +40,8 @@ from cloudrc.records import (
 )
 
 if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.link.verify.monitor import LinkMonitor
 
@@ -225,6 +225,8 @@ def from_line(line: str) -> Record:
 
 @cache
 def _kind(name: str) -> TypeAdapter[Record]:
+    from pydantic import TypeAdapter
+
     return TypeAdapter({kind.__name__: kind for kind in get_args(Record)}[name])
 
 
