@@ -47,7 +47,7 @@ LEG_FACTOR = 3.0
 """Time limit for the way to a waypoint, as a multiple of the expected time.
 Source: docs/reference/faults.md, "F28"."""
 ONLY_MISSION = 1
-"""Mission number in a cloud that flies only one mission."""
+"""Mission number in virtual time, where teleop flies only one mission."""
 GRACE = 30.0
 """Time after the end of the mission's time limit at which a flight is stopped [s]."""
 VIRTUAL_CLOCK = bytes(16)
@@ -58,8 +58,13 @@ FENCE_SPAN = dist(fence.LOW, fence.HIGH)
 """Length of the longest straight line inside the fence [m]."""
 
 
-def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoint, VirtualRun]:
-    """Build world and cloud, and connect them for a flight in virtual time; do not fly yet."""
+def assemble(
+    experiment: ResolvedExperiment,
+) -> tuple[WorldEndpoint, CloudEndpoint, Teleop, VirtualRun]:
+    """Build world, cloud and teleop, and connect them for a flight in virtual time.
+
+    The mission starts with the flight; `Teleop.over` tells when it is over.
+    """
     from cloudrc.drivers.virtual import CPU_CLOCK, Clock, VirtualRun
 
     own = Clock(round(experiment.cloud.clock_offset_s * 1e9), experiment.cloud.clock_drift_ppm)
@@ -68,9 +73,18 @@ def assemble(experiment: ResolvedExperiment) -> tuple[WorldEndpoint, CloudEndpoi
     clock_id = VIRTUAL_CLOCK if own == Clock() else CLOUD_CLOCK
     of_world = Identity(VIRTUAL_CLOCK, b"world".ljust(16), VIRTUAL_RING, passes)
     of_cloud = Identity(clock_id, b"cloud".ljust(16), VIRTUAL_RING, passes)
-    world = build_world(experiment, of_world)
-    cloud = build_cloud(experiment, of_cloud, lambda: own.at(0), cpu_clock=CPU_CLOCK)
-    return world, cloud, VirtualRun(world, cloud, *links, cloud_clock=own)
+    world, teleop = build_world(experiment, of_world), start_mission(experiment, own.at(0))
+    cloud = build_cloud(experiment, of_cloud, teleop, lambda: own.at(0), cpu_clock=CPU_CLOCK)
+    return world, cloud, teleop, VirtualRun(world, cloud, *links, cloud_clock=own)
+
+
+def start_mission(experiment: ResolvedExperiment, now_ns: int = 0) -> Teleop:
+    """Make a teleop that flies the experiment's mission from `now_ns` [ns] on, cloud's clock."""
+    from cloudrc.teleop.store import Mission, Order
+
+    teleop = Teleop()
+    teleop.start(now_ns, Mission("m1", Order(build_plan(experiment)), ONLY_MISSION))
+    return teleop
 
 
 def fly(experiment: ResolvedExperiment, see: Sink) -> None:
@@ -79,12 +93,12 @@ def fly(experiment: ResolvedExperiment, see: Sink) -> None:
     Every 100 ms of virtual time, call `see` with the new records of world and of cloud, both on
     world's clock.
     """
-    _, cloud, run = assemble(experiment)
+    _, _, teleop, run = assemble(experiment)
 
     def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
         see(from_world, run.on_world_clock(from_cloud))
 
-    run.fly(lambda: cloud.mission_over, round(flight_limit(experiment) * 1e9), sink)
+    run.fly(lambda: teleop.over, round(flight_limit(experiment) * 1e9), sink)
 
 
 def virtual_notes(experiment: ResolvedExperiment) -> tuple[str, ...]:
@@ -133,18 +147,18 @@ def build_world(
 def build_cloud(
     experiment: ResolvedExperiment,
     identity: Identity,
+    teleop: Operator,
     clock: Callable[[], int] = lambda: 0,
-    teleop: Operator | None = None,
     *,
     cpu_clock: Callable[[], int] | None = None,
     make_loop: Callable[..., ControlLoop] = ControlLoop,
 ) -> CloudEndpoint:
-    """Build cloud: plug-ins, teleoperation, and cloud's end of the tunnel.
+    """Build cloud: plug-ins, and cloud's end of the tunnel.
 
-    `clock` returns cloud's monotonic time [ns]. `teleop` provides the setpoints; without it, a new
-    `Teleop` flies the mission at once. In virtual time, `cpu_clock` returns the processor
-    time of this thread [ns], which delays commands if `cloud.compute_measured` is set.
-    `make_loop` is called in place of `ControlLoop`, for example to make a loop that lies.
+    `teleop` provides the setpoints. `clock` returns cloud's monotonic time [ns]. In virtual time,
+    `cpu_clock` returns the processor time of this thread [ns], which delays commands if
+    `cloud.compute_measured` is set. `make_loop` is called in place of `ControlLoop`, for example to
+    make a loop that lies.
     """
     cloud = experiment.cloud
     loop = make_loop(
@@ -162,13 +176,9 @@ def build_cloud(
         rng = _generator(experiment.seed, "compute time")
         times = cloud.compute_ms * MS_TO_NS, cloud.compute_deviation_ms * MS_TO_NS
         compute = ComputeTime(*times, rng, cpu_clock)
-    start_ns = clock()
-    if teleop is None:
-        teleop = Teleop()
-        teleop.start(start_ns, build_plan(experiment), ONLY_MISSION)
     newest_wins = experiment.tunnel.order == "newest"
     return CloudEndpoint(
-        loop, teleop, identity, newest_wins=newest_wins, compute=compute, start_ns=start_ns
+        loop, teleop, identity, newest_wins=newest_wins, compute=compute, start_ns=clock()
     )
 
 

@@ -28,7 +28,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cloud": {"endpoint", "tunnel", "config", "plugins", "teleop"},
     "teleop": {"config", "files", "geometry", "metrics"},
     "exposition": set(),
-    "drivers": {"endpoint", "tunnel", "link", "exposition", "files", "record"},
+    "drivers": {"endpoint", "tunnel", "link", "exposition", "files", "record", "teleop"},
     "record": {"endpoint", "files"},
     "metrics": {"record", "config", "geometry", "plugins"},
     "report": {"assembly", "record", "metrics", "config", "geometry", "link", "files", "console"},
@@ -55,7 +55,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "yaml": ("config/", "link/", "record/", "report/", "cli/", "cluster/", "faults/schedule"),
     "pydantic": (
         *("config/", "link/", "cli/", "teleop/", "sweep/", "report/folder"),
-        "faults/schedule",
+        *("drivers/process", "faults/schedule"),
     ),
     **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("teleop/api", "teleop/auth")),
     "fcntl": ("drivers/local", "cli/console"),

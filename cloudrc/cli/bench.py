@@ -96,10 +96,10 @@ def _replay(experiment: ResolvedExperiment) -> Callable[[], int]:
     from cloudrc.assembly import assemble
     from cloudrc.world.simulator import replay
 
-    world, cloud, run = assemble(experiment)
+    world, _, teleop, run = assemble(experiment)
     simulator = world.robot.simulator
     start, simulator.tape = simulator.state(), []
-    run.fly(lambda: cloud.mission_over, LIMIT_NS, lambda of_world, of_cloud: None)
+    run.fly(lambda: teleop.over, LIMIT_NS, lambda of_world, of_cloud: None)
     tape, end = np.array(simulator.tape), simulator.state()[0]
 
     def play() -> int:
@@ -114,7 +114,7 @@ def flight(experiment: ResolvedExperiment) -> Callable[[], int]:
     """Prepare a flight; return a function that flies and returns the number of physics steps."""
     from cloudrc.assembly import assemble
 
-    _, cloud, run = assemble(experiment)
+    _, _, teleop, run = assemble(experiment)
     records: list[Record] = []
 
     def sink(of_world: list[Record], of_cloud: list[Record]) -> None:
@@ -122,7 +122,7 @@ def flight(experiment: ResolvedExperiment) -> Callable[[], int]:
         records.extend(of_cloud)
 
     def play() -> int:
-        run.fly(lambda: cloud.mission_over, LIMIT_NS, sink)
+        run.fly(lambda: teleop.over, LIMIT_NS, sink)
         return round(run.now_ns * 1e-9 / STEP)
 
     return play

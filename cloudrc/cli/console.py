@@ -127,12 +127,10 @@ def _local(options: argparse.Namespace) -> Flight:
     from cloudrc.console.steering import Link
     from cloudrc.drivers.local import LINK_FOLDER, under_way
 
-    found = find_local_run(options, lambda run, api: (run, api), "no run flies there", flag="")
+    found = find_local_run(options, flag="")
     if found is None:
         raise BadInputError("no run flies here; start one: cloudrc up")
     run, url = found[0].resolve(), found[1]
-    if not url:
-        raise BadInputError(f"{run}: has no API; pip install 'cloudrc[api]', then fly again")
 
     def read() -> dict[str, Any]:
         states = read_states(run / LINK_FOLDER)

@@ -17,7 +17,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
 }
 """Name of an extra in pyproject.toml -> the modules that it installs."""
 MODES: dict[str, tuple[str, ...]] = {
-    "local": ("world", "record", "report"),
+    "local": ("world", "record", "report", "api"),
     "virtual": ("world", "record", "report"),
     "cluster": ("kube", "record", "report"),
 }

@@ -5,14 +5,12 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from pathlib import Path
-from typing import TypeVar
 
 from cloudrc.cli.output import print_line
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 
-_Found = TypeVar("_Found")
 RUNS = Path("runs")
 KUBECTL_PLUGIN = "kubectl-cloudrc"
 """Name of this program when kubectl starts it as a plugin."""
@@ -32,32 +30,25 @@ def short(path: Path) -> str:
 
 
 def find_local_run(
-    options: argparse.Namespace,
-    look: Callable[[Path, str], _Found | None],
-    nobody: str,
-    *,
-    steers: bool = True,
-    flag: str = "--run ",
-) -> _Found | None:
+    options: argparse.Namespace, *, steers: bool = True, flag: str = "--run "
+) -> tuple[Path, str] | None:
     """Find the run in flight that a command means: that of `--run`, else the only one.
 
-    If the user's newest run here, ./runs/latest, has ended or cannot be used, a command that
-    changes a flight rejects the only run in flight, which may belong to somebody else.
+    If the user's newest run here, ./runs/latest, has ended, a command that changes a flight rejects
+    the only run in flight, which may belong to somebody else.
 
     Args:
         options: Parsed arguments of the command.
-        look: Function of a run's folder and the URL of its API ("" without an API). It returns
-            what the command needs, or None if the command cannot use this run.
-        nobody: Text of the error if `--run` names no run in flight.
         steers: Whether the command changes the flight.
         flag: Flag that names a run, for the texts of errors; "" for a positional argument.
 
     Returns:
-        The result of `look`; None if no run is in flight, or if the flags name a cluster.
+        Folder of the run and URL of its API; None if no run is in flight, or if the flags name a
+        cluster.
 
     Raises:
         BadInputError: If `--run` names no run in flight; if several runs are in flight; or if
-            the command changes a flight and ./runs/latest has ended or cannot be used.
+            the command changes a flight and ./runs/latest has ended.
     """
     from cloudrc.drivers.local import under_way
 
@@ -71,12 +62,11 @@ def find_local_run(
     flights = under_way()
     if options.run is not None:
         url = flights.get(Path(os.path.realpath(options.run)))
-        if url is None or (found := look(options.run, url)) is None:
-            raise BadInputError(f"{flag}{options.run}: {nobody}")
-        return found
-    candidates = {run: found for run in flights if (found := look(Path(short(run)), flights[run]))}
-    ask_if_unclear(candidates, steers=steers, flag=flag)
-    return next(iter(candidates.values()), None)
+        if url is None:
+            raise BadInputError(f"{flag}{options.run}: no run flies there; name another folder")
+        return options.run, url
+    ask_if_unclear(flights, steers=steers, flag=flag)
+    return next(((Path(short(run)), url) for run, url in flights.items()), None)
 
 
 def ask_if_unclear(candidates: Collection[Path], *, steers: bool, flag: str = "--run ") -> None:

@@ -59,14 +59,10 @@ def execute(options: argparse.Namespace) -> int:
     began, number = monotonic(), secrets.token_hex(4)
     from cloudrc.drivers.local import LINK_FOLDER
 
-    def link_folder(run: Path, api: str) -> Path | None:
-        folder = run / LINK_FOLDER
-        return folder if folder.is_dir() else None
-
-    folder = find_local_run(options, link_folder, "no run flies there")
-    if folder is not None:
-        edit, states = set_here(folder, options.profile, options.settings, number)
-        where = str(folder.parent)
+    if (found := find_local_run(options)) is not None:
+        run, _ = found
+        edit, states = set_here(run / LINK_FOLDER, options.profile, options.settings, number)
+        where = str(run)
         took = monotonic() - began
     else:
         from cloudrc.cluster.link import keep, send

@@ -55,7 +55,6 @@ robot falls. After an emergency stop or a landing, 'acknowledge' allows the next
 mission. An API in a network asks for a token: give --token-file or
 CLOUDRC_TOKEN_FILE; for a release the command reads its Secret with your rights
 in the cluster. A run that is found on this machine needs no token."""
-NO_API = "no run with an API flies there; name another folder, or --api URL"
 READS = ("list", "status", "logs")
 """Verbs that do not steer the robot."""
 POLL_PERIOD = 0.5
@@ -121,11 +120,9 @@ def execute(options: argparse.Namespace) -> int:
     if verb == "fly":
         raise BadInputError("fly needs --api; without a Job use: cloudrc mission run FILE")
 
-    def look(run: Path, url: str) -> Api | None:
-        return Api(url, place=str(run)) if url else None  # a local run needs no token: send none
-
-    if (api := find_local_run(options, look, NO_API, steers=verb not in READS)) is not None:
-        return carry_out(options, api)
+    if (found := find_local_run(options, steers=verb not in READS)) is not None:
+        run, url = found
+        return carry_out(options, Api(url, place=str(run)))  # it needs no token: send none
     if verb == "run":
         return _run_job(options)
     with _forwarded_api(options) as forwarded:

@@ -9,16 +9,17 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import print_line
-from cloudrc.drivers.process import EndProcess, Feed, StopSignal
-from cloudrc.drivers.realtime import Address, Peer, split_address
+from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
+from cloudrc.drivers.realtime import Address, Peer, bind, split_address
 from cloudrc.errors import BadInputError
 from cloudrc.files import warn_if_readable
+from cloudrc.link.state import STATE_FILE
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
@@ -28,8 +29,12 @@ if TYPE_CHECKING:
     from cloudrc.tunnel.end import Identity
 
 TRACE_MAX = 2 << 20
-"""Maximum size of a trace file whose name comes from the link container [bytes]. World and cloud do
-not trust this container. Real traces come from a ConfigMap, which holds at most 1 MiB."""
+"""Maximum size of a trace file whose name comes from the link process [bytes]. World and cloud do
+not trust this process. In a cluster, traces come from a ConfigMap, which holds at most 1 MiB."""
+
+FORWARD_LIMIT_NS = 800_000_000
+"""Longest time for which cloud, when asked to end, still forwards teleop's request to hold [ns]. A
+process has 1.5 s to end."""
 
 
 class Command(NamedTuple):
@@ -44,7 +49,7 @@ class Command(NamedTuple):
 
 
 def _add(
-    parser: argparse._ActionsContainer, flag: str, kind: str, text: str, *, required: bool = False
+    parser: argparse.ArgumentParser, flag: str, kind: str, text: str, *, required: bool = False
 ) -> None:
     """Declare a flag; `kind`, such as "FILE", names its value; with "" the flag has no value."""
     if not kind:
@@ -63,21 +68,21 @@ def process_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _end_arguments(parser: argparse.ArgumentParser) -> None:
     process_arguments(parser)
-    _add(parser, "--record", "FILE", "MCAP file; an existing one becomes NAME.before.mcap")
+    file = "MCAP file to record to; an existing one becomes NAME.before.mcap"
+    _add(parser, "--record", "FILE", file, required=True)
     _add(parser, "--record-flights", "", "no periodic records while the robot does not fly")
     size = "limit of both recordings, such as 500M or 1Gi; at 90 %% the recording ends"
     _add(parser, "--record-max", "SIZE", size)
     _add(parser, "--listen", "HOST:PORT", "address to receive at", required=True)
-    _add(parser, "--link", "FILE", "the link's state, to record it (default: beside --route)")
     _add(parser, "--key", "FILE", "the tunnel's key ('cloudrc key new FILE')", required=True)
-    target = parser.add_mutually_exclusive_group(required=True)
-    _add(target, "--peer", "HOST:PORT", "address to send to; a name is resolved once")
-    _add(target, "--route", "FILE", "file with the numeric HOST:PORT to send to; it may change")
+    route = "the link's file with the address to send to; the link's state is beside it"
+    _add(parser, "--route", "FILE", route, required=True)
 
 
 def _cloud_arguments(parser: argparse.ArgumentParser) -> None:
     _end_arguments(parser)
-    _add(parser, "--teleop", "DIR", "missions from 'cloudrc teleop --socket DIR' (default: own)")
+    text = "folder of the sockets of 'cloudrc teleop --socket DIR'"
+    _add(parser, "--teleop", "DIR", text, required=True)
 
 
 def read_address(text: str) -> Address:
@@ -141,24 +146,6 @@ def _addresses(name: str, family: int) -> list[str]:
     return [str(entry[4][0]) for entry in found]
 
 
-def resolve_address(flag: str, where: Address, listen: Address) -> Address:
-    """Resolve the host of an address before a control loop starts: the loop must not wait for DNS.
-
-    The result is IPv4 or IPv6, like the address `listen` of this process. If `listen` is [::], the
-    result may be either. Raise a BadInputError, which names `flag`, if the host cannot be resolved.
-    """
-    host, port = where
-    family = socket.AF_INET6 if ":" in listen[0] else socket.AF_INET
-    try:
-        return _addresses(host, 0 if listen[0] == "::" else family)[0], port
-    except OSError as error:
-        wanted = "IPv6" if family == socket.AF_INET6 else "IPv4"
-        raise BadInputError(
-            f"{flag} {show_address(where)}: {host} cannot be resolved ({error.strerror or error});"
-            f" name a host that has an {wanted} address, or the address itself"
-        ) from error
-
-
 def warn_if_exposed(listen: Address) -> None:
     """Print a warning if other machines can send to the address `listen`."""
     if not listen[0].startswith("127.") and listen[0] not in ("localhost", "::1"):
@@ -188,8 +175,7 @@ def open_exporter(
     from cloudrc.drivers.exporter import Exporter
 
     warn_if_exposed(options.metrics)
-    missions = getattr(options, "teleop", None) is None
-    exporter = Exporter(role, fingerprint(experiment), missions=missions)
+    exporter = Exporter(role, fingerprint(experiment))
     exporter.serve(options.metrics)
     return exporter
 
@@ -205,24 +191,22 @@ def _run_world(options: argparse.Namespace) -> int:
 
 
 def _run_cloud(options: argparse.Namespace) -> int:
-    stop: Callable[[], bool] = StopSignal()
+    stop = StopSignal()
     from cloudrc import assembly
-    from cloudrc.drivers.teleop import LastWord, RemoteTeleop, UnixPeer
+    from cloudrc.drivers.teleop import RemoteTeleop, UnixPeer
     from cloudrc.messages import GuardState
-    from cloudrc.teleop import wire
 
     experiment, identity, end = open_end(options, "cloud")
-    teleop = None
-    if options.teleop:
-        paths = options.teleop / "cloud.sock", options.teleop / "teleop.sock"
-        teleop = RemoteTeleop(UnixPeer(*paths, wire.encode, wire.decode), time.monotonic_ns())
-    cloud = assembly.build_cloud(experiment, identity, time.monotonic_ns, teleop)
+    paths = options.teleop / "cloud.sock", options.teleop / "teleop.sock"
+    with closing(UnixPeer(*paths)) as peer:
+        teleop = RemoteTeleop(peer, time.monotonic_ns())
+        cloud = assembly.build_cloud(experiment, identity, teleop, time.monotonic_ns)
 
-    def flies() -> bool:
-        return cloud.guard is GuardState.TRACK
+        def flies() -> bool:
+            return cloud.guard is GuardState.TRACK
 
-    asked = LastWord(stop, flies) if teleop else stop
-    end.run(cloud, lambda: asked() or cloud.mission_over, flies)
+        ends = GracefulStop(stop, lambda: not flies(), FORWARD_LIMIT_NS)
+        end.run(cloud, ends, flies)
     return 0
 
 
@@ -246,39 +230,25 @@ def open_end(
     experiment = load_experiment(path) if name == "cloud" else given
     keys = KeyFile(key, time.monotonic_ns())
     warn_if_readable(key, lambda text: print_line(f"cloudrc: {text}", sys.stderr))
-    link = options.link
-    if link is None and options.route is not None:
-        link = Path(options.route).with_name("link.json")
+    link = options.route.with_name(STATE_FILE)
+    with listening("--listen", options.listen):
+        peer = Peer(bind(options.listen), options.route)
     end = EndProcess(
         end=name,
-        peer=open_peer(options),
+        peer=peer,
         recorder=open_recorder(options, name, clock),  # renames an old recording
         keys=keys,
         feed=feed,
         exporter=exporter,
         flights_only=options.record_flights,
         link=link,
-        check=link_monitor(experiment, uplink=name == "cloud", trusted=bool(options.link)),
+        check=link_monitor(experiment, uplink=name == "cloud"),
     )
     return experiment, Identity(clock, os.urandom(16), keys.ring), end
 
 
-def open_peer(options: argparse.Namespace) -> Peer:
-    """Bind the socket of world or cloud.
-
-    The peer's address is the value of `--peer`, or the content of the file `--route`.
-    """
-    target: Address | Path | None = options.route
-    if target is None:
-        target = resolve_address("--peer", options.peer, options.listen)
-    elif not options.route.exists():
-        print(f"cloudrc: sends nothing until {target} exists", file=sys.stderr)
-    with listening("--listen", options.listen):
-        return Peer.bind(options.listen, target)
-
-
 def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> Recorder:
-    """Make the recorder of world or cloud; without `--record` the recorder writes to /dev/null.
+    """Make the recorder of world or cloud, which writes to the file of `--record`.
 
     The recording of a previous process is kept as NAME.before.mcap, because it may show why that
     process ended. `--record-max` limits the size of both recordings together. `clock` is "world" or
@@ -288,7 +258,7 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     from cloudrc.drivers.recording import Recorder
     from cloudrc.record.writer import McapWriter
 
-    path: Path = options.record or Path(os.devnull)
+    path: Path = options.record
     kept, size_max = 0, None
     with suppress(OSError):  # the recorder will meet the same error and report it
         if path.is_file() and (kept := path.stat().st_size):
@@ -306,13 +276,13 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     )
 
 
-def link_monitor(experiment: ResolvedExperiment, *, uplink: bool, trusted: bool) -> LinkMonitor:
+def link_monitor(experiment: ResolvedExperiment, *, uplink: bool) -> LinkMonitor:
     """Make the monitor that compares the received datagrams with the link profile.
 
-    `uplink` is True in cloud, False in world. If the link is not `trusted`, the monitor refuses
-    trace files that are larger than TRACE_MAX.
+    `uplink` is True in cloud, False in world. The monitor refuses trace files that are larger than
+    TRACE_MAX.
     """
-    from cloudrc.link.traces import SIZE_MAX, link_profile
+    from cloudrc.link.traces import link_profile
     from cloudrc.link.verify.judge import Flow
     from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.messages import plan_length
@@ -322,8 +292,8 @@ def link_monitor(experiment: ResolvedExperiment, *, uplink: bool, trusted: bool)
     rate = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz
     size = SIZES[kind] if uplink else COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
     flow = Flow(experiment.seed, uplink, kind, size)
-    file_max, computes = SIZE_MAX if trusted else TRACE_MAX, experiment.cloud.compute_ms > 0
-    check = LinkMonitor(uplink, flow, period=1.0 / rate, computes=computes, file_max=file_max)
+    computes = experiment.cloud.compute_ms > 0
+    check = LinkMonitor(uplink, flow, period=1.0 / rate, computes=computes, file_max=TRACE_MAX)
     check.begin((link_profile(experiment.uplink), link_profile(experiment.downlink)))
     return check
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from cloudrc.advice import advise
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
-from cloudrc.cli.extras import MODES, missing, require
+from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.find_run import RUNS
 from cloudrc.cli.output import (
     escape,
@@ -347,24 +347,17 @@ def _record_virtual(
                 writer.attach(name, data)
 
 
-def _prepare(experiment: ResolvedExperiment, folder: Path) -> bool:
-    """Check the user's robot and scene, and write the link's profile into the run's `folder`.
-
-    Return whether the packages of the operator's API are installed; if not, warn on stderr.
-    """
+def _prepare(experiment: ResolvedExperiment, folder: Path) -> None:
+    """Check the user's robot and scene, and write the link's profile into the run's `folder`."""
     from cloudrc.cli.link_run import prepare_link
     from cloudrc.drivers.local import LINK_FOLDER
 
-    if absent := missing("api"):
-        text = f"no operator's API in this run: {', '.join(absent)} not installed"
-        print(f"cloudrc: {text}; run: pip install 'cloudrc[api]'", file=sys.stderr)
     world = experiment.world
     if world.robot.endswith(".xml") or world.scene.endswith(".xml"):
         from cloudrc.world.scene import compile_model
 
         compile_model(world.robot, world.scene)  # report an invalid model before the flight
     prepare_link(folder / LINK_FOLDER, experiment)
-    return not absent
 
 
 @contextlib.contextmanager
@@ -387,7 +380,8 @@ def _record_local(
     from cloudrc.report.write import attachments
     from cloudrc.world.native.library import library
 
-    local = LocalRun(folder, see, api=_prepare(experiment, folder), session=session)
+    _prepare(experiment, folder)
+    local = LocalRun(folder, see, session=session)
     broken, interrupted = None, True
     try:
         local.fly(inf if session else flight_limit(experiment))

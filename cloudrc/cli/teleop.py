@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import print_line
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.geometry.scene import Scene
     from cloudrc.records import Record
-    from cloudrc.teleop.api import ApiServer
+    from cloudrc.teleop.api import ApiServer, Bridge
     from cloudrc.teleop.service import MissionService
     from cloudrc.teleop.store import MissionStore
 
@@ -51,7 +51,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     process_arguments(parser)
     where = (
         "serve the API here: [HOST:]PORT (default HOST: 127.0.0.1; PORT 0: any free port) or "
-        "unix:PATH, for your user only (default: no API)"
+        "unix:PATH, for your user only"
     )
     for flag, metavar, kind, text in (
         ("--socket", "DIR", Path, "folder of the two sockets"),
@@ -59,12 +59,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         ("--tokens", "DIR", Path, "folder of the token files 'operator' and 'reader'"),
         ("--audit", "FILE", Path, "log all commands and their callers (JSON lines)"),
         ("--api-file", "FILE", Path, "write the API's URL to this file"),
-        ("--journal", "FILE", Path, "store missions in this file (default: not stored)"),
     ):
-        required = flag == "--socket"
+        required = flag in ("--socket", "--api", "--audit")
         parser.add_argument(flag, type=kind, metavar=metavar, required=required, help=text)
+    missions = parser.add_mutually_exclusive_group()
+    journal = "store missions in this file (default: not stored)"
+    missions.add_argument("--journal", type=Path, metavar="FILE", help=journal)
     start = "fly the experiment's mission, then exit"
-    parser.add_argument("--start", action="store_true", help=start)
+    missions.add_argument("--start", action="store_true", help=start)
 
 
 def api_address(text: str) -> Address | Path:
@@ -79,25 +81,41 @@ def api_address(text: str) -> Address | Path:
 def execute(options: argparse.Namespace) -> int:
     """Run teleop until a signal stops the process or, with --start, the mission has ended."""
     from cloudrc.config.load import read_experiment
-    from cloudrc.drivers.process import StopSignal
+    from cloudrc.drivers.process import GracefulStop, StopSignal
     from cloudrc.geometry.scene import load_scene
     from cloudrc.teleop.service import MissionService
+    from cloudrc.teleop.store import Order
 
-    if options.api:
-        require("the API of teleop", ("api",))
+    require("the API of teleop", ("api",))
     stop, experiment = StopSignal(), read_experiment(str(options.config))
     exporter = open_exporter(options, "teleop", experiment)
     with ExitStack() as opened:
         scene = load_scene(experiment.world.scene)
-        server = serve_api(options, experiment, scene) if options.api else None
-        if server is not None:
-            opened.callback(server.stop)
-        book = _open_store(options.journal, stop, server)
+        server = serve_api(options, experiment, scene)
+        opened.callback(server.stop)
+        book = _open_store(options.journal, stop, server.bridge)
         if book is not None:  # None: stopped while another teleop process locked the journal
             opened.callback(book.close)
             service = MissionService(experiment.criteria.contact_speed_max_mps, book, scene)
-            over = ending(service, stop, single=_start(options, experiment, service))
-            _fly(options, service, server, exporter, over)
+            if options.start:
+                from cloudrc.assembly import build_plan
+
+                contact = bool(experiment.criteria.contact)
+                order = Order(build_plan(experiment), experiment.name, contact=contact)
+                service.create(order, time.monotonic_ns())
+            pause = GracefulStop(
+                stop,
+                lambda: service.settled,
+                PAUSE_LIMIT_NS,
+                lambda: service.pause(time.monotonic_ns()),
+            )
+            _fly(
+                options,
+                service,
+                server,
+                exporter,
+                lambda: pause() or (options.start and service.over),
+            )
     return 0
 
 
@@ -119,9 +137,8 @@ def serve_api(
         plan=partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps),
     )  # fmt: skip
     tokens = Tokens(options.tokens, log_line) if options.tokens else None
-    audit = Audit(options.audit, log_line) if options.audit else None
     app = create_app(bridge, order, partial(read_goto, scene=scene), log_line)
-    server = ApiServer(Gate(app, tokens, audit), bridge, options.api)
+    server = ApiServer(Gate(app, tokens, Audit(options.audit, log_line)), bridge, options.api)
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     files = FILES_MAX if hard == resource.RLIM_INFINITY else min(FILES_MAX, hard)
     resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))
@@ -137,33 +154,10 @@ def log_line(text: str) -> None:
     print_line(f"cloudrc teleop: {text}", sys.stderr)
 
 
-def ending(
-    service: MissionService, asked: Callable[[], bool], *, single: bool = False
-) -> Callable[[], bool]:
-    """Return a function that tells whether teleop's process may end.
-
-    After `asked()` has become true, the returned function pauses the mission. It returns True as
-    soon as the robot holds its position, or after `PAUSE_LIMIT_NS`. While `asked()` is false, it
-    returns True only if `single` is True and all missions are over.
-    """
-    until_ns = 0
-
-    def may_end() -> bool:
-        nonlocal until_ns
-        if not asked():
-            return single and service.over
-        if not until_ns:
-            service.pause(time.monotonic_ns())
-            until_ns = time.monotonic_ns() + PAUSE_LIMIT_NS  # pause() may take long
-        return service.settled or time.monotonic_ns() > until_ns
-
-    return may_end
-
-
 def _fly(
     options: argparse.Namespace,
     service: MissionService,
-    server: ApiServer | None,
+    server: ApiServer,
     exporter: Exporter | None,
     over: Callable[[], bool],
 ) -> None:
@@ -171,17 +165,13 @@ def _fly(
     from cloudrc.drivers.process import Feed
     from cloudrc.drivers.teleop import TeleopLoop, UnixPeer
     from cloudrc.records import Counted, Fault
-    from cloudrc.teleop import wire
+    from cloudrc.teleop.wire import ALARM
 
     feed = Feed.on_stdout(watched=options.feed)
     paths = options.socket / "teleop.sock", options.socket / "cloud.sock"
-    peer = UnixPeer(*paths, wire.encode, wire.decode)
-    queued: dict[str, Any] = {}
-    if server is not None:
-        server.bridge.alarm = lambda: peer.send(wire.ALARM)
-        server.bridge.open(service)
-        queued = {"calls": server.bridge.make_calls, "stops": server.bridge.make_stops}
-    feed.ready()
+    peer, bridge = UnixPeer(*paths), server.bridge
+    bridge.alarm = lambda: peer.send(ALARM)
+    bridge.open(service)
 
     def tell(records: Sequence[Record]) -> None:
         feed.tell(record for record in records if isinstance(record, Fault))  # cloud feeds events
@@ -191,21 +181,17 @@ def _fly(
     def is_over() -> bool:
         if exporter is not None:
             exporter.ready(service.seen is not None)
-            counts = {
-                "api_events_dropped": service.book.dropped,
-                **(server.counts if server else {}),
-            }
+            counts = {"api_events_dropped": service.book.dropped, **server.counts}
             exporter.see([Counted(0, "teleop", name, count) for name, count in counts.items()])
         return over()
 
     if notice := service.book.notice:
         tell([Fault(0, "journal", notice), Counted(0, "teleop", "journal_repaired", 1)])
-    TeleopLoop(service, peer, tell, **queued).run(feed.alive_while(is_over))
+    loop = TeleopLoop(service, peer, tell, calls=bridge.make_calls, stops=bridge.make_stops)
+    loop.run(feed.alive_while(is_over))
 
 
-def _open_store(
-    path: Path | None, stop: Callable[[], bool], server: ApiServer | None
-) -> MissionStore | None:
+def _open_store(path: Path | None, stop: Callable[[], bool], bridge: Bridge) -> MissionStore | None:
     """Open the journal of missions at `path`, or make a store in memory if `path` is None.
 
     Wait while another teleop process locks the file; return None if `stop()` becomes true first.
@@ -221,32 +207,7 @@ def _open_store(
         except StoreLockedError as error:
             if not reported:
                 log_line(str(error))
-                if server is not None:
-                    server.bridge.close(str(error))
+                bridge.close(str(error))
             reported = True
             time.sleep(LOCK_PERIOD)
     return None
-
-
-def _start(
-    options: argparse.Namespace, experiment: ResolvedExperiment, service: MissionService
-) -> bool:
-    """With `--start`, start or resume the experiment's mission; return whether that was done."""
-    from cloudrc import assembly
-    from cloudrc.teleop.store import ConflictError, Order
-
-    if not options.start:
-        return False
-    criteria = experiment.criteria
-    plan = assembly.mission_plan(experiment.mission, criteria.time_limit_s, experiment.seed)
-    if any(each.order.plan == plan for each in service.book.open()):
-        return True  # a previous process started this mission: it resumes
-    try:
-        order = Order(plan, experiment.name, contact=bool(criteria.contact))
-        service.create(order, time.monotonic_ns())
-    except ConflictError as error:
-        if not options.api:
-            raise
-        log_line(str(error))
-        return False  # the operator can solve the conflict through the API
-    return True

@@ -10,7 +10,6 @@ the operator's requests.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from math import nan
 from typing import Any
@@ -54,8 +53,6 @@ HELLO_PERIOD_NS = 100_000_000
 KEY_PERIOD_NS = 5_000_000_000
 """Time between two hellos with a new pre-shared key while the session uses the old key [ns]. Until
 world has the new key, world counts the hellos as forged; 12 hellos a minute raise no alert."""
-GIVE_UP_NS = 5_000_000_000
-"""Longest time for which cloud tries to tell the robot that the mission has ended [ns]."""
 SILENCE_NS = 500_000_000
 """Time without telemetry after which cloud asks for a session again [ns]."""
 ALIVE_PERIOD_NS = 100_000_000
@@ -133,7 +130,7 @@ class CloudEndpoint(TunnelEnd):
             compute: The simulated time between computation and departure of a command; None: 0.
             start_ns: The present time on cloud's monotonic clock [ns].
         """
-        super().__init__(identity, Direction.DOWNLINK, newest_wins)
+        super().__init__(identity, Direction.DOWNLINK, loop.counts, newest_wins=newest_wins)
         self._loop, self.teleop = loop, teleop
         self._handshake = ClientHandshake(identity.nonce, identity.clock_id)
         self._hellos = 0
@@ -153,29 +150,13 @@ class CloudEndpoint(TunnelEnd):
         self._hello_ns = start_ns - KEY_PERIOD_NS  # time of the last periodic hello
         self._alive_ns = start_ns
         self._heard_ns = start_ns
-        self._flying_ns = start_ns
         self._commanded_ns = NEVER_NS
         self._count_ns = start_ns + COUNT_PERIOD_NS
-
-    @property
-    def counts(self) -> Counter[str]:
-        """Copy of the counters: name of an event -> how often the event has happened."""
-        return Counter(self._counts | self._loop.counts)
 
     @property
     def guard(self) -> GuardState:
         """State of the guard in the newest telemetry."""
         return GuardState.GROUND if self.telemetry is None else self.telemetry.guard
-
-    @property
-    def mission_over(self) -> bool:
-        """Whether the mission has ended, so that cloud may stop.
-
-        Telemetry must show that the robot has acted on the last request, or the mission must have
-        ended more than `GIVE_UP_NS` ago.
-        """
-        done = self.teleop.settled or self._tick_ns - self._flying_ns > GIVE_UP_NS
-        return done and self.teleop.outcome is not None
 
     def next_deadline_ns(self) -> int:
         """Return when cloud has to send a computed command or to compute the next command [ns]."""
@@ -208,8 +189,6 @@ class CloudEndpoint(TunnelEnd):
         if self._alarm.sounds and self._session.epoch:
             if (alarm := self._alarm.due(self._asked, now_ns)) is not None:
                 self._relay(alarm)
-        if self.teleop.outcome is None:
-            self._flying_ns = now_ns
         if self._session.epoch and self._loop.ready and self._setpoint is not None:
             self._send_command(self._setpoint, now_ns)
         elif self._session.epoch and now_ns >= self._alive_ns:
@@ -237,7 +216,7 @@ class CloudEndpoint(TunnelEnd):
             elif kind == Kind.BUSY:
                 (nonce,) = codec.decode(Kind.BUSY, body)
                 if self._handshake.is_refused(nonce) and self._wants_session(now_ns):
-                    self._counts["busy"] += 1
+                    self.counts["busy"] += 1
                     self._tell("busy", BUSY_TEXT, now_ns)
             elif kind != Kind.ALIVE:
                 raise DecodeError("malformed")
@@ -245,14 +224,14 @@ class CloudEndpoint(TunnelEnd):
             self._refuse(str(error), data, now_ns)
 
     def _refuse(self, outcome: str, data: bytes, now_ns: int) -> None:
-        self._counts[outcome] += 1
+        self.counts[outcome] += 1
         if outcome == "old_epoch" and codec.peek(data)[1] > self._session.epoch:
             self._say_hello_if_due(now_ns)  # world's ACCEPT of a new session may be lost
         elif self._wants_session(now_ns):
             self._tell_refusal(outcome, data, now_ns)
 
     def _note_missed(self, count: int, now_ns: int) -> None:
-        self._counts["missed_periods"] += count
+        self.counts["missed_periods"] += count
         if now_ns - self._late_window_ns > LATE_WINDOW_NS:
             self._late_ns, self._late_window_ns = 0, now_ns
         self._late_ns += count * self._period_ns
@@ -279,7 +258,7 @@ class CloudEndpoint(TunnelEnd):
         asks = self._wants_session(now_ns)
         nonces = self._handshake.receive_accept(epoch, accept, asks=asks)
         if nonces is None:
-            self._counts["accept_ignored"] += 1
+            self.counts["accept_ignored"] += 1
             return
         self._session.begin(epoch, nonces, self._session.greeting_key)
         self._told.clear()
@@ -299,7 +278,7 @@ class CloudEndpoint(TunnelEnd):
         outcome = self._channel.take(counter)
         if outcome != REPEATED:  # an attacker can repeat datagrams
             self._heard_ns = now_ns
-        self._counts[outcome] += 1
+        self.counts[outcome] += 1
         used = outcome == USED
         telemetry, delay = codec.decode_telemetry(body) if type(body) is bytes else body, nan
         if self._clock_is_shared:
@@ -325,7 +304,7 @@ class CloudEndpoint(TunnelEnd):
     def _take_from_teleop(self) -> None:
         for message in self.teleop.take_outputs():
             if not is_for_session(self._session.epoch, message):
-                self._counts["words_dropped"] += 1
+                self.counts["words_dropped"] += 1
             elif isinstance(message, Setpoint):
                 self._setpoint = message
             elif isinstance(message, OperatorRequest):
@@ -343,7 +322,7 @@ class CloudEndpoint(TunnelEnd):
         before the first telemetry, and while it repeats an emergency stop.
         """
         if request.number > codec.NUMBER_MAX:  # somebody with the keys has used up the numbers
-            self._counts["words_dropped"] += 1
+            self.counts["words_dropped"] += 1
             return
         may_start = self._loop.ready and not self._alarm.sounds
         if request.number == 0 and request.request is Request.ESTOP:
@@ -374,5 +353,5 @@ class CloudEndpoint(TunnelEnd):
 
     def _record_counts(self, now_ns: int) -> None:
         self._count_ns = max(self._count_ns, now_ns - COUNT_PERIOD_NS) + COUNT_PERIOD_NS
-        for name, count in sorted((self._counts | self._loop.counts).items()):
+        for name, count in sorted(self.counts.items()):
             self._records.append(Counted(now_ns, "cloud", name, count))

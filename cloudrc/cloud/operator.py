@@ -13,7 +13,7 @@ from cloudrc.messages import (
     Setpoint,
     Telemetry,
 )
-from cloudrc.records import Control, Fault, MissionEvent
+from cloudrc.records import Control, Fault
 from cloudrc.teleop.wire import Output, RobotStatus
 from cloudrc.tunnel.session import NO_EPOCH
 
@@ -30,14 +30,6 @@ class Operator(Protocol):
     @property
     def outputs(self) -> Sequence[Output | Fault]:
         """Messages from teleop since the last call of `take_outputs`."""
-
-    @property
-    def outcome(self) -> MissionEvent | None:
-        """Last event of the mission once the mission has ended; None before."""
-
-    @property
-    def settled(self) -> bool:
-        """Whether telemetry shows that the robot has acted on the last request."""
 
     def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Pass the newest telemetry, received at `now_ns` [ns], to teleop."""

@@ -134,14 +134,13 @@ def read_throttling(root: Path = CGROUP) -> Readings:
 class Exporter:
     """Collects the metrics of one process and serves them over HTTP."""
 
-    def __init__(self, role: str, config: str = "", *, missions: bool = True) -> None:
+    def __init__(self, role: str, config: str = "") -> None:
         """Set the role of the process: "world", "cloud", "teleop" or "link".
 
-        `config` is the hash of the process's configuration. `missions` is False in cloud if a
-        separate teleop process exports the metrics of missions.
+        `config` is the hash of the process's configuration.
         """
         self._role, self._metrics = role, of_role(role)
-        self._live = LiveMetrics(role, missions=missions)
+        self._live = LiveMetrics(role)
         self._sync_age: Callable[[], float | None] = lambda: None
         self._said_ready, self._config = False, config[:CONFIG_DIGITS]
         self._seen_at: float | None = None  # time of the newest records; None before the first

@@ -33,7 +33,6 @@ from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.teleop import PATH_MAX
 from cloudrc.errors import InvalidRunError, TimedOutError
 from cloudrc.link.follow import PROFILE
-from cloudrc.link.state import STATE_FILE
 from cloudrc.records import Fault, Record
 from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
 
@@ -51,9 +50,10 @@ SOCKET_NAME = "/cloudrc-12345678/teleop.sock"
 """Longest path of a socket, relative to the folder for temporary files."""
 API_FILE, AUDIT_FILE = "api.json", "audit.jsonl"
 """Files in a run's folder: the API's address, and the log of the API's commands."""
-LINK_FOLDER = "link"
+LINK_FOLDER, ROUTE_FILE = "link", "route"
 """Folder in a run's folder, during the flight: the link's profile, and a folder per direction with
-the state of the link and the change from `cloudrc link set`."""
+the address of the relay (`ROUTE_FILE`), the state of the link and the change from `cloudrc link
+set`."""
 JOURNAL_FILE = "missions.journal"
 """File in a session's folder: teleop's store of the missions."""
 LINK_LOG = "uplink.log"
@@ -77,7 +77,7 @@ def flights_folder() -> Path:
 class FlightFile(NamedTuple):
     """What a flight file tells other commands about a flight, besides the folder of the run."""
 
-    api: str  # address of the operator's API; "" for none
+    api: str  # address of the operator's API
     kind: str  # RUN or SESSION
     pid: int  # process id of the supervisor
 
@@ -87,7 +87,7 @@ def announced(run: Path, api: str = "", kind: str = RUN) -> Iterator[None]:
     """Keep a flight file during the `with` block, if the folder of flight files is writable.
 
     The file tells other commands `run`, the folder of the run; `api`, the address of the operator's
-    API ("" without an API); and `kind`, RUN or SESSION.
+    API; and `kind`, RUN or SESSION.
     """
     about = FlightFile(api, kind, os.getpid())._asdict()
     flight = json.dumps({"schemaVersion": 1, "run": str(run.resolve()), **about})
@@ -106,7 +106,7 @@ def announced(run: Path, api: str = "", kind: str = RUN) -> Iterator[None]:
 
 
 def under_way() -> dict[Path, str]:
-    """Return the flights of this user: folder of the run -> address of its API ("" for none)."""
+    """Return the flights of this user: folder of the run -> address of its API."""
     return {run: flight.api for run, flight in flight_files().items()}
 
 
@@ -176,21 +176,19 @@ class LocalRun:
         self,
         folder: Path,
         see: Callable[[list[Record]], None],
-        *,
-        api: bool = True,
         session: Callable[[str, dict[str, str]], None] | None = None,
     ) -> None:
         """Prepare a run in `folder`; start no process yet.
 
         `folder` contains config.yaml and, in `LINK_FOLDER`, profile.yaml and one folder per
         direction. The run writes world.mcap, cloud.mcap and five logs to `folder`. It calls `see`
-        with the records that the processes print. With `api`, teleop serves the operator's API.
+        with the records that the processes print.
 
         If `session` is given, the run is a session: teleop waits for missions, all processes serve
         metrics, and the recordings contain only the flights. When all processes are ready,
         `session` gets the API's address and a mapping: process -> HOST:PORT of its metrics.
         """
-        self._folder, self._see, self._api, self._session = folder, see, api, session
+        self._folder, self._see, self._session = folder, see, session
         self._metrics: dict[str, str] = {}
         self.announcement = contextlib.ExitStack()
         self._children: list[Child] = []
@@ -208,7 +206,7 @@ class LocalRun:
         # The sockets are not in the run's folder, whose path may be too long for a Unix socket.
         # Their folder is private: it also contains this run's key.
         with tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder()) as sockets:
-            url = f"unix:{sockets}/api.sock" if self._api else ""
+            url = f"unix:{sockets}/api.sock"
             kind = SESSION if self._session else RUN
             self.announcement.enter_context(announced(self._folder, url, kind))
             try:
@@ -231,9 +229,8 @@ class LocalRun:
         self._metrics = dict(zip(names, ports[4:], strict=False))
 
         def start_end(name: str, way: str, **more: object) -> None:
-            more |= {"listen": at[name], "peer": at[way], "key": sockets / "key"}
-            more |= {"record": folder / f"{name}.mcap"}
-            more |= {"link": folder / LINK_FOLDER / way / STATE_FILE}
+            more |= {"listen": at[name], "route": folder / LINK_FOLDER / way / ROUTE_FILE}
+            more |= {"key": sockets / "key", "record": folder / f"{name}.mcap"}
             self._start(name, name, *(("--record-flights",) if session else ()), **more)
 
         def start_link(way: str, end: str, peer: str) -> None:
@@ -243,8 +240,8 @@ class LocalRun:
 
         start_end("world", "uplink")
         # Only this user can open the socket of the API: no token is needed.
-        files = {"api-file": folder / API_FILE, "audit": folder / AUDIT_FILE}
-        given: dict[str, object] = {"api": url, **files} if url else {}
+        given: dict[str, object] = {"api": url, "api-file": folder / API_FILE}
+        given |= {"audit": folder / AUDIT_FILE}
         given |= {"journal": folder / JOURNAL_FILE} if session else {}
         start = () if session else ("--start",)
         self._start("teleop", "teleop", *start, socket=sockets, **given)
@@ -362,7 +359,7 @@ def link_words(folder: Path, way: str) -> list[str]:
     `way` is "uplink" or "downlink". `folder` contains profile.yaml and a folder per direction, in
     which the process writes its route file and its state.
     """
-    files = [f"--profile={folder / PROFILE}", f"--route={folder / way / 'route'}"]
+    files = [f"--profile={folder / PROFILE}", f"--route={folder / way / ROUTE_FILE}"]
     return ["link", "run", f"--direction={way}", *files]
 
 

@@ -13,13 +13,12 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
-from enum import IntEnum
+from functools import cache
 from math import nan
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, get_args
 
-from cloudrc import records as kinds
 from cloudrc.drivers.keyfile import KeyFile
 from cloudrc.drivers.realtime import Peer, serve
 from cloudrc.drivers.recording import FlightsOnly, Recorder
@@ -41,6 +40,8 @@ from cloudrc.records import (
 )
 
 if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.link.verify.monitor import LinkMonitor
 
@@ -89,6 +90,34 @@ class StopSignal:
         self._asked = True
 
 
+class GracefulStop:
+    """Delays the end of a process until it has done its last work, for a limited time."""
+
+    def __init__(
+        self,
+        asked: Callable[[], bool],
+        done: Callable[[], bool],
+        limit_ns: int,
+        begin: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Set the functions that give the state of the process.
+
+        After `asked()` has become true, `begin` is called once. The process may end as soon as
+        `done()` is true, or `limit_ns` [ns] later.
+        """
+        self._asked, self._done, self._limit_ns, self._begin = asked, done, limit_ns, begin
+        self._until_ns: int | None = None
+
+    def __call__(self) -> bool:
+        """Return whether the process has to end now; its loop calls this repeatedly."""
+        if not self._asked():
+            return False
+        if self._until_ns is None:
+            self._begin()  # may take long
+            self._until_ns = time.monotonic_ns() + self._limit_ns
+        return self._done() or time.monotonic_ns() >= self._until_ns
+
+
 class Feed:
     """Writes all event records and some of the periodic records to a pipe, one record per line.
 
@@ -117,15 +146,11 @@ class Feed:
         os.dup2(2, 1)
         return feed
 
-    def ready(self) -> None:
-        """Tell the supervisor that this process can receive datagrams."""
-        self._write(READY)
-
     def alive_while(self, stop: Callable[[], bool]) -> Callable[[], bool]:
         """Return a function that returns `stop()` and, every `ALIVE_PERIOD`, prints `READY`.
 
-        `READY` shows a supervisor that this process is alive; without a supervisor, the function
-        does not print.
+        `READY` tells a supervisor that this process can receive datagrams, and that it is alive.
+        Without a supervisor, the function does not print.
         """
         due = 0.0
 
@@ -193,23 +218,16 @@ def from_line(line: str) -> Record:
     """Parse a line from `to_line`; raise a ValueError if the line is not a record."""
     try:
         name, values = json.loads(line)
-        kind = getattr(kinds, name)
-        if kind not in get_args(Record):
-            raise ValueError(name)
-        record: Record = _from_json(kind, values)
-    except (TypeError, AttributeError, ValueError, RecursionError) as error:
+        return _kind(name).validate_python(values)
+    except (TypeError, KeyError, ValueError, RecursionError) as error:
         raise ValueError(f"not a record: {line!r}") from error
-    return record
 
 
-def _from_json(kind: Any, value: Any) -> Any:
-    if hasattr(kind, "_fields"):
-        hints = get_type_hints(kind)
-        fields = zip(kind._fields, value, strict=True)
-        return kind(*[_from_json(hints[name], item) for name, item in fields])
-    if get_origin(kind) is tuple:
-        return tuple(value)
-    return kind(value) if isinstance(kind, type) and issubclass(kind, IntEnum) else value
+@cache
+def _kind(name: str) -> TypeAdapter[Record]:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter({kind.__name__: kind for kind in get_args(Record)}[name])
 
 
 class LinkNotes:
@@ -219,7 +237,7 @@ class LinkNotes:
     second file. World and cloud do not trust the content of these files.
     """
 
-    def __init__(self, path: Path, *, uplink: bool, check: LinkMonitor | None = None) -> None:
+    def __init__(self, path: Path, *, uplink: bool, check: LinkMonitor) -> None:
         """Follow the state file at `path`, which may not exist yet; `uplink` is True in world.
 
         `check` gets each new profile.
@@ -263,11 +281,11 @@ class LinkNotes:
             state = from_text(read(self._path, STATE_MAX).decode())
         except TooLongError:  # a long time line
             self._since_ns = None
-            self._request(None)
+            self._check.request(None)
             return []
         since_ns, self._since_ns = self._since_ns, state.since_ns
         if since_ns != state.since_ns:
-            self._request(state.profile)
+            self._check.request(state.profile)
         asked = {key: nan if value is None else float(value) for key, value in state.asked.items()}
         changed = LinkChanged(
             stamp_ns=now_ns - slip_ns,
@@ -281,10 +299,6 @@ class LinkNotes:
         )
         return [changed] if begins or since_ns != state.since_ns else []
 
-    def _request(self, profile: dict[str, Any] | None) -> None:
-        if self._check is not None:
-            self._check.request(profile)
-
 
 @dataclass
 class EndProcess:
@@ -295,14 +309,13 @@ class EndProcess:
     recorder: Recorder
     keys: KeyFile  # reloaded when it changes
     feed: Feed  # sends records to the supervisor
+    link: Path  # file with the state of the link
+    check: LinkMonitor  # compares the received datagrams with the link profile
     exporter: Exporter | None = None  # turns records into metrics
     flights_only: bool = False  # whether to record no samples while the robot does not fly
-    link: Path | None = None  # file with the state of the link
-    check: LinkMonitor | None = None  # compares the received datagrams with the link profile
 
     def __post_init__(self) -> None:
-        world = self.end == "world"
-        self._notes = LinkNotes(self.link, uplink=world, check=self.check) if self.link else None
+        self._notes = LinkNotes(self.link, uplink=self.end == "world", check=self.check)
         self._trouble, self._dropped = "", 0
         self._clock_offset = time.time() - time.clock_gettime(SINCE_BOOT)
 
@@ -328,7 +341,6 @@ class EndProcess:
             self.tell(records)
 
         self.recorder.start()
-        self.feed.ready()
         try:
             ends = self.feed.alive_while(stop)
             serve(endpoint, self.peer, end=self.end, sink=sink, stop=ends, slip_ns=slip_ns)
@@ -361,11 +373,8 @@ class EndProcess:
             text = f"wall clock stepped by {step:+.1f} s: the flight is not affected"
             noted.append(Fault(now_ns - slip_ns, CLOCK_SET, text))
         noted += self.keys.follow(now_ns)
-        if self._notes is not None:
-            noted += self._notes.after(records, now_ns, slip_ns)
-        if self.check is not None:
-            noted += self.check.after([*records, *noted], now_ns - slip_ns)
-        return noted
+        noted += self._notes.after(records, now_ns, slip_ns)
+        return noted + self.check.after([*records, *noted], now_ns - slip_ns)
 
     def _clock_step(self) -> float:
         """Return the step of the wall clock since the last call [s]; 0 without a step."""

@@ -44,7 +44,7 @@ WAIT_MAX_NS = 100_000_000
 PORTS = range(20_000, 30_000)
 """Ports from which `free_ports` chooses."""
 ROUTE_PERIOD_NS = 500_000_000
-"""Time between two checks of the route file [ns]."""
+"""Time between two checks of the route file once the address is known [ns]."""
 
 
 def split_address(text: str) -> Address:
@@ -64,33 +64,26 @@ class Peer:
 
     Attributes:
         socket: The socket, bound and not blocking.
+        route: File from which `follow` reads `address` as HOST:PORT; the link process writes it.
         address: Address of the peer: world, cloud or the relay; None while it is unknown.
-        route: File from which `follow` reads `address` as HOST:PORT; None for a fixed address.
     """
 
     socket: socket.socket
-    address: Address | None
-    route: Path | None = None
+    route: Path
+    address: Address | None = None
     _seen: tuple[int, int, int] | None = field(default=None, init=False)
-    _followed_ns: int = field(default=0, init=False)
-
-    @classmethod
-    def bind(cls, listen: Address, where: Address | Path) -> Peer:
-        """Bind a socket at `listen`; `where` is the peer's address or a file that contains it."""
-        bound = bind(listen)
-        if isinstance(where, Path):
-            return cls(bound, None, where)
-        return cls(bound, _reachable(bound, where))
+    _due_ns: int = field(default=0, init=False)
 
     def follow(self, now_ns: int) -> None:
         """Update the address from the route file, if a check is due at `now_ns` [ns].
 
-        If the file is missing or incomplete, or contains a host name, keep the last address: a
-        query to a name server would block the loop.
+        While the address is unknown, each call checks the file. If the file is missing or
+        incomplete, or contains a host name, keep the last address: a query to a name server would
+        block the loop.
         """
-        if self.route is None or now_ns < self._followed_ns:
+        if self.address is not None and now_ns < self._due_ns:
             return
-        self._followed_ns = now_ns + ROUTE_PERIOD_NS
+        self._due_ns = now_ns + ROUTE_PERIOD_NS
         seen = version(self.route)
         if seen == self._seen:
             return

@@ -82,17 +82,15 @@ class Recorder:
         self,
         path: Path,
         open_sink: Callable[[Path], McapWriter],
-        capacity: int = CAPACITY,
         size_max: int | None = None,
     ) -> None:
-        """Create the queue of `capacity` records; after `start`, a thread opens the file.
+        """Create the queue of records; after `start`, a thread opens the file.
 
         When the file reaches `size_max` [bytes], recording ends; None means no limit.
         """
         self.error = ""  # why records are missing from the file, in words
         self._path = path
         self._open_sink = open_sink
-        self._capacity = capacity
         self._size_max = size_max
         self._queue: deque[Record] = deque()
         self._sink: McapWriter | None = None
@@ -114,7 +112,7 @@ class Recorder:
         """Queue records, oldest first; never wait."""
         queue = self._queue
         queue.extend(records)
-        while len(queue) > self._capacity:
+        while len(queue) > CAPACITY:
             # The other thread may have emptied the queue in the meantime.
             with contextlib.suppress(IndexError):
                 queue.popleft()
@@ -184,8 +182,7 @@ class Recorder:
         if sink is not None:
             try:
                 sink.sync()
-                if self._path.is_file():
-                    self._safe_since = began
+                self._safe_since = began
             except OSError as error:  # the next flush, in the other thread, ends the file
                 self._sync_error = error
             except ValueError:  # the file was closed in the meantime

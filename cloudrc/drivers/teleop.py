@@ -13,11 +13,15 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from cloudrc.errors import BadInputError
 from cloudrc.messages import OperatorRequest, Request, Setpoint
 from cloudrc.records import Fault, MissionEvent
+from cloudrc.teleop.wire import Message, Output, RobotStatus, decode, encode
+
+if TYPE_CHECKING:
+    from cloudrc.teleop.service import MissionService
 
 DATAGRAM_MAX = 8_192
 """Size limit of a datagram between teleop and cloud [bytes]; all messages are smaller."""
@@ -39,9 +43,6 @@ SILENCE_NS = 1_000_000_000
 """Time without a datagram from teleop after which cloud reports a fault [ns]."""
 EVENTS_KEPT = 256
 """Largest number of mission events that teleop stores while cloud does not accept them."""
-LAST_WORD_NS = 800_000_000
-"""Time for which cloud, when it has to end, still forwards teleop's request to hold [ns]. A process
-has 1.5 s to end."""
 Make = Callable[[int], None]
 """Function that makes the calls that other threads have queued, at a time [ns], monotonic clock."""
 
@@ -49,19 +50,12 @@ Make = Callable[[int], None]
 class UnixPeer:
     """Exchanges messages with another process over two Unix sockets."""
 
-    def __init__(
-        self,
-        own: Path,
-        other: Path,
-        encode: Callable[[Any], bytes],
-        decode: Callable[[bytes], Any],
-    ) -> None:
+    def __init__(self, own: Path, other: Path) -> None:
         """Bind the path `own`, in place of an earlier process's socket; send to the path `other`.
 
-        `decode` raises a ValueError if the bytes are not a message. Raise a BadInputError if `own`
-        cannot be bound.
+        Raise a BadInputError if `own` cannot be bound.
         """
-        self._other, self._encode, self._decode = str(other), encode, decode
+        self._other = str(other)
         if len(bytes(own)) > PATH_MAX:
             raise BadInputError(f"--socket: {own} is longer than {PATH_MAX} bytes; choose another")
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -74,25 +68,25 @@ class UnixPeer:
             self._socket.close()
             raise BadInputError(f"--socket: cannot make {own}: {error.strerror}") from error
 
-    def receive(self) -> list[Any]:
+    def receive(self) -> list[Message | None]:
         """Return the messages that have arrived.
 
         None in the list stands for an empty datagram, a sign of life of the other process.
         """
-        messages: list[Any] = []
+        messages: list[Message | None] = []
         with suppress(BlockingIOError):
             while len(messages) < DRAIN_MAX:
                 data = self._socket.recv(DATAGRAM_MAX)
                 with suppress(ValueError):
-                    messages.append(self._decode(data) if data else None)
+                    messages.append(decode(data) if data else None)
         return messages
 
-    def send(self, message: Any) -> bool:
+    def send(self, message: Message | None) -> bool:
         """Send a message (None: an empty datagram, a sign of life); return whether it was accepted.
 
         False means that the other process does not run, or that the queue of its socket is full.
         """
-        data = b"" if message is None else self._encode(message)
+        data = b"" if message is None else encode(message)
         try:
             self._socket.sendto(data, self._other)
         except OSError:  # the other process does not run, or its queue is full
@@ -111,18 +105,15 @@ class RemoteTeleop:
         outputs: Requests, setpoints and events from teleop since the last call of `take_outputs`.
     """
 
-    outcome = None  # cloud does not end when a mission ends
-    settled = True
-
     def __init__(self, peer: UnixPeer, start_ns: int) -> None:
         self._peer = peer
         # Time of teleop's last datagram; before one, time of the first telemetry sent to teleop.
         self._heard_ns: int | None = None
         self._silent = self._stalled = False
         self._tell_ns = self._looked_ns = self._alive_ns = start_ns
-        self.outputs: list[Any] = []
+        self.outputs: list[Output | Fault] = []
 
-    def see(self, seen: Any, now_ns: int) -> None:
+    def see(self, seen: RobotStatus, now_ns: int) -> None:
         """Send `seen`, the status of the robot, to teleop; at most once per `TELL_NS`."""
         if now_ns >= self._tell_ns:
             self._tell_ns, self._alive_ns = now_ns + TELL_NS, now_ns + ALIVE_NS
@@ -141,7 +132,9 @@ class RemoteTeleop:
             self._peer.send(None)
         self._stalled = not self._stalled and now_ns - self._looked_ns > STALL_NS
         self._looked_ns = now_ns
-        for output in filter(None, self._peer.receive()):
+        for output in self._peer.receive():
+            if output is None or isinstance(output, RobotStatus):
+                continue
             self._heard_ns, self._silent = now_ns, False
             if not (self._stalled and _moves_robot(output)):
                 self.outputs.append(output)
@@ -151,45 +144,16 @@ class RemoteTeleop:
             text = "no message from teleop for 1 s: the last setpoint is kept; see teleop's log"
             self.outputs.append(Fault(now_ns, "teleop_silent", text))
 
-    def take_outputs(self) -> list[Any]:
+    def take_outputs(self) -> list[Output | Fault]:
         """Return and remove the outputs that have arrived since the last call."""
         outputs, self.outputs = self.outputs, []
         return outputs
 
 
-def _moves_robot(output: Any) -> bool:
+def _moves_robot(output: Output) -> bool:
     if isinstance(output, OperatorRequest):
         return output.request is Request.START
     return isinstance(output, Setpoint) and output.waypoint >= 0
-
-
-class LastWord:
-    """Delays the end of cloud's process until the robot stops following commands, at most 0.8 s.
-
-    Meanwhile cloud forwards teleop's request that the robot holds its position.
-    """
-
-    def __init__(
-        self,
-        asked: Callable[[], bool],
-        flies: Callable[[], bool],
-        clock: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
-        """Set the functions that give the state of cloud and robot.
-
-        `asked` returns True after cloud has been asked to end. `flies` returns True while the guard
-        is in TRACK. `clock` returns the time [ns].
-        """
-        self._asked, self._flies, self._clock = asked, flies, clock
-        self._until_ns: int | None = None
-
-    def __call__(self) -> bool:
-        """Return whether cloud's process has to end now; cloud's loop calls this repeatedly."""
-        if not self._asked():
-            return False
-        if self._until_ns is None:
-            self._until_ns = self._clock() + LAST_WORD_NS
-        return not self._flies() or self._clock() >= self._until_ns
 
 
 class TeleopLoop:
@@ -197,14 +161,14 @@ class TeleopLoop:
 
     def __init__(
         self,
-        machine: Any,
+        machine: MissionService,
         peer: UnixPeer,
         tell: Callable[[list[MissionEvent | Fault]], None],
         *,
         calls: Make = lambda now_ns: None,
         stops: Make = lambda now_ns: None,
     ) -> None:
-        """Connect `machine`, a `MissionService` or an object with the same methods, to `peer`.
+        """Connect `machine` to `peer`.
 
         `tell` is called with the events and faults of each period, and must not block. `stops`
         executes the queued API calls for an emergency stop or a hold, `calls` all others.
@@ -233,7 +197,7 @@ class TeleopLoop:
         state arrives, for at most `BLIND_WAKES` periods.
         """
         machine, arrived = self._machine, self._peer.receive()
-        states = [state for state in arrived if state is not None]
+        states = [state for state in arrived if isinstance(state, RobotStatus)]
         if self._blind:  # ignore `late_ns`: otherwise a loop that is always late would wait forever
             self._blind = 0 if states else self._blind - 1
         elif late_ns > STALL_NS:
@@ -250,7 +214,7 @@ class TeleopLoop:
         machine.handle_deadline(now_ns)
         self._send(machine.take_outputs())
 
-    def _send(self, outputs: Sequence[Any]) -> None:
+    def _send(self, outputs: Sequence[Output | Fault]) -> None:
         """Send unsent events, then `outputs`, to cloud; pass new events and faults to `tell`."""
         unsent, peer = self._unsent, self._peer
         while unsent and peer.send(unsent[0]):

@@ -342,21 +342,16 @@ def _places(metrics: Iterable[Metric], values: Values) -> dict[str, list[tuple[V
 class LiveMetrics:
     """Current metrics of one process. One thread calls `see`, any other thread may call `read`."""
 
-    def __init__(self, role: str, *, missions: bool = True) -> None:
-        """Set the role of the process: "world", "cloud", "teleop" or "link".
-
-        `missions` is False in a cloud whose separate teleop exposes the metrics of missions.
-        """
-        of_missions = (table.CLOUD, table.TELEOP)  # processes that expose the metrics of missions
+    def __init__(self, role: str) -> None:
+        """Set the role of the process: "world", "cloud", "teleop" or "link"."""
         # The exporter reads the metrics that all processes have.
-        omitted = (table.ROLES,) if missions else (table.ROLES, of_missions)
-        metrics = [metric for metric in of_role(role) if metric.roles not in omitted]
+        metrics = [metric for metric in of_role(role) if metric.roles != table.ROLES]
         # It has a key per metric from now on: another thread may read it at any time.
         self._values = values = {metric.name: _beginning(metric) for metric in metrics}
         ends: dict[str, type[WorldEnd | CloudEnd]] = {table.WORLD: WorldEnd, table.CLOUD: CloudEnd}
         self.end: End | None = ends[role](values) if role in ends else None
         self.link = Link(values) if role == table.LINK else None
-        mission = Mission(values) if missions and role in of_missions else None
+        mission = Mission(values) if role == table.TELEOP else None
         self._places = _places(metrics, values)
         # The method `_on_NAME` of a part handles the records of the class NAME.
         self._handlers: dict[type, Callable[[Any], None]] = {

@@ -157,13 +157,11 @@ cloudrc_words_dropped_total = words_dropped: Messages of teleop that cloud dropp
 cloudrc_loop_missed_periods_total = missed_periods: Periods without a command because the loop was
     late.
 
-cloud teleop
+teleop
 cloudrc_mission_state: State of the mission: {numbered(MISSION_STATES)}.
 cloudrc_mission_waypoint: Index of the next waypoint; -1 if none.
 cloudrc_waypoints_reached_total: Waypoints reached.
 cloudrc_missions_total[outcome]: Missions ended, by outcome.
-
-teleop
 cloudrc_api_requests_total = api_served: Requests that the API has served.
 cloudrc_api_rejected_total[reason] = api_*: Requests that the API rejected, by reason.
 cloudrc_missions_refused_total[reason] = api_order_*: Mission orders that the API refused, by

@@ -71,8 +71,6 @@ class HostileOperator:
     Until teleop's first setpoint it forwards teleop's requests, too, so that a mission begins.
     """
 
-    outcome, settled = None, True
-
     def __init__(self, honest: Operator, words: Words) -> None:
         self._honest, self._words = honest, words
         self.outputs: Sequence[Output | Fault] = []

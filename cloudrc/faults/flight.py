@@ -183,7 +183,7 @@ class Flight:
             teleop = HostileOperator(teleop, self._words)
         make_loop = partial(DishonestLoop, self._lies) if self._lies else ControlLoop
         cloud = assembly.build_cloud(
-            self.experiment, identity, lambda: start_ns, teleop, make_loop=make_loop
+            self.experiment, identity, teleop, lambda: start_ns, make_loop=make_loop
         )
         if self._rival_at is None:
             return [cloud]
@@ -193,9 +193,9 @@ class Flight:
     def _build_rival(self, start_ns: int) -> CloudEndpoint:
         """Build a second cloud with the same key; it has its own teleop and the same mission."""
         teleop = Teleop()
-        teleop.start(start_ns, assembly.build_plan(self.experiment))
+        teleop.start(start_ns, Mission("rival", self.make_order(), 0))
         identity = Identity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
-        return assembly.build_cloud(self.experiment, identity, lambda: start_ns, teleop)
+        return assembly.build_cloud(self.experiment, identity, teleop, lambda: start_ns)
 
     def _make_link(self, way: str) -> LinkDirection:
         ends = {"up": self.experiment.uplink, "down": self.experiment.downlink}

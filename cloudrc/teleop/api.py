@@ -442,8 +442,8 @@ class ApiServer(uvicorn.Server):
     @property
     def counts(self) -> dict[str, int]:
         """Counts by name: requests with each outcome, and lost lines of the audit log."""
-        lost = 0 if self.gate.audit is None else self.gate.audit.dropped
-        return {f"api_{name}": n for name, n in {**self.gate.counts, "audit_dropped": lost}.items()}
+        counts = {**self.gate.counts, "audit_dropped": self.gate.audit.dropped}
+        return {f"api_{name}": count for name, count in counts.items()}
 
     def start(self) -> None:
         """Start to serve the API, in a thread of its own."""
@@ -455,8 +455,7 @@ class ApiServer(uvicorn.Server):
         self.should_exit = True
         self._thread.join(STOP_LIMIT)
         self._socket.close()
-        if self.gate.audit is not None:
-            self.gate.audit.stop()
+        self.gate.audit.stop()
 
 
 def _bind(address: Address) -> tuple[socket.socket, str]:

@@ -167,7 +167,7 @@ class Audit(RotatingFileHandler):
 class Gate:
     """Check token and role of every request before the application gets the request."""
 
-    def __init__(self, app: ASGIApp, tokens: Tokens | None, audit: Audit | None = None) -> None:
+    def __init__(self, app: ASGIApp, tokens: Tokens | None, audit: Audit) -> None:
         """Set application and audit log; without `tokens`, all who can connect may command."""
         self._app, self.tokens, self.audit = app, tokens, audit
         self._in_flight: Counter[str] = Counter()
@@ -201,7 +201,7 @@ class Gate:
             if path in ORDERS and answer["status"] in COUNTED:
                 self.counts[COUNTED[answer["status"]]] += 1
             steers = path == STEERING and answer["status"] == 200
-            if self.audit is not None and scope["method"] not in READS and not steers:
+            if scope["method"] not in READS and not steers:
                 self.audit.note(caller, scope, answer)
 
     async def caller(self, scope: Scope) -> Caller | None:

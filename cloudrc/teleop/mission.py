@@ -50,7 +50,6 @@ from cloudrc.teleop.wire import (
     STATES,
     Leg,
     Output,
-    Plan,
     RobotStatus,
 )
 
@@ -73,6 +72,8 @@ PROMPT_NS = 100_000_000
 after the planned time, the carrot leaves as planned, else when telemetry shows the robot there."""
 UNSEEN_MAX_NS = 2_000_000_000
 """Longest time without telemetry after which the dwell time at a waypoint continues [ns]."""
+GIVE_UP_NS = 5_000_000_000
+"""Longest time for which teleop tries to tell the robot that the mission has ended [ns]."""
 JUMP_SPEED = 6.0
 """Highest speed of the setpoint on a track [m/s]; along a faster part the setpoint jumps."""
 GROUND, TRACK, HOLD, _, ESTOP = GuardState  # to look up a member takes time
@@ -142,7 +143,7 @@ class Teleop:
         self._setpoint: Setpoint | None = None
         self._is_pending = False  # whether the mission's first setpoint has not been sent yet
         self._stays = False  # whether waypoints are ignored
-        self._seen_ns = NEVER_NS
+        self._seen_ns, self._now_ns = NEVER_NS, 0  # times of newest telemetry and deadline
         # Whether the robot has followed commands in this mission, and whether the carrot waits.
         self._followed = self._waits = False
         self._released_ns = NEVER_NS  # end of the wait for a request to drive; or NEVER_NS
@@ -153,6 +154,14 @@ class Teleop:
         """Whether telemetry shows that the robot has acted on the last request."""
         return self.requests.settled and not self.stopping
 
+    @property
+    def over(self) -> bool:
+        """Whether the mission has ended, and the robot knows it or has not confirmed it for 5 s."""
+        ended = self.outcome
+        if ended is None:
+            return False
+        return self.settled or self._now_ns - ended.stamp_ns > GIVE_UP_NS
+
     def elapsed(self, now_ns: int) -> float:
         """Return the time since the mission began [s]."""
         return (now_ns - self._began_ns) * 1e-9
@@ -162,28 +171,28 @@ class Teleop:
         outputs, self.outputs = self.outputs, []
         return outputs
 
-    def start(self, now_ns: int, plan: Plan, mission_id: int = 0) -> None:
-        """Fly a plan; the robot stores the progress under `mission_id`, unless this number is 0."""
-        self._order(plan, mission_id, now_ns)
-        here = None if plan.start is Start.SPAWN else self.seen
-        self._world = here.world if here else ""
-        self._expected = (here.mission_id, mission_id) if here else ()
-        self.requests.report(mission_id, 0)
-        self.requests.ask(Request.START, plan.start, after=True)
-        self._is_pending = True
-        if self.seen:
-            self.see(self.seen, now_ns)  # an earlier teleop may have flown the mission
+    def start(self, now_ns: int, mission: Mission) -> None:
+        """Fly a mission; if an earlier teleop process has begun it, continue at its waypoint.
 
-    def continue_mission(self, now_ns: int, mission: Mission) -> None:
-        """Continue the mission of an earlier teleop process at the current waypoint."""
-        self._order(mission.order.plan, mission.number, now_ns - round(mission.elapsed * 1e9))
-        self.leg, self._world, self._expected = mission.waypoint, mission.world, (mission.number,)
-        self._continued, self._was_held = True, mission.state == "held"
+        The robot stores the progress under the mission's number, unless this number is 0.
+        """
+        self._plan, self._mission_id, self._began_ns = mission.order.plan, mission.number, now_ns
+        self.state, self.outcome, self.leg = STARTING, None, mission.waypoint
+        self._continued, self._was_held = bool(mission.world), mission.state == HELD
+        self._followed = self._waits = False
+        self._knot, self._is_pending = -1, not self._was_held
         self.requests.report(mission.number, self.leg)
-        self.requests.ask(Request.START, Start.HERE)
-        self._is_pending = not self._was_held
-        if self.seen:
-            self.see(self.seen, now_ns)  # the mission may be over, or world restarted
+        if self._continued:
+            self._began_ns -= round(mission.elapsed * 1e9)
+            self._world, self._expected = mission.world, (mission.number,)
+            self.requests.ask(Request.START, Start.HERE)
+        else:
+            here = None if self._plan.start is Start.SPAWN else self.seen
+            self._world = here.world if here else ""
+            self._expected = (here.mission_id, mission.number) if here else ()
+            self.requests.ask(Request.START, self._plan.start, after=True)
+        if self.seen:  # an earlier teleop may have flown the mission, or world has restarted
+            self.see(self.seen, now_ns)
 
     def go_to(self, now_ns: int, leg: Leg) -> None:
         """Fly to a point; raise BadInputError if the mission is not in the state `HELD`."""
@@ -288,6 +297,7 @@ class Teleop:
 
     def handle_deadline(self, now_ns: int) -> None:
         """Check the time limits, move the setpoint along a track, and repeat a request if due."""
+        self._now_ns = now_ns
         if self.state in UNDER_WAY and (timeout := self._find_timeout(now_ns)):
             self._end(*timeout, now_ns)
         if self.state == FLYING and self._plan.track:
@@ -342,12 +352,6 @@ class Teleop:
         if mission_id != self._mission_id and over and not self.stopping:
             self.requests.ask(Request.END, after=True)
         self._select_here()
-
-    def _order(self, plan: Plan, mission_id: int, began_ns: int) -> None:
-        self.state, self.outcome, self.leg = STARTING, None, 0
-        self._plan, self._mission_id, self._began_ns = plan, mission_id, began_ns
-        self._continued = self._was_held = self._followed = self._waits = False
-        self._knot = -1
 
     def _begin(self, seen: RobotStatus, now_ns: int) -> None:
         """Begin the mission, now that telemetry shows that the robot has started."""

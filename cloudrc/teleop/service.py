@@ -385,13 +385,11 @@ class MissionService:
         mission = waiting[0]
         if queued and mission.state == QUEUED:
             self._note(mission, "starting", ASKED, now_ns)
-        if mission.world:  # an earlier teleop has begun it
+        if mission.world or (mission.state != QUEUED and not self.book.trouble):
             self._current = mission
-            self._teleop.continue_mission(now_ns, mission)
-            self._note(mission, "restarted", RESTARTED, now_ns)
-        elif mission.state != QUEUED and not self.book.trouble:
-            self._current = mission
-            self._teleop.start(now_ns, mission.order.plan, mission.number)
+            self._teleop.start(now_ns, mission)
+            if mission.world:  # an earlier teleop has begun it
+                self._note(mission, "restarted", RESTARTED, now_ns)
         self._collect(now_ns)
         return self._current
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,10 +27,17 @@ class Identity:
 
 
 class TunnelEnd:
-    """The common part of world's and cloud's `Endpoint`."""
+    """The common part of world's and cloud's `Endpoint`.
 
-    def __init__(self, identity: Identity, sends: Direction, newest_wins: bool) -> None:
-        self._identity = identity
+    Attributes:
+        counts: Name of an event -> how often the event has happened. The robot's guard or the
+            control loop counts its events here, too.
+    """
+
+    def __init__(
+        self, identity: Identity, sends: Direction, counts: Counter[str], *, newest_wins: bool
+    ) -> None:
+        self._identity, self.counts = identity, counts
         self._session = Session(sends, identity.ring)
         self._make_datagram = self._session.pass_on if identity.passes else self._encode
         self._channel = Channel(newest_wins)
@@ -38,7 +45,6 @@ class TunnelEnd:
         self._clock_is_shared = False
         self._datagrams: list[Datagram] = []
         self._records: list[Record] = []
-        self._counts: defaultdict[str, int] = defaultdict(int)
 
     @property
     def epoch(self) -> int:
@@ -77,11 +83,11 @@ class TunnelEnd:
 
     def _send(self, kind: int, body: bytes) -> None:
         self._datagrams.append(self._session.seal(kind, body))
-        self._counts["sent"] += 1
+        self.counts["sent"] += 1
 
     def _send_message(self, kind: int, message: Telemetry | Command) -> None:
         self._datagrams.append(self._make_datagram(kind, message))
-        self._counts["sent"] += 1
+        self.counts["sent"] += 1
 
     def _encode(self, kind: int, message: Telemetry | Command) -> bytes:
         encode: Any = encode_command if isinstance(message, Command) else encode_telemetry
@@ -89,4 +95,4 @@ class TunnelEnd:
 
     def _queue(self, datagrams: list[Datagram]) -> None:
         self._datagrams += datagrams
-        self._counts["sent"] += len(datagrams)
+        self.counts["sent"] += len(datagrams)

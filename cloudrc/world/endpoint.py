@@ -13,7 +13,6 @@ a session, and when a mission starts from the spawn, the robot's initial place i
 
 from __future__ import annotations
 
-from collections import Counter
 from math import hypot, isnan, nan
 
 from cloudrc.messages import (
@@ -79,7 +78,8 @@ class WorldEndpoint(TunnelEnd):
         `odometry_period_ns` is the time between two odometry samples [ns], a multiple of the step.
         `start_ns` is the present time on the monotonic clock [ns].
         """
-        super().__init__(identity, Direction.UPLINK, newest_wins)
+        counts = robot.guard.counts
+        super().__init__(identity, Direction.UPLINK, counts, newest_wins=newest_wins)
         self.robot, self._sensors = robot, sensors
         self._tick_ns, self._slip_ns = start_ns, 0  # world's clock and its lag
         self._command_age_max_ns = age_max_ns = robot.guard.command_age_max_ns
@@ -97,11 +97,6 @@ class WorldEndpoint(TunnelEnd):
         # operator, contacts with pipes, and the speed of the tip at its first touch of the board.
         self._mission_id = self._reached = self._pipes = 0
         self._touch_speed = nan
-
-    @property
-    def counts(self) -> Counter[str]:
-        """Copy of the counters: name of an event -> how often the event has happened."""
-        return Counter(self._counts | self.robot.guard.counts)
 
     @property
     def slip_ns(self) -> int:
@@ -134,7 +129,7 @@ class WorldEndpoint(TunnelEnd):
                     self._advance(world_ns)
                     self._receive_operator(codec.decode_operator(body), now_ns)
         except DecodeError as error:
-            self._counts[str(error)] += 1
+            self.counts[str(error)] += 1
             if not self._session.epoch:
                 self._tell_refusal(str(error), data, world_ns)
 
@@ -149,7 +144,7 @@ class WorldEndpoint(TunnelEnd):
         behind_ns = world_ns - self._tick_ns
         if behind_ns > self._command_age_max_ns:
             self._stalled_wake_ns = now_ns
-            self._counts["stalls"] += 1
+            self.counts["stalls"] += 1
         if behind_ns <= CATCH_UP_NS:
             return world_ns
         self._slip_ns += behind_ns - CATCH_UP_NS
@@ -234,8 +229,8 @@ class WorldEndpoint(TunnelEnd):
         """Record the counters of world and guard; report a slow simulation once per session."""
         guard, before_ns = self.robot.guard, self._counted_slip_ns
         self._count_ns, self._counted_slip_ns = self._count_ns + COUNT_PERIOD_NS, self._slip_ns
-        self._counts["held_seconds"] += guard.armed and guard.state is HOLD
-        for name, count in sorted((self._counts | guard.counts).items()):
+        self.counts["held_seconds"] += guard.armed and guard.state is HOLD
+        for name, count in sorted(self.counts.items()):
             self._records.append(Counted(now_ns, "world", name, count))
         passed_ns = COUNT_PERIOD_NS + self._slip_ns - (before_ns or 0)
         if before_ns is not None and COUNT_PERIOD_NS < REAL_TIME_FACTOR_MIN * passed_ns:
@@ -245,7 +240,7 @@ class WorldEndpoint(TunnelEnd):
         if now_ns == self._stalled_wake_ns:
             raise DecodeError("stale")
         answer = self._door.receive_hello(hello, counter, now_ns)
-        self._counts[answer.outcome] += 1
+        self.counts[answer.outcome] += 1
         if answer.opened:
             self._clock_is_shared = hello.clock == self._identity.clock_id
             self._number = 0
@@ -285,7 +280,7 @@ class WorldEndpoint(TunnelEnd):
                 self._refuse_old(tick_ns - request.basis_stamp_ns, now_ns)
                 # Telemetry does not confirm this request: the operator has to acknowledge first.
                 if guard.latched:
-                    self._counts["start_refused"] += 1
+                    self.counts["start_refused"] += 1
                     return
             self._number = request.number
         if starts and (request.mission_id != self._mission_id or request.start is Start.SPAWN):
@@ -338,4 +333,4 @@ class WorldEndpoint(TunnelEnd):
             self._records.append(_new(Arrival, (world_ns, False, epoch, counter, delay, used)))
         if used and guard.state is TRACK:
             self._waiting = (epoch, counter, command)
-        self._counts[outcome] += 1
+        self.counts[outcome] += 1

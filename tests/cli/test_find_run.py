@@ -131,10 +131,10 @@ def test_a_local_run_gets_no_token(tmp_path, monkeypatch, call):
         call("mission estop --api", api.url, code=2)
 
 
-def test_link_set_finds_the_only_run_with_a_link(tmp_path, elsewhere, said, monkeypatch):
+def test_link_set_finds_the_only_run(elsewhere, said, monkeypatch):
     here = elsewhere / "runs" / "latest"
     (here / "link").mkdir(parents=True)
-    with local.announced(here), local.announced(tmp_path / "without a link"):
+    with local.announced(here):
         assert "runs/latest: no link is up there (yet)" in said(2, SET)
         monkeypatch.setattr(sys, "argv", ["/usr/local/bin/kubectl-cloudrc"])
         error = said(3, SET)

@@ -15,7 +15,6 @@ from cloudrc.cli.processes import (
     open_recorder,
     read_address,
     read_size,
-    resolve_address,
     show_address,
 )
 from cloudrc.config.load import load_experiment
@@ -28,7 +27,7 @@ from tests.record.conftest import MS, counted, world_records
 
 FREE = "127.0.0.1:9"
 ENDS = ("world", "cloud")
-END = f"--listen {FREE} --peer {FREE}"
+END = f"--listen {FREE} --route route --record end.mcap"
 
 
 @pytest.fixture
@@ -47,11 +46,6 @@ def taken():
         tcp.bind(address)
         tcp.listen()
         yield f"127.0.0.1:{address[1]}"
-
-
-@pytest.mark.parametrize("more", ["", f"--peer {FREE} --route route"])
-def test_an_end_has_a_peer_or_a_route(more, refused):
-    assert "--peer" in refused(f"world --config hover --listen {FREE} --key key {more}")
 
 
 # The process would close the socket at its end, but here the test process goes on.
@@ -95,10 +89,10 @@ def test_an_end_stopped_at_its_start_completes_its_recording(end, key, tmp_path,
     monkeypatch.setattr(assembly, f"build_{end}", stop_and_build)
     (tmp_path / "key").chmod(0o644)
     flags = f"--listen 127.0.0.1:{free_ports(1)[0]} --route route {key} --record end.mcap"
+    flags += " --teleop teleop" if end == "cloud" else ""
     errors = call(f"{end} --config hover {flags}").err
     assert (tmp_path / "end.mcap").read_bytes().endswith(b"\x89MCAP0\r\n")
     assert f"warning: {tmp_path / 'key'} can be read by others: chmod 600" in errors
-    assert "sends nothing until route exists" in errors
 
 
 def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch):
@@ -108,9 +102,6 @@ def test_a_link_names_a_peer_with_ipv6_alone(monkeypatch):
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
     with pytest.raises(OSError, match="only IPv6 addresses, but a link needs IPv4"):
         ipv4_addresses("cloud")
-    assert resolve_address("--peer", ("cloud", 1), ("::1", 2)) == ("::5", 1)
-    with pytest.raises(BadInputError, match="--peer cloud:1: cloud cannot be resolved"):
-        resolve_address("--peer", ("cloud", 1), ("0.0.0.0", 0))
 
 
 def test_sizes_are_read_as_in_kubernetes():
@@ -167,14 +158,14 @@ def test_the_link_is_expected_to_carry_the_plans(plan_s, size, monkeypatch):
     monitor = Mock()
     monkeypatch.setattr("cloudrc.link.verify.monitor.LinkMonitor", monitor)
     experiment = load_experiment("fast", [f"cloud.plan_s={plan_s}"])
-    processes.link_monitor(experiment, uplink=False, trusted=False)
+    processes.link_monitor(experiment, uplink=False)
     assert monitor.call_args.args[1].size == size
 
 
 def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch):
     monitor, path = Mock(), tmp_path / "trace.csv"
     monkeypatch.setattr("cloudrc.link.verify.monitor.LinkMonitor", monitor)
-    processes.link_monitor(load_experiment("paper"), uplink=False, trusted=False)
+    processes.link_monitor(load_experiment("paper"), uplink=False)
 
     def load(**uplink):
         return link_profile(Direction(**uplink), monitor.call_args.kwargs["file_max"])

@@ -31,7 +31,7 @@ def test_a_measured_time_is_that_of_the_clock():
 def test_a_command_leaves_after_its_stamp_and_compute_time(compute_ms):
     """While cloud computes, it begins no other command, and so it misses periods."""
     settings = "link.profile=ideal", f"cloud.compute_ms={compute_ms}"
-    _, cloud, run = assemble(load_experiment("hover", settings))
+    _, cloud, _, run = assemble(load_experiment("hover", settings))
     of_world, of_cloud = fly_on(run, 3000 * MS)
     began, arrived = (
         {(r.epoch, r.counter): r.stamp_ns for r in records if isinstance(r, kind)}

@@ -55,7 +55,7 @@ def test_a_status_has_the_values_of_its_telemetry():
 
 def test_round_trip_and_uplink_of_a_status_give_the_downlink():
     ways = ["link.profile=ideal", "link.uplink.delay_ms=30", "link.downlink.delay_ms=10"]
-    _, cloud, flight = assembly.assemble(load_experiment("hover", ways))
+    _, cloud, _, flight = assembly.assemble(load_experiment("hover", ways))
     statuses, see = [], cloud.teleop.see
     cloud.teleop.see = lambda status, now_ns: (statuses.append(status), see(status, now_ns))
     flight.fly(lambda: len(statuses) > 200, 10**10, lambda of_world, of_cloud: None)

@@ -16,18 +16,13 @@ from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.errors import CloudrcError
 from cloudrc.messages import GuardState
-from cloudrc.teleop.wire import decode, encode
-
-
-def as_bytes(message):
-    return message if isinstance(message, bytes) else encode(message)
 
 
 @pytest.fixture
 def peers(tmp_path):
-    """Make teleop's and cloud's socket, in the order that a test chooses; bytes are sent as is."""
+    """Make teleop's and cloud's socket, in the order that a test chooses."""
     paths = tmp_path / "a.sock", tmp_path / "b.sock"
-    pair = [UnixPeer(*each, as_bytes, decode) for each in (paths, paths[::-1])]
+    pair = [UnixPeer(*each) for each in (paths, paths[::-1])]
     yield pair
     for peer in pair:
         peer.close()
@@ -118,9 +113,9 @@ MISSION = "waypoints:\n" + "".join(WAYPOINT % y for y in ("0.0", "3.6", "3.0"))
 
 
 class Release:
-    """A release without its link: three processes, a journal, an API; some ends record."""
+    """A release without its link: three processes, a journal, an API, two recordings."""
 
-    def __init__(self, folder, *recorded):
+    def __init__(self, folder):
         self.folder, self.running, self.all = folder, {}, []
         world, cloud = (f"127.0.0.1:{port}" for port in free_ports(2))
         (folder / "config.yaml").write_text(dump(load_experiment("paper")))
@@ -128,14 +123,16 @@ class Release:
         (folder / "mission.yaml").write_text(MISSION)
         (folder / "operator").write_text(TOKEN)
         (folder / "operator").chmod(0o600)
+        for end, peer in (("world", cloud), ("cloud", world)):
+            (folder / f"{end}.route").write_text(peer)
         self.flags = {
-            "world": ["--listen", world, "--peer", cloud, "--key", "key"],
-            "cloud": ["--listen", cloud, "--peer", world, "--key", "key", "--teleop", "."],
+            "world": ["--listen", world, "--route", "world.route", "--key", "key"],
+            "cloud": ["--listen", cloud, "--route", "cloud.route", "--key", "key", "--teleop", "."],
             "teleop": ["--socket", ".", "--api", "0", "--api-file", "api.json", "--tokens", ".",
                        "--audit", "audit.jsonl", "--journal", "journal/missions"],
         }  # fmt: skip
-        for name in recorded:
-            self.flags[name] += ["--record", f"{name}.mcap"]
+        for end in ("world", "cloud"):
+            self.flags[end] += ["--record", f"{end}.mcap"]
         for name in self.flags:
             self.start(name)
         self.until(lambda: self.ask("/v1/state")["seen"] is not None)

@@ -33,7 +33,7 @@ def fly(folder, seconds):
     error [ms].
     """
     folder.mkdir()
-    release, floods, edges = Release(folder, "cloud"), [], []
+    release, floods, edges = Release(folder), [], []
     try:
         release.post("/v1/missions", HOVER)
         release.until(lambda: release.mission()["state"] == "flying")

@@ -16,12 +16,12 @@ from cloudrc.drivers.process import (
     PERIOD_NS,
     EndProcess,
     Feed,
+    GracefulStop,
     LinkNotes,
     StopSignal,
     from_line,
     in_words,
 )
-from cloudrc.drivers.teleop import LAST_WORD_NS, LastWord
 from cloudrc.files import write_atomically
 from cloudrc.link.state import STATE_MAX, LinkState, to_text
 from cloudrc.messages import GuardState
@@ -44,18 +44,20 @@ def test_it_ends_if_it_is_not_the_child_of_who_has_started_it(monkeypatch):
     assert StopSignal()() is False, "nothing was told"
 
 
-def test_cloud_ends_once_nothing_flies_or_after_its_last_word():
-    asked, flies, now_ns = False, True, 0
-    ends = LastWord(lambda: asked, lambda: flies, lambda: now_ns)
+def test_a_process_ends_once_its_work_is_done_or_after_its_limit(monkeypatch):
+    asked, done, begun, now_ns = False, False, [], 0
+    monkeypatch.setattr(time, "monotonic_ns", lambda: now_ns)
+    ends = GracefulStop(lambda: asked, lambda: done, 800, lambda: begun.append(now_ns))
     assert not ends()
-    now_ns, asked = 10_000_000_000, True
+    now_ns, asked = 10_000, True
     assert not ends()
-    flies = False
+    done = True
     assert ends()
-    flies = True
-    for passed_ns, ended in ((LAST_WORD_NS - 1, False), (LAST_WORD_NS, True)):
-        now_ns = 10_000_000_000 + passed_ns
+    done = False
+    for passed_ns, ended in ((799, False), (800, True)):
+        now_ns = 10_000 + passed_ns
         assert ends() is ended
+    assert begun == [10_000]
 
 
 EVENT = MissionEvent(5, "reached", 1, 'waypoint "2" of 7 \u2013 reached')
@@ -176,7 +178,7 @@ def test_a_change_is_recorded_once_and_again_at_a_mission_start(path):
 def test_nonsense_is_recorded_as_nothing(path, wrong):
     """Neither is the state before it, which no longer holds."""
     tell(path, STATE)
-    notes = LinkNotes(path, uplink=False)
+    notes = LinkNotes(path, uplink=False, check=Mock())
     assert len(notes.after([], 200 * MS)) == 1
     text = wrong if isinstance(wrong, str) else json.dumps(asdict(SET) | wrong)
     for file in (path, path.with_suffix(".released")):
@@ -197,7 +199,8 @@ def end(path, pipe):
     )
     keys = SimpleNamespace(follow=lambda now_ns: [Fault(now_ns, "key", "new key")])
     feed = Feed(pipe[1], watched=False)
-    made = EndProcess("world", None, recorder, keys, feed, Exporter("world"), link=path)
+    check = SimpleNamespace(after=lambda records, now_ns: [])
+    made = EndProcess("world", None, recorder, keys, feed, path, check, Exporter("world"))
     made.recorded = put
     return made
 

@@ -4,9 +4,11 @@ import os
 import socket
 import time
 from contextlib import closing
+from pathlib import Path
 
 import pytest
 
+from cloudrc.cli.processes import show_address
 from cloudrc.drivers.realtime import (
     DRAIN_MAX,
     ROUTE_PERIOD_NS,
@@ -50,7 +52,7 @@ def write(path, text, moment_ns):
 def test_what_is_no_route_changes_nothing(tmp_path, make):
     path = tmp_path / "route"
     write(path, "127.0.0.1:7401\n", 1)
-    peer, found = Peer(socket.socket(type=socket.SOCK_DGRAM), None, path), []
+    peer, found = Peer(socket.socket(type=socket.SOCK_DGRAM), path), []
 
     def look():
         peer.follow(len(found) * ROUTE_PERIOD_NS)
@@ -70,28 +72,32 @@ def test_what_is_no_route_changes_nothing(tmp_path, make):
 
 def test_a_peer_follows_its_route_twice_a_second(tmp_path):
     path = tmp_path / "route"
-    peer = Peer.bind(("127.0.0.1", 0), path)
+    peer = Peer(bind(("127.0.0.1", 0)), path)
     with peer.socket, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as there:
         there.bind(("127.0.0.1", 0))
         there.settimeout(5)
         peer.follow(0)
         peer.send([b"to nobody"])
         write(path, f"127.0.0.1:{there.getsockname()[1]}\n", 1)
-        peer.follow(ROUTE_PERIOD_NS - 1)
-        assert peer.address is None
-        peer.follow(ROUTE_PERIOD_NS)
+        peer.follow(1)
         peer.send([b"hello"])
         assert there.recv(100) == b"hello"
+        write(path, "10.1.2.3:7400", 2)
+        peer.follow(ROUTE_PERIOD_NS)
+        assert peer.address == there.getsockname()
+        peer.follow(ROUTE_PERIOD_NS + 1)
+        assert peer.address == THERE
 
 
 @pytest.mark.parametrize(
     ("listen", "other"), [pytest.param("::", "::1", marks=needs_ipv6), ("::", "127.0.0.1")]
 )
-def test_ends_meet_over_ipv6_and_at_both_families(listen, other):
-    far = Peer.bind((other, 0), ("127.0.0.1", 9))
-    own = Peer.bind((listen, 0), far.socket.getsockname()[:2])
-    far.address = (other, own.socket.getsockname()[1])
+def test_ends_meet_over_ipv6_and_at_both_families(listen, other, tmp_path):
+    far, own = Peer(bind((other, 0)), tmp_path / "far"), Peer(bind((listen, 0)), tmp_path / "own")
     with closing(own.socket), closing(far.socket):
+        for peer, to in ((far, own), (own, far)):
+            peer.route.write_text(show_address((other, to.socket.getsockname()[1])))
+            peer.follow(0)
         own.send([b"there"])
         far.send([b"back"])
         assert (far.receive(), own.receive()) == ([b"there"], [b"back"])
@@ -142,14 +148,15 @@ def test_what_waited_through_a_stall_is_taken_in_one_wake(late_ns, arrive, wakes
                 sent.extend(sender.sendto(b"waits", udp.getsockname()) for _ in range(MANY))
             return len(end.wakes) == len(wakes)
 
-        serve(end, Peer(udp, None), end="world", sink=list, stop=over)
+        serve(end, Peer(udp, Path("absent")), end="world", sink=list, stop=over)
         assert end.wakes == wakes
 
 
-def test_an_end_does_not_answer_strangers():
+def test_an_end_does_not_answer_strangers(tmp_path):
     with bind(("127.0.0.1", 0)) as stranger:
         stranger.settimeout(0.06)
-        peer, asked = Peer.bind(("127.0.0.1", 0), stranger.getsockname()), iter([False] * 3)
+        peer, asked = Peer(bind(("127.0.0.1", 0)), tmp_path / "route"), iter([False] * 3)
+        peer.route.write_text(show_address(stranger.getsockname()))
         with closing(peer.socket):
             serve(bare_world(ring()), peer, end="world", sink=list, stop=lambda: next(asked, 1))
         with pytest.raises(TimeoutError):

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.process
 
 @pytest.fixture
 def release(tmp_path):
-    one = Release(tmp_path, "world")
+    one = Release(tmp_path)
     yield one
     one.end()
 

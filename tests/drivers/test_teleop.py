@@ -14,12 +14,14 @@ from cloudrc.drivers.teleop import (
     UnixPeer,
 )
 from cloudrc.errors import BadInputError
-from cloudrc.messages import OperatorRequest, Request, Setpoint
+from cloudrc.messages import GuardState, OperatorRequest, Request, Setpoint
 from cloudrc.records import Fault, MissionEvent
-from cloudrc.teleop.wire import decode, encode
+from cloudrc.teleop.wire import RobotStatus, encode
 
 SECOND, PERIOD_NS = 1_000_000_000, 10_000_000
-POINT, PAST = Setpoint((1.0, 2.0, 3.0)), Setpoint((0.0, 0.0, 3.0))
+POINT = Setpoint((1.0, 2.0, 3.0))
+KNOWN = {"touch_speed": 0.0, "uplink_delay": 0.0}  # not NaN, so that equal statuses compare equal
+NOW, OLD = (RobotStatus(1, (x, 0.0, 1.0), GuardState.TRACK, 0, **KNOWN) for x in (1.0, 0.0))
 
 
 def event(number):
@@ -37,7 +39,7 @@ def test_a_full_socket_drops_and_never_blocks(peers):
 
 def test_a_path_that_is_too_long_is_named(tmp_path):
     with pytest.raises(BadInputError, match="longer than 107 bytes"):
-        UnixPeer(tmp_path / ("x" * 120), tmp_path / "b", encode, decode)
+        UnixPeer(tmp_path / ("x" * 120), tmp_path / "b")
 
 
 # Cloud's side
@@ -49,13 +51,13 @@ def test_cloud_reports_each_silence_of_teleop_once(peers):
     for now_ns in range(0, 3 * SECOND, PERIOD_NS):
         teleop.handle_deadline(now_ns)
     assert teleop.take_outputs() == [], "without telemetry teleop has nothing to say"
-    teleop.see(POINT, 3 * SECOND)
+    teleop.see(NOW, 3 * SECOND)
     for now_ns in range(3 * SECOND, 6 * SECOND, PERIOD_NS):
         teleop.handle_deadline(now_ns)
     (fault,) = teleop.take_outputs()
     assert (type(fault), fault.code) == (Fault, "teleop_silent")
-    for data in (b"rubbish", b"", b'["Nobody", []]', POINT):  # what is no message is ignored
-        other.send(data)
+    for data in (b"rubbish", b"", b'["Nobody", []]', encode(POINT)):
+        other._socket.sendto(data, other._other)  # what is no message is ignored
     for now_ns in range(6 * SECOND, 9 * SECOND, PERIOD_NS):
         teleop.handle_deadline(now_ns)
     assert [type(output) for output in teleop.take_outputs()] == [Setpoint, Fault]
@@ -108,11 +110,11 @@ def serve(machine, peer, wakes, calls=lambda now_ns: None, told=None):
 @pytest.mark.parametrize(
     ("wakes", "done"),
     [
-        ("-", [PAST, "asked"]),
-        ("s--p", [POINT, "asked"]),
+        ("-", [OLD, "asked"]),
+        ("s--p", [NOW, "asked"]),
         ("s" + "-" * (BLIND_WAKES - 1), []),
         ("s" + "-" * BLIND_WAKES, ["asked"]),
-        ("ss", [PAST, "asked"]),
+        ("ss", [OLD, "asked"]),
     ],
 )
 def test_after_a_stall_old_states_are_skipped_before_calls(peers, monkeypatch, wakes, done):
@@ -123,19 +125,19 @@ def test_after_a_stall_old_states_are_skipped_before_calls(peers, monkeypatch, w
     machine, clock, coming = Machine(), [SECOND], iter(wakes)
     calls = ["asked"]
     if wakes == "-":
-        peers[1].send(PAST)
+        peers[1].send(OLD)
 
     def sleep(seconds):
         what = next(coming)
         clock[0] += round(seconds * 1e9) + (2 * STALL_NS if what == "s" else 0)
         if what in "sp":
-            peers[1].send(PAST if what == "s" else POINT)
+            peers[1].send(OLD if what == "s" else NOW)
 
     monkeypatch.setattr("cloudrc.drivers.teleop.time.sleep", sleep)
     monkeypatch.setattr("cloudrc.drivers.teleop.time.monotonic_ns", lambda: clock[0])
     serve(machine, peers[0], len(wakes), lambda now_ns: calls and machine.seen.append(calls.pop()))
     assert machine.seen == done
-    assert bool(machine.heard) == bool({POINT, PAST} & set(done)), "old signs of life do not count"
+    assert bool(machine.heard) == bool({NOW, OLD} & set(done)), "old signs of life do not count"
 
 
 def test_events_wait_for_an_absent_cloud_in_order_and_bounded(peers, tmp_path):
@@ -151,7 +153,7 @@ def test_events_wait_for_an_absent_cloud_in_order_and_bounded(peers, tmp_path):
     while len(received) < EVENTS_KEPT:
         assert time.monotonic() < limit
         if len(told) > len(events):
-            back = back or UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock", encode, decode)
+            back = back or UnixPeer(tmp_path / "b.sock", tmp_path / "a.sock")
             received += back.receive()
         time.sleep(0.005)
     server.join()

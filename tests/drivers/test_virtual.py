@@ -1,5 +1,6 @@
 """The run in virtual time hands datagrams to the link."""
 
+from collections import Counter
 from types import SimpleNamespace
 
 import pytest
@@ -39,7 +40,8 @@ def endpoint(deadline_ns, datagrams=()):
 def test_a_command_loads_the_link_as_its_bytes_would(planned):
     sizes = []
     for passes in (False, True):
-        end = TunnelEnd(Identity(CLOCK, bytes(16), ring(), passes), Direction.DOWNLINK, True)
+        identity = Identity(CLOCK, bytes(16), ring(), passes)
+        end = TunnelEnd(identity, Direction.DOWNLINK, Counter(), newest_wins=True)
         end._session.begin(1, bytes(32))
         end._send_message(Kind.COMMAND, Command(1, 2, 3, ZERO, 0.0, (ZERO,) * planned, 4))
         downlink = Link()

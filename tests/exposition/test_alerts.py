@@ -66,13 +66,13 @@ def seen_by(flight, role, until):
 
 def scrapes(flight, role, times):
     """Yield the readings of a process at each time [s]."""
-    live, seen, sent = LiveMetrics(role, missions=role != "cloud"), 0, 0
+    live, seen, sent = LiveMetrics(role), 0, 0
     for time in times:
         records = seen_by(flight, role, time)
         for record in records[seen:]:
             if isinstance(record, Counted) and record.name == "sent":
                 if record.total < sent:  # a new process, which counts from 0
-                    live = LiveMetrics(role, missions=role != "cloud")
+                    live = LiveMetrics(role)
                 sent = record.total
             live.see([record])
         seen = len(records)

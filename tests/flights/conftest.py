@@ -1,5 +1,6 @@
 """Endpoints without robot and loop; flights in virtual time; a world and the test's own cloud."""
 
+from collections import Counter
 from functools import lru_cache
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -35,7 +36,7 @@ KEY = Key(b"k" * 32)
 def bare_robot():
     """A robot that flies every accepted command."""
     guard = Mock(state=GuardState.TRACK, cause=Cause.COMMAND, latched=False, armed=True)
-    guard.configure_mock(command_age_max_ns=250 * MS, counts={}, changes=[], reference=ZERO)
+    guard.configure_mock(command_age_max_ns=250 * MS, counts=Counter(), changes=[], reference=ZERO)
     guard.accept_command.return_value = None
     truth = lambda now_ns: Odometry(now_ns, ZERO, UPRIGHT, ZERO, ZERO)  # noqa: E731
     simulator = Mock(tip_force=lambda: 0.0, truth=truth, touches=[])
@@ -194,9 +195,9 @@ def fly_on(run, until_ns, over=lambda: False):
 
 def records(experiment):
     """Fly and return the records of world and of cloud."""
-    _, cloud, run = assembly.assemble(experiment)
+    _, _, teleop, run = assembly.assemble(experiment)
     limit_ns = round(assembly.flight_limit(experiment) * 1e9)
-    return fly_on(run, limit_ns, lambda: cloud.mission_over)
+    return fly_on(run, limit_ns, lambda: teleop.over)
 
 
 @lru_cache(maxsize=8)

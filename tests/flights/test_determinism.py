@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.assembly import assemble, build_cloud, build_links, build_world
+from cloudrc.assembly import assemble, build_cloud, build_links, build_world, start_mission
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.messages import Passed
@@ -57,16 +57,17 @@ PLAN = ("cloud.predictor=model_based", "cloud.estimator=earliest", "cloud.plan_s
 )
 def test_objects_and_encrypted_bytes_make_the_same_records(settings):
     experiment, identity = short(*settings), Identity(bytes(16), bytes(16), ring())
-    world, cloud = build_world(experiment, identity), build_cloud(experiment, identity)
+    world, teleop = build_world(experiment, identity), start_mission(experiment)
+    cloud = build_cloud(experiment, identity, teleop)
     run, records = VirtualRun(world, cloud, *build_links(experiment)), RecordStore()
-    run.fly(lambda: cloud.mission_over, 150_000_000_000, records.add)
+    run.fly(lambda: teleop.over, 150_000_000_000, records.add)
     assert Recording(records=records).sha256 == digest(experiment)
 
 
 def test_a_link_that_damages_datagrams_gets_bytes():
     damaging = short("link.downlink.corrupt=0.2", "link.profile=ideal")
     for experiment, kind in ((short(), Passed), (damaging, bytes)):
-        world, _, run = assemble(experiment)
+        world, _, _, run = assemble(experiment)
         run.fly(lambda: False, 200_000_000, lambda of_world, of_cloud: None)
         world.handle_deadline(world.next_deadline_ns())
         assert {type(data) for data in world.take_datagrams()} == {kind}
@@ -99,7 +100,7 @@ def watch_damage(link, session):
 
 def test_both_ends_refuse_every_damaged_datagram_in_virtual_time():
     damaging = both_ways(corrupt=0.3)
-    world, cloud, run = assemble(load_experiment("hover", ["link.profile=ideal", *damaging]))
+    world, cloud, _, run = assemble(load_experiment("hover", ["link.profile=ideal", *damaging]))
     ways = ((run._downlink, world), (run._uplink, cloud))
     seen = [watch_damage(link, end._session) for link, end in ways]
     run.fly(lambda: False, 3_000_000_000, lambda of_world, of_cloud: None)

@@ -56,7 +56,7 @@ def test_a_start_that_was_held_back_on_the_way_starts_nothing(talk, held_back, a
     captured = talk.asked(3, Request.START, Start.SPAWN)
     talk.wait(held_back - ahead)
     talk.send(captured)
-    assert talk.world._counts[outcome] == (outcome != "")
+    assert talk.world.counts[outcome] == (outcome != "")
     assert talk.world.robot.guard.armed == (outcome == "")
     if outcome:  # repeated, it is obeyed
         talk.send(talk.asked(4, Request.START, Start.SPAWN))
@@ -70,7 +70,7 @@ def test_after_a_stall_a_stop_counts_and_a_start_does_not(talk, request_):
     talk.now_ns += 60_000 * MS
     talk.send(captured)
     started = request_ is Request.START
-    assert talk.world._counts["stale"] == started
+    assert talk.world.counts["stale"] == started
     assert talk.world._number == (1 if started else 2)
     assert talk.world.robot.guard.armed is started
 

@@ -19,7 +19,7 @@ ESTOP = GuardState.ESTOP
 
 def join(experiment=HOVER):
     """Assemble both ends and their flight."""
-    _, cloud, run = assembly.assemble(experiment)
+    _, cloud, _, run = assembly.assemble(experiment)
     return SimpleNamespace(cloud=cloud, run=run)
 
 
@@ -52,7 +52,7 @@ def test_setpoints_and_starts_are_for_their_own_session(ends):
     for said in (setpoint, start, start._replace(start=Start.SPAWN)):
         assert say(ends, said._replace(epoch=epoch - 1), said._replace(epoch=epoch + 1)) == []
     assert ends.cloud._setpoint is before
-    assert ends.cloud._counts["words_dropped"] == 6
+    assert ends.cloud.counts["words_dropped"] == 6
     assert say(ends, start, start._replace(epoch=epoch)) == [Kind.OPERATOR] * 2
     for said in (setpoint, setpoint._replace(epoch=epoch)):
         say(ends, said)

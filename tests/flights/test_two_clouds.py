@@ -26,7 +26,7 @@ def test_the_incumbent_keeps_authority_while_it_is_heard(bare, alive):
         bare.send(cloud.session.seal(Kind.ALIVE, b"") if alive else cloud.command(bare.now_ns))
         assert bare.hello("b") == 0
     assert "BUSY" in bare.cloud("b").heard
-    assert bare.world._counts["busy"] == 20
+    assert bare.world.counts["busy"] == 20
     assert bare.world.epoch == 1
 
 

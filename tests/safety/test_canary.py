@@ -39,15 +39,13 @@ def content_of(path):
 
 
 class ObservedRelease(Release):
-    """A release with metrics and recordings."""
+    """A release with metrics."""
 
     def run(self, *words):
         if words[0] in ("world", "cloud", "teleop"):
             address = f"127.0.0.1:{free_ports(1)[0]}"
             self.metrics = [*getattr(self, "metrics", []), address]
             words = (*words, "--metrics", address)
-        if words[0] in ("world", "cloud"):
-            words = (*words, "--record", f"{words[0]}.mcap")
         return super().run(*words)
 
 

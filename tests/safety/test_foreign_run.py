@@ -77,12 +77,14 @@ def test_link_verify_executes_nothing_of_the_run(run, trace):
 
 @pytest.mark.parametrize(("end", "imports"), [("world", False), ("cloud", True)])
 def test_only_cloud_imports_plug_ins(run, trace, monkeypatch, end, imports):
-    for name in ("open_peer", "open_recorder", "open_exporter", "link_monitor"):
+    for name in ("bind", "open_recorder", "open_exporter", "link_monitor"):
         monkeypatch.setattr(processes, name, lambda *words, **more: None)
     (run / "config.yaml").write_text("cloud: {predictor: ./spy.py}")
     (run / "key").write_bytes(b"k" * 32)
-    unused = dict.fromkeys(("feed", "record_flights", "link", "route"))
-    options = argparse.Namespace(config=run / "config.yaml", key=run / "key", **unused)
+    options = argparse.Namespace(
+        config=run / "config.yaml", key=run / "key", listen=("127.0.0.1", 0), route=run / "route",
+        feed=False, record_flights=False,
+    )  # fmt: skip
     processes.open_end(options, end)
     assert trace.exists() == imports
 

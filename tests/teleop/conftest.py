@@ -81,9 +81,11 @@ class Flight:
         self.first_shown_ns.setdefault(self.mission, self.now_ns)
         self.teleop.see(self.seen, self.now_ns)
 
-    def operate(self, verb, *words, **more):
+    def operate(self, verb, *words, number=0):
+        if verb == "start":
+            words = [store.Mission("m1", Order(*words), number)]
         try:
-            getattr(self.teleop, verb)(self.now_ns, *words, **more)
+            getattr(self.teleop, verb)(self.now_ns, *words)
         finally:
             self._collect()
 

@@ -325,8 +325,10 @@ def test_the_api_and_its_client_speak_both_address_families():
     ("where", "host", "warns"),
     [("0", "127.0.0.1", False), ("[::1]:0", "::1", False), ("0.0.0.0:0", "0.0.0.0", True)],
 )
-def test_a_network_address_needs_tokens(where, host, warns, capsys):
-    options = argparse.Namespace(api=api_address(where), tokens=None, audit=None, api_file=None)
+def test_a_network_address_needs_tokens(where, host, warns, tmp_path, capsys):
+    options = argparse.Namespace(
+        api=api_address(where), tokens=None, audit=tmp_path / "audit", api_file=None
+    )
     assert options.api == (host, 0)
     with pytest.raises(BadInputError, match="needs --tokens DIR"):
         serve_api(options, load_experiment("hover"), load_scene("empty"))

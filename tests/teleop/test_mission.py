@@ -29,6 +29,15 @@ def test_the_old_world_does_not_confirm_a_start_from_spawn():
     assert (flight.state, flight.epoch) == ("FLYING", 2)
 
 
+@pytest.mark.parametrize(("downlink", "after"), [(True, 0.02), (False, 5.02)])
+def test_a_mission_is_over_once_the_robot_knows_or_after_5_s(downlink, after):
+    flight = flying()
+    flight.downlink = downlink
+    flight.operate("cancel")
+    over = [(flight.step(), flight.teleop.over)[1] for _ in range(600)]
+    assert over.index(True) * 0.01 == pytest.approx(after, abs=0.02)
+
+
 def test_dwell_starts_again_outside_of_the_tolerance():
     flight = flying()
     flight.step(position=A, seconds=0.45)
@@ -87,7 +96,7 @@ def test_a_robot_seen_to_hold_gets_the_first_waypoint_at_once():
 def started():
     flight = Flight()
     flight.step(position=AWAY)
-    flight.operate("start", THREE, ID)
+    flight.operate("start", THREE, number=ID)
     flight.step(seconds=0.05)
     return flight
 
@@ -116,7 +125,7 @@ def test_a_robot_that_waits_during_its_mission_is_started_again(guard):
 def test_each_copy_of_a_request_names_the_current_session():
     flight, said = Flight(), []
     flight.step()
-    flight.operate("start", FROM_SPAWN, ID)
+    flight.operate("start", FROM_SPAWN, number=ID)
     for epoch in (1, 1, 2):
         flight.epoch = epoch
         flight.now_ns += REPEAT_NS

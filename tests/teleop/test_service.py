@@ -1,14 +1,11 @@
 """Missions as a service: keys, the queue, the operator's hand, restarts, and what is shown."""
 
 import re
-from argparse import Namespace
 from math import inf, nan
 from unittest.mock import Mock
 
 import pytest
 
-from cloudrc.cli.teleop import _start
-from cloudrc.config.load import load_experiment
 from cloudrc.drivers.teleop import STALL_NS, TeleopLoop
 from cloudrc.exposition.table import MISSION_OUTCOMES
 from cloudrc.messages import Cause, GuardState, Setpoint, Start
@@ -205,17 +202,6 @@ def test_an_event_says_what_happened_once(script, said):
     play(flight, script)
     events = flight.teleop.book.events_after(0)
     assert [said in event["text"] for event in events].count(True) == 1
-
-
-def test_a_restart_with_the_same_options_continues_the_mission():
-    flight, flags = ServiceFlight(), Namespace(start=True, api=None)
-    flight.step()
-    for _ in range(2):
-        assert _start(flags, load_experiment("hover"), flight.teleop)
-        assert list(flight.teleop.book.missions) == ["m1"]
-        flight.restart_teleop()
-    with pytest.raises(ConflictError, match="mission m1 is"):
-        _start(flags, load_experiment("paper"), flight.teleop)
 
 
 def test_every_end_of_a_mission_is_counted_under_its_own_name():

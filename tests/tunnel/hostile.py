@@ -16,7 +16,7 @@ from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[2]))  # it is a program, too
 
-from cloudrc.assembly import build_cloud
+from cloudrc.assembly import build_cloud, start_mission
 from cloudrc.records import Fault
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import Kind
@@ -38,7 +38,7 @@ class Target:
         """Begin a session; time passes after every `pace` datagrams."""
         self.pace, self.now_ns = pace, 0
         self.world = bare_world(ring())
-        self.cloud = build_cloud(HOVER, Identity(CLOCK, b"c" * 16, ring()))
+        self.cloud = build_cloud(HOVER, Identity(CLOCK, b"c" * 16, ring()), start_mission(HOVER))
         self.frames: list[bytes] = []
         for _ in range(40):  # until both are in one session
             self.cloud.handle_deadline(self.cloud.next_deadline_ns())
@@ -72,7 +72,7 @@ class Target:
         accepted = "used late repeated stale hello busy accept_ignored unanswered".split()
         ends = (self.world, self.cloud)
         return (
-            [[end._counts[name] for name in accepted] for end in ends],
+            [[end.counts[name] for name in accepted] for end in ends],
             [end._session.epoch for end in ends],
             *(self.world._door._fresh_until_ns, self.cloud._heard_ns),
             *(self.world._number, self.world._waiting),

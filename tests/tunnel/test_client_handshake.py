@@ -1,5 +1,7 @@
 """Cloud's side of the handshake, the faults that it causes, and an end's datagrams."""
 
+from collections import Counter
+
 import pytest
 
 from cloudrc.records import Fault, SessionOpened
@@ -129,7 +131,9 @@ def test_another_version_or_key_is_logged_once(code, text):
 
 
 def test_a_text_is_told_once_in_a_session():
-    end = TunnelEnd(Identity(CLOCK, NONCE, ring()), codec.Direction.UPLINK, True)
+    end = TunnelEnd(
+        Identity(CLOCK, NONCE, ring()), codec.Direction.UPLINK, Counter(), newest_wins=True
+    )
     for data in (bytes(16), bytes([4]) + bytes(15), bytes(16)):
         end._tell_refusal("version", data, 7)
     end._tell_refusal("malformed", bytes(16), 7)

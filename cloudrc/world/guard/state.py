@@ -94,9 +94,9 @@ class Guard:
             [ns].
         acceleration_max: Largest rate of change of the velocity reference [m/s^2].
         changes: Changes of the state since the last `take_changes`.
-        counts: "limited_speed": number of shortened velocities of commands and plans;
-            "limited_yaw_rate": commands with a limited yaw rate; "limited_fence": steps in which
-            the fence limited the reference.
+        counts: Counters of world. The guard counts "limited_speed": shortened velocities of
+            commands and plans; "limited_yaw_rate": commands with a limited yaw rate;
+            "limited_fence": steps in which the fence limited the reference.
     """
 
     def __init__(self, limits: ResolvedGuard) -> None:
