@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc.errors import BadInputError
 from cloudrc.files import read, version
-from cloudrc.link.profile import DirectionProfile
 from cloudrc.link.state import CHANGE_FILE, Change, parse, read_change
 
 if TYPE_CHECKING:
+    from cloudrc.link.profile import DirectionProfile
     from cloudrc.link.relay import Address
 
 PROFILE_PERIOD = 0.05  # time between two checks whether the profile's file has changed [s]

@@ -138,3 +138,16 @@ def _conditions(profile: DirectionProfile, instant: float) -> Conditions:
     blackout = any(b.start_s <= instant < b.start_s + b.duration_s for b in profile.blackouts)
     rate = None if rate is None else rate * 1e3
     return Conditions(round(delay * 1e9), jitter * 1e-3, loss, rate, blackout)
+
+
+def summary(profile: DirectionProfile) -> dict[str, float | None]:
+    """Summarise a direction's conditions at the start of its time line.
+
+    Returns:
+        `delay` and `jitter` [s]; `loss`, the long-run share in [0, 1]; and `rate` [bit/s], which is
+        None without a bottleneck.
+    """
+    first = Timeline(profile).at(0)
+    loss = 1.0 if first.blackout else mean_loss(first.loss)
+    delay = round(first.delay_ns * 1e-9, 9)
+    return {"delay": delay, "jitter": first.jitter, "loss": loss, "rate": first.rate}

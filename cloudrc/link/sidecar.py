@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 from cloudrc.errors import CloudrcError
 from cloudrc.files import write_atomically
 from cloudrc.link.follow import Loaded
-from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.profile import DirectionProfile, summary
 from cloudrc.link.relay import Address, Relay
-from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, summary, to_text
+from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE, LinkState, to_text
 
 if TYPE_CHECKING:
     from cloudrc.link.netem import Netem

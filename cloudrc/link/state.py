@@ -11,8 +11,6 @@ from dataclasses import asdict, dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from cloudrc.link.profile import DirectionProfile, Timeline, mean_loss
-
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
@@ -56,7 +54,7 @@ class LinkState:
     changes: int = 0  # number of changes since the link came up
     change: str = ""  # number of the last change that took effect; "" if unknown
     cause: str = ""  # why the profile was changed, in words; "" before the first change
-    asked: dict[str, float | None] = field(default_factory=dict)  # the result of `summary`
+    asked: dict[str, float | None] = field(default_factory=dict)  # the result of `profile.summary`
     origin_ns: int = 0  # start of the time line [ns]
     refused: str = ""  # number of the last refused change; "" if no change was refused
     refusal: str = ""  # why the last refused change was refused, in words
@@ -105,16 +103,3 @@ def read_change(text: str) -> Change:
         return Change(str(found["number"]), str(found["cause"]), bool(found["restart"]))
     except (ValueError, KeyError, TypeError):
         return Change()
-
-
-def summary(profile: DirectionProfile) -> dict[str, float | None]:
-    """Summarise a direction's conditions at the start of its time line.
-
-    Returns:
-        `delay` and `jitter` [s]; `loss`, the long-run share in [0, 1]; and `rate` [bit/s], which is
-        None without a bottleneck.
-    """
-    first = Timeline(profile).at(0)
-    loss = 1.0 if first.blackout else mean_loss(first.loss)
-    delay = round(first.delay_ns * 1e-9, 9)
-    return {"delay": delay, "jitter": first.jitter, "loss": loss, "rate": first.rate}

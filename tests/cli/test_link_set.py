@@ -13,7 +13,8 @@ from cloudrc.drivers import local
 from cloudrc.errors import BadInputError
 from cloudrc.files import write_atomically
 from cloudrc.link.follow import HANDED_FILE, Profiles
-from cloudrc.link.state import LinkState, summary, to_text
+from cloudrc.link.profile import summary
+from cloudrc.link.state import LinkState, to_text
 
 CHANGES = [{"at_s": 9.0, "delay_ms": 50.0, "jitter_ms": 20.0}, {"at_s": 12.0, "loss": 0.1}]
 TIMED = {"uplink": {"delay_ms": 40.0}, "downlink": {"delay_ms": 25.0, "changes": CHANGES}}

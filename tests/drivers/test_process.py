@@ -199,7 +199,7 @@ def end(path, pipe):
     )
     keys = SimpleNamespace(follow=lambda now_ns: [Fault(now_ns, "key", "new key")])
     feed = Feed(pipe[1], watched=False)
-    check = SimpleNamespace(after=lambda records, now_ns: [])
+    check = SimpleNamespace(after=lambda records, now_ns: [], request=lambda profile: None)
     made = EndProcess("world", None, recorder, keys, feed, path, check, Exporter("world"))
     made.recorded = put
     return made
