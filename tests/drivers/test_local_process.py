@@ -68,20 +68,6 @@ def test_ctrl_c_ends_all_processes_in_2_s_and_leaves_a_report(tmp_path, how):
     assert (tmp_path / "run" / "mission.mcap").stat().st_size > 1000
 
 
-def test_a_killed_supervisor_ends_all_and_leaves_a_recording(tmp_path):
-    folder = tmp_path / "run"
-    run = start(folder)
-    pids = wait_until_flying(run)
-    time.sleep(1.0)
-    run.kill()
-    run.communicate()
-    wait_until_ended(pids, 5.0)
-    assert local.under_way() == {}, "nor does a file say that it flies"
-    subprocess.run([*COMMAND, "report", str(folder)], check=False, capture_output=True)
-    assert report(folder)["numbers"]["commands_applied"]["value"] > 10
-    assert (folder / "mission.mcap").exists()
-
-
 HANGS, DIES = signal.SIGSTOP, signal.SIGKILL
 
 

@@ -210,13 +210,6 @@ def test_an_experiment_has_the_same_records_in_c(name, settings, monkeypatch):
     assert not isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
 
 
-@pytest.mark.parametrize("setting", ["wind.velocity_mps=[0, 1]", "plant.mass_factor=1.1"])
-def test_what_c_cannot_simulate_is_flown_in_python(setting):
-    experiment = load_experiment("hover", [f"world.{setting}"])
-    identity = Identity(CLOCK, bytes(16), ring())
-    assert not isinstance(assembly.build_world(experiment, identity).robot, NativeRobot)
-
-
 def test_the_number_of_contacts_is_found_in_the_memory_of_mujoco():
     simulator = Simulator("pelican", "empty")
     data, contacts = simulator.data, simulator.data.ncon
