@@ -15,7 +15,6 @@ from tempfile import TemporaryDirectory
 import pytest
 
 from cloudrc import assembly
-from cloudrc.cli.client import Api
 from cloudrc.cloud.operator import EmergencyStopRepeater
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import Cause, GuardState, OperatorRequest, Request, Setpoint, Start
@@ -291,11 +290,6 @@ def play(flight, script):
             getattr(flight, do.get(action, action))()
 
 
-def finish(flight):
-    """Fly to all waypoints of `FROM_SPAWN`."""
-    play(flight, "A B C")
-
-
 def asked(flight, since=0):
     """Requests since an index, without those that only carry progress."""
     return [r.request for r in flight.requests[since:] if r.request is not Request.PROGRESS]
@@ -383,10 +377,6 @@ class Running:
         """Return the status and the answer of a POST; `body` may be bytes."""
         data = body if isinstance(body, bytes) else json.dumps(body).encode()
         return self.send(self.request(path, data, token, "POST"))
-
-    def post_local(self, path, body=None):
-        """Post over the socket file."""
-        return Api(self.url).post(path, body)
 
     def send(self, request):
         try:
