@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import socket
+import time
 from math import isfinite, nan
 
 import pytest
@@ -36,6 +37,15 @@ def _has_ipv6() -> bool:
     except OSError:
         return False
     return True
+
+
+def wait_until(condition, limit=120.0):
+    """Wait until `condition()` is true, at most `limit` [s]; return how long it took [s]."""
+    began = time.monotonic()
+    while not condition():
+        assert time.monotonic() - began < limit, "not in time"
+        time.sleep(0.01)
+    return time.monotonic() - began
 
 
 needs_ipv6 = pytest.mark.skipif(not _has_ipv6(), reason="needs the IPv6 address ::1")

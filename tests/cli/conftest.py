@@ -1,7 +1,5 @@
 """The working folder of each command, calls of commands, and text that would control a terminal."""
 
-import time
-
 import pytest
 
 from cloudrc.cli.main import main
@@ -19,15 +17,6 @@ def assert_harmless(text, count=None):
     assert text.count(SHOWN) == count if count else SHOWN in text
     assert [c for c in text if not c.isprintable() and c != "\n"] == []
     assert [line for line in text.splitlines() if line.startswith("cloudrc: all")] == []
-
-
-def until(condition, limit=90.0):
-    """Wait until `condition()` is true, at most `limit` [s]; return its value."""
-    deadline = time.monotonic() + limit
-    while not (found := condition()):
-        assert time.monotonic() < deadline, "not in time"
-        time.sleep(0.05)
-    return found
 
 
 @pytest.fixture(autouse=True)

@@ -17,6 +17,7 @@ from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.errors import CloudrcError
 from cloudrc.messages import GuardState
 from cloudrc.teleop.wire import decode, encode
+from tests.conftest import wait_until
 
 
 def as_bytes(message):
@@ -187,10 +188,7 @@ class Release:
         return missions[-1] if missions else {"state": "away", "reached": []}
 
     def until(self, condition):
-        limit = time.monotonic() + LIMIT
-        while not condition():
-            assert time.monotonic() < limit, "not in time"
-            time.sleep(0.05)
+        wait_until(condition, LIMIT)
 
     def until_guard(self, state):
         self.until(lambda: self.ask("/v1/state")["seen"]["guard"] == state)

@@ -16,7 +16,7 @@ import pytest
 
 from cloudrc.drivers import local
 from cloudrc.record.columns import Recording
-from tests.conftest import nightly
+from tests.conftest import nightly, wait_until
 from tests.drivers.conftest import WITHOUT_PAGE, start, wait_until_flying
 
 pytestmark = pytest.mark.process
@@ -43,10 +43,7 @@ def alive(pid):
 
 def wait_until_ended(pids, limit):
     """Wait until all processes have ended, at most `limit` [s]."""
-    until = time.monotonic() + limit
-    while any(alive(pid) for pid in pids.values()):
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    wait_until(lambda: not any(map(alive, pids.values())), limit)
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, *nightly(signal.SIGTERM, signal.SIGHUP)])

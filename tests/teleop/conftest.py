@@ -28,6 +28,7 @@ from cloudrc.teleop.models import read_goto, read_order
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import ConflictError, MissionStore, Order, UnavailableError
 from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus
+from tests.conftest import wait_until
 
 PERIOD_NS = 10_000_000
 A, B, C = (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (3.0, 0.0, 1.0)
@@ -393,10 +394,7 @@ class Running:
         return [json.loads(line) for line in self.audit_file.read_text().splitlines()]
 
     def until(self, condition):
-        limit = time.monotonic() + LIMIT
-        while not condition():
-            assert time.monotonic() < limit, "not in time"
-            time.sleep(0.01)
+        wait_until(condition, LIMIT)
 
     def fly(self, mission):
         """Post a mission and wait until it flies; return its id."""
