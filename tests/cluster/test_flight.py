@@ -16,6 +16,7 @@ from cloudrc.record.writer import McapWriter
 from cloudrc.records import LinkChanged
 from tests.cluster.conftest import terminated
 from tests.flights.conftest import records
+from tests.record.conftest import later
 
 SECOND = 1_000_000_000
 NAME, SETTING = "hover", "mission.waypoints.0.dwell_s=1.0"
@@ -27,10 +28,6 @@ def flown():
     world, cloud = records(load_experiment(NAME, [SETTING]))
     link = LinkChanged(world[0].stamp_ns, True, "relay", "", 0.0, nan, 0.02, 0.0, 0.0, nan, "{}")
     return [link, *world], cloud
-
-
-def later(given, by_ns):
-    return [record._replace(stamp_ns=record.stamp_ns + by_ns) for record in given]
 
 
 def record(folder, *flights, torn):

@@ -13,13 +13,12 @@ from cloudrc.config.load import dump
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
-from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted
 from cloudrc.report.document import Run
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
 from tests.metrics.conftest import at, good, paper
-from tests.record.conftest import rewrite, write_mission
+from tests.record.conftest import rewrite, write, write_mission
 
 RUN = Run("virtual", "virtual", notes=("seen",), physics_steps="C")
 
@@ -132,11 +131,14 @@ def test_an_interrupted_run_stays_interrupted(run):
     assert found["notes"][0] == "the relay died"
 
 
+def write_ends(folder):
+    """Record the flight as the processes of world and cloud do."""
+    for end, records in zip(("world", "cloud"), good().ends(), strict=True):
+        write(folder / f"{end}.mcap", records, end, "same")
+
+
 def test_a_run_with_a_torn_end_keeps_its_facts(run):
-    world, cloud = good().ends()
-    for end, part in (("world", world), ("cloud", cloud)):
-        with McapWriter(run / f"{end}.mcap", clock=end, clock_id="same") as writer:
-            writer.write(part)
+    write_ends(run)
     cut(run / "world.mcap", run / "world.mcap")
     mission = merge(run / "world.mcap", run / "cloud.mcap")
     facts = Run("cluster", "netem", interrupted=True, notes=("the world process died",))
@@ -153,10 +155,7 @@ def test_a_recording_of_an_earlier_version_gives_a_report(run):
 
 
 def test_the_recordings_are_merged_if_they_are_not_yet(run):
-    world, cloud = good().ends()
-    for end, part in (("world", world), ("cloud", cloud)):
-        with McapWriter(run / f"{end}.mcap", clock=end, clock_id="same") as writer:
-            writer.write(part)
+    write_ends(run)
     first = report(run)["numbers"]
     for what in (Path.unlink, lambda path: path.write_bytes(b"")):
         what(run / "mission.mcap")

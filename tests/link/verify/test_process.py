@@ -8,28 +8,14 @@ from functools import partial
 import pytest
 
 from cloudrc.cli import link_verify
-from cloudrc.cli.link_verify import find_experiment, make_plans, probe_link, run_link
+from cloudrc.cli.link_verify import find_experiment, run_link
 from cloudrc.cli.main import main
 from cloudrc.config.schema import Profile
 from cloudrc.errors import CloudrcError
-from cloudrc.link.verify.causes import find_causes
-from cloudrc.link.verify.judge import verdict_of
 
 # Far above what a machine adds that does other things, too.
 LINK = ["link.uplink.delay_ms=100", "link.uplink.jitter_ms=40", "link.downlink.delay_ms=80"]
 LINK += ["link.downlink.jitter_ms=30"]
-
-
-@pytest.mark.process
-def test_an_honest_link_is_believed_unless_the_machine_delays_it():
-    experiment = find_experiment("paper-p1", LINK)
-    with run_link(experiment, "relay") as ways:
-        found = probe_link(ways, make_plans(experiment, 4.0, "relay"))
-    codes = {cause.code for cause in find_causes(found)}
-    for rows, known in found.values():
-        if "throttled" not in codes:  # the suite runs on machines that do other things, too
-            assert verdict_of(rows) == "ok"
-        assert (known.shaper, known.layers, known.passed) == ("relay", 1, known.sent)
 
 
 @pytest.mark.process
