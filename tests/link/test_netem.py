@@ -11,16 +11,7 @@ from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.draws import Purpose, shape, stream_key
-from cloudrc.link.netem import (
-    STRETCH,
-    Netem,
-    check,
-    explain,
-    limit,
-    options,
-    table,
-    write_table,
-)
+from cloudrc.link.netem import STRETCH, Netem, check, explain, limit, options, table, write_table
 from cloudrc.link.profile import Blackout, Change, DirectionProfile, GilbertElliott, Timeline, Trace
 
 PEER = ("10.244.0.7", 7400)

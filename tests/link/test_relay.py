@@ -20,14 +20,7 @@ from cloudrc.exposition.table import LINK_OUTCOMES, RELEASE_PERCENTILES
 from cloudrc.link import relay as module
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
-from cloudrc.link.relay import (
-    AGE_MAX_NS,
-    QUANTILES,
-    Relay,
-    ReleaseErrors,
-    Stamps,
-    ask_for_stamps,
-)
+from cloudrc.link.relay import AGE_MAX_NS, QUANTILES, Relay, ReleaseErrors, Stamps, ask_for_stamps
 from cloudrc.link.verify.judge import Flow, Plan
 from cloudrc.link.verify.probe import PROBE, ProbeEnd
 from cloudrc.tunnel.codec import Kind, encode_header

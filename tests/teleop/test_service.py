@@ -16,14 +16,7 @@ from cloudrc.teleop.api import Bridge
 from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX, next_step
 from cloudrc.teleop.store import ConflictError, Order, UnavailableError
 from cloudrc.teleop.wire import ENDED, STATES, Leg, Plan
-from tests.teleop.conftest import (
-    FROM_SPAWN,
-    PLACES,
-    A,
-    ServiceFlight,
-    play,
-    service_flying,
-)
+from tests.teleop.conftest import FROM_SPAWN, PLACES, A, ServiceFlight, play, service_flying
 
 QUICK = Plan((Leg(A, dwell=0.0),), Start.HERE)
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState

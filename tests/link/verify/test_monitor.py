@@ -15,14 +15,7 @@ from cloudrc.link.verify.judge import netem_makes
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.records import Arrival, Fault, Lateness, LinkChecked, Record
 from tests.console.conftest import control
-from tests.link.verify.conftest import (
-    PERIOD_NS,
-    arrivals,
-    asked,
-    checked,
-    hearing,
-    is_believed,
-)
+from tests.link.verify.conftest import PERIOD_NS, arrivals, asked, checked, hearing, is_believed
 
 PAPER = asked("paper-p2", "downlink")
 
