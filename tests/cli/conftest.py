@@ -2,8 +2,6 @@
 
 import pytest
 
-from cloudrc.cli.main import main
-
 KEYS = "mission.steps.count=1", "mission.steps.period_s=1.0", "criteria.settle_m=null"
 SHORT = [f"--set={key}" for key in KEYS]
 """Overrides of `steps` for one second of flight."""
@@ -24,30 +22,6 @@ def folder(tmp_path, monkeypatch):
     """Work in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-@pytest.fixture
-def call(capsys):
-    """Return a function that runs a command, checks its exit code, and returns its output."""
-
-    def run(line, *more, code=0):
-        capsys.readouterr()
-        assert main([*line.split(), *map(str, more)]) == code
-        return capsys.readouterr()
-
-    return run
-
-
-@pytest.fixture
-def refused(call):
-    """Return a function that runs a command and returns its only output: one line of error."""
-
-    def run(line, *more, code=2):
-        out, error = call(line, *more, code=code)
-        assert (out, error.count("\n"), error[:16]) == ("", 1, "cloudrc: error: ")
-        return error
-
-    return run
 
 
 @pytest.fixture

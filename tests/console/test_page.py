@@ -13,7 +13,6 @@ from PIL import Image
 
 from cloudrc.cli import extras
 from cloudrc.cli.client import Api
-from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import PANEL_WIDTH, Page, _with_gaps
@@ -254,13 +253,11 @@ def test_a_port_in_use_is_an_error():
             Page(port)
 
 
-def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys):
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch, refused):
     monkeypatch.setitem(extras.EXTRAS, "console", ("viser_is_not_here",))
-    assert main(["console"]) == 3
-    assert "pip install 'cloudrc[console]'" in capsys.readouterr().err
+    assert "pip install 'cloudrc[console]'" in refused("console", code=3)
 
 
-def test_without_a_flight_the_console_says_so(monkeypatch, capsys, tmp_path):
+def test_without_a_flight_the_console_says_so(monkeypatch, refused, tmp_path):
     monkeypatch.chdir(tmp_path)
-    assert main(["console"]) == 2
-    assert "no run flies here" in capsys.readouterr().err
+    assert "no run flies here" in refused("console")

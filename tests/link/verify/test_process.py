@@ -9,7 +9,6 @@ import pytest
 
 from cloudrc.cli import link_verify
 from cloudrc.cli.link_verify import find_experiment, run_link
-from cloudrc.cli.main import main
 from cloudrc.config.schema import Profile
 from cloudrc.errors import CloudrcError
 
@@ -19,25 +18,20 @@ LINK += ["link.downlink.jitter_ms=30"]
 
 
 @pytest.mark.process
-def test_a_fault_is_named_on_the_command_line(capsys, monkeypatch):
+def test_a_fault_is_named_on_the_command_line(call, monkeypatch):
     twice = {"delay_ms": 200.0, "jitter_ms": 40.0}, {"delay_ms": 160.0, "jitter_ms": 30.0}
     wrong = Profile.model_validate(dict(zip(("uplink", "downlink"), twice, strict=True)))
     monkeypatch.setattr(link_verify, "run_link", partial(run_link, applied=wrong))
-    words = ["link", "verify", "paper-p1", "--seconds", "4", "-o", "json"]
-    words += [word for value in LINK for word in ("--set", value)]
-    assert main(words) == 1
-    report = json.loads(capsys.readouterr().out)
+    settings = [f"--set={value}" for value in LINK]
+    report = json.loads(call("link verify paper-p1 --seconds 4 -o json", *settings, code=1).out)
     assert report["verdict"] == "not believed"
     assert {cause["code"] for cause in report["causes"]} - {"throttled"} == {"doubled_delay"}
     assert {row["name"] for row in report["directions"]["uplink"]["rows"]} >= {"mean", "loss"}
 
 
-def test_netem_without_root_is_a_missing_prerequisite(monkeypatch, capsys):
+def test_netem_without_root_is_a_missing_prerequisite(monkeypatch, refused):
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    assert main(["link", "verify", "ideal", "--shaper", "netem"]) == 3
-    said = capsys.readouterr().err.strip()
-    assert "needs root" in said
-    assert "\n" not in said
+    assert "needs root" in refused("link verify ideal --shaper netem", code=3)
 
 
 @pytest.mark.parametrize(
