@@ -1,4 +1,4 @@
-"""Fixtures of all tests: a browser, checked numbers, signals and folders as in a new process."""
+"""Fixtures of all tests: commands, a browser, checked numbers, signals as in a new process."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ import os
 import shutil
 import signal
 import socket
+import time
 from math import isfinite, nan
 
 import pytest
+
+from cloudrc.cli.main import main
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
@@ -36,6 +39,15 @@ def _has_ipv6() -> bool:
     except OSError:
         return False
     return True
+
+
+def wait_until(condition, limit=120.0):
+    """Wait until `condition()` is true, at most `limit` [s]; return how long it took [s]."""
+    began = time.monotonic()
+    while not condition():
+        assert time.monotonic() - began < limit, "not in time"
+        time.sleep(0.01)
+    return time.monotonic() - began
 
 
 needs_ipv6 = pytest.mark.skipif(not _has_ipv6(), reason="needs the IPv6 address ::1")
@@ -109,6 +121,30 @@ def signals_stay_as_they_were():
         if signal.getsignal(number) is not handler:
             signal.signal(number, handler)
     gc.unfreeze()  # a command may freeze what it has loaded
+
+
+@pytest.fixture
+def call(capsys):
+    """Return a function that runs a command, checks its exit code, and returns its output."""
+
+    def run(line, *more, code=0):
+        capsys.readouterr()
+        assert main([*line.split(), *map(str, more)]) == code
+        return capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def refused(call):
+    """Return a function that runs a command and returns its only output: one line of error."""
+
+    def run(line, *more, code=2):
+        out, error = call(line, *more, code=code)
+        assert (out, error.count("\n"), error[:16]) == ("", 1, "cloudrc: error: ")
+        return error
+
+    return run
 
 
 @pytest.fixture(scope="session")

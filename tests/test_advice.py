@@ -8,13 +8,11 @@ from cloudrc.advice import advise
 from cloudrc.config import shipped
 from cloudrc.config.load import load_experiment
 from tests.conftest import nightly
-from tests.flights.conftest import fly, numbers
+from tests.flights.conftest import both_ways, fly, numbers
 
 
 def both(delay, jitter, **others):
-    keys = {"delay_ms": delay, "jitter_ms": jitter, **others}
-    ways = ("uplink", "downlink")
-    return ["link.profile=ideal", *(f"link.{way}.{k}={v}" for way in ways for k, v in keys.items())]
+    return ["link.profile=ideal", *both_ways(delay_ms=delay, jitter_ms=jitter, **others)]
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 import cloudrc
-from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,11 +23,11 @@ def result():
     return cloudrc.fly("steps", SHORT, seed=3)
 
 
-def test_a_flight_equals_that_of_the_command(result, tmp_path, capsys, monkeypatch):
+def test_a_flight_equals_that_of_the_command(result, tmp_path, call, monkeypatch):
     monkeypatch.setattr("cloudrc.report.write._write_page", lambda *given: None)
-    sets = [word for key, value in SHORT.items() for word in ("--set", f"{key}={value}")]
-    main(["run", "steps", "--mode=virtual", "--seed=3", *sets, f"--out={tmp_path}/run", "-o=json"])
-    report = json.loads(capsys.readouterr().out)
+    sets = [f"--set={key}={value}" for key, value in SHORT.items()]
+    out = call("run steps --mode=virtual --seed=3 -o=json", *sets, "--out", tmp_path / "run").out
+    report = json.loads(out)
     assert result.records_sha256 == report["records_sha256"]
     assert result.verdict == report["verdict"]
     measured = {name: (value, result.units[name]) for name, value in result.numbers.items()}

@@ -4,7 +4,6 @@ import json
 
 import pytest
 
-from cloudrc.cli.main import main
 from tools import evidence
 
 
@@ -27,15 +26,14 @@ def test_the_nightly_page_shows_the_worst_of_each_number(figure, tmp_path, monke
     ]
 
 
-def test_the_nightly_page_shows_all_kinds_of_results(tmp_path, capsys):
+def test_the_nightly_page_shows_all_kinds_of_results(tmp_path, call):
     files = {
         "search-adversarial.json": "",  # its command failed
         "tests.xml": '<testsuite tests="9" failures="1" errors="0" skipped="2"/>',
         "mutants.txt": "  a.x_b__mutmut_1: killed\n  a.x_b__mutmut_2: survived\n",
     }
     for name, words in (("faults", "run F17"), ("search-random", "search --minutes 0.001")):
-        assert main(["faults", *words.split(), "-o", "json"]) == 0
-        files[f"{name}.json"] = capsys.readouterr().out
+        files[f"{name}.json"] = call(f"faults {words} -o json").out
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     evidence.write(tmp_path)

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.main import main
 from tests.conftest import nightly
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -96,9 +95,8 @@ def numbers_only(folder, monkeypatch):
 
 @pytest.mark.usefixtures("numbers_only")
 @pytest.mark.parametrize("command", FLIGHTS[1:])
-def test_another_flight_works(command, capsys):
-    assert main(shlex.split(command)[1:]) == 0
-    captured = capsys.readouterr()
+def test_another_flight_works(command, call):
+    captured = call("", *shlex.split(command)[1:])
     assert captured.err == ""
     assert "faults noted" not in captured.out
     folder = Path(captured.out.splitlines()[-1]).parent
@@ -106,23 +104,22 @@ def test_another_flight_works(command, capsys):
 
 
 @pytest.mark.usefixtures("numbers_only")
-def test_the_readme_s_way_to_read_a_recording_works(folder):
-    assert main("run hover --mode virtual --set mission.waypoints.0.dwell_s=1".split()) == 0
+def test_the_readme_s_way_to_read_a_recording_works(folder, call):
+    call("run hover --mode virtual --set mission.waypoints.0.dwell_s=1")
     done = execute(f"{sys.executable} read_recording.py", folder)
     assert done.returncode == 0, done.stderr
     assert "the base is at" in done.stdout
 
 
 @pytest.mark.usefixtures("numbers_only")
-def test_the_predictor_and_the_metric_of_the_pages_work(capsys):
+def test_the_predictor_and_the_metric_of_the_pages_work(call):
     """Compare a share of 0.5 with a share of 1, which is the predictor `constant_velocity`."""
     fly = "run steps --mode virtual -o json --set mission.steps.count=3"
     fly += " --set cloud.predictor=./my_predictor.py --set report.metrics=./overshoot.py"
     report = "report runs/latest --metric ./overshoot.py -o json"
     found = []
     for line in (*(f"{fly} --set cloud.predictor.share={share}" for share in (0.5, 1.0)), report):
-        assert main(line.split()) == 0
-        numbers = json.loads(capsys.readouterr().out)["numbers"]
+        numbers = json.loads(call(line).out)["numbers"]
         found.append({name: number["value"] for name, number in numbers.items()})
     half, whole, again = found
     assert half["fault_count"] == whole["fault_count"] == 0

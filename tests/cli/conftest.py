@@ -1,10 +1,6 @@
 """The working folder of each command, calls of commands, and text that would control a terminal."""
 
-import time
-
 import pytest
-
-from cloudrc.cli.main import main
 
 KEYS = "mission.steps.count=1", "mission.steps.period_s=1.0", "criteria.settle_m=null"
 SHORT = [f"--set={key}" for key in KEYS]
@@ -21,44 +17,11 @@ def assert_harmless(text, count=None):
     assert [line for line in text.splitlines() if line.startswith("cloudrc: all")] == []
 
 
-def until(condition, limit=90.0):
-    """Wait until `condition()` is true, at most `limit` [s]; return its value."""
-    deadline = time.monotonic() + limit
-    while not (found := condition()):
-        assert time.monotonic() < deadline, "not in time"
-        time.sleep(0.05)
-    return found
-
-
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     """Work in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-@pytest.fixture
-def call(capsys):
-    """Return a function that runs a command, checks its exit code, and returns its output."""
-
-    def run(line, *more, code=0):
-        capsys.readouterr()
-        assert main([*line.split(), *map(str, more)]) == code
-        return capsys.readouterr()
-
-    return run
-
-
-@pytest.fixture
-def refused(call):
-    """Return a function that runs a command and returns its only output: one line of error."""
-
-    def run(line, *more, code=2):
-        out, error = call(line, *more, code=code)
-        assert (out, error.count("\n"), error[:16]) == ("", 1, "cloudrc: error: ")
-        return error
-
-    return run
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import pytest
 
 from cloudrc.cli.client import Api
 from cloudrc.drivers import local
-from tests.cli.conftest import until
+from tests.conftest import wait_until
 from tests.teleop.conftest import running
 
 SET = "link set uplink.loss=0.1"
@@ -79,7 +79,7 @@ def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call):
         served.until(lambda: api.get("/v1/state")["mission"]["state"] == "flying")
 
         def cancel_second():
-            until(lambda: len(api.get("/v1/missions")["missions"]) == 2)
+            wait_until(lambda: len(api.get("/v1/missions")["missions"]) == 2)
             api.post("/v1/missions/m2/cancel")
 
         for words, does in (

@@ -25,7 +25,7 @@ from cloudrc.messages import Start
 from cloudrc.record.columns import Recording
 from cloudrc.teleop.store import Order, open_store
 from cloudrc.teleop.wire import Leg, Plan
-from tests.cli.conftest import until
+from tests.conftest import wait_until
 from tests.drivers.conftest import FAST, processes_of
 
 USING = "cloudrc: using the run in s\n"
@@ -95,7 +95,7 @@ def test_a_console_is_shown_and_a_missing_one_is_explained(folder, monkeypatch):
         monkeypatch.setattr("cloudrc.drivers.machine.interpreter", lambda *words: [*PYTHON, code])
         said = []
         with session._console(folder, said.append):
-            until(lambda: said)
+            wait_until(lambda: said)
         return said
 
     sleeps = "import time; print('console: http://127.0.0.1:1', flush=True); time.sleep(60)"
@@ -123,7 +123,7 @@ def up(folder, *words):
             [*FAST, "up", "hover", "--out", "s", *words], stdout=said, stderr=said
         )
     try:
-        until(lambda: "to end: Ctrl-C here, or cloudrc down" in (folder / "said").read_text())
+        wait_until(lambda: "to end: Ctrl-C here, or cloudrc down" in (folder / "said").read_text())
         yield process
     finally:
         process.kill()
@@ -143,13 +143,13 @@ def test_a_session_flies_missions_and_reports_the_last_one(folder, command, figu
         for _, port in ports:
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=10) as page:
                 assert b"cloudrc_build_info" in page.read()
-        until(lambda: "guard GROUND" in command("mission status --run s"))
+        wait_until(lambda: "guard GROUND" in command("mission status --run s"))
         (folder / "m.yaml").write_text("waypoints: [{position_m: [0.2, 0, 0.6]}]")
         assert "SUCCESS" in command("mission run m.yaml --run s")
         assert "s: flying to (0.5, 0, 1.2); mission m2" in command("mission goto 0.5 0 1.2")
-        until(lambda: "done" in command("mission list --run s").splitlines()[-1])
+        wait_until(lambda: "done" in command("mission list --run s").splitlines()[-1])
         assert "s: in force after" in command("link set downlink.delay_ms=60")
-        until(lambda: "link: downlink 60 " in (folder / "said").read_text())
+        wait_until(lambda: "link: downlink 60 " in (folder / "said").read_text())
         assert command("down") == f"s/report.html\n{USING}"
         assert process.wait(10) == 0
     said = (folder / "said").read_text()
@@ -174,10 +174,10 @@ def test_a_session_that_ends_with_a_drive_has_its_report(folder, command, ended)
             with suppress(ApiError):  # at first there is no telemetry
                 api.post("/v1/drive", {"velocity_mps": velocity})
             time.sleep(0.1)
-        until(lambda: "next: the operator drives;" in command("mission status --run s"))
+        wait_until(lambda: "next: the operator drives;" in command("mission status --run s"))
         if ended:
             command("mission resume --run s")
-            until(lambda: "SUCCESS" in command("mission list --run s"))
+            wait_until(lambda: "SUCCESS" in command("mission list --run s"))
         assert command("down") == f"s/report.html\n{USING}"
         assert process.wait(10) == 0
     document = json.loads((folder / "s/report.json").read_text())
@@ -193,13 +193,13 @@ def test_a_session_that_ends_with_a_drive_has_its_report(folder, command, ended)
 def test_a_session_that_dies_in_flight_can_be_reported(folder, command, victim, code):
     with up(folder) as process:
         command("mission goto 0.5 0 1.2")
-        until(lambda: "mission started" in (folder / "said").read_text())
+        wait_until(lambda: "mission started" in (folder / "said").read_text())
         time.sleep(1.0)
         pids = processes_of(process)
         os.kill(pids[victim] if victim else process.pid, signal.SIGKILL)
         assert process.wait(60) == code
-        until(lambda: local.under_way() == {})
-        until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids.values()))
+        wait_until(lambda: local.under_way() == {})
+        wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids.values()))
     if victim:
         assert "the cloud process died in flight (signal 9)" in (folder / "said").read_text()
     command("report s", code=130)  # interrupted

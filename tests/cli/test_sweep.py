@@ -18,7 +18,8 @@ from cloudrc.cli.sweep_run import as_table, fly_row, summarise
 from cloudrc.cluster import batch
 from cloudrc.sweep.plan import read_plan
 from cloudrc.sweep.store import read_rows
-from tests.cli.conftest import KEYS, SHORT, until
+from tests.cli.conftest import KEYS, SHORT
+from tests.conftest import wait_until
 from tests.sweep.conftest import flown, write_sweep
 
 __all__ = ["write_sweep"]
@@ -162,11 +163,11 @@ def test_a_killed_sweep_continues_to_equal_bytes(write_sweep):
     file = str(write_sweep(seeds=4))
     command = [sys.executable, "-m", "cloudrc", "sweep", "run", file, "--jobs", "2", "--out"]
     with subprocess.Popen([*command, "killed"], stdout=subprocess.DEVNULL) as process:
-        until(lambda: rows("killed"))
+        wait_until(lambda: rows("killed"))
         workers = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
         os.kill(process.pid, signal.SIGKILL)
     assert len(workers) >= 2
-    until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), 20.0)
+    wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), 20.0)
     assert 0 < len(rows("killed")) < 16
     with Path("killed/rows.jsonl").open("ab") as torn:
         torn.write(b'{"key": "73')
@@ -263,6 +264,15 @@ def test_programs_get_a_document(call):
     assert [(run["seed"], run["verdict"]) for run in document["runs"]] == [(1, "success")]
 
 
+def test_numbers_may_be_missing_and_failed_plugins_do_not_count():
+    failed = flown("failure", "plugin_failed", x=9.0)
+    rows = [flown(x=1.0), flown("failure", y=2.0), flown(x=3.0), failed]
+    summary = summarise(rows, {"x": "m", "y": "1"})
+    assert (summary["done"], summary["count"]) == (2, 4)
+    assert (summary["numbers"]["x"]["median"], summary["numbers"]["x"]["count"]) == (2.0, 2)
+    assert "(2 runs)" in as_table(summary)
+
+
 @pytest.mark.process
 def test_a_signal_ends_a_sweep_at_once(folder):
     command = [sys.executable, "-m", "cloudrc", "run", "paper", "--seeds", "40", "--out", "sweep"]
@@ -274,12 +284,3 @@ def test_a_signal_ends_a_sweep_at_once(folder):
     assert "Traceback" not in errors
     counts = json.loads((folder / "sweep/sweep.json").read_text())["counts"]
     assert 1 <= sum(counts.values()) < 40
-
-
-def test_numbers_may_be_missing_and_failed_plugins_do_not_count():
-    failed = flown("failure", "plugin_failed", x=9.0)
-    rows = [flown(x=1.0), flown("failure", y=2.0), flown(x=3.0), failed]
-    summary = summarise(rows, {"x": "m", "y": "1"})
-    assert (summary["done"], summary["count"]) == (2, 4)
-    assert (summary["numbers"]["x"]["median"], summary["numbers"]["x"]["count"]) == (2.0, 2)
-    assert "(2 runs)" in as_table(summary)

@@ -4,11 +4,7 @@ from math import pi, sqrt
 
 import pytest
 
-from cloudrc.cloud.predictors import (
-    commanded_velocity,
-    constant_acceleration,
-    constant_velocity,
-)
+from cloudrc.cloud.predictors import commanded_velocity, constant_acceleration, constant_velocity
 from cloudrc.messages import UPRIGHT, Command, Odometry
 
 HALF = sqrt(0.5)

@@ -7,7 +7,6 @@ from unittest.mock import Mock
 
 import pytest
 
-from cloudrc.cli.main import main
 from cloudrc.cluster import flight, pods
 from cloudrc.cluster.client import ClusterError, connect
 from cloudrc.cluster.jobs import run_job
@@ -16,10 +15,11 @@ from cloudrc.record.writer import McapWriter
 from cloudrc.records import LinkChanged
 from tests.cluster.conftest import terminated
 from tests.flights.conftest import records
+from tests.record.conftest import later
 
 SECOND = 1_000_000_000
 NAME, SETTING = "hover", "mission.waypoints.0.dwell_s=1.0"
-LINE = ["run", NAME, "--set", SETTING, "--mode", "cluster", "-o", "json"]
+LINE = f"run {NAME} --set {SETTING} --mode cluster -o json"
 
 
 @cache
@@ -27,10 +27,6 @@ def flown():
     world, cloud = records(load_experiment(NAME, [SETTING]))
     link = LinkChanged(world[0].stamp_ns, True, "relay", "", 0.0, nan, 0.02, 0.0, 0.0, nan, "{}")
     return [link, *world], cloud
-
-
-def later(given, by_ns):
-    return [record._replace(stamp_ns=record.stamp_ns + by_ns) for record in given]
 
 
 def record(folder, *flights, torn):
@@ -85,15 +81,14 @@ def ends(api, kind="Complete", exit_code=0, message="done"):
     api.at_look(2, action)
 
 
-def test_a_flight_on_a_cluster_writes_a_whole_run(ready, tmp_path, capsys):
+def test_a_flight_on_a_cluster_writes_a_whole_run(ready, tmp_path, call):
     (tmp_path / "two.py").write_text("UNIT = '1'\ndef measure(flight):\n    return 2.0\n")
     ends(ready)
-    code = main([*LINE, "--out", "out", "--set", "report.metrics=./two.py"])
-    captured = capsys.readouterr()
+    # The recording was made in virtual time, so it does not prove real time.
+    captured = call(f"{LINE} --out out --set report.metrics=./two.py", code=6)
     assert "waypoint 1 of 1 reached" in captured.err
     report = json.loads(captured.out)
-    # The recording was made in virtual time, so it does not prove real time.
-    assert (code, report["verdict"]) == (6, "invalid")
+    assert report["verdict"] == "invalid"
     assert (report["mode"], report["shaper"]) == ("cluster", "relay")
     assert report["complete"]
     assert report["numbers"]["waypoints_reached"]["value"] == 1
@@ -110,40 +105,38 @@ def test_a_flight_on_a_cluster_writes_a_whole_run(ready, tmp_path, capsys):
     assert "--namespace=demo --create-namespace" in line
 
 
-def test_a_job_flies_a_carrot_mission_over_the_users_profile(ready, tmp_path):
+def test_a_job_flies_a_carrot_mission_over_the_users_profile(ready, tmp_path, call):
     (tmp_path / "own.yaml").write_text("uplink: {delay_ms: 5}")
     ends(ready)
-    own = ["--set", "mission.carrot.speed_mps=1.5", "--set", "link.profile=./own.yaml"]
-    assert main([*LINE, "--out", "out", *own]) == 6
+    own = "--set mission.carrot.speed_mps=1.5 --set link.profile=./own.yaml"
+    call(f"{LINE} --out out {own}", code=6)
     (plan,) = [body for key, body in ready.objects.items() if key[0] == "configmaps"]
     (text,) = plan["data"].values()
     assert json.loads(text)["carrot"] == {"speed_mps": 1.5, "acceleration_mps2": 2.0}
 
 
-def test_a_refused_mission_leaves_no_run(ready, tmp_path, capsys):
+def test_a_refused_mission_leaves_no_run(ready, tmp_path, call):
     ends(ready, "Failed", 5, "mission m-1 is under way")
-    assert main(LINE) == 5
-    said = capsys.readouterr().err
+    said = call(LINE, code=5).err
     assert "did not fly its mission: mission m-1 is under way" in said
     assert "what was recorded" not in said
     assert list((tmp_path / "runs").glob("*")) == []
 
 
 @pytest.mark.parametrize("left", ["", "before\n"])
-def test_the_recording_from_before_a_restart_is_copied(ready, tmp_path, capsys, left):
+def test_the_recording_from_before_a_restart_is_copied(ready, tmp_path, call, left):
     (key,) = [key for key in ready.objects if key[0] == "pods" and "world" in key[1]]
     ready.objects[key]["status"]["containerStatuses"][0]["restartCount"] = 1
     ends(ready)
     if left:
         (tmp_path / "left").write_text(left)
-    assert main(LINE) == 6
-    assert "world was restarted" in capsys.readouterr().err
+    assert "world was restarted" in call(LINE, code=6).err
     found = (tmp_path / "runs" / "latest").glob("*.before.mcap")
     wanted = {"world.before.mcap": left} if left else {}
     assert {path.name: path.read_text() for path in found} == wanted
 
 
-def test_a_broken_connection_loses_logs_but_no_report(ready, tmp_path, capsys, monkeypatch):
+def test_a_broken_connection_loses_logs_but_no_report(ready, call, monkeypatch):
     def fails(*arguments):
         raise ClusterError("no way to the pod")
 
@@ -155,35 +148,29 @@ def test_a_broken_connection_loses_logs_but_no_report(ready, tmp_path, capsys, m
     monkeypatch.setattr(pods, "fetch_logs", fails)
     monkeypatch.setattr(pods, "fetch_recording", fails_once)
     ends(ready)
-    assert main([*LINE, "--out", "out"]) == 6
-    captured = capsys.readouterr()
+    captured = call(f"{LINE} --out out", code=6)
     assert json.loads(captured.out)["shaper"] == "relay"
     assert "without the world pod's logs: no way to the pod" in captured.err
     assert "no way to the pod; trying again" in captured.err
 
 
-def test_an_interrupted_flight_cancels_and_reports_its_mission(
-    ready, tmp_path, capsys, monkeypatch
-):
+def test_an_interrupted_flight_cancels_and_reports_its_mission(ready, tmp_path, call, monkeypatch):
     monkeypatch.setattr(flight, "follow", Mock(side_effect=KeyboardInterrupt))
     record(tmp_path, [each[: len(each) // 2] for each in flown()], torn=False)
-    assert main([*LINE, "--out", "out"]) == 130
-    captured = capsys.readouterr()
+    captured = call(f"{LINE} --out out", code=130)
     assert "cancelling the mission" in captured.err
     assert "DELETE jobs/" in " ".join(ready.seen)
     report = json.loads(captured.out)
     assert (report["mode"], report["verdict"]) == ("cluster", "interrupted")
 
 
-def test_a_run_does_not_end_a_flight_in_progress(ready, teleop, tmp_path, capsys):
+def test_a_run_does_not_end_a_flight_in_progress(ready, teleop, tmp_path, call):
     teleop.mission = {"id": "m7"}
-    assert main([*LINE, "--out", "out"]) == 5
-    said = capsys.readouterr().err
+    said = call(f"{LINE} --out out", code=5).err
     assert "mission m7 is under way on release 'cloudrc'" in said
     assert "end it: cloudrc mission cancel m7 --namespace=demo --release=cloudrc, or" in said
     run_job(connect(), {}, name="first")
-    assert main([*LINE, "--out", "out"]) == 5
-    assert "Job 'first' is under way" in capsys.readouterr().err
+    assert "Job 'first' is under way" in call(f"{LINE} --out out", code=5).err
     assert not (tmp_path / "helm").exists()
     assert not (tmp_path / "out").exists()
 
@@ -201,7 +188,7 @@ FITTED = "cloud.predictor={name: command_history, model: ./mine.yaml}"
     ],
 )
 def test_files_that_pods_lack_are_refused_before_the_install(
-    tmp_path, capsys, monkeypatch, settings, words
+    tmp_path, call, monkeypatch, settings, words
 ):
     monkeypatch.chdir(tmp_path)
     plugin = "from cloudrc.cloud.predictors.last_sample import build as build\n"
@@ -209,6 +196,5 @@ def test_files_that_pods_lack_are_refused_before_the_install(
     (tmp_path / "mine.xml").write_text("<mujoco/>")
     fitted = "{time_constant: [1, 1, 1], dead_time: [0, 0, 0], gain: [1, 1, 1]}"
     (tmp_path / "mine.yaml").write_text(fitted)
-    assert main(["run", *settings, "--mode", "cluster"]) == 2
-    assert words in capsys.readouterr().err
+    assert words in call("run --mode cluster", *settings, code=2).err
     assert not (tmp_path / "runs").exists()

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 import yaml
 
-from cloudrc.cli.main import main
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.link import APPLY_LIMIT, APPLY_SCRIPT, with_files
 from cloudrc.errors import BadInputError
@@ -22,7 +21,7 @@ from cloudrc.link.state import STATE_FILE, LinkState, to_text
 
 PROFILE = "uplink: {delay_ms: 45, jitter_ms: 25}\ndownlink: {delay_ms: 45, jitter_ms: 25}\n"
 TRACE = "time_s,delay_ms\n0,40\n1,60\n"
-LINE = ["link", "set", "downlink.delay_ms=120", "-n", "demo"]
+LINE = "link set downlink.delay_ms=120 -n demo"
 
 
 def item(kind, name, component, **rest):
@@ -81,8 +80,8 @@ def cluster(monkeypatch):
     return found
 
 
-def test_a_change_reaches_both_pods_and_the_configmap(cluster, capsys):
-    assert main([*LINE, "--context", "kind"]) == 0
+def test_a_change_reaches_both_pods_and_the_configmap(cluster, call):
+    out = call(f"{LINE} --context kind").out
     profile = yaml.safe_load(cluster.kept["profile.yaml"])
     assert profile["uplink"] == {"delay_ms": 45.0, "jitter_ms": 25.0}
     assert profile["downlink"] == {"delay_ms": 120.0, "jitter_ms": 25.0}
@@ -95,14 +94,14 @@ def test_a_change_reaches_both_pods_and_the_configmap(cluster, capsys):
     verbs = [word for line in asked for word in line if word in ("get", "exec", "patch")]
     assert verbs == ["get", "exec", "exec", "patch"], "in force first, then for good"
     assert all(line[:2] == ["--context=kind", "--namespace=demo"] for line in asked)
-    assert "downlink   netem" in capsys.readouterr().out
+    assert "downlink   netem" in out
 
 
-def test_a_local_trace_is_stored_beside_the_profile(cluster, tmp_path, monkeypatch):
+def test_a_local_trace_is_stored_beside_the_profile(cluster, tmp_path, monkeypatch, call):
     (tmp_path / "my trace.csv").write_text(TRACE)
     setting = [f"uplink.trace={tmp_path / 'my trace.csv'}"]
     cluster.items[0]["data"] |= {"old.csv": "of a profile before"}
-    assert main(["link", "set", *setting, "-n", "demo"]) == 0
+    call("link set -n demo", *setting)
     handed = cluster.handed["world-1"]
     assert set(handed) == {"profile.yaml", "change.json", "uplink-my_trace.csv"}
     assert handed["uplink-my_trace.csv"] == cluster.kept["uplink-my_trace.csv"] == TRACE
@@ -118,61 +117,49 @@ def test_a_local_trace_is_stored_beside_the_profile(cluster, tmp_path, monkeypat
         with_files({"profile.yaml": PROFILE}, None, setting)
 
 
-LATER = "; the ConfigMap has the change, and the pods apply it within 2 minutes"
+LATER = "; the ConfigMap has the change, and the pods apply it within 2 minutes\n"
 
 
-def error(capsys):
-    """Return the one line of an error message."""
-    (line,) = capsys.readouterr().err.splitlines()
-    return line
-
-
-def test_an_unreachable_or_silent_container_is_changed_later(cluster, capsys):
+def test_an_unreachable_or_silent_container_is_changed_later(cluster, refused):
     cluster.broken.add("cloud-1")
-    assert main(LINE) == 5
-    said = error(capsys)
+    said = refused(LINE, code=5)
     assert said.count("the pod is gone") == 1
     assert said.endswith(LATER)
     assert cluster.kept
     cluster.broken.clear()
     cluster.deaf.add("cloud-1")
-    assert main(LINE) == 4
-    said = error(capsys)
+    said = refused(LINE, code=4)
     assert "the downlink did not apply the change within 5 s; see the log" in said
     assert said.endswith(f"container link of pod cloud-1{LATER}")
     cluster.states["cloud-1"].clear()
-    assert main(LINE) == 5
-    assert "a link container has another version: not a LinkState: " in error(capsys)
+    said = refused(LINE, code=5)
+    assert "a link container has another version: not a LinkState: " in said
 
 
-def test_a_failed_write_names_where_the_change_is_in_force(cluster, capsys):
+def test_a_failed_write_names_where_the_change_is_in_force(cluster, refused):
     cluster.refused.add("patch")
-    assert main(LINE) == 5
-    said = error(capsys)
+    said = refused(LINE, code=5)
     assert "the ConfigMap is unchanged: 'kubectl patch' failed" in said
     for way in ("uplink", "downlink"):
         assert f"the {way} has the change until its pod is replaced" in said
     cluster.refused.add("exec")
-    assert main(LINE) == 5
-    said = error(capsys)
+    said = refused(LINE, code=5)
     assert (said.count("this is forbidden"), "has the change" in said) == (3, False)
 
 
-def test_a_refused_change_is_not_written_to_the_configmap(cluster, capsys):
+def test_a_refused_change_is_not_written_to_the_configmap(cluster, refused):
     cluster.cannot["cloud-1"] = "corrupt"
-    assert main(["link", "set", "downlink.corrupt=0.5", "uplink.delay_ms=9", "-n", "demo"]) == 2
-    assert error(capsys) == (
+    assert refused("link set downlink.corrupt=0.5 uplink.delay_ms=9 -n demo") == (
         "cloudrc: error: the downlink is unchanged: netem cannot do that; the uplink has the "
-        "change; the ConfigMap is unchanged, and restarted pods take it"
+        "change; the ConfigMap is unchanged, and restarted pods take it\n"
     )
     assert not cluster.kept
 
 
-def test_a_missing_pod_is_named(cluster, running, capsys):
+def test_a_missing_pod_is_named(cluster, running, refused):
     running.get("pods", "world-1")["status"]["phase"] = "Pending"
     del cluster.items[2]
-    assert main(LINE) == 5
-    assert "the world pod of release 'cloudrc' does not run" in error(capsys)
+    assert "the world pod of release 'cloudrc' does not run" in refused(LINE, code=5)
 
 
 # The script in the link container, with a real `sh`.
@@ -246,8 +233,8 @@ KUBECTL_NEEDS = {
 """Verb of kubectl -> permissions that it needs, according to an API server's audit log."""
 
 
-def test_the_role_allows_just_what_its_commands_need(cluster):
-    assert main(LINE) == 0
+def test_the_role_allows_just_what_its_commands_need(cluster, call):
+    call(LINE)
     rules = yaml.safe_load(ROLE.read_text())["rules"]
     (changing,) = (rule for rule in rules if "patch" in rule["verbs"])
     assert changing["resourceNames"] == ["cloudrc-link"], "another one has the guard's limits"

@@ -1,6 +1,5 @@
 """Statuses of the robot, as teleop's API sends them, and an API that a test answers."""
 
-import time
 from math import nan
 
 import pytest
@@ -13,15 +12,6 @@ from cloudrc.teleop.wire import RobotStatus
 
 LIMIT = 120.0
 """Time limit for what has no number of its own [s]: a browser without a graphics card is slow."""
-
-
-def wait_for(condition):
-    """Return how long it takes until the condition holds [s]."""
-    began = time.monotonic()
-    while not condition():
-        assert time.monotonic() - began < LIMIT
-        time.sleep(0.02)
-    return time.monotonic() - began
 
 
 def control(at, basis=0.0, **fields):

@@ -13,7 +13,6 @@ from PIL import Image
 
 from cloudrc.cli import extras
 from cloudrc.cli.client import Api
-from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import PANEL_WIDTH, Page, _with_gaps
@@ -21,7 +20,8 @@ from cloudrc.console.steering import Steering
 from cloudrc.drivers.local import under_way
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import Scene, load_scene
-from tests.console.conftest import LIMIT, status, wait_for
+from tests.conftest import wait_until
+from tests.console.conftest import LIMIT, status
 
 
 def start(folder, *words):
@@ -37,10 +37,10 @@ def session(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.getbasetemp()))
         session = start(folder, "up", "hover", "--set", "link.profile=wifi")
-        wait_for(lambda: under_way() or session.poll() is not None)
+        wait_until(lambda: under_way() or session.poll() is not None)
         ((run, url),) = under_way().items()
         api = Api(url)
-        wait_for(lambda: answers(api))
+        wait_until(lambda: answers(api))
         patch.setenv("BROWSER", "echo opens %s")
         console = start(folder, "console", run)
     address, opened = (console.stdout.readline().split()[-1] for _ in range(2))
@@ -60,9 +60,9 @@ def flight(session):
         api.post("/v1/acknowledge")
     elif mission := api.get("/v1/state")["mission"]:
         api.post(f"/v1/missions/{mission['id']}/cancel")
-    wait_for(lambda: not api.get("/v1/state")["mission"] and answers(api)["guard"] != "ESTOP")
+    wait_until(lambda: not api.get("/v1/state")["mission"] and answers(api)["guard"] != "ESTOP")
     mission = api.post("/v1/missions", {"waypoints": [{"position_m": (0.0, 0.0, 0.6)}]})
-    wait_for(lambda: api.get("/v1/state")["mission"]["state"] == "flying")
+    wait_until(lambda: api.get("/v1/state")["mission"]["state"] == "flying")
     api.post(f"/v1/missions/{mission['id']}/cancel")
     return session
 
@@ -129,16 +129,16 @@ def test_drag_and_send_moves_the_setpoint(flight, page):
         page.mouse.move(x, y - up)
         page.wait_for_timeout(300)
     page.mouse.up()
-    wait_for(lambda: target() != before)
+    wait_until(lambda: target() != before)
     page.wait_for_timeout(1000)
     asked = target()
     button(page, "Send").click()
-    wait_for(lambda: api.get("/v1/state")["mission"])
+    wait_until(lambda: api.get("/v1/state")["mission"])
     mission = api.get("/v1/state")["mission"]
     assert api.get(f"/v1/missions/{mission['id']}")["route_m"] == [asked]
     api.post(f"/v1/missions/{mission['id']}/cancel")
     api.post("/v1/goto", {"position_m": (0.3, 0.2, 0.9)})
-    wait_for(lambda: target() == [0.3, 0.2, 0.9])  # after Send it follows the setpoint again
+    wait_until(lambda: target() == [0.3, 0.2, 0.9])  # after Send it follows the setpoint again
     numbers.nth(2).fill("99")
     page.keyboard.press("Enter")
     button(page, "Send").click()
@@ -153,23 +153,23 @@ def test_drag_and_send_moves_the_setpoint(flight, page):
 def test_keys_drive_and_sliders_change_the_delay(flight, page, figure):
     api, _, _ = flight
     page.keyboard.down("KeyW")
-    wait_for(lambda: api.get("/v1/state")["seen"]["position_m"][2] > 0.5)
+    wait_until(lambda: api.get("/v1/state")["seen"]["position_m"][2] > 0.5)
     page.keyboard.up("KeyW")
     mission = api.get("/v1/state")["mission"]
     assert mission["name"] == "drive"
     page.get_by_role("tab", name="Link").click()
     page.get_by_role("textbox").first.fill("150")  # the uplink's delay
     page.keyboard.press("Enter")
-    took = wait_for(lambda: api.get("/v1/state")["seen"]["rtt_s"] > 0.15)
+    took = wait_until(lambda: api.get("/v1/state")["seen"]["rtt_s"] > 0.15)
     figure("slider to measured delay", took, "<=", 2.0, "s")
     page.get_by_role("textbox").first.fill("9999")
     page.keyboard.press("Enter")
-    wait_for(lambda: page.get_by_role("textbox").first.input_value() == "500")
+    wait_until(lambda: page.get_by_role("textbox").first.input_value() == "500")
     page.get_by_role("textbox").first.fill("10")  # with 500 ms no drive ends: the guard holds
     page.keyboard.press("Enter")
     page.get_by_role("tab", name="Fly").click()
     button(page, "Start").click()  # it ends the drive first
-    wait_for(lambda: (api.get("/v1/state")["mission"] or mission)["name"] == "hover")
+    wait_until(lambda: (api.get("/v1/state")["mission"] or mission)["name"] == "hover")
 
 
 @pytest.mark.process
@@ -190,9 +190,9 @@ def test_the_second_browser_reads_and_stop_works_under_load(browse, flight, page
     for thread in threads:
         thread.start()
     try:
-        wait_for(lambda: api.get("/v1/state")["seen"]["guard"] != "GROUND")
+        wait_until(lambda: api.get("/v1/state")["seen"]["guard"] != "GROUND")
         button(page, "STOP").click()
-        took = wait_for(lambda: api.get("/v1/state")["seen"]["guard"] == "ESTOP")
+        took = wait_until(lambda: api.get("/v1/state")["seen"]["guard"] == "ESTOP")
     finally:
         over.set()
         for thread in threads:
@@ -257,13 +257,11 @@ def test_a_port_in_use_is_an_error():
             Page(port)
 
 
-def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys):
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch, refused):
     monkeypatch.setitem(extras.EXTRAS, "console", ("viser_is_not_here",))
-    assert main(["console"]) == 3
-    assert "pip install 'cloudrc[console]'" in capsys.readouterr().err
+    assert "pip install 'cloudrc[console]'" in refused("console", code=3)
 
 
-def test_without_a_flight_the_console_says_so(monkeypatch, capsys, tmp_path):
+def test_without_a_flight_the_console_says_so(monkeypatch, refused, tmp_path):
     monkeypatch.chdir(tmp_path)
-    assert main(["console"]) == 2
-    assert "no run flies here" in capsys.readouterr().err
+    assert "no run flies here" in refused("console")

@@ -8,7 +8,7 @@ import pytest
 from cloudrc.console.steering import Link, Steering
 from cloudrc.errors import BadInputError
 from cloudrc.messages import ZERO
-from tests.console.conftest import wait_for
+from tests.conftest import wait_until
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def test_held_keys_add_up_and_a_released_one_counts_no_more(steering):
 def test_a_drive_ends_with_a_request_to_rest(api, steering):
     steering.start()
     steering.hold_key("up", (0.0, 0.0, 0.4), 60.0)
-    wait_for(lambda: len(api.posted) > 3)
+    wait_until(lambda: len(api.posted) > 3)
     steering.end_drive()
     assert [body["velocity_mps"][2] for _, body in api.posted[-2:]] == [0.4, 0.0]
 
@@ -102,9 +102,9 @@ def test_a_stop_is_repeated_until_the_api_answers(api, steering):
     api.refused["/v1/estop"] = "teleop does not answer"
     steering.start()
     steering.stop()
-    wait_for(lambda: len(api.posted) >= 3)
+    wait_until(lambda: len(api.posted) >= 3)
     api.refused.clear()
-    wait_for(lambda: steering.answer[0] == "stopping the rotors")
+    wait_until(lambda: steering.answer[0] == "stopping the rotors")
     count = len(api.posted)
     time.sleep(0.5)
     assert len(api.posted) == count
@@ -122,12 +122,12 @@ def test_a_slow_link_gets_the_newest_value_of_each_slider(steering):
     steering.link = Link(change=change)
     steering.start()
     steering.set_link("uplink.delay_ms", 10)
-    wait_for(lambda: applied)
+    wait_until(lambda: applied)
     for value in (20, 30, 40):
         steering.set_link("uplink.delay_ms", value)
     steering.set_link("downlink.loss", 0.25)
     go.set()
-    wait_for(lambda: len(applied) == 2)
+    wait_until(lambda: len(applied) == 2)
     assert applied == [["uplink.delay_ms=10"], ["downlink.loss=0.25", "uplink.delay_ms=40"]]
     steering.set_link("uplink.loss", 2)
-    wait_for(lambda: steering.answer[0] == "link: loss: must be at most 1")
+    wait_until(lambda: steering.answer[0] == "link: loss: must be at most 1")

@@ -16,6 +16,7 @@ from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.errors import CloudrcError
 from cloudrc.messages import GuardState
+from tests.conftest import wait_until
 
 
 @pytest.fixture
@@ -184,10 +185,7 @@ class Release:
         return missions[-1] if missions else {"state": "away", "reached": []}
 
     def until(self, condition):
-        limit = time.monotonic() + LIMIT
-        while not condition():
-            assert time.monotonic() < limit, "not in time"
-            time.sleep(0.05)
+        wait_until(condition, LIMIT)
 
     def until_guard(self, state):
         self.until(lambda: self.ask("/v1/state")["seen"]["guard"] == state)

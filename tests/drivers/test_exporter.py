@@ -13,15 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers import exporter as exporters
 from cloudrc.drivers.exporter import Exporter, read_throttling
-from cloudrc.exposition.table import (
-    BODIES,
-    ENDS,
-    LINK_OUTCOMES,
-    METRICS,
-    ROLES,
-    Kind,
-    of_role,
-)
+from cloudrc.exposition.table import BODIES, ENDS, LINK_OUTCOMES, METRICS, ROLES, Kind, of_role
 from cloudrc.link.relay import ReleaseErrors
 from cloudrc.messages import ZERO
 from cloudrc.records import (

@@ -4,14 +4,13 @@ import json
 import socket
 import subprocess
 import sys
-import time
 from contextlib import ExitStack
 
 import pytest
 
 from cloudrc.cli.client import Api
 from cloudrc.config.load import dump, load_experiment
-from tests.conftest import needs_ipv6
+from tests.conftest import needs_ipv6, wait_until
 from tests.drivers.conftest import LIMIT, TOKEN
 
 FILES = 256
@@ -29,10 +28,7 @@ def test_idle_connections_do_not_lock_a_stop_out(tmp_path):
     command = [sys.executable, *words.split(), "--api", "[::1]:0", "--audit", "audit.jsonl"]
     shell = ["bash", "-c", f'ulimit -Sn {FILES}; exec "$@"', "bash", *command]
     process = subprocess.Popen(shell, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
-    limit = time.monotonic() + LIMIT
-    while not (tmp_path / "api.json").exists():
-        assert time.monotonic() < limit
-        time.sleep(0.02)
+    wait_until((tmp_path / "api.json").exists, LIMIT)
     url = json.loads((tmp_path / "api.json").read_text())["url"]
     with ExitStack() as idle:
         for _ in range(2 * FILES):

@@ -7,7 +7,6 @@ import pytest
 
 from cloudrc import exercise
 from cloudrc.cli import class_
-from cloudrc.cli.main import main
 from cloudrc.exercise import checks
 
 SOLUTION = Path(__file__).with_name("solution")
@@ -66,21 +65,18 @@ def test_whatever_a_file_does_the_other_parts_are_scored(tmp_path):
 
 
 @pytest.mark.process
-def test_gradescope_gets_the_points_of_new_files(tmp_path, capsys):
-    assert main(["class", "new", str(tmp_path / "a")]) == 0
+def test_gradescope_gets_the_points_of_new_files(tmp_path, call):
+    call("class new", tmp_path / "a")
     (tmp_path / "a" / "predictor.py").unlink()
-    capsys.readouterr()
-    assert main(["class", "check", str(tmp_path / "a"), "-o", "gradescope"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    found = json.loads(call("class check -o gradescope", tmp_path / "a").out)
     assert found["score"] == 0.0
     assert sum(test["max_score"] for test in found["tests"]) == 100
     assert found["tests"][3]["output"].endswith("'predictor.py': there is no such file")
     assert {test["visibility"] for test in found["tests"]} == {"visible"}
 
 
-def test_files_are_not_overwritten_and_a_folder_must_exist(tmp_path, capsys):
+def test_files_are_not_overwritten_and_a_folder_must_exist(tmp_path, refused):
     (tmp_path / "controller.py").write_text("my work")
-    assert main(["class", "new", str(tmp_path)]) == 2
+    refused("class new", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["controller.py"]
-    assert main(["class", "check", str(tmp_path / "nowhere")]) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 2
+    refused("class check", tmp_path / "nowhere")

@@ -17,27 +17,11 @@ def test_a_clock_reaches_a_time_exactly_when_it_says(offset_ns, drift_ppm, now_n
     assert clock.at(when_ns - 1) < clock.at(now_ns) <= clock.at(when_ns)
 
 
-def faulty(*events, start=True):
-    return Flight(Schedule(3, "ideal", events), start=start)
-
-
 def test_teleop_pauses_and_its_successor_resumes():
-    flight = faulty(Event("pod_shut_down", 8.0, 4.0, 0.25)).fly(8.5)
+    schedule = Schedule(3, "ideal", (Event("pod_shut_down", 8.0, 4.0, 0.25),))
+    flight = Flight(schedule).fly(8.5)
     assert flight.events("paused")
     assert flight.guard_now()[0] is GuardState.HOLD
     flight.fly(9.5)
     assert (flight.teleop.service, flight.cloud.inner) == (None, None)
     assert flight.fly_mission().mission.state == "done"
-
-
-def test_a_frozen_cloud_forwards_no_old_start():
-    flight = faulty(Event("cloud_paused", 8.0, 3.03), start=False)
-
-    def cancel(service, now_ns):
-        service.cancel(flight.mission.id, now_ns)
-
-    flight.cloud.at(8.2, flight.order_if_possible)
-    flight.cloud.at(10.0, lambda now_ns: flight.teleop.ask(cancel))
-    flight.fly(13.0)
-    assert flight.mission.state == "cancelled"
-    assert flight.changes == []

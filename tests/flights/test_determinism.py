@@ -52,7 +52,7 @@ PLAN = ("cloud.predictor=model_based", "cloud.estimator=earliest", "cloud.plan_s
     "settings",
     [
         *((f"link.profile={name}",) for name in ("paper-p2", "lossy")),
-        ("link.profile=paper-p3", *PLAN),
+        ("link.profile=lte", *PLAN),
     ],
 )
 def test_objects_and_encrypted_bytes_make_the_same_records(settings):

@@ -8,14 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.link.draws import (
-    BLOCK,
-    Purpose,
-    bad_states,
-    normals,
-    stream_key,
-    uniforms,
-)
+from cloudrc.link.draws import BLOCK, Purpose, bad_states, normals, stream_key, uniforms
 from cloudrc.link.model import LinkDirection, Stream, loss_runs, numbers, sample
 from cloudrc.link.profile import Trace
 from tests.link.profiles import blackout, change, changed, in_bursts, profile_of

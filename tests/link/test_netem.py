@@ -10,16 +10,7 @@ from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.draws import Purpose, shape, stream_key
-from cloudrc.link.netem import (
-    STRETCH,
-    Netem,
-    check,
-    explain,
-    limit,
-    options,
-    table,
-    write_table,
-)
+from cloudrc.link.netem import STRETCH, Netem, check, explain, limit, options, table, write_table
 from cloudrc.link.profile import Timeline, Trace
 from cloudrc.link.traces import link_profile
 from tests.link.profiles import blackout, change, in_bursts, profile_of

@@ -19,17 +19,11 @@ from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.exposition.table import LINK_OUTCOMES, RELEASE_PERCENTILES
 from cloudrc.link import relay as module
 from cloudrc.link.model import LinkDirection
-from cloudrc.link.relay import (
-    AGE_MAX_NS,
-    QUANTILES,
-    Relay,
-    ReleaseErrors,
-    Stamps,
-    ask_for_stamps,
-)
+from cloudrc.link.relay import AGE_MAX_NS, QUANTILES, Relay, ReleaseErrors, Stamps, ask_for_stamps
 from cloudrc.link.verify.judge import Flow, Plan
 from cloudrc.link.verify.probe import PROBE, ProbeEnd
 from cloudrc.tunnel.codec import Kind, encode_header
+from tests.conftest import wait_until
 from tests.link.profiles import profile_of
 from tools.bench_link import compare
 
@@ -55,14 +49,6 @@ def peek(data):
 
 def packet(n):
     return n.to_bytes(4, "little")
-
-
-def until(condition):
-    began = time.monotonic()
-    while not condition():
-        assert time.monotonic() < began + PATIENCE, "never came true"
-        time.sleep(0.002)
-    return time.monotonic() - began
 
 
 class Bench:
@@ -109,7 +95,7 @@ def test_a_packet_leaves_when_the_model_says_never_earlier(bench):
         errors.append(time.monotonic_ns() - sent - wanted)
     assert min(errors) >= 0
     assert sorted(errors)[10] < 50 * MS
-    until(lambda: pair.relay.released().get("released") == 20)
+    wait_until(lambda: pair.relay.released().get("released") == 20)
     assert 0 <= pair.relay.counts()["release_error_p99_ns"] < 100 * MS
 
 
@@ -125,7 +111,7 @@ def test_every_datagram_is_counted_once(bench, monkeypatch):
     pair.send(packet(1))
     counts = {"received": 10, "malformed": 4, "overflow": 2, "lost": 1, "forwarded": 3}
     expected = {**dict.fromkeys(LINK_OUTCOMES, 0), **counts}
-    until(lambda: expected.items() <= pair.relay.counts().items())
+    wait_until(lambda: expected.items() <= pair.relay.counts().items())
 
 
 def test_a_stranger_does_not_reach_the_peer(bench):
@@ -134,7 +120,7 @@ def test_a_stranger_does_not_reach_the_peer(bench):
         stranger.sendto(packet(7), pair.route)
     pair.send(packet(1))
     assert [pair.far.recv(100) for _ in range(2)] == [packet(1)] * 2
-    until(lambda: pair.relay.counts()["forwarded"] == 2)
+    wait_until(lambda: pair.relay.counts()["forwarded"] == 2)
     assert pair.relay.counts()["received"] == 1
 
 
@@ -144,7 +130,7 @@ def test_the_peer_can_restart_and_can_change_in_flight(bench):
     pair.far.close()
     for n in range(3):
         pair.send(packet(n))
-    until(lambda: pair.relay.counts()["received"] == 3)
+    wait_until(lambda: pair.relay.counts()["received"] == 3)
     pair.far = bind_loopback(address[1])
     pair.send(packet(3))
     assert pair.far.recv(100) == packet(3)
@@ -223,7 +209,7 @@ def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(tmp_path):
     with subprocess.Popen([*command, "auto"], cwd=ROOT) as process:
         killer = Timer(PATIENCE, process.kill)  # where this test fails, the process ends, too
         killer.start()
-        until((folder / "route").exists)
+        wait_until((folder / "route").exists)
         with bind_loopback() as stranger:
             stranger.sendto(encode_header(Kind.TELEMETRY, 0, 1, 999) + bytes(150), listen)
         Timer(0.2, draft.replace, [profile]).start()
@@ -235,7 +221,7 @@ def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(tmp_path):
             for n in range(300):
                 sender.send(n)
                 sender.receive(far)  # waits for 5 ms if nothing arrives
-            until(lambda: sender.receive(far) or sender.stream().copies.all())
+            wait_until(lambda: sender.receive(far) or sender.stream().copies.all())
         stream = sender.stream()
         assert stream.copies.tolist() == [1] * 300
         assert stream.delays[:20].min() >= 0.250
@@ -246,7 +232,7 @@ def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(tmp_path):
         assert (state["shaper"], state["mode"]) == ("relay", "auto")
         assert state["reason"].startswith("netem does not work here: tc may not change the network")
         process.terminate()
-        assert until(lambda: process.poll() is not None) < 0.5
+        assert wait_until(lambda: process.poll() is not None) < 0.5
         assert process.returncode == 0
         killer.cancel()
     assert [path.name for path in folder.iterdir()] == ["link.json"]

@@ -6,13 +6,7 @@ from cloudrc.config.schema import Mission, Waypoint
 from cloudrc.errors import DISK_FULL
 from cloudrc.messages import GuardState
 from cloudrc.metrics import SHIPPED, Number
-from cloudrc.metrics.verdict import (
-    SLIP_MAX,
-    exit_code,
-    flight_evidence,
-    judge,
-    operator_verdict,
-)
+from cloudrc.metrics.verdict import SLIP_MAX, exit_code, flight_evidence, judge, operator_verdict
 from cloudrc.records import (
     REAL_TIME_FACTOR_MIN,
     Counted,

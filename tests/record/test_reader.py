@@ -15,7 +15,6 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType, Writer
 
-from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
 from cloudrc.record.reader import recover
@@ -300,19 +299,16 @@ def test_a_recording_without_messages_is_not_recovered(path):
     assert not new.exists()
 
 
-def test_the_command_says_what_is_kept_and_lost(path, capsys):
+def test_the_command_says_what_is_kept_and_lost(path, call, refused):
     new = path.with_name("new.mcap")
     path.write_bytes(WHOLE)
-    assert main(["recover", str(path)]) == 0
-    assert "kept 100.0%" in capsys.readouterr().out
+    assert "kept 100.0%" in call("recover", path).out
     path.write_bytes(WHOLE[: CHUNKS[0][1] + 100])
-    assert main(["recover", str(path), "--to", str(new), "-o", "json"]) == 1
-    account = json.loads(capsys.readouterr().out)
+    account = json.loads(call("recover -o json", path, "--to", new, code=1).out)
     assert (account["schemaVersion"], account["complete"]) == (1, False)
     assert 0 < account["bytes_lost"] <= 100
     for target, reason in (
         (new, "already there; name another file with --to"),
         (new / "none", "Not a directory; check the path"),
     ):
-        assert main(["recover", str(path), "-t", str(target)]) == 2
-        assert f"{target}: {reason}" in capsys.readouterr().err
+        assert f"{target}: {reason}" in refused("recover", path, "-t", target)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from cloudrc import files
 from cloudrc.config.load import load_profile, read_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.files import atomic_file, write_atomically
@@ -49,6 +50,17 @@ def test_a_pipe_or_device_is_refused_at_once(tmp_path, read):
         with pytest.raises(BadInputError, match=r"^[^\n]*not a file; (give|name) a [^\n]*$"):
             read(path)
     assert len(os.listdir("/proc/self/fd")) == len(before)
+
+
+def test_what_is_beyond_the_limit_is_refused_and_not_cut(tmp_path):
+    """Files of /proc claim to be empty, and so does a file that grows during the read."""
+    for size in (0, 1, 99, 100):
+        (tmp_path / "a").write_bytes(bytes(size))
+        assert files.read(tmp_path / "a", 100) == bytes(size)
+    (tmp_path / "a").write_bytes(bytes(101))
+    for path in (tmp_path / "a", Path("/proc/self/status")):
+        with pytest.raises(files.TooLongError, match="longer than 100 bytes"):
+            files.read(path, 100)
 
 
 @pytest.mark.parametrize("named", ["/dev/zero", "./loop", "~nobody/x.csv", "a\\0/b.py"])

@@ -4,7 +4,6 @@ import json
 
 import pytest
 
-from cloudrc.cli.main import main
 from cloudrc.errors import BadInputError
 from cloudrc.sweep.compare import of_sweep
 from cloudrc.sweep.figure import draw_sweep
@@ -81,10 +80,10 @@ def test_numbers_of_a_plugin_that_failed_are_not_drawn(drawn):
     assert [point.middle for point in success.lines["a"]] == [50, 100]
 
 
-def test_a_figure_is_three_files_whose_text_is_text(tmp_path, capsys):
+def test_a_figure_is_three_files_whose_text_is_text(tmp_path, call):
     folder = sweep(tmp_path / "s")
-    assert main(["sweep", "figure", str(folder), "--out", str(tmp_path / "one.png")]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "one.svg")
+    out = call("sweep figure", folder, "--out", tmp_path / "one.png").out
+    assert out.splitlines()[-1] == str(tmp_path / "one.svg")
     assert (tmp_path / "one.pdf").read_bytes().startswith(b"%PDF")
     assert (tmp_path / "one.png").read_bytes().startswith(b"\x89PNG")
     assert ">delay (ms)</text>" in (tmp_path / "one.svg").read_text()
@@ -96,9 +95,8 @@ def test_a_figure_is_three_files_whose_text_is_text(tmp_path, capsys):
      (["--number", "iea"], "no number named 'iea'"),
      (["--x", "gain", "--by", "gain"], "--x and --by are both gain; name two axes")],
 )  # fmt: skip
-def test_a_figure_of_unknown_names_is_refused(arguments, text, tmp_path, capsys):
-    assert main(["sweep", "figure", str(sweep(tmp_path / "s")), *arguments]) == 2
-    assert text in capsys.readouterr().err
+def test_a_figure_of_unknown_names_is_refused(arguments, text, tmp_path, refused):
+    assert text in refused("sweep figure", sweep(tmp_path / "s"), *arguments)
 
 
 def test_a_sweep_without_axes_or_rows_has_no_figure(tmp_path):
@@ -108,12 +106,11 @@ def test_a_sweep_without_axes_or_rows_has_no_figure(tmp_path):
         read_flights(sweep(tmp_path / "s", rows=0))
 
 
-def test_missing_flights_are_reported(tmp_path, capsys, drawn):
+def test_missing_flights_are_reported(tmp_path, call, drawn):
     """An unfinished sweep may give another result in the end."""
     folder = sweep(tmp_path / "s", rows=22)
     assert "s, of which 2 flights are not done, over" in of_sweep(folder, "none", "kalman").what
-    assert main(["sweep", "figure", str(folder)]) == 0
-    assert "2 flights are not done." in capsys.readouterr().out
+    assert "2 flights are not done." in call("sweep figure", folder).out
 
 
 def test_values_of_an_axis_are_paired_over_the_others(tmp_path):

@@ -15,7 +15,6 @@ from tempfile import TemporaryDirectory
 import pytest
 
 from cloudrc import assembly
-from cloudrc.cli.client import Api
 from cloudrc.cloud.operator import EmergencyStopRepeater
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import Cause, GuardState, OperatorRequest, Request, Setpoint, Start
@@ -29,6 +28,7 @@ from cloudrc.teleop.models import read_goto, read_order
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import ConflictError, MissionStore, Order, UnavailableError
 from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus
+from tests.conftest import wait_until
 
 PERIOD_NS = 10_000_000
 A, B, C = (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (3.0, 0.0, 1.0)
@@ -293,11 +293,6 @@ def play(flight, script):
             getattr(flight, do.get(action, action))()
 
 
-def finish(flight):
-    """Fly to all waypoints of `FROM_SPAWN`."""
-    play(flight, "A B C")
-
-
 def asked(flight, since=0):
     """Requests since an index, without those that only carry progress."""
     return [r.request for r in flight.requests[since:] if r.request is not Request.PROGRESS]
@@ -386,10 +381,6 @@ class Running:
         data = body if isinstance(body, bytes) else json.dumps(body).encode()
         return self.send(self.request(path, data, token, "POST"))
 
-    def post_local(self, path, body=None):
-        """Post over the socket file."""
-        return Api(self.url).post(path, body)
-
     def send(self, request):
         try:
             answer = DIRECT.open(request, timeout=LIMIT)
@@ -405,10 +396,7 @@ class Running:
         return [json.loads(line) for line in self.audit_file.read_text().splitlines()]
 
     def until(self, condition):
-        limit = time.monotonic() + LIMIT
-        while not condition():
-            assert time.monotonic() < limit, "not in time"
-            time.sleep(0.01)
+        wait_until(condition, LIMIT)
 
     def fly(self, mission):
         """Post a mission and wait until it flies; return its id."""

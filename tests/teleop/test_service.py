@@ -13,15 +13,7 @@ from cloudrc.teleop.api import Bridge
 from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX, next_step
 from cloudrc.teleop.store import ConflictError, Order, UnavailableError
 from cloudrc.teleop.wire import ENDED, STATES, Leg, Plan
-from tests.teleop.conftest import (
-    FROM_SPAWN,
-    PLACES,
-    A,
-    ServiceFlight,
-    finish,
-    play,
-    service_flying,
-)
+from tests.teleop.conftest import FROM_SPAWN, PLACES, A, ServiceFlight, play, service_flying
 
 QUICK = Plan((Leg(A, dwell=0.0),), Start.HERE)
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -211,7 +203,7 @@ def test_every_end_of_a_mission_is_counted_under_its_own_name():
 
 def test_a_key_is_that_of_one_order_for_ever():
     flight, mission_id = service_flying(key="uid")
-    finish(flight)
+    play(flight, "A B C")
     for _ in range(2):
         assert flight.create(key="uid") == mission_id
         for order in (Order(QUICK, key="uid"), Order(FROM_SPAWN, key="uid", contact=True)):
@@ -256,7 +248,7 @@ def test_what_the_robot_touched_decides(seen, codes, exit_code, restarted):
     vars(flight).update(seen)
     flight.step(seconds=0.05)
     assert ("board_touched" in flight.names(mission_id)) == ("touch_speed" in seen)
-    finish(flight)
+    play(flight, "A B C")
     verdict = flight.view(mission_id)["verdict"]
     assert verdict["exit_code"] == exit_code
     assert [failure["code"] for failure in verdict["failures"]] == codes

@@ -4,12 +4,11 @@ import os
 import subprocess
 import sys
 from math import pi, tan
-from xml.etree import ElementTree
 
-import numpy as np
 import pytest
 
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.geometry.scene import load_scene
 from cloudrc.world.rotors import STOPPED
 from cloudrc.world.scene import FOLDER, compile_model, import_mujoco, mujoco
 from cloudrc.world.simulator import Simulator
@@ -23,12 +22,6 @@ def pipes():
     return compile_model("pelican", "pipes")
 
 
-def facts(scene):
-    """Return the scene as readers without MuJoCo see it."""
-    root = ElementTree.parse(FOLDER / "scenes" / f"{scene}.xml").getroot()
-    return {n.get("name"): [float(x) for x in n.get("data").split()] for n in root.iter("numeric")}
-
-
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_every_robot_compiles_in_every_scene(robot, scene, tmp_path, monkeypatch):
@@ -37,22 +30,20 @@ def test_every_robot_compiles_in_every_scene(robot, scene, tmp_path, monkeypatch
     assert not list(tmp_path.iterdir()), "MuJoCo wrote a log"
 
 
-@pytest.mark.parametrize("name", ["pipe_1", "pipe_2", "pipe_3"])
-def test_staves_are_tangent_to_the_pipe(pipes, name):
-    numbers = facts("pipes")[name]
-    centre, axis = np.array(numbers[:3]), np.array(numbers[3:6])
+@pytest.mark.parametrize("pipe", load_scene("pipes").pipes, ids=lambda pipe: pipe.name)
+def test_staves_are_tangent_to_the_pipe(pipes, pipe):
     data = mujoco.MjData(pipes)
     mujoco.mj_kinematics(pipes, data)
-    staves = [i for i in range(pipes.ngeom) if pipes.geom(i).name.startswith(f"{name}/")]
+    staves = [i for i in range(pipes.ngeom) if pipes.geom(i).name.startswith(f"{pipe.name}/")]
     assert len(staves) == 32
     for stave in staves:
-        out = data.geom_xpos[stave] - centre
+        out = data.geom_xpos[stave] - pipe.centre
         frame = data.geom_xmat[stave].reshape(3, 3)
-        assert out @ axis == pytest.approx(0, abs=1e-9)
-        assert abs(frame[:, 2] @ axis) == pytest.approx(1)
+        assert out @ pipe.axis == pytest.approx(0, abs=1e-9)
+        assert abs(frame[:, 2] @ pipe.axis) == pytest.approx(1)
         assert frame[:, 0] @ out == pytest.approx(0.681)  # the middle of the wall
         assert pipes.geom_size[stave] == pytest.approx((0.019, 0.7 * tan(pi / 32), 2.5), abs=1e-4)
-    assert sum(data.geom_xpos[staves] - centre) == pytest.approx([0, 0, 0], abs=1e-9)
+    assert sum(data.geom_xpos[staves] - pipe.centre) == pytest.approx([0, 0, 0], abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,7 @@ from cloudrc.link.profile import mean_loss
 from cloudrc.link.verify.causes import Evidence, Findings, find_causes
 from cloudrc.link.verify.judge import look_twice, netem_makes, verdict_of
 from tests.link.profiles import changed, in_bursts, profile_of
-from tests.link.verify.conftest import (
-    asked,
-    random_profile,
-    rows_of,
-    verify,
-)
+from tests.link.verify.conftest import asked, random_profile, rows_of, verify
 
 PAPER = asked("paper-p2", "uplink")
 LOSING = profile_of(0.045, 0.025, loss=0.05)

@@ -9,19 +9,12 @@ import pytest
 from cloudrc.config.shipped import names
 from cloudrc.link.verify.judge import netem_makes
 from cloudrc.link.verify.monitor import LinkMonitor
-from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
+from cloudrc.records import Arrival, Fault, Lateness, LinkChecked, Record
+from tests.console.conftest import control
 from tests.link.profiles import changed, profile_of
-from tests.link.verify.conftest import (
-    PERIOD_NS,
-    arrivals,
-    asked,
-    checked,
-    hearing,
-    is_believed,
-)
+from tests.link.verify.conftest import PERIOD_NS, arrivals, asked, checked, hearing, is_believed
 
-PAPER, P1 = asked("paper-p2", "downlink"), asked("paper-p1", "downlink")
-ZERO = (0.0, 0.0, 0.0)
+PAPER = asked("paper-p2", "downlink")
 
 
 @pytest.mark.parametrize(
@@ -110,19 +103,13 @@ def test_late_wakes_of_the_ends_are_no_fault_of_the_link():
     assert moments[-1]["mean"].verdict == "open"
 
 
-def control(stamp_ns, rtt):
-    return Control(
-        stamp_ns, 1, 0, 0, 0.0, rtt, rtt, ZERO, ZERO, (1.0, *ZERO), ZERO, ZERO, 0, ZERO, 0.0,
-        ZERO, ZERO, ZERO,
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize(("slower", "verdict"), [(0.001, "ok"), (0.030, "off")])
 def test_cloud_judges_round_trips_without_a_common_clock(slower, verdict):
     up, down = profile_of(0.040), profile_of(0.080)
     heard = []
     for arrival in arrivals(up, overhead=nan, uplink=True):
-        heard += [arrival, control(arrival.stamp_ns, 0.120 + slower + arrival.counter * 1e-9)]
+        rtt = 0.120 + slower + arrival.counter * 1e-9
+        heard += [arrival, control(arrival.stamp_ns * 1e-9, rtt=rtt)]
     moments, _ = checked(hearing(up, down, uplink=True), heard)
     trip = moments[-1]["round_trip"]
     assert (trip.asked, trip.verdict) == (pytest.approx(0.120, abs=1e-4), verdict)

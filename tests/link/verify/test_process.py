@@ -8,7 +8,6 @@ import pytest
 
 from cloudrc.cli import link_verify
 from cloudrc.cli.link_verify import find_experiment, make_plans, probe_link, run_link
-from cloudrc.cli.main import main
 from cloudrc.errors import CloudrcError
 from cloudrc.link.verify.causes import find_causes
 from cloudrc.link.verify.judge import verdict_of
@@ -33,25 +32,20 @@ def test_an_honest_link_is_believed_unless_the_machine_delays_it():
 
 @pytest.mark.process
 @pytest.mark.alone
-def test_a_fault_is_named_on_the_command_line(capsys, monkeypatch):
+def test_a_fault_is_named_on_the_command_line(call, monkeypatch):
     twice = [one.replace("=100", "=200").replace("=80", "=160") for one in LINK]
     wrong = find_experiment("paper-p1", twice)
     monkeypatch.setattr(link_verify, "run_link", lambda _, shaper: run_link(wrong, shaper))
-    words = ["link", "verify", "paper-p1", "--seconds", "2", "-o", "json"]
-    words += [word for value in LINK for word in ("--set", value)]
-    assert main(words) == 1
-    report = json.loads(capsys.readouterr().out)
+    settings = [f"--set={value}" for value in LINK]
+    report = json.loads(call("link verify paper-p1 --seconds 2 -o json", *settings, code=1).out)
     assert report["verdict"] == "not believed"
     assert {cause["code"] for cause in report["causes"]} - {"throttled"} == {"doubled_delay"}
     assert {row["name"] for row in report["directions"]["uplink"]["rows"]} >= {"mean", "loss"}
 
 
-def test_netem_without_root_is_a_missing_prerequisite(monkeypatch, capsys):
+def test_netem_without_root_is_a_missing_prerequisite(monkeypatch, refused):
     monkeypatch.setattr(os, "geteuid", lambda: 1000)
-    assert main(["link", "verify", "ideal", "--shaper", "netem"]) == 3
-    said = capsys.readouterr().err.strip()
-    assert "needs root" in said
-    assert "\n" not in said
+    assert "needs root" in refused("link verify ideal --shaper netem", code=3)
 
 
 @pytest.mark.parametrize(
