@@ -176,6 +176,12 @@ def test_the_second_browser_reads_and_stop_works_under_load(browse, flight, page
     second = browse(f"{address}/?fixedDpr=0.5")
     second.get_by_text("Read only").wait_for(timeout=LIMIT * 1e3)
     assert button(second, "STOP").count() == 0
+    for width in (1280, 800):
+        page.set_viewport_size({"width": width, "height": 800})
+        for x, y in ((14, 8), (26, 36)):  # where viser collapses the panel, and opens its settings
+            page.mouse.click(width - x, y)
+            page.wait_for_timeout(300)
+            button(page, "STOP").click(trial=True)
     over = threading.Event()
 
     def load():
@@ -194,6 +200,10 @@ def test_the_second_browser_reads_and_stop_works_under_load(browse, flight, page
         for thread in threads:
             thread.join()
     figure("stop under load", took, "<=", 1.0, "s")
+    button(page, "Acknowledge").click()
+    wait_for(lambda: api.get("/v1/state")["seen"]["guard"] != "ESTOP")
+    page.keyboard.press("Shift+X")
+    wait_for(lambda: api.get("/v1/state")["seen"]["guard"] == "ESTOP")
     page.close()
     button(second, "STOP").wait_for(timeout=LIMIT * 1e3)
 
