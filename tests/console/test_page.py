@@ -147,7 +147,7 @@ def test_drag_and_send_moves_the_setpoint(flight, page):
 
 
 @pytest.mark.process
-def test_keys_drive_and_sliders_change_the_delay(flight, page, figure):
+def test_keys_drive_sliders_change_the_delay_and_buttons_steer(flight, page, figure):
     api, _, _ = flight
     page.keyboard.down("KeyW")
     wait_for(lambda: api.get("/v1/state")["seen"]["position_m"][2] > 0.5)
@@ -167,6 +167,12 @@ def test_keys_drive_and_sliders_change_the_delay(flight, page, figure):
     page.get_by_role("tab", name="Fly").click()
     button(page, "Start").click()  # it ends the drive first
     wait_for(lambda: (api.get("/v1/state")["mission"] or mission)["name"] == "hover")
+    wait_for(lambda: api.get("/v1/state")["mission"]["state"] == "flying")
+    for name, state in (("Hold", "held"), ("Resume", "flying")):
+        button(page, name).click()
+        wait_for(lambda state=state: api.get("/v1/state")["mission"]["state"] == state)
+    button(page, "Cancel").click()
+    wait_for(lambda: not api.get("/v1/state")["mission"])
 
 
 @pytest.mark.process
