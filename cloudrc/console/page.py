@@ -282,7 +282,7 @@ class Page:
         acts: dict[str, Callable[[], object]] = {
             "Start": self._start_mission,
             HOLD: lambda: steering.ask("holding", "/v1/hold"),
-            "Resume": lambda: steering.ask("resumed", "/v1/resume"),
+            "Resume": steering.resume,
             "Cancel": steering.cancel,
             "Acknowledge": lambda: steering.ask("acknowledged", "/v1/acknowledge"),
         }

@@ -122,10 +122,15 @@ class Steering:
         else:
             self.say("cancel: no mission is under way", is_refusal=True)
 
+    def resume(self) -> bool:
+        """Continue the held mission, or end a drive; return whether teleop accepted it."""
+        words = "ending the drive" if is_drive(self.state.get("mission")) else "resumed"
+        return self.ask(words, "/v1/resume")
+
     def fly(self, order: Mapping[str, Any]) -> None:
         """Fly a mission; if the user drives the robot by keys, first end this drive."""
         if is_drive(self.state.get("mission")):
-            if not self.ask("ending the drive", "/v1/resume"):
+            if not self.resume():
                 return
             order = {**order, "queue": True}  # in case the drive has not ended yet
         back = order.get("start", "spawn") == "spawn"

@@ -101,6 +101,10 @@ def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call):
             error = call(f"mission {words}", code=code).err
             assert error.startswith("cloudrc: error: runs/latest: "), error
             assert why in error
+        api.post("/v1/drive", {"velocity_mps": [0.1, 0.0, 0.0]})
+        served.until(lambda: api.get("/v1/state")["mission"]["state"] == "held")
+        ends = "runs/latest: the drive ends, and the robot holds; mission m3 is then done"
+        assert call("mission resume").out.startswith(ends)
 
 
 def test_the_console_names_a_run_as_it_was_given(tmp_path, said):

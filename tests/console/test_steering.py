@@ -62,6 +62,11 @@ def test_a_start_ends_a_drive_that_waits_for_keys(api, steering):
     start = ("/v1/missions", {"waypoints": [], "queue": True})
     assert api.posted == [("/v1/resume", None), start]
     api.posted.clear()
+    for by_hand, words in ((True, "ending the drive"), (False, "resumed")):
+        steering.state = {"mission": {"by_hand": by_hand, "state": "held"}}
+        assert steering.resume()
+        assert steering.answer[0] == words
+    api.posted.clear()
     steering.state = {"mission": None}
     steering.fly({"waypoints": []})
     assert api.posted == [("/v1/missions", {"waypoints": []})]
