@@ -32,7 +32,8 @@ examples:
 
 The page is served on this machine only. The first browser steers; others read.
 Keys: arrows fly along x and y, W and S up and down, while they are held; Space
-holds; Shift+X stops the rotors."""
+holds; Shift+X stops the rotors. No key turns the robot: the published onboard
+controller holds the yaw at 0."""
 LINK_SET = "link set "
 """Start of a line that a pod's console prints to request a change of the link."""
 RETRY_PERIOD = 0.2
