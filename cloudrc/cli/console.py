@@ -172,7 +172,8 @@ def _in_pod(options: argparse.Namespace) -> Flight:
         print_line(f"{LINK_SET}{' '.join(settings)}")
 
     api = Api(options.api, token_reader(token_file(options)))
-    return Flight(options.config, api, Link(read, change), lambda: False)
+    note = " requested; only 'cloudrc console --cluster' carries it out"
+    return Flight(options.config, api, Link(read, change, note), lambda: False)
 
 
 def _show_release(options: argparse.Namespace) -> int:

@@ -48,10 +48,12 @@ class Link:
     Attributes:
         read: Returns the present profile, as in its file; {} if unknown.
         change: Applies settings such as "uplink.delay_ms=120"; raises a CloudrcError.
+        note: Text after the settings in the page's answer: who applies them, if not `change`.
     """
 
     read: Callable[[], Mapping[str, Any]] = dict
     change: Callable[[Sequence[str]], object] = list
+    note: str = ""
 
 
 @dataclass
@@ -229,7 +231,7 @@ class Steering:
             try:
                 if settings:
                     self.link.change(settings)
-                    self.say(f"link: {', '.join(settings)}")
+                    self.say(f"link: {', '.join(settings)}{self.link.note}")
             except CloudrcError as error:
                 self.say(f"link: {error}", is_refusal=True)
 

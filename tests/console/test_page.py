@@ -6,12 +6,13 @@ import subprocess
 import sys
 import threading
 import urllib.request
+from argparse import Namespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from cloudrc.cli import extras
+from cloudrc.cli import console, extras
 from cloudrc.cli.client import Api
 from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
@@ -267,6 +268,19 @@ def test_a_port_in_use_is_an_error():
         port = other.getsockname()[1]
         with pytest.raises(BadInputError, match=f"--port {port}: is in use"):
             Page(port)
+
+
+def test_in_a_pod_a_slider_requests_a_change_and_returns(monkeypatch, capsys, tmp_path):
+    profile = tmp_path / "profile.yaml"
+    profile.write_text("uplink: {delay_ms: 40}")
+    flags = {"config": profile, "profile": profile, "api": "http://127.0.0.1:1"}
+    link = console._in_pod(Namespace(**flags, token_file=None)).link
+    link.change(["uplink.delay_ms=120"])
+    assert capsys.readouterr().out == "link set uplink.delay_ms=120\n"
+    assert "requested; only 'cloudrc console --cluster' carries it out" in link.note
+    assert link.read()["uplink"] == {"delay_ms": 120.0}
+    monkeypatch.setattr(console, "OWN_S", 0.0)
+    assert link.read()["uplink"] == {"delay_ms": 40}
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys):

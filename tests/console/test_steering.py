@@ -124,7 +124,7 @@ def test_a_slow_link_gets_the_newest_value_of_each_slider(steering):
             raise BadInputError("loss: must be at most 1")
         go.wait()
 
-    steering.link = Link(change=change)
+    steering.link = Link(change=change, note=" requested")
     steering.start()
     steering.set_link("uplink.delay_ms", 10)
     wait_for(lambda: applied)
@@ -133,6 +133,7 @@ def test_a_slow_link_gets_the_newest_value_of_each_slider(steering):
     steering.set_link("downlink.loss", 0.25)
     go.set()
     wait_for(lambda: len(applied) == 2)
+    wait_for(lambda: steering.answer[0].endswith("uplink.delay_ms=40 requested"))
     assert applied == [["uplink.delay_ms=10"], ["downlink.loss=0.25", "uplink.delay_ms=40"]]
     steering.set_link("uplink.loss", 2)
     wait_for(lambda: steering.answer[0] == "link: loss: must be at most 1")
