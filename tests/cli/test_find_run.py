@@ -107,10 +107,13 @@ def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call):
         assert call("mission resume").out.startswith(ends)
 
 
-def test_the_console_names_a_run_as_it_was_given(tmp_path, said):
+def test_the_console_names_a_run_as_it_was_given(tmp_path, elsewhere, said):
     with flying(tmp_path / "a"), flying(tmp_path / "b"):
         assert "error: runs/nope: no run flies there" in said(2, "console runs/nope")
         assert f"choose one: {tmp_path / 'a'} or {tmp_path / 'b'}" in said(2, "console")
+        assert said(3, "console nope") == said(3, "console --release nope")
+        (elsewhere / "nope").mkdir()
+        assert "error: nope: no run flies there" in said(2, "console nope")
 
 
 def test_no_request_goes_to_a_server_that_a_folder_names(elsewhere, said):
