@@ -28,10 +28,12 @@ examples:
   cloudrc console
   cloudrc console runs/hover-local-seed1 --port 8080 --no-open
   cloudrc console --cluster -n demo      a release with console.enabled=true
+  cloudrc console my-release             the same, by the name of the release
 
 The page is served on this machine only. The first browser steers; others read.
 Keys: arrows fly along x and y, W and S up and down, while they are held; Space
-holds; Shift+X stops the rotors."""
+holds; Shift+X stops the rotors. No key turns the robot: the published onboard
+controller holds the yaw at 0."""
 LINK_SET = "link set "
 """Start of a line that a pod's console prints to request a change of the link."""
 RETRY_PERIOD = 0.2
@@ -44,8 +46,8 @@ shows the value in the profile's file, which Kubernetes has updated by then."""
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     add = parser.add_argument
-    about = "folder of the flying run (default: ./runs/latest, else the only one)"
-    add("run", nargs="?", type=Path, metavar="RUN", help=about)
+    about = "folder of the flying run (default: ./runs/latest, else the only one), or a release"
+    add("run", nargs="?", type=Path, metavar="RUN|RELEASE", help=about)
     port = "port of the page on 127.0.0.1 (default: any free port)"
     add("--port", type=whole_number(0, 65_535), default=0, metavar="N", help=port)
     about = "show the page of a release, and carry out its changes of the link until Ctrl-C"
@@ -61,6 +63,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Serve the page until the flight ends or the user interrupts."""
+    run: Path | None = options.run
+    if run and len(run.parts) == 1 and not (run.exists() or options.release):
+        options.run, options.release = None, str(run)
     if options.cluster or options.context or options.namespace or options.release:
         return _show_release(options)
     require("the console", ("console", "world"))
@@ -165,7 +170,8 @@ def _in_pod(options: argparse.Namespace) -> Flight:
         print_line(f"{LINK_SET}{' '.join(settings)}")
 
     api = Api(options.api, token_reader(token_file(options)))
-    return Flight(options.config, api, Link(read, change), lambda: False)
+    note = " requested; only 'cloudrc console --cluster' carries it out"
+    return Flight(options.config, api, Link(read, change, note), lambda: False)
 
 
 def _show_release(options: argparse.Namespace) -> int:

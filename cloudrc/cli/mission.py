@@ -294,6 +294,9 @@ def _order(options: argparse.Namespace, api: Api) -> int:
         action = "flying to ({:g}, {:g}, {:g})".format(*point)
     else:
         mission = api.post(f"/v1/{options.verb}")
+        if options.verb == "resume" and mission["by_hand"]:
+            api.say(f"the drive ends, and the robot holds; mission {mission['id']} is then done")
+            return 0
         action = f"flying to waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
         action = _describe_stay(api) if options.verb == "hold" else action
     api.say(f"{action}; {describe_mission(mission)}")

@@ -90,7 +90,12 @@ button[style*='red-filled'] {height: 60px !important; font-size: 24px; letter-sp
 div:has(> button[style*='red-filled']) {position: sticky; top: 0; z-index: 9}
 div:has(> button[style*='gray-filled']) {display: inline-block; width: 33.3%;
   margin: 0 !important; padding: 0 6px 6px !important}
+div:has(+ div button[style*='red-filled']):not(:has(canvas)) {pointer-events: none;
+  & :is(button, [role='button']) {visibility: hidden}}
+.mantine-Notifications-root {z-index: 4 !important}
 """
+"""Looks of the buttons. Of the last two rules, the first keeps the panel of STOP from being
+collapsed or moved, the second keeps notifications from covering STOP."""
 
 
 class Page:
@@ -277,7 +282,7 @@ class Page:
         acts: dict[str, Callable[[], object]] = {
             "Start": self._start_mission,
             HOLD: lambda: steering.ask("holding", "/v1/hold"),
-            "Resume": lambda: steering.ask("resumed", "/v1/resume"),
+            "Resume": steering.resume,
             "Cancel": steering.cancel,
             "Acknowledge": lambda: steering.ask("acknowledged", "/v1/acknowledge"),
         }

@@ -48,10 +48,12 @@ class Link:
     Attributes:
         read: Returns the present profile, as in its file; {} if unknown.
         change: Applies settings such as "uplink.delay_ms=120"; raises a CloudrcError.
+        note: Text after the settings in the page's answer: who applies them, if not `change`.
     """
 
     read: Callable[[], Mapping[str, Any]] = dict
     change: Callable[[Sequence[str]], object] = list
+    note: str = ""
 
 
 @dataclass
@@ -122,10 +124,15 @@ class Steering:
         else:
             self.say("cancel: no mission is under way", is_refusal=True)
 
+    def resume(self) -> bool:
+        """Continue the held mission, or end a drive; return whether teleop accepted it."""
+        words = "ending the drive" if is_drive(self.state.get("mission")) else "resumed"
+        return self.ask(words, "/v1/resume")
+
     def fly(self, order: Mapping[str, Any]) -> None:
         """Fly a mission; if the user drives the robot by keys, first end this drive."""
         if is_drive(self.state.get("mission")):
-            if not self.ask("ending the drive", "/v1/resume"):
+            if not self.resume():
                 return
             order = {**order, "queue": True}  # in case the drive has not ended yet
         back = order.get("start", "spawn") == "spawn"
@@ -224,7 +231,7 @@ class Steering:
             try:
                 if settings:
                     self.link.change(settings)
-                    self.say(f"link: {', '.join(settings)}")
+                    self.say(f"link: {', '.join(settings)}{self.link.note}")
             except CloudrcError as error:
                 self.say(f"link: {error}", is_refusal=True)
 

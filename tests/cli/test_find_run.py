@@ -101,12 +101,19 @@ def test_each_answer_names_the_run_and_what_the_robot_does(elsewhere, call):
             error = call(f"mission {words}", code=code).err
             assert error.startswith("cloudrc: error: runs/latest: "), error
             assert why in error
+        api.post("/v1/drive", {"velocity_mps": [0.1, 0.0, 0.0]})
+        served.until(lambda: api.get("/v1/state")["mission"]["state"] == "held")
+        ends = "runs/latest: the drive ends, and the robot holds; mission m3 is then done"
+        assert call("mission resume").out.startswith(ends)
 
 
-def test_the_console_names_a_run_as_it_was_given(tmp_path, said):
+def test_the_console_names_a_run_as_it_was_given(tmp_path, elsewhere, said):
     with flying(tmp_path / "a"), flying(tmp_path / "b"):
         assert "error: runs/nope: no run flies there" in said(2, "console runs/nope")
         assert f"choose one: {tmp_path / 'a'} or {tmp_path / 'b'}" in said(2, "console")
+        assert said(3, "console nope") == said(3, "console --release nope")
+        (elsewhere / "nope").mkdir()
+        assert "error: nope: no run flies there" in said(2, "console nope")
 
 
 def test_no_request_goes_to_a_server_that_a_folder_names(elsewhere, said):

@@ -6,12 +6,13 @@ import subprocess
 import sys
 import threading
 import urllib.request
+from argparse import Namespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from cloudrc.cli import extras
+from cloudrc.cli import console, extras
 from cloudrc.cli.client import Api
 from cloudrc.config.load import load_experiment
 from cloudrc.console.feed import FlightFeed
@@ -150,7 +151,7 @@ def test_drag_and_send_moves_the_setpoint(flight, page):
 
 @pytest.mark.process
 @pytest.mark.alone
-def test_keys_drive_and_sliders_change_the_delay(flight, page, figure):
+def test_keys_drive_sliders_change_the_delay_and_buttons_steer(flight, page, figure):
     api, _, _ = flight
     page.keyboard.down("KeyW")
     wait_until(lambda: api.get("/v1/state")["seen"]["position_m"][2] > 0.5)
@@ -170,6 +171,12 @@ def test_keys_drive_and_sliders_change_the_delay(flight, page, figure):
     page.get_by_role("tab", name="Fly").click()
     button(page, "Start").click()  # it ends the drive first
     wait_until(lambda: (api.get("/v1/state")["mission"] or mission)["name"] == "hover")
+    wait_until(lambda: api.get("/v1/state")["mission"]["state"] == "flying")
+    for name, state in (("Hold", "held"), ("Resume", "flying")):
+        button(page, name).click()
+        wait_until(lambda state=state: api.get("/v1/state")["mission"]["state"] == state)
+    button(page, "Cancel").click()
+    wait_until(lambda: not api.get("/v1/state")["mission"])
 
 
 @pytest.mark.process
@@ -180,6 +187,12 @@ def test_the_second_browser_reads_and_stop_works_under_load(browse, flight, page
     second = browse(f"{address}/?fixedDpr=0.25")
     second.get_by_text("Read only").wait_for(timeout=LIMIT * 1e3)
     assert button(second, "STOP").count() == 0
+    for width in (1280, 800):
+        page.set_viewport_size({"width": width, "height": 800})
+        for x, y in ((14, 8), (26, 36)):  # where viser collapses the panel, and opens its settings
+            page.mouse.click(width - x, y)
+            page.wait_for_timeout(300)
+            button(page, "STOP").click(trial=True)
     over = threading.Event()
 
     def load():
@@ -198,6 +211,10 @@ def test_the_second_browser_reads_and_stop_works_under_load(browse, flight, page
         for thread in threads:
             thread.join()
     figure("stop under load", took, "<=", 1.0, "s")
+    button(page, "Acknowledge").click()
+    wait_until(lambda: api.get("/v1/state")["seen"]["guard"] != "ESTOP")
+    page.keyboard.press("Shift+X")
+    wait_until(lambda: api.get("/v1/state")["seen"]["guard"] == "ESTOP")
     page.close()
     button(second, "STOP").wait_for(timeout=LIMIT * 1e3)
 
@@ -255,6 +272,19 @@ def test_a_port_in_use_is_an_error():
         port = other.getsockname()[1]
         with pytest.raises(BadInputError, match=f"--port {port}: is in use"):
             Page(port)
+
+
+def test_in_a_pod_a_slider_requests_a_change_and_returns(monkeypatch, capsys, tmp_path):
+    profile = tmp_path / "profile.yaml"
+    profile.write_text("uplink: {delay_ms: 40}")
+    flags = {"config": profile, "profile": profile, "api": "http://127.0.0.1:1"}
+    link = console._in_pod(Namespace(**flags, token_file=None)).link
+    link.change(["uplink.delay_ms=120"])
+    assert capsys.readouterr().out == "link set uplink.delay_ms=120\n"
+    assert "requested; only 'cloudrc console --cluster' carries it out" in link.note
+    assert link.read()["uplink"] == {"delay_ms": 120.0}
+    monkeypatch.setattr(console, "OWN_S", 0.0)
+    assert link.read()["uplink"] == {"delay_ms": 40}
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch, refused):

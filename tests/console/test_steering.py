@@ -62,6 +62,11 @@ def test_a_start_ends_a_drive_that_waits_for_keys(api, steering):
     start = ("/v1/missions", {"waypoints": [], "queue": True})
     assert api.posted == [("/v1/resume", None), start]
     api.posted.clear()
+    for by_hand, words in ((True, "ending the drive"), (False, "resumed")):
+        steering.state = {"mission": {"by_hand": by_hand, "state": "held"}}
+        assert steering.resume()
+        assert steering.answer[0] == words
+    api.posted.clear()
     steering.state = {"mission": None}
     steering.fly({"waypoints": []})
     assert api.posted == [("/v1/missions", {"waypoints": []})]
@@ -119,7 +124,7 @@ def test_a_slow_link_gets_the_newest_value_of_each_slider(steering):
             raise BadInputError("loss: must be at most 1")
         go.wait()
 
-    steering.link = Link(change=change)
+    steering.link = Link(change=change, note=" requested")
     steering.start()
     steering.set_link("uplink.delay_ms", 10)
     wait_until(lambda: applied)
@@ -128,6 +133,7 @@ def test_a_slow_link_gets_the_newest_value_of_each_slider(steering):
     steering.set_link("downlink.loss", 0.25)
     go.set()
     wait_until(lambda: len(applied) == 2)
+    wait_until(lambda: steering.answer[0].endswith("uplink.delay_ms=40 requested"))
     assert applied == [["uplink.delay_ms=10"], ["downlink.loss=0.25", "uplink.delay_ms=40"]]
     steering.set_link("uplink.loss", 2)
     wait_until(lambda: steering.answer[0] == "link: loss: must be at most 1")
