@@ -46,6 +46,8 @@ SETTLE_TIME = 4.0
 LEG_FACTOR = 3.0
 """Time limit for the way to a waypoint, as a multiple of the expected time.
 Source: docs/reference/faults.md, "F28"."""
+LIMIT_MIN = 60.0
+"""Smallest time limit of a mission whose order gives none [s]."""
 ONLY_MISSION = 1
 """Mission number in virtual time, where teleop flies only one mission."""
 GRACE = 30.0
@@ -108,7 +110,7 @@ def virtual_notes(experiment: ResolvedExperiment) -> tuple[str, ...]:
 
 def flight_limit(experiment: ResolvedExperiment) -> float:
     """Return the time after which a flight is stopped [s]."""
-    return experiment.criteria.time_limit_s + GRACE
+    return build_plan(experiment).time_limit + GRACE
 
 
 def build_world(
@@ -196,24 +198,28 @@ def build_plan(experiment: ResolvedExperiment) -> Plan:
 
 
 def mission_plan(
-    mission: schema.Mission, time_limit: float, seed: int = 0, *, speed_max: float = inf
+    mission: schema.Mission, time_limit: float | None, seed: int = 0, *, speed_max: float = inf
 ) -> Plan:
-    """Convert a valid mission to a plan for teleop, with the `time_limit` of the mission [s].
+    """Convert a valid mission to a plan for teleop.
 
-    `seed` is the seed of random setpoints, `speed_max` the guard's speed limit [m/s].
+    `time_limit` is the time limit of the mission [s]; None: as long as the mission may need. `seed`
+    is the seed of random setpoints, `speed_max` the guard's speed limit [m/s].
     """
     track = read_setpoints(Path(mission.setpoints)) if mission.setpoints else ()
     if track:
         legs: tuple[Leg, ...] = (Leg(track[0][1], tolerance=inf, time_limit=inf),)
+        needed = LEG_FACTOR * track[-1][0]
     elif mission.steps is not None:
         legs = _step_legs(mission.steps, seed)
+        needed = LEG_FACTOR * mission.steps.count * mission.steps.period_s
     else:
         starts = (None, *mission.waypoints)
         ways = zip(starts, mission.waypoints, strict=False)  # no way starts at the last waypoint
         carrot = mission.carrot
         legs = tuple(_leg(start, waypoint, speed_max, carrot) for start, waypoint in ways)
+        needed = sum(leg.time_limit for leg in legs)
     start = Start.SPAWN if mission.start == "spawn" else Start.HERE
-    return Plan(legs, start, time_limit, track=track)
+    return Plan(legs, start, time_limit or max(LIMIT_MIN, needed), track=track)
 
 
 def with_order(

@@ -67,9 +67,6 @@ TURN_MAX = 30.0
 this process was suspended; the suspension does not count towards a time limit."""
 TERMINATION_LOG = Path("/dev/termination-log")
 """File in a pod for the pod's last message, which `kubectl describe` shows after the pod's end."""
-LIMIT_MAX = 86_400.0
-"""Time limit of a Job if the mission file gives no valid time limit [s]. Teleop ends the mission
-earlier, by the time limit of the release's experiment."""
 
 _Answer = TypeVar("_Answer")
 Json = dict[str, Any]
@@ -431,12 +428,9 @@ def _run_job(options: argparse.Namespace) -> int:
     from cloudrc.cluster.pods import find_deployment
 
     find_deployment(release, "cloud")
-    given = mission.get("time_limit_s")
-    # The API refuses a mission with any other limit.
-    limit = given if isinstance(given, int | float) and 0 < given <= 1e6 else LIMIT_MAX
     # After 'helm install' without --wait, the release needs some seconds to become ready.
     wait_ready(release, timeout=options.timeout, tell=print_line)
-    job = run_job(release, mission, limit=limit, queue=options.queue)
+    job = run_job(release, mission, queue=options.queue)
     print_line(f"Job {job} on release '{release.name}' in namespace '{release.namespace}'")
     try:
         ended = follow(release, job, print_line)

@@ -131,9 +131,9 @@ def serve_api(
 
     if not isinstance(options.api, Path):
         warn_if_exposed(options.api)
-    criteria, bridge = experiment.criteria, Bridge()
+    bridge, contact = Bridge(), bool(experiment.criteria.contact)
     order = partial(
-        read_order, scene=scene, time_limit=criteria.time_limit_s, contact=bool(criteria.contact),
+        read_order, scene=scene, contact=contact,
         plan=partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps),
     )  # fmt: skip
     tokens = Tokens(options.tokens, log_line) if options.tokens else None

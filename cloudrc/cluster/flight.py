@@ -197,10 +197,10 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
 
 
 def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
-    flown, limit = {"start", "waypoints", "carrot"}, experiment.criteria.time_limit_s
+    flown = {"start", "waypoints", "carrot"}
     mission = experiment.mission.model_dump(mode="json", include=flown)
-    document = {"name": experiment.name, "time_limit_s": limit, **mission}
-    job = run_job(release, document, limit=limit)
+    limit = experiment.criteria.time_limit_s
+    job = run_job(release, {"name": experiment.name, "time_limit_s": limit, **mission})
     tell(f"Job {job} flies {experiment.name}")
     try:
         ended = follow(release, job, tell)

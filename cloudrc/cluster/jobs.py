@@ -41,6 +41,8 @@ START_ALLOWANCE = 120
 """Time to start the pod and to get the robot's state, added to the mission's time limit [s]."""
 QUEUE_ALLOWANCE = 3600
 """Time for earlier missions to end, added to the time limit of a Job that may wait [s]."""
+LIMIT_MAX = 86_400
+"""Time limit of a mission without a valid time limit [s]. Teleop ends the mission earlier."""
 KEEP_FINISHED = 3600
 """Time for which Kubernetes keeps the finished Job of a mission [s]."""
 LOOK_PERIOD = 1.0
@@ -63,7 +65,6 @@ def run_job(
     mission: Mapping[str, Any],
     *,
     name: str = "",
-    limit: float = 60.0,
     queue: bool = False,
 ) -> str:
     """Create the Job of a mission, and return its name; the Job runs even if nobody follows it.
@@ -72,7 +73,6 @@ def run_job(
         release: Release that flies the mission.
         mission: Mission in the API's format: name, start, time_limit_s, waypoints.
         name: Name of the Job; default: an unused name.
-        limit: Time limit of the mission [s].
         queue: Whether to wait while another mission flies; if False, the API refuses the mission.
 
     Raises:
@@ -83,7 +83,10 @@ def run_job(
     plan, job = read_example(release, COMPONENT, name)
     deployment = find_deployment(release, "cloud")
     job["metadata"]["ownerReferences"] = [owner_of("apps/v1", "Deployment", deployment)]
-    deadline = ceil(limit) + START_ALLOWANCE + queue * QUEUE_ALLOWANCE
+    given = mission.get("time_limit_s")
+    # The API refuses a mission with any other limit.
+    limit = ceil(given) if isinstance(given, int | float) and 0 < given <= 1e6 else LIMIT_MAX
+    deadline = limit + START_ALLOWANCE + queue * QUEUE_ALLOWANCE
     job["spec"] |= {"activeDeadlineSeconds": deadline, "ttlSecondsAfterFinished": KEEP_FINISHED}
     _fill_pod(job["spec"]["template"]["spec"], release, deployment, queue)
     plan["data"] = {FILE: json.dumps(mission, indent=2) + "\n"}

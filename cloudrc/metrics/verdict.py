@@ -181,7 +181,7 @@ def flight_evidence(
         contact_speed_max=criteria.contact_speed_max_mps,
         ending=_ending(flight, interrupted),
         end=UNKNOWN if end_ns is None else _moment(flight, end_ns),
-        time_limit=criteria.time_limit_s,
+        time_limit=criteria.time_limit_s or inf,
         touch=touch,
         violations=tuple(_violations(flight)),
         slow=_not_real_time(numbers) if real_time else "",

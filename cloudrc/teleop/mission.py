@@ -335,10 +335,16 @@ class Teleop:
         limit, leg_limit = self._plan.time_limit, self._plan.legs[self.leg].time_limit
         if self.elapsed(now_ns) >= limit:
             if self.state == STARTING:
-                return "timed_out", f"the robot has not started within {limit:g} s; is the link up?"
-            return "timed_out", f"mission not done within {limit:g} s: {self.where}"
+                return (
+                    "timed_out",
+                    f"the robot has not started within {limit:g} s (time_limit_s); is the link up?",
+                )
+            return "timed_out", f"mission not done within {limit:g} s (time_limit_s): {self.where}"
         if self._watch.flown >= leg_limit and self.state == FLYING:
-            return "leg_timed_out", f"{self._leg_name} not reached in {leg_limit:g} s"
+            return (
+                "leg_timed_out",
+                f"{self._leg_name} not reached in {leg_limit:g} s (its time_limit_s)",
+            )
         return None
 
     def _stop_foreign_mission(self, seen: RobotStatus) -> None:

@@ -37,7 +37,6 @@ PROBLEMS_MAX = 50
 
 
 Text = Annotated[str, Field(max_length=200)]
-DEFAULT = "default: as in the experiment"
 
 
 class MissionRequest(Section):
@@ -46,12 +45,15 @@ class MissionRequest(Section):
     name: Text = Field("", description="Shown to people")
     description: str = Field("", description="One line, not kept")
     start: Literal["spawn", "here"] = Field("spawn", description="Where the mission starts")
-    time_limit_s: TimeLimit | None = Field(None, description=f"With all holds [s]; {DEFAULT}")
+    time_limit_s: TimeLimit | None = Field(
+        None, description="With all holds [s]; default: 3 times the expected time, at least 60 s"
+    )
     waypoints: tuple[Waypoint, ...] = Field((), max_length=MAX_WAYPOINTS, description="In order")
     carrot: Carrot | None = Field(None, description="How the setpoint moves; null: it jumps")
     contact: bool | None = Field(
         None,
-        description=f"The arm has to touch the board; {DEFAULT}, if a waypoint is at the board",
+        description="The arm has to touch the board; default: as in the experiment, if a waypoint "
+        "is at the board",
     )
     key: Text = Field("", description="Teleop makes one mission for each key")
     queue: bool = Field(False, description="Wait for the mission under way, if there is one")
@@ -233,16 +235,15 @@ _Request = TypeVar("_Request", bound=Section)
 def read_order(
     body: bytes,
     scene: Scene,
-    time_limit: float,
     *,
     contact: bool,
-    plan: Callable[[Mission, float], Plan],
+    plan: Callable[[Mission, float | None], Plan],
 ) -> Order:
     """Read, check and plan the mission in the body of a request.
 
-    `time_limit` [s] and `contact` are defaults; `contact` tells whether the arm has to touch the
-    board in missions with a waypoint at the board. `plan` makes a plan from a mission and a time
-    limit [s]. Raise a RefusedError that lists all problems.
+    `contact` is a default: whether the arm has to touch the board in missions with a waypoint at
+    the board. `plan` makes a plan from a mission and a time limit [s], which may be None. Raise a
+    RefusedError that lists all problems.
     """
     request = _parse(body, MissionRequest)
     if not request.waypoints:  # only an experiment may have steps instead
@@ -252,7 +253,7 @@ def read_order(
         raise RefusedError(problems)
     contact = contact and leads_to_board(mission, scene)
     contact = contact if request.contact is None else request.contact
-    planned = plan(mission, request.time_limit_s or time_limit)
+    planned = plan(mission, request.time_limit_s)
     return Order(planned, request.name, request.key, contact, request.queue)
 
 

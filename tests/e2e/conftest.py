@@ -209,7 +209,7 @@ def job_log(name):
 def fly(name, waypoints, limit=60.0):
     """Start a Job that flies waypoints, as `cloudrc mission run` does."""
     mission = {"name": name, "time_limit_s": limit, "waypoints": list(waypoints)}
-    run_job(place(), mission, name=name, limit=limit)
+    run_job(place(), mission, name=name)
 
 
 def save(folder):

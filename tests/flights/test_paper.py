@@ -3,6 +3,7 @@
 import pytest
 
 from cloudrc import assembly
+from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Mission
 from tests.conftest import nightly
 from tests.flights.conftest import fly, numbers
@@ -49,5 +50,14 @@ def test_the_limit_of_a_leg_defaults_to_three_times_its_time():
     points.append({**points[1], "time_limit_s": 7.5})
     mission = Mission.model_validate({"start": "here", "waypoints": tuple(points)})
     for options, second in (({}, 33.0), ({"speed_max": 0.5}, 48.0)):
-        legs = assembly.mission_plan(mission, 60.0, **options).legs
-        assert [leg.time_limit for leg in legs][1:] == [second, 7.5]
+        plan = assembly.mission_plan(mission, None, **options)
+        limits = [leg.time_limit for leg in plan.legs]
+        assert limits[1:] == [second, 7.5]
+        assert plan.time_limit == max(60.0, sum(limits))
+
+
+def test_a_long_mission_needs_no_time_limit_of_its_own():
+    flight = fly("hover", "mission.waypoints.0.dwell_s=70", "criteria={contact: false}")
+    assert flight.verdict.failures == ()
+    steps = load_experiment("steps", ["mission.steps.count=20"])
+    assert assembly.build_plan(steps).time_limit > 20 * 4.25

@@ -322,7 +322,7 @@ class Running:
         self.flight.uplink = uplink
         self.alarms, self.complaints = [], []
         self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
-        how = {"time_limit": 60.0, "contact": True, "plan": assembly.mission_plan}
+        how = {"contact": True, "plan": assembly.mission_plan}
         order, goto = (partial(read, scene=self.scene) for read in (read_order, read_goto))
         app = create_app(self.bridge, partial(order, **how), goto, self.complaints.append)
         tokens = None if unix else Tokens(folder, self.complaints.append)

@@ -75,7 +75,7 @@ def test_a_leg_that_takes_too_long_fails_the_mission():
     assert flight.state == "FLYING"
     flight.step(seconds=0.2)
     assert (flight.state, last_event(flight)) == ("FAILED", "leg_timed_out")
-    assert flight.events[-1].text == "waypoint 2 of 2 not reached in 2 s"
+    assert flight.events[-1].text == "waypoint 2 of 2 not reached in 2 s (its time_limit_s)"
 
 
 def test_a_robot_seen_to_hold_gets_the_first_waypoint_at_once():
