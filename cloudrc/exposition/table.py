@@ -138,7 +138,7 @@ cloudrc_delay_estimate_seconds: Clamped delay estimate: how far ahead cloud pred
 cloudrc_delay_estimate_error_seconds: Delay estimate minus the true time from the odometry to the
     application of the command, for the newest command that the robot confirmed.
 cloudrc_prediction_error_meters[axis]: Predicted minus measured position for the same instant,
-    newest value.
+    newest value (`estimate_error_rms` in the report).
 cloudrc_prediction_error_square_meters_total: Sum of the squared lengths of all prediction errors.
 cloudrc_predictions_judged_total: Predictions compared with a measurement.
 cloudrc_tracking_error_meters[axis]: Setpoint minus measured position, in the newest period.

@@ -15,7 +15,7 @@ from cloudrc.exposition.live import LiveMetrics
 from cloudrc.exposition.parts import WINDOW, DatagramTally, PredictionJudge
 from cloudrc.records import CommandApplied, Control
 from tests.console.conftest import control
-from tests.flights.conftest import records
+from tests.flights.conftest import fly, numbers, records
 
 
 def taken(counters):
@@ -87,3 +87,12 @@ def test_delay_errors_of_a_flight_match_its_ground_truth():
             seen.add(round(error[()] * 1e6))
     assert len(seen) > 100
     assert len(seen - truth) <= 0.01 * len(seen), "equal to 1 us, except for rounding"
+
+
+def test_the_prediction_error_is_the_estimate_error_of_the_report():
+    judge, chosen = PredictionJudge(), ("link.profile=paper-p3",)
+    for record in records(load_experiment("steps", chosen))[1]:
+        if isinstance(record, Control):
+            judge.take(record)
+    error = math.sqrt(judge.square / judge.judged)
+    assert error == pytest.approx(numbers(fly("steps", *chosen))["estimate_error_rms"], rel=0.02)
