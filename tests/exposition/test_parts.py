@@ -95,4 +95,4 @@ def test_the_prediction_error_is_the_estimate_error_of_the_report():
         if isinstance(record, Control):
             judge.take(record)
     error = math.sqrt(judge.square / judge.judged)
-    assert error == pytest.approx(numbers(fly("steps", *chosen))["estimate_error_rms"], rel=0.02)
+    assert error == pytest.approx(numbers(fly("steps", *chosen))["estimate_error_rms"], rel=0.05)
