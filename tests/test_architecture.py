@@ -52,7 +52,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "mujoco": ("world/",),
     # The simulator packs forces into MuJoCo's buffers; this is the fastest way.
     "struct": ("tunnel/codec", "record/", "world/simulator", "world/native/robot"),
-    "yaml": ("config/", "link/", "record/", "report/", "cli/", "cluster/", "faults/schedule"),
+    "yaml": ("config/", "link/", "record/", "report/", "cli/", "cluster/"),
     "pydantic": (
         *("config/", "link/", "cli/", "teleop/", "sweep/", "report/folder"),
         *("drivers/process", "faults/schedule"),

@@ -115,7 +115,9 @@ def set_here(
 
     states = read_states(folder)
     if not states:
-        raise BadInputError(f"{folder.parent}: no link is up there (yet); wait for the start")
+        raise BadInputError(
+            f"{folder.parent}: no link is up there: the flight has not begun or has ended"
+        )
     edit = edit_profile(Document(states[0].profile), profile, settings)
     note = write_change(Change(number, edit.cause, edit.restart))
     document = json.dumps({CHANGE_FILE: note, PROFILE: write_yaml(edit.values)})

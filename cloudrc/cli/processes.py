@@ -242,7 +242,7 @@ def open_end(
         exporter=exporter,
         flights_only=options.record_flights,
         link=link,
-        check=link_monitor(experiment, uplink=name == "cloud"),
+        check=link_monitor(experiment, uplink=name == "cloud", trusted=options.feed),
     )
     return experiment, Identity(clock, os.urandom(16), keys.ring), end
 
@@ -276,13 +276,13 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     )
 
 
-def link_monitor(experiment: ResolvedExperiment, *, uplink: bool) -> LinkMonitor:
+def link_monitor(experiment: ResolvedExperiment, *, uplink: bool, trusted: bool) -> LinkMonitor:
     """Make the monitor that compares the received datagrams with the link profile.
 
-    `uplink` is True in cloud, False in world. The monitor refuses trace files that are larger than
-    TRACE_MAX.
+    `uplink` is True in cloud, False in world. If the link is not `trusted`, as in a pod, the
+    monitor refuses trace files that are larger than TRACE_MAX.
     """
-    from cloudrc.link.traces import link_profile
+    from cloudrc.link.traces import SIZE_MAX, link_profile
     from cloudrc.link.verify.judge import Flow
     from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.messages import plan_length
@@ -292,8 +292,8 @@ def link_monitor(experiment: ResolvedExperiment, *, uplink: bool) -> LinkMonitor
     rate = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz
     size = SIZES[kind] if uplink else COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
     flow = Flow(experiment.seed, uplink, kind, size)
-    computes = experiment.cloud.compute_ms > 0
-    check = LinkMonitor(uplink, flow, period=1.0 / rate, computes=computes, file_max=TRACE_MAX)
+    computes, file_max = experiment.cloud.compute_ms > 0, SIZE_MAX if trusted else TRACE_MAX
+    check = LinkMonitor(uplink, flow, period=1.0 / rate, computes=computes, file_max=file_max)
     check.begin((link_profile(experiment.uplink), link_profile(experiment.downlink)))
     return check
 

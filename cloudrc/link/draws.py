@@ -218,7 +218,7 @@ def _packets_hit(key: StreamKey, purpose: Purpose, block: int, chance: float) ->
 
 
 def _lose_in_bursts(table: list[Fate], key: StreamKey, block: int, loss: GilbertElliott) -> None:
-    """Lose packets of a block in bursts; delay packets longer that pass in the bad state."""
+    """Lose packets of a block in bursts; add `delay_bad_ms` to those that pass in the bad state."""
     extra = round(loss.delay_bad_ms * 1e-3 * 1e9)
     draws = uniforms(key, Purpose.LOSS, block).tolist()
     for n, bad in enumerate(bad_states(key, block, loss.bad_start, loss.bad_end)):

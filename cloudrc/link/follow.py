@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -58,6 +59,16 @@ def read_handed(text: bytes | str) -> dict[str, str]:
     if PROFILE not in files or not all(map(_NAME.fullmatch, files)):
         raise ValueError(f"not a profile's files: {', '.join(sorted(files))}")
     return files
+
+
+def _with_names(values: dict[str, Any]) -> dict[str, Any]:
+    """Replace the paths of files in a profile by the names of the files."""
+    ways = {way: keys for way, keys in values.items() if isinstance(keys, dict)}
+    names = {
+        way: {key: Path(keys[key]).name for key in ("trace", "table") if keys.get(key)}
+        for way, keys in ways.items()
+    }
+    return values | {way: keys | names[way] for way, keys in ways.items()}
 
 
 class Profiles:
@@ -108,8 +119,11 @@ class Profiles:
             self._known[number] = loaded.values
             if known is None:
                 return loaded
-            if known != loaded.values:  # `helm upgrade` keeps the number of the previous change
+            if _with_names(known) != _with_names(loaded.values):
+                # `helm upgrade` keeps the number of the previous change.
                 return loaded._replace(change=Change())
+            if known != loaded.values:  # the same files in another folder, which stays
+                return loaded._replace(change=replace(loaded.change, restart=False))
         return None
 
     def _read_profile(self, path: Path) -> Loaded:

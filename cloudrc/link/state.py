@@ -54,7 +54,7 @@ class LinkState:
     changes: int = 0  # number of changes since the link came up
     change: str = ""  # number of the last change that took effect; "" if unknown
     cause: str = ""  # why the profile was changed, in words; "" before the first change
-    asked: dict[str, float | None] = field(default_factory=dict)  # the result of `profile.summary`
+    asked: dict[str, float | None] = field(default_factory=dict)  # by `link.profile.summary`
     origin_ns: int = 0  # start of the time line [ns]
     refused: str = ""  # number of the last refused change; "" if no change was refused
     refusal: str = ""  # why the last refused change was refused, in words

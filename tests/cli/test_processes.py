@@ -158,14 +158,14 @@ def test_the_link_is_expected_to_carry_the_plans(plan_s, size, monkeypatch):
     monitor = Mock()
     monkeypatch.setattr("cloudrc.link.verify.monitor.LinkMonitor", monitor)
     experiment = load_experiment("fast", [f"cloud.plan_s={plan_s}"])
-    processes.link_monitor(experiment, uplink=False)
+    processes.link_monitor(experiment, uplink=False, trusted=False)
     assert monitor.call_args.args[1].size == size
 
 
 def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch):
     monitor, path = Mock(), tmp_path / "trace.csv"
     monkeypatch.setattr("cloudrc.link.verify.monitor.LinkMonitor", monitor)
-    processes.link_monitor(load_experiment("paper"), uplink=False)
+    processes.link_monitor(load_experiment("paper"), uplink=False, trusted=False)
 
     def load(**uplink):
         return link_profile(Direction(**uplink), monitor.call_args.kwargs["file_max"])

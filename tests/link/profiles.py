@@ -1,4 +1,4 @@
-"""Profiles in SI units, for short tests. Nothing checks the values."""
+"""Profiles in SI units, for short tests. Only changes and blackouts are checked."""
 
 from cloudrc.config.schema import Blackout, Change, GilbertElliott
 from cloudrc.link.profile import DirectionProfile

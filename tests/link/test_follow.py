@@ -124,8 +124,15 @@ def test_an_upgrade_after_a_change_by_hand_takes_effect(pod):
 def test_a_change_can_contain_a_trace(pod):
     pod.first()
     files = {"profile.yaml": "uplink: {trace: t.csv}\n", "t.csv": "time_s,delay_ms\n0,40\n1,60\n"}
+    files["change.json"] = note("a1")
     write_atomically(pod.run / HANDED_FILE, json.dumps(files).encode())
     assert pod.profiles.poll().direction.rows.delays == (0.04, 0.06)
+    for name, text in files.items():  # the same change, in the folder of the ConfigMap
+        write_atomically(pod.map / name, text.encode())
+    again = pod.profiles.poll()
+    assert (again.change.number, again.change.restart) == ("a1", False)
+    assert again.values["uplink"]["trace"] == str(pod.map / "t.csv")
+    assert pod.poll() is None
 
 
 @pytest.mark.parametrize(

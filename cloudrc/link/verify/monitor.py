@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from cloudrc.config.schema import Profile
-from cloudrc.errors import describe_error
+from cloudrc.errors import BadInputError, describe_error
 from cloudrc.link.model import Stream
 from cloudrc.link.profile import DirectionProfile, Timeline, settled
 from cloudrc.link.traces import link_profile
@@ -85,7 +85,8 @@ class LinkMonitor:
     def request(self, values: dict[str, Any] | None) -> None:
         """Judge the link by a profile with the `values` of its file; None: they are unknown.
 
-        The thread loads the profile later. If the profile is invalid, the old one stays.
+        The thread loads the profile later. If the profile is invalid, the old one stays. If a file
+        that it names cannot be used, the profile is unknown.
         """
         self._news.append(values)
 
@@ -103,8 +104,12 @@ class LinkMonitor:
         if values is None:
             return None
         profile = Profile.model_validate_json(json.dumps(values))
-        uplink, downlink = profile.uplink, profile.downlink
-        return link_profile(uplink, self._file_max), link_profile(downlink, self._file_max)
+        ways = profile.uplink, profile.downlink
+        try:
+            uplink, downlink = (link_profile(way, self._file_max) for way in ways)
+        except BadInputError:  # a file is too large, or deleted since
+            return None
+        return uplink, downlink
 
     def after(self, records: Sequence[Record], now_ns: int) -> list[Record]:
         """Process this end's new records at `now_ns` [ns]; return `LinkChecked`s and `Fault`s."""

@@ -142,8 +142,10 @@ def test_the_monitor_follows_the_link_and_ignores_nonsense():
         monitor.request(values)
         assert monitor.after([], 0) == []
         assert monitor._asked[0].delay_ms == delay_ms
-    monitor.request(None)
-    assert checked(monitor, arrivals(FAULTS["mean"], 20.0)) == ([], []), "nothing is known"
+    for unknown in (None, {"uplink": {"trace": "/no/such.csv"}}):
+        monitor.request(unknown)
+        assert checked(monitor, arrivals(FAULTS["mean"], 20.0)) == ([], []), "nothing is known"
+        monitor.follow((PAPER, PAPER))
 
 
 def test_the_thread_judges_like_the_loop_and_survives_a_failure(monkeypatch):
