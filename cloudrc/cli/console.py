@@ -65,6 +65,7 @@ def execute(options: argparse.Namespace) -> int:
     """Serve the page until the flight ends or the user interrupts."""
     run: Path | None = options.run
     if run and len(run.parts) == 1 and not (run.exists() or options.release):
+        print_line(f"cloudrc: no folder '{run}' here: looking for a release", sys.stderr)
         options.run, options.release = None, str(run)
     if options.cluster or options.context or options.namespace or options.release:
         return _show_release(options)

@@ -35,7 +35,7 @@ from cloudrc.cluster.pods import METRICS, NO_PROXY
 from cloudrc.config import shipped
 from cloudrc.config.load import ResolvedExperiment, dump, read_experiment
 from cloudrc.config.schema import Experiment, Profile
-from cloudrc.drivers.local import link_words, start_process
+from cloudrc.drivers.local import ROUTE_FILE, link_words, start_process
 from cloudrc.drivers.realtime import bind, free_ports, split_address
 from cloudrc.errors import (
     BadInputError,
@@ -175,7 +175,7 @@ def measure(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Str
     """Send all probes over a running link; return what the probes measured in each direction."""
     since_wall_ns, ends = time.time_ns() - time.monotonic_ns(), []
     for name, way in ways.items():
-        route = split_address((way.folder / "route").read_text())
+        route = split_address((way.folder / ROUTE_FILE).read_text())
         origin_ns = from_text((way.folder / STATE_FILE).read_text()).origin_ns + since_wall_ns
         ends.append(ProbeEnd(way.own, route, plans[name], origin_ns))
     return dict(zip(ways, send_probes(ends), strict=True))
@@ -224,7 +224,7 @@ def run_link(experiment: ResolvedExperiment, shaper: str) -> Iterator[dict[str, 
             way.process = _start(name, way, shaper)
             stack.callback(end_process, way.process)
         deadline = time.monotonic() + START_LIMIT
-        while not all((way.folder / "route").exists() for way in ways.values()):
+        while not all((way.folder / ROUTE_FILE).exists() for way in ways.values()):
             for name, way in ways.items():
                 if way.process and (code := way.process.poll()) is not None:
                     raise _ended(name, code, (way.folder / "log").read_text(errors="replace"))

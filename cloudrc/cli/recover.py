@@ -35,7 +35,7 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.record.reader import recover
 
     source: Path = options.file
-    target = options.to or source.with_name(f"{source.stem}.recovered{source.suffix}")
+    target = options.to or source.parent / f"{source.stem}.recovered{source.suffix}"
     if os.path.lexists(target):
         raise BadInputError(f"{target}: already there; name another file with --to")
     recovery = recover(source, target)

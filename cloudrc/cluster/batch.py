@@ -52,7 +52,8 @@ def start(
         delete_job(release, name)
     files, job = read_example(release, COMPONENT, name)
     if queue:
-        job["metadata"]["labels"] |= {"kueue.x-k8s.io/queue-name": queue}
+        labels = job["metadata"]["labels"]  # the pods keep theirs
+        job["metadata"]["labels"] = {**labels, "kueue.x-k8s.io/queue-name": queue}
     job["spec"] |= {"completions": shards, "parallelism": shards}
     (container,) = job["spec"]["template"]["spec"]["containers"]
     container["image"], container["args"][-1] = image, f"--shard=auto/{shards}"
@@ -69,11 +70,14 @@ def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iter
     Raises:
         ClusterError: If the Job fails, or if a pod will never run.
     """
+    told = set[str]()
 
     def see_end(state: Any) -> None:
-        if state.exit_code:
-            words = to_one_line(state.message) or state.reason
-            tell(f"a pod failed with exit code {state.exit_code}: {words}")
+        words = to_one_line(state.message) or state.reason
+        text = f"a pod failed with exit code {state.exit_code}: {words}"
+        if state.exit_code and text not in told:
+            told.add(text)
+            tell(text)
 
     yield from read_log(release, name, tell, see_end)
     if ending := failure_of(release.request("get", "jobs", name=name)):

@@ -211,43 +211,51 @@ def read_log(
 ) -> Iterator[str]:
     """Yield each different line of the logs of a Job's pods, until the Job has ended.
 
-    `tell` receives a sentence if a pod waits for a node. `see_end` receives the final state of the
-    container of each pod that ends. Raise a ClusterError if a pod will never run.
+    `tell` receives a sentence if a pod waits for a node, or if the log of an ended pod cannot be
+    read. `see_end` receives the final state of the container of each pod that ends. Raise a
+    ClusterError if a pod will never run.
     """
     told, read, seen = set[str](), set[str](), set[int]()  # seen: hashes of lines
+
+    def tell_once(text: str) -> None:
+        if text and text not in told:
+            told.add(text)
+            tell(text)
+
     while True:
         job = release.request("get", "jobs", name=name)
-        (container,) = job.spec.template.spec.containers
+        component = job.metadata.labels["app.kubernetes.io/component"]
         has_ended, selector = failure_of(job) is not None, f"{UID_LABEL}={job.metadata.uid}"
         pods = release.request("list", "pods", label_selector=selector)
-        why = "" if has_ended else _why_waiting(release, job, pods)
-        if why and why not in told:
-            told.add(why)
-            tell(f"waiting: {why}")
+        tell_once("" if has_ended else _why_waiting(release, job, pods))
         for pod in pods:
             if pod.status.phase == "Pending" or pod.metadata.uid in read:
                 continue
             # A service mesh may add containers, which end later.
-            own = (each for each in container_statuses(pod) if each.name == container.name)
+            own = (each for each in container_statuses(pod) if each.name == component)
             ended = next((each.state.terminated for each in own), None)
             is_done = ended is not None or pod.status.phase in ("Succeeded", "Failed")
             if is_done:
                 read.add(pod.metadata.uid)
             if ended is not None:
                 see_end(ended)
-            last = None if is_done else OVERLAP
-            with suppress(ClusterError):  # the pod may be gone
-                for line in pod_log(release, pod.metadata.name, container.name, last).splitlines():
-                    if hash(line) not in seen:
-                        seen.add(hash(line))
-                        yield line
+            try:
+                last = None if is_done else OVERLAP
+                text = pod_log(release, pod.metadata.name, component, last)
+            except ClusterError as error:  # the pod may be gone
+                text = ""
+                tell_once(str(error) if is_done else "")
+            for line in text.splitlines():
+                if hash(line) not in seen:
+                    seen.add(hash(line))
+                    yield line
         if has_ended:
             return
         time.sleep(LOOK_PERIOD)
 
 
 def _why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
-    """Return why pods of a Job wait for a node, "" if none waits.
+    """Return that pods of a Job wait, and why; "" if none waits.
 
     Raise a ClusterError if a pod will never run, or if the cluster refuses to make the pods.
     """
@@ -263,4 +271,4 @@ def _why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
                 f"Job '{name}' cannot start: {why}; fix this, then delete the Job: "
                 f"{release.kubectl} delete job {name}"
             )
-    return next(filter(None, found), "")
+    return next((f"waiting: {why}" for why in found if why), "")

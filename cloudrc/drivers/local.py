@@ -83,7 +83,7 @@ class FlightFile(NamedTuple):
 
 
 @contextlib.contextmanager
-def announced(run: Path, api: str = "", kind: str = RUN) -> Iterator[None]:
+def announced(run: Path, api: str, kind: str = RUN) -> Iterator[None]:
     """Keep a flight file during the `with` block, if the folder of flight files is writable.
 
     The file tells other commands `run`, the folder of the run; `api`, the address of the operator's

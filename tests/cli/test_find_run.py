@@ -111,7 +111,8 @@ def test_the_console_names_a_run_as_it_was_given(tmp_path, elsewhere, said):
     with flying(tmp_path / "a"), flying(tmp_path / "b"):
         assert "error: runs/nope: no run flies there" in said(2, "console runs/nope")
         assert f"choose one: {tmp_path / 'a'} or {tmp_path / 'b'}" in said(2, "console")
-        assert said(3, "console nope") == said(3, "console --release nope")
+        looks = "cloudrc: no folder 'nope' here: looking for a release\n"
+        assert said(3, "console nope") == looks + said(3, "console --release nope")
         (elsewhere / "nope").mkdir()
         assert "error: nope: no run flies there" in said(2, "console nope")
 
@@ -141,7 +142,7 @@ def test_a_local_run_gets_no_token(tmp_path, monkeypatch, call):
 def test_link_set_finds_the_only_run(elsewhere, said, monkeypatch):
     here = elsewhere / "runs" / "latest"
     (here / "link").mkdir(parents=True)
-    with local.announced(here):
+    with local.announced(here, ""):
         assert "runs/latest: no link is up there:" in said(2, SET)
         monkeypatch.setattr(sys, "argv", ["/usr/local/bin/kubectl-cloudrc"])
         error = said(3, SET)

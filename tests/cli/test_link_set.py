@@ -108,7 +108,7 @@ class Flight:
 def flight(tmp_path, monkeypatch):
     found = Flight(tmp_path / "runs" / "latest" / "link")
     monkeypatch.setattr(link_set, "sleep", found.wait)
-    with local.announced(tmp_path / "runs" / "latest"):
+    with local.announced(tmp_path / "runs" / "latest", ""):
         yield found
 
 

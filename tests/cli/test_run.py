@@ -7,7 +7,9 @@ from unittest.mock import Mock
 
 import pytest
 
+from cloudrc.cli import extras
 from cloudrc.cli.main import main
+from cloudrc.cli.report import summary
 from cloudrc.cli.run import new_folder
 from cloudrc.errors import BadInputError
 from tests.cli.conftest import FLY, SHORT
@@ -141,3 +143,14 @@ def test_what_is_there_is_never_overwritten(out, said):
     with pytest.raises(BadInputError, match=said):
         new_folder(out, "x")
     assert Path("full/precious").read_text() == "data"
+
+
+def test_each_later_failure_has_its_time():
+    failures = [{"text": "touched pipe_2"}, {"text": "too slow", "time": 3.25}]
+    found = {"verdict": "failure", "failures": failures, "numbers": {}}
+    assert "  also: too slow (at 3.25 s)" in summary(found, Path("runs/a")).splitlines()
+
+
+def test_a_run_in_real_time_needs_the_extra_of_the_api(monkeypatch, refused):
+    monkeypatch.setitem(extras.EXTRAS, "api", ("fastapi_is_not_here",))
+    assert "pip install 'cloudrc[api]'" in refused("run hover --mode local", code=3)

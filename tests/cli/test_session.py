@@ -49,7 +49,7 @@ def down(monkeypatch, call):
 
 def test_down_ends_sessions_only_and_asks_which(folder, down):
     assert "no session runs here; start one: cloudrc up;" in down(3)
-    with local.announced(folder / "r"):
+    with local.announced(folder / "r", ""):
         assert "a flight of 'cloudrc run' ends by Ctrl-C there" in down(3)
         assert "--run r: no session runs there" in down(2, "--run r")
     (folder / "runs/latest").mkdir(parents=True)
@@ -58,7 +58,7 @@ def test_down_ends_sessions_only_and_asks_which(folder, down):
         with local.announced(folder / "b", "", "session"):
             assert "2 runs are flying here; choose one: --run" in down(2)
         assert "runs/latest has ended; name another flight: --run theirs;" in down(2)
-        with local.announced(folder / "runs/latest"):  # by 'cloudrc run'
+        with local.announced(folder / "runs/latest", ""):  # by 'cloudrc run'
             assert "runs/latest does not take this command; name" in down(2)
         assert "theirs: ended" in down(0, "--run theirs")
 
@@ -198,8 +198,8 @@ def test_a_session_that_dies_in_flight_can_be_reported(folder, command, victim, 
         pids = processes_of(process)
         os.kill(pids[victim] if victim else process.pid, signal.SIGKILL)
         assert process.wait(60) == code
-        wait_until(lambda: local.under_way() == {})
-        wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids.values()))
+        wait_until(lambda: local.under_way() == {}, 5.0)
+        wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in pids.values()), 5.0)
     if victim:
         assert "the cloud process died in flight (signal 9)" in (folder / "said").read_text()
     command("report s", code=130)  # interrupted

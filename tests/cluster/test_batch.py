@@ -39,7 +39,10 @@ def test_the_job_flies_each_index_with_its_flights(started, api, release):
     assert container["args"] == ["sweep", "rows", "/flights/flights.json.gz", "--shard=auto/4"]
     assert "kueue.x-k8s.io/queue-name" not in job["metadata"]["labels"]
     batch.start(release, "sweep-2", b"flights", 4, **{**WORDS, "queue": "lab"})
-    assert api.get("jobs", "sweep-2")["metadata"]["labels"]["kueue.x-k8s.io/queue-name"] == "lab"
+    queued = api.get("jobs", "sweep-2")
+    assert queued["metadata"]["labels"]["kueue.x-k8s.io/queue-name"] == "lab"
+    pods = queued["spec"]["template"]["metadata"]["labels"]
+    assert "kueue.x-k8s.io/queue-name" not in pods, "the queue takes the whole Job"
 
 
 def test_a_running_job_is_kept_and_a_failed_job_is_replaced(started, api, release):

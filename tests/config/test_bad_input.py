@@ -128,6 +128,7 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ("world.robot=./no.xml", "no.xml; names of shipped robots: pelican"),
         ("world.robot=/x/q", "world.robot: no such .xml file: /x/q"),
         # A limit of the guard cannot be switched off.
+        ("guard.command_age_max_ms=true", "--set: guard.command_age_max_ms: "),
         ("guard.speed_max_mps=1e-320", "--set: guard.speed_max_mps: "),
         ("guard.hold_max_s=1e-10", "--set: guard.hold_max_s: "),
         (

@@ -54,7 +54,7 @@ async def flood(url, token, seconds, rate):
     await asyncio.gather(*answers)
     for _, writer in opened:
         writer.close()
-    return found | {"seconds": took}
+    return found | {"seconds": took, "answered": time.monotonic() - began}
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ def flights(tmp_path, monkeypatch):
 
 def test_a_flight_is_found_while_it_lasts_and_leaves_nothing(tmp_path, flights, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with suppress(KeyboardInterrupt), local.announced(Path("runs/a")):
+    with suppress(KeyboardInterrupt), local.announced(Path("runs/a"), ""):
         monkeypatch.chdir("/")
         assert local.under_way() == {tmp_path / "runs" / "a": ""}
         assert stat.S_IMODE(flights.stat().st_mode) == 0o700
@@ -48,14 +48,14 @@ def test_a_flight_is_in_the_home_without_a_runtime_folder(tmp_path, runtime, mon
     monkeypatch.setenv("XDG_RUNTIME_DIR", runtime and str(tmp_path / runtime))
     (tmp_path / "of_others").mkdir()
     monkeypatch.setattr(os, "getuid", lambda: os.stat(tmp_path).st_uid + 1)
-    with local.announced(tmp_path):
+    with local.announced(tmp_path, ""):
         assert list(local.under_way()) == [tmp_path]
         assert (tmp_path / "home/.local/state/cloudrc/flights").is_dir()
 
 
 def test_a_flight_without_a_writable_folder_is_not_found(tmp_path):
     (tmp_path / "cloudrc").write_text("in the way")
-    with local.announced(tmp_path):
+    with local.announced(tmp_path, ""):
         assert local.under_way() == {}
 
 

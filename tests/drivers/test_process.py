@@ -178,12 +178,14 @@ def test_a_change_is_recorded_once_and_again_at_a_mission_start(path):
 def test_nonsense_is_recorded_as_nothing(path, wrong):
     """Neither is the state before it, which no longer holds."""
     tell(path, STATE)
-    notes = LinkNotes(path, uplink=False, check=Mock())
+    notes = LinkNotes(path, uplink=False, check=(check := Mock()))
     assert len(notes.after([], 200 * MS)) == 1
     text = wrong if isinstance(wrong, str) else json.dumps(asdict(SET) | wrong)
     for file in (path, path.with_suffix(".released")):
         file.write_text(text)
     assert notes.after(BEGINS, 2200 * MS) == []
+    is_unknown = call(None) in check.request.mock_calls  # else the monitor keeps the profile
+    assert is_unknown == (len(text) > STATE_MAX)
     path.unlink()
     os.mkfifo(path)  # is not waited for
     assert notes.after(BEGINS, 2400 * MS) == []

@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -138,7 +139,7 @@ def test_a_run_with_a_torn_end_keeps_its_facts(run):
     write_ends(run)
     cut(run / "world.mcap", run / "world.mcap")
     mission = merge(run / "world.mcap", run / "cloud.mcap")
-    facts = Run("cluster", "netem", interrupted=True, notes=("the world process died",))
+    facts = replace(RUN, mode="cluster", shaper="netem", interrupted=True)
     mission.metadata |= facts.metadata
     mission.write(run / "mission.mcap", {})
     (run / "report.json").unlink()

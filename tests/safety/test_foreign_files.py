@@ -155,7 +155,6 @@ def records(path, name="theirs.mcap"):
 
 WRITERS = [
     lambda path: write_atomically(path, b"new"),
-    lambda path: write_atomically(path, b"new"),
     lambda path: write_json(path, {}),
     lambda path: recover(records(path), path),
     lambda path: merge(records(path), records(path, "other.mcap")).write(path),

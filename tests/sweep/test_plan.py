@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from cloudrc.assembly import build_links
 from cloudrc.errors import BadInputError
 from cloudrc.sweep import plan
 from cloudrc.sweep.plan import pack, read_plan, unpack
@@ -63,6 +64,16 @@ def test_a_key_depends_on_the_code_of_a_named_plugin(write_sweep, monkeypatch, t
     plan._code.cache_clear()
     assert found[0][0] != found[1][0]
     assert found[0][1] == found[1][1]
+
+
+def test_points_with_one_seed_meet_the_same_draws(write_sweep):
+    def delays(experiment):
+        return [link.send(1, 2, n, 100, 0) for link in build_links(experiment) for n in range(300)]
+
+    grid = {"cloud.predictor": ["last_sample", "constant_velocity"]}
+    flights = read_plan(write_sweep(grid, seeds=2)).flights.values()
+    first, other, again, _ = (delays(each.experiment) for each in flights)
+    assert first == again != other
 
 
 def test_relative_paths_start_at_the_file(write_sweep, tmp_path, monkeypatch):
