@@ -405,10 +405,13 @@ def _without_marks(raw: list[Entry], column: str, log: Log, *, has_losses: bool)
 
 _WRAP = 1 << 16
 _STAMP = re.compile(
-    r"\[?(?P<unix>(?<=\[)\d+(?:\.\d+)?|\d{9,10}\.\d+)\]? +"
-    r"|(?P<clock>\d\d:\d\d:\d\d\.\d+)\S* +"
+    r"^(?:\[?(?P<unix>(?<=\[)\d+(?:\.\d+)?|\d{9,10}\.\d+)\]?(?: +|$)"
+    r"|(?P<clock>\d\d:\d\d:\d\d\.\d+)\S* +)"
 )
-"""Time stamp at the start of a line, from `ping -D`, `ts '[%.s]'` or `ping --apple-time`."""
+"""Time stamp at the start of a line, from `ping -D`, `ts '[%.s]'` or `ping --apple-time`.
+
+`ts` stamps every line, also the heads and the summary.
+"""
 _NUMBER = re.compile(r"\b(?:icmp6?_)?(?:seq|req)[= ](\d{1,12})\b|(?<= : )\[(\d{1,12})\], ")
 _ROUND_TRIP = re.compile(r"(?:[=<] ?|, )(\d+(?:[.,]\d+)?) ?(?:ms|msec|msek|мс|毫秒|ミリ秒)(?=\W|$)")
 _REPLY = re.compile(r"ttl=|hlim=|bytes from", re.IGNORECASE)
@@ -456,7 +459,7 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
         raise _sessions(f"number {known[times.argmax()]:.0f} comes twice", log)
     late = replied & (number < np.maximum.accumulate(number))
     log.counts["out of order, sorted"] += int(late.sum())
-    others = [line for line in lines if not _NUMBER.search(line)]
+    others = [_STAMP.sub("", line) for line in lines if not _NUMBER.search(line)]
     first, last = _ping_range(int(number.min()), int(number.max()), len(known), others, log)
     sent, delays = (stamp - trip)[replied][index], np.full(last - first + 1, nan)
     delays[known.astype(int) - first] = trip[replied][index] / 2

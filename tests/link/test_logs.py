@@ -326,6 +326,31 @@ def test_other_pings_and_languages_are_read(lines, delays):
     assert found == pytest.approx(list(delays))
 
 
+TS = (
+    "PING 192.0.2.7 (192.0.2.7): 56 data bytes",
+    "64 bytes from 192.0.2.7: seq=0 ttl=57 time=20.0 ms",
+    "64 bytes from 192.0.2.7: seq=2 ttl=57 time=20.0 ms",
+    "",
+    "--- 192.0.2.7 ping statistics ---",
+    "4 packets transmitted, 2 packets received, 50% packet loss",
+    "round-trip min/avg/max = 20.0/20.0/20.0 ms",
+)
+"""Output of BusyBox's ping."""
+
+
+@pytest.mark.parametrize("stamp", ["[170000000{}.200000] ", "170000000{}.200000 ", "10:00:0{}.5 "])
+def test_a_stamp_on_every_line_changes_nothing(stamp):
+    """As from `ping HOST | ts '[%.s]'`, the remedy for BusyBox and BSD."""
+    lines = [stamp.format(n) + line for n, line in enumerate(TS)]
+    packets = ping(*lines)
+    assert delays_of(packets) == pytest.approx((0.010, None, 0.010, None))
+    assert packets.notes == ()
+    with pytest.raises(BadInputError, match="counts 4 sent and 2 received, but it has 1 replies"):
+        ping(*lines[:2], *lines[3:])
+    with pytest.raises(BadInputError, match="more than one session of ping"):
+        ping(*lines[:3], lines[0])
+
+
 def test_ping_counts_on_after_65535():
     """A late reply from before the wrap keeps its place."""
     packets = ping(reply(65534, 1.0), reply(0, 3.0), reply(65535, 2.0), reply(1, 4.0))
