@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import re
 from collections.abc import Callable, Sequence
 from functools import partial
 from math import isnan, nan
@@ -182,14 +183,15 @@ def show(options: argparse.Namespace) -> int:
 
 
 def _profile(name: str) -> tuple[Profile, bool]:
-    """Load the profile `name`, or make one from a CSV trace; return whether `name` is a trace."""
+    """Load the profile `name`, or make one from a trace; return whether `name` is a trace."""
     from cloudrc.config.load import load_profile
     from cloudrc.config.schema import Direction, Profile
-    from cloudrc.link.traces import read_trace
+    from cloudrc.link.traces import read_lines, read_trace
 
-    if not name.endswith(".csv"):
-        return load_profile(name), False
     path = Path(name).absolute()
+    lines = read_lines(path, name, "give a profile or a trace") if path.is_file() else []
+    if not (name.endswith(".csv") or re.match(r"(\s|#.*\n)*(time_s|\d)", "\n".join(lines[:9]))):
+        return load_profile(name), False
     times = read_trace(path).times
     about = f"a trace of {len(times)} rows in {times[-1] - times[0]:.4g} s"
     return Profile(description=about, uplink=Direction(trace=str(path))), True

@@ -16,6 +16,7 @@ import copy
 import inspect
 import json
 from collections.abc import Iterable
+from functools import reduce
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -49,7 +50,7 @@ Settings: TypeAlias = dict[KeyPath, Setting]
 def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
     """Make settings from triples of a key, such as `link.both.delay_ms`, its value and its source.
 
-    Raise a BadInputError if a key has an empty part or is set twice.
+    Raise a BadInputError if a key has an empty part or is set twice, also inside another's value.
     """
     found: Settings = {}
     for key, value, source in given:
@@ -60,6 +61,11 @@ def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
             if each in found:
                 raise BadInputError(f"{source.label} {key}: is set twice; keep one of them")
             found[each] = Setting(value, source._replace(is_setting=True))
+    for path, depth in [(each, n) for each in found for n in range(1, len(each))]:
+        above = found.get(path[:depth])
+        if above and reduce(child, path[depth:], above.value) is not None:
+            both = f"{'.'.join(path)}: is set twice, also by {'.'.join(path[:depth])}"
+            raise BadInputError(f"{found[path].source.label} {both}; keep one of them")
     return {path: found[path] for path in sorted(found, key=len)}
 
 

@@ -16,7 +16,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from math import isnan, nan
 from typing import Any, Literal, TypeAlias
@@ -24,7 +24,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from cloudrc.errors import BadInputError
-from cloudrc.link.model import Stream
+from cloudrc.link.model import Array, Stream
 from cloudrc.link.profile import Trace
 from cloudrc.link.traces import LATEST, Row, looks_lost, read_rows
 
@@ -32,11 +32,11 @@ Direction: TypeAlias = Literal["uplink", "downlink"]
 Entry: TypeAlias = tuple[float, float]
 """Time of sending [s] and delay [s]; the delay is NaN if the packet was lost."""
 LONGEST = 5.0  # largest plausible median delay [s]; a larger median suggests that the unit is wrong
+RARE, OFTEN = 86_400.0, 1e-4  # implausible time between packets [s]: more than, less than
 UNUSABLE_MAX = 0.01  # largest share of rows that may be left out, in [0, 1]
-GAP, GAP_MIN = 5, 1.0
-"""A gap between packets is reported if it is longer than GAP_MIN [s] and longer than GAP times the
-median time between packets."""
-STEPS_MAX = 3  # largest number of jumps back in time that count as clock steps, not as disorder
+GAP, GAP_MIN, BACK_MAX = 5, 0.1, 1.0
+"""A gap between packets, or a jump back, is reported if it is longer than GAP_MIN [s] and longer
+than GAP times the median time between packets. A log that jumps back by BACK_MAX [s] is refused."""
 PACKETS_MAX = 10_000_000  # limit for packets in a log of ping; more mean a wrong sequence number
 HALVE = (
     "a trace is one way; if both directions are alike, use half of each round trip with "
@@ -66,31 +66,26 @@ class Log:
         """Check the packets, sort them by time of sending, and add a note on each correction.
 
         Raise a BadInputError if no packet arrived; if a delay is negative; if the times jump far
-        back once to three times, as after a step of the clock; if more than 1 % of the rows are
-        unusable; or if more than 1 % of the packets have the time of an earlier packet.
+        back, as after a step of the clock; if more than 1 % of the rows are unusable; or if more
+        than 1 % of the packets have the time of an earlier packet.
         """
         self._refuse_beyond_limit(len(self.unusable), *self.unusable[:1])
         times, delays = np.array(self.entries or [(nan, nan)]).T
         if np.isnan(delays).all():
             raise self.error("no packet arrived; give a log with at least one reply")
         self.refuse_early(float(np.nanmin(delays)))
-        steps = np.diff(times)
-        far = max(GAP_MIN, GAP * float(np.median(np.abs(steps)))) if len(steps) else GAP_MIN
-        back = np.flatnonzero(steps < -far)
-        if 1 <= len(back) <= STEPS_MAX:  # sorting would mix two sessions
-            raise self.error(
-                f"after row {back[0] + 1} the times go back by {-steps[back[0]]:.4g} s: a step of "
-                "the clock, midnight in times without a date, or two sessions in one log; give the "
-                "rows before or after it"
-            )
+        period = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
+        far = max(GAP_MIN, GAP * period)
+        jumps = self._jumps(times, delays, far)
         unique = dict(reversed(self.entries))  # of packets with the same time, the first is kept
         repeated = len(times) - len(unique)
         same = f"{repeated} of {len(times)} packets have the same time as another one"
-        self._refuse_beyond_limit(repeated, f"{self.name}: {same}; give times with more digits")
+        cause = jumps[0] if jumps else "give times with more digits"
+        self._refuse_beyond_limit(repeated, f"{self.name}: {same}; {cause}")
         self.counts["out of order, sorted"] += int(np.sum(times < np.maximum.accumulate(times)))
         self.counts["left out, at the time of another one"] += repeated
         self.counts["left out, unreadable"] += len(self.unusable)
-        notes = [f"{count} {what}" for what, count in self.counts.items() if count]
+        notes = [f"{count} {what}" for what, count in self.counts.items() if count] + jumps
         sent, delays = np.array(sorted(unique.items())).T
         gaps = np.diff(sent)
         if gaps.max(initial=0.0) > far:
@@ -100,6 +95,35 @@ class Log:
             )
         copies = np.isfinite(delays).astype(int)
         return Packets(sent, delays, copies, tuple(notes), self.halved)
+
+    def _jumps(self, times: Array, delays: Array, far: float) -> list[str]:
+        """Return a note if the times go back by more than `far` [s] and stay back.
+
+        Rows in the order of arrival are no jump, nor is a single row out of order: the medians of
+        11 rows before and after, less the usual progress, have to differ. Raise a BadInputError if
+        a jump is at least BACK_MAX [s]: sorting would mix two sessions.
+        """
+        steps = np.diff(times)
+        usual = np.median(steps) if len(steps) else 0.0
+        arrivals = times + delays * (2 if self.halved else 1)
+        back = np.flatnonzero((steps < min(usual - far, 0.0)) & ~(np.diff(arrivals) >= 0.0))
+        back = back[(back > 0) & (back < len(steps) - 1)]  # a first or last row tells nothing
+        level = np.pad(times - usual * np.arange(len(times)), 10, constant_values=nan)
+        around = np.lib.stride_tricks.sliding_window_view(level, 11)
+        before = np.nanquantile(around[back], 0.5, axis=1, method="lower")
+        after = np.nanquantile(around[back + 11], 0.5, axis=1, method="higher")
+        back = back[before - after > far / 2]
+        if not len(back):
+            return []
+        at = back[steps[back].argmin()]
+        note = (
+            f"after row {at + 1} the times go back by {-steps[at]:.4g} s"
+            f"{f', the longest of {len(back)} such jumps' if len(back) > 1 else ''}: a step of the "
+            "clock, midnight in times without a date, or several sessions in one log"
+        )
+        if -steps[at] >= BACK_MAX:
+            raise self.error(f"{note}; give the rows of one session, sorted by time")
+        return [note]
 
     def error(self, text: str) -> BadInputError:
         """Make an error that begins with the name of the log."""
@@ -313,21 +337,27 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     scales = SCALES[time_unit or "s"], SCALES[unit] * (0.5 if log.halved else 1.0)
     log.entries = [((sent - start) * scales[0], value * scales[1]) for sent, value in raw]
     packets = log.packets()
-    if not trust_units:
-        _check_unit(packets, unit, f"{name}: {delay}")
-    return packets
+    return packets if trust_units else _check_units(packets, time, delay, unit, name)
 
 
-def _check_unit(packets: Packets, unit: str, name: str) -> None:
-    """Raise a BadInputError if the delays are probably not in `unit`, the column's unit."""
+def _check_units(packets: Packets, time: str, delay: str, unit: str, name: str) -> Packets:
+    """Refuse delays that are probably not in `unit`; refuse or note times in an unlikely unit."""
     factor, found = 1 / SCALES[unit], ""
     top, middle = np.nanmax(packets.delays), np.nanmedian(packets.delays)
+    period = float(np.median(np.diff(packets.sent))) if len(packets.sent) > 1 else 1.0
+    note = f"one packet in {period:.4g} s, if {time} is in the unit that its name says"
     if unit != "s" and 0.0 < top * factor < 1.0:
-        found = f"is at most {top * factor:.4g} {unit}, which looks like seconds"
+        found = f"{delay} is at most {top * factor:.4g} {unit}, which looks like seconds"
     elif middle > LONGEST:
-        found = f"has a median of {middle * factor:.6g} {unit}, which looks like {FINER[unit]}"
+        seen = f"{middle * factor:.6g} {unit}"
+        found = f"{delay} has a median of {seen}, which looks like {FINER[unit]}"
+    elif period > RARE:
+        found = note
     if found:
-        raise BadInputError(f"{name} {found}; name the column after its unit, or use --trust-units")
+        raise BadInputError(
+            f"{name}: {found}; name the column after its unit, or use --trust-units"
+        )
+    return packets if OFTEN <= period <= LONGEST else replace(packets, notes=(*packets.notes, note))
 
 
 def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, str]:
@@ -405,8 +435,8 @@ def _without_marks(raw: list[Entry], column: str, log: Log, *, has_losses: bool)
 
 _WRAP = 1 << 16
 _STAMP = re.compile(
-    r"\[?(?P<unix>(?<=\[)\d+(?:\.\d+)?|\d{9,10}\.\d+)\]? +"
-    r"|(?P<clock>\d\d:\d\d:\d\d\.\d+)\S* +"
+    r"^(?:\[?(?P<unix>(?<=\[)\d+(?:\.\d+)?|\d{9,10}\.\d+)\]?(?: +|$)"
+    r"|(?P<clock>\d\d:\d\d:\d\d\.\d+)\S* +)"
 )
 """Time stamp at the start of a line, from `ping -D`, `ts '[%.s]'` or `ping --apple-time`."""
 _NUMBER = re.compile(r"\b(?:icmp6?_)?(?:seq|req)[= ](\d{1,12})\b|(?<= : )\[(\d{1,12})\], ")
@@ -456,7 +486,7 @@ def read_ping(lines: list[str], name: str, *, halve: bool) -> Packets:
         raise _sessions(f"number {known[times.argmax()]:.0f} comes twice", log)
     late = replied & (number < np.maximum.accumulate(number))
     log.counts["out of order, sorted"] += int(late.sum())
-    others = [line for line in lines if not _NUMBER.search(line)]
+    others = [_STAMP.sub("", line) for line in lines if not _NUMBER.search(line)]
     first, last = _ping_range(int(number.min()), int(number.max()), len(known), others, log)
     sent, delays = (stamp - trip)[replied][index], np.full(last - first + 1, nan)
     delays[known.astype(int) - first] = trip[replied][index] / 2

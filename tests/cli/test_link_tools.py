@@ -101,3 +101,16 @@ def test_a_trace_is_shown_row_by_row_whatever_its_span(folder, call):
         assert any(line.split()[:2] == ["lost", "9.98"] for line in said.splitlines())
     assert trace.startswith("t: a trace of 501 rows in 3.154e+07 s\n")
     assert "downlink" not in trace
+
+
+@pytest.mark.parametrize("name", ["Verizon.up", "./Verizon.up", "delays.csv"])
+def test_a_rate_trace_or_bare_delays_are_named_with_the_remedy(name, folder, refused):
+    (folder / name).write_text("\n12\n15\n15\n")
+    assert "a rate trace of mahimahi has no delays, use rate_kbit;" in refused(f"link show {name}")
+
+
+def test_a_trace_needs_no_ending_and_a_profile_no_name(folder, call):
+    (folder / "t.txt").write_text("# half of ping\ntime_s,delay_ms\n0,40\n1,50\n")
+    assert call("link show t.txt").out.startswith("t: a trace of 2 rows in 1 s\n")
+    (folder / "mine.yaml").write_text("---\nuplink: {delay_ms: 30}\n")
+    assert call("link show mine.yaml").out.startswith("mine\n")

@@ -117,6 +117,15 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
     [
         ("seed", "--set seed: must be key=value"),
         ("seed=1 name=x seed=2", "--set seed: is set twice; keep one"),
+        (
+            "link={'uplink':{'delay_ms':4}} link.both.delay_ms=3",
+            "link.uplink.delay_ms: is set twice, also by link; keep one of them",
+        ),
+        ("link.both={'delay_ms':4} link.uplink.delay_ms=3", "is set twice, also by link.uplink;"),
+        (
+            "mission.waypoints=[{'dwell_s':1}] mission.waypoints.0.dwell_s=2",
+            "dwell_s: is set twice",
+        ),
         ("a..b=1", "is no key"),
         ("seed=[", "--set seed"),
         ("seed=[1],[2]", "--set seed: [1],[2]: text after the value"),

@@ -5,6 +5,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -16,6 +17,7 @@ LOCKS = {
     ROOT / "images" / "cloud" / "requirements.txt": ROLES["cloud"],
     ROOT / "tests" / "requirements.txt": ("dev",),
 }
+BUILD = ROOT / "images" / "build-requirements.txt"
 
 
 def locked(path):
@@ -42,13 +44,21 @@ def test_a_lock_satisfies_pyproject(lock):
         assert requirement.specifier.contains(versions[name], prereleases=True), name
 
 
-@pytest.mark.parametrize("lock", [*LOCKS, ROOT / "images" / "build-requirements.txt"])
+@pytest.mark.parametrize("lock", [*LOCKS, BUILD])
 def test_every_package_has_a_hash_and_no_address(lock):
     text = lock.read_text()
     blocks = re.split(r"^(?=[a-z0-9-]+(?:\[.*\])?==)", text, flags=re.MULTILINE)[1:]
     assert all("--hash=sha256:" in block for block in blocks)
     assert blocks
     assert "://" not in text
+
+
+def test_dependabot_looks_at_every_lock_and_dockerfile():
+    entries = yaml.safe_load((ROOT / ".github" / "dependabot.yml").read_text())["updates"]
+    for kind, paths in {"pip": [*LOCKS, BUILD], "docker": DOCKERFILES}.items():
+        (seen,) = (each["directories"] for each in entries if each["package-ecosystem"] == kind)
+        folders = {f"/{path.parent.relative_to(ROOT)}" for path in paths}
+        assert folders == {*seen} - {"/"}, kind
 
 
 def test_the_build_context_has_only_what_images_need():

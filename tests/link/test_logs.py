@@ -2,6 +2,7 @@
 
 import json
 from math import isnan, nan
+from random import Random
 
 import numpy as np
 import pytest
@@ -142,6 +143,69 @@ def test_up_to_1_percent_may_be_unusable_and_all_is_counted():
     rows[70] = rows[80] = "7"
     with pytest.raises(BadInputError, match=r"line 52: .* \(3 of 200 rows cannot be used\)"):
         read("\n".join(["time_s,delay_ms", *rows]))
+
+
+def rows(*times):
+    """Make a log of rows with delays of 40 to 44 ms at these times [s]."""
+    lines = [f"{time:.9g},{40 + n % 5}" for n, time in enumerate(times)]
+    return "\n".join(["time_s,delay_ms", *lines])
+
+
+def test_appended_sessions_are_never_sorted_into_one_another():
+    """Sessions of 0.5 s may be packets out of order, so they are only named."""
+    long = [n / 10 + session / 100 for session in range(5) for n in range(60)]
+    with pytest.raises(BadInputError, match=r"after row 60 .* by 5.89 s, the longest of 4 such ju"):
+        read(rows(*long))
+    short = [n / 100 + session / 1000 for session in range(5) for n in range(50)]
+    says = "after row 50 the times go back by 0.489 s, the longest of 4 such jumps: a step of "
+    assert says in read(rows(*short)).notes[1]
+
+
+def test_rows_out_of_order_are_sorted_however_far_they_are_from_their_place():
+    times = [n / 10 for n in range(300)]
+    for n in (20, 80, 140, 200, 240):
+        times.insert(n + 40, times.pop(n))
+    times.insert(5, times.pop())
+    for order in (times, times[::-1], Random(1).sample(times, 300)):
+        packets = read(rows(*order))
+        assert packets.sent == pytest.approx(np.arange(300) / 10)
+        assert [note.partition(" ")[2] for note in packets.notes] == ["out of order, sorted"]
+
+
+def test_rows_in_the_order_of_arrival_are_no_step_of_a_clock():
+    late = [(n, (900 - 10 * n if 30 < n < 60 else 20) + n % 5) for n in range(200)]
+    late.sort(key=lambda packet: packet[0] * 10 + packet[1])
+    text = "\n".join(["time_ms,delay_ms", *(f"{n * 10},{delay}" for n, delay in late)])
+    assert len(read(text).notes) == 1
+
+
+@pytest.mark.parametrize("period", [0.01, 0.1])
+@pytest.mark.parametrize(
+    ("step", "says"),
+    [(-0.5537, "after row 150 the times go back by"), (0.9, "nothing sent for")],
+)
+def test_a_step_of_the_clock_below_a_second_is_named(period, step, says):
+    packets = read(rows(*(1.0 + n * period + step * (n >= 150) for n in range(300))))
+    assert says in packets.notes[-1]
+    assert "a step of the clock" in packets.notes[-1]
+
+
+def test_packets_of_equal_time_after_a_step_are_not_blamed_on_the_digits():
+    with pytest.raises(BadInputError, match=r"same time as another one; after row 150 .* by 0.54"):
+        read(rows(*(1.0 + n / 100 - 0.55 * (n >= 150) for n in range(300))))
+
+
+@pytest.mark.parametrize(("times", "every"), [(range(0, 30_000, 100), "100"), ((0, 1e-5), "1e-05")])
+def test_times_that_may_have_another_unit_are_named(times, every):
+    said = (f"one packet in {every} s, if time_s is in the unit that its name says",)
+    assert read(rows(*times)).notes == said
+    assert read(rows(*times), trust_units=True).notes == ()
+
+
+def test_two_rows_in_years_are_refused_unless_trusted():
+    with pytest.raises(BadInputError, match=r"one packet in 1e\+09 s, .*--trust-units"):
+        read(rows(0, 1e9))
+    assert len(read(rows(0, 1e9), trust_units=True).sent) == 2
 
 
 @pytest.mark.parametrize(
@@ -324,6 +388,31 @@ def test_other_pings_and_languages_are_read(lines, delays):
     assert packets.sent[-1] - packets.sent[0] == pytest.approx(len(delays) - 1)
     found = [delay and delay * 1e3 for delay in delays_of(packets)]
     assert found == pytest.approx(list(delays))
+
+
+TS = (
+    "PING 192.0.2.7 (192.0.2.7): 56 data bytes",
+    "64 bytes from 192.0.2.7: seq=0 ttl=57 time=20.0 ms",
+    "64 bytes from 192.0.2.7: seq=2 ttl=57 time=20.0 ms",
+    "",
+    "--- 192.0.2.7 ping statistics ---",
+    "4 packets transmitted, 2 packets received, 50% packet loss",
+    "round-trip min/avg/max = 20.0/20.0/20.0 ms",
+)
+"""Output of BusyBox's ping."""
+
+
+@pytest.mark.parametrize("stamp", ["[170000000{}.200000] ", "170000000{}.200000 ", "10:00:0{}.5 "])
+def test_a_stamp_on_every_line_changes_nothing(stamp):
+    """As from `ping HOST | ts '[%.s]'`, the remedy for BusyBox and BSD."""
+    lines = [stamp.format(n) + line for n, line in enumerate(TS)]
+    packets = ping(*lines)
+    assert delays_of(packets) == pytest.approx((0.010, None, 0.010, None))
+    assert packets.notes == ()
+    with pytest.raises(BadInputError, match="counts 4 sent and 2 received, but it has 1 replies"):
+        ping(*lines[:2], *lines[3:])
+    with pytest.raises(BadInputError, match="more than one session of ping"):
+        ping(*lines[:3], lines[0])
 
 
 def test_ping_counts_on_after_65535():
