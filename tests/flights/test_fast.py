@@ -33,14 +33,11 @@ def test_plans_predict_to_4_mm_with_fast_gains():
     assert numbers(flight)["delay_estimate_error_rms"] <= 1e-9
 
 
-@pytest.mark.parametrize("speed", [2.0, *nightly(4.0)])
 @pytest.mark.parametrize("at", [10.5, 14.0, *nightly(*(6.25 + 0.5 * k for k in range(24)))])
 @pytest.mark.parametrize("way", [*nightly("both", "up"), "down"])
-def test_a_silence_of_20_s_in_a_pipe_touches_nothing(at, way, speed):
-    """The guard does not allow more than 4 m/s with commands of 500 ms and plans of 0.8 s."""
+def test_a_silence_of_20_s_in_a_pipe_touches_nothing(at, way):
     silence = f"[{{start_s: {at}, duration_s: {SILENT}}}]"
     dark = [f"link.{each}link.blackouts={silence}" for each in WAYS[way]]
-    limits = ["criteria.time_limit_s=90", *["guard.command_age_max_ms=500"] * (speed > 2.0)]
-    flight = fly("fast", *link(200), *dark, *limits, f"mission.carrot.speed_mps={speed}")
+    flight = fly("fast", *link(200), *dark, "criteria.time_limit_s=90")
     assert flight.verdict.failures == ()
     assert numbers(flight)["pipe_contacts"] == 0
