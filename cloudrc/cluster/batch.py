@@ -70,16 +70,12 @@ def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iter
     Raises:
         ClusterError: If the Job fails, or if a pod will never run.
     """
-    told = set[str]()
 
-    def see_end(state: Any) -> None:
+    def describe_end(state: Any) -> str:
         words = to_one_line(state.message) or state.reason
-        text = f"a pod failed with exit code {state.exit_code}: {words}"
-        if state.exit_code and text not in told:
-            told.add(text)
-            tell(text)
+        return f"a pod failed with exit code {state.exit_code}: {words}" if state.exit_code else ""
 
-    yield from read_log(release, name, tell, see_end)
+    yield from read_log(release, name, tell, describe_end)
     if ending := failure_of(release.request("get", "jobs", name=name)):
         see = f"see: {release.kubectl} describe job {name}; then repeat the command"
         raise ClusterError(f"Job '{name}' failed: {ending}; {see}")

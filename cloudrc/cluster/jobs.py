@@ -207,17 +207,17 @@ def follow(release: Release, name: str, write: Callable[[str], None]) -> Ended:
 
 
 def read_log(
-    release: Release, name: str, tell: Callable[[str], None], see_end: Callable[[Any], None]
+    release: Release, name: str, tell: Callable[[str], None], see_end: Callable[[Any], str | None]
 ) -> Iterator[str]:
     """Yield each different line of the logs of a Job's pods, until the Job has ended.
 
-    `tell` receives a sentence if a pod waits for a node, or if the log of an ended pod cannot be
-    read. `see_end` receives the final state of the container of each pod that ends. Raise a
-    ClusterError if a pod will never run.
+    `see_end` receives the final state of the container of each pod that ends; it may return a
+    sentence about it. `tell` receives this sentence, and others if a pod waits for a node or if the
+    log of an ended pod cannot be read, each once. Raise a ClusterError if a pod will never run.
     """
     told, read, seen = set[str](), set[str](), set[int]()  # seen: hashes of lines
 
-    def tell_once(text: str) -> None:
+    def tell_once(text: str | None) -> None:
         if text and text not in told:
             told.add(text)
             tell(text)
@@ -238,7 +238,7 @@ def read_log(
             if is_done:
                 read.add(pod.metadata.uid)
             if ended is not None:
-                see_end(ended)
+                tell_once(see_end(ended))
             try:
                 last = None if is_done else OVERLAP
                 text = pod_log(release, pod.metadata.name, component, last)
