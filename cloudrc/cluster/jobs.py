@@ -255,7 +255,7 @@ def read_log(
 
 
 def _why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
-    """Return that pods of a Job wait, and why; "" if none waits.
+    """Return a sentence on why pods of a Job wait; "" if none waits.
 
     Raise a ClusterError if a pod will never run, or if the cluster refuses to make the pods.
     """

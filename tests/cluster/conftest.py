@@ -84,7 +84,10 @@ class FakeApi:
             if (plural, name) not in self.objects:
                 return 404, {"message": f'{plural} "{name}" not found', "code": 404}
             if subresource == "log":
-                return 200, self.logs.get(name, "")
+                log = self.logs.get(name, "")
+                return (
+                    (200, log) if log is not None else (403, {"message": "no right", "code": 403})
+                )
             if method == "DELETE":
                 return 200, self.objects.pop((plural, name))
             return 200, self.objects[plural, name]

@@ -56,7 +56,9 @@ def test_a_running_job_is_kept_and_a_failed_job_is_replaced(started, api, releas
 
 def test_the_lines_of_lost_and_complete_pods_are_read(started, api, release):
     add_pod(api, "a", "Running", "row 1\n")
-    add_pod(api, "b", "Failed", "row 2\n", state=terminated(137, ""))
+    for name, log in (("b", "row 2\n"), ("d", ""), ("e", "")):
+        add_pod(api, name, "Failed", log, state=terminated(137, ""))
+    api.logs["e"] = None  # refused
 
     def replace():
         api.objects.pop(("pods", "a"))
@@ -67,7 +69,9 @@ def test_the_lines_of_lost_and_complete_pods_are_read(started, api, release):
     found, told = lines(release)
     assert {*found} == {"row 1", "row 2", "row 3"}
     assert found.count("row 2") == 1
-    assert "exit code 137" in told[0]
+    end, log = told
+    assert "exit code 137" in end, "once, although three pods ended so"
+    assert "cannot get pods/log" in log
     assert api.jobs() == []
 
 
