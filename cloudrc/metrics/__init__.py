@@ -1,119 +1,46 @@
 """Compute the metrics of a recorded flight; each metric is one number with a unit.
 
-The metrics of cloudrc are rows of tables in `flight`, `control`, `link` and `mission`.
-docs/plugins.md explains how to add your own metrics.
+`measure` finds and computes metrics; the metrics of cloudrc are rows of tables in `flight`,
+`control`, `link` and `mission`. docs/plugins.md
+explains how to add your own metrics.
 """
 
-from __future__ import annotations
+from typing import TYPE_CHECKING, Any
 
-import inspect
-from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass
-from math import isfinite
-from pathlib import Path
+if TYPE_CHECKING:
+    from cloudrc.metrics.measure import (
+        METRIC_NOTE,
+        SHIPPED,
+        Flight,
+        Metric,
+        Number,
+        check,
+        find,
+        measure_all,
+        name_of,
+        not_measured,
+        scale,
+    )
 
-from cloudrc import plugins
-from cloudrc.errors import BadInputError, describe_error
-from cloudrc.metrics import control, link, mission, response
-from cloudrc.metrics.flight import SHIPPED, Flight, Metric
-
-__all__ = ["SHIPPED", "Flight", "Metric", "control", "link", "mission", "response"]
-
-METRIC_NOTE = "metric "
-"""Beginning of a note about a metric."""
-
-
-@dataclass(frozen=True, slots=True)
-class Number:
-    """The value of a metric with its unit."""
-
-    value: float  # finite
-    unit: str  # SI unit as text; "1" for counts and shares
-    meaning: str  # one sentence
-
-
-def scale(unit: str, largest: float) -> tuple[float, str]:
-    """Return a factor and a new unit for small values: 1000 and "mm" if the unit is "m".
-
-    `largest` [`unit`] is the largest of the values. If it is not small, the factor is 1.
-    """
-    if 0 < largest < {"m": 0.1, "s": 1.0}.get(unit, 0.0):
-        return 1e3, f"m{unit}"
-    return 1.0, "" if unit == "1" else unit
+__all__ = [
+    "METRIC_NOTE",
+    "SHIPPED",
+    "Flight",
+    "Metric",
+    "Number",
+    "check",
+    "find",
+    "measure_all",
+    "name_of",
+    "not_measured",
+    "scale",
+]
 
 
-def find(choice: str) -> Metric:
-    """Find a metric by its name, or by the path of a Python file, which is executed.
+def __getattr__(name: str) -> Any:
+    # Lazily, because a module of this package may need neither recordings nor pydantic.
+    if name in __all__:
+        from cloudrc.metrics import measure
 
-    Raises:
-        BadInputError: If the metric does not exist, or if the file defines no metric.
-    """
-    if choice in SHIPPED:
-        return SHIPPED[choice]
-    known = [*SHIPPED, *plugins.names("metrics")]
-    name, is_path = name_of(choice), plugins.is_path(choice)
-    if not is_path and name not in known:
-        raise BadInputError(plugins.unknown_name_text("metric", choice, sorted(known)))
-    if is_path and name in known:
-        raise BadInputError(f"metric {choice!r}: {name} is a metric already; rename the file")
-    found = plugins.find("metrics", choice)
-    unit, measure = getattr(found, "UNIT", None), getattr(found, "measure", None)
-    if not isinstance(unit, str) or not callable(measure):
-        raise BadInputError(
-            f"metric {choice!r} needs a text UNIT and a function measure(flight); write both"
-        )
-    return Metric(name, unit, (inspect.getdoc(found) or "").partition("\n")[0], measure)
-
-
-def name_of(choice: str) -> str:
-    """Return a metric's name in report.json; if `choice` is a path, the file name without `.py`."""
-    return Path(choice).stem if plugins.is_path(choice) else choice
-
-
-def check(own: Iterable[str]) -> None:
-    """Check the user's metrics before the flight; `own` lists their names or file paths.
-
-    Raises:
-        BadInputError: If a metric is invalid, or if two metrics have the same name.
-    """
-    for name, count in Counter(find(choice).name for choice in own).items():
-        if count > 1:
-            raise BadInputError(f"{count} metrics are named {name}; rename a file")
-
-
-def not_measured(named: Iterable[str], own: Iterable[str]) -> list[str]:
-    """Return a note for each metric of the experiment that is a file and was not measured.
-
-    `named` are the experiment's metrics, `own` those that the user names with --metric. A file may
-    be code from somebody else, so it is executed only if the user names it.
-    """
-    names = set(map(name_of, own))
-    return [
-        f"{METRIC_NOTE}{name_of(choice)} is not measured: name its file with --metric"
-        for choice in named
-        if plugins.is_path(choice) and name_of(choice) not in names
-    ]
-
-
-def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Number], list[str]]:
-    """Compute the metrics of cloudrc, of installed packages and of the user.
-
-    `own` lists the user's metrics by name or file path. Return the known numbers by name, sorted,
-    and a note for each metric that failed. An exception in a user's metric affects only this
-    metric.
-    """
-    numbers: dict[str, Number] = {}
-    notes: list[str] = []
-    for choice in sorted({*SHIPPED, *plugins.names("metrics"), *own}, key=name_of):
-        name = name_of(choice)
-        try:
-            metric = find(choice)
-            value = metric.measure(flight)
-            if value is not None and isfinite(value):
-                numbers[name] = Number(float(value), metric.unit, metric.meaning)
-            elif value is not None:
-                notes.append(f"{METRIC_NOTE}{name} gave {value}: left out")
-        except Exception as error:
-            notes.append(f"{METRIC_NOTE}{name} failed: {describe_error(error)}")
-    return numbers, notes
+        return getattr(measure, name)
+    raise AttributeError(f"module 'cloudrc.metrics' has no attribute {name!r}")

@@ -188,7 +188,7 @@ class Metric:
 
 
 SHIPPED: dict[str, Metric] = {}
-"""The metrics of cloudrc by name; complete once `cloudrc.metrics` is imported."""
+"""The metrics of cloudrc by name; complete once `cloudrc.metrics.measure` is imported."""
 
 
 def add_metrics(group: str, *rows: tuple[str, str, str, Measure]) -> None:
