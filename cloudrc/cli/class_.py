@@ -14,6 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from cloudrc.cli.extras import require
 from cloudrc.cli.output import format_document, print_or_drop, print_result, table
 from cloudrc.cli.parser import add_verbs
 from cloudrc.cli.pool import interrupt_on_signals
@@ -47,6 +48,7 @@ def execute(options: argparse.Namespace) -> int:
         return _new(options.folder)
     if not options.folder.is_dir():
         raise BadInputError(f"{options.folder}: no such folder; 'cloudrc class new' makes one")
+    require("a check", ("world",))
     interrupt_on_signals()
     rows = check(options.folder.resolve())
     score, of = (round(sum(row[key] for row in rows), 1) for key in ("points", "max_points"))

@@ -22,6 +22,8 @@ MODES: dict[str, tuple[str, ...]] = {
     "cluster": ("kube", "record", "report"),
 }
 """Mode of a run -> the extras that it needs."""
+SIM = MODES["virtual"]
+"""The extras that the extra `sim` combines."""
 
 
 def missing(extra: str) -> list[str]:
@@ -37,7 +39,10 @@ def require(purpose: str, extras: Iterable[str]) -> None:
     absent = {extra: found for extra in extras if (found := missing(extra))}
     if absent:
         modules = ", ".join(module for names in absent.values() for module in names)
+        names = list(absent)
+        if absent.keys() >= set(SIM):
+            names = ["sim", *(name for name in absent if name not in SIM)]
         raise MissingPrerequisiteError(
             f"{purpose} needs {modules} (not installed); "
-            f"run: pip install 'cloudrc[{','.join(absent)}]'"
+            f"run: pip install 'cloudrc[{','.join(names)}]'"
         )

@@ -75,7 +75,7 @@ def _up(options: argparse.Namespace) -> int:
             stack.enter_context(_console(folder, say))
 
     interrupt_on_signals()
-    require("a session", MODES["local"])
+    require("a session", (*MODES["local"], *(["console"] if options.console else [])))
     try:
         return fly_once(options, "local", ready)
     except NothingFlownError as nothing:

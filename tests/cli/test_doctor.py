@@ -56,4 +56,13 @@ def test_the_extras_are_those_of_pyproject():
     declared = project["optional-dependencies"]
     for extra, modules in extras.EXTRAS.items():
         assert all(module in " ".join(declared[extra]) for module in modules), extra
-    assert set(extras.EXTRAS) | {"all", "dev"} == set(declared)
+    assert set(extras.EXTRAS) | {"sim", "all", "dev"} == set(declared)
+    assert declared["sim"] == [f"cloudrc[{','.join(extras.MODES['virtual'])}]"]
+
+
+def test_who_lacks_all_of_the_simulation_is_told_its_one_extra(monkeypatch):
+    monkeypatch.setattr(extras, "missing", lambda extra: [f"module_of_{extra}"])
+    with pytest.raises(MissingPrerequisiteError, match=r"cloudrc\[sim,api\]"):
+        extras.require("mode local", extras.MODES["local"])
+    with pytest.raises(MissingPrerequisiteError, match=r"cloudrc\[record\]"):
+        extras.require("recover", ["record"])
