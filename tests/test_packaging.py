@@ -1,8 +1,11 @@
 """The package: dependencies, version, licence and the files of the wheel."""
 
+import os
+import shutil
 import subprocess
 import sys
 import tomllib
+import venv
 import zipfile
 from pathlib import Path
 
@@ -10,6 +13,7 @@ import pytest
 
 import cloudrc
 from cloudrc.world.native.library import built_file, compilers
+from tools.pack_chart import pack
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -21,15 +25,18 @@ def test_cloudrc_is_a_plugin_of_kubectl_and_names_one_version():
     assert f"\nversion: {cloudrc.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
+def build(root, folder, *targets):
+    """Build `targets` ("wheel", "sdist") of the tree `root` in `folder`."""
+    pytest.importorskip("hatchling", reason="the build backend comes with the extra dev")
+    command = [sys.executable, "-m", "hatchling", "build", "-d", str(folder)]
+    for target in targets:
+        command += ["-t", target]
+    subprocess.run(command, cwd=root, check=True, capture_output=True)
+
+
 def build_wheel(folder):
     """Build the wheel in `folder`; return its name and the names of the package's files in it."""
-    pytest.importorskip("hatchling", reason="the build backend comes with the extra dev")
-    subprocess.run(
-        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)],
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-    )
+    build(ROOT, folder, "wheel")
     (wheel,) = folder.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         return wheel.name, {name for name in archive.namelist() if name.startswith("cloudrc/")}
@@ -55,3 +62,85 @@ def test_a_platform_wheel_holds_the_machine_code(tmp_path, monkeypatch):
     assert "-py3-none-any" not in name
     assert f"cloudrc/world/native/{built_file().name}" in packed
     assert not built_file().exists()
+
+
+@pytest.fixture
+def copied(tmp_path):
+    """Copy what a package is made of, with new times and other rights."""
+    tree = tmp_path / "tree"
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    for name in filter(None, listed.stdout.split("\0")):
+        if (ROOT / name).exists():
+            (tree / name).parent.mkdir(parents=True, exist_ok=True)
+            (tree / name).write_bytes((ROOT / name).read_bytes())
+            (tree / name).chmod(0o600)
+            os.utime(tree / name, (1e9, 1e9))
+    return tree
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_two_builds_of_one_tree_are_byte_equal(copied, tmp_path, monkeypatch):
+    monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
+    monkeypatch.delenv("CLOUDRC_NATIVE", raising=False)
+    for root, name in ((ROOT, "a"), (copied, "b")):
+        build(root, tmp_path / name, "wheel", "sdist")
+    assert len(contents(tmp_path / "a")) == 2
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+@pytest.mark.skipif(not shutil.which("helm"), reason="no helm here")
+def test_two_packed_charts_are_byte_equal_and_helm_reads_them(copied, tmp_path):
+    for root, name in ((ROOT, "a"), (copied, "b")):
+        pack(root / "charts" / "cloudrc", tmp_path / name, 1700000000)
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+    (chart,) = (tmp_path / "a").iterdir()
+    read = subprocess.run(["helm", "template", "x", chart], check=True, capture_output=True)
+    assert b"kind: Deployment" in read.stdout
+
+
+class Fresh:
+    """A new environment that has the wheel alone, and a folder far from the clone."""
+
+    def __init__(self, folder):
+        self.folder, self.bin = folder, folder / "venv" / "bin"
+        venv.create(folder / "venv", with_pip=True)
+        build_wheel(folder / "wheel")
+        (self.wheel,) = (folder / "wheel").iterdir()
+
+    def install(self, extras):
+        words = ["-m", "pip", "install", "--quiet", f"{self.wheel}{extras}"]
+        subprocess.run([self.bin / "python", *words], check=True, cwd=self.folder)
+
+    def cloudrc(self, *words):
+        clean = {key: text for key, text in os.environ.items() if key != "PYTHONPATH"}
+        command = [self.bin / "cloudrc", *words]
+        return subprocess.run(command, cwd=self.folder, env=clean, capture_output=True, text=True)
+
+
+@pytest.mark.full
+def test_the_wheel_alone_lists_then_flies_and_hands_out_the_exercise(tmp_path):
+    fresh = Fresh(tmp_path)
+    fresh.install("")
+    assert fresh.cloudrc("list").returncode == 0
+    for words, extra in (
+        (["run", "--mode", "virtual"], "cloudrc[sim]"),
+        (["up", "--console"], "cloudrc[sim,api,console]"),
+        (["console", "--cluster"], "cloudrc[kube]"),
+    ):
+        refused = fresh.cloudrc(*words)
+        assert (refused.returncode, extra in refused.stderr) == (3, True), refused.stderr
+    fresh.install("[sim]")
+    flown = fresh.cloudrc("run", "--mode", "virtual", "--out", "run")
+    assert flown.returncode == 0, flown.stderr
+    assert (tmp_path / "run" / "report.html").exists()
+    assert fresh.cloudrc("class", "new", "exercise").returncode == 0
+    assert "score 0 of 100" in fresh.cloudrc("class", "check", "exercise").stdout
