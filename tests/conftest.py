@@ -13,6 +13,7 @@ from math import isfinite, nan
 
 import pytest
 
+from cloudrc.cli.interrupts import forget_interrupt
 from cloudrc.cli.main import main
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -120,6 +121,7 @@ def signals_stay_as_they_were():
     for number, handler in handlers.items():
         if signal.getsignal(number) is not handler:
             signal.signal(number, handler)
+    forget_interrupt()
     gc.unfreeze()  # a command may freeze what it has loaded
 
 

@@ -15,9 +15,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from cloudrc.cli.extras import require
+from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import format_document, print_or_drop, print_result, table
 from cloudrc.cli.parser import add_verbs
-from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.errors import BadInputError
 
 TIME_LIMIT = 120.0

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import MODES, require
+from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import (
     format_number,
     output_argument,
@@ -18,7 +19,7 @@ from cloudrc.cli.output import (
     table,
 )
 from cloudrc.cli.parser import read_count
-from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
+from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:

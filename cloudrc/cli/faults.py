@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import require
+from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import escape, output_argument, paint, print_line, print_result, table
 from cloudrc.cli.parser import add_verbs, number, read_count, whole_number
-from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
+from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:

@@ -25,10 +25,10 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from cloudrc.cli.cluster_flags import release_from_flags
+from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.link import VERIFY_DEFAULT
 from cloudrc.cli.link_run import prepare_link, run_tool
 from cloudrc.cli.output import escape, paint, print_result, table
-from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.cli.processes import show_address
 from cloudrc.cluster.client import end_process
 from cloudrc.cluster.pods import METRICS, NO_PROXY

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from cloudrc.advice import simulate_ages
 from cloudrc.cli.compare import flight_arguments
 from cloudrc.cli.extras import MODES, require
+from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import output_argument, print_or_drop, print_result
-from cloudrc.cli.pool import interrupt_on_signals, map_in_order
+from cloudrc.cli.pool import map_in_order
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:

@@ -17,9 +17,9 @@ from cloudrc.cli import client
 from cloudrc.cli.client import Api, UnreachableError, mission_path, token_file, token_reader
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
+from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import escape, output_argument, print_line, print_result, table
 from cloudrc.cli.parser import add_verbs, number
-from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.drivers.machine import Deadline
 from cloudrc.errors import (
     BadInputError,

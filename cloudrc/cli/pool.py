@@ -1,4 +1,4 @@
-"""Run work in worker processes, and end a command and its workers on signals."""
+"""Run work in worker processes, which end with the command."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from itertools import chain, islice
-from types import FrameType
 from typing import Any, TypeVar
 
+from cloudrc.cli.interrupts import is_interrupted, raise_if_interrupted
 from cloudrc.drivers.machine import usable_cores
 from cloudrc.errors import InterruptedRunError, InvalidRunError
 
@@ -26,22 +26,6 @@ with more than 16,384 of them (cpython issue 105829)."""
 
 class WorkerDiedError(InvalidRunError):
     """Report that a worker process was killed."""
-
-
-def interrupt_on_signals() -> None:
-    """Raise KeyboardInterrupt on SIGTERM and SIGHUP, as on Ctrl-C.
-
-    Under `nohup`, which ignores SIGHUP, this process continues to ignore SIGHUP.
-    """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        signal.signal(signal.SIGHUP, _hung_up)
-
-
-def _hung_up(number: int, frame: FrameType | None) -> None:
-    # The shell and the kernel each send a SIGHUP; the second must not interrupt the report.
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    raise KeyboardInterrupt
 
 
 def _end_with_parent() -> None:
@@ -82,13 +66,16 @@ def map_in_order(
     `work` may be endless. With `in_order` False, yield each result once it is ready. At most `jobs`
     worker processes run, and at most one per core. If one worker is enough, this process makes the
     calls itself. The function has to be at module level: a worker imports the function. Ctrl-C or
-    closing the generator kills the workers and drops all calls that have not ended.
+    closing the generator kills the workers and drops all calls that have not ended. After a signal
+    no result is yielded, even if `function` has caught the KeyboardInterrupt.
     """
     rest = iter(work)
     chunk = [*islice(rest, CHUNK)]
     workers = min(jobs, len(chunk), usable_cores())
     if workers <= 1:
-        yield from map(function, chain(chunk, rest))
+        for result in map(function, chain(chunk, rest)):
+            raise_if_interrupted()
+            yield result
         return
     # Spawn, do not fork: libraries may have started threads in this process.
     context = multiprocessing.get_context("spawn")
@@ -99,7 +86,9 @@ def map_in_order(
             with isolated_start():  # submit() starts the workers
                 futures = [pool.submit(function, each) for each in chunk]
             for future in futures if in_order else as_completed(futures):
-                yield future.result()
+                result = future.result()
+                raise_if_interrupted()
+                yield result
             chunk = [*islice(rest, CHUNK)]
     except BrokenProcessPool as error:
         text = "a worker was killed, perhaps by the kernel because memory ran out"
@@ -125,6 +114,12 @@ def take_each(
                 take(result)
     except KeyboardInterrupt:
         return "interrupted", InterruptedRunError.exit_code
-    except WorkerDiedError as error:
+    except Exception as error:
+        if (
+            is_interrupted()
+        ):  # the signal also killed a worker, or a library converted its exception
+            return "interrupted", InterruptedRunError.exit_code
+        if not isinstance(error, WorkerDiedError):
+            raise
         return str(error), error.exit_code
     return "", 0

@@ -18,6 +18,7 @@ from cloudrc.advice import advise
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.find_run import RUNS
+from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import (
     escape,
     is_live,
@@ -27,7 +28,6 @@ from cloudrc.cli.output import (
     print_result,
 )
 from cloudrc.cli.parser import read_count, whole_number
-from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.errors import (
     DISK_FULL,

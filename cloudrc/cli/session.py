@@ -17,8 +17,8 @@ from typing import IO, TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.find_run import ask_if_unclear, run_argument, short
+from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import escape, print_line
-from cloudrc.cli.pool import interrupt_on_signals
 from cloudrc.cli.processes import Command
 from cloudrc.cli.run import experiment_arguments, fly_once
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, NothingFlownError

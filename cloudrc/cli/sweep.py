@@ -8,6 +8,7 @@ from pathlib import Path
 
 from cloudrc import __version__
 from cloudrc.cli.cluster_flags import release_arguments
+from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import output_argument
 from cloudrc.cli.parser import COUNT_MAX, add_verbs, figure_arguments, read_count
 
@@ -99,6 +100,8 @@ def _shard(text: str) -> tuple[int, int]:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the chosen verb; return the exit code."""
+    # First: until then, the first process of a container ignores signals.
+    interrupt_on_signals()
     from cloudrc.cli import sweep_run as actions
 
     functions = (actions.run, actions.print_status, actions.fly_again, actions.draw_figure,

@@ -24,7 +24,7 @@ from cloudrc.cli.output import (
     print_result,
     table,
 )
-from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
+from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.cli.progress import SweepView
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.cli.run import fly, load, new_folder, refuse_seed, warn
@@ -46,7 +46,6 @@ METHOD = "95 % interval of the median, by order statistics"
 
 def run(options: argparse.Namespace) -> int:
     """Fly the flights of a sweep whose results or recordings are missing; return the exit code."""
-    interrupt_on_signals()
     plan, folder, (shard, count) = _plan(options), options.out, options.shard or (None, 1)
     if options.shard:
         folder.mkdir(parents=True, exist_ok=True)  # another shard may be faster
@@ -253,11 +252,13 @@ def rows_from_pods(
 
 def print_rows(options: argparse.Namespace) -> int:
     """Fly one shard (part) of the flights in a file; print the result of each flight as a row."""
-    interrupt_on_signals()  # the first process of a container ignores signals by default
     shard, count = options.shard
-    for flight in unpack(options.file)[shard - 1 :: count]:
-        print(json.dumps(fly_row(flight), allow_nan=False), flush=True)
-    return 0
+    flights = unpack(options.file)[shard - 1 :: count]
+
+    def print_row(row: Row) -> None:
+        print(json.dumps(row, allow_nan=False), flush=True)
+
+    return take_each(map_in_order(fly_row, flights, jobs=1), print_row)[1]
 
 
 # `cloudrc run --seeds N`.

@@ -1,4 +1,4 @@
-"""Work on several cores: order, killed workers, Ctrl-C; SIGHUP and SIGTERM act like Ctrl-C."""
+"""Work on several cores: order, killed workers, Ctrl-C."""
 
 import multiprocessing
 import os
@@ -8,7 +8,7 @@ from copy import copy
 
 import pytest
 
-from cloudrc.cli.pool import interrupt_on_signals, map_in_order, take_each
+from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.errors import BadInputError, DiskFullError
 
 KILLED = 5
@@ -61,18 +61,6 @@ def test_ctrl_c_ends_the_workers_at_once():
     with pytest.raises(KeyboardInterrupt):
         done.throw(KeyboardInterrupt)
     assert time.monotonic() - started < 30.0
-
-
-def test_only_the_first_hang_up_interrupts():
-    interrupt_on_signals()
-    with pytest.raises(KeyboardInterrupt):
-        os.kill(os.getpid(), signal.SIGHUP)
-    os.kill(os.getpid(), signal.SIGHUP)
-    with pytest.raises(KeyboardInterrupt):  # a second request still counts
-        os.kill(os.getpid(), signal.SIGTERM)
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as under nohup
-    interrupt_on_signals()
-    os.kill(os.getpid(), signal.SIGHUP)
 
 
 @pytest.mark.parametrize("error", [DiskFullError("runs/a"), BadInputError("a: b")])

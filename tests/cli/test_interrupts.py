@@ -1,0 +1,141 @@
+"""SIGINT, SIGTERM and SIGHUP interrupt a command; none gets lost in an import or a library.
+
+MuJoCo turns every exception in its import into an ImportError, so that a sweep stored rows with the
+verdict `error` and ended as if it was done.
+"""
+
+import importlib
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cli import interrupts, sweep_run
+from cloudrc.cli.interrupts import interrupt_on_signals, is_interrupted
+from cloudrc.cli.pool import map_in_order, take_each
+from cloudrc.sweep.plan import pack, read_plan
+from cloudrc.sweep.store import read_rows
+from tests.sweep.conftest import write_sweep
+
+__all__ = ["write_sweep"]
+SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+
+
+@pytest.fixture(autouse=True)
+def one_core_and_a_terminal(monkeypatch):
+    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 1)
+    for number in SIGNALS:  # tests/conftest.py restores them
+        signal.signal(number, signal.SIG_DFL)
+    yield
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+
+
+@pytest.fixture
+def make_module(tmp_path, monkeypatch):
+    """Return a function that writes a module whose import gets a signal, and returns its name."""
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def make(number, rest=""):
+        name = f"gets_{int(number)}"
+        lines = ["import os, signal", "ended = False", f"os.kill(os.getpid(), {int(number)})", rest]
+        text = "\n".join([*lines, "ended = True"])
+        (tmp_path / f"{name}.py").write_text(text)
+        monkeypatch.delitem(sys.modules, name, raising=False)
+        return name
+
+    return make
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_during_an_import_interrupts_after_the_import(number, make_module):
+    interrupt_on_signals()
+    module = importlib.import_module(make_module(number))
+    assert module.ended
+    assert is_interrupted()
+    with pytest.raises(KeyboardInterrupt):
+        time.sleep(60.0)
+
+
+def test_an_import_that_never_ends_is_interrupted(make_module, monkeypatch):
+    monkeypatch.setattr(interrupts, "LOOKS_MAX", 2)
+    interrupt_on_signals()
+    with pytest.raises(KeyboardInterrupt):
+        importlib.import_module(make_module(signal.SIGTERM, "while True: pass"))
+
+
+def test_a_second_signal_interrupts_an_import_at_once(make_module):
+    interrupt_on_signals()
+    with pytest.raises(KeyboardInterrupt):
+        importlib.import_module(make_module(signal.SIGTERM, "os.kill(os.getpid(), signal.SIGINT)"))
+    time.sleep(2 * interrupts.PERIOD)  # no further interrupt arrives
+
+
+def test_only_the_first_hang_up_interrupts():
+    interrupt_on_signals()
+    with pytest.raises(KeyboardInterrupt):
+        os.kill(os.getpid(), signal.SIGHUP)
+    os.kill(os.getpid(), signal.SIGHUP)
+    with pytest.raises(KeyboardInterrupt):  # a second request still counts
+        os.kill(os.getpid(), signal.SIGTERM)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as under nohup
+    interrupt_on_signals()
+    os.kill(os.getpid(), signal.SIGHUP)
+
+
+def swallow(flight):
+    """Get a signal as in an import of MuJoCo that turns it into an error, and return a row."""
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+    except KeyboardInterrupt:
+        text = "MissingPrerequisiteError: the simulator needs MuJoCo (initialization failed)"
+        found = {"verdict": "error", "failures": ["error"], "text": text}
+        return flight.row({**found, "numbers": {}, "records_sha256": ""})
+
+
+def convert(flight):
+    """Get a signal as in a library that turns it into an exception of its own."""
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+    except KeyboardInterrupt:
+        raise ImportError("initialization failed") from None
+
+
+@pytest.mark.parametrize("fly", [swallow, convert])
+def test_a_sweep_stores_no_row_after_a_signal_that_a_library_caught(
+    fly, write_sweep, monkeypatch, call
+):
+    monkeypatch.setattr(sweep_run, "fly_row", lambda flight, **words: fly(flight))
+    error = call("sweep run --out grid", write_sweep(), code=130).err
+    assert "cloudrc: interrupted; to continue: " in error
+    assert read_rows(Path("grid")) == {}
+
+
+@pytest.mark.parametrize("fly", [swallow, convert])
+def test_a_pod_prints_no_row_after_a_signal_that_a_library_caught(
+    fly, write_sweep, monkeypatch, call, tmp_path
+):
+    (tmp_path / "flights").write_bytes(pack(read_plan(write_sweep()).flights.values()))
+    monkeypatch.setattr(sweep_run, "fly_row", fly)
+    assert call("sweep rows", tmp_path / "flights", code=130).out == ""
+
+
+def test_results_before_the_signal_are_kept():
+    """The second of three calls gets the signal, and returns a result all the same."""
+    interrupt_on_signals()
+    results = []
+
+    def work(number):
+        try:
+            if number == 1:
+                os.kill(os.getpid(), signal.SIGINT)
+        except KeyboardInterrupt:
+            pass
+        return json.dumps(number)
+
+    assert take_each(map_in_order(work, range(3), 1), results.append) == ("interrupted", 130)
+    assert results == ["0"]
