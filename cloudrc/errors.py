@@ -32,6 +32,10 @@ class MissingPrerequisiteError(CloudrcError):
     exit_code = 3
 
 
+class OutOfMemoryError(MissingPrerequisiteError):
+    """The machine has too little memory for a user's code."""
+
+
 class DiskFullError(MissingPrerequisiteError):
     """The disk is full, so that the recording or the report is not complete."""
 
@@ -71,6 +75,9 @@ def describe_error(error: BaseException) -> str:
     """Describe an exception in one line: its type and its message."""
     name = type(error).__name__
     try:
-        return to_one_line(f"{name}: {error}")
-    except Exception:  # the exception's __str__ may raise, too
-        return to_one_line(name)
+        text = to_one_line(f"{name}: {error}")
+    except KeyboardInterrupt:
+        raise
+    except BaseException:  # the exception's __str__ may raise, too
+        text = to_one_line(name)
+    return f"{text} (sys.exit() was called)" if isinstance(error, SystemExit) else text

@@ -7,6 +7,9 @@ places:
 1. the package of the kind in cloudrc, without files whose name begins with an underscore;
 2. installed packages with an entry point in the group `cloudrc.<kind>`;
 3. a file, if the name is a path or ends in `.py`.
+
+Plug-ins are code of the user, which may raise anything and may call `sys.exit()`. `check_failure`
+decides what is a failure of a plug-in; all parts of cloudrc that call plug-ins use it.
 """
 
 from __future__ import annotations
@@ -24,7 +27,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from cloudrc.errors import BadInputError, CloudrcError, describe_error, to_one_line
+from cloudrc.errors import (
+    BadInputError,
+    CloudrcError,
+    OutOfMemoryError,
+    describe_error,
+)
 
 PACKAGES = {
     "estimators": "cloudrc.cloud.estimators",
@@ -33,6 +41,8 @@ PACKAGES = {
     "metrics": "",
 }
 """Kind of plug-in -> package that contains cloudrc's plug-ins of this kind; "" for metrics."""
+METHODS = {"estimators": "horizon", "predictors": "predict", "controllers": "update"}
+"""Kind of plug-in -> the method that every plug-in of this kind defines."""
 
 
 def names(kind: str) -> list[str]:
@@ -52,22 +62,28 @@ def describe(kind: str, name: str) -> str:
 def signature(kind: str, name: str) -> inspect.Signature:
     """Return the parameters of a plug-in's `build`; their annotations are types, not strings."""
     build = _build(kind, name)
-    with _explained(kind, name, "has a build() with annotations that cannot be read"):
+    with refuse_failure(
+        f"{_one(kind)} {name!r} has a build() with annotations that cannot be read"
+    ):
         return inspect.signature(build, eval_str=True)
 
 
 def load(kind: str, name: str, **parameters: Any) -> Any:
     """Find a plug-in and build it; raise a BadInputError if it is missing or its `build` fails."""
-    build = _build(kind, name)
-    with _explained(kind, name, "cannot be built"):
-        return build(**parameters)
+    build, method = _build(kind, name), METHODS[kind]
+    with refuse_failure(f"{_one(kind)} {name!r} cannot be built"):
+        plugin = build(**parameters)
+        if not callable(getattr(plugin, method, None)):
+            built = type(plugin).__name__
+            raise ValueError(f"build() returned {built}, which has no method {method}()")
+    return plugin
 
 
 def find(kind: str, name: str) -> Any:
     """Import a plug-in by name or path; return its module, or the object of an entry point."""
     if is_path(name) and not Path(name).is_file():
         raise BadInputError(f"{_one(kind)} {name!r}: there is no such file")
-    with _explained(kind, name, "cannot be imported"):
+    with refuse_failure(f"{_one(kind)} {name!r} cannot be imported"):
         if is_path(name):
             return _load_file(Path(name))
         if name in _shipped(kind):
@@ -76,6 +92,32 @@ def find(kind: str, name: str) -> Any:
         if (entry := _installed(kind).get(name)) is not None:
             return entry.load()
     raise BadInputError(unknown_name_text(_one(kind), name, names(kind)))
+
+
+def check_failure(error: BaseException, what: str) -> None:
+    """Return if `error`, which a plug-in raised, is the plug-in's failure; else raise.
+
+    Everything is, also SystemExit, except Ctrl-C, which is the user's, and a lack of memory, which
+    is the machine's: no result may depend on it. `what` names the plug-in in the error's text.
+    """
+    if isinstance(error, KeyboardInterrupt | OutOfMemoryError):
+        raise error
+    if isinstance(error, MemoryError):
+        text = f"{what}: memory ran out ({describe_error(error)})"
+        raise OutOfMemoryError(f"{text}; let it use less memory, or free some") from error
+
+
+@contextmanager
+def refuse_failure(what: str) -> Iterator[None]:
+    """Convert the failure of a plug-in to a BadInputError; `what` says which one failed to do what.
+
+    Use it before a flight and between flights; in flight, cloud goes on.
+    """
+    try:
+        yield
+    except BaseException as error:
+        check_failure(error, what)
+        raise BadInputError(f"{what}: {_explain(error)}") from error
 
 
 def is_path(name: str) -> bool:
@@ -134,12 +176,9 @@ def _one(kind: str) -> str:
     return kind.removesuffix("s")
 
 
-@contextmanager
-def _explained(kind: str, name: str, what: str) -> Iterator[None]:
-    """Convert any exception of a plug-in to a BadInputError; `what` says in words what failed."""
-    try:
-        yield
-    except Exception as error:
-        plain = isinstance(error, ValueError | CloudrcError) and str(error)
-        text = to_one_line(str(error)) if plain else describe_error(error)
-        raise BadInputError(f"{_one(kind)} {name!r} {what}: {text}") from error
+def _explain(error: BaseException) -> str:
+    """Describe an exception in one line, without its type if it was raised to inform the user."""
+    described = describe_error(error)
+    if isinstance(error, ValueError | CloudrcError):
+        return described.partition(": ")[2] or described
+    return described

@@ -39,6 +39,7 @@ from cloudrc.messages import (
     Vector,
     plan_length,
 )
+from cloudrc.plugins import check_failure, refuse_failure
 from cloudrc.records import Control, Fault
 from cloudrc.teleop.carrot import setpoint_at
 from cloudrc.tunnel.codec import as_planned
@@ -68,8 +69,6 @@ PLAN_STEP = PLAN_STEP_NS * 1e-9
 PLANNED_MAX = 1000.0
 """Largest component of a planned velocity [m/s]; the guard refuses a plan with a larger one.
 Source: docs/reference/faults.md, "F23"."""
-PLUGIN_ERRORS = (Exception, SystemExit, GeneratorExit)
-"""What counts as the failure of a plug-in. A user's Ctrl-C does not."""
 
 
 class InvalidResultError(ValueError):
@@ -105,7 +104,7 @@ class ControlLoop:
         the horizon plus `freeze_after` [s]. `period_ns` is the time between two commands [ns]. Each
         command contains a plan, the velocities of the next `plan` [s]; 0 means no plan.
 
-        Here the loop does not catch exceptions of plug-ins, because the robot does not fly yet.
+        Here the failure of a plug-in is a BadInputError, because the robot does not fly yet.
         """
         self._build_estimator, self._predictor = build_estimator, predictor
         self._controller = controller
@@ -116,8 +115,9 @@ class ControlLoop:
         self.counts: Counter[str] = Counter()
         self._now_ns = 0  # stamp of faults
         estimator = build_estimator()
-        predictor.reset()
-        controller.reset()
+        for kind, plug_in in (("predictor", predictor), ("controller", controller)):
+            with refuse_failure(f"cloud.{kind}: its reset() failed"):
+                plug_in.reset()
         self._begin(estimator)
 
     def reset(self, now_ns: int) -> None:
@@ -125,7 +125,7 @@ class ControlLoop:
         self._now_ns = now_ns
         try:
             estimator = self._build_estimator()
-        except PLUGIN_ERRORS as error:
+        except BaseException as error:
             self._note("estimator", error)
             estimator = Estimator()  # it has no estimate, so the horizon stays 0
         self._call("predictor", self._predictor.reset)
@@ -243,7 +243,7 @@ class ControlLoop:
         assert basis is not None, "check `ready` first"
         try:
             self._horizon = self._estimate_horizon((now_ns - basis.stamp_ns) * 1e-9)
-        except PLUGIN_ERRORS as error:
+        except BaseException as error:
             self._note("estimator", error)
         horizon = self._horizon
         estimate = self._predict(basis, horizon)
@@ -288,7 +288,7 @@ class ControlLoop:
             if not isfinite(sum(position + velocity + orientation)):
                 _refuse(position=position, velocity=velocity, orientation=orientation)
             return _new(Odometry, (stamp_ns, position, orientation, velocity, rate))
-        except PLUGIN_ERRORS as error:
+        except BaseException as error:
             self._note("predictor", error)
             return basis
 
@@ -301,7 +301,7 @@ class ControlLoop:
                 _refuse(velocity=velocity, yaw_rate=(yaw_rate,))
             terms = (_triple(proportional), _triple(integral), _triple(derivative))
             return _new(ControlOutput, (velocity, yaw_rate, *terms))
-        except PLUGIN_ERRORS as error:
+        except BaseException as error:
             self._note("controller", error)
             return STAND_STILL
 
@@ -335,7 +335,7 @@ class ControlLoop:
                 if not (isfinite(sum(velocity)) and max(map(abs, velocity)) <= PLANNED_MAX):
                     break
                 plan.append(as_planned(velocity))
-        except PLUGIN_ERRORS as error:
+        except BaseException as error:
             self._note(plug_in, error, "cloud sends this command without a plan")
             return ()
         return tuple(plan)
@@ -352,14 +352,18 @@ class ControlLoop:
         """Call a plug-in's method that has no result; count and report an exception."""
         try:
             call(*arguments)
-        except PLUGIN_ERRORS as error:
+        except BaseException as error:
             self._note(kind, error, "cloud goes on using it")
 
     def _note(self, kind: str, error: BaseException, instead: str = "") -> None:
         """Count a failure of the plug-in `kind`, such as "estimator"; report the first one.
 
         `instead` tells the user what cloud does now; "" stands for the text in `INSTEAD`.
+
+        Raises:
+            BaseException: `error`, if it is not the plug-in's failure.
         """
+        check_failure(error, f"cloud.{kind}")
         code = f"{kind}_failed"
         self.counts[code] += 1
         if self.counts[code] == 1:

@@ -141,18 +141,7 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
             name = str(document.source((*path, "name")).absolute(name))
         try:
             if build:
-                for parameter in plugins.signature(kind, name).parameters.values():
-                    place = (*path, parameter.name)
-                    if parameter.annotation == Path | None and isinstance(
-                        document.get(*place), str
-                    ):
-                        file = document.source(place).absolute(parameters[parameter.name])
-                        parameters[parameter.name] = str(file)
-                checked = _check(kind, name, parameters)
-                plugin = plugins.load(kind, name, **dict(checked))
-                if key == "predictor" and document.get("cloud", "plan_s"):
-                    _check_model(plugin, name)
-                parameters = checked.model_dump(mode="json")
+                parameters = _complete(document, path, name, parameters)
         except ValidationError as error:
             found += problems.from_pydantic(error, parameter_model(kind, name), path)
         except BadInputError as error:
@@ -163,10 +152,38 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
     return found
 
 
+def _complete(
+    document: Document, path: KeyPath, name: str, given: dict[str, Any]
+) -> dict[str, Any]:
+    """Check the parameters `given` to a plug-in, and add defaults; build the plug-in as a test.
+
+    `path` is the key of the plug-in, such as ("cloud", "predictor"). Raise a ValidationError or a
+    BadInputError about a wrong parameter or a plug-in that fails.
+    """
+    kind = KINDS[path[-1]]
+    model, parameters = parameter_model(kind, name), dict(given)
+    for parameter, field in model.model_fields.items():
+        place = (*path, parameter)
+        if field.annotation == Path | None and isinstance(document.get(*place), str):
+            file = document.source(place).absolute(parameters[parameter])
+            parameters[parameter] = str(file)
+    checked = model.model_validate_json(json.dumps(parameters))
+    with plugins.refuse_failure(f"{path[-1]} {name!r} has a default that YAML cannot contain"):
+        values: dict[str, Any] = checked.model_dump(mode="json")
+    # Check the defaults as `build_plugin` will do.
+    checked = model.model_validate_json(json.dumps(values))
+    plugin = plugins.load(kind, name, **dict(checked))
+    if kind == "predictors" and document.get("cloud", "plan_s"):
+        _check_model(plugin, name)
+    return values
+
+
 def _check_model(predictor: Any, name: str) -> None:
     """Raise a BadInputError if the predictor has no robot model, which `cloud.plan_s` needs."""
-    predictor.predict(Odometry(0, ZERO, UPRIGHT, ZERO, ZERO), 0.0)
-    if predictor.model() is None:
+    with plugins.refuse_failure(f"predictor {name!r} cannot predict"):
+        predictor.predict(Odometry(0, ZERO, UPRIGHT, ZERO, ZERO), 0.0)
+        model = predictor.model()
+    if model is None:
         raise BadInputError(
             f"'{name}' has no model of the robot, which cloud.plan_s above 0 needs; choose "
             "model_based, command_history or kalman, or set cloud.plan_s to 0"

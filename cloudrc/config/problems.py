@@ -198,6 +198,7 @@ _REASONS: Mapping[str, str] = {
     "string_pattern_mismatch": "must be text without slashes",
     "finite_number": "must be finite",
     "literal_error": "must be {expected}",
+    "needs_python_object": "must be an object of a class, which YAML cannot contain",
 }
 """Type of pydantic's error -> format of `Problem.reason`."""
 

@@ -97,8 +97,7 @@ def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Numb
     """Compute the metrics of cloudrc, of installed packages and of the user.
 
     `own` lists the user's metrics by name or file path. Return the known numbers by name, sorted,
-    and a note for each metric that failed. An exception in a user's metric affects only this
-    metric.
+    and a note for each metric that failed. A failure of a user's metric affects only this metric.
     """
     numbers: dict[str, Number] = {}
     notes: list[str] = []
@@ -111,6 +110,7 @@ def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Numb
                 numbers[name] = Number(float(value), metric.unit, metric.meaning)
             elif value is not None:
                 notes.append(f"{METRIC_NOTE}{name} gave {value}: left out")
-        except Exception as error:
+        except BaseException as error:
+            plugins.check_failure(error, f"{METRIC_NOTE}{name}")
             notes.append(f"{METRIC_NOTE}{name} failed: {describe_error(error)}")
     return numbers, notes

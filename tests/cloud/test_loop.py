@@ -1,6 +1,7 @@
 """The control loop: delays, when it freezes, and that it goes on whatever a plug-in does."""
 
 import re
+from asyncio import CancelledError
 from functools import partial
 from math import inf, nan
 
@@ -13,6 +14,7 @@ from cloudrc.cloud.estimators.running_mean import RunningMean
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.cloud.predictors.last_sample import LastSample
 from cloudrc.drivers.process import from_line, to_line
+from cloudrc.errors import BadInputError, OutOfMemoryError
 from cloudrc.messages import ZERO
 from tests.cloud.conftest import HERE, MS, Integrating, command, loop, telemetry
 
@@ -133,7 +135,15 @@ def returns(horizon=0.0, output=None, **changes):
     return Odd
 
 
-ERRORS = (RuntimeError("out of\nluck"), StopIteration, SystemExit("enough"), GeneratorExit)
+class NoText(BaseException):
+    def __str__(self):
+        raise SystemExit(0)
+
+
+ERRORS = (
+    *(RuntimeError("out of\nluck"), StopIteration, SystemExit("enough"), GeneratorExit),
+    *(CancelledError, RecursionError, NoText()),
+)
 LONG = ValueError("no caf\udce9 " + "x" * 100_000)
 ANY = ControlOutput((0.1, 0.2, 0.3), 0.4, ZERO, ZERO, ZERO)
 OUT_OF_SHAPE = returns((0.1,), ANY._replace(velocity=(0.1, 0.2)), position=(1.0, 2.0))
@@ -182,6 +192,31 @@ def test_arrays_and_generators_become_plain_numbers():
     assert sent.velocity == (1.0, 2.0, 3.0)
     assert (control.horizon, control.position, control.integral) == (0.5, HERE, (4.0, 5.0, 6.0))
     assert str(from_line(to_line(control))) == str(control)
+
+
+@pytest.mark.parametrize(
+    ("error", "raised"), [(KeyboardInterrupt, KeyboardInterrupt), (MemoryError, OutOfMemoryError)]
+)
+@pytest.mark.parametrize("kind", ["estimator", "predictor", "controller"])
+def test_ctrl_c_and_a_lack_of_memory_end_the_flight(kind, error, raised):
+    bad = raises(error)
+    a_loop = loop(**{kind: bad if kind == "estimator" else bad()})
+
+    def fly():
+        a_loop.observe(telemetry(100, 1000), 1090 * MS)
+        command(a_loop, 1094)
+
+    with pytest.raises(raised):
+        fly()
+    assert a_loop.counts == {}
+
+
+@pytest.mark.parametrize("kind", ["predictor", "controller"])
+def test_a_reset_that_fails_before_the_flight_is_refused(kind):
+    plug_in = raises(SystemExit(0))()
+    plug_in.reset = plug_in.update
+    with pytest.raises(BadInputError, match=rf"cloud\.{kind}: its reset\(\) failed: SystemExit"):
+        loop(**{kind: plug_in})
 
 
 def test_a_failing_reset_is_reported():

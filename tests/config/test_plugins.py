@@ -9,6 +9,7 @@ from cloudrc import plugins
 from cloudrc.config.load import load_experiment
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.schema import PlugIn
+from cloudrc.errors import BadInputError, OutOfMemoryError
 from tests.config.conftest import refused
 
 SOURCE = '''"""Looks ahead by a share of the horizon.
@@ -72,15 +73,56 @@ def test_parameters_are_checked_against_build(share, setting, reason):
          "annotations that cannot be read: NameError: name 'Nowhere' is not defined"),
         ("def build():\n    return 1 / 0\n", "cannot be built: ZeroDivisionError"),
         ("def build(share: float): ...", "cloud.predictor.share: is missing"),
+        ("import sys\nsys.exit(0)", "cannot be imported: SystemExit: 0 (sys.exit() was called)"),
+        ("import argparse\nargparse.ArgumentParser().parse_args(['-h'])", "SystemExit: 0"),
+        ("def build():\n    raise StopIteration", "cannot be built: StopIteration"),
+        ("from asyncio import CancelledError\ndef build():\n    raise CancelledError",
+         "cannot be built: CancelledError"),
+        ("def build():\n    return build()", "cannot be built: RecursionError: "),
+        ("def build(): ...", "build() returned NoneType, which has no method predict()"),
+        ("def build(share=object()): ...", "has a default that YAML cannot contain: "),
+        ("class A: ...\ndef build(a: A = None): ...", "must be an object of a class, which YAML"),
     ],
 )  # fmt: skip
 def test_a_broken_plug_in_is_one_line(share, text, reason):
     share.write_text(text)
     found = refused("paper", f"cloud.predictor={share}")
     assert reason in found
-    assert "\n" not in found
+    assert "\n" not in found.strip()
     if "cannot be imported" in reason:
         assert plugins.describe("predictors", str(share)).startswith("(not usable")
+
+
+class ExitingTextError(Exception):
+    def __str__(self):
+        raise SystemExit(0)
+
+
+@pytest.mark.parametrize(
+    "error", [ValueError("no"), SystemExit(0), GeneratorExit(), StopIteration(), ExitingTextError()]
+)
+def test_every_exception_of_a_plug_in_becomes_one_error(error):
+    with pytest.raises(BadInputError, match=r"^it failed: "), plugins.refuse_failure("it failed"):
+        raise error
+
+
+def test_a_plug_in_is_not_blamed_for_ctrl_c_and_for_a_lack_of_memory(share):
+    with pytest.raises(KeyboardInterrupt), plugins.refuse_failure("it failed"):
+        raise KeyboardInterrupt
+    share.write_text(f"{SOURCE}\nraise MemoryError('9 PiB')\n")
+    with pytest.raises(OutOfMemoryError, match=r"memory ran out \(MemoryError: 9 PiB\)") as found:
+        load_experiment("paper", [f"cloud.predictor={share}"])
+    assert (found.value.exit_code, "share.py" in str(found.value)) == (3, True)
+
+
+@pytest.mark.parametrize("text", ["sys.exit(0)", "1 / 0"])
+def test_a_predictor_that_cannot_predict_is_refused_if_cloud_plans(share, text):
+    share.write_text(
+        "import sys\nfrom cloudrc.cloud.predictors import Predictor\n"
+        f"class build(Predictor):\n    def predict(self, *given):\n        {text}\n"
+    )
+    found = refused("paper", f"cloud.predictor={share}", "cloud.plan_s=0.4")
+    assert "share.py' cannot predict: " in found
 
 
 def test_a_plug_in_file_must_exist_and_end_in_py(tmp_path):

@@ -31,6 +31,7 @@ BODIES = {
     "overshoot": OVERSHOOT,
     "raises": f"{FAILING}raise RuntimeError('no such\\ncolumn')",
     "infinite": f"{FAILING}return float('inf')",
+    "exits": f"{FAILING}raise SystemExit(0)",
 }
 SHORT = ["steps", "--mode", "virtual", "--set", "mission.steps.count=1"]
 
@@ -49,13 +50,14 @@ def report_of(run):
 
 
 def test_a_later_report_measures_a_file_only_if_named(folder):
-    run, names = folder / "run", ("infinite", "overshoot", "raises")
+    run, names = folder / "run", ("exits", "infinite", "overshoot", "raises")
     asked = f"report.metrics=[{', '.join(f'mine/{name}.py' for name in names)}]"
     assert main(["run", *SHORT, "--set", asked, "--out", "run"]) == 0
     first = report_of(run)
     overshoot = first["numbers"]["overshoot"]
     assert (overshoot["value"] >= 0.0, overshoot["unit"]) == (True, "m")
     assert first["notes"] == [
+        "metric exits failed: SystemExit: 0 (sys.exit() was called)",
         "metric infinite gave inf: left out",
         "metric raises failed: RuntimeError: no such column",
     ]
@@ -77,6 +79,7 @@ def test_a_later_report_measures_a_file_only_if_named(folder):
         (["no.py"], "", "there is no such file"),
         (["bad.py"], "def measure(flight): ...", "needs a text UNIT"),
         (["bad.py"], "import nowhere", "cannot be imported: ModuleNotFoundError"),
+        (["bad.py"], "import sys; sys.exit(0)", "cannot be imported: SystemExit: 0"),
         (["duration.py"], OVERSHOOT, "duration is a metric already; rename the file"),
         (["bad.py", "mine/../bad.py"], OVERSHOOT, "2 metrics are named bad"),
         (["overshoot"], "", "no metric named 'overshoot'; available: age_of_"),
@@ -109,8 +112,10 @@ def test_an_installed_metric_is_in_every_report(folder, monkeypatch):
     sys.modules.pop("overshoot", None)
 
 
-def test_a_row_tells_that_a_metric_failed():
-    keys = *KEYS, "report.metrics=[mine/raises.py]"
-    row = fly_point(load_experiment("steps", keys))
-    assert (row["verdict"], "raises" in row["numbers"]) == ("success", False)
-    assert row["text"] == "metric raises failed: RuntimeError: no such column"
+@pytest.mark.parametrize(
+    ("name", "why"), [("raises", "RuntimeError: no such column"), ("exits", "SystemExit: 0")]
+)
+def test_a_row_tells_that_a_metric_failed(name, why):
+    row = fly_point(load_experiment("steps", [*KEYS, f"report.metrics=[mine/{name}.py]"]))
+    assert (row["verdict"], name in row["numbers"]) == ("success", False)
+    assert row["text"].startswith(f"metric {name} failed: {why}")

@@ -36,10 +36,13 @@ def trace(tmp_path):
     return tmp_path / "trace"
 
 
+BUILD = "from cloudrc.cloud.predictors import Predictor as build\n"
+
+
 @pytest.fixture
 def spy(trace):
     """A plug-in that creates the file `trace` when it is imported."""
-    return f"from pathlib import Path\nPath({str(trace)!r}).touch()\ndef build(): ...\n"
+    return f"from pathlib import Path\nPath({str(trace)!r}).touch()\n{BUILD}"
 
 
 @pytest.fixture

@@ -77,7 +77,7 @@ def test_points_with_one_seed_meet_the_same_draws(write_sweep):
 
 
 def test_relative_paths_start_at_the_file(write_sweep, tmp_path, monkeypatch):
-    source = "def build():\n    return lambda state, horizon, command: state\n"
+    source = "from cloudrc.cloud.predictors import Predictor as build\n"
     (tmp_path / "mine.py").write_text(source)
     (tmp_path / "own.yaml").write_text("{world: {scene: empty}, mission: steps}\n")
     monkeypatch.chdir("/")

@@ -88,7 +88,7 @@ def test_a_folder_holds_one_sweep(plan, rows, write_sweep, tmp_path):
 
 def test_a_changed_plugin_is_not_mixed_with_rows_of_the_old_one(write_sweep, tmp_path):
     mine = tmp_path / "mine.py"
-    source = "def build():\n    return lambda state, horizon, command: state\n"
+    source = "from cloudrc.cloud.predictors import Predictor as build\n"
     mine.write_text(source)
     path = write_sweep({"cloud.predictor": ["./mine.py"]})
     (flight,) = read_plan(path).flights.values()
