@@ -78,6 +78,7 @@ RULES = {
     "size": QUANTITY,
     "type": _one_of("ClusterIP", "NodePort", "LoadBalancer"),
     "port": {"type": "integer", "minimum": 1, "maximum": 65_535},
+    "leaseSeconds": {"type": "integer", "minimum": 5, "maximum": 3600},
     "allowFrom": PEERS,
     "dns": PEERS,
     "plan": _either(STRING, _ref("Mission"), NULL),

@@ -24,6 +24,7 @@ from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.files import read_token, warn_if_readable
 
 if TYPE_CHECKING:
+    from cloudrc.cluster.client import Release
     from cloudrc.teleop.wire import RobotStatus
 
 REQUEST_TIMEOUT = 10.0
@@ -175,6 +176,40 @@ def _refusal(answer: http.client.HTTPResponse, place: str, *, with_token: bool) 
     if answer.status in (400, 413, 422):
         return BadInputError(detail)
     return UnreachableError(detail) if answer.status in RETRY_STATUSES else ApiError(detail)
+
+
+@contextmanager
+def release_api(release: Release, token: Path | None = None) -> Iterator[Api]:
+    """Yield the API of a release, over a forwarded port, while the `with` block runs.
+
+    `token` is the file with the token; by default the token comes from the release's Secret.
+    """
+    from cloudrc.cluster.pods import api_url, operator_token
+
+    known = operator_token(release) if token is None else ""
+    place = f"release '{release.name}' {release.where}"
+    with api_url(release) as url:
+        yield Api(url, token_reader(token) if token else lambda: known, place)
+
+
+def cancel_mission_of(release: Release, job: str) -> str:
+    """Cancel the mission of a Job, whose UID is the mission's key; return the mission's id.
+
+    Return "" if the Job has posted no mission, or if its mission has ended.
+    """
+    with release_api(release) as api:
+        mission_id = mission_of(release, job, api)
+        if mission_id:
+            api.post(f"{mission_path(mission_id)}/cancel")
+        return mission_id
+
+
+def mission_of(release: Release, job: str, api: Api) -> str:
+    """Return the id of the mission of a Job; "" if it has posted none, or if it has ended."""
+    key = release.request("get", "jobs", name=job).metadata.uid
+    missions = api.get("/v1/missions")["missions"]
+    mine = (each["id"] for each in missions if each["key"] == key and not each["verdict"])
+    return str(next(mine, ""))
 
 
 def token_argument(parser: argparse._ActionsContainer) -> None:

@@ -6,18 +6,28 @@ In a cluster, `run` creates a Kubernetes Job, whose pod posts the mission to the
 from __future__ import annotations
 
 import argparse
+import os
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from types import FrameType
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from cloudrc.cli import client
-from cloudrc.cli.client import Api, UnreachableError, mission_path, token_file, token_reader
+from cloudrc.cli.client import (
+    Api,
+    UnreachableError,
+    mission_of,
+    mission_path,
+    release_api,
+    token_file,
+    token_reader,
+)
 from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
-from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import escape, output_argument, print_line, print_result, table
 from cloudrc.cli.parser import add_verbs, number
 from cloudrc.drivers.machine import Deadline
@@ -55,6 +65,8 @@ robot falls. After an emergency stop or a landing, 'acknowledge' allows the next
 mission. An API in a network asks for a token: give --token-file or
 CLOUDRC_TOKEN_FILE; for a release the command reads its Secret with your rights
 in the cluster. A run that is found on this machine needs no token."""
+BEGINS = ("queued", "starting")
+"""States of a mission that nobody has followed yet."""
 READS = ("list", "status", "logs")
 """Verbs that do not steer the robot."""
 POLL_PERIOD = 0.5
@@ -65,6 +77,11 @@ The second limit is longer, because the pod of the API may still have to load it
 TURN_MAX = 30.0
 """Longest time that a request and the pause after the request take [s]. If more time has passed,
 this process was suspended; the suspension does not count towards a time limit."""
+LEASE = 60.0
+"""Default lease of a mission that `mission fly` posts [s]."""
+TERMINATED = 143
+"""Exit code of `mission fly` after SIGTERM. Kubernetes then starts a new pod, because the Job
+ignores this code."""
 TERMINATION_LOG = Path("/dev/termination-log")
 """File in a pod for the pod's last message, which `kubectl describe` shows after the pod's end."""
 
@@ -88,6 +105,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument("--name", default="", help="name shown to people (default: the file's name)")
     fly.add_argument("--mission", required=True, metavar="FILE", help="mission file")
     fly.add_argument("--key", default="", help="a mission posted twice under one key flies once")
+    lease = f"seconds that the mission flies on after the end of this command (default: {LEASE:g})"
+    seconds = number(5, 3600, "seconds")
+    fly.add_argument("--lease", type=seconds, default=LEASE, metavar="S", help=lease)
     queue = "wait for the current mission to end"
     for verb in (run, fly):
         verb.add_argument("--queue", action="store_true", help=queue)
@@ -147,25 +167,33 @@ def read_mission(name: str, shown: str = "") -> Json:
 class MissionFollower:
     """Follows one mission until its verdict, even if the API restarts in a new pod meanwhile."""
 
-    def __init__(self, api: Api, patience: float) -> None:
+    def __init__(self, api: Api, patience: float, lease: float = 0.0) -> None:
         """Store the API; `patience` is the time limit for an API that does not answer [s].
 
         After this time the methods raise a TimedOutError; other errors are those of `Api.post`.
+        Teleop cancels a posted mission `lease` [s] after the end of this follower; 0: never.
         """
-        self._api, self._patience, self._last_event = api, patience, 0
+        self._api, self._patience, self._lease, self._last_event = api, patience, lease, 0
 
     def post(self, mission: Mapping[str, Any]) -> str:
         """Post a mission; return its id."""
-        view = self._retry(lambda: self._api.post("/v1/missions", mission))
+        leased = {**mission, "lease_s": self._lease} if self._lease else mission
+        view = self._retry(lambda: self._api.post("/v1/missions", leased))
         text = f"mission {view['id']}: {view['state']}, waypoints: {view['waypoints']}"
-        back = mission.get("start", "spawn") == "spawn"
-        self._api.say(f"{text}; the robot is set back to its spawn at the start" if back else text)
+        if view["state"] not in BEGINS:
+            text = f"following {describe_mission(view)}"
+        elif mission.get("start", "spawn") == "spawn":
+            text += "; the robot is set back to its spawn at the start"
+        self._api.say(text)
         return str(view["id"])
 
     def follow(self, mission_id: str) -> Json:
         """Print the events of a mission until it has ended; return its verdict."""
+        path = mission_path(mission_id)
         while True:
-            view = self._retry(lambda: self._api.get(mission_path(mission_id)))
+            view = self._retry(
+                lambda: self._api.post(f"{path}/renew") if self._lease else self._api.get(path)
+            )
             for event in view["events"]:
                 if event["id"] > self._last_event:
                     self._last_event = event["id"]
@@ -196,36 +224,60 @@ def describe_verdict(verdict: Mapping[str, Any]) -> str:
     return f"{verdict['outcome'].upper()}: {reasons}"
 
 
-def _fly(options: argparse.Namespace, api: Api) -> int:
+def _run(options: argparse.Namespace, api: Api) -> int:
     """Post a mission, follow it to its verdict, and return the exit code of the verdict.
 
-    After Ctrl-C, the mission of `mission run` goes on; that of `mission fly` is cancelled.
+    After Ctrl-C the mission goes on.
     """
-    is_job = options.verb == "fly"
-    if is_job:
-        interrupt_on_signals()
-        order = {**read_mission(options.mission), "key": options.key}
-    else:
-        order = read_mission(options.mission, options.name)
-    follower = MissionFollower(api, API_TIMEOUT if is_job else RUN_TIMEOUT)
+    follower = MissionFollower(api, RUN_TIMEOUT)
+    order = read_mission(options.mission, options.name)
     mission_id = follower.post({**order, "queue": options.queue})
     try:
         verdict = follower.follow(mission_id)
     except KeyboardInterrupt:
-        if is_job:
-            with suppress(CloudrcError):
-                api.post(f"{mission_path(mission_id)}/cancel")
-            print_line("INTERRUPTED: the Job was stopped, its mission is cancelled")
-        else:
-            command = f"cloudrc mission cancel {mission_id}"
-            print_line(f"mission {mission_id} goes on; cancel it: {command}", sys.stderr)
+        command = f"cloudrc mission cancel {mission_id}"
+        print_line(f"mission {mission_id} goes on; cancel it: {command}", sys.stderr)
+        raise
+    print_line(describe_verdict(verdict))
+    return int(verdict["exit_code"])
+
+
+def _fly(options: argparse.Namespace, api: Api) -> int:
+    """Like `_run`, in the pod of a Job: a watcher of the mission, whose end does not end it.
+
+    SIGTERM, by which Kubernetes ends a pod, leaves the mission to the next pod with the same key.
+    Teleop cancels the mission if no pod follows it for the time of the lease. Ctrl-C of somebody
+    who runs this command by hand cancels the mission at once.
+    """
+    signal.signal(signal.SIGTERM, _leave)
+    follower = MissionFollower(api, API_TIMEOUT, options.lease)
+    order = {**read_mission(options.mission), "key": options.key}
+    mission_id = follower.post({**order, "queue": options.queue})
+    try:
+        verdict = follower.follow(mission_id)
+    except KeyboardInterrupt:
+        with suppress(CloudrcError):
+            api.post(f"{mission_path(mission_id)}/cancel")
+        print_line("INTERRUPTED: the mission is cancelled")
         raise
     text = describe_verdict(verdict)
     print_line(text)
-    if is_job and TERMINATION_LOG.exists():
+    _write_last_words(text)
+    return int(verdict["exit_code"])
+
+
+def _leave(number: int, frame: FrameType | None) -> NoReturn:
+    """End this process at once; an exception could get lost where libraries catch it."""
+    text = "this watcher of the mission is stopped; the mission goes on if a new one follows it"
+    os.write(sys.stdout.fileno(), f"{text}\n".encode())  # `print` may be interrupted itself
+    _write_last_words(text)
+    os._exit(TERMINATED)
+
+
+def _write_last_words(text: str) -> None:
+    if TERMINATION_LOG.exists():
         with suppress(OSError):
             TERMINATION_LOG.write_text(f"{escape(text)}\n", encoding="utf-8")
-    return int(verdict["exit_code"])
 
 
 def _list(options: argparse.Namespace, api: Api) -> int:
@@ -339,7 +391,7 @@ def _drive(_: argparse.Namespace, api: Api) -> int:
 
 
 VERBS: dict[str, tuple[str, Callable[[argparse.Namespace, Api], int]]] = {
-    "run": ("fly a mission and show its progress until the verdict", _fly),
+    "run": ("fly a mission and show its progress until the verdict", _run),
     "list": ("list all missions", _list),
     "status": ("show the robot's state, or the state of a mission", _status),
     "cancel": ("cancel a mission; the robot holds its position", _cancel),
@@ -409,15 +461,10 @@ def _release(options: argparse.Namespace) -> Release:
 @contextmanager
 def _forwarded_api(options: argparse.Namespace) -> Iterator[Api]:
     """Yield the API of a release, which is reachable over a forwarded port while the block runs."""
-    release, path = _release(options), token_file(options)
-    from cloudrc.cluster.pods import api_url, operator_token
-
-    token = operator_token(release) if path is None else ""
-    place = f"release '{release.name}' {release.where}"
-    with api_url(release) as url:
+    with release_api(_release(options), token_file(options)) as api:
         if options.verb in READS and not (options.context or options.namespace or options.release):
-            print_line(f"cloudrc: using {place}", sys.stderr)
-        yield Api(url, token_reader(path) if path else lambda: token, place)
+            print_line(f"cloudrc: using {api.place}", sys.stderr)
+        yield api
 
 
 def _run_job(options: argparse.Namespace) -> int:
@@ -435,10 +482,19 @@ def _run_job(options: argparse.Namespace) -> int:
     try:
         ended = follow(release, job, print_line)
     except KeyboardInterrupt:
-        command = f"{release.kubectl} delete job {job}"
-        print_line(f"Job {job} is still running; cancel its mission: {command}", sys.stderr)
+        remedy = _cancelling_command(release, job)
+        print_line(f"Job {job} is still running; cancel its mission: {remedy}", sys.stderr)
         raise
     if ended.exit_code is None:
         print_line(ended.message)
         return 1
     return ended.exit_code
+
+
+def _cancelling_command(release: Release, job: str) -> str:
+    """Return the command that cancels the mission of a Job."""
+    with suppress(CloudrcError), release_api(release) as api:
+        if mission_id := mission_of(release, job, api):
+            flags = " ".join([*release.flags, f"--release={release.name}"])
+            return f"cloudrc mission cancel {mission_id} {flags}"
+    return f"{release.kubectl} delete job {job}"

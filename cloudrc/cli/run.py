@@ -257,7 +257,7 @@ def _local_flight(
 def _cluster_flight(
     experiment: ResolvedExperiment, options: argparse.Namespace, stream: TextIO
 ) -> Flight:
-    from cloudrc.cli.client import Api
+    from cloudrc.cli.client import Api, cancel_mission_of
     from cloudrc.cluster.client import program
     from cloudrc.cluster.flight import fly_in_cluster, refuse_local_files, refuse_second_flight
 
@@ -266,8 +266,12 @@ def _cluster_flight(
     for name in ("helm", "kubectl"):
         program(name)
     refuse_second_flight(release, lambda url, token: Api(url, lambda: token).get("/v1/state"))
+
+    def tell(text: str) -> None:
+        print_line(f"  {text}", stream)
+
     return lambda folder: fly_in_cluster(
-        experiment, folder, release, options.timeout, lambda text: print_line(f"  {text}", stream)
+        experiment, folder, release, options.timeout, tell, cancel_mission_of
     )
 
 

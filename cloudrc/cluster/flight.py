@@ -26,6 +26,9 @@ Tell = Callable[[str], None]
 Ask = Callable[[str, str], Any]
 """Function that gets the state of robot and missions from the API with a given URL and token."""
 
+Cancel = Callable[[Release, str], str]
+"""Function that cancels the mission of the Job with a given name, and returns the mission's id."""
+
 LOOK_PERIOD = 1.0
 """Time between two requests for the state of the pods [s]."""
 FAILURE_TIME = 5.0
@@ -141,7 +144,12 @@ def refuse_second_flight(release: Release, ask: Ask) -> None:
 
 
 def fly_in_cluster(
-    experiment: ResolvedExperiment, folder: Path, release: Release, timeout: float, tell: Tell
+    experiment: ResolvedExperiment,
+    folder: Path,
+    release: Release,
+    timeout: float,
+    tell: Tell,
+    cancel: Cancel,
 ) -> dict[str, Any]:
     """Fly one experiment in a cluster, fill its run folder, and return the report.
 
@@ -151,6 +159,7 @@ def fly_in_cluster(
         release: The Helm release to use; it is installed if it is missing, and stays afterwards.
         timeout: Time limit for the release to become ready [s].
         tell: Receives the progress, one line per call.
+        cancel: Cancels the mission after Ctrl-C.
     """
     from cloudrc.config.load import dump
 
@@ -160,7 +169,7 @@ def fly_in_cluster(
     tell(f"release '{release.name}' {release.where} is ready after {took:.0f} s")
     interrupted = False
     try:
-        _fly(experiment, release, tell)
+        _fly(experiment, release, tell, cancel)
     except KeyboardInterrupt:
         interrupted = True
     (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
@@ -196,7 +205,7 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
         )
 
 
-def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
+def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell, cancel: Cancel) -> None:
     flown = {"start", "waypoints", "carrot"}
     mission = experiment.mission.model_dump(mode="json", include=flown)
     limit = experiment.criteria.time_limit_s
@@ -206,10 +215,12 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> None:
         ended = follow(release, job, tell)
     except KeyboardInterrupt:
         tell("cancelling the mission")
-        try:
-            delete_job(release, job)
-        except CloudrcError as error:
-            tell(f"cannot cancel: {error}")
+        # The pod of a deleted Job does not cancel: teleop would fly on for the mission's lease.
+        for action in (cancel, delete_job):
+            try:
+                action(release, job)
+            except CloudrcError as error:
+                tell(f"cannot cancel: {error}")
         raise
     if ended.exit_code not in FLOWN:
         raise ClusterError(f"Job {job} did not fly its mission: {ended.message}")

@@ -169,7 +169,7 @@ def find_job(release: Release, name: str) -> Any:
 
 
 def delete_job(release: Release, name: str) -> None:
-    """Delete a Job with its pods and ConfigMap; the pod of a mission first cancels the mission."""
+    """Delete a Job with its pods and ConfigMap; the mission of a Job ends later, with its lease."""
     release.request("delete", "jobs", name=name, propagation_policy="Foreground")
     until = time.monotonic() + DELETE_LIMIT
     while find_job(release, name) is not None:

@@ -284,6 +284,16 @@ async def cancel_mission(id: str, bridge: Bridged) -> Any:
     return await bridge.ask(lambda service, now_ns: service.cancel(id, now_ns))
 
 
+@router.post("/missions/{id}/renew", response_model=models.MissionView)
+async def renew_mission(id: str, bridge: Bridged) -> Any:
+    """Renew the lease of a mission: its watcher lives.
+
+    An order with `lease_s` is cancelled if this request, or the same order again, does not come for
+    that time. To other missions this request does nothing.
+    """
+    return await bridge.ask(lambda service, now_ns: service.renew(id, now_ns))
+
+
 @router.post("/hold", response_model=models.MissionView)
 async def hold(bridge: Bridged) -> Any:
     """Hold the robot at its position, at least 0.35 m above the floor."""

@@ -35,9 +35,9 @@ BEARER = HTTPBearer(auto_error=False, description="An operator's token, or a rea
 READS = ("GET", "HEAD")
 URGENT = ("/v1/estop", "/v1/hold")
 """Paths of commands that are accepted even if too many requests are open."""
-STEERING = "/v1/drive"
-"""Path of requests to drive, which an operator repeats at 10 Hz. Therefore the audit log contains
-only the refused ones."""
+REPEATED = ("/drive", "/renew")
+"""Ends of the paths of requests that a program repeats: to drive, to renew a mission's lease. Of
+these requests, the audit log contains only the refused ones."""
 ORDERS = ("/v1/missions", "/v1/goto")
 """Paths of orders to fly a mission or to a point; refused orders are counted by reason."""
 COUNTED = {409: "order_conflict", 413: "order_invalid", 422: "order_invalid"}
@@ -200,8 +200,8 @@ class Gate:
             self.counts["served"] += 1
             if path in ORDERS and answer["status"] in COUNTED:
                 self.counts[COUNTED[answer["status"]]] += 1
-            steers = path == STEERING and answer["status"] == 200
-            if scope["method"] not in READS and not steers:
+            repeats = path.endswith(REPEATED) and answer["status"] == 200
+            if scope["method"] not in READS and not repeats:
                 self.audit.note(caller, scope, answer)
 
     async def caller(self, scope: Scope) -> Caller | None:

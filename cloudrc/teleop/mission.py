@@ -235,9 +235,9 @@ class Teleop:
         self._select_leg(self.leg, now_ns)
         self._report("resumed", self.leg, f"resumed {self.where}", now_ns)
 
-    def cancel(self, now_ns: int) -> None:
-        """End the mission under way."""
-        self._end("cancelled", "mission cancelled", now_ns)
+    def cancel(self, now_ns: int, text: str = "mission cancelled") -> None:
+        """End the mission under way; `text` is the text of the event."""
+        self._end("cancelled", text, now_ns)
 
     def stop(self, now_ns: int) -> None:
         """Stop the rotors at once in any state, and drop all earlier requests to the robot.

@@ -34,7 +34,9 @@ from cloudrc.teleop.wire import Leg, Plan
 
 PROBLEMS_MAX = 50
 """Largest number of problems that one answer lists."""
-
+LEASE_MIN, LEASE_MAX = 5, 3600
+"""Limits of a mission's lease [s]. A shorter lease would end a mission whose watcher waits for
+a busy processor; with a longer one, a robot would fly for hours without a watcher."""
 
 Text = Annotated[str, Field(max_length=200)]
 
@@ -57,6 +59,11 @@ class MissionRequest(Section):
     )
     key: Text = Field("", description="Teleop makes one mission for each key")
     queue: bool = Field(False, description="Wait for the mission under way, if there is one")
+    lease_s: Annotated[float, Field(ge=LEASE_MIN, le=LEASE_MAX)] | None = Field(
+        None,
+        description="Cancel the mission if nobody renews it for this time [s]; null: it needs no "
+        "watcher",
+    )
 
 
 class GoToRequest(Section):
@@ -254,7 +261,8 @@ def read_order(
     contact = contact and leads_to_board(mission, scene)
     contact = contact if request.contact is None else request.contact
     planned = plan(mission, request.time_limit_s)
-    return Order(planned, request.name, request.key, contact, request.queue)
+    lease = request.lease_s or 0.0
+    return Order(planned, request.name, request.key, contact, request.queue, lease)
 
 
 def read_goto(body: bytes, scene: Scene) -> Leg:

@@ -7,6 +7,7 @@ has restarted. If an emergency stop has not reached the robot, the new process s
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from math import hypot, inf
 from typing import Any
@@ -38,7 +39,7 @@ QUEUE_MAX = 16
 DRIVEN = "driven"
 """State for `next_step` while the operator drives the robot by hand during a held mission."""
 TAKES_OFF = "a velocity other than zero makes the robot take off, once telemetry has arrived"
-NEVER_BEGAN, ASKED = "mission cancelled before it began", "the robot is asked to start"
+CANCELLED, BEFORE, ASKED = "mission cancelled", " before it began", "the robot is asked to start"
 RESTARTED = "teleop has restarted; the robot is asked to go on"
 REST = "after a stop or a landing only when it has stood still, at least 0.5 m inside the fence"
 BY_ITSELF = "without commands the robot holds its position, then lands, by itself"
@@ -106,6 +107,7 @@ class MissionService:
         self._ends = False  # whether this process ends; the next process flies the queue
         self._trouble = ""  # trouble of the store that was last reported
         self._driven_ns = -HEARTBEAT_NS  # time of the last request to drive
+        self._renewed_ns: dict[str, int] = {}  # mission's id -> time of its watcher's last word
         self._interrupted = False  # whether a drive has to pause (let go) before it continues
 
     @property
@@ -130,6 +132,7 @@ class MissionService:
         """
         known = self.book.with_key(order.key)
         if known is not None:
+            self._renewed_ns[known.id] = now_ns
             if (known.order.plan, known.order.contact) != (order.plan, order.contact):
                 text = f"mission {known.id} has the key '{order.key}' already, with another plan"
                 raise ConflictError(f"{text}; take a new key", known.id)
@@ -143,21 +146,32 @@ class MissionService:
         if order.plan.start is Start.HERE and not waiting and not order.plan.by_hand:
             self._check_way(order.plan.legs[0])
         mission = self.book.add(order)
+        self._renewed_ns[mission.id] = now_ns
         if waiting:
             self._note(mission, "queued", f"mission waits for {waiting[-1].id}", now_ns)
         else:
             self._start_next(now_ns, queued=True)
         return mission, True
 
-    def cancel(self, mission_id: str, now_ns: int) -> Mission:
-        """End a mission, or remove it from the queue; raise UnknownMissionError for a wrong id."""
+    def renew(self, mission_id: str, now_ns: int) -> Mission:
+        """Note that the mission's watcher lives; raise UnknownMissionError for a wrong id."""
         mission = self.book.find(mission_id)
+        self._renewed_ns[mission.id] = now_ns
+        return mission
+
+    def cancel(self, mission_id: str, now_ns: int, why: str = "") -> Mission:
+        """End a mission, or remove it from the queue; raise UnknownMissionError for a wrong id.
+
+        `why` follows the words "mission cancelled"; "" if an operator asks for it.
+        """
+        mission, why = self.book.find(mission_id), why and f": {why}"
         if not mission.ended and mission is self._start_next(now_ns):
-            return self._operate(self._teleop.cancel, now_ns)
+            return self._operate(lambda now: self._teleop.cancel(now, CANCELLED + why), now_ns)
         if mission.ended:  # maybe just now, because world has restarted
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
-        verdict = Verdict("interrupted", (Failure("cancelled", NEVER_BEGAN),)).as_json()
-        self._note(mission, "cancelled", NEVER_BEGAN, now_ns, verdict=verdict)
+        text = CANCELLED + BEFORE + why
+        verdict = Verdict("interrupted", (Failure("cancelled", text),)).as_json()
+        self._note(mission, "cancelled", text, now_ns, verdict=verdict)
         if self.book.trouble:
             text = f"{mission.id} is cancelled, but waits again if teleop restarts"
             raise UnavailableError(f"{text}: {self.book.trouble}")
@@ -270,6 +284,7 @@ class MissionService:
         """Start a waiting mission, check time limits, and repeat the messages that are due."""
         self.book.catch_up(now_ns)
         if not self._ends:
+            self._cancel_unwatched(now_ns)
             blocked = self.seen is None or self.book.trouble or self._blocked
             self._start_next(now_ns, queued=not blocked)
         self._teleop.handle_deadline(now_ns)
@@ -403,6 +418,19 @@ class MissionService:
         told, self._trouble = self._trouble, self.book.trouble
         if self._trouble not in ("", told):
             self._outputs.append(Fault(now_ns, "journal", self._trouble))
+
+    def _cancel_unwatched(self, now_ns: int) -> None:
+        """Cancel each mission whose watcher has sent no word for the time of its lease.
+
+        A new teleop process gives each watcher its full time again.
+        """
+        for mission in self.book.open():
+            lease = mission.order.lease
+            renewed_ns = self._renewed_ns.setdefault(mission.id, now_ns)
+            if lease and now_ns - renewed_ns > lease * 1e9:
+                why = f"its watcher is gone (no word from it for {lease:g} s)"
+                with suppress(ConflictError, UnavailableError):  # it has just ended
+                    self.cancel(mission.id, now_ns, why)
 
     def _process_event(self, event: MissionEvent, now_ns: int) -> None:
         mission, seen = self._current, self.seen

@@ -38,6 +38,7 @@ class Order:
     key: str = ""  # orders with the same key make one mission; "": no key
     contact: bool = False  # whether the arm has to touch the board
     queue: bool = False  # whether the order waits for the mission under way; else it is refused
+    lease: float = 0.0  # longest time without word from the mission's watcher [s]; 0: no watcher
 
 
 @dataclass(slots=True)

@@ -1,11 +1,13 @@
 """Missions as Jobs of the chart, of the examples and of `helm test`; each flies once."""
 
 import copy
+import signal
 
 import pytest
 import yaml
 
 import cloudrc
+from cloudrc.cli.mission import TERMINATED
 from cloudrc.config.load import load_experiment
 from tests.chart.conftest import CHART, of_kind, pod_specs, render
 
@@ -41,6 +43,19 @@ def test_a_job_flies_once_and_has_time_limits(job):
     field = variable["valueFrom"]["fieldRef"]["fieldPath"]
     assert field == "metadata.labels['batch.kubernetes.io/controller-uid']"
     assert f"--key=$({variable['name']})" in container["args"]
+    assert "--lease=60" in container["args"]
+
+
+@pytest.mark.parametrize("job", [*jobs(ENABLED), *(job for _, job in EXAMPLES.values())])
+def test_a_stopped_watcher_does_not_fail_its_job(job):
+    rules = job["spec"]["podFailurePolicy"]["rules"]
+    assert {rule["action"] for rule in rules} == {"Ignore"}
+    conditions = [each["type"] for rule in rules for each in rule.get("onPodConditions", [])]
+    assert conditions == ["DisruptionTarget"]
+    (codes,) = (rule["onExitCodes"] for rule in rules if "onExitCodes" in rule)
+    (container,) = job["spec"]["template"]["spec"]["containers"]
+    assert codes["containerName"] == container["name"]
+    assert set(codes["values"]) == {128 + signal.SIGKILL, TERMINATED}
 
 
 def test_a_job_calls_the_releases_api():

@@ -1,6 +1,8 @@
 """`cloudrc mission` against the real API: its output and exit codes."""
 
 import json
+import subprocess
+import sys
 import threading
 from unittest.mock import Mock
 
@@ -8,6 +10,7 @@ import pytest
 
 from cloudrc.cli import mission as command
 from cloudrc.cli.client import Api, token_reader
+from tests.conftest import wait_until
 from tests.teleop.conftest import A, B, running
 
 FILE = """
@@ -89,11 +92,28 @@ def interrupted(monkeypatch):
 
 
 @pytest.mark.usefixtures("interrupted")
-def test_a_stopped_job_cancels_its_mission(api, mission):
+def test_ctrl_c_of_somebody_who_flies_a_jobs_mission_by_hand_cancels_it(api, mission):
     api.post("/v1/missions", {"waypoints": [{"position_m": B}]})
     assert "mission m1 is" in mission("fly --mission two.yaml", 5).err
     mission("fly --mission two.yaml --queue", 130)
     assert api.state_of("m2") == "cancelled"
+
+
+def test_sigterm_leaves_the_mission_to_the_next_watcher(api, mission, folder):
+    words = ["mission", "fly", "--mission=two.yaml", "--key=uid", f"--api={api.url}"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "cloudrc", *words], stdout=subprocess.PIPE, text=True
+    ) as watcher:
+        wait_until(lambda: api.get("/v1/missions")["missions"], 30.0)
+        api.until(lambda: api.state_of("m1") == "flying")
+        watcher.terminate()
+        assert watcher.wait(10.0) == command.TERMINATED
+        assert "goes on" in watcher.stdout.read().splitlines()[-1]
+    assert api.state_of("m1") == "flying"
+    assert api.flight.teleop.book.find("m1").order.lease == command.LEASE
+    threading.Timer(0.2, lambda: api.post("/v1/missions/m1/cancel")).start()
+    first = mission("fly --mission two.yaml --key uid --lease 30", 130).out.splitlines()[0]
+    assert first == "following mission m1 (two): flying, waypoint 1 of 2"
 
 
 @pytest.mark.usefixtures("interrupted")

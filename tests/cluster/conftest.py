@@ -156,6 +156,7 @@ class FakeTeleop:
 
     def __init__(self):
         self.mission = None
+        self.missions = list  # makes the list of all missions
         self.posted = []
         self.tokens = set()
         self.server = serve(self._answer)
@@ -163,7 +164,7 @@ class FakeTeleop:
     def _answer(self, request, body):
         self.tokens.add(request.headers["Authorization"])
         if request.command == "GET":
-            return 200, {"missions": [], "mission": self.mission}
+            return 200, {"missions": self.missions(), "mission": self.mission}
         self.posted.append(request.path)
         return 200, {}
 
@@ -301,6 +302,11 @@ def teleop(running, pretend):
     yield fake
     fake.server.shutdown()
     fake.server.server_close()
+
+
+def missions_of(api):
+    """List a mission under way for each Job of the fake API server."""
+    return [{"id": "m4", "key": job["metadata"]["uid"], "verdict": None} for job in api.jobs()]
 
 
 MISSION = {"name": "short", "start": "spawn", "waypoints": [{"position_m": [0, 0, 1]}]}

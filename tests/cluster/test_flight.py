@@ -13,7 +13,7 @@ from cloudrc.cluster.jobs import run_job
 from cloudrc.config.load import load_experiment
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import LinkChanged
-from tests.cluster.conftest import terminated
+from tests.cluster.conftest import missions_of, terminated
 from tests.flights.conftest import records
 from tests.record.conftest import later
 
@@ -154,12 +154,16 @@ def test_a_broken_connection_loses_logs_but_no_report(ready, call, monkeypatch):
     assert "no way to the pod; trying again" in captured.err
 
 
-def test_an_interrupted_flight_cancels_and_reports_its_mission(ready, tmp_path, call, monkeypatch):
+def test_an_interrupted_flight_cancels_and_reports_its_mission(
+    ready, teleop, tmp_path, call, monkeypatch
+):
+    teleop.missions = lambda: missions_of(ready)  # none once the Job is deleted
     monkeypatch.setattr(flight, "follow", Mock(side_effect=KeyboardInterrupt))
     record(tmp_path, [each[: len(each) // 2] for each in flown()], torn=False)
     captured = call(f"{LINE} --out out", code=130)
     assert "cancelling the mission" in captured.err
     assert "DELETE jobs/" in " ".join(ready.seen)
+    assert teleop.posted == ["/v1/missions/m4/cancel"]
     report = json.loads(captured.out)
     assert (report["mode"], report["verdict"]) == ("cluster", "interrupted")
 

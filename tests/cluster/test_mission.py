@@ -10,7 +10,7 @@ from cloudrc.cli import mission as command
 from cloudrc.cli.main import main
 from cloudrc.cluster import jobs
 from cloudrc.drivers import local
-from tests.cluster.conftest import TOKEN, pod, terminated
+from tests.cluster.conftest import TOKEN, missions_of, pod, terminated
 
 WAYPOINTS = "waypoints: [{position_m: [0.5, 0.0, 1.0]}]"
 VERDICT = {0: "SUCCESS: all met", 1: "FAILURE: pipe_contact"}
@@ -82,6 +82,13 @@ def test_an_interrupted_run_says_that_the_job_continues(running, call, monkeypat
     said = call("mission run one.yaml", code=130).err
     (job,) = running.jobs()
     assert f"kubectl --namespace=demo delete job {job['metadata']['name']}\n" in said
+
+
+def test_an_interrupted_run_names_the_mission_of_its_job(running, teleop, call, monkeypatch):
+    teleop.missions = lambda: missions_of(running)
+    monkeypatch.setattr(jobs, "follow", Mock(side_effect=KeyboardInterrupt))
+    said = call("mission run one.yaml", code=130).err
+    assert "cloudrc mission cancel m4 --namespace=demo --release=cloudrc\n" in said
 
 
 @pytest.fixture

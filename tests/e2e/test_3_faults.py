@@ -8,6 +8,7 @@ import time
 
 import pytest
 
+from cloudrc.cli.mission import LEASE
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.pods import fetch_recording
 from cloudrc.config.load import load_experiment
@@ -16,7 +17,6 @@ from cloudrc.record.columns import Recording
 from tests.drivers.conftest import ages_at_hold
 from tests.e2e.conftest import (
     NAME,
-    NAMESPACE,
     eventually,
     fly,
     job_end,
@@ -109,15 +109,19 @@ def recording(component, folder):
 
 
 @pytest.mark.full
+def test_a_mission_outlives_its_watcher(installed):
+    fly_until("watched", "waypoint 2 of 7 reached")
+    kubectl("delete", "pod", "--selector=batch.kubernetes.io/job-name=watched")
+    check_completed("watched")
+
+
+@pytest.mark.full
 def test_a_mission_whose_job_is_deleted_is_cancelled(installed):
-    fly_until("leaderless", "waypoint 2 of 7 reached")
-    follow = ["kubectl", f"--namespace={NAMESPACE}", "logs", "--follow", "job/leaderless"]
-    with subprocess.Popen(follow, stdout=subprocess.PIPE, text=True) as reader:
-        assert reader.stdout is not None
-        reader.stdout.readline()  # from now on the log is read, which is deleted with the pod
-        kubectl("delete", "pod", "--selector=batch.kubernetes.io/job-name=leaderless")
-        assert reader.stdout.read().splitlines()[-1].startswith("INTERRUPTED")
-    eventually(lambda: guard() == "HOLD", "the robot holds")
+    fly("leaderless", [{"position_m": [0.5, 0.0, 0.7], "dwell_s": 1000.0}], 2000.0)
+    eventually(lambda: guard() == "TRACK", "the mission flies", 60.0)
+    kubectl("delete", "job", "leaderless")
+    assert guard() == "TRACK", "the mission ends with its lease"
+    eventually(lambda: guard() == "HOLD", "the robot holds", LEASE + 10.0)
     fly("successor", PIPES, 120.0)
     check_completed("successor")
 

@@ -82,6 +82,15 @@ def test_the_operator_steers_and_a_conflict_names_its_mission(api):
     assert (state["seen"]["guard"], state["seen"]["rtt_s"]) == ("TRACK", None)
 
 
+def test_a_lease_is_renewed_and_an_impossible_one_refused(api):
+    mission_id = api.fly({**MISSION, "lease_s": 30.0})
+    assert api.flight.teleop.book.find(mission_id).order.lease == 30.0
+    assert api.post(f"/v1/missions/{mission_id}/renew")[1]["id"] == mission_id
+    assert api.post("/v1/missions/m99/renew")[0] == 404
+    for lease in (0, 4.9, 3601, "soon", True):
+        assert api.post("/v1/missions", {**MISSION, "lease_s": lease})[0] == 422
+
+
 def test_only_a_mission_to_the_board_must_touch_it(api):
     pipes = [point.position_m for point in load_experiment("paper").mission.waypoints]
     for points, contact in (([(0.5, 0.0, 1.0)], False), (pipes, True)):

@@ -213,6 +213,45 @@ def test_a_key_is_that_of_one_order_for_ever():
     assert flight.create(key="another") == "m2"
 
 
+def test_a_mission_without_its_watcher_is_cancelled_when_its_lease_ends():
+    flight, mission_id = service_flying(lease=10.0)
+    flight.step(seconds=9.0)
+    flight.teleop.renew(mission_id, flight.now_ns)
+    flight.step(seconds=9.0)
+    assert state(flight) == "flying", "the watcher lives"
+    flight.step(seconds=1.5)
+    assert state(flight) == "cancelled"
+    verdict = flight.view(mission_id)["verdict"]
+    assert (verdict["outcome"], verdict["exit_code"]) == ("interrupted", 130)
+    assert "its watcher is gone" in flight.view(mission_id)["events"][-1]["text"]
+
+
+def test_a_new_watcher_with_the_same_key_renews_the_lease():
+    flight, mission_id = service_flying(lease=10.0, key="uid")
+    flight.step(seconds=9.0)
+    assert flight.create(lease=10.0, key="uid") == mission_id
+    flight.step(seconds=9.0)
+    assert state(flight) == "flying"
+
+
+def test_a_waiting_mission_without_its_watcher_is_cancelled_and_never_flown():
+    flight, _ = service_flying()
+    waiting = flight.create(queue=True, lease=10.0)
+    flight.step(seconds=11.0)
+    assert (state(flight), state(flight, waiting)) == ("flying", "cancelled")
+    assert "started" not in flight.names(waiting)
+
+
+def test_a_restarted_teleop_gives_a_watcher_its_full_lease_again():
+    flight, _ = service_flying(lease=10.0)
+    flight.step(seconds=9.0)
+    flight.restart_teleop()
+    flight.step(seconds=9.0)
+    assert state(flight) == "flying"
+    flight.step(seconds=1.5)
+    assert state(flight) == "cancelled"
+
+
 def test_the_queue_of_missions_is_bounded():
     flight, _ = service_flying()
     play(flight, "queue " * QUEUE_MAX)

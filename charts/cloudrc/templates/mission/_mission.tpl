@@ -28,6 +28,7 @@
     - --token-file=/etc/cloudrc-tokens/operator
     - --mission=/etc/cloudrc-mission/mission.yaml
     - --key=$(MISSION_KEY)
+    - --lease={{ .root.Values.mission.leaseSeconds }}
     {{- if .queue }}
     - --queue
     {{- end }}
