@@ -36,7 +36,7 @@ COMPILE = $(bin)/uv pip compile --quiet --upgrade --python-version 3.11 --python
 DRAWING := glfw pyopengl mujoco-studio
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test process process-shared process-alone e2e e2e-full test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types audit bench bench-link pictures results docs dist images kind-load lock clean
+.PHONY: help demo test process process-shared process-alone e2e e2e-full test-netem smoke-netem test-netem-full faults faults-named faults-random faults-hostile coverage mutants nightly lint types api audit bench bench-link pictures results docs dist images kind-load lock clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-15s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -163,6 +163,11 @@ audit: $(VENV)/dev ## look up the images' packages in the advisories; write an S
 
 types: $(VENV)/dev ## check types
 	$(bin)/mypy
+
+# The commit to compare with; default: the last release.
+SINCE ?=
+api: $(VENV)/dev ## list changes of the public Python API since the last release, or since SINCE
+	$(bin)/python -m tools.api $(SINCE)
 
 bench: $(VENV)/all ## measure the closed loop against raw physics
 	$(bin)/cloudrc bench
