@@ -1,4 +1,4 @@
-"""`cloudrc recover FILE`: copy a damaged recording, up to the first damage, into a valid file."""
+"""`cloudrc recover FILE`: copy what is readable of a damaged recording into a valid file."""
 
 from __future__ import annotations
 
@@ -6,10 +6,15 @@ import argparse
 import os
 from dataclasses import asdict
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import escape, output_argument, print_result
-from cloudrc.errors import BadInputError
+from cloudrc.errors import BadInputError, describe_error
+
+if TYPE_CHECKING:
+    from cloudrc.record.columns import Message, Recording
 
 LOSSY = 1
 """Exit code if the copy lacks data of the recording."""
@@ -32,17 +37,43 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Copy a damaged recording; print which share of the data was kept, and the known losses."""
     require("a recovery", ("record",))
-    from cloudrc.record.reader import recover
+    from cloudrc.record.reader import LISTED_MAX
+    from cloudrc.record.recovery import recover
 
     source: Path = options.file
     target = options.to or source.parent / f"{source.stem}.recovered{source.suffix}"
     if os.path.lexists(target):
         raise BadInputError(f"{target}: already there; name another file with --to")
-    recovery = recover(source, target)
+    recovery = recover(source, target, _views)
     kept = ", ".join(f"{count} {kind}" for kind, count in recovery.kept.items() if count)
-    lines = [f"kept {recovery.share:.1%}: {kept}", *(f"lossy: {note}" for note in recovery.notes)]
+    lines = [f"kept {recovery.share:.1%}: {kept}"]
+    lines.append("topics: " + ", ".join(f"{name} {n}" for name, n in recovery.topics.items()))
+    lines += [f"lossy: {note}" for note in recovery.notes]
+    if len(recovery.dropped) > LISTED_MAX:  # the note lists only some
+        counts = {name: "?" if n is None else n for name, n in recovery.dropped.items()}
+        lines.append("dropped: " + ", ".join(f"{name} {n}" for name, n in counts.items()))
+    if recovery.derived:
+        lines.append(f"made again from the other topics: {', '.join(recovery.derived)}")
     if recovery.complete and recovery.index_is_new:
         lines.append("the index was missing or damaged and is rebuilt; nothing is lost")
     text = "\n".join(map(escape, [*lines, str(target)]))
     print_result(options.output, {"file": str(target), **asdict(recovery)}, text)
     return 0 if recovery.complete else LOSSY
+
+
+def _views(recording: Recording) -> list[Message]:
+    """Make the topics for viewers from a recording and the experiment that is attached to it."""
+    from cloudrc.config.load import read_experiment
+    from cloudrc.report.views import views
+
+    if "config.yaml" not in recording.attachments:
+        raise BadInputError("its config.yaml, which names the scene, is lost")
+    with TemporaryDirectory() as folder:
+        config = Path(folder) / "config.yaml"
+        config.write_bytes(recording.attachments["config.yaml"])
+        try:
+            return views(recording, read_experiment(config))
+        except BadInputError as error:
+            raise BadInputError(str(error).replace(str(config), "its config.yaml")) from error
+        except (ValueError, OSError) as error:  # impossible values
+            raise BadInputError(describe_error(error)) from error

@@ -328,6 +328,9 @@ def _record_virtual(
     store, interrupted = RecordStore(), False
     # Record during the flight, so that the recording is kept if the run or its report fails.
     with McapWriter(folder / "mission.mcap", clock="world") as writer:
+        at_start = attachments(folder)  # the experiment, also for a copy that is cut short
+        for name, data in at_start.items():
+            writer.attach(name, data)
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
             writer.write(heapq.merge(from_world, from_cloud, key=attrgetter("stamp_ns")))
@@ -347,7 +350,7 @@ def _record_virtual(
             writer.write_views(views(recording, experiment))
             yield recording, experiment, run
         finally:
-            for name, data in attachments(folder).items():
+            for name, data in attachments(folder).items() - at_start.items():
                 writer.attach(name, data)
 
 

@@ -1,7 +1,8 @@
-"""Read or repair an MCAP file, up to its end or to its first damaged part.
+"""Read or repair an MCAP file: all of it, or what a kill or damage has left.
 
 A killed process leaves a file without an end; this module reads it up to its last complete chunk.
-The package `mcap` parses the format. This module limits the unpacked size, and describes in words
+In a damaged file, it goes on behind the damage if the file's index is intact. The package `mcap`
+parses the format. This module limits the unpacked size, and describes in words
 what is missing.
 """
 
@@ -14,15 +15,18 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from io import BufferedReader, BytesIO
 from itertools import pairwise
 from pathlib import Path
+from struct import Struct
+from typing import IO, NamedTuple
 
 import lz4.frame
 import zstandard
 from mcap import records as mcap
 from mcap.exceptions import EndOfFile, RecordLengthLimitExceeded
+from mcap.opcode import Opcode
 from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.writer import MCAP0_MAGIC
 
@@ -39,9 +43,15 @@ as 1 MiB. Recordings of flights need a ratio of 10, recordings of an idle robot 
 MESSAGE_COST = 128
 """Memory for a message's Python objects, in addition to its content [bytes]."""
 LISTED_MAX = 3
-"""Largest number of topics that an error message lists."""
-LOSSY_SHARE_MAX = 0.999
-"""Largest value of `Recovery.share` if something is missing [1]."""
+"""Largest number of topics or damaged places that an error message lists."""
+UNKNOWN = "unknown"
+"""In place of the topic of messages whose topic is lost."""
+RECORD_HEAD_SIZE = 9
+"""Size of a record's opcode and length [bytes]."""
+_FOOTER = Struct("<BQQQI8s")
+"""The last record of a file (opcode, length, start of the index, start of the index of the index,
+checksum of the index), and the end of the file."""
+FOOTER_SIZE = _FOOTER.size
 KINDS = {
     b"": "is empty; name a recording (.mcap)",
     b"#ROSBAG V": "is a ROS 1 bag, not an MCAP file; convert it with: rosbags-convert",
@@ -69,22 +79,69 @@ _UNPACK: dict[str, Callable[[bytes, int], bytes]] = {
 used, because they allocate whatever size the file claims."""
 
 
-class _File:
-    """Reads one MCAP file, including its chunks, up to the first damaged part."""
+class Part(NamedTuple):
+    """A chunk, an attachment or a metadata record of a file."""
+
+    start: int  # position in the file [bytes]
+    size: int  # [bytes]
+    content: str  # what the index says about its content; "" if nothing
+
+
+@dataclass(slots=True)
+class _Index:
+    """What the end of a file says about the whole file."""
+
+    parts: list[Part] = field(default_factory=list)  # by position
+    channels: dict[int, mcap.Channel] = field(default_factory=dict)
+    schemas: dict[int, mcap.Schema] = field(default_factory=dict)
+    statistics: mcap.Statistics | None = None
+
+    @staticmethod
+    def read(stream: IO[bytes], size: int) -> _Index | None:
+        """Read the index at the end of a file of `size` bytes; None if it is missing or damaged."""
+        stream.seek(max(size - FOOTER_SIZE, 0))
+        opcode, _, start, _, checksum, magic = _FOOTER.unpack(stream.read().rjust(FOOTER_SIZE))
+        if opcode != Opcode.FOOTER or magic != MCAP0_MAGIC or not 0 < start < size:
+            return None
+        stream.seek(start)
+        data = stream.read(size - start)
+        checked = data[: -len(MCAP0_MAGIC) - 4]  # up to the checksum itself
+        if checksum not in (0, zlib.crc32(checked)):
+            return None
+        index = _Index()
+        with suppress(Exception):  # without a checksum, the bytes may be anything
+            for record in StreamReader(BytesIO(data), skip_magic=True, emit_chunks=True).records:
+                index._store(record)
+        index.parts.sort()
+        return index if index.parts else None
+
+    def _store(self, record: mcap.McapRecord) -> None:
+        if isinstance(record, mcap.ChunkIndex):
+            times = record.message_start_time * 1e-9, record.message_end_time * 1e-9
+            content = f"{times[0]:.2f} to {times[1]:.2f} s"
+            self.parts.append(Part(record.chunk_start_offset, record.chunk_length, content))
+        elif isinstance(record, mcap.AttachmentIndex | mcap.MetadataIndex):
+            self.parts.append(Part(record.offset, record.length, to_one_line(record.name)))
+        elif isinstance(record, mcap.Channel):
+            self.channels[record.id] = record
+        elif isinstance(record, mcap.Schema):
+            self.schemas[record.id] = record
+        elif isinstance(record, mcap.Statistics):
+            self.statistics = record
+
+
+class File:
+    """Reads one MCAP file, including its chunks, and goes on behind damaged parts if it can.
+
+    The records of an intact file are read in their order. In a damaged file, only the index tells
+    where the records behind the damage begin. If the index is missing too, a damaged chunk is left
+    out as long as its length is intact.
+    """
 
     def __init__(self, path: Path) -> None:
         """Read a file; raise a BadInputError if it cannot be read or is not MCAP."""
-        self.recording = Recording(source=str(path))
-        self.position = 0  # end of the last intact record in the file [bytes]
-        self.data_ended = False  # whether all messages were read; only the index follows
-        self.ended = False  # whether the whole file was read
-        self.fault = ""  # why reading stopped or what is wrong, in words; "" if nothing is wrong
-        self.cut = False  # whether the file breaks off at the fault, as after a kill
-        self.total = 0  # number of messages, also of other programs, read or stated by the index
-        self.channels: dict[int, mcap.Channel] = {}
-        self.ours: dict[int, bool] = {}  # whether cloudrc records a channel's topic in this layout
-        self._schemas: dict[int, mcap.Schema] = {}
-        self._sequences = array("L")
+        self._path = path
+        self._compression = ""  # in words: chunks are compressed in a way that cloudrc cannot read
         try:
             self._stream = BufferedReader(open_file(path))
         except (OSError, ValueError) as error:  # ValueError: a pipe or a device
@@ -94,24 +151,53 @@ class _File:
             ) from error
         with self._stream:
             self.size = os.fstat(self._stream.fileno()).st_size  # [bytes]
-            self._room = UNPACKED_MAX * max(self.size, 1 << 20)
-            head = self._stream.peek(16)
-            if not head.startswith(MCAP0_MAGIC):
-                kind = next((k for k in KINDS if k and head.startswith(k)), head[:16].strip(b"\0"))
-                text = KINDS.get(kind, "is not an MCAP file; name a recording (.mcap)")
-                raise (BadInputError if kind else NothingReadableError)(f"{path}: {text}")
+            self._clear()
             self._read()
-        if not self.data_ended and not self.recording.messages:
+        if not self.recording.messages and (self.gaps or not self.data_ended):
+            damage = _describe(self.gaps) if self.gaps else ""
+            reasons = [self._compression or damage, self.fault]
+            reason = "; ".join(filter(None, reasons))
             raise NothingReadableError(
-                f"{path}: holds no readable message: {self.fault}; name another recording"
+                f"{path}: holds no readable message: {reason}; name another recording"
             )
         self._sort()
         _note(self)
 
+    def _clear(self) -> None:
+        self.recording = Recording(source=str(self._path))
+        self.position = 0  # end of the last intact record in the file [bytes]
+        self.data_ended = False  # whether all messages were read; only the index follows
+        self.ended = False  # whether the whole file was read
+        self.fault = ""  # why reading stopped or what is wrong, in words; "" if nothing is wrong
+        self.cut = False  # whether the file breaks off at the fault, as after a kill
+        self.gaps = list[Part]()  # what was left out
+        self.read = Counter[int]()  # channel -> number of messages, also of other programs
+        self.statistics: mcap.Statistics | None = None
+        self.channels: dict[int, mcap.Channel] = {}
+        self.ours: dict[int, bool] = {}  # whether cloudrc records a channel's topic in this layout
+        self._schemas: dict[int, mcap.Schema] = {}
+        self._sequences = array("L")
+        self._room = UNPACKED_MAX * max(self.size, 1 << 20)
+
     def _read(self) -> None:
+        head = self._stream.peek(16)[:16]
+        begins = head.startswith(MCAP0_MAGIC)
+        may_be_damaged = not begins or self._try(self._read_records)
+        if self.gaps and self.data_ended:  # thus the checksum of all data is wrong, too
+            self.fault = ""
+        if may_be_damaged and (index := _Index.read(self._stream, self.size)):
+            self._clear()
+            self._try(lambda: self._read_parts(index))
+        elif not begins:
+            kind = next((k for k in KINDS if k and head.startswith(k)), head.strip(b"\0"))
+            text = KINDS.get(kind, "is not an MCAP file; name a recording (.mcap)")
+            raise (BadInputError if kind else NothingReadableError)(f"{self._path}: {text}")
+
+    def _try(self, read: Callable[[], None]) -> bool:
+        """Read; note an error as the fault. Return whether the file's bytes may be the cause."""
         try:
-            for record in self._records():
-                self._store(record)
+            read()
+            return bool(self.gaps)
         except CRCValidationError as error:
             self.fault = "damaged: a checksum is wrong"
             self.data_ended |= isinstance(error.record, mcap.DataEnd)
@@ -119,42 +205,83 @@ class _File:
             self.fault, self.cut = "cut short", True
         except _StopError as error:
             self.fault = str(error)
+            return False
         except OSError as error:
             self.fault = f"unreadable: {error.strerror}"
+            return False
         except Exception:  # the library may raise anything on damaged bytes
             self.cut = self._stream.tell() >= self.size
             self.fault = "cut short" if self.cut else "damaged"
+        return True
 
-    def _records(self) -> Iterator[mcap.McapRecord]:
+    def _read_records(self) -> None:
         reader = StreamReader(
             self._stream, emit_chunks=True, validate_crcs=True, record_size_limit=self.size
         )
         for record in reader.records:
+            end = self._stream.tell()
             if isinstance(record, mcap.Chunk):
-                yield from self._unpack(record)
+                self._store_chunk(record, Part(self.position, end - self.position, ""))
             elif not self.data_ended:  # records after the data repeat the definitions
-                yield record
+                self._store(record)
             if isinstance(record, mcap.Statistics):
-                self.total = max(self.total, record.message_count)
+                self.statistics = record
             self.data_ended |= isinstance(record, mcap.DataEnd)
-            self.position = self._stream.tell()
+            self.position = end
         self.position = self._stream.tell()
         self.ended = self.data_ended = True
         if self.position < self.size:
             self.fault = "something follows its end"
 
+    def _read_parts(self, index: _Index) -> None:
+        """Read the parts that the index names, and leave out those that are damaged."""
+        self.channels |= index.channels
+        self._schemas |= index.schemas
+        self.statistics = index.statistics
+        for part in index.parts:
+            if part.start < self.position:
+                continue  # a wrong index names a part twice
+            self._stream.seek(part.start)
+            data = self._stream.read(part.size)
+            try:
+                record = _parse(data)
+            except Exception:  # the library may raise anything on damaged bytes
+                self.gaps.append(part)
+            else:
+                if isinstance(record, mcap.Chunk):
+                    self._store_chunk(record, part)
+                else:
+                    self._store(record)
+            self.position = part.start + part.size
+        self.position = self.size
+        self.ended = self.data_ended = True
+        if not self.gaps:
+            self.fault = "damaged outside of its messages"
+
+    def _store_chunk(self, chunk: mcap.Chunk, part: Part) -> None:
+        """Store the records of a chunk; leave out a damaged chunk."""
+        try:
+            for record in self._unpack(chunk):
+                self._store(record)
+        except _StopError:
+            raise
+        except Exception:  # the libraries may raise anything on damaged bytes
+            self.gaps.append(part)
+
     def _store(self, record: mcap.McapRecord) -> None:
-        """Store a record; raise a KeyError for a message whose channel is not defined."""
+        """Store a record."""
         recording = self.recording
         if isinstance(record, mcap.Message):
             self._take_room(MESSAGE_COST)
-            self.total += 1
-            topic = self.channels[record.channel_id].topic
+            self.read[record.channel_id] += 1
             if record.channel_id not in self.ours:
-                self.ours[record.channel_id] = self._is_ours(self.channels[record.channel_id])
-            if self.ours[record.channel_id] and topic in VIEWS:
+                self.ours[record.channel_id] = self._is_ours(self.channels.get(record.channel_id))
+            if not self.ours[record.channel_id]:
+                return
+            topic = self.channels[record.channel_id].topic
+            if topic in VIEWS:
                 recording.views.append((topic, record.log_time, record.data))
-            elif self.ours[record.channel_id]:
+            else:
                 recording.messages.append((topic, record.log_time, record.data))
                 self._sequences.append(record.sequence)
         elif isinstance(record, mcap.Schema):
@@ -166,8 +293,10 @@ class _File:
         elif isinstance(record, mcap.Attachment):
             recording.attachments[record.name] = record.data
 
-    def _is_ours(self, channel: mcap.Channel) -> bool:
+    def _is_ours(self, channel: mcap.Channel | None) -> bool:
         """Check whether a channel's topic and layout are those that cloudrc records."""
+        if channel is None:  # its definition is lost
+            return False
         topic, schema = TOPICS.get(channel.topic), self._schemas.get(channel.schema_id)
         ros_type = topic.ros_type if topic else VIEWS.get(channel.topic)
         if schema is None or ros_type is None or schema.name != ros_type:
@@ -184,13 +313,24 @@ class _File:
 
     @property
     def unread(self) -> int:
-        """Size of the unread part of the file [bytes]; 0 if only the file's index is damaged."""
+        """Size of the file's unread end [bytes]; 0 if only the file's index is damaged."""
         return 0 if self.data_ended and not self.ended else self.size - self.position
 
     @property
-    def lost(self) -> int:
-        """Number of messages in the file that are not in `recording`."""
-        return self.total - len(self.recording.messages) - len(self.recording.views)
+    def left_out(self) -> int:
+        """Size of the damaged parts that were left out [bytes]."""
+        return sum(part.size for part in self.gaps)
+
+    @property
+    def stated(self) -> Counter[str]:
+        """Number of messages in the file by topic, as far as they were read or the index knows."""
+        counts = self.statistics.channel_message_counts if self.statistics else {}
+        found = Counter[str]()
+        for number in self.read.keys() | counts.keys():
+            channel = self.channels.get(number)
+            topic = to_one_line(channel.topic) if channel else UNKNOWN
+            found[topic] += max(self.read[number], counts.get(number, 0))
+        return found | _stored_counts(self.recording)  # of both, the larger number
 
     def _take_room(self, size: int) -> None:
         self._room -= size
@@ -201,10 +341,11 @@ class _File:
         size = chunk.uncompressed_size
         self._take_room(size)
         if chunk.compression not in _UNPACK:
-            raise _StopError(
+            self._compression = (
                 f"its chunks are compressed by {to_one_line(chunk.compression)!r}; cloudrc reads"
                 " zstd and lz4: convert it with: mcap compress"
             )
+            raise ValueError(self._compression)
         data = _UNPACK[chunk.compression](chunk.data, size + 1)
         if len(data) != size:
             raise ValueError("the chunk is not as long as it states")
@@ -220,106 +361,102 @@ class _File:
             raise ValueError("a record is not as long as it states") from error
 
 
+def _parse(data: bytes) -> mcap.McapRecord:
+    """Parse one record of the data section; raise any error if the bytes are damaged."""
+    stream = StreamReader(
+        BytesIO(data), skip_magic=True, emit_chunks=True, record_size_limit=len(data)
+    )
+    record = next(stream.records)
+    if isinstance(record, mcap.Attachment):
+        checksum = int.from_bytes(data[-4:], "little")
+        if checksum not in (0, zlib.crc32(data[RECORD_HEAD_SIZE:-4])):
+            raise CRCValidationError(checksum, 0, record)
+    return record
+
+
 def read(path: Path) -> Recording:
-    """Read an MCAP file up to its end or to its first damaged part, for `Recording.read`."""
-    return _File(path).recording
+    """Read an MCAP file without its damaged parts, for `Recording.read`."""
+    return File(path).recording
 
 
-def _note(file: _File) -> None:
+def _note(file: File) -> None:
     """Describe in words what a file lacks; store the texts in the file's `recording`."""
-    recording, fault, metadata = file.recording, file.fault, file.recording.metadata
-    changed = list[str]()
+    recording, fault = file.recording, file.fault
+    metadata = recording.metadata
     if file.data_ended and file.cut:
         recording.remarks += ("had a torn index: all its messages were read",)
         fault = ""
     elif fault and not file.data_ended:
         count, until = len(recording.messages), recording.messages[-1][1] * 1e-9
         fault += f": {count} messages were read, the last at {until:.2f} s"
-    channels = Counter((file.channels[number].topic, known) for number, known in file.ours.items())
-    others = {name for name, known in channels if not known}
-    if foreign := sorted(others - TOPICS.keys()):
-        told = f"has topics that cloudrc does not record: {_list(foreign)}"
-        recording.remarks += (to_one_line(told),)
-    if other := sorted(others & TOPICS.keys()):
-        changed.append(f"topics of another layout were left out: {', '.join(other)}")
-    twice = [name for (name, known), n in channels.items() if known and n > 1 and name in TOPICS]
-    if double := [name for name in twice if TOPICS[name].end != "either"]:
-        changed.append(f"two robots or two recordings are in one file: {', '.join(double)}")
-    if not metadata.get(CLOCK):
-        changed.append("the metadata of cloudrc, which names the clock, is not there")
-    if file.data_ended:
-        changed += _changed(recording)
+    damage = [_describe(file.gaps)] if file.gaps else []
+    if nameless := file.stated[UNKNOWN]:
+        damage.append(f"damaged: the topic of {nameless} messages is not known")
+    if fault and not file.cut:
+        damage.append(fault)
+    changed = list(_changes(file))
     if before := to_one_line(metadata.get(CHANGED, "")):  # known when the file was written
         changed.append(before)
     if changed:
         metadata[CHANGED] = "; ".join(changed)
-    recording.torn, damage = (fault, "") if file.cut else ("", fault)
-    recording.lacking = "; ".join(filter(None, [damage, *changed]))
+    recording.torn = fault if file.cut else ""
+    recording.lacking = "; ".join([*damage, *changed])
     recording.told = to_one_line(metadata.get(MISSING, ""))
+
+
+def _describe(gaps: list[Part]) -> str:
+    """Describe the damaged parts of a file in words."""
+    shown = [
+        f"byte {gap.start}" + f" ({gap.content})" * bool(gap.content) for gap in gaps[:LISTED_MAX]
+    ]
+    if more := len(gaps) - len(shown):
+        shown.append(f"{more} more places")
+    size = sum(gap.size for gap in gaps)
+    return f"damaged at {', '.join(shown)}: {size} bytes were left out"
+
+
+def _changes(file: File) -> Iterator[str]:
+    """Describe what another program has removed from a file or added to it."""
+    recording = file.recording
+    channels = Counter(
+        (file.channels[n].topic, ours) for n, ours in file.ours.items() if n in file.channels
+    )
+    others = {name for name, known in channels if not known}
+    if foreign := sorted(others - TOPICS.keys()):
+        told = f"has topics that cloudrc does not record: {list_some(foreign)}"
+        recording.remarks += (to_one_line(told),)
+    if other := sorted(others & TOPICS.keys()):
+        yield f"topics of another layout were left out: {', '.join(other)}"
+    twice = [name for (name, known), n in channels.items() if known and n > 1 and name in TOPICS]
+    if double := [name for name in twice if TOPICS[name].end != "either"]:
+        yield f"two robots or two recordings are in one file: {', '.join(double)}"
+    if not recording.metadata.get(CLOCK):
+        yield "the metadata of cloudrc, which names the clock, is not there"
+    if file.data_ended and not file.gaps:
+        yield from _changed(recording)
+
+
+def _stored_counts(recording: Recording) -> Counter[str]:
+    """Return the number of messages by topic that the writer has noted; empty if it has not."""
+    with suppress(ValueError, RecursionError):
+        stored = json.loads(recording.metadata.get(COUNTS) or "{}")
+        if isinstance(stored, dict):
+            return Counter({t: n for t in TOPICS if isinstance(n := stored.get(t), int)})
+    return Counter()
 
 
 def _changed(recording: Recording) -> Iterator[str]:
     """Describe how the messages of a complete file differ from the counts stored by its writer."""
     metadata, read = recording.metadata, Counter(message[0] for message in recording.messages)
-    counts: dict[str, int] = {}
-    with suppress(ValueError, RecursionError):
-        if isinstance(stored := json.loads(metadata.get(COUNTS) or "{}"), dict):
-            counts = stored
-    pairs = [(topic, read[topic], counts.get(topic, 0)) for topic in TOPICS if counts]
+    counts = _stored_counts(recording)
+    pairs = [(topic, read[topic], counts[topic]) for topic in TOPICS if counts]
     if wrong := [f"{found} of {n} on {topic}" for topic, found, n in pairs if found != n]:
-        yield f"messages were removed or added: it holds {_list(wrong)}"
+        yield f"messages were removed or added: it holds {list_some(wrong)}"
     if metadata.get(COUNTS) == "" and MISSING not in metadata:
         yield "it was torn, and another program added an end"
 
 
-def _list(topics: list[str]) -> str:
+def list_some(topics: list[str]) -> str:
+    """List the first topics in words, and count the others."""
     more = len(topics) - LISTED_MAX
     return ", ".join(topics[:LISTED_MAX]) + f" and {more} more topics" * (more > 0)
-
-
-@dataclass(slots=True)
-class Recovery:
-    """What `recover` has saved of a damaged recording, and what is lost."""
-
-    complete: bool  # whether nothing is missing or doubtful
-    share: float  # share of the messages that were kept, in [0, 1]; if unknown, of the bytes
-    size: int  # size of the damaged file [bytes]
-    kept: dict[str, int]  # number of objects in the new file, by kind
-    dropped: dict[str, int]  # {"messages": number of lost messages}; {} if none or unknown
-    bytes_lost: int  # number of bytes after the last intact record
-    notes: list[str]  # what is missing or doubtful, in words
-    index_is_new: bool  # whether the old file had no readable index
-
-
-def recover(source: Path, target: Path) -> Recovery:
-    """Write a complete copy of a recording that may be torn or damaged.
-
-    The copy contains the topics that cloudrc records, the attachments, the metadata, and a note
-    about what is missing. It ends before the first damaged part. Raise a BadInputError if the file
-    has no readable message, or an OSError if the new file cannot be written.
-    """
-    file = _File(source)
-    recording, lost = file.recording, file.lost
-    if not recording.messages:
-        reason = recording.note or "none is in it"
-        raise BadInputError(f"{source}: holds no readable message: {reason}; nothing is written")
-    missed = list[str]()
-    if file.unread:
-        missed.append(f"{file.unread} bytes after the last intact part were not read")
-    if lost:
-        missed.append(f"{lost} messages are lost, or of topics that cloudrc does not record")
-    notes = [*filter(None, [recording.note]), *missed]
-    recording.told = "; ".join(filter(None, [recording.told, *missed]))
-    recording.write(target)
-    count, topics = len(recording.messages), {topic for topic, _, _ in recording.messages}
-    share = count / (count + lost) if lost else 1.0 - file.unread / file.size
-    return Recovery(
-        complete=not notes,
-        share=min(share, LOSSY_SHARE_MAX) if notes else 1.0,
-        size=file.size,
-        kept={"messages": count, "attachments": len(recording.attachments), "topics": len(topics)},
-        dropped={"messages": lost} if lost else {},
-        bytes_lost=file.unread,
-        notes=notes,
-        index_is_new=not file.ended,
-    )

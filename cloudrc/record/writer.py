@@ -220,15 +220,18 @@ class McapWriter:
 
 
 def write(recording: Recording, target: Path, attachments: Mapping[str, bytes]) -> None:
-    """Write the messages of a recording and further `attachments` to a file, atomically."""
+    """Write the messages of a recording and further `attachments` to a file, atomically.
+
+    The attachments come first: a copy that was cut short still contains the experiment.
+    """
     metadata, messages = recording.metadata, recording.messages
     clock, machine = metadata.get(CLOCK, ""), metadata.get("clock_id", "")
     with atomic_file(target) as file, McapWriter(file, clock=clock, clock_id=machine) as writer:
         writer.note({**metadata, **({MISSING: recording.note} if recording.note else {})})
         if messages and (began := wall_time(metadata, messages[0][1])):
             writer.note({STARTED: began.isoformat(timespec="milliseconds")})
+        for name, data in {**recording.attachments, **attachments}.items():
+            writer.attach(name, data)
         for message in messages:
             writer.write_message(*message)
         writer.write_views(recording.views)
-        for name, data in {**recording.attachments, **attachments}.items():
-            writer.attach(name, data)

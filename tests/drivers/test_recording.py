@@ -17,7 +17,7 @@ from cloudrc.drivers.recording import AFTERWARDS_NS, TROUBLE, FlightsOnly, Recor
 from cloudrc.errors import BadInputError
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
-from cloudrc.record.reader import recover
+from cloudrc.record.recovery import recover
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import Counted, GuardChange, Lateness
 from tests.record.conftest import Shelf, assert_equal, counted, open_mcap, world_records

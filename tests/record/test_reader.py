@@ -5,6 +5,7 @@ import itertools
 import json
 import re
 import tracemalloc
+from collections import Counter
 from contextlib import suppress
 from random import Random
 
@@ -17,7 +18,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from cloudrc.errors import BadInputError
 from cloudrc.record.columns import Recording
-from cloudrc.record.reader import recover
+from cloudrc.record.recovery import recover
 from cloudrc.record.ros import definition
 from cloudrc.record.writer import McapWriter
 from tests.record.conftest import assert_equal, rewrite, world_records, write
@@ -264,25 +265,99 @@ def test_every_cut_and_every_flipped_byte_is_noticed(tmp_path, places):
         examine(tmp_path, WHOLE[:at])
 
 
-def test_a_recovery_says_what_is_kept_and_lost(path):
+def test_a_recovery_of_a_torn_file_says_what_is_kept_and_lost(path):
     new, middle = path.with_name("new.mcap"), sum(CHUNKS[1]) // 2
-    for data, said in (
-        (WHOLE[:middle], "cut short"),
-        (flipped(middle), "damaged: a checksum is wrong"),
-    ):
-        path.write_bytes(data)
-        assert Recording.read(path).note.startswith(f"{said}: {SIZES[0]} messages were read")
-        recovery = recover(path, new)
-        assert recovery.kept["messages"] == SIZES[0]
-        assert recovery.share == 1 - recovery.bytes_lost / len(data)
-        assert recovery.notes[0].startswith(f"{said}: ")
-        kept = Recording.read(new)
-        assert kept.note == "; ".join(recovery.notes)
-        assert 40 < len(kept["/odometry"]) < 80
+    path.write_bytes(WHOLE[:middle])
+    assert Recording.read(path).note.startswith(f"cut short: {SIZES[0]} messages were read")
+    recovery = recover(path, new)
+    assert recovery.kept["messages"] == SIZES[0]
+    assert recovery.share == 1 - recovery.bytes_lost / middle
+    assert recovery.notes[0].startswith("cut short: ")
+    kept = Recording.read(new)
+    assert kept.note == "; ".join(recovery.notes)
+    assert 40 < len(kept["/odometry"]) < 80
     path.write_bytes(WHOLE * 2)
     assert Recording.read(path).lacking == "something follows its end"
     recovery = recover(path, new)
     assert (recovery.bytes_lost, recovery.share) == (len(WHOLE), pytest.approx(0.5))
+
+
+def middle_of(number):
+    return sum(CHUNKS[number]) // 2
+
+
+FIRST, SECOND, THIRD = map(middle_of, range(3))
+END = len(WHOLE) - 1
+OPCODE, LENGTH, HUGE = (CHUNKS[1][0] + n for n in (0, 2, 7))
+
+
+@pytest.mark.parametrize(
+    ("places", "left_out"),
+    [
+        ([SECOND], [1]),
+        ([FIRST], [0]),
+        ([FIRST, THIRD], [0, 2]),
+        ([OPCODE], [1]),
+        ([LENGTH], [1]),
+        ([HUGE], [1]),
+        ([LENGTH, THIRD], [1, 2]),
+        ([WHOLE.index(b"zstd", SECOND - 9000)], [1]),
+        ([0], []),
+        ([12], []),
+        ([END - 100, SECOND], [1]),
+        ([END, SECOND], [1]),
+    ],
+    ids=str,
+)
+def test_intact_parts_behind_damage_are_recovered(path, places, left_out):
+    """A part is left out as a whole, and its messages are counted by topic."""
+    data, new = bytearray(WHOLE), path.with_name("new.mcap")
+    for at in places:
+        data[at] ^= 255
+    path.write_bytes(data)
+    bounds = list(itertools.accumulate(SIZES, initial=0))
+    lost = [message for n in left_out for message in MESSAGES[bounds[n] : bounds[n + 1]]]
+    recovery = recover(path, new)
+    kept = Recording.read(new)
+    assert kept.messages == [message for message in MESSAGES if message not in lost]
+    assert recovery.topics == Counter(topic for topic, _, _ in kept.messages)
+    assert recovery.kept["messages"] == len(kept.messages)
+    assert recovery.kept["topics"] == len(recovery.topics)
+    dropped = {topic: number for topic, number in recovery.dropped.items() if number is not None}
+    assert dropped == Counter(topic for topic, _, _ in lost)
+    assert not recovery.complete
+    assert kept.note == "; ".join(recovery.notes)
+    if left_out:
+        assert recovery.share == len(kept.messages) / len(MESSAGES)
+        assert recovery.bytes_lost == sum(CHUNKS[n][1] - CHUNKS[n][0] for n in left_out)
+        assert recovery.notes[0].startswith(f"damaged at byte {CHUNKS[left_out[0]][0]}")
+
+
+def test_without_an_index_damaged_chunks_of_a_torn_file_are_left_out(path):
+    """Messages whose topic was named in a damaged chunk are counted, too."""
+    path.write_bytes(flipped(SECOND)[: CHUNKS[3][0] + 50])
+    recovery = recover(path, path.with_name("new.mcap"))
+    assert recovery.kept["messages"] == SIZES[0] + SIZES[2]
+    path.write_bytes(flipped(FIRST)[: CHUNKS[3][0] + 50])
+    with pytest.raises(
+        BadInputError, match=r"no readable message: damaged at byte [^\n]*cut short"
+    ):
+        recover(path, path.with_name("none.mcap"))
+
+
+def test_messages_of_another_program_are_named_as_dropped(whole, path):
+    rewrite(whole, path, rename=lambda topic: topic.replace("/guard", "/camera"))
+    assert recover(path, path.with_name("new.mcap")).dropped == {"/camera": 1, "/guard": 1}
+    rewrite(whole, path, rename=lambda topic: f"/r2{topic}")
+    with pytest.raises(BadInputError, match="has topics that cloudrc does not record: /r2/"):
+        recover(path, path.with_name("none.mcap"))
+
+
+def test_an_attachment_that_was_changed_is_left_out(path):
+    path.write_bytes(flipped(WHOLE.index(b"seed: 1")))
+    recovery = recover(path, path.with_name("new.mcap"))
+    assert (recovery.dropped, recovery.kept["attachments"]) == ({}, 0)
+    assert "config.yaml" in recovery.notes[0]
 
 
 def test_a_channel_without_a_definition_is_damaged(path, tmp_path):

@@ -18,7 +18,7 @@ from cloudrc.files import atomic_file, write_atomically
 from cloudrc.link.traces import read_trace
 from cloudrc.record.columns import Recording
 from cloudrc.record.merge import merge
-from cloudrc.record.reader import recover
+from cloudrc.record.recovery import recover
 from cloudrc.record.writer import COUNTS
 from cloudrc.report.document import clock_offset_document, write_json
 from cloudrc.report.figures import FIGURES

@@ -1,0 +1,115 @@
+"""Copy what is readable of a damaged recording into a valid file, and say what is lost."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from cloudrc.errors import BadInputError
+from cloudrc.record.columns import Message, Recording
+from cloudrc.record.reader import File, list_some
+from cloudrc.record.topics import VIEWS
+
+LOSSY_SHARE_MAX = 0.999
+"""Largest value of `Recovery.share` if something is missing [1]."""
+
+
+@dataclass(slots=True)
+class Recovery:
+    """What `recover` has saved of a damaged recording, and what is lost."""
+
+    complete: bool  # whether nothing is missing or doubtful
+    share: float  # share of the messages that were kept, in [0, 1]; if unknown, of the bytes
+    size: int  # size of the damaged file [bytes]
+    kept: dict[str, int]  # number of objects in the new file, by kind
+    topics: dict[str, int]  # number of messages in the new file, by topic
+    derived: list[str]  # topics for viewers that were made again from the other topics
+    dropped: dict[str, int | None]  # number of messages that are not in the new file, by topic
+    bytes_lost: int  # number of bytes that were not read
+    notes: list[str]  # what is missing or doubtful, in words
+    index_is_new: bool  # whether the old file had no readable index
+
+
+def recover(
+    source: Path, target: Path, views: Callable[[Recording], list[Message]] | None = None
+) -> Recovery:
+    """Write a complete copy of a recording that may be torn or damaged.
+
+    The copy contains the topics that cloudrc records, the attachments, the metadata, and a note
+    about what is missing. From a damaged recording, `views` makes the topics for viewers again; it
+    raises a BadInputError if this is impossible. Raise a BadInputError if the file has no readable
+    message, or an OSError if the new file cannot be written.
+    """
+    file = File(source)
+    recording = file.recording
+    if not recording.messages:
+        reason = "; ".join([*recording.remarks, recording.note]).strip("; ") or "none is in it"
+        raise BadInputError(f"{source}: holds no readable message: {reason}; nothing is written")
+    notes = [recording.note] if recording.note else []
+    derived, missed = _make_views_again(file, views) if views else ([], [])
+    if file.unread:
+        missed.insert(0, f"{file.unread} bytes after the last intact part were not read")
+    if dropped := _dropped(file):
+        counts = [topic if n is None else f"{n} on {topic}" for topic, n in dropped.items()]
+        missed.append(f"messages that are not in the copy: {list_some(counts)}")
+    recording.told = "; ".join(filter(None, [recording.told, *missed]))
+    recording.write(target)
+    notes += missed
+    written = _written(recording)
+    share = _share(file, written.total(), sum(filter(None, dropped.values())))
+    kept = {"messages": written.total(), "attachments": len(recording.attachments)}
+    return Recovery(
+        complete=not notes,
+        share=min(share, LOSSY_SHARE_MAX) if notes else 1.0,
+        size=file.size,
+        kept={**kept, "topics": len(written)},
+        topics=dict(sorted(written.items())),
+        derived=derived,
+        dropped=dropped,
+        bytes_lost=file.unread + file.left_out,
+        notes=notes,
+        index_is_new=not file.ended,
+    )
+
+
+def _make_views_again(
+    file: File, views: Callable[[Recording], list[Message]]
+) -> tuple[list[str], list[str]]:
+    """Make the topics for viewers again if messages are lost; return their names, and notes."""
+    if not _has_views(file) or not (file.unread or _dropped(file)):
+        return [], []
+    try:
+        file.recording.views = views(file.recording)
+    except BadInputError as error:
+        return [], [f"the topics for viewers could not be made again: {error}"]
+    return sorted({topic for topic, _, _ in file.recording.views}), []
+
+
+def _share(file: File, written: int, lost: int) -> float:
+    """Return the share of the messages that were kept, in [0, 1]; if unknown, of the bytes."""
+    if lost:
+        return written / (written + lost)
+    unread = file.unread if file.data_ended else file.unread + file.left_out
+    return 1.0 - unread / file.size
+
+
+def _has_views(file: File) -> bool:
+    """Return whether a file is the recording of a mission, which has topics for viewers."""
+    known = {channel.topic for channel in file.channels.values()}
+    return bool(known & VIEWS.keys()) or "config.yaml" in file.recording.attachments
+
+
+def _written(recording: Recording) -> Counter[str]:
+    return Counter(topic for topic, _, _ in [*recording.messages, *recording.views])
+
+
+def _dropped(file: File) -> dict[str, int | None]:
+    """Count the messages that `file` has lost, by topic; None: some, but nobody knows how many."""
+    written = _written(file.recording)
+    dropped: dict[str, int | None] = dict(sorted((file.stated - written).items()))
+    is_uncounted = file.statistics is None and (file.recording.torn or file.gaps)
+    if is_uncounted and _has_views(file):
+        dropped |= {topic: None for topic in VIEWS.keys() - written.keys() - dropped.keys()}
+    return dropped
