@@ -1,8 +1,8 @@
 """Run Kubernetes Jobs: create, follow and delete them; fly a mission as a Job.
 
-A Job has the form of an example of the chart, such as `examples/mission-job.yaml`. The container of
-a mission's Job posts the mission to the release's API, follows the mission, and ends with the exit
-code of the mission's verdict.
+The chart makes the Job of a mission from the release's values, and keeps it in a ConfigMap; the Job
+of a sweep has the form of the chart's `examples/sweep-job.yaml`. The container of a mission's Job
+posts the mission to the release's API, follows it, and ends with the exit code of its verdict.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from cloudrc.cluster.pods import (
     find_deployment,
     pod_failure,
     pod_log,
-    tokens_secret,
 )
 from cloudrc.errors import CloudrcError, TimedOutError, to_one_line
 
@@ -34,9 +33,8 @@ FILE = "mission.yaml"
 """Key in the ConfigMap under which the mission is stored."""
 UID_LABEL = "batch.kubernetes.io/controller-uid"
 """Label with the Job's UID, which Kubernetes sets on the Job's pods."""
-FROM_POD = ("nodeSelector", "tolerations", "affinity", "imagePullSecrets", "securityContext")
-FROM_CONTAINER = ("image", "imagePullPolicy", "securityContext")
-"""Keys that the pod and the container of a mission take from teleop's pod and container."""
+TEMPLATE, TEMPLATE_FILE = "mission-job", "job.yaml"
+"""Label `component` of the ConfigMap with the Job of a mission, and key of the Job in it."""
 START_ALLOWANCE = 120
 """Time to start the pod and to get the robot's state, added to the mission's time limit [s]."""
 QUEUE_ALLOWANCE = 3600
@@ -80,22 +78,39 @@ def run_job(
     """
     # A Job's pod has a longer name than the Job; the limit is 63 characters.
     name = name or f"{release.name[:40].rstrip('-.')}-mission-{secrets.token_hex(3)}"
-    plan, job = read_example(release, COMPONENT, name)
     deployment = find_deployment(release, "cloud")
-    job["metadata"]["ownerReferences"] = [owner_of("apps/v1", "Deployment", deployment)]
+    job = _read_template(release)
+    labels = {**release.labels(COMPONENT), "app.kubernetes.io/managed-by": "cloudrc"}
+    owner = owner_of("apps/v1", "Deployment", deployment)
+    job["metadata"] = {"name": name, "labels": labels, "ownerReferences": [owner]}
     given = mission.get("time_limit_s")
     # The API refuses a mission with any other limit.
     limit = ceil(given) if isinstance(given, int | float) and 0 < given <= 1e6 else LIMIT_MAX
     deadline = limit + START_ALLOWANCE + queue * QUEUE_ALLOWANCE
     job["spec"] |= {"activeDeadlineSeconds": deadline, "ttlSecondsAfterFinished": KEEP_FINISHED}
-    _fill_pod(job["spec"]["template"]["spec"], release, deployment, queue)
-    plan["data"] = {FILE: json.dumps(mission, indent=2) + "\n"}
-    create_job(release, job, plan)
+    pod = job["spec"]["template"]["spec"]
+    for volume in pod["volumes"]:
+        if "configMap" in volume:
+            volume["configMap"]["name"] = name
+    if queue:
+        pod["containers"][0]["args"].append("--queue")
+    data = {FILE: json.dumps(mission, indent=2) + "\n"}
+    create_job(release, job, {"apiVersion": "v1", "kind": "ConfigMap", "data": data})
     return name
 
 
+def _read_template(release: Release) -> Any:
+    """Read the Job of a mission that the chart has made from the release's values."""
+    for found in release.find("configmaps", TEMPLATE):
+        return yaml.safe_load(found.data[TEMPLATE_FILE])
+    raise ClusterError(
+        f"release '{release.name}' {release.where} has no Job for missions: it has another version "
+        "of the chart; upgrade it: helm upgrade"
+    )
+
+
 def read_example(release: Release, component: str, name: str) -> tuple[Any, Any]:
-    """Read ConfigMap and Job from the chart's example for a component, "mission" or "sweep".
+    """Read ConfigMap and Job from the chart's example for a component, such as "sweep".
 
     Both get the name `name`, and the Job gets the labels of the release.
     """
@@ -133,33 +148,6 @@ def owner_of(version: str, kind: str, owner: Any) -> dict[str, Any]:
     """Make an owner reference: deleting `owner` also deletes the objects with this reference."""
     metadata = owner.metadata
     return {"apiVersion": version, "kind": kind, "name": metadata.name, "uid": metadata.uid}
-
-
-def _fill_pod(pod: dict[str, Any], release: Release, deployment: Any, queue: bool) -> None:
-    (tokens,) = (volume for volume in pod["volumes"] if volume["name"] == "tokens")
-    tokens["secret"]["secretName"] = tokens_secret(release)
-    cloud = release.client.sanitize_for_serialization(deployment.spec.template.spec)
-    (teleop,) = (each for each in cloud["containers"] if each["name"] == "teleop")
-    (container,) = pod["containers"]
-    for target, source, keys in ((pod, cloud, FROM_POD), (container, teleop, FROM_CONTAINER)):
-        for key in keys:
-            target.pop(key, None)
-            if key in source:
-                target[key] = source[key]
-    arguments = [word for word in container["args"] if not word.startswith("--api=")]
-    api = f"--api={_api_address(release)}"
-    container["args"] = [*arguments, api, *(["--queue"] if queue else [])]
-
-
-def _api_address(release: Release) -> str:
-    for service in release.find("services", "cloud"):
-        for port in service.spec.ports or []:
-            if port.name == "api":
-                return f"http://{service.metadata.name}:{port.port}"
-    raise ClusterError(
-        f"release '{release.name}' {release.where} has no Service with a port 'api'; "
-        "install it again: helm upgrade --install"
-    )
 
 
 def find_job(release: Release, name: str) -> Any:

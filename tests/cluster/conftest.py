@@ -15,6 +15,7 @@ import pytest
 from cloudrc.cluster import client, flight, jobs
 from cloudrc.cluster.client import connect
 from cloudrc.cluster.jobs import UID_LABEL
+from tests.chart.conftest import render
 
 
 def _terms(selector):
@@ -264,6 +265,13 @@ def release(api):
     return connect()
 
 
+def job_template(values=None):
+    """Make the ConfigMap with the Job of a mission, as the chart makes it from values."""
+    objects = render(values, release="cloudrc")
+    (found,) = (each for each in objects if each["metadata"]["name"] == "cloudrc-mission-job")
+    return found
+
+
 @pytest.fixture
 def running(api, release):
     """The fake API server with a release that is ready to fly."""
@@ -273,6 +281,7 @@ def running(api, release):
     ports = [{"name": "api", "port": 8080, "targetPort": "api"}]
     metadata = {"name": "cloudrc-api", "labels": labels("cloud")}
     api.put("services", {"metadata": metadata, "spec": {"ports": ports}})
+    api.put("configmaps", job_template())
     token = base64.b64encode(TOKEN.encode()).decode()
     api.put("secrets", {"metadata": {"name": "cloudrc-tokens"}, "data": {"operator": token}})
     return api

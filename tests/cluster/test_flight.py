@@ -110,8 +110,8 @@ def test_a_job_flies_a_carrot_mission_over_the_users_profile(ready, tmp_path, ca
     ends(ready)
     own = "--set mission.carrot.speed_mps=1.5 --set link.profile=./own.yaml"
     call(f"{LINE} --out out {own}", code=6)
-    (plan,) = [body for key, body in ready.objects.items() if key[0] == "configmaps"]
-    (text,) = plan["data"].values()
+    maps = [body["data"] for key, body in ready.objects.items() if key[0] == "configmaps"]
+    (text,) = (data["mission.yaml"] for data in maps if "mission.yaml" in data)
     assert json.loads(text)["carrot"] == {"speed_mps": 1.5, "acceleration_mps2": 2.0}
 
 

@@ -9,7 +9,7 @@ from cloudrc.cluster import jobs
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import delete_job, follow, run_job
 from cloudrc.errors import TimedOutError
-from tests.cluster.conftest import MISSION, SECURE, TELEOP, TOKEN, terminated
+from tests.cluster.conftest import MISSION, TOKEN, job_template, terminated
 
 
 def pod_of(api, name):
@@ -35,23 +35,34 @@ def test_a_job_posts_the_mission_to_its_release(running, release):
     assert "--queue" in pod_of(running, "patient")["containers"][0]["args"]
 
 
-def test_a_job_has_owner_nodes_and_rights_of_its_release(running, release):
-    cloud = running.get("deployments", "cloudrc-cloud")
+def test_a_job_follows_the_values_of_its_release(running, release):
+    inject = {"sidecar.istio.io/inject": "false"}
+    large = {"requests": {"cpu": "1", "memory": "1Gi"}, "limits": {"cpu": "2", "memory": "2Gi"}}
+    mission = {"podAnnotations": inject, "resources": large, "leaseSeconds": 30, "queue": True}
     where = {"nodeSelector": {"disk": "fast"}, "tolerations": [{"key": "lab"}]}
+    values = {"mission": mission, "cloud": where, "podSecurityContext": None}
+    running.put("configmaps", job_template(values))
     run_job(release, MISSION, name="first")
-    pod = pod_of(running, "first")
-    assert pod["securityContext"] == SECURE
-    assert pod["containers"][0]["securityContext"] == TELEOP["securityContext"]
-    assert not pod.keys() & where.keys()
+    template = running.get("jobs", "first")["spec"]["template"]
+    assert template["metadata"]["annotations"] == inject
+    pod = template["spec"]
+    assert where.items() <= pod.items()
+    assert pod["serviceAccountName"] == "cloudrc-cloud"
     assert pod["automountServiceAccountToken"] is False
-    bare = {key: value for key, value in TELEOP.items() if key != "securityContext"}
-    spec = cloud["spec"]["template"]["spec"]
-    spec |= {**where, "securityContext": None, "containers": [bare]}  # as a chart for OpenShift
-    run_job(release, MISSION, name="second")
-    (owner,) = running.get("jobs", "second")["metadata"]["ownerReferences"]
+    assert "securityContext" not in pod, "as a chart for OpenShift"
+    (container,) = pod["containers"]
+    assert container["resources"] == large
+    assert "--lease=30" in container["args"]
+    assert "--queue" not in container["args"], "the value is for the chart's own mission"
+    cloud = running.get("deployments", "cloudrc-cloud")
+    (owner,) = running.get("jobs", "first")["metadata"]["ownerReferences"]
     assert (owner["kind"], owner["uid"]) == ("Deployment", cloud["metadata"]["uid"])
-    assert where.items() <= pod_of(running, "second").items()
-    assert "securityContext" not in str(pod_of(running, "second"))
+
+
+def test_a_release_of_another_version_of_the_chart_is_named(running, release):
+    running.objects.pop(("configmaps", "cloudrc-mission-job"))
+    with pytest.raises(ClusterError, match="another version of the chart; upgrade it"):
+        run_job(release, MISSION)
 
 
 def test_a_job_has_an_unused_and_short_name(running, release):

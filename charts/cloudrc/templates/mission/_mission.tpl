@@ -60,20 +60,35 @@
       - {key: operator, path: operator}
 {{- end }}
 
-{{- define "cloudrc.missionPodTemplate" -}}
-metadata:
-  labels:
-    {{- include "cloudrc.podLabels" (dict "root" . "component" "mission") | nindent 4 }}
-  {{- with .Values.mission.podAnnotations }}
-  annotations:
-    {{- toYaml . | nindent 4 }}
-  {{- end }}
-spec:
-  restartPolicy: Never
-  {{- include "cloudrc.pod" (dict "root" . "component" "cloud") | nindent 2 }}
-  {{- with include "cloudrc.placement" .Values.cloud }}
-  {{- . | nindent 2 }}
-  {{- end }}
-  containers:
-    {{- include "cloudrc.missionContainer" (dict "root" . "name" "mission" "uid" "metadata.labels['batch.kubernetes.io/controller-uid']" "queue" .Values.mission.queue) | nindent 4 }}
+{{/* Spec of a Job that flies a mission. Argument: (dict "root" $ "name" CONFIGMAP "queue" BOOL). */}}
+{{- define "cloudrc.missionJobSpec" -}}
+# A failed mission is not flown again automatically.
+backoffLimit: 0
+# A stopped watcher ends nothing: a new pod follows the mission.
+podFailurePolicy:
+  rules:
+    - action: Ignore
+      onPodConditions: [{type: DisruptionTarget, status: "True"}]
+    - action: Ignore
+      onExitCodes: {containerName: mission, operator: In, values: [137, 143]}
+activeDeadlineSeconds: {{ .root.Values.mission.activeDeadlineSeconds }}
+ttlSecondsAfterFinished: {{ .root.Values.mission.ttlSecondsAfterFinished }}
+template:
+  metadata:
+    labels:
+      {{- include "cloudrc.podLabels" (dict "root" .root "component" "mission") | nindent 6 }}
+    {{- with .root.Values.mission.podAnnotations }}
+    annotations:
+      {{- toYaml . | nindent 6 }}
+    {{- end }}
+  spec:
+    restartPolicy: Never
+    {{- include "cloudrc.pod" (dict "root" .root "component" "cloud") | nindent 4 }}
+    {{- with include "cloudrc.placement" .root.Values.cloud }}
+    {{- . | nindent 4 }}
+    {{- end }}
+    containers:
+      {{- include "cloudrc.missionContainer" (dict "root" .root "name" "mission" "uid" "metadata.labels['batch.kubernetes.io/controller-uid']" "queue" .queue) | nindent 6 }}
+    volumes:
+      {{- include "cloudrc.missionVolumes" (dict "root" .root "name" .name) | nindent 6 }}
 {{- end }}
