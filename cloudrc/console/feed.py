@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cloudrc.exposition.parts import PredictionJudge
 from cloudrc.geometry.clearance import Array, clearance
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import NEVER_NS, GuardState
+from cloudrc.metrics.definitions import Echoes, PredictionJudge, tracking_error
 from cloudrc.records import Control
 from cloudrc.teleop.wire import RobotStatus
 
@@ -54,13 +54,13 @@ class FlightFeed:
 
     def __init__(self, scene: Scene) -> None:
         """Begin without a status; measure the clearance from the pipes of `scene`."""
-        self._scene, self._judge = scene, PredictionJudge()
+        self._scene, self._judge, self._echoes = scene, PredictionJudge(), Echoes()
         self.status: RobotStatus | None = None
         self.samples: deque[Sample] = deque()
         self.flown = 0
         # Times of the newest telemetry, control period, judged prediction and echo [s].
         self._heard = self._controlled = self._judged = self._echoed = -inf
-        self._downlink = self._rtt = nan
+        self._downlink = nan
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL_MAX)  # position and clearance
 
     def take(self, status: RobotStatus | None, now: float) -> None:
@@ -116,8 +116,8 @@ class FlightFeed:
         self._judge.take(control)
         if self._judge.judged > judged:
             self._judged = now
-        if control.rtt != self._rtt:  # a new echo
-            self._rtt, self._echoed = control.rtt, now
+        if self._echoes.take(control.rtt, control.loop_delay):
+            self._echoed = now
             self._downlink = control.rtt - uplink_delay
 
     def _follow(self, status: RobotStatus, last: RobotStatus | None) -> None:
@@ -140,7 +140,7 @@ class FlightFeed:
             uplink,
             self._downlink if echoed else nan,
             control.horizon,
-            dist(control.setpoint, control.measured),
+            hypot(*tracking_error(control.setpoint, control.measured)),
             hypot(*self._judge.error) if judged else nan,
             speed,
         )

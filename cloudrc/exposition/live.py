@@ -13,16 +13,18 @@ from math import nan
 from typing import Any, TypeAlias, get_args
 
 from cloudrc.exposition import table
-from cloudrc.exposition.parts import (
-    DatagramTally,
-    DelayJudge,
-    Histogram,
-    PredictionJudge,
-    Readings,
-    samples,
-)
+from cloudrc.exposition.parts import Histogram, Readings, samples
 from cloudrc.exposition.table import Kind, Metric, of_role
 from cloudrc.messages import NEVER_NS, Cause, GuardState
+from cloudrc.metrics.definitions import (
+    DatagramTally,
+    DelayJudge,
+    Echoes,
+    PredictionJudge,
+    age,
+    real_time_factor,
+    tracking_error,
+)
 from cloudrc.records import (
     BY_HAND,
     UNDER_WAY,
@@ -151,7 +153,7 @@ class End:
         """Store the age of the newest datagram at `now_ns` [ns], this process's clock."""
         delay = self._newest_delay
         if delay == delay:
-            self._observe("age_of_information", delay + (now_ns - self._newest_ns) * 1e-9)
+            self._observe("age_of_information", delay + age(now_ns, self._newest_ns))
 
 
 STEP_NS, STEPS = 1_000_000_000, 10
@@ -168,7 +170,7 @@ class WorldEnd(End):
         values["cloudrc_guard_state"] = GuardState.GROUND
         self._reason = GuardState.GROUND, Cause.SPAWN
         self._basis_ns = NEVER_NS
-        # Samples of world's clock and of the machine's clock [ns].
+        # Samples of world's clock and of its lag behind the machine's clock [ns].
         self._instants: deque[tuple[int, int]] = deque(maxlen=STEPS + 1)
 
     @property
@@ -194,7 +196,7 @@ class WorldEnd(End):
             self._values["cloudrc_guard_causes_total"][table.GUARD_CAUSES[reason[1]]] += 1
             self._reason = reason
         if record.telemetry.guard is GuardState.TRACK:  # no other state uses commands
-            self._observe("command_age", (record.stamp_ns - self._basis_ns) * 1e-9)
+            self._observe("command_age", age(record.stamp_ns, self._basis_ns))
 
     def _on_guardchange(self, record: GuardChange) -> None:
         state, values = record.state, self._values
@@ -211,12 +213,11 @@ class WorldEnd(End):
         super()._on_lateness(record)
         self._values["cloudrc_world_slip_seconds_total"] = record.slip_ns * 1e-9
         now_ns, instants = self._deadline_ns, self._instants
-        if not instants or now_ns >= instants[-1][1] + STEP_NS:
-            instants.append((record.stamp_ns, now_ns))
-            if len(instants) > 1:
-                (world_ns, machine_ns), (world_end_ns, machine_end_ns) = instants[0], instants[-1]
-                factor = (world_end_ns - world_ns) / (machine_end_ns - machine_ns)
-                self._values["cloudrc_real_time_factor"] = factor
+        if not instants or now_ns >= sum(instants[-1]) + STEP_NS:
+            instants.append((record.stamp_ns, record.slip_ns))
+            (first_ns, first_slip_ns), (last_ns, last_slip_ns) = instants[0], instants[-1]
+            factor = real_time_factor(last_ns - first_ns, last_slip_ns - first_slip_ns)
+            self._values["cloudrc_real_time_factor"] = factor
 
 
 class CloudEnd(End):
@@ -225,7 +226,7 @@ class CloudEnd(End):
     def __init__(self, values: Values) -> None:
         super().__init__(table.CLOUD, values)
         self._prediction, self._delay = PredictionJudge(), DelayJudge()
-        self._loop_delay, self._used_count = nan, 0
+        self._echoes, self._used_count = Echoes(), 0
 
     def _on_sessionopened(self, record: SessionOpened) -> None:
         super()._on_sessionopened(record)
@@ -239,23 +240,20 @@ class CloudEnd(End):
     def _on_control(self, record: Control) -> None:
         self._count_age(record.stamp_ns)
         self._prediction.take(record)
-        loop_delay = record.loop_delay
-        if loop_delay != self._loop_delay and loop_delay == loop_delay:  # a new echo
-            self._loop_delay = loop_delay
-            self._observe("loop_delay", loop_delay)
+        if self._echoes.take(record.rtt, record.loop_delay):
+            self._observe("loop_delay", record.loop_delay)
             self._observe("rtt", record.rtt)
             if self._used_count == 1:  # else it is unknown which odometry had the echo
                 self._delay.echoed(record, self._newest_ns)
         self._used_count = 0
         self._delay.sent(record)
-        (sx, sy, sz), (mx, my, mz) = record.setpoint, record.measured
         values = self._values
         values["cloudrc_delay_estimate_seconds"] = record.horizon
         values["cloudrc_delay_estimate_error_seconds"] = self._delay.error
         values["cloudrc_prediction_error_meters"] = self._prediction.error
         values["cloudrc_prediction_error_square_meters_total"] = self._prediction.square
         values["cloudrc_predictions_judged_total"] = self._prediction.judged
-        values["cloudrc_tracking_error_meters"] = (sx - mx, sy - my, sz - mz)
+        values["cloudrc_tracking_error_meters"] = tracking_error(record.setpoint, record.measured)
         values["cloudrc_setpoint_meters"] = record.setpoint
         values["cloudrc_command_velocity_meters_per_second"] = record.command
         values["cloudrc_command_yaw_rate_radians_per_second"] = record.yaw_rate

@@ -1,8 +1,8 @@
 """Compute the metrics of a recorded flight; each metric is one number with a unit.
 
 `measure` finds and computes metrics; the metrics of cloudrc are rows of tables in `flight`,
-`control`, `link` and `mission`. docs/plugins.md
-explains how to add your own metrics.
+`control`, `link` and `mission`. `definitions` has the quantities that live metrics, console and
+report share. docs/plugins.md explains how to add your own metrics.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -38,7 +38,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # Lazily, because a module of this package may need neither recordings nor pydantic.
+    # Lazily, because `definitions` needs neither recordings nor pydantic.
     if name in __all__:
         from cloudrc.metrics import measure
 

@@ -2,46 +2,92 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
-from cloudrc.metrics.flight import Columns, Flight, add_metrics, mean, percentile, rms, select
+from cloudrc.metrics.definitions import (
+    Echoes,
+    PredictionJudge,
+    age,
+    delay_error,
+    real_time_factor,
+    target_ns,
+    tracking_error,
+)
+from cloudrc.metrics.flight import (
+    Array,
+    Columns,
+    Flight,
+    add_metrics,
+    finite,
+    mean,
+    percentile,
+    rms,
+    select,
+)
 
 
 def round_trips(flight: Flight) -> Columns:
-    """Select the control periods in which cloud measured a new round trip.
-
-    All other periods repeat the last measured values, for seconds on end if the link is silent.
-    """
-    control = flight.control
-    pair = np.stack([control["rtt"], control["loop_delay"]], axis=1)
-    new = np.ones(len(pair), dtype=bool)
-    new[1:] = (pair[1:] != pair[:-1]).any(axis=1)
-    return select(control, new)
+    """Select the control periods in which cloud measured a new round trip."""
+    control, echoes = flight.control, Echoes()
+    measured = zip(control["rtt"].tolist(), control["loop_delay"].tolist(), strict=True)
+    return select(control, np.array([echoes.take(*each) for each in measured], dtype=bool))
 
 
 def _age_of_information(flight: Flight) -> float | None:
     """Compute the mean age of the odometry that cloud used [s]; None without a shared clock."""
     if not np.isfinite(flight.during("/uplink_delay")["delay"]).any():
         return None
-    return mean((flight.control["stamp_ns"] - flight.control["basis_stamp_ns"]) * 1e-9)
+    return mean(age(flight.control["stamp_ns"], flight.control["basis_stamp_ns"]))
 
 
-def _prediction_error(flight: Flight) -> float | None:
-    """Compute the RMS distance from the predicted to the true position of the robot [m].
+def compare_with_truth(
+    flight: Flight, at_ns: Array, predicted: Array
+) -> tuple[PredictionJudge, Array, Array]:
+    """Compare predicted positions with the true position at the same instants.
 
-    The true position is that at the time when the robot applies the command. So an error of the
-    estimated delay adds to the result.
+    Args:
+        flight: The flight.
+        at_ns: Instants on world's clock [ns], shape (n,).
+        predicted: Predicted positions [m], shape (n, 3).
+
+    Returns:
+        The judge with the sum of all errors. Then, of the predictions that it compared, the
+        instants [ns], shape (m,), and the errors [m], shape (m, 3).
+    """
+    truth, judge, found = flight.recording["/ground_truth"], PredictionJudge(), []
+    order = np.argsort(at_ns, kind="stable")
+    waiting = deque(zip(at_ns[order].tolist(), predicted[order].tolist(), strict=True))
+    # The rows of the true position around these instants.
+    ends_ns = at_ns[order[[0, -1]]] if len(order) else np.zeros(2, np.int64)
+    first, last = truth["stamp_ns"].searchsorted(ends_ns, "right").tolist()
+    rows = slice(max(first - 1, 0), last + 1)
+    stamps, positions = truth["stamp_ns"][rows].tolist(), truth["position"][rows].tolist()
+    for stamp_ns, position in zip(stamps, positions, strict=True):
+        while waiting and waiting[0][0] <= stamp_ns:
+            judge.predict(*waiting.popleft())
+        found += judge.know(stamp_ns, position)
+    instants = np.array([at for at, _ in found], dtype=np.int64)
+    errors = np.array([error for _, error in found], dtype=float).reshape(-1, 3)
+    return judge, instants, errors
+
+
+def prediction_errors(flight: Flight) -> tuple[PredictionJudge, Array, Array]:
+    """Compare each predicted position with the true position when the command was applied.
+
+    So an error of the estimated delay adds to the result, which is that of `compare_with_truth`.
     Source: docs/reference/control.md, "Predictors".
     """
-    applied = flight.applied
-    return rms(applied["position"] - flight.true_position(applied["stamp_ns"]))
+    return compare_with_truth(flight, flight.applied["stamp_ns"], flight.applied["position"])
 
 
 def _estimate_error(flight: Flight) -> float | None:
     """Compute the RMS distance [m] from predicted to true positions at the predicted times."""
     control = flight.control
-    target_ns = control["basis_stamp_ns"] + np.rint(control["horizon"] * 1e9).astype(np.int64)
-    return rms(control["position"] - flight.true_position(target_ns))
+    each = zip(control["basis_stamp_ns"].tolist(), control["horizon"].tolist(), strict=True)
+    at_ns = np.array([target_ns(*one) for one in each], dtype=np.int64)
+    return finite(compare_with_truth(flight, at_ns, control["position"])[0].rms)
 
 
 def _delay_error(flight: Flight) -> float | None:
@@ -50,8 +96,13 @@ def _delay_error(flight: Flight) -> float | None:
     Commands before the first measured round trip are left out.
     """
     applied = flight.applied
-    errors = applied["horizon"] - (applied["stamp_ns"] - applied["basis_stamp_ns"]) * 1e-9
+    errors = delay_error(applied["horizon"], applied["basis_stamp_ns"], applied["stamp_ns"])
     return rms(errors[np.isfinite(applied["rtt"])])
+
+
+def tracking_errors(flight: Flight, position: Array) -> Array:
+    """Return setpoint minus `position` [m], one row per control period, both of shape (n, 3)."""
+    return np.stack(tracking_error(flight.control["setpoint"].T, position.T), axis=1)
 
 
 def wakes(flight: Flight, end: str) -> Columns:
@@ -69,10 +120,11 @@ def _slip(flight: Flight) -> float | None:
 
 
 def _real_time_factor(flight: Flight) -> float | None:
-    slipped = _slip(flight)
-    if slipped is None or flight.duration <= 0.0:
+    columns = wakes(flight, "world")
+    stamps_ns, slips_ns = columns["stamp_ns"].tolist(), columns["slip_ns"].tolist()
+    if not stamps_ns:
         return None
-    return flight.duration / (flight.duration + slipped)
+    return finite(real_time_factor(stamps_ns[-1] - stamps_ns[0], slips_ns[-1] - slips_ns[0]))
 
 
 def _missed_periods(flight: Flight) -> float | None:
@@ -97,16 +149,16 @@ add_metrics(
 add_metrics(
     "Estimation and tracking",
     ("prediction_error_rms", "m", "RMS distance from the predicted to the true position when each "
-     "command was applied.", _prediction_error),
+     "command was applied.", lambda flight: finite(prediction_errors(flight)[0].rms)),
     ("estimate_error_rms", "m", "RMS distance from the predicted to the true position at the "
      "instant of the prediction.", _estimate_error),
     ("delay_estimate_error_rms", "s", "RMS difference between the horizon and the true delay from "
      "odometry to applied command, from the first echo on.", _delay_error),
     ("tracking_rms_measured", "m", "RMS distance between the setpoint and the measured position "
      "that cloud used.",
-     lambda flight: rms(flight.control["setpoint"] - flight.control["measured"])),
+     lambda flight: rms(tracking_errors(flight, flight.control["measured"]))),
     ("tracking_rms_estimated", "m", "RMS distance between the setpoint and cloud's estimated "
-     "position.", lambda flight: rms(flight.control["setpoint"] - flight.control["position"])),
+     "position.", lambda flight: rms(tracking_errors(flight, flight.control["position"]))),
 )  # fmt: skip
 add_metrics(
     "Real time",

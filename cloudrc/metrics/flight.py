@@ -196,6 +196,11 @@ def add_metrics(group: str, *rows: tuple[str, str, str, Measure]) -> None:
     SHIPPED.update({row[0]: Metric(*row, group) for row in rows})
 
 
+def finite(value: float) -> float | None:
+    """Return `value` [any unit] as the value of a metric; None if it is NaN or infinite."""
+    return float(value) if isfinite(value) else None
+
+
 def mean(values: Array) -> float | None:
     """Average the finite `values`, shape (n,), any unit; None if no value is finite."""
     finite = values[np.isfinite(values)]
@@ -224,7 +229,7 @@ def rms(errors: Array) -> float | None:
 def _least_clearance(flight: Flight, *, inside: bool) -> float | None:
     truth, rows = flight.truth, flight.inside if inside else slice(None)
     found = least_clearance(flight.scene, truth["position"][rows], truth["orientation_wxyz"][rows])
-    return found if isfinite(found) else None
+    return finite(found)
 
 
 def _distance(flight: Flight) -> float | None:

@@ -9,7 +9,8 @@ from functools import partial
 
 import numpy as np
 
-from cloudrc.metrics.flight import Flight, add_metrics, mean
+from cloudrc.metrics.definitions import WINDOW_MAX, DatagramTally
+from cloudrc.metrics.flight import Flight, add_metrics, finite, mean, select
 
 WAYS = {"uplink": "from world to cloud", "downlink": "from cloud to world"}
 """Direction -> words for the direction in the description of a metric."""
@@ -45,10 +46,17 @@ def loss(flight: Flight, way: str) -> float | None:
     world = flight.recording["/telemetry"]["stamp_ns"]
     if not len(world):
         return None
-    settled = sent["stamp_ns"] <= world[-1] - SETTLING_NS
-    keys = set(zip(sent["epoch"][settled], sent["counter"][settled], strict=True))
-    arrived = keys.intersection(zip(arrivals["epoch"], arrivals["counter"], strict=True))
-    return 1.0 - len(arrived) / len(keys) if keys else None
+    sent = select(sent, sent["stamp_ns"] <= world[-1] - SETTLING_NS)
+    tally = DatagramTally(WINDOW_MAX)
+    for epoch in np.unique(sent["epoch"]).tolist():
+        counters = sent["counter"][sent["epoch"] == epoch]
+        first, last = int(counters.min()), int(counters.max())
+        arrived = arrivals["counter"][arrivals["epoch"] == epoch]
+        tally.begin(epoch, first)
+        for counter in arrived[(arrived >= first) & (arrived <= last)].tolist():
+            tally.take(epoch, counter)
+        tally.end(last)
+    return finite(tally.loss)
 
 
 def _add_direction(way: str, words: str) -> None:

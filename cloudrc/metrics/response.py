@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cloudrc.metrics.control import tracking_errors
 from cloudrc.metrics.flight import Array, Flight, add_metrics, mean, percentile
 
 SHORTEST_NS = 500_000_000
@@ -134,8 +135,7 @@ def _mean_of(flight: Flight, name: str) -> float | None:
 
 
 def _tracking_errors(flight: Flight) -> Array:
-    control = flight.control
-    errors = control["setpoint"] - flight.true_position(control["stamp_ns"])
+    errors = tracking_errors(flight, flight.true_position(flight.control["stamp_ns"]))
     return np.asarray(np.linalg.norm(errors, axis=1))
 
 

@@ -25,6 +25,7 @@ import numpy as np
 from cloudrc.errors import DISK_FULL, DiskFullError
 from cloudrc.messages import GuardState, Vector
 from cloudrc.metrics import Flight, Number
+from cloudrc.metrics.definitions import real_time_factor
 from cloudrc.metrics.mission import first_touch, reported
 from cloudrc.metrics.response import steps
 from cloudrc.records import REAL_TIME_FACTOR_MIN
@@ -342,12 +343,13 @@ class Observations:
 
         `known` sets further fields of the returned `Evidence`.
         """
+        slip = self.slip_ns * 1e-9
         return Evidence(
             ending=ending,
             end=Moment(elapsed),
             touch=None if self.touch_speed is None else (self.touch_speed, UNKNOWN),
             violations=(_pipe_touched("a pipe", self.pipe_contacts),) if self.pipe_contacts else (),
-            slow=_too_slow(1.0 - self.slip_ns * 1e-9 / elapsed) if elapsed > 0 else "",
+            slow=_too_slow(real_time_factor(elapsed - slip, slip)) if elapsed > 0 else "",
             **known,
         )
 

@@ -18,7 +18,8 @@ import numpy as np
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.geometry.scene import Pipe, load_scene
 from cloudrc.metrics import Flight
-from cloudrc.metrics.flight import Columns, select
+from cloudrc.metrics.control import prediction_errors, tracking_errors
+from cloudrc.metrics.flight import Array, Columns, select
 from cloudrc.record.columns import Message, Recording
 from cloudrc.record.ros import encode_view, header, part
 from cloudrc.report.solids import PATH, Face, board_faces, bore, robot_faces, strip
@@ -60,8 +61,8 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[Message]
         ("/scene", first_ns, encode_view("/scene", markers)),
         *_transforms(poses, base_link=("position", "orientation_wxyz")),
         *_transforms(control, estimate=("position", "orientation_wxyz"), setpoint=("setpoint", "")),
-        *_errors("/tracking_error", flight, flight.control, "setpoint"),
-        *_errors("/prediction_error", flight, flight.applied, "position"),
+        *_errors("/tracking_error", *_tracking(flight)),
+        *_errors("/prediction_error", *prediction_errors(flight)[1:]),
     ]
 
 
@@ -93,16 +94,21 @@ def _transforms(columns: Columns, **frames: tuple[str, str]) -> Iterator[Message
         yield "/tf", stamp_ns, encode_view("/tf", parts)
 
 
-def _errors(topic: str, flight: Flight, columns: Columns, name: str) -> Iterator[Message]:
-    """Yield messages of `topic`: the distance from a position to the robot's true position [m].
+def _tracking(flight: Flight) -> tuple[Array, Array]:
+    """Return the stamps of all control periods [ns], and setpoint minus true position [m]."""
+    stamps_ns = flight.control["stamp_ns"]
+    return stamps_ns, tracking_errors(flight, flight.true_position(stamps_ns))
 
-    `name` is the column of `columns` with the positions. At most one message per PERIOD_NS.
+
+def _errors(topic: str, stamps_ns: Array, errors: Array) -> Iterator[Message]:
+    """Yield messages of `topic`: the lengths of `errors` [m], shape (n, 3), at `stamps_ns` [ns].
+
+    At most one message per PERIOD_NS.
     """
-    columns = _thin(columns)
-    away = columns[name] - flight.true_position(columns["stamp_ns"])
-    errors = np.linalg.norm(away, axis=1).astype(np.float32).tolist()
-    for stamp_ns, error in zip(columns["stamp_ns"].tolist(), errors, strict=True):
-        yield topic, stamp_ns, encode_view(topic, error)
+    thin = _thin({"stamp_ns": stamps_ns, "error": errors})
+    sizes = np.linalg.norm(thin["error"], axis=1).astype(np.float32).tolist()
+    for stamp_ns, size in zip(thin["stamp_ns"].tolist(), sizes, strict=True):
+        yield topic, stamp_ns, encode_view(topic, size)
 
 
 def _quaternion(wxyz: Iterable[float]) -> Any:

@@ -25,6 +25,7 @@ from cloudrc.messages import (
     Start,
     Telemetry,
 )
+from cloudrc.metrics.definitions import real_time_factor
 from cloudrc.records import (
     REAL_TIME_FACTOR_MIN,
     Arrival,
@@ -232,8 +233,9 @@ class WorldEndpoint(TunnelEnd):
         self.counts["held_seconds"] += guard.armed and guard.state is HOLD
         for name, count in sorted(self.counts.items()):
             self._records.append(Counted(now_ns, "world", name, count))
-        passed_ns = COUNT_PERIOD_NS + self._slip_ns - (before_ns or 0)
-        if before_ns is not None and COUNT_PERIOD_NS < REAL_TIME_FACTOR_MIN * passed_ns:
+        lost_ns = self._slip_ns - (before_ns or 0)
+        is_slow = real_time_factor(COUNT_PERIOD_NS, lost_ns) < REAL_TIME_FACTOR_MIN
+        if before_ns is not None and is_slow:
             self._tell("late", SLOW_TEXT, now_ns)
 
     def _receive_hello(self, hello: Hello, counter: int, now_ns: int) -> None:

@@ -35,12 +35,12 @@ from cloudrc.link.verify.judge import (
     told,
     verdict_of,
 )
+from cloudrc.metrics.definitions import WINDOW, Echoes
 from cloudrc.records import Arrival, Control, Fault, Lateness, LinkChecked, Record
 
 CHECK_NS = 5_000_000_000  # time between two verdicts [ns]
 SETTLE_NS = 2_000_000_000  # time after a change in which nothing is judged [ns]
 KEPT = 6000  # largest number of datagrams that one verdict uses
-FINAL = 128  # a missing datagram counts as lost if the newest counter is higher by this number
 ENDS = 2e-3  # largest delay that world and cloud add to a round trip if they wake on time [s]
 FOLLOW_PERIOD = 0.1  # period at which the thread reads new records [s]
 UNJUDGED = {"distribution"}  # not judged in flight: late wakes of world and cloud change it
@@ -66,6 +66,7 @@ class LinkMonitor:
         self._period, self._computes = period, computes
         self._arrivals = deque[Arrival](maxlen=KEPT)
         self._trips, self._lates = (deque[float](maxlen=KEPT) for _ in range(2))
+        self._echoes = Echoes()
         self._asked: Asked | None = None
         self._plans: list[Plan] = []  # for the received flow, and for the other direction
         self._news = deque[dict[str, Any] | None](maxlen=1)  # the newest profile, if not used yet
@@ -145,8 +146,8 @@ class LinkMonitor:
                 self._arrivals.append(record)
             elif isinstance(record, Lateness):
                 self._lates.append(record.lateness + record.busy)
-            elif isinstance(record, Control) and not isnan(record.rtt):
-                if not self._trips or record.rtt != self._trips[-1]:  # a new echo
+            elif isinstance(record, Control):
+                if self._echoes.take(record.rtt, record.loop_delay):
                     self._trips.append(record.rtt)
         if self._asked is None:
             return []
@@ -226,7 +227,7 @@ def _in_order(arrivals: Sequence[Arrival], period: float) -> tuple[Stream, int, 
     Return the stream, the first counter, and whether world and cloud share a clock. Without a
     shared clock, the delays have an unknown constant offset.
     """
-    last = max((one.counter for one in arrivals), default=0) - FINAL
+    last = max((one.counter for one in arrivals), default=0) - WINDOW
     arrivals = [one for one in arrivals if last - KEPT < one.counter <= last]
     first = arrivals[0].counter if arrivals else last + 1
     arrivals = [one for one in arrivals if one.counter >= first]

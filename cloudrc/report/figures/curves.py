@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
-from cloudrc.metrics.control import round_trips
+from cloudrc.metrics.control import prediction_errors, round_trips, tracking_errors
 from cloudrc.metrics.flight import Array, rms
 from cloudrc.report.figures import style
 from cloudrc.report.figures.labels import is_free
@@ -209,20 +209,20 @@ ERROR = (
 def draw_error(subject: Subject) -> Figure:
     """Draw the distance to the setpoint and, in a second panel, the errors of the estimates."""
     figure, (tracking, accuracy) = subject.look.two_panels()
-    flight, control, applied = subject.flight, subject.flight.control, subject.flight.applied
+    flight, control = subject.flight, subject.flight.control
 
     panel(tracking, "a")
     time = flight.seconds(control["stamp_ns"])
     for column in ("measured", "position"):
-        error = control["setpoint"] - control[column]
+        error = tracking_errors(flight, control[column])
         look = LINES[column] | {"label": f"{LINES[column]['label']}{_rms(error, 'm', 1.0)}"}
         tracking.plot(time, np.linalg.norm(error, axis=1), **look)
     tracking.set_ylim(bottom=0.0)
     _finish(tracking, subject, "distance to reference (m)", 2)
 
     panel(accuracy, "b")
-    error = applied["position"] - flight.true_position(applied["stamp_ns"])
-    time, distance = flight.seconds(applied["stamp_ns"]), np.linalg.norm(error, axis=1) * 1e3
+    _, instants_ns, error = prediction_errors(flight)
+    time, distance = flight.seconds(instants_ns), np.linalg.norm(error, axis=1) * 1e3
     dots(accuracy, time, distance, style.SKY, f"each command{_rms(error, 'mm', 1e3)}", 2.0)
     accuracy.set_ylim(bottom=0.0)
     _finish(accuracy, subject, "distance to truth (mm)", 2)

@@ -1,0 +1,263 @@
+"""Define the quantities that a flight's report, its live metrics and the console all show.
+
+Each quantity is computed step by step. Live metrics and console do so while the records arrive, the
+report does so afterwards, with the same functions: the same records give the same value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from heapq import heappop, heappush
+from math import nan, sqrt
+from typing import Any
+
+from cloudrc.messages import Vector
+from cloudrc.records import Control
+
+# Delays. Stamps are subtracted only from stamps of the same clock.
+
+
+def age(now_ns: Any, stamp_ns: Any) -> Any:
+    """Return the age of information [s]: the time from its stamp to `now_ns`, both [ns].
+
+    Both are numbers or arrays, on one clock.
+    """
+    return (now_ns - stamp_ns) * 1e-9
+
+
+def target_ns(basis_stamp_ns: int, horizon: float) -> int:
+    """Return the instant for which cloud predicted the robot's state [ns], world's clock.
+
+    `basis_stamp_ns` is the stamp of the odometry [ns], `horizon` the time to predict ahead [s].
+    """
+    return basis_stamp_ns + round(horizon * 1e9)
+
+
+def delay_error(horizon: Any, basis_stamp_ns: Any, applied_ns: Any) -> Any:
+    """Return how wrong a delay estimate was: estimated minus true delay [s].
+
+    The estimate is the `horizon` [s] of a command. The true delay is the time from the stamp of the
+    odometry that the command is based on, `basis_stamp_ns`, to the command's application at
+    `applied_ns` [ns], both on world's clock. All are numbers or arrays.
+    """
+    return horizon - age(applied_ns, basis_stamp_ns)
+
+
+class Echoes:
+    """Finds the control periods in which cloud measured a new round trip.
+
+    All other periods repeat the last measured values, for seconds on end if the link is silent.
+    """
+
+    def __init__(self) -> None:
+        self._last = nan, nan
+
+    def take(self, rtt: float, loop_delay: float) -> bool:
+        """Return whether a period with `rtt` [s] and `loop_delay` [s] has a new round trip."""
+        known = rtt, loop_delay
+        is_new = rtt == rtt and known != self._last
+        self._last = known
+        return is_new
+
+
+# Errors.
+
+
+def tracking_error(setpoint: Iterable[Any], position: Iterable[Any]) -> tuple[Any, Any, Any]:
+    """Return `setpoint` minus `position` [m], x, y and z, each a number or an array."""
+    (sx, sy, sz), (x, y, z) = setpoint, position
+    return sx - x, sy - y, sz - z
+
+
+GAP_MAX_NS = 50_000_000
+"""Longest time between two known positions between which positions are interpolated [ns]."""
+WAITING_MAX = 256
+"""Largest number of stored predictions or commands; 100 are enough for delays of 1 s."""
+LONG_AGO_NS = -(1 << 62)
+"""Stamp of the position that is known before the first one [ns]."""
+
+
+class PredictionJudge:
+    """Compares predicted positions with the position that was known later for the same instant.
+
+    Live metrics and the console know the measured positions, the report knows the true positions.
+    Between two known positions, the position is interpolated linearly.
+
+    Attributes:
+        error: Newest error: predicted minus known position [m]; NaN before the first.
+        square: Sum of the squared lengths of all errors [m^2].
+        judged: Number of compared predictions.
+    """
+
+    def __init__(self) -> None:
+        self.error: Vector = (nan, nan, nan)
+        self.square = 0.0
+        self.judged = 0
+        self.reset()
+
+    @property
+    def rms(self) -> float:
+        """Root mean square length of all errors [m]; NaN without a compared prediction."""
+        return sqrt(self.square / self.judged) if self.judged else nan
+
+    def reset(self) -> None:
+        """Drop all predictions and positions, because a new session has started."""
+        self._waiting: list[tuple[int, Vector]] = []
+        self._known_ns = LONG_AGO_NS
+        self._known: Vector = (nan, nan, nan)
+
+    def take(self, control: Control) -> None:
+        """Judge predictions for times up to a new measurement; store the new prediction."""
+        self.know(control.basis_stamp_ns, control.measured)
+        at_ns = target_ns(control.basis_stamp_ns, control.horizon)
+        self.predict(at_ns, control.position)
+
+    def predict(self, at_ns: int, position: Vector) -> None:
+        """Store the `position` [m] predicted for the instant `at_ns` [ns]."""
+        if len(self._waiting) < WAITING_MAX:
+            heappush(self._waiting, (at_ns, position))
+
+    def know(self, stamp_ns: int, position: Vector) -> list[tuple[int, Vector]]:
+        """Judge the predictions for instants up to `stamp_ns` [ns], with its known position [m].
+
+        Return instant [ns] and error [m] of each judged prediction.
+        """
+        waiting, before_ns, found = self._waiting, self._known_ns, list[tuple[int, Vector]]()
+        if stamp_ns <= before_ns:
+            return found
+        before, self._known_ns, self._known = self._known, stamp_ns, position
+        while waiting and waiting[0][0] <= stamp_ns:
+            at_ns, predicted = heappop(waiting)
+            if before_ns <= at_ns and stamp_ns - before_ns <= GAP_MAX_NS:
+                share = (at_ns - before_ns) / (stamp_ns - before_ns)
+                self._judge(predicted, before, position, share)
+                found.append((at_ns, self.error))
+        return found
+
+    def _judge(self, predicted: Vector, before: Vector, after: Vector, share: float) -> None:
+        (px, py, pz), (ax, ay, az), (bx, by, bz) = predicted, before, after
+        x = px - ax - share * (bx - ax)
+        y = py - ay - share * (by - ay)
+        z = pz - az - share * (bz - az)
+        self.error = (x, y, z)
+        self.square += x * x + y * y + z * z
+        self.judged += 1
+
+
+class DelayJudge:
+    """Compares delay estimates with true delays, which echoes show in flight.
+
+    Cloud computes each command from an odometry sample. The delay is the time from the stamp of
+    this sample until world applies the command. Telemetry contains an echo of the newest command
+    that world has applied: the command's stamp on cloud's clock, and the time since then.
+    """
+
+    def __init__(self) -> None:
+        self.error = nan  # newest error: estimated minus true delay [s]
+        self.reset()
+
+    def reset(self) -> None:
+        """Drop the records of commands without an echo, because a new session has started."""
+        self._sent: dict[int, Control] = {}
+
+    def sent(self, control: Control) -> None:
+        """Store the record of a sent command; its echo will show the true delay."""
+        self._sent[control.stamp_ns] = control
+        if len(self._sent) > WAITING_MAX:
+            del self._sent[next(iter(self._sent))]  # the oldest
+
+    def echoed(self, control: Control, arrival_ns: int) -> None:
+        """Compute how wrong the estimated delay was for a command whose echo has arrived.
+
+        The echo arrived at `arrival_ns` [ns], cloud's clock. `control` is the record of the first
+        control period after this arrival; it contains the delays that the echo shows.
+        """
+        sent = self._sent.get(arrival_ns - round(control.loop_delay * 1e9))
+        if sent is not None:
+            applied_ns = control.basis_stamp_ns - round((control.loop_delay - control.rtt) * 1e9)
+            self.error = delay_error(sent.horizon, sent.basis_stamp_ns, applied_ns)
+
+
+# Lost datagrams.
+
+WINDOW = 128
+"""In flight, a missing datagram counts as lost after this number of newer datagrams: 1.28 s at 100
+Hz, so that a loss shows soon."""
+WINDOW_MAX = 1024
+"""In a report, a missing datagram counts as lost after this number of newer datagrams; the receiver
+refuses an older one, whether it is new or repeated (`cloudrc.tunnel.channel.WINDOW`)."""
+
+
+class DatagramTally:
+    """Counts lost and reordered datagrams of one direction of the link.
+
+    The sender numbers datagrams by a counter, which restarts in each epoch (session).
+
+    Attributes:
+        lost: Number of datagrams that had not arrived when the peer had sent `window` newer ones.
+        reordered: Number of datagrams that arrived after a newer one, without repetitions.
+    """
+
+    def __init__(self, window: int = WINDOW) -> None:
+        """Count a missing datagram as lost after `window` newer datagrams, > 0."""
+        self.lost = self.reordered = 0
+        self._window, self._mask = window, (1 << window) - 1
+        self._before = 0  # value of `expected` at the end of the last epoch
+        self._epoch = self._first = self._newest = -1
+        self._seen = self._mask  # bit k: the datagram with the counter newest - k has arrived
+
+    @property
+    def expected(self) -> int:
+        """Number of datagrams for which the receiver no longer waits: arrived or lost."""
+        return self._before + max(0, self._newest - self._first - self._window + 1)
+
+    @property
+    def loss(self) -> float:
+        """Share of the expected datagrams that were lost, in [0, 1]; NaN if none was expected."""
+        return self.lost / self.expected if self.expected else nan
+
+    def begin(self, epoch: int, first: int) -> None:
+        """Expect the datagrams of a session, from the counter `first` on."""
+        self._before = self.expected
+        self._epoch, self._first, self._newest, self._seen = epoch, first, first - 1, self._mask
+
+    def take(self, epoch: int, counter: int) -> bool:
+        """Count the arrival of a datagram; return True if the datagram is certainly new.
+
+        Return False for a repeated or very old datagram: an attacker may have sent it again.
+        """
+        if epoch != self._epoch:
+            # Datagrams before the first arrival are not lost: the receiver may not have run.
+            self.begin(epoch, counter)
+        ahead, window = counter - self._newest, self._window
+        if ahead > 0:  # the skipped datagrams are lost or late
+            leaving = min(ahead, window)
+            self.lost += ahead - (self._seen >> (window - leaving)).bit_count()
+            self._seen = (self._seen << ahead | 1) & self._mask if ahead < window else 1
+            self._newest = counter
+        elif ahead > -window and not self._seen >> -ahead & 1:
+            self._seen |= 1 << -ahead
+            self.reordered += 1
+        else:
+            return False
+        return True
+
+    def end(self, last: int) -> None:
+        """End the session: what is still missing up to the newest sent counter, `last`, is lost."""
+        self.lost += self._window - self._seen.bit_count() + last - self._newest
+        self._before += last - self._first + 1
+        self._first, self._newest, self._seen = last + 1, last, self._mask
+
+
+# Time.
+
+
+def real_time_factor(simulated: float, slip: float) -> float:
+    """Return simulated time divided by the time on the machine's clock; NaN if no time passed.
+
+    Args:
+        simulated: Time that passed on world's clock [any unit].
+        slip: Time by which world's clock fell further behind the machine's clock [the same unit].
+    """
+    passed = simulated + slip
+    return simulated / passed if passed > 0 else nan

@@ -1,0 +1,251 @@
+"""Losses, reordering, and errors of predictions and delay estimates.
+
+They are computed by hand, by a full count, and from a flight's ground truth. The same records give
+the same value in live metrics and in the report.
+"""
+
+import math
+import random
+from functools import cache
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloudrc.config.load import load_experiment
+from cloudrc.exposition.live import LiveMetrics
+from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
+from cloudrc.metrics import SHIPPED
+from cloudrc.metrics.definitions import (
+    LONG_AGO_NS,
+    WINDOW,
+    WINDOW_MAX,
+    DatagramTally,
+    Echoes,
+    PredictionJudge,
+    real_time_factor,
+)
+from cloudrc.records import (
+    Arrival,
+    CommandApplied,
+    Control,
+    GroundTruth,
+    GuardChange,
+    Lateness,
+    MissionEvent,
+    TelemetrySent,
+)
+from cloudrc.tunnel.channel import WINDOW as REMEMBERED
+from tests.console.conftest import control
+from tests.flights.conftest import fly, numbers, records
+from tests.metrics.conftest import SECOND, Log, at, flown
+
+
+def taken(counters):
+    stream = DatagramTally()
+    for counter in counters:
+        stream.take(1, counter)
+    return stream
+
+
+def test_what_has_left_the_window_is_lost_until_an_epoch_begins():
+    stream = taken([0, 2, *range(3, WINDOW + 1)])  # only number 0 has left the window
+    assert (stream.expected, stream.lost) == (1, 0)
+    for counter in (WINDOW + 1, 1000 + WINDOW, *range(1001 + WINDOW, 1001 + 2 * WINDOW)):
+        stream.take(1, counter)
+    assert (stream.expected, stream.lost) == (1001 + WINDOW, 999)
+    for counter in range(1000, 1000 + WINDOW):
+        stream.take(2, counter)
+    assert (stream.expected, stream.lost) == (1001 + WINDOW, 999), "an epoch has its own window"
+
+
+def test_a_report_waits_as_long_as_the_receiver_remembers():
+    assert WINDOW_MAX == REMEMBERED
+
+
+def test_at_the_end_of_a_session_all_that_is_missing_is_lost():
+    stream = DatagramTally(WINDOW_MAX)
+    stream.begin(1, 10)
+    for counter in (12, 11, 15, 15):
+        stream.take(1, counter)
+    assert math.isnan(stream.loss), "the receiver still waits"
+    stream.end(19)
+    assert (stream.expected, stream.lost, stream.loss) == (10, 7, 0.7)
+    stream.begin(2, 0)
+    stream.take(2, 0)
+    stream.end(1)
+    assert (stream.expected, stream.lost) == (12, 8)
+
+
+@given(seed=st.integers(0, 10_000), loss=st.floats(0, 0.9), jitter=st.integers(0, 60))
+@settings(max_examples=40, deadline=None)
+def test_counts_match_the_true_loss_and_reordering(seed, loss, jitter):
+    rng, count = random.Random(seed), 400
+    sent = [0] + [n for n in range(1, count) if rng.random() >= loss]
+    sent[1:] = sorted(sent[1:], key=lambda n: n + rng.random() * jitter)
+    stream = taken([*sent, *range(count, count + WINDOW)])
+    newest, late = -1, 0
+    for counter in sent:
+        late += counter < newest
+        newest = max(newest, counter)
+    assert stream.expected == count
+    assert stream.lost == count - len(sent)
+    assert stream.reordered == late
+
+
+def flying_along_x(predicted_lead, *, every_ms=10):
+    """Yield a flight at 1 m/s along x, predicted 25 ms ahead with an error `predicted_lead` [m]."""
+    for x in (ms * 1e-3 for ms in range(0, 400, every_ms)):
+        predicted = (x + 0.025 + predicted_lead, 0.0, 0.0)
+        yield control(7.0 + x, x, measured=(x, 0.0, 0.0), position=predicted, horizon=0.025)
+
+
+@pytest.mark.parametrize(("lead", "every_ms", "judged"), [(0.01, 10, 37), (0, 10, 37), (1, 60, 0)])
+def test_a_prediction_is_compared_at_its_own_instant(lead, every_ms, judged):
+    """The last three wait for a measurement 25 ms later; none is compared across a gap."""
+    judge = PredictionJudge()
+    for period in flying_along_x(lead, every_ms=every_ms):
+        judge.take(period)
+    assert judge.judged == judged
+    assert judge.square == pytest.approx(judged * lead**2, abs=1e-12)
+    assert judge.error == pytest.approx((lead, 0, 0) if judged else (math.nan,) * 3, nan_ok=True)
+
+
+def test_nothing_is_judged_before_the_first_known_position():
+    judge = PredictionJudge()
+    judge.predict(0, (1.0, 0.0, 0.0))
+    assert judge.know(0, (0.0, 0.0, 0.0)) == []
+    assert math.isnan(judge.rms)
+    judge.predict(0, (1.0, 0.0, 0.0))
+    assert judge.know(10_000_000, (0.0, 0.0, 0.0)) == [(0, (1.0, 0.0, 0.0))]
+    assert (judge.rms, LONG_AGO_NS < -SECOND) == (1.0, True)
+
+
+def test_a_round_trip_is_new_once():
+    echoes, none = Echoes(), math.nan
+    periods = [(none, none), (0.1, 0.2), (0.1, 0.2), (0.1, 0.3), (none, none), (0.1, 0.3)]
+    assert [echoes.take(*each) for each in periods] == [False, True, False, True, False, True]
+
+
+def test_the_real_time_factor_is_simulated_time_over_machine_time():
+    assert real_time_factor(9.0, 1.0) == 0.9
+    assert math.isnan(real_time_factor(0.0, 0.0))
+
+
+@cache
+def lossy():
+    """Fly over a link that loses a tenth; return the flight and the records of both ends."""
+    settings = (
+        "hover",
+        "link.both.loss=0.1",
+        "link.both.delay_ms=30",
+        "link.both.jitter_ms=20",
+        "seed=3",
+    )
+    flight = fly(*settings).flight
+    return flight, *records(load_experiment(settings[0], settings[1:]))
+
+
+def measured(flight, name):
+    return SHIPPED[name].measure(flight)
+
+
+def average(live, name):
+    histogram = live.read()[name]
+    return histogram.total / histogram.cumulative()[-1]
+
+
+def test_round_trip_and_age_of_a_flight_are_equal_live_and_in_the_report():
+    flight, _, cloud = lossy()
+    live = LiveMetrics("cloud")
+    for record in cloud:
+        if not isinstance(record, Control) or flight.start_ns <= record.stamp_ns <= flight.end_ns:
+            live.see([record])
+    for name, metric in (
+        ("rtt_mean", "cloudrc_rtt_seconds"),
+        ("loop_delay_mean", "cloudrc_loop_delay_seconds"),
+        ("age_of_information_mean", "cloudrc_age_of_information_seconds"),
+    ):
+        assert average(live, metric) == pytest.approx(measured(flight, name), rel=1e-9), name
+    newest = flight.control["setpoint"][-1] - flight.control["measured"][-1]
+    tracking = live.read()["cloudrc_tracking_error_meters"]
+    assert [tracking[axis,] for axis in "xyz"] == list(newest)
+
+
+def test_the_loss_of_a_flight_is_equal_live_and_in_the_report():
+    flight, world, cloud = lossy()
+    sent = [
+        r.counter
+        for r in world
+        if isinstance(r, TelemetrySent)
+        and flight.start_ns <= r.stamp_ns <= min(flight.end_ns, world[-1].stamp_ns - 2 * SECOND)
+    ]
+    arrivals = [r for r in cloud if isinstance(r, Arrival) and r.counter >= sent[0]]
+    live = LiveMetrics("cloud")
+    live.see([r for r in arrivals if r.counter <= sent[-1] + WINDOW])
+    found = live.read()
+    lost, expected = (
+        found[f"cloudrc_datagrams_{name}_total"]["uplink",] for name in ("lost", "expected")
+    )
+    assert expected == len(sent), "the first one, and that at the window's end, have arrived"
+    assert lost / expected == measured(flight, "loss_uplink") > 0.05
+
+
+def test_the_error_of_an_estimate_is_equal_live_and_in_the_report():
+    """For the report, what cloud measured stands for the truth."""
+    flight, _, cloud = lossy()
+    periods = [r for r in cloud if isinstance(r, Control)]
+    periods = [r for r in periods if flight.start_ns <= r.stamp_ns <= flight.end_ns]
+    log, live = (
+        Log(cloud=[*periods, MissionEvent(flight.end_ns, "done", 0, "")]),
+        LiveMetrics("cloud"),
+    )
+    log.world.append(GuardChange(flight.start_ns, GuardState.TRACK, ""))
+    for each in {r.basis_stamp_ns: r for r in periods}.values():
+        known = Odometry(each.basis_stamp_ns, each.measured, UPRIGHT, ZERO, ZERO)
+        log.world.append(GroundTruth(known.stamp_ns, known, 0.0, 0.0, 0.0, ZERO))
+    live.see(periods)
+    found = live.read()
+    square = found["cloudrc_prediction_error_square_meters_total"][()]
+    count = found["cloudrc_predictions_judged_total"][()]
+    assert count > 0.9 * len(periods)
+    error = measured(log.flight(), "estimate_error_rms")
+    assert math.sqrt(square / count) == pytest.approx(error, rel=1e-9)
+
+
+def test_the_real_time_factor_of_ten_seconds_is_equal_live_and_in_the_report():
+    log = flown()
+    wakes = [Lateness(at(n), "world", 1e-3, 1e-4, n * n * SECOND // 300) for n in range(11)]
+    log.world += wakes
+    live = LiveMetrics("world")
+    live.see(wakes)
+    factor = live.read()["cloudrc_real_time_factor"][()]
+    assert factor == measured(log.flight(), "real_time_factor") < 0.98
+
+
+def test_delay_errors_of_a_flight_match_its_ground_truth():
+    experiment = load_experiment("hover", ["link.profile=paper-p2", "cloud.clock_offset_s=5"])
+    world, cloud = records(experiment)
+    controls = {(c.epoch, c.counter): c for c in cloud if isinstance(c, Control)}
+    truth = set()
+    for applied in (r for r in world if isinstance(r, CommandApplied)):
+        passed_ns = applied.stamp_ns - applied.basis_stamp_ns
+        horizon = controls[applied.epoch, applied.counter].horizon
+        truth.add(round((horizon - passed_ns * 1e-9) * 1e6))
+    live, seen = LiveMetrics("cloud"), set()
+    for record in cloud:
+        live.see([record])
+        error = live.read().get("cloudrc_delay_estimate_error_seconds")
+        if isinstance(record, Control) and error:
+            seen.add(round(error[()] * 1e6))
+    assert len(seen) > 100
+    assert len(seen - truth) <= 0.01 * len(seen), "equal to 1 us, except for rounding"
+
+
+def test_the_prediction_error_is_the_estimate_error_of_the_report():
+    judge, chosen = PredictionJudge(), ("link.profile=paper-p3",)
+    for record in records(load_experiment("steps", chosen))[1]:
+        if isinstance(record, Control):
+            judge.take(record)
+    error = math.sqrt(judge.square / judge.judged)
+    assert error == pytest.approx(numbers(fly("steps", *chosen))["estimate_error_rms"], rel=0.05)
