@@ -65,6 +65,31 @@ class InterruptedRunError(CloudrcError):
     exit_code = 130
 
 
+def machine_error(error: BaseException) -> MissingPrerequisiteError | None:
+    """Return the error to report if the machine has raised `error`; None for all other errors.
+
+    A package that cannot be imported, a lack of memory, a full disk and a missing permission say
+    nothing about the flight in which they occur: it must be flown again.
+    """
+    if isinstance(error, MissingPrerequisiteError):
+        return error
+    if isinstance(error, OSError):
+        if error.errno in DISK_FULL:
+            return DiskFullError(str(error.filename or "this folder"))
+        where = f"{error.filename}: " if error.filename else ""
+        text = to_one_line(f"{where}{error.strerror or error}")
+        return MissingPrerequisiteError(f"{text}; check disk, path and permissions")
+    if isinstance(error, MemoryError):
+        return MissingPrerequisiteError(
+            f"memory ran out ({describe_error(error)}); use fewer processes, or free some memory"
+        )
+    if isinstance(error, ImportError):
+        return MissingPrerequisiteError(
+            f"a package cannot be imported ({describe_error(error)}); install it again"
+        )
+    return None
+
+
 def to_one_line(text: str | None) -> str:
     """Convert text from another program or file to one printable line; None becomes ""."""
     line = " ".join((text or "")[:TEXT_MAX].split())

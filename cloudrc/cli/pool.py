@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from cloudrc.cli.interrupts import is_interrupted, raise_if_interrupted
 from cloudrc.drivers.machine import usable_cores
-from cloudrc.errors import InterruptedRunError, InvalidRunError
+from cloudrc.errors import InterruptedRunError, InvalidRunError, machine_error
 
 Work = TypeVar("Work")
 Result = TypeVar("Result")
@@ -106,7 +106,8 @@ def take_each(
 ) -> tuple[str, int]:
     """Call `take` with each result until the work ends or is interrupted.
 
-    Return "" and 0; if the work ended early, return the reason and the exit code instead.
+    Return "" and 0. If the work ended early, return the reason and the exit code instead: after a
+    signal, or if the machine failed, for example because the disk is full.
     """
     try:
         with closing(results):
@@ -119,7 +120,8 @@ def take_each(
             is_interrupted()
         ):  # the signal also killed a worker, or a library converted its exception
             return "interrupted", InterruptedRunError.exit_code
-        if not isinstance(error, WorkerDiedError):
+        failure = error if isinstance(error, WorkerDiedError) else machine_error(error)
+        if failure is None or isinstance(error, BrokenPipeError):
             raise
-        return str(error), error.exit_code
+        return str(failure), failure.exit_code
     return "", 0

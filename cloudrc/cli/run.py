@@ -29,13 +29,7 @@ from cloudrc.cli.output import (
 )
 from cloudrc.cli.parser import read_count, whole_number
 from cloudrc.cli.report import print_traceback, summary
-from cloudrc.errors import (
-    DISK_FULL,
-    BadInputError,
-    CloudrcError,
-    DiskFullError,
-    InterruptedRunError,
-)
+from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError, machine_error
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
@@ -302,10 +296,8 @@ def fly(
         with record(experiment, folder, see) as flown:
             return write_report(folder, *flown, own=own, page=page)
     except OSError as error:
-        where = str(error.filename or folder)
-        if error.errno in DISK_FULL:
-            raise DiskFullError(where) from error
-        raise CloudrcError(f"{where}: {error.strerror or error}; choose another folder") from error
+        error.filename = str(error.filename or folder)
+        raise machine_error(error) or error from error
 
 
 @contextlib.contextmanager

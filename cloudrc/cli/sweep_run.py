@@ -9,13 +9,14 @@ import statistics
 import sys
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.extras import MODES, require
+from cloudrc.cli.mission import TERMINATION_LOG
 from cloudrc.cli.output import (
     escape,
     format_number,
@@ -33,7 +34,7 @@ from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.pods import refuse_local_files
 from cloudrc.config.document import write_yaml
 from cloudrc.config.overrides import parse_settings
-from cloudrc.errors import BadInputError, InvalidRunError
+from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, describe_error
 from cloudrc.files import write_atomically
 from cloudrc.metrics.verdict import EXIT_CODES
 from cloudrc.sweep import store
@@ -117,7 +118,12 @@ def _keep(
             see(row)
 
         stopped, code = take_each(flown, take)
-    return store.finish(folder, plan), stopped, code
+    try:
+        return store.finish(folder, plan), stopped, code
+    except OSError:
+        if not stopped:
+            raise
+        return store.read_rows(folder), stopped, code  # the reason to tell is the first one
 
 
 def fly_row(flight: Flight, record: str | None = None, folder: Path = Path()) -> Row:
@@ -251,14 +257,36 @@ def rows_from_pods(
 
 
 def print_rows(options: argparse.Namespace) -> int:
-    """Fly one shard (part) of the flights in a file; print the result of each flight as a row."""
+    """Fly one shard (part) of the flights in a file; print the result of each flight as a row.
+
+    If the shard cannot be finished, leave the reason for Kubernetes, which flies the shard again.
+    """
+    try:
+        stopped, code = _print_rows(options)
+    except Exception as error:
+        _leave_message(str(error) if isinstance(error, CloudrcError) else describe_error(error))
+        raise
+    if stopped:
+        print_line(f"cloudrc: error: {stopped}", sys.stderr)
+        _leave_message(stopped)
+    return code
+
+
+def _print_rows(options: argparse.Namespace) -> tuple[str, int]:
     shard, count = options.shard
     flights = unpack(options.file)[shard - 1 :: count]
 
     def print_row(row: Row) -> None:
         print(json.dumps(row, allow_nan=False), flush=True)
 
-    return take_each(map_in_order(fly_row, flights, jobs=1), print_row)[1]
+    return take_each(map_in_order(fly_row, flights, jobs=1), print_row)
+
+
+def _leave_message(text: str) -> None:
+    """Leave one sentence about the end of this pod, which Kubernetes shows with the pod's state."""
+    if TERMINATION_LOG.exists():
+        with suppress(OSError):
+            TERMINATION_LOG.write_text(f"{escape(text)}\n", encoding="utf-8")
 
 
 # `cloudrc run --seeds N`.

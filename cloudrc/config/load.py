@@ -208,16 +208,21 @@ def fingerprint(experiment: ResolvedExperiment) -> str:
     return hashlib.sha256(dump(experiment).encode()).hexdigest()
 
 
-def local_files(value: Any, key: str = "") -> dict[str, str]:
-    """Return dotted key -> path of each existing file whose absolute path is in `value`.
+def local_files(value: Any) -> dict[str, str]:
+    """Return dotted key -> path of each existing file whose absolute path is in `value`."""
+    return {key: path for key, path in absolute_paths(value).items() if Path(path).is_file()}
+
+
+def absolute_paths(value: Any, key: str = "") -> dict[str, str]:
+    """Return dotted key -> each text in `value` that is an absolute path, if only by its form.
 
     `key` is the dotted key of `value` itself.
     """
     if isinstance(value, str):
-        return {key: value} if value.startswith("/") and Path(value).is_file() else {}
+        return {key: value} if value.startswith("/") else {}
     listed = dict(enumerate(value)) if isinstance(value, list) else value
     inner = listed.items() if isinstance(listed, dict) else ()
-    parts = [local_files(each, f"{key}.{name}".lstrip(".")) for name, each in inner]
+    parts = [absolute_paths(each, f"{key}.{name}".lstrip(".")) for name, each in inner]
     return {where: path for part in parts for where, path in part.items()}
 
 

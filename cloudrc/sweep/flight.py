@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from typing import Any, TypeAlias
 
 from cloudrc import assembly, metrics, plugins
-from cloudrc.config.load import ResolvedExperiment
-from cloudrc.errors import describe_error
+from cloudrc.config.load import ResolvedExperiment, absolute_paths
+from cloudrc.errors import MissingPrerequisiteError, describe_error, machine_error
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.report.document import Assessment, Run
 from cloudrc.report.write import assess
@@ -21,12 +22,26 @@ failed, `traceback`. A row of a sweep also has `key`, `point` and `seed`."""
 
 
 def fly_point(experiment: ResolvedExperiment) -> Row:
-    """Fly an experiment in virtual time and measure it; an exception becomes the verdict ERROR."""
+    """Fly an experiment in virtual time and measure it; an exception becomes the verdict ERROR.
+
+    Raises:
+        MissingPrerequisiteError: If the machine failed, not the flight. It must be flown again.
+    """
     try:
         return measure(experiment)
     except (Exception, SystemExit) as error:  # one point that cannot fly must not stop the others
+        if failure := machine_error(error) or _lost_file(experiment):
+            raise failure from error
         text, none = describe_error(error), {"numbers": {}, "records_sha256": ""}
         return {"verdict": ERROR, "failures": [ERROR], "text": text, **none}
+
+
+def _lost_file(experiment: ResolvedExperiment) -> MissingPrerequisiteError | None:
+    """Return an error if a file of the experiment, which was there before, cannot be read."""
+    for path in absolute_paths(experiment.model_dump(mode="json")).values():
+        if not os.access(path, os.R_OK):
+            return MissingPrerequisiteError(f"{path}: cannot be read any more")
+    return None
 
 
 def measure(experiment: ResolvedExperiment) -> Row:

@@ -63,13 +63,18 @@ def append_rows(folder: Path, shard: int | None) -> Iterator[Callable[[Row], Non
     If `shard` is None, the sweep is not divided, and the function appends to its only file.
     """
     path = folder / ("rows.jsonl" if shard is None else f"rows-{shard}.jsonl")
-    with path.open("ab+") as file:
+    with path.open("ab+", buffering=0) as file:
         file.seek(0)
         file.truncate(file.read().rfind(b"\n") + 1)  # a killed process may leave half a line
 
         def append(row: Row) -> None:
-            file.write(json.dumps(row, allow_nan=False).encode() + b"\n")
-            file.flush()
+            rest = memoryview(json.dumps(row, allow_nan=False).encode() + b"\n")
+            try:
+                while rest:  # a disk that becomes full takes a part
+                    rest = rest[file.write(rest) :]
+            except OSError as error:
+                error.filename = str(path)
+                raise
 
         yield append
 

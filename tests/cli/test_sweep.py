@@ -3,8 +3,11 @@
 `cloudrc run --seeds` prints one table of all seeds, or of the finished ones, and writes a sweep.
 """
 
+import errno
+import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,11 +15,13 @@ from pathlib import Path
 
 import pytest
 
+from cloudrc import assembly
 from cloudrc.assembly import assemble
 from cloudrc.cli.sweep import _shard
 from cloudrc.cli.sweep_run import as_table, fly_row, summarise
 from cloudrc.cluster import batch
-from cloudrc.sweep.plan import read_plan
+from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.sweep.plan import pack, read_plan
 from cloudrc.sweep.store import read_rows
 from tests.cli.conftest import KEYS, SHORT
 from tests.conftest import wait_until
@@ -132,6 +137,120 @@ def test_an_error_becomes_a_row_and_the_others_fly(write_sweep, monkeypatch, cal
     assert (bad["verdict"], bad["failures"], bad["numbers"]) == ("error", ["error"], {})
     assert good["verdict"] == "success"
     assert rf"{bad['key']}: error: RuntimeError: no\x1b luck" in out
+
+
+# An error of the machine says nothing about a flight: it ends the sweep, and no row is stored.
+
+MACHINE = {
+    "import": (ImportError("initialization failed"), "a package cannot be imported"),
+    "package": (MissingPrerequisiteError("the simulator needs MuJoCo"), "needs MuJoCo"),
+    "memory": (MemoryError(), "memory ran out"),
+    "disk": (OSError(errno.ENOSPC, "No space left on device", "/tmp/x"), "disk_full: /tmp/x"),
+    "quota": (OSError(errno.EDQUOT, "Disk quota exceeded", "/tmp/x"), "disk_full: /tmp/x"),
+    "permission": (PermissionError(errno.EACCES, "Permission denied", "a.csv"), "a.csv: Permis"),
+    "descriptors": (OSError(errno.EMFILE, "Too many open files"), "Too many open files"),
+}
+
+
+@pytest.fixture(params=MACHINE)
+def broken_machine(request, monkeypatch):
+    """Let the flight with seed 2 meet an error of the machine; return the error's text."""
+    error, said = MACHINE[request.param]
+
+    def fly(experiment):
+        if experiment.seed == 2:
+            raise error
+        return assemble(experiment)
+
+    monkeypatch.setattr("cloudrc.assembly.assemble", fly)
+    return said
+
+
+def test_an_error_of_the_machine_ends_a_sweep_and_is_no_row(broken_machine, write_sweep, call):
+    error = call("sweep run --out grid", write_sweep(ONE, seeds=[1, 2, 3]), code=3).err
+    (line,) = error.splitlines()
+    assert broken_machine in line
+    assert "; to continue: cloudrc sweep run" in line
+    assert [row["seed"] for row in rows("grid")] == [1]
+
+
+def test_an_error_of_the_machine_ends_a_pod_with_one_sentence(
+    broken_machine, write_sweep, call, tmp_path, monkeypatch
+):
+    """No exit code 2: with all others, Kubernetes flies the shard again."""
+    log = tmp_path / "termination-log"
+    log.touch()
+    monkeypatch.setattr("cloudrc.cli.sweep_run.TERMINATION_LOG", log)
+    plan = read_plan(write_sweep(ONE, seeds=[1, 2, 3]))
+    (tmp_path / "flights").write_bytes(pack(plan.flights.values()))
+    out, error = call("sweep rows", tmp_path / "flights", code=3)
+    assert [json.loads(line)["seed"] for line in out.splitlines()] == [1]
+    (line,) = error.splitlines()
+    assert broken_machine in line
+    assert line == f"cloudrc: error: {log.read_text()}".rstrip()
+
+
+def test_a_pod_with_other_input_says_so_in_one_sentence(tmp_path, call, monkeypatch):
+    log = tmp_path / "termination-log"
+    log.touch()
+    monkeypatch.setattr("cloudrc.cli.sweep_run.TERMINATION_LOG", log)
+    (tmp_path / "flights").write_bytes(b"other")
+    call("sweep rows", tmp_path / "flights", code=2)
+    assert "is not a file of flights" in log.read_text()
+
+
+def test_a_file_that_is_lost_during_the_sweep_ends_it(write_sweep, tmp_path, call, monkeypatch):
+    """MuJoCo reports a lost scene like a scene that does not compile."""
+    scene = tmp_path / "mine.xml"
+    shutil.copy(Path(assembly.__file__).parent / "world/scenes/empty.xml", scene)
+    path = write_sweep({"world.scene": [str(scene), "empty"]})
+
+    def lose(experiment):
+        scene.unlink(missing_ok=True)
+        return assemble(experiment)
+
+    monkeypatch.setattr("cloudrc.assembly.assemble", lose)
+    assert f"{scene}: cannot be read any more" in call("sweep run --out grid", path, code=3).err
+    assert rows("grid") == []
+
+
+def test_a_full_disk_keeps_the_earlier_rows_and_ends_the_sweep(write_sweep, call, monkeypatch):
+    """The file system takes a part of the second row, and nothing after it."""
+    path, real, written = write_sweep(ONE, seeds=3), Path.open, []
+
+    class SmallDisk(io.FileIO):
+        def write(self, data):
+            written.append(data)
+            if len(written) == 1:
+                return super().write(data)
+            if len(written) == 2:
+                return super().write(data[:9])
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "open", lambda self, *mode, **words: (
+        SmallDisk(self, "ab+") if self.name == "rows.jsonl" and mode == ("ab+",)
+        else real(self, *mode, **words)
+    ))  # fmt: skip
+    error = call("sweep run --out grid", path, code=3).err
+    assert "disk_full: grid/rows.jsonl: free some space" in error
+    assert [row["seed"] for row in rows("grid")] == [1]
+    monkeypatch.setattr(Path, "open", real)
+    call("sweep run --out grid", path)
+    assert [row["seed"] for row in rows("grid")] == [1, 2, 3]
+
+
+def _end(flight, **words):
+    if flight.seed == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return fly_row(flight)
+
+
+def test_a_killed_worker_ends_a_sweep_and_is_no_row(write_sweep, call, monkeypatch):
+    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 2)
+    monkeypatch.setattr("cloudrc.cli.sweep_run.fly_row", _end)
+    error = call("sweep run --out grid", write_sweep(ONE, seeds=[1, 2, 3, 4]), code=6).err
+    assert "a worker was killed, perhaps by the kernel because memory ran out" in error
+    assert "error" not in {row["verdict"] for row in rows("grid")}
 
 
 @pytest.mark.parametrize(
