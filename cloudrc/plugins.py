@@ -21,8 +21,9 @@ import inspect
 import pkgutil
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import EntryPoint, entry_points
+from numbers import Real
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -32,6 +33,7 @@ from cloudrc.errors import (
     CloudrcError,
     OutOfMemoryError,
     describe_error,
+    to_one_line,
 )
 
 PACKAGES = {
@@ -41,6 +43,8 @@ PACKAGES = {
     "metrics": "",
 }
 """Kind of plug-in -> package that contains cloudrc's plug-ins of this kind; "" for metrics."""
+SHOWN_MAX = 60
+"""Largest length of a wrong value's representation in a message [characters]."""
 METHODS = {"estimators": "horizon", "predictors": "predict", "controllers": "update"}
 """Kind of plug-in -> the method that every plug-in of this kind defines."""
 
@@ -118,6 +122,33 @@ def refuse_failure(what: str) -> Iterator[None]:
     except BaseException as error:
         check_failure(error, what)
         raise BadInputError(f"{what}: {_explain(error)}") from error
+
+
+class InvalidResultError(ValueError):
+    """A plug-in returned a value of a wrong type or shape, or a number that is not finite."""
+
+
+def to_number(value: Any, name: str) -> float:
+    """Convert a number that a plug-in returned to a float; `name` names it in the error's text.
+
+    A scalar or an array without dimensions of numpy, PyTorch or JAX is a number. A boolean, a text,
+    a Decimal, and an integer that no float can hold are none: they raise an InvalidResultError.
+    """
+    if type(value) is float:
+        return value
+    plain = value.item() if getattr(value, "shape", None) == () else value
+    if not isinstance(plain, bool) and isinstance(plain, Real):
+        with suppress(OverflowError):
+            return float(plain)
+    raise InvalidResultError(f"its {name} is {shorten(value)}, which is no number")
+
+
+def shorten(value: Any) -> str:
+    """Describe a value in a short text: its type and, as far as it has one, its representation."""
+    shown = ""
+    with suppress(Exception):  # a user's __repr__ may raise, and so does that of a huge integer
+        shown = to_one_line(repr(value))[:SHOWN_MAX]
+    return f"{type(value).__name__} {shown}".strip()
 
 
 def is_path(name: str) -> bool:

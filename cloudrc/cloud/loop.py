@@ -22,11 +22,12 @@ from collections.abc import Callable
 from copy import deepcopy
 from math import isfinite, nan
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.predictors import Predictor
+from cloudrc.cloud.results import check_estimate, check_output, refuse, to_vector
 from cloudrc.errors import describe_error
 from cloudrc.messages import (
     NEVER_NS,
@@ -39,7 +40,7 @@ from cloudrc.messages import (
     Vector,
     plan_length,
 )
-from cloudrc.plugins import check_failure, refuse_failure
+from cloudrc.plugins import InvalidResultError, check_failure, refuse_failure, to_number
 from cloudrc.records import Control, Fault
 from cloudrc.teleop.carrot import setpoint_at
 from cloudrc.tunnel.codec import as_planned
@@ -69,10 +70,6 @@ PLAN_STEP = PLAN_STEP_NS * 1e-9
 PLANNED_MAX = 1000.0
 """Largest component of a planned velocity [m/s]; the guard refuses a plan with a larger one.
 Source: docs/reference/faults.md, "F23"."""
-
-
-class InvalidResultError(ValueError):
-    """A plug-in returned a value that is not a number, or not finite."""
 
 
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
@@ -212,15 +209,14 @@ class ControlLoop:
         `age` is cloud's time minus the stamp of the newest odometry on world's clock [s].
 
         Raises:
-            InvalidResultError: If the estimator's horizon is not finite.
+            InvalidResultError: If the estimator's horizon is not a finite number.
         """
-        horizon = float(self._estimator.horizon(age))
+        horizon = to_number(self._estimator.horizon(age), "horizon")
         if horizon == 0.0 and self._newest_echo_ns == NEVER_NS:
             horizon = self._expected
         if 0.0 <= horizon <= self._horizon_max:
             return horizon
-        if not isfinite(horizon):
-            raise InvalidResultError(f"its horizon is {horizon}")
+        refuse("horizon", horizon)
         self.counts["horizon_clamped"] += 1
         return min(max(horizon, 0.0), self._horizon_max)
 
@@ -276,31 +272,16 @@ class ControlLoop:
         faults, self.faults = self.faults, []
         return faults
 
-    # A sum is finite only if all terms are finite. Finite terms whose sum overflows are refused,
-    # too, because no robot can fly them.
-
     def _predict(self, basis: Odometry, horizon: float) -> Odometry:
         try:
-            estimate = self._predictor.predict(basis, horizon)
-            stamp_ns, position, (w, x, y, z), velocity, rate = estimate
-            position, velocity = _triple(position), _triple(velocity)
-            orientation = (float(w), float(x), float(y), float(z))
-            if not isfinite(sum(position + velocity + orientation)):
-                _refuse(position=position, velocity=velocity, orientation=orientation)
-            return _new(Odometry, (stamp_ns, position, orientation, velocity, rate))
+            return check_estimate(self._predictor.predict(basis, horizon))
         except BaseException as error:
             self._note("predictor", error)
             return basis
 
     def _steer(self, estimate: Odometry, setpoint: Setpoint, dt: float) -> ControlOutput:
         try:
-            output = self._controller.update(estimate, setpoint, dt)
-            velocity, yaw_rate, proportional, integral, derivative = output
-            velocity, yaw_rate = _triple(velocity), float(yaw_rate)
-            if not isfinite(sum(velocity, yaw_rate)):
-                _refuse(velocity=velocity, yaw_rate=(yaw_rate,))
-            terms = (_triple(proportional), _triple(integral), _triple(derivative))
-            return _new(ControlOutput, (velocity, yaw_rate, *terms))
+            return check_output(self._controller.update(estimate, setpoint, dt))
         except BaseException as error:
             self._note("controller", error)
             return STAND_STILL
@@ -328,11 +309,18 @@ class ControlLoop:
             for k in range(1, self._planned + 1):
                 plug_in = "predictor"
                 state = model.step(velocity, PLAN_STEP)
+                if type(state) is not Odometry:
+                    state = check_estimate(state)
                 later = setpoint_at(setpoint, now_ns + k * PLAN_STEP_NS)
                 plug_in = "controller"
-                x, y, z = controller.update(state, later, PLAN_STEP).velocity
-                velocity = (float(x), float(y), float(z))
-                if not (isfinite(sum(velocity)) and max(map(abs, velocity)) <= PLANNED_MAX):
+                output = controller.update(state, later, PLAN_STEP)
+                velocity = to_vector(output.velocity, "planned velocity")
+                if not isfinite(sum(velocity)):
+                    plug_in = "predictor"
+                    check_estimate(state)  # a wrong state is the model's failure
+                    plug_in = "controller"
+                    refuse("planned velocity", *velocity)
+                if max(map(abs, velocity)) > PLANNED_MAX:
                     break
                 plan.append(as_planned(velocity))
         except BaseException as error:
@@ -378,18 +366,3 @@ class ControlLoop:
 def _locate(error: BaseException) -> str:
     frame = traceback.extract_tb(error.__traceback__)[-1]
     return f"{Path(frame.filename).name}:{frame.lineno} in {frame.name}"
-
-
-def _refuse(**values: tuple[float, ...]) -> NoReturn:
-    """Raise an InvalidResultError that names the first value that is not finite."""
-    wrong = (each for each in values.items() if not isfinite(sum(each[1])))
-    name, value = next(wrong, next(iter(values.items())))
-    shown = ", ".join(f"{number:.4g}" for number in value)
-    raise InvalidResultError(f"its {name} is ({shown})")
-
-
-def _triple(numbers: Vector) -> Vector:
-    x, y, z = numbers
-    if float is type(x) is type(y) is type(z) and type(numbers) is tuple:  # save time
-        return numbers
-    return float(x), float(y), float(z)

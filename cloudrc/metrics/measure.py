@@ -105,11 +105,13 @@ def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Numb
         name = name_of(choice)
         try:
             metric = find(choice)
-            value = metric.measure(flight)
-            if value is not None and isfinite(value):
-                numbers[name] = Number(float(value), metric.unit, metric.meaning)
-            elif value is not None:
-                notes.append(f"{METRIC_NOTE}{name} gave {value}: left out")
+            if (value := metric.measure(flight)) is None:
+                continue
+            number = plugins.to_number(value, "value")
+            if isfinite(number):
+                numbers[name] = Number(number, metric.unit, metric.meaning)
+            else:
+                notes.append(f"{METRIC_NOTE}{name} gave {number}: left out")
         except BaseException as error:
             plugins.check_failure(error, f"{METRIC_NOTE}{name}")
             notes.append(f"{METRIC_NOTE}{name} failed: {describe_error(error)}")

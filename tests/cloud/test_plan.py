@@ -1,5 +1,7 @@
 """Plans: the controller's future commands, by the predictor's model and the future setpoints."""
 
+from math import nan
+
 import pytest
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
@@ -62,14 +64,20 @@ def test_a_plan_does_not_change_the_controller():
     assert controller.seen == []
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1000.1])
-def test_a_plan_ends_before_a_velocity_that_the_guard_refuses(bad):
-    class Breaking(Integrating):
-        def update(self, estimate, setpoint, dt):
-            self.asked += 1
-            return ControlOutput((1.0, bad if self.asked == 3 else 0.0, 0.0), 0.0)
+class Breaking(Integrating):
+    """A controller whose third command is wrong."""
 
-    assert len(make_plan(Breaking(), Setpoint(ZERO), ZERO, 0, 9)) == 2
+    def __init__(self, wrong):
+        super().__init__()
+        self.wrong = wrong
+
+    def update(self, estimate, setpoint, dt):
+        self.asked += 1
+        return ControlOutput((1.0, self.wrong if self.asked == 3 else 0.0, 0.0), 0.0)
+
+
+def test_a_plan_ends_before_a_velocity_that_the_guard_refuses():
+    assert len(make_plan(Breaking(1000.1), Setpoint(ZERO), ZERO, 0, 9)) == 2
 
 
 def test_a_command_has_the_plan_and_its_time():
@@ -97,6 +105,26 @@ class Uncopied(Integrating):
         raise TypeError("cannot copy")
 
 
+class Lost(Modelled):
+    """A predictor whose model returns a wrong state."""
+
+    def __init__(self, state):
+        self.state = state
+
+    def model(self):
+        model = Model()
+        model.step = lambda velocity, dt: self.state
+        return model
+
+
+class Following(Controller):
+    def update(self, estimate, setpoint, dt):
+        return ControlOutput((1.0, 0.0 * estimate.position[0], 0.0), 0.0)
+
+
+NOWHERE = Odometry(0, (nan, 0.0, 0.0), UPRIGHT, ZERO, ZERO)
+
+
 class Impatient(Integrating):
     def update(self, estimate, setpoint, dt):
         return ControlOutput((1.0, 0.0, 0.0), 0.0) if estimate.stamp_ns else 1 / 0
@@ -108,6 +136,10 @@ class Impatient(Integrating):
         (Broken(), Integrating(), "predictor", "in model"),
         (Modelled(), Uncopied(), "controller", "cannot copy"),
         (Modelled(), Impatient(), "controller", "in update"),
+        (Modelled(), Breaking(nan), "controller", "its planned velocity is (1, nan, 0)"),
+        (Modelled(), Breaking("1"), "controller", "its planned velocity is str '1'"),
+        (Lost(None), Following(), "predictor", "its result is NoneType None, not 5 values"),
+        (Lost(NOWHERE), Following(), "predictor", "its position is (nan, 0, 0)"),
     ],
 )
 def test_without_its_plan_a_command_leaves_and_a_fault_says_why(predictor, controller, kind, text):

@@ -1,0 +1,97 @@
+"""Check the values that plug-ins return, so that only valid ones reach commands and recordings.
+
+A plug-in may return anything. Each function here returns the value with plain floats, or raises an
+`InvalidResultError`, which counts as a failure of the plug-in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Set
+from itertools import islice
+from math import isfinite, sqrt
+from typing import Any, NoReturn
+
+from cloudrc.cloud.controllers import ControlOutput
+from cloudrc.messages import Odometry, Quaternion, Vector
+from cloudrc.plugins import InvalidResultError, shorten, to_number
+
+SQUARE_TOLERANCE = 0.01
+"""Largest deviation from 1 of an orientation's squared length [1]. A smaller one, such as that of a
+first-order integration, is scaled away. ROS's tf2 accepts the same deviation."""
+SQUARE_ROUNDING = 1e-9
+"""Deviation from 1 of an orientation's squared length that comes from rounding [1]."""
+_new = tuple.__new__  # makes a named tuple twice as fast as its class does
+
+# A sum is finite only if all terms are finite. Finite terms whose sum overflows are refused, too,
+# because no robot can fly them.
+
+
+def check_estimate(estimate: Any) -> Odometry:
+    """Check the odometry that a predictor or its model returned; return it with plain numbers."""
+    stamp_ns, position, orientation, velocity, rate = _unpack(estimate, 5, "result")
+    position, velocity = to_vector(position, "position"), to_vector(velocity, "velocity")
+    rate = to_vector(rate, "angular velocity")
+    w, x, y, z = _unpack(orientation, 4, "orientation")
+    if not float is type(w) is type(x) is type(y) is type(z):
+        w, x, y, z = (to_number(each, "orientation") for each in (w, x, y, z))
+    square = w * w + x * x + y * y + z * z
+    if not isfinite(sum(position + velocity + rate)) or not abs(square - 1.0) <= SQUARE_TOLERANCE:
+        _refuse_estimate(position, velocity, rate, (w, x, y, z))
+    if abs(square - 1.0) > SQUARE_ROUNDING:
+        length = sqrt(square)
+        w, x, y, z = w / length, x / length, y / length, z / length
+    stamp = to_number(stamp_ns, "stamp")
+    refuse("stamp", stamp)
+    whole_ns = stamp_ns if type(stamp_ns) is int else round(stamp)
+    return _new(Odometry, (whole_ns, position, (w, x, y, z), velocity, rate))
+
+
+def check_output(output: Any) -> ControlOutput:
+    """Check the output of a controller; return it with plain numbers."""
+    velocity, yaw_rate, *given = _unpack(output, 5, "result")
+    velocity, yaw_rate = to_vector(velocity, "velocity"), to_number(yaw_rate, "yaw rate")
+    proportional, integral, derivative = (to_vector(each, "PID term") for each in given)
+    if not isfinite(sum(velocity + proportional + integral + derivative, yaw_rate)):
+        refuse("velocity", *velocity)
+        refuse("yaw rate", yaw_rate)
+        refuse("PID terms", *proportional, *integral, *derivative)
+    return _new(ControlOutput, (velocity, yaw_rate, proportional, integral, derivative))
+
+
+def to_vector(numbers: Any, name: str) -> Vector:
+    """Return three numbers as a tuple of floats; `name` names the value in the error's text."""
+    x, y, z = _unpack(numbers, 3, name)
+    if float is type(x) is type(y) is type(z):
+        return numbers if type(numbers) is tuple else (x, y, z)
+    return to_number(x, name), to_number(y, name), to_number(z, name)
+
+
+def refuse(name: str, *numbers: float) -> None:
+    """Raise an InvalidResultError if one of the numbers is not finite, or if their sum is not."""
+    if not isfinite(sum(numbers)):
+        raise InvalidResultError(f"its {name} is ({', '.join(f'{each:.4g}' for each in numbers)})")
+
+
+def _refuse_estimate(
+    position: Vector, velocity: Vector, rate: Vector, orientation: Quaternion
+) -> NoReturn:
+    refuse("position", *position)
+    refuse("velocity", *velocity)
+    refuse("angular velocity", *rate)
+    refuse("orientation", *orientation)
+    refuse("result", *position, *velocity, *rate)
+    shown = ", ".join(f"{each:.4g}" for each in orientation)
+    length = sqrt(sum(each * each for each in orientation))
+    raise InvalidResultError(f"its orientation ({shown}) has the length {length:.4g}, not 1")
+
+
+def _unpack(value: Any, count: int, name: str) -> tuple[Any, ...]:
+    """Return the `count` parts of a value, in order."""
+    if isinstance(value, tuple) and len(value) == count:
+        return value
+    parts: tuple[Any, ...] = ()
+    if isinstance(value, Iterable) and not isinstance(value, str | bytes | Set | Mapping):
+        parts = tuple(islice(value, count + 1))  # it may be endless
+    if len(parts) != count:
+        raise InvalidResultError(f"its {name} is {shorten(value)}, not {count} values")
+    return parts
