@@ -85,7 +85,8 @@ def start_mission(experiment: ResolvedExperiment, now_ns: int = 0) -> Teleop:
     from cloudrc.teleop.store import Mission, Order
 
     teleop = Teleop()
-    teleop.start(now_ns, Mission("m1", Order(build_plan(experiment)), ONLY_MISSION))
+    order = Order(build_plan(experiment), contact=bool(experiment.criteria.contact))
+    teleop.start(now_ns, Mission("m1", order, ONLY_MISSION))
     return teleop
 
 

@@ -129,7 +129,7 @@ class Telemetry(NamedTuple):
     slip_ns: Slip
     mission: Annotated[int, "", "number of the last operator's request that world obeyed"]
     guard: Annotated[GuardState, "", STATES]
-    pipe_contacts: Annotated[int, "", "contacts with a pipe that began in this mission"] = 0
+    obstacle_contacts: Annotated[int, "", "contacts with obstacles that began in this mission"] = 0
     touch_speed: Annotated[float, "m/s", "of the tip's first contact with the board, or NaN"] = nan
     mission_id: Annotated[int, "", "identity of the mission started last; 0 if none"] = 0
     reached: Annotated[int, "", f"waypoints reached; {MISSION_OVER} if the mission is over"] = 0
@@ -182,6 +182,8 @@ class OperatorRequest(NamedTuple):
     # Stamp of cloud's newest odometry when cloud forwarded the request [ns], world's clock.
     basis_stamp_ns: int = NEVER_NS
     epoch: int = 0  # session that teleop saw when it made the request, for cloud only; 0 for none
+    # Whether the mission has to touch the board, so that the board is no obstacle; for START only.
+    contact: bool = False
 
 
 class Motion(NamedTuple):

@@ -149,6 +149,16 @@ def refused(call):
     return run
 
 
+@pytest.fixture
+def no_page(monkeypatch):
+    """Leave out the figures of a report, which take longer than a flight."""
+
+    def write_page(folder, *assessment):
+        (folder / "report.html").write_text("drawn elsewhere")
+
+    monkeypatch.setattr("cloudrc.report.write._write_page", write_page)
+
+
 @pytest.fixture(scope="session")
 def chromium():
     """A headless Chromium, for `browse`; tests that use it carry the mark `process`."""

@@ -19,6 +19,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "messages": set(),
     "records": set(),
+    "renamed": set(),
     "endpoint": set(),
     "files": set(),
     "geometry": set(),
@@ -47,7 +48,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "__main__": {"cli"},
     "__init__": {"api"},
 }
-ALWAYS = {"errors", "messages", "records", "__version__"}
+ALWAYS = {"errors", "messages", "records", "renamed", "__version__"}
 
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it. Ruff checks
 # clocks, sockets, threads, signals, chance, and calls such as `eval` and `print` (pyproject.toml).

@@ -21,6 +21,7 @@ from cloudrc.cli.output import (
 from cloudrc.cli.parser import read_count
 from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.errors import BadInputError
+from cloudrc.renamed import new_name
 
 if TYPE_CHECKING:
     from cloudrc.sweep.compare import Found
@@ -53,7 +54,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     flight_arguments(parser, seeds=10)
     add("--in", type=Path, dest="sweep", metavar="DIR", help="compare flights of this sweep")
     about = "compare this metric instead of the default ones; repeatable"
-    add("--number", action="append", default=[], metavar="NAME", help=about)
+    add("--number", action="append", type=new_name, default=[], metavar="NAME", help=about)
     output_argument(parser)
 
 

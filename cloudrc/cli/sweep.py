@@ -11,6 +11,7 @@ from cloudrc.cli.cluster_flags import release_arguments
 from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import output_argument
 from cloudrc.cli.parser import COUNT_MAX, add_verbs, figure_arguments, read_count
+from cloudrc.renamed import new_name
 
 VERBS = {
     "run": "fly all points of a grid, or those that are missing in --out",
@@ -67,7 +68,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     output_argument(status)
     add = figure.add_argument
     about = "metric to draw; repeatable (default: three that matter first)"
-    add("--number", action="append", default=[], metavar="NAME", help=about)
+    add("--number", action="append", type=new_name, default=[], metavar="NAME", help=about)
     about = "axis of the sweep along x (default: the first one with numbers)"
     add("--x", metavar="AXIS", help=about)
     about = "axis with one line per value (default: the first with names, else the next one)"

@@ -66,11 +66,11 @@ def make_robot_status(
     # fmt: off
     stamp_ns, odometry, _, echo_ns, hold_ns, slip_ns, mission, guard, *rest = telemetry
     _, position, orientation, velocity, _ = odometry
-    pipes, touch, mission_id, reached, cause = rest
+    obstacles, touch, mission_id, reached, cause = rest
     age_ns = NEVER_NS if echo_ns == NEVER_NS else hold_ns
     return _new(RobotStatus, (
-        epoch, position, guard, mission, world, pipes, touch, slip_ns, mission_id, reached, cause,
-        stamp_ns, orientation, velocity, age_ns, delay, control,
+        epoch, position, guard, mission, world, obstacles, touch, slip_ns, mission_id, reached,
+        cause, stamp_ns, orientation, velocity, age_ns, delay, control,
     ))
     # fmt: on
 

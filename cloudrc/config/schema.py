@@ -507,8 +507,8 @@ class Criteria(Section):
     """Conditions for the success of a flight."""
 
     contact: bool | None = None
-    """Whether the tip of the arm must touch the board; null: only in a scene that has a board, and
-    not with random steps"""
+    """Whether the tip of the arm must touch the board; if not, the board is an obstacle. null: only
+    in a scene that has a board, and not with random steps"""
     contact_speed_max_mps: Positive = 0.25
     """Largest speed of the tip when it touches the board [m/s]; with a higher speed the flight
     fails"""

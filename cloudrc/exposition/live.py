@@ -206,8 +206,8 @@ class WorldEnd(End):
         values["cloudrc_guard_state"] = state
 
     def _on_contact(self, record: Contact) -> None:
-        kind, contacts = record.body.rstrip("_0123456789"), self._values["cloudrc_contacts_total"]
-        contacts[kind if kind in contacts else "other"] += 1
+        contacts = self._values["cloudrc_contacts_total"]
+        contacts[record.body if record.body in contacts else "obstacle"] += 1
 
     def _on_lateness(self, record: Lateness) -> None:
         super()._on_lateness(record)

@@ -39,8 +39,8 @@ GUARD_CAUSES = {cause: cause.words.partition(",")[0] for cause in Cause}
 MISSION_STATES = ("idle", "starting", "flying", "held", "done", "failed", "cancelled")
 """States of a mission; the value of `cloudrc_mission_state` is the index of the state."""
 MISSION_OUTCOMES = ("done", "cancelled", *FAILURES, "other")
-BODIES = ("pipe", "board", "floor", "other")
-"""Kinds of bodies that the robot can touch, such as "pipe" for the body `pipe_2`."""
+BODIES = ("floor", "board", "obstacle")
+"""Kinds of bodies that the robot can touch; an obstacle is any body but the first two."""
 LINK_OUTCOMES = ("received", "forwarded", "lost", "malformed", "overflow", "unread", "unsent")
 """Outcomes of a datagram at the relay; `cloudrc.link.relay.Relay.counts` explains them."""
 RELEASE_PERCENTILES = ("50", "99", "99.9")

@@ -22,6 +22,9 @@ from cloudrc.messages import Vector
 
 SPAWN: Vector = (0.0, 0.0, 0.1)
 """Position of the base at the start of a mission in the shipped scenes [m], world frame."""
+FLOOR, BOARD, WORLD = "floor", "board", "world"
+"""Names of the body on which the robot stands, of the body that a mission may have to touch, and of
+all geoms in a scene's worldbody."""
 SCENES = Path(__file__).parents[1] / "world" / "scenes"
 
 
@@ -55,6 +58,15 @@ class Scene:
     board: Board | None = None
     floor: float = 0.0  # z of the floor [m], world frame
     spawn: Vector = SPAWN  # position of the base at the start of a mission [m], world frame
+
+
+def is_obstacle(body: str, *, contact: bool) -> bool:
+    """Return whether the robot must not touch a body, given by its name.
+
+    Every body but the floor is an obstacle. If the mission has to touch the board (`contact`, of
+    criteria.contact), the board is none.
+    """
+    return body != FLOOR and not (contact and body == BOARD)
 
 
 def load_scene(name: str) -> Scene:

@@ -21,6 +21,7 @@ from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording, Table
 from cloudrc.records import UNDER_WAY
+from cloudrc.renamed import new_name
 
 Array: TypeAlias = NDArray[Any]
 Columns: TypeAlias = dict[str, Array]
@@ -164,13 +165,22 @@ class Flight:
         return select(columns, rows)
 
 
+class _Columns(Columns):
+    """Columns by name; the old name of a column finds it, too."""
+
+    def __missing__(self, name: str) -> Array:
+        if (new := new_name(name)) == name:
+            raise KeyError(name)
+        return self[new]
+
+
 def _columns(table: Table) -> Columns:
-    return {name: table[name] for name in table.names}
+    return _Columns((name, table[name]) for name in table.names)
 
 
 def select(columns: Columns, rows: Array) -> Columns:
     """Select rows of all columns by `rows` [1]: an index, indices, or a truth value per row."""
-    return {name: column[rows] for name, column in columns.items()}
+    return _Columns((name, column[rows]) for name, column in columns.items())
 
 
 Measure: TypeAlias = Callable[[Flight], float | None]

@@ -13,6 +13,7 @@ from cloudrc import plugins
 from cloudrc.errors import BadInputError, describe_error
 from cloudrc.metrics import control, link, mission, response
 from cloudrc.metrics.flight import SHIPPED, Flight, Metric
+from cloudrc.renamed import new_name
 
 # The imported modules add the metrics of cloudrc to SHIPPED.
 __all__ = ["SHIPPED", "Flight", "Metric", "control", "link", "mission", "response"]
@@ -46,6 +47,7 @@ def find(choice: str) -> Metric:
     Raises:
         BadInputError: If the metric does not exist, or if the file defines no metric.
     """
+    choice = new_name(choice)
     if choice in SHIPPED:
         return SHIPPED[choice]
     known = [*SHIPPED, *plugins.names("metrics")]

@@ -8,11 +8,10 @@ from functools import partial
 import numpy as np
 
 from cloudrc.config.schema import Waypoint
+from cloudrc.geometry.scene import BOARD, is_obstacle
 from cloudrc.messages import GuardState
 from cloudrc.metrics.flight import Array, Flight, Measure, add_metrics, mean, select
 
-BOARD = "board"
-"""Name in the scene of the board that the arm must touch."""
 IMPACT_NS = 100_000_000
 """Time from the first touch over which the impulse is summed [ns]: the impact and its bounces."""
 ODOMETRY_NS = 10_000_000
@@ -132,11 +131,11 @@ def _steady_force(flight: Flight, touch: dict[str, Array]) -> float | None:
     return mean(force["tip_force"][force["stamp_ns"] >= begin_ns])
 
 
-def _pipe_contacts(flight: Flight) -> float | None:
-    if not flight.scene.pipes:
-        return None
-    bodies = flight.during("/contact")["body"]
-    return flight.count(sum(str(body).startswith("pipe") for body in bodies))
+def obstacle_contacts(flight: Flight) -> dict[str, Array]:
+    """Select the rows of /contact in which the robot touches an obstacle."""
+    contact, board = flight.during("/contact"), bool(flight.criteria.contact)
+    rows = [is_obstacle(str(body), contact=board) for body in contact["body"]]
+    return select(contact, np.array(rows, dtype=bool))
 
 
 def _steady_error(flight: Flight, axis: int) -> float | None:
@@ -175,12 +174,13 @@ def _recorder_dropped(flight: Flight) -> float | None:
     return float(sum(last.values())) if last else None
 
 
-add_metrics("Distance to the pipes",
-            ("pipe_contacts", "1", "Number of contacts with a pipe.", _pipe_contacts))  # fmt: skip
 add_metrics(
     "Mission",
     ("waypoints_reached", "1", "Number of waypoints at which the true position stayed within the "
      "tolerance for the dwell time.", _waypoints_reached),
+    ("obstacle_contacts", "1", "Number of contacts with obstacles. These are all bodies but the "
+     "floor and, if the mission has to touch it, the board.",
+     lambda flight: flight.count(len(obstacle_contacts(flight)["stamp_ns"]))),
     ("contact_time", "s", "Time from the start of the mission to the arm's first touch of the "
      "board.", _of_touch(lambda flight, touch: float(flight.seconds(touch["stamp_ns"])))),
     ("tip_speed", "m/s", "Speed of the arm's tip just before it first touches the board.",

@@ -26,7 +26,7 @@ from cloudrc.errors import DISK_FULL, DiskFullError
 from cloudrc.messages import GuardState, Vector
 from cloudrc.metrics import Flight, Number
 from cloudrc.metrics.definitions import real_time_factor
-from cloudrc.metrics.mission import first_touch, reported
+from cloudrc.metrics.mission import first_touch, obstacle_contacts, reported
 from cloudrc.metrics.response import steps
 from cloudrc.records import REAL_TIME_FACTOR_MIN
 
@@ -151,9 +151,9 @@ def _unmet_goals(evidence: Evidence) -> Iterator[Failure]:
         yield Failure("time_limit_exceeded", text, *end)
 
 
-def _pipe_touched(name: str, count: int, moment: Moment = UNKNOWN) -> Failure:
+def _obstacle_touched(name: str, count: int, moment: Moment = UNKNOWN) -> Failure:
     times = f" ({count} times)" if count > 1 else ""
-    return Failure("pipe_touched", f"the robot touched {name}{times}", *moment)
+    return Failure("obstacle_touched", f"the robot touched {name}{times}", *moment)
 
 
 def _too_slow(factor: float) -> str:
@@ -191,7 +191,7 @@ def flight_evidence(
 
 def _violations(flight: Flight) -> Iterator[Failure]:
     """Yield a failure for each recorded event that a successful flight must not have."""
-    yield from _pipes(flight)
+    yield from _obstacles(flight)
     yield from _interventions(flight)
     yield from _restarts(flight)
     yield from _plugins(flight)
@@ -220,14 +220,14 @@ def _moment(flight: Flight, stamp_ns: int) -> Moment:
     return Moment(float(flight.seconds(stamp_ns)), place)
 
 
-def _pipes(flight: Flight, until_ns: float = inf) -> Iterator[Failure]:
-    """Yield a failure for each pipe that the robot touched at or before `until_ns`."""
-    contact = flight.during("/contact")
-    for body in sorted({str(body) for body in contact["body"] if str(body).startswith("pipe")}):
+def _obstacles(flight: Flight, until_ns: float = inf) -> Iterator[Failure]:
+    """Yield a failure for each obstacle that the robot touched at or before `until_ns`."""
+    contact = obstacle_contacts(flight)
+    for body in sorted(set(map(str, contact["body"]))):
         stamps = contact["stamp_ns"][contact["body"] == body]
         stamps = stamps[stamps <= until_ns]
         if len(stamps):
-            yield _pipe_touched(body, len(stamps), _moment(flight, int(stamps[0])))
+            yield _obstacle_touched(body, len(stamps), _moment(flight, int(stamps[0])))
 
 
 def _interventions(flight: Flight) -> Iterator[Failure]:
@@ -303,7 +303,7 @@ def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, N
 
     A waypoint is reached if teleop reported it, and timing is judged by the real-time factor alone.
     Contacts count if telemetry reported them before the end. The time limit and violations other
-    than contacts with pipes do not count. All other facts are those of the report's `evidence`.
+    than contacts with obstacles do not count. All other facts are those of the report's `evidence`.
     """
     basis = flight.control["basis_stamp_ns"]
     seen_ns = int(basis[-1]) if len(basis) else 0
@@ -312,7 +312,7 @@ def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, N
         evidence,
         reached=len(reported(flight)),
         touch=evidence.touch if touch is not None and touch["stamp_ns"] <= seen_ns else None,
-        violations=tuple(_pipes(flight, seen_ns)),
+        violations=tuple(_obstacles(flight, seen_ns)),
         time_limit=inf,
         slow=_too_slow(factor.value) if evidence.slow and factor is not None else "",
     )
@@ -323,7 +323,7 @@ def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, N
 class Observations:
     """Contacts in a mission, and lag of world's clock (slip), as telemetry reports them."""
 
-    pipe_contacts: int = 0  # number of contacts with pipes
+    obstacle_contacts: int = 0  # number of contacts with obstacles
     touch_speed: float | None = None  # of the arm's tip at its first touch of the board [m/s]
     slip_ns: int = 0  # time by which world's clock fell behind while teleop ran [ns]
 
@@ -332,8 +332,8 @@ class Observations:
 
         `elapsed` is the present mission time [s].
         """
-        if self.pipe_contacts > before.pipe_contacts:
-            yield "pipe_touched", f"the robot touched a pipe at {elapsed:.2f} s"
+        if self.obstacle_contacts > before.obstacle_contacts:
+            yield "obstacle_touched", f"the robot touched an obstacle at {elapsed:.2f} s"
         if self.touch_speed != before.touch_speed:
             text = f"board touched at {elapsed:.2f} s with {self.touch_speed:.2f} m/s"
             yield "board_touched", text
@@ -344,11 +344,12 @@ class Observations:
         `known` sets further fields of the returned `Evidence`.
         """
         slip = self.slip_ns * 1e-9
+        count = self.obstacle_contacts
         return Evidence(
             ending=ending,
             end=Moment(elapsed),
             touch=None if self.touch_speed is None else (self.touch_speed, UNKNOWN),
-            violations=(_pipe_touched("a pipe", self.pipe_contacts),) if self.pipe_contacts else (),
+            violations=(_obstacle_touched("an obstacle", count),) if count else (),
             slow=_too_slow(real_time_factor(elapsed - slip, slip)) if elapsed > 0 else "",
             **known,
         )

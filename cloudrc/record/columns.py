@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from cloudrc.errors import BadInputError
 from cloudrc.record.topics import BY_SOURCE, TOPICS, Kind, Topic
 from cloudrc.records import Arrival, Record
+from cloudrc.renamed import new_name
 
 Column: TypeAlias = NDArray[Any]
 Message: TypeAlias = tuple[str, int, bytes]
@@ -70,7 +71,7 @@ class Table:
 
     def __getitem__(self, name: str) -> Column:
         try:
-            return self._columns[name]
+            return self._columns[name if name in self._columns else new_name(name)]
         except KeyError:
             known = ", ".join(self.names)
             raise KeyError(f"no column {name!r} in {self.topic.name}; it has: {known}") from None

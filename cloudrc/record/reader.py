@@ -36,6 +36,7 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.ros import is_known
 from cloudrc.record.topics import TOPICS, VIEWS
 from cloudrc.record.writer import CHANGED, CLOCK, COUNTS, MISSING
+from cloudrc.renamed import with_new_names
 
 UNPACKED_MAX = 64
 """Largest ratio of a recording's size in memory to its size in the file; a file below 1 MiB counts
@@ -301,7 +302,7 @@ class File:
         ros_type = topic.ros_type if topic else VIEWS.get(channel.topic)
         if schema is None or ros_type is None or schema.name != ros_type:
             return False
-        return is_known(ros_type, schema.data.decode("utf-8", "replace"))
+        return is_known(ros_type, with_new_names(schema.data.decode("utf-8", "replace")))
 
     def _sort(self) -> None:
         messages = self.recording.messages

@@ -20,6 +20,7 @@ from cloudrc import __version__
 from cloudrc.config.document import write_yaml
 from cloudrc.errors import BadInputError
 from cloudrc.files import write_atomically
+from cloudrc.renamed import NEW_NAMES
 from cloudrc.sweep.flight import Row, units
 from cloudrc.sweep.plan import Plan
 
@@ -52,8 +53,14 @@ def parse_row(line: bytes | str) -> Row | None:
     with suppress(ValueError):
         row = json.loads(line)
         if isinstance(row, dict) and FIELDS <= row.keys():
+            row["failures"] = [NEW_NAMES.get(code, code) for code in row["failures"]]
+            row["numbers"] = _with_new_keys(row["numbers"])
             return row
     return None
+
+
+def _with_new_keys(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {NEW_NAMES.get(name, name): value for name, value in values.items()}
 
 
 @contextmanager
@@ -168,7 +175,11 @@ def read_flights(folder: Path) -> tuple[list[Row], dict[str, str], str]:
     if not rows:
         raise BadInputError(f"{folder}: has no rows; run the sweep again with this --out")
     missing = summary["flights"] - len(rows)
-    return rows, summary["units"], f"{missing} flights are not done" if missing else ""
+    return (
+        rows,
+        _with_new_keys(summary["units"]),
+        f"{missing} flights are not done" if missing else "",
+    )
 
 
 def values_of(rows: Sequence[Row]) -> dict[str, list[Any]]:

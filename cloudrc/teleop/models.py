@@ -133,8 +133,8 @@ class Event(_Answer):
     mission: str = _field("Id of the mission")
     event: str = _field(
         "queued, starting, started, reached, held, resumed, goto, driving, operator_lost, "
-        "restarted, new_session, board_touched, pipe_touched, paused; at the end done, cancelled, "
-        f"{', '.join(FAILURES)}"
+        "restarted, new_session, board_touched, obstacle_touched, paused; at the end done, "
+        f"cancelled, {', '.join(FAILURES)}"
     )
     waypoint: int = _field("Index of the waypoint, from 0")
     text: str = _field("Event in words")
@@ -180,7 +180,7 @@ class Seen(_Answer):
     cause: str = _field("Why the guard is in this state; after a landing, why the robot landed")
     guard_for_s: float | None = _field("Time in this guard state [s]; null if `age_s` is above 1 s")
     next_step: str = _field("What the robot does next, or what the operator has to do")
-    pipe_contacts: int = _field("Number of contacts with pipes in the mission")
+    obstacle_contacts: int = _field("Number of contacts with obstacles in the mission")
     touch_speed_mps: float | None = _field(
         "Speed of the arm's tip at its first touch of the board [m/s]"
     )

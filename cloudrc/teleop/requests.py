@@ -75,6 +75,11 @@ class RequestSender:
         self._is_started = False
         self._pending = self._next = None
 
+    def begin(self, mission_id: int, reached: int, *, contact: bool) -> None:
+        """Set the mission of the following requests; `contact`: it has to touch the board."""
+        self._progress = self._progress._replace(contact=contact)
+        self.report(mission_id, reached)
+
     def report(self, mission_id: int, reached: int) -> None:
         """Set the progress that every request contains: mission and number of reached waypoints."""
         self._progress = self._progress._replace(mission_id=mission_id, reached=reached)

@@ -268,7 +268,7 @@ class MissionService:
             known = mission.witness
             mission.witness = replace(
                 known,
-                pipe_contacts=seen.pipe_contacts,
+                obstacle_contacts=seen.obstacle_contacts,
                 touch_speed=finite_or_none(seen.touch_speed),
                 slip_ns=known.slip_ns + (seen.slip_ns - before.slip_ns if before else 0),
             )
@@ -325,7 +325,7 @@ class MissionService:
             "cause": seen.cause.words,
             "guard_for_s": (now_ns - self._guard_ns) * 1e-9 if age <= SILENCE else None,
             "next_step": next_step(seen.guard, age, cloud_age, state),
-            "pipe_contacts": seen.pipe_contacts,
+            "obstacle_contacts": seen.obstacle_contacts,
             "touch_speed_mps": finite_or_none(seen.touch_speed),
             "horizon_s": control and finite_or_none(control.horizon),
             "rtt_s": control and finite_or_none(control.rtt),

@@ -21,6 +21,7 @@ from pydantic import TypeAdapter
 
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.metrics.verdict import Observations
+from cloudrc.renamed import with_new_names
 from cloudrc.teleop.wire import ENDED, QUEUED, STATES, Plan
 
 Event: TypeAlias = dict[str, Any]
@@ -320,7 +321,12 @@ class MissionStore:
     def _read(self) -> None:
         for row, ordered, status in self._db.execute("SELECT * FROM missions ORDER BY n"):
             number, order = json.loads(ordered)
-            known = {"id": f"m{row}", "number": number, "order": order, **json.loads(status)}
+            known = {
+                "id": f"m{row}",
+                "number": number,
+                "order": order,
+                **json.loads(with_new_names(status)),
+            }
             mission = _MISSION.validate_python(known)
             mission.events = deque(mission.events, SHOWN)
             self._events = max(self._events, *(event["id"] for event in mission.events), 0)

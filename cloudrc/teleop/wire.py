@@ -79,7 +79,7 @@ class RobotStatus(NamedTuple):
     guard: GuardState
     mission: int  # number of the last operator request that world has acted on; 0 if none
     world: str = ""  # identifies world's process; a restart of world changes it
-    pipe_contacts: int = 0  # number of contacts with pipes in the mission
+    obstacle_contacts: int = 0  # number of contacts with obstacles in the mission
     touch_speed: float = nan  # of the arm's tip at the mission's first touch of the board [m/s]
     slip_ns: int = 0  # lag of world's clock behind its machine's clock [ns]
     mission_id: int = 0  # number of the mission of the last start request; 0 if none

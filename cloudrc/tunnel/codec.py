@@ -83,6 +83,7 @@ class Accept(NamedTuple):
     clock: bytes  # 16 bytes that identify world's monotonic clock
 
 
+_CONTACT = 0b10  # bit of the byte `start`: the mission has to touch the board
 COOKIE_SIZE = 13  # size of a cookie [bytes]
 _HEADER = struct.Struct("<BBIxBQ")  # the pad byte is 0
 _BODIES = {
@@ -157,13 +158,13 @@ def encode_telemetry(telemetry: Telemetry) -> bytes:
     """Encode the body of a TELEMETRY datagram."""
     # fmt: off
     (
-        stamp_ns, odometry, force, echo_ns, hold_ns, slip_ns, mission, guard, pipes, touch,
+        stamp_ns, odometry, force, echo_ns, hold_ns, slip_ns, mission, guard, obstacles, touch,
         mission_id, reached, cause,
     ) = telemetry
     _, (px, py, pz), (qw, qx, qy, qz), (vx, vy, vz), (rx, ry, rz) = odometry
     return _TELEMETRY.pack(
         stamp_ns, px, py, pz, qw, qx, qy, qz, vx, vy, vz, rx, ry, rz, force, echo_ns, hold_ns,
-        slip_ns, mission, touch, pipes, mission_id, reached, guard, cause,
+        slip_ns, mission, touch, obstacles, mission_id, reached, guard, cause,
     )
     # fmt: on
 
@@ -173,7 +174,7 @@ def decode_telemetry(body: bytes) -> Telemetry:
     # fmt: off
     (
         stamp_ns, px, py, pz, qw, qx, qy, qz, vx, vy, vz, rx, ry, rz, force, echo_ns, hold_ns,
-        slip_ns, mission, touch, pipes, mission_id, reached, guard, cause,
+        slip_ns, mission, touch, obstacles, mission_id, reached, guard, cause,
     ) = _TELEMETRY.unpack(body)
     if guard >= len(_GUARD_STATES) or cause >= len(_CAUSES):
         raise DecodeError("malformed")
@@ -181,8 +182,8 @@ def decode_telemetry(body: bytes) -> Telemetry:
         Odometry, (stamp_ns, (px, py, pz), (qw, qx, qy, qz), (vx, vy, vz), (rx, ry, rz))
     )
     return _new(Telemetry, (
-        stamp_ns, odometry, force, echo_ns, hold_ns, slip_ns, mission, _GUARD_STATES[guard], pipes,
-        touch, mission_id, reached, _CAUSES[cause],
+        stamp_ns, odometry, force, echo_ns, hold_ns, slip_ns, mission, _GUARD_STATES[guard],
+        obstacles, touch, mission_id, reached, _CAUSES[cause],
     ))
     # fmt: on
 
@@ -215,16 +216,20 @@ def decode_command(body: bytes) -> Command:
 
 def encode_operator(request: OperatorRequest) -> bytes:
     """Encode the body of an OPERATOR datagram; the header has the request's epoch."""
-    return _OPERATOR.pack(*request[:-1])
+    number, kind, start, mission_id, reached, basis_stamp_ns, _, contact = request
+    place = start | _CONTACT if contact else start
+    return _OPERATOR.pack(number, kind, place, mission_id, reached, basis_stamp_ns)
 
 
 def decode_operator(body: bytes) -> OperatorRequest:
     """Decode the body of an OPERATOR datagram."""
-    number, kind, start, mission_id, reached, basis_stamp_ns = _OPERATOR.unpack(body)
+    number, kind, place, mission_id, reached, basis_stamp_ns = _OPERATOR.unpack(body)
+    start, contact = place & ~_CONTACT, bool(place & _CONTACT)
     # A recording holds signed 64-bit integers.
     if mission_id >> 63 or kind >= len(Request) or start >= len(Start):
         raise DecodeError("malformed")
-    return OperatorRequest(number, Request(kind), Start(start), mission_id, reached, basis_stamp_ns)
+    fields = number, Request(kind), Start(start), mission_id, reached, basis_stamp_ns
+    return OperatorRequest(*fields, contact=contact)
 
 
 def encode(kind: Kind, *fields: Any) -> bytes:

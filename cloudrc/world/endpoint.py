@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from math import hypot, isnan, nan
 
+from cloudrc.geometry.scene import BOARD, is_obstacle
 from cloudrc.messages import (
     NEVER_NS,
     Command,
@@ -95,9 +96,10 @@ class WorldEndpoint(TunnelEnd):
         self._echo_stamp_ns = self._applied_ns = NEVER_NS
         self._number = 0  # of the newest operator request carried out in this session
         # Of the mission that was started last: its number, waypoints reached as reported by the
-        # operator, contacts with pipes, and the speed of the tip at its first touch of the board.
-        self._mission_id = self._reached = self._pipes = 0
-        self._touch_speed = nan
+        # operator, contacts with obstacles, speed of the tip at its first touch of the board, and
+        # whether the mission has to touch the board, so that the board is no obstacle.
+        self._mission_id = self._reached = self._obstacles = 0
+        self._touch_speed, self._contact = nan, False
 
     @property
     def slip_ns(self) -> int:
@@ -212,7 +214,7 @@ class WorldEndpoint(TunnelEnd):
                 self._slip_ns,
                 self._number,
                 guard.state,
-                self._pipes,
+                self._obstacles,
                 self._touch_speed,
                 self._mission_id,
                 self._reached,
@@ -261,9 +263,9 @@ class WorldEndpoint(TunnelEnd):
             observer.see_session(now_ns)
 
     def _note_touch(self, touch: Contact) -> None:
-        if touch.body.startswith("pipe"):
-            self._pipes += 1
-        elif touch.body == "board" and touch.tip and isnan(self._touch_speed):
+        if is_obstacle(touch.body, contact=self._contact):
+            self._obstacles += 1
+        if touch.body == BOARD and touch.tip and isnan(self._touch_speed):
             self._touch_speed = hypot(*touch.tip_velocity)
 
     def _receive_operator(self, request: OperatorRequest, now_ns: int) -> None:
@@ -287,7 +289,9 @@ class WorldEndpoint(TunnelEnd):
             self._number = request.number
         if starts and (request.mission_id != self._mission_id or request.start is Start.SPAWN):
             self._mission_id, self._reached = request.mission_id, 0
-            self._pipes, self._touch_speed = 0, nan
+            self._obstacles, self._touch_speed = 0, nan
+        if starts:
+            self._contact = request.contact
         if request.mission_id == self._mission_id:  # stored on board for a restarted cloud
             self._reached = max(self._reached, request.reached)
         if kind is Request.END:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import os
+from itertools import count
 from math import inf, nan
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -18,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from cloudrc.config.schema import Plant
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.geometry.scene import WORLD
 from cloudrc.world.low_level import GRAVITY, THRUST_MAX
 from cloudrc.world.plant import Array, Inertia, point_inertia, true_inertia
 
@@ -107,16 +109,18 @@ def _compile(
     """
     try:
         spec = mujoco.MjSpec.from_file(str(scene_path))
-        for number, geom in enumerate(spec.geoms):
-            geom.name = f"{geom.parent.name or 'unnamed'}/{number}"
+        _name_geoms(spec.worldbody)
         if spec.frame("spawn") is None:
             raise BadInputError(f"{scene_path}: needs a frame named spawn in its worldbody")
         if spec.body("floor") is None:
             raise BadInputError(
                 f"{scene_path}: needs a body named floor; other bodies are obstacles"
             )
+        robot = mujoco.MjSpec.from_file(str(robot_path))
+        for number, geom in enumerate(robot.worldbody.geoms):
+            geom.name = f"{WORLD}/{number}"
         # An empty prefix would make MuJoCo write MUJOCO_LOG.TXT into the working directory.
-        spec.attach(mujoco.MjSpec.from_file(str(robot_path)), prefix=ROBOT_PREFIX, frame="spawn")
+        spec.attach(robot, prefix=ROBOT_PREFIX, frame="spawn")
         spec.compiler.fusestatic = fuse
         if inertia is not None:
             _set_inertia(spec.joints[0].parent, *inertia)
@@ -124,6 +128,40 @@ def _compile(
     except (ValueError, KeyError) as error:
         reason = " ".join(str(error).split())
         raise BadInputError(f"{robot_path} in {scene_path} does not compile: {reason}") from None
+
+
+def _name_geoms(worldbody: Any) -> None:
+    """Give each geom of a scene the name BODY/NUMBER; `worldbody` is that of an `MjSpec`.
+
+    A body without a name belongs to the body around it. In the worldbody, such bodies are numbered.
+    """
+    numbers, unnamed = count(), count(1)
+    waiting = [(WORLD, worldbody)]
+    for name, body in waiting:
+        for geom in body.geoms:
+            geom.name = f"{name}/{next(numbers)}"
+        for child in body.bodies:
+            other = (
+                f"unnamed body {next(unnamed)}" if body is worldbody and not child.name else name
+            )
+            waiting.append((child.name or other, child))
+
+
+def is_of_robot(model: Any) -> Any:
+    """Return for each geom of a compiled model whether it belongs to the robot, shape (n,)."""
+    base = model.jnt_bodyid[0]
+    return model.body_rootid[model.geom_bodyid] == base
+
+
+def bodies_of_geoms(model: Any) -> list[str]:
+    """Return the name of the body of each geom in a compiled model, "" for geoms of the robot."""
+    names = []
+    for number, is_robot in enumerate(is_of_robot(model)):
+        name = model.geom(number).name
+        if name.startswith(f"{ROBOT_PREFIX}{WORLD}/"):  # it stands in the worldbody of the robot
+            name = name.removeprefix(ROBOT_PREFIX)
+        names.append("" if is_robot else name.rpartition("/")[0])
+    return names
 
 
 def _inertia(model: Any) -> Inertia:

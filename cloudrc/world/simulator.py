@@ -19,7 +19,7 @@ from cloudrc.records import Contact
 from cloudrc.world.plant import Wind
 from cloudrc.world.readings import Readings, RotorSpeeds
 from cloudrc.world.rotors import STOPPED, Controls, Rotors
-from cloudrc.world.scene import ROBOT_PREFIX, compile_model, mujoco
+from cloudrc.world.scene import ROBOT_PREFIX, bodies_of_geoms, compile_model, mujoco
 
 TOUCH_GAP = 0.1
 """Shortest time without contact before a contact counts as a new contact [s]."""
@@ -78,9 +78,7 @@ class Simulator:
         self._tip = model.site(f"{ROBOT_PREFIX}tip").id
         self._tip_offset: Vector = tuple(model.site_pos[self._tip].tolist())
         self._tip_radius = float(model.site_size[self._tip, 0])
-        names = [model.geom(number).name for number in range(model.ngeom)]
-        # The robot's geoms get an empty name, because a contact has the name of the other body.
-        self._bodies = ["" if n.startswith(ROBOT_PREFIX) else n.split("/")[0] for n in names]
+        self._bodies = bodies_of_geoms(model)
         self._gap_steps = round(TOUCH_GAP / self.dt)
         self.reset()
 
@@ -214,7 +212,11 @@ class Simulator:
         contact = self.data.contact
         tip = self.data.site_xpos[self._tip].tolist()
         pairs, places = contact.geom.tolist(), contact.pos.tolist()
-        for (first, second), place in zip(pairs, places, strict=True):
+        for (first, second), place, is_near in zip(
+            pairs, places, contact.exclude.tolist(), strict=True
+        ):
+            if is_near:  # not nearer than the `gap` of a geom
+                continue
             body = self._bodies[first] or self._bodies[second]
             by_tip = dist(place, tip) <= self._tip_radius
             last = self._last_touch.get((body, by_tip))

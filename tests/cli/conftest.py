@@ -25,16 +25,6 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def no_page(monkeypatch):
-    """Leave out the figures of a report, which take longer than a flight."""
-
-    def write_page(folder, *assessment):
-        (folder / "report.html").write_text("drawn elsewhere")
-
-    monkeypatch.setattr("cloudrc.report.write._write_page", write_page)
-
-
-@pytest.fixture
 def replace_flights(monkeypatch):
     """Return a function that replaces flights by `fly(experiment)`, in this process."""
     monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 1)

@@ -39,7 +39,13 @@ def test_an_alarm_stays_above_all_other_requests():
 
 
 def test_a_status_has_the_values_of_its_telemetry():
-    values = {"slip_ns": 5, "mission": 6, "guard": ESTOP, "pipe_contacts": 8, "touch_speed": 0.9}
+    values = {
+        "slip_ns": 5,
+        "mission": 6,
+        "guard": ESTOP,
+        "obstacle_contacts": 8,
+        "touch_speed": 0.9,
+    }
     values |= {"mission_id": 10, "reached": 11, "cause": Cause.STOPPED}
     telemetry = told(0.1, velocity=(1.0, 2.0, 3.0), **values, echo_hold_ns=7).telemetry
     status = make_robot_status(telemetry, 12, "world", 0.03, None)

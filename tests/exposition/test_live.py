@@ -132,7 +132,7 @@ def test_guard_and_contacts_are_counted():
     for state in ("hold", "land"):  # a touch-down repeats LAND
         assert value(live, "cloudrc_guard_transitions_total", state) == 1
     found = {body: value(live, "cloudrc_contacts_total", body) for body in table.BODIES}
-    assert found == {"board": 1, "pipe": 2, "other": 1, "floor": 0}
+    assert found == {"board": 1, "obstacle": 3, "floor": 0}
 
 
 def test_changes_of_the_guard_are_counted_by_cause():

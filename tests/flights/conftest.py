@@ -76,9 +76,9 @@ class BareCloud:
         body = codec.encode_command(Command(now_ns, basis_ns, 0, velocity, 0.0))
         return self.session.seal(Kind.COMMAND, body)
 
-    def ask(self, number, request, start, mission_id=0, basis_ns=0, reached=0):
+    def ask(self, number, request, start, mission_id=0, basis_ns=0, reached=0, contact=False):
         asked = OperatorRequest(
-            number, request, start, mission_id, reached, basis_stamp_ns=basis_ns
+            number, request, start, mission_id, reached, basis_stamp_ns=basis_ns, contact=contact
         )
         return self.session.seal(Kind.OPERATOR, codec.encode_operator(asked))
 
@@ -152,13 +152,13 @@ class Bare:
             self.world.handle_deadline(self.world.next_deadline_ns())
         self.world.take_datagrams()
 
-    def asked(self, number, request, start, mission_id=0):
+    def asked(self, number, request, start, mission_id=0, **more):
         """A request that is passed on now."""
         world_ns = self.now_ns - self.world.slip_ns
-        return self.speaker.ask(number, request, start, mission_id, world_ns)
+        return self.speaker.ask(number, request, start, mission_id, world_ns, **more)
 
-    def request(self, number, request, start, mission_id=0):
-        self.send(self.asked(number, request, start, mission_id))
+    def request(self, number, request, start, mission_id=0, **more):
+        self.send(self.asked(number, request, start, mission_id, **more))
 
     def command(self, velocity=(0.0, 0.0, 1.0), basis_ns=None):
         return self.speaker.command(self.now_ns, basis_ns, velocity)

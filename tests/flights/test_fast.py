@@ -40,4 +40,4 @@ def test_a_silence_of_20_s_in_a_pipe_touches_nothing(at, way):
     dark = [f"link.{each}link.blackouts={silence}" for each in WAYS[way]]
     flight = fly("fast", *link(200), *dark, "criteria.time_limit_s=90")
     assert flight.verdict.failures == ()
-    assert numbers(flight)["pipe_contacts"] == 0
+    assert numbers(flight)["obstacle_contacts"] == 0

@@ -2,8 +2,8 @@
 
 import pytest
 
-from cloudrc.messages import GuardState, Request, Start
-from cloudrc.records import CommandApplied, GuardChange, SessionOpened, TelemetrySent
+from cloudrc.messages import ZERO, GuardState, Request, Start
+from cloudrc.records import CommandApplied, Contact, GuardChange, SessionOpened, TelemetrySent
 from tests.flights.conftest import MS, Bare, ring, talking
 
 
@@ -93,13 +93,24 @@ def test_commands_during_a_stop_or_a_hold_are_not_echoed(talk):
 def test_contacts_are_reported_until_the_next_mission_starts(talk):
     """Cloud may die right after the touch; the next cloud must learn of it."""
     ask(talk, 2, Request.END)
-    talk.world._pipes = 1
+    talk.world._obstacles = 1
     talk.wait(300)
     talk.hello("another")
     for number, mission_id, contacts in ((3, 0, 1), (4, 7, 0)):
         talk.request(number, Request.START, Start.HERE, mission_id)
         talk.wait(20)
-        assert talk.take(TelemetrySent)[-1].telemetry.pipe_contacts == contacts
+        assert talk.take(TelemetrySent)[-1].telemetry.obstacle_contacts == contacts
+
+
+@pytest.mark.parametrize(("contact", "counted"), [(True, 2), (False, 3)])
+def test_the_board_is_an_obstacle_of_missions_that_need_not_touch_it(talk, contact, counted):
+    ask(talk, 2, Request.END)
+    talk.request(3, Request.START, Start.HERE, mission_id=7, contact=contact)
+    for body in ("pillar", "board", "floor", "world"):
+        talk.world.robot.simulator.touches.append(Contact(0, body, ZERO, ZERO, ZERO, tip=True))
+    talk.wait(20)
+    telemetry = talk.take(TelemetrySent)[-1].telemetry
+    assert (telemetry.obstacle_contacts, telemetry.touch_speed) == (counted, 0.0)
 
 
 def test_holds_are_counted_during_missions_only(talk):

@@ -148,12 +148,12 @@ NUMBERS = {
         "age_of_information_mean": approx(0.05),
         "commands_applied": 251.0,  # 25 per second for 10 s, both ends included
         # The HOLD after the mission's end does not count.
-        **dict.fromkeys(("hold_count", "hold_time", "fault_count"), 0.0),
+        **dict.fromkeys(("hold_count", "hold_time", "fault_count", "obstacle_contacts"), 0.0),
         **{f"{name}_{way}": 0.0 for name in ("loss", "late") for way in WAYS},
         # No board contact, no pipe, no rest, no real time, no relay.
         **dict.fromkeys(("contact_time", "tip_speed", "steady_contact_force", "contact_impulse")),
         **dict.fromkeys(("peak_contact_force", "min_clearance", "min_clearance_flight")),
-        **dict.fromkeys(("pipe_contacts", "steady_error_x", "recorder_dropped")),
+        **dict.fromkeys(("steady_error_x", "recorder_dropped")),
         **dict.fromkeys(REAL_TIME | OF_RELAYS),
     },
     contact: {
@@ -162,14 +162,14 @@ NUMBERS = {
         "peak_contact_force": 10.3,
         "contact_impulse": approx(0.02, abs=3e-3),  # 0.2 N over 0.1 s
         "steady_contact_force": approx(0.2, abs=3e-3),
-        "pipe_contacts": 1.0,
+        "obstacle_contacts": 1.0,
     },
     # The pipe is from x = 2 m to 7 m. Just before it the robot's front is inside it, with the rotor
     # at y = .21 + .1.
     lambda: flown(lambda t: (t, 0.1 if t < 2 else 0.0, 1.0)).flight(ONE_PIPE): {
         "min_clearance": approx(ON_AXIS),
         "min_clearance_flight": approx(ON_AXIS - 0.1, abs=0.05),
-        "pipe_contacts": 0.0,
+        "obstacle_contacts": 0.0,
     },
     lambda: plus(*REACHED, waypoints=2): {"waypoints_reached": 2.0, "duration": 10.0},
     lambda: changed(Control, echo_twice): {

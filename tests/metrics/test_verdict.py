@@ -76,7 +76,7 @@ def met(speed):
             lambda: world(touch(7, "pipe_1"), GuardChange(at(2), GuardState.LAND, ""), log=flown),
             {"waypoints": 2},
             "failure",
-            ["guard_intervened", "pipe_touched", "waypoint_not_reached", "board_not_touched"],
+            ["guard_intervened", "obstacle_touched", "waypoint_not_reached", "board_not_touched"],
         ),
     ],
 )
@@ -88,7 +88,12 @@ def test_rules(log, limits, outcome, found):
 @pytest.mark.parametrize(
     ("log", "code", "text", "time"),
     [
-        (world(touch(4, "pipe_1"), touch(3, "pipe_1")), "pipe_touched", "pipe_1 (2 times)", 3.0),
+        (
+            world(touch(4, "pipe_1"), touch(3, "pipe_1")),
+            "obstacle_touched",
+            "pipe_1 (2 times)",
+            3.0,
+        ),
         (  # A touch-down repeats LAND.
             world(*(GuardChange(at(n), GuardState.LAND, f"why {n}") for n in (5, 6))),
             "guard_intervened",
@@ -107,6 +112,31 @@ def test_a_failure_says_what_when_and_where(log, code, text, time):
     assert failure.place == pytest.approx((time, 0.0, 1.0))
 
 
+@pytest.mark.parametrize(
+    ("body", "contact", "is_obstacle"),
+    [
+        *((body, True, True) for body in ("pillar", "world", "pipe_1", "unnamed body 1", "board2")),
+        *(("board", contact, not contact) for contact in (True, False)),
+        *(("floor", contact, False) for contact in (True, False)),
+    ],
+)
+def test_every_body_is_an_obstacle_but_the_floor_and_a_board_to_touch(body, contact, is_obstacle):
+    flight = world(touch(3, body), log=flown).flight(contact=contact)
+    found = [f for f in judged(flight).failures if f.code == "obstacle_touched"]
+    said = [(f.text, f.time, f.place) for f in found]
+    assert said == [(f"the robot touched {body}", 3.0, (3.0, 0.0, 1.0))] * is_obstacle
+    assert SHIPPED["obstacle_contacts"].measure(flight) == is_obstacle
+
+
+def test_two_bodies_touched_at_once_are_two_failures():
+    log = world(touch(3, "b"), touch(3, "a"), touch(4, "b"), log=flown)
+    found = judged(log.flight(contact=False)).failures
+    assert [each.text for each in found if each.code == "obstacle_touched"] == [
+        "the robot touched a",
+        "the robot touched b (2 times)",
+    ]
+
+
 def test_a_robot_that_never_flew_is_a_failure():
     log = flown()
     log.change(GuardChange, lambda n, change: None)
@@ -119,7 +149,7 @@ def test_an_interrupted_run_lists_only_certain_failures():
     log = without_end(world(touch(3, "pipe_1"), log=flown))
     verdict = judged(log.flight(ONE_PIPE, contact=True), interrupted=True)
     assert verdict.outcome == "interrupted"
-    assert codes(verdict) == ["interrupted", "pipe_touched"]
+    assert codes(verdict) == ["interrupted", "obstacle_touched"]
     log.change(GuardChange, lambda n, change: None)
     (failure,) = judged(log.flight(), interrupted=True).failures
     assert failure.text.endswith("before the mission started")
@@ -135,9 +165,9 @@ MISSED = Mission(waypoints=(Waypoint(position_m=(0.0, 5.0, 1.0)),))
     [
         (good(), None, [], []),
         (good(), MISSED, ["waypoint_not_reached"], []),  # the operator had reported it
-        (world(touch(3, "pipe_1")), None, ["pipe_touched"], ["pipe_touched"]),
+        (world(touch(3, "pipe_1")), None, ["obstacle_touched"], ["obstacle_touched"]),
         # What telemetry had not shown when the mission ended
-        (world(touch(9.99, "pipe_1")), None, ["pipe_touched"], []),
+        (world(touch(9.99, "pipe_1")), None, ["obstacle_touched"], []),
         (world(touch(9.99), log=flown), None, [], ["board_not_touched"]),
     ],
 )

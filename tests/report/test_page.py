@@ -61,7 +61,7 @@ def test_the_page_says_what_the_flight_did(folder):
 
 def test_failures_and_notes_are_escaped():
     place = (1.0, -2.0, 0.7)
-    failures = Failure("pipe_touched", "it hit", 3.5, place), Failure("x", "<script>alert(1)")
+    failures = Failure("obstacle_touched", "it hit", 3.5, place), Failure("x", "<script>alert(1)")
     assessment = replace(
         assess(*reversed(paper()), Run("local", "relay")),
         verdict=Verdict("failure", failures),
@@ -70,7 +70,7 @@ def test_failures_and_notes_are_escaped():
     picture = Picture("delay", {"svg": b"<svg/>"}, "Caption.", 7.16, "A picture of something.")
     page = render(assessment, [picture], environment_document())
     assert "The mission failed." in page
-    assert "it hit, at 3.50 s, x 1.00, y -2.00, z 0.70 m <code>pipe_touched</code>" in page
+    assert "it hit, at 3.50 s, x 1.00, y -2.00, z 0.70 m <code>obstacle_touched</code>" in page
     assert "<script>" not in page
     assert "metric &lt;b&gt; &amp;" in page
 

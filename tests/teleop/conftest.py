@@ -48,7 +48,7 @@ class Flight:
         self.epoch, self.world, self.mission = 1, "world 1", 0
         self.onboard = (0, 0)  # mission's number and waypoints reached, as world keeps them
         self.guard, self.cause = GuardState.GROUND, Cause.SPAWN
-        self.pipe_contacts, self.touch_speed, self.slip_ns = 0, float("nan"), 0
+        self.obstacle_contacts, self.touch_speed, self.slip_ns = 0, float("nan"), 0
         self.uplink = self.downlink = True
         self.first_shown_ns = {}  # number of a request -> when telemetry first showed it
         self.said, self.said_at = [], []
@@ -73,7 +73,7 @@ class Flight:
     def seen(self):
         return RobotStatus(
             *(self.epoch, self.position, self.guard, self.mission, self.world),
-            *(self.pipe_contacts, self.touch_speed, self.slip_ns),
+            *(self.obstacle_contacts, self.touch_speed, self.slip_ns),
             mission_id=self.onboard[0], reached=self.onboard[1], cause=self.cause,
         )  # fmt: skip
 

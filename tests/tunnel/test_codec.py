@@ -123,7 +123,7 @@ TELEMETRY = bytes(codec.BODY_SIZES[Kind.TELEMETRY])
     ("decode", "body", "offset", "largest"),
     [
         (codec.decode_operator, LARGEST, 4, max(Request)),
-        (codec.decode_operator, LARGEST, 5, max(Start)),
+        (codec.decode_operator, LARGEST, 5, max(Start) + 0b10),  # with the bit of the board
         (codec.decode_operator, LARGEST, 13, 0x7F),  # a mission that no recording can name
         (codec.decode_telemetry, TELEMETRY, -2, max(GuardState)),
         (codec.decode_telemetry, TELEMETRY, -1, max(Cause)),

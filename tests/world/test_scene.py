@@ -10,7 +10,14 @@ import pytest
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.geometry.scene import load_scene
 from cloudrc.world.rotors import STOPPED
-from cloudrc.world.scene import FOLDER, compile_model, import_mujoco, mujoco
+from cloudrc.world.scene import (
+    FOLDER,
+    PELICAN,
+    bodies_of_geoms,
+    compile_model,
+    import_mujoco,
+    mujoco,
+)
 from cloudrc.world.simulator import Simulator
 
 ROBOTS = sorted(path.stem for path in (FOLDER / "robots").glob("*.xml"))
@@ -61,6 +68,32 @@ def test_what_the_robot_touches(scene_at, place, touched):
     simulator = Simulator("pelican", scene_at(*place))
     simulator.step(STOPPED)
     assert {(touch.body, touch.tip) for touch in simulator.take_contacts()} == touched
+
+
+BODIES = """
+  <geom type="box" size=".1 .1 .1" pos="3 0 1"/>
+  <body name="robot" pos="4 0 1"><geom size=".1"/></body>
+  <body pos="5 0 1"><geom size=".1"/><body name="in"><geom size=".1"/><body><geom size=".1"/></body></body></body>
+  <body pos="6 0 1"><geom size=".1"/></body>
+  <body name="a/b" pos="7 0 1"><geom type="capsule" size=".1 .1"/></body>
+  <body name="mocap" mocap="true" pos="8 0 1"><geom type="cylinder" size=".1 .1"/></body>
+  <body name="seen" pos="9 0 1"><geom type="ellipsoid" size=".1 .1 .1" contype="0" conaffinity="0"/></body>
+</worldbody><contact><exclude body1="a/b" body2="mocap"/></contact>"""  # noqa: E501
+
+
+def test_each_geom_has_the_name_of_its_body_and_the_robot_none(tmp_path):
+    """MuJoCo fuses static bodies, but not those that `exclude` or mocap names."""
+    scene, robot = tmp_path / "scene.xml", tmp_path / "robot.xml"
+    text = (FOLDER / "scenes" / "empty.xml").read_text()
+    scene.write_text(text.replace("</worldbody>", BODIES))
+    text = PELICAN.read_text()
+    robot.write_text(text.replace("<worldbody>", '<worldbody><geom size=".1" pos="0 0 2"/>'))
+    names = bodies_of_geoms(compile_model(str(robot), str(scene)))
+    assert sorted(filter(None, names)) == [
+        *("a/b", "floor", "in", "in", "mocap", "robot", "seen"),
+        *("unnamed body 1", "unnamed body 2", "world", "world"),
+    ]
+    assert names.count("") == 7
 
 
 SHIPPED = {"robots": "pelican", "scenes": "empty"}

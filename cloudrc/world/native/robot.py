@@ -28,7 +28,7 @@ from cloudrc.world.low_level import LowLevel
 from cloudrc.world.native.library import Library, library
 from cloudrc.world.readings import Readings
 from cloudrc.world.robot import STEP, STEP_NS, Robot
-from cloudrc.world.scene import ROBOT_PREFIX, mujoco
+from cloudrc.world.scene import ROBOT_PREFIX, is_of_robot, mujoco
 from cloudrc.world.simulator import CONTACT_CHECK_STEPS, Simulator
 
 _POINTERS = (
@@ -126,7 +126,7 @@ def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
     the base's origin touches a box. If the model has springs or similar forces, the radius is
     infinite, so that C never leaves out the search.
     """
-    option, rows, radius = model.opt, [], 0.0
+    option, rows, radius, own = model.opt, [], 0.0, is_of_robot(model)
     other = option.density, option.viscosity, model.nflex, model.npair, model.neq, model.ntendon
     each = model.dof_frictionloss, model.dof_damping, model.jnt_stiffness, model.body_gravcomp
     if any(other) or any(values.any() for values in each):
@@ -136,7 +136,7 @@ def _obstacles(model: Any, data: Any) -> tuple[Any, float]:
         place, axes = data.geom_xpos[geom], data.geom_xmat[geom]
         margin = model.geom_margin[geom] + model.geom_gap[geom]
         margin = MARGIN + max(margin, option.o_margin)
-        if model.geom_bodyid[geom]:  # a geom of the robot; those of the scene are fused to body 0
+        if own[geom]:
             radius = max(radius, dist(place, data.qpos[:3]) + bound + margin)
         elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
             rows.append([*place, *axes, *size, margin])

@@ -148,6 +148,23 @@ def test_a_micrometre_of_room_means_that_no_fence_limits():
     assert found > 1000
 
 
+def test_c_finds_the_contacts_with_a_body_that_mujoco_does_not_fuse(tmp_path):
+    """`exclude` names the pillar, so that the pillar stays a body of its own."""
+    text = (FOLDER / "scenes" / "empty.xml").read_text()
+    pillar = '<body name="pillar" pos="1.2 0 1"><geom type="capsule" size=".1 1"/></body>'
+    exclude = '</worldbody><contact><exclude body1="pillar" body2="floor"/></contact>'
+    path = tmp_path / "scene.xml"
+    path.write_text(text.replace("</worldbody>", pillar + exclude))
+
+    def into_the_pillar(pilot):
+        return UP if pilot.now_ns < SECOND else (0.8, 0.0, 0.0)
+
+    pilots = [Pilot(robot).fly(2.5, into_the_pillar) for robot in both(str(path))]
+    assert pilots[0].seen == pilots[1].seen
+    touches = [touch for each in pilots[1].seen[7::8] for touch in each]
+    assert touches[0].body == "pillar"
+
+
 def nearest(robot, position):
     """Return how far the ball around a robot at `position` is from every obstacle of `step.c`."""
     rows, _ = robot._flight.keep

@@ -1,0 +1,80 @@
+"""The robot flies straight into a body of a user's scene: the verdict names the body."""
+
+import pytest
+
+from cloudrc.config.load import load_experiment
+from cloudrc.sweep.flight import fly_in_memory
+from cloudrc.world.scene import FOLDER
+
+TRACK = "time_s,x_m,y_m,z_m\n0,0,0,1\n1.5,0,0,1\n2.5,1.5,0,1\n4,1.5,0,1\n"
+"""Up, and then 1.5 m ahead. Setpoints of a file are not checked before the flight."""
+
+
+@pytest.fixture
+def flown_into(tmp_path):
+    """Return a function that flies into a body 0.8 m ahead, and returns the assessment."""
+
+    def fly(body, *settings):
+        text = (FOLDER / "scenes" / "empty.xml").read_text()
+        scene, track = tmp_path / "mine.xml", tmp_path / "track.csv"
+        scene.write_text(text.replace("</worldbody>", f"{body}</worldbody>"))
+        track.write_text(TRACK)
+        keys = f"world.scene={scene}", f"mission.setpoints={track}", "criteria.settle_m=null"
+        return fly_in_memory(load_experiment("hover", [*keys, *settings]))
+
+    return fly
+
+
+GEOM = '<geom type="box" size=".05 .5 2"/>'
+PLACED = 'pos="1.2 0 0"'
+
+
+@pytest.mark.parametrize(
+    ("body", "name"),
+    [
+        (f'<body name="pillar" {PLACED}>{GEOM}</body>', "pillar"),
+        (f"<body {PLACED}>{GEOM}</body>", "unnamed body 1"),
+        (f'<body name="hall" {PLACED}><body name="post">{GEOM}</body></body>', "post"),
+        (f'<geom type="box" size=".05 .5 2" {PLACED}/>', "world"),
+        (f'<body name="a" {PLACED}><geom type="cylinder" size=".1 2"/></body>', "a"),
+        (f'<body name="a" {PLACED}><geom type="capsule" size=".1 2"/></body>', "a"),
+        ('<body name="a" pos="1.2 0 1"><geom size=".3"/></body>', "a"),
+    ],
+)
+def test_a_body_that_the_robot_touches_fails_the_flight(flown_into, body, name):
+    found = flown_into(body)
+    touched = [each for each in found.verdict.failures if each.code == "obstacle_touched"]
+    assert found.verdict.outcome == "failure"
+    assert touched[0].text.startswith(f"the robot touched {name}")
+    assert touched[0].time == pytest.approx(2.3, abs=0.6)
+    assert touched[0].place == pytest.approx((0.75, 0.0, 1.0), abs=0.3)
+    counted = found.flight.during("/telemetry")["obstacle_contacts"][-1]
+    assert counted == found.numbers["obstacle_contacts"].value > 0
+
+
+def test_what_nothing_can_touch_is_no_obstacle(flown_into):
+    seen = GEOM.replace("/>", ' contype="0" conaffinity="0"/>')
+    found = flown_into(f'<body name="ghost" {PLACED}>{seen}</body>')
+    assert (found.verdict.outcome, found.numbers["obstacle_contacts"].value) == ("success", 0)
+
+
+@pytest.mark.parametrize("contact", [True, False])
+def test_the_board_is_an_obstacle_if_the_mission_need_not_touch_it(flown_into, contact):
+    board = f'<body name="board" {PLACED}>{GEOM}</body>'
+    limits = f"criteria.contact={str(contact).lower()}", "criteria.contact_speed_max_mps=9"
+    found = flown_into(board, *limits)
+    codes = [each.code for each in found.verdict.failures]
+    counted = found.flight.during("/telemetry")["obstacle_contacts"][-1]
+    assert (codes.count("obstacle_touched"), counted > 0) == (not contact, not contact)
+    assert found.numbers["tip_speed"].value > 0
+
+
+def test_two_bodies_are_told_apart(flown_into):
+    found = flown_into(
+        f'<body name="left" pos="1.2 .25 0">{GEOM.replace(".5", ".2")}</body>'
+        f'<body name="right" pos="1.2 -.25 0">{GEOM.replace(".5", ".2")}</body>'
+        f'<body name="far" pos="3 0 0">{GEOM}</body>'
+    )
+    touched = [each.text for each in found.verdict.failures if each.code == "obstacle_touched"]
+    names = [text.partition(" (")[0] for text in touched]
+    assert sorted(names) == ["the robot touched left", "the robot touched right"]
