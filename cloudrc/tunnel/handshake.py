@@ -29,7 +29,7 @@ EPOCH_MAX = 2**32 - 1  # largest session number that the header can hold; the ne
 CHALLENGE_NS = 100_000_000  # shortest time between two challenges [ns]
 COOKIE_NS = 2_000_000_000  # length of a time slot; a cookie is valid in its slot and the next [ns]
 GRACE_NS = 1_000_000_000  # time limit for the first encrypted datagram of a new session [ns]
-REPEATS_MAX = 3  # repeats of ACCEPT to a cloud that sends no encrypted datagrams
+REPEATS_MAX = 3  # repeats of ACCEPT to a cloud that shows no sign of the epoch's key
 CLOUDS_MAX = 64  # number of cloud processes of which world remembers the newest hello
 NO_COOKIE = bytes(codec.COOKIE_SIZE)  # cookie in a hello for which cloud has no cookie from world
 REPLIES_MAX = 3  # largest number of challenges that cloud answers per periodic hello
@@ -65,7 +65,7 @@ class ServerHandshake:
         self._age_max_ns = age_max_ns
         self._fresh_until_ns = -1
         self._incumbent = Hello(b"", b"", b"", NO_EPOCH)
-        self._repeated = 0  # repeated ACCEPTs since the last encrypted datagram
+        self._repeated = 0  # HELLOs with another key since the last sign of the epoch's key
         self._challenged_ns = -CHALLENGE_NS
         self._counters: dict[bytes, int] = {}  # newest counter answered, by nonce
         self._windows = {
@@ -106,7 +106,7 @@ class ServerHandshake:
         if len(self._counters) > CLOUDS_MAX:
             del self._counters[next(iter(self._counters))]
         if hello.nonce == self._incumbent.nonce:
-            if self._keeps_epoch(now_ns):  # with the epoch's key
+            if self._keeps_epoch():  # with the epoch's key
                 return HelloAnswer("hello", [self._accept()])
         elif now_ns <= self._fresh_until_ns:
             return HelloAnswer(
@@ -125,20 +125,20 @@ class ServerHandshake:
         self._session.begin(self._epoch)
         return self._accept()
 
-    def _keeps_epoch(self, now_ns: int) -> bool:
+    def _keeps_epoch(self) -> bool:
         """Return whether the present epoch continues after a repeated HELLO of the session's cloud.
 
-        A HELLO with a newer key ends the epoch. Otherwise the epoch survives REPEATS_MAX repeats
-        without an encrypted datagram in between. It survives further repeats only while they have
-        the epoch's key and the session has not timed out.
+        A cloud with the epoch's key can use the repeated ACCEPT, so its HELLOs never end the epoch:
+        over a slow link with losses, many are under way before cloud gets the first answer. A HELLO
+        with a newer key ends the epoch, and so do more than REPEATS_MAX HELLOs with another key if
+        nothing else arrives in between: cloud has lost the epoch's key.
         """
         session, key = self._session, self._session.greeting_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current
         if is_upgrade or session.epoch == NO_EPOCH:
             return False
-        self._repeated += 1
-        is_heard = key == session.epoch_key and now_ns <= self._fresh_until_ns
-        return is_heard or self._repeated <= REPEATS_MAX
+        self._repeated = 0 if key == session.epoch_key else self._repeated + 1
+        return self._repeated <= REPEATS_MAX
 
     def _begin(self, now_ns: int) -> None:
         self._epoch = self._epoch % EPOCH_MAX + 1

@@ -6,7 +6,7 @@ import pytest
 
 from cloudrc.records import Arrival
 from cloudrc.tunnel.codec import Kind
-from tests.flights.conftest import Bare, ring
+from tests.flights.conftest import Bare, both_ways, fly, ring
 
 
 @pytest.fixture
@@ -100,3 +100,13 @@ def test_the_check_finds_reverted_commands(monkeypatch):
     monkeypatch.setattr("cloudrc.tunnel.channel.Channel.take", lambda *_: "used")
     with pytest.raises(AssertionError):
         explore(BASIC, 4)
+
+
+def test_repeated_hellos_over_a_slow_lossy_link_open_no_session():
+    """Each of them is seconds old when world gets it."""
+    limits = "guard.command_age_max_ms=2000", "cloud.horizon_max_s=3", "cloud.freeze_after_s=3"
+    link = both_ways(delay_ms=500, jitter_ms=100, loss=0.5)
+    flown = fly("hover", *link, *limits, "seed=3")
+    session = flown.flight.recording["/session"]
+    causes = session["cause"][session["end"] == "world"]
+    assert list(causes) == ["cloud said hello", "mission starts from spawn"]
