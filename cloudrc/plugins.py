@@ -6,7 +6,7 @@ places:
 
 1. the package of the kind in cloudrc, without files whose name begins with an underscore;
 2. installed packages with an entry point in the group `cloudrc.<kind>`;
-3. a file, if the name is a path or ends in `.py`.
+3. a file, if the name is a path or ends in `.py`; `plugin_file` loads it.
 
 Plug-ins are code of the user, which may raise anything and may call `sys.exit()`. `check_failure`
 decides what is a failure of a plug-in; all parts of cloudrc that call plug-ins use it.
@@ -16,10 +16,8 @@ from __future__ import annotations
 
 import difflib
 import importlib
-import importlib.util
 import inspect
 import pkgutil
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from importlib.metadata import EntryPoint, entry_points
@@ -35,6 +33,7 @@ from cloudrc.errors import (
     describe_error,
     to_one_line,
 )
+from cloudrc.plugin_file import load_file
 
 PACKAGES = {
     "estimators": "cloudrc.cloud.estimators",
@@ -89,7 +88,7 @@ def find(kind: str, name: str) -> Any:
         raise BadInputError(f"{_one(kind)} {name!r}: there is no such file")
     with refuse_failure(f"{_one(kind)} {name!r} cannot be imported"):
         if is_path(name):
-            return _load_file(Path(name))
+            return load_file(Path(name))
         if name in _shipped(kind):
             return importlib.import_module(f"{PACKAGES[kind]}.{name}")
         # Last, because the search of all installed packages takes milliseconds.
@@ -189,18 +188,6 @@ def _shipped(kind: str) -> list[str]:
 
 def _installed(kind: str) -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=f"cloudrc.{kind}")}
-
-
-def _load_file(path: Path) -> ModuleType:
-    # The module name contains the whole path, because two files may have the same name.
-    module_name = f"cloudrc_plugin:{path.resolve()}"
-    spec = importlib.util.spec_from_file_location(module_name, path)
-    if spec is None or spec.loader is None:
-        raise ValueError("it is not a Python file; name it *.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[module_name] = module  # dataclasses look up their module there
-    spec.loader.exec_module(module)
-    return module
 
 
 def _one(kind: str) -> str:

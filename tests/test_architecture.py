@@ -23,7 +23,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "endpoint": set(),
     "files": set(),
     "geometry": set(),
-    "plugins": set(),
+    "plugins": {"plugin_file"},
+    "plugin_file": set(),
     "tunnel": {"endpoint"},
     "link": {"config", "files", "exposition", "metrics.definitions", "tunnel"},
     "config": {"plugins", "geometry", "link", "files"},
@@ -38,7 +39,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "report": {"assembly", "record", "metrics", "config", "geometry", "link", "files", "console"},
     "console": {"config", "exposition", "geometry", "metrics.definitions", "teleop", "world"},
     "cluster": {"config", "link", "record", "report"},
-    "sweep": {"assembly", "config", "files", "metrics", "plugins", "record", "report"},
+    "sweep": {
+        *("assembly", "config", "files", "metrics", "plugin_file", "plugins", "record", "report")
+    },
     "assembly": EVERYTHING,
     "advice": {"assembly", "config", "link", "tunnel", "world"},
     "api": {"advice", "sweep", "config", "metrics", "record"},

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from pydantic import Field
 
-from cloudrc import __version__, files, metrics, plugins
+from cloudrc import __version__, files, metrics, plugin_file, plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, Source, read_document
 from cloudrc.config.load import ResolvedExperiment, load_experiment, local_files, validate
@@ -117,8 +117,11 @@ def read_plan(path: Path) -> Plan:
 def _everything(point: ResolvedExperiment) -> dict[str, Any]:
     values = point.model_dump(mode="json")
     code = [_code(kind, getattr(point.cloud, key).name) for key, kind in KINDS.items()]
+    named = local_files(values).values()
     hashes = {
-        file: sha256(Path(file).read_bytes()).hexdigest() for file in local_files(values).values()
+        str(file): sha256(file.read_bytes()).hexdigest()
+        for each in named
+        for file in plugin_file.sources(Path(each))
     }
     return {**values, "cloudrc": __version__, "code": code, "files": hashes}
 

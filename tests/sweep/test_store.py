@@ -86,15 +86,16 @@ def test_a_folder_holds_one_sweep(plan, rows, write_sweep, tmp_path):
         store.begin(tmp_path, other)
 
 
-def test_a_changed_plugin_is_not_mixed_with_rows_of_the_old_one(write_sweep, tmp_path):
-    mine = tmp_path / "mine.py"
-    source = "from cloudrc.cloud.predictors import Predictor as build\n"
-    mine.write_text(source)
+@pytest.mark.parametrize("changed", ["mine.py", "helper.py"])
+def test_a_changed_plugin_is_not_mixed_with_rows_of_the_old_one(write_sweep, tmp_path, changed):
+    (tmp_path / "mine.py").write_text("from helper import build\n")
+    (tmp_path / "helper.py").write_text("from cloudrc.cloud.predictors import Predictor as build\n")
     path = write_sweep({"cloud.predictor": ["./mine.py"]})
     (flight,) = read_plan(path).flights.values()
     write(tmp_path, [flight.row(flown())])
     assert list(store.begin(tmp_path, read_plan(path))) == [flight.key]
-    mine.write_text(f"{source}# changed\n")
+    with (tmp_path / changed).open("a") as file:
+        file.write("# changed\n")
     with pytest.raises(BadInputError, match=r"has rows of .* changed plug-ins"):
         store.begin(tmp_path, read_plan(path))
 

@@ -1,0 +1,159 @@
+"""Load the file of a plug-in; its import statements find the modules beside it.
+
+Each plug-in becomes a package of its own, whose folder is that of the file: two plug-ins may each
+have a module `helper` beside them, and `sys.path` stays as it is. The package's modules get their
+own import statement, which looks beside the plug-in first, as Python does for a script. So a module
+beside the plug-in may be named like one of Python, and only the plug-in sees it.
+"""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import importlib
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from hashlib import sha256
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import CodeType, ModuleType
+from typing import Any
+
+PREFIX = "cloudrc_plugin_"
+"""Beginning of the names of plug-ins' packages."""
+OWN = "cloudrc"
+"""Name that always means this package: a plug-in may lie in the folder of its sources."""
+
+
+def load_file(path: Path) -> ModuleType:
+    """Execute the file of a plug-in anew, and the modules beside it that it imports."""
+    if path.suffix != ".py":
+        raise ValueError("it is not a Python file; name it *.py")
+    file = path.resolve()
+    name = PREFIX + sha256(str(file).encode(errors="surrogateescape")).hexdigest()[:16]
+    for known in [each for each in sys.modules if f"{each}.".startswith(f"{name}.")]:
+        del sys.modules[known]
+    importlib.invalidate_caches()  # a file may be new
+    if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _Finder())  # before the finder of paths
+    package = module_from_spec(ModuleSpec(name, None, is_package=True))
+    package.__path__ = [str(file.parent)]
+    package.__dict__["import_beside"] = _ImportStatement(name, str(file.parent))
+    sys.modules[name] = package
+    inner = f"{name}.{file.stem.replace('.', '_')}"
+    spec = spec_from_file_location(inner, path, loader=_Loader(inner, str(path)))
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[inner] = module  # dataclasses look up their module there
+    spec.loader.exec_module(module)
+    return module
+
+
+class _ImportStatement:
+    """What `import` does in the modules of one plug-in."""
+
+    def __init__(self, package: str, folder: str) -> None:
+        self._package, self._folder = package, folder
+        self._beside: dict[str, bool] = {OWN: False}
+
+    def __call__(
+        self,
+        name: str,
+        globals: Mapping[str, Any] | None = None,
+        locals: Mapping[str, Any] | None = None,
+        fromlist: Sequence[str] | None = (),
+        level: int = 0,
+    ) -> ModuleType:
+        """Import a module as the built-in function `__import__` does."""
+        top, more = name.partition(".")[0], fromlist or ()
+        importer = globals or {}
+        itself = importer.get("__name__") == f"{self._package}.{top}" and "__path__" not in importer
+        if level or itself or not self._is_beside(top):
+            return builtins.__import__(name, globals, locals, more, level)
+        if more:
+            return builtins.__import__(f"{self._package}.{name}", globals, locals, more, 0)
+        importlib.import_module(f"{self._package}.{name}")
+        return sys.modules[f"{self._package}.{top}"]
+
+    def _is_beside(self, top: str) -> bool:
+        """Return whether the module `top`, a name without dots, lies beside the plug-in."""
+        if top not in self._beside:
+            spec = PathFinder.find_spec(top, [self._folder])
+            if spec is not None and spec.loader is None:  # a folder without __init__.py comes last
+                spec = None if top in sys.modules or find_spec(top) else spec
+            self._beside[top] = spec is not None
+        return self._beside[top]
+
+
+class _Loader(SourceFileLoader):
+    """Executes a module of a plug-in with the plug-in's import statement."""
+
+    def get_code(self, fullname: str) -> CodeType:
+        """Compile the source; a cached file may be that of an earlier source."""
+        path = self.get_filename(fullname)
+        return self.source_to_code(self.get_data(path), path)
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Execute a module."""
+        package = sys.modules[module.__name__.partition(".")[0]]
+        own = {**vars(builtins), "__import__": package.__dict__["import_beside"]}
+        module.__dict__["__builtins__"] = own
+        super().exec_module(module)
+
+
+class _Finder(MetaPathFinder):
+    """Finds the modules of plug-ins' packages, and no others."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Find a module by its full name in the folders `path` of its package."""
+        if path is None or not fullname.startswith(PREFIX):
+            return None
+        spec = PathFinder.find_spec(fullname, path, target)
+        if spec is not None and isinstance(spec.loader, SourceFileLoader):
+            spec.loader = _Loader(fullname, spec.loader.path)
+        return spec
+
+
+def sources(path: Path) -> list[Path]:
+    """Return the file of a plug-in and all files beside it that its import statements name."""
+    file = path.resolve()
+    found, left = {file: path}, [file]
+    while left:
+        for other in _imported(left.pop(), file.parent):
+            if other not in found:
+                found[other] = other
+                left.append(other)
+    return list(found.values())
+
+
+def _imported(file: Path, folder: Path) -> Iterator[Path]:
+    """Yield the files in `folder` that the import statements in `file` name."""
+    try:
+        nodes = [*ast.walk(ast.parse(file.read_bytes()))] if file.suffix == ".py" else []
+    except (OSError, SyntaxError, ValueError, RecursionError):
+        return
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield from _files(folder, alias.name)
+        elif isinstance(node, ast.ImportFrom):
+            above = [*file.parents][: node.level][-1] if node.level else folder
+            for alias in node.names:
+                yield from _files(above, f"{node.module or ''}.{alias.name}".lstrip("."))
+
+
+def _files(folder: Path, name: str) -> Iterator[Path]:
+    """Yield the files of a module and of the packages that contain it, as far as they exist."""
+    places: list[str] | None = [str(folder)]
+    for part in name.split("."):
+        spec = PathFinder.find_spec(part, places) if places and part != OWN else None
+        if spec is None:
+            return
+        if spec.origin is not None and Path(spec.origin).is_file():
+            yield Path(spec.origin).resolve()
+        places = list(spec.submodule_search_locations or ())

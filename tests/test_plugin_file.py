@@ -1,0 +1,151 @@
+"""Modules beside a plug-in: its import statements find them, and nobody else does."""
+
+import statistics
+import sys
+from pathlib import Path
+
+import pytest
+
+from cloudrc.errors import BadInputError
+from cloudrc.plugin_file import load_file, sources
+from cloudrc.plugins import find
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Return a function that writes files, path -> source, and returns their folder."""
+
+    def make(**files):
+        for name, text in files.items():
+            path = tmp_path / f"{name.replace('__', '/')}.py"
+            path.parent.mkdir(exist_ok=True, parents=True)
+            path.write_text(text)
+        return tmp_path
+
+    return make
+
+
+IMPORTS = {
+    "import helper\nvalue = helper.value": "an import",
+    "import helper as other\nvalue = other.value": "another name",
+    "from helper import value": "a name of it",
+    "from helper import *": "all its names",
+    "from .helper import value": "a relative import",
+    "from . import helper\nvalue = helper.value": "a module of the folder",
+    "import package.inner\nvalue = package.inner.value": "a module of a package",
+    "import package.inner as other\nvalue = other.value": "a module of a package by another name",
+    "from package import inner\nvalue = inner.value": "a module from a package",
+    "from package.inner import value": "a name of a package's module",
+    "from package import value": "a name of a package",
+    "from package.deep import value": "a relative import in a package",
+    "from plain.inner import value": "a folder that is no package",
+    "from chain import value": "a module that imports another one",
+    "def late():\n    import helper\n    return helper.value\nvalue = late()": "a late import",
+    "try:\n    import nowhere\nexcept ImportError:\n    from helper import value": "a missing one",
+}
+
+
+@pytest.mark.parametrize("text", IMPORTS, ids=IMPORTS.values())
+def test_every_form_of_import_finds_what_is_beside(write, text):
+    folder = write(
+        helper="value = 3",
+        package__inner="value = 3",
+        package__deep="from ..helper import value",
+        plain__inner="value = 3",
+        chain="from helper import value",
+        mine=text,
+    )
+    (folder / "package" / "__init__.py").write_text("from package.inner import value")
+    before = [*sys.path]
+    assert load_file(folder / "mine.py").value == 3
+    assert sys.path == before
+    assert not {"helper", "package", "plain", "chain"} & set(sys.modules)
+    assert [*folder.rglob("__pycache__")] == []
+
+
+def test_helpers_of_the_same_name_do_not_mix(write):
+    source = "import helper\ndef late():\n    from helper import value\n    return value\n"
+    folder = write(a__mine=source, a__helper="value = 1", b__mine=source, b__helper="value = 2")
+    first, second = (load_file(folder / name / "mine.py") for name in "ab")
+    assert (first.helper.value, second.helper.value) == (1, 2)
+    assert (first.late(), second.late(), first.late()) == (1, 2, 1)
+
+
+def test_a_changed_helper_counts_at_the_next_load(write):
+    folder = write(mine="from helper import value", helper="value = 1")
+    assert load_file(folder / "mine.py").value == 1
+    write(helper="value = 2")
+    assert load_file(folder / "mine.py").value == 2
+
+
+def test_a_module_named_like_one_of_python_is_seen_by_the_plug_in_only(write):
+    folder = write(
+        mine="import statistics, wave\nvalue = statistics.value, wave.value",
+        statistics="import random\nvalue = 3, random.__name__",  # it uses Python's own
+        wave="from statistics import value",
+    )
+    assert load_file(folder / "mine.py").value == ((3, "random"),) * 2
+    assert sys.modules["statistics"] is statistics
+    assert statistics.median([1, 2, 3]) == 2
+
+
+def test_a_plug_in_named_like_a_module_of_python_can_import_that(write):
+    folder = write(statistics="from statistics import median\nvalue = median([3])")
+    assert load_file(folder / "statistics.py").value == 3
+
+
+def test_a_plug_in_in_the_folder_of_the_sources_uses_cloudrc_itself(write):
+    folder = write(mine="from cloudrc.messages import ZERO", cloudrc__messages="ZERO = 3")
+    (folder / "cloudrc" / "__init__.py").touch()
+    assert load_file(folder / "mine.py").ZERO == (0.0, 0.0, 0.0)
+    assert sources(folder / "mine.py") == [folder / "mine.py"]
+
+
+def test_a_folder_without_init_does_not_hide_an_installed_package(write):
+    folder = write(mine="import numpy\nvalue = numpy.zeros(3)", numpy__other="")
+    assert len(load_file(folder / "mine.py").value) == 3
+
+
+def test_a_dataclass_of_a_helper_knows_its_module(write):
+    helper = (
+        "from __future__ import annotations\nfrom dataclasses import dataclass\n"
+        "from typing import ClassVar\n@dataclass\nclass Gain:\n    u: ClassVar[str]\n    p: float\n"
+    )
+    folder = write(mine="from helper import Gain\nvalue = Gain(3).p", helper=helper)
+    assert load_file(folder / "mine.py").value == 3
+
+
+@pytest.mark.parametrize(
+    ("helper", "said"),
+    [
+        ("1 / 0", "ZeroDivisionError: division by zero"),
+        ("import sys; sys.exit(0)", "SystemExit: 0"),
+        ("def x(:", "SyntaxError: "),
+        ("from mine import build", "ImportError: "),
+    ],
+)
+def test_a_broken_helper_is_one_error_of_the_plug_in(write, helper, said):
+    folder = write(mine="from helper import value", helper=helper)
+    with pytest.raises(BadInputError, match=rf"mine.py' cannot be imported: {said}"):
+        find("predictors", str(folder / "mine.py"))
+
+
+def names(files, folder):
+    return {str(Path(each).relative_to(folder)) for each in files}
+
+
+def test_the_sources_of_a_plug_in_are_all_files_that_it_imports(write):
+    folder = write(
+        mine="import helper\ndef late():\n    from package import deep\n    import numpy, os",
+        helper="from .other import value",
+        other="import mine",  # a circle
+        package__deep="from ..third import value",
+        third="",
+        unused="",
+    )
+    (folder / "package" / "__init__.py").touch()
+    wanted = {"mine.py", "helper.py", "other.py", "package/__init__.py", "package/deep.py"}
+    assert names(sources(folder / "mine.py"), folder) == wanted | {"third.py"}
+    assert sources(folder / "trace.csv") == [folder / "trace.csv"]
+    write(mine="def build(:")
+    assert sources(folder / "mine.py") == [folder / "mine.py"]
