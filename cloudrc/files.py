@@ -5,7 +5,9 @@ Reading never blocks. Writing replaces the file in one step.
 
 from __future__ import annotations
 
+import grp
 import os
+import pwd
 import re
 import stat
 from collections.abc import Callable, Iterator
@@ -60,8 +62,53 @@ def open_file(path: Path) -> FileIO:
     raise ValueError(f"{path}: not a file")
 
 
+def who_may_write(path: Path) -> str:
+    """Say which other user could change the file or folder at `path`; "" if there is none.
+
+    Whoever may write to a folder above could put another one in its place, except in a folder with
+    the sticky bit, such as /tmp. Root may do everything and is not meant. Raise an OSError if
+    nothing is at `path`.
+    """
+    path = Path(os.path.abspath(path))
+    path.stat()  # raises for a circle of symbolic links
+    for place in (*reversed(path.parents), path):
+        status = place.lstat()
+        if status.st_uid not in (0, os.geteuid()):
+            return f"another user owns {place}"
+        if stat.S_ISLNK(status.st_mode):
+            if found := who_may_write(place.parent.resolve() / place.readlink()):
+                return found
+        elif place != path and status.st_mode & stat.S_ISVTX:
+            continue
+        elif status.st_mode & stat.S_IWOTH:
+            return f"everybody may write to {place}"
+        elif status.st_mode & stat.S_IWGRP and not _is_group_of_one(status.st_gid):
+            return f"a group may write to {place}"
+    return ""
+
+
+def make_own_folder(path: Path) -> str:
+    """Make a folder if it is missing, for this user alone; return what `who_may_write` says.
+
+    Missing folders above are made in the same way, whatever the umask. May raise an OSError.
+    """
+    for place in (*reversed(path.parents), path):
+        if not place.is_dir():
+            place.mkdir(mode=0o700, exist_ok=True)  # another process may be faster
+    return who_may_write(path)
+
+
+def _is_group_of_one(gid: int) -> bool:
+    """Return whether a group is the one that many systems make for this user alone."""
+    try:
+        user, group = pwd.getpwuid(os.geteuid()), grp.getgrgid(gid)
+    except KeyError:
+        return False
+    return (gid, group.gr_name) == (user.pw_gid, user.pw_name) and not group.gr_mem
+
+
 def warn_if_readable(path: Path, warn: Callable[[str], None]) -> None:
-    """Call `warn` with one line if other users can read the secret in this file.
+    """Call `warn` with one line if other users can read or change the secret in this file.
 
     If another user owns the file, its group may read it: Kubernetes gives the files of a Secret to
     root, and lets the pod's group read them.
@@ -69,8 +116,11 @@ def warn_if_readable(path: Path, warn: Callable[[str], None]) -> None:
     with suppress(OSError):  # a missing file is reported by its reader
         status = path.stat()
         group = stat.S_IRGRP if status.st_uid == os.geteuid() else 0
-        if status.st_mode & (stat.S_IROTH | group):
-            warn(f"warning: {path} can be read by others: chmod 600 {path}")
+        masks = {"read": stat.S_IROTH | group, "changed": stat.S_IWOTH | stat.S_IWGRP}
+        if allowed := [verb for verb, mask in masks.items() if status.st_mode & mask]:
+            warn(
+                f"warning: {path} can be {' and '.join(allowed)} by others: chmod 600 {path}",
+            )
 
 
 def read_token(path: Path) -> str:

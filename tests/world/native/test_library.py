@@ -55,14 +55,36 @@ def test_a_compiler_is_used_once(name, monkeypatch, cache):
     assert module.library().text == f"C (compiled by {name})"
 
 
-def test_a_broken_compiler_or_cache_means_python(monkeypatch, cache):
+def test_a_broken_compiler_means_python(monkeypatch, cache):
     use(monkeypatch, BROKEN)
     assert module.library().text == "Python (cc: no crt1.o)"
     assert not list(cache.iterdir())
-    cache.rmdir()
+
+
+@pytest.mark.skipif(not COMPILERS, reason="no compiler here")
+def test_without_a_cache_each_process_compiles(cache):
     cache.write_text("a file, no folder")
-    module._load.cache_clear()
-    assert "File exists" in module.library().text
+    text = module.library().text
+    assert text.startswith("C (compiled by ")
+    assert text.endswith(f", not kept: {cache}: File exists)")
+
+
+@pytest.mark.skipif(not COMPILERS, reason="no compiler here")
+@pytest.mark.parametrize("where", ["folder", "file"])
+def test_a_file_that_others_may_write_is_compiled_anew(where, monkeypatch, cache):
+    name, command = next(iter(COMPILERS.items()))
+    use(monkeypatch, (name, command))
+    cache.mkdir(mode=0o700)
+    planted = built_file(cache, name)
+    planted.write_bytes(b"no library")
+    {"folder": cache, "file": planted}[where].chmod(0o777)
+    text = module.library().text
+    assert text.startswith(f"C (compiled by {name}")
+    if where == "folder":
+        assert f"not kept: everybody may write to {cache}" in text
+        assert planted.read_bytes() == b"no library", "a foreign folder stays as it is"
+    else:
+        assert text == f"C (compiled by {name})"
 
 
 @pytest.mark.skipif(not COMPILERS, reason="no compiler here")
