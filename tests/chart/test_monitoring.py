@@ -56,7 +56,7 @@ def series():
     return {name + part for name, one in METRICS.items() for part in parts.get(one.kind, ("",))}
 
 
-def test_the_rules_use_existing_metrics_and_name_a_runbook():
+def test_the_rules_use_existing_metrics_of_the_release_and_say_what_to_do():
     known = series() | RECORDED
     for rule in RULES:
         asked = re.findall(r"(?:\w+:)?cloudrc_\w+(?::\w+)?", rule["expr"])
@@ -64,26 +64,57 @@ def test_the_rules_use_existing_metrics_and_name_a_runbook():
         assert set(asked) <= known
         if "alert" in rule:
             assert rule["labels"]["severity"] in {"info", "warning", "critical"}
-            runbook = rule["annotations"]["runbook"]
-            assert runbook.endswith(f"README.md#{rule['alert'].lower()}")
+            assert rule["annotations"].keys() == {"summary", "description"}
+        # Each series is selected by the release's pods, which the chart puts in.
+        assert len(re.findall(r"[\w:]+\{\$pods[,}]", rule["expr"])) >= len(asked)
+
+
+def rendered_rules(release):
+    """Render the rules of a release in the namespace `lab`."""
+    on = {"metrics": {"prometheusRule": {"enabled": True, "force": True}}}
+    (rule,) = of_kind(render(on, release=release), "PrometheusRule").values()
+    return rule["spec"]
+
+
+def in_release(labels, release="demo"):
+    """Give the labels of alerts.yaml the namespace and the pod names of a release."""
+    pod = f"{release}-cloudrc-world-{labels.get('pod', 'x')}"
+    return {**labels, "namespace": "lab", "pod": pod}
+
+
+def labels_text(labels):
+    return "{" + ",".join(f'{key}="{value}"' for key, value in labels.items()) + "}"
+
+
+def series_in_release(series, release="demo"):
+    """Convert a series such as name{pod="world"} to one of a release."""
+    name, _, text = series.rstrip("}").partition("{")
+    return name + labels_text(in_release(dict(re.findall(r'(\w+)="(.*?)"', text)), release))
 
 
 def promtool_test(case):
     """Convert a case of alerts.yaml to the format of `promtool test rules`."""
     alerts = []
     for time, name, *fired in case.get("fires", ()):
-        more, texts = ALERTS[name]["labels"], ALERTS[name]["annotations"]
-        expected = [{"exp_labels": labels | more, "exp_annotations": texts} for labels in fired]
+        more = ALERTS[name]["labels"] | {"release": "demo"}
+        expected = []
+        for labels in fired:
+            # What is absent has no pod.
+            seen = {**labels, "namespace": "lab"} if "Absent" in name else in_release(labels)
+            texts = ALERTS[name]["annotations"]
+            expected.append({"exp_labels": seen | more, "exp_annotations": texts})
         alerts.append({"eval_time": time, "alertname": name, "exp_alerts": expected})
-    samples = [
-        {"labels": f'{{rule="{rule}",{labels}}}', "value": value}
-        for rule, (value, labels) in case.get("recorded", {}).items()
-    ]
+    samples = []
+    for rule, (value, labels) in case.get("recorded", {}).items():
+        labels = in_release({"rule": rule, **dict(re.findall(r'(\w+)="(.*?)"', labels))})
+        samples.append({"labels": labels_text(labels), "value": value})
     round_all = 'round(label_replace({__name__=~"pod:.+"}, "rule", "$1", "__name__", "(.+)"), 0.01)'
     asked = {"expr": round_all, "eval_time": "2m", "exp_samples": samples}
     return {
         "interval": "5s",
-        "input_series": [{"series": k, "values": v} for k, v in case["series"].items()],
+        "input_series": [
+            {"series": series_in_release(k), "values": v} for k, v in case["series"].items()
+        ],
         "alert_rule_test": alerts,
         "promql_expr_test": [asked] if samples else [],
     }
@@ -95,13 +126,43 @@ def test_the_alerts_fire_when_they_should_and_only_then(tmp_path):
     rows = [row for case in cases for row in case.get("fires", ())]
     assert {name for _, name, *fired in rows if fired} == ALERTS.keys(), "each alert has a case"
     assert cases[-1]["recorded"].keys() == RECORDED
-    document = {"rule_files": [str(FILE)], "evaluation_interval": "5s"}
-    (tmp_path / "tests.yaml").write_text(
-        yaml.safe_dump(document | {"tests": list(map(promtool_test, cases))})
-    )
-    for words in (["check", "rules", FILE], ["test", "rules", tmp_path / "tests.yaml"]):
-        done = subprocess.run(["promtool", *words], capture_output=True, text=True)
+    (tmp_path / "demo.yaml").write_text(yaml.safe_dump(rendered_rules("demo")))
+    promtool(tmp_path, ["demo.yaml"], list(map(promtool_test, cases)))
+
+
+def promtool(folder, rule_files, tests):
+    document = {"rule_files": rule_files, "evaluation_interval": "5s", "tests": tests}
+    (folder / "tests.yaml").write_text(yaml.safe_dump(document))
+    for words in (["check", "rules", *rule_files], ["test", "rules", "tests.yaml"]):
+        done = subprocess.run(["promtool", *words], capture_output=True, text=True, cwd=folder)
         assert "SUCCESS" in done.stdout, done.stdout + done.stderr
+
+
+@needs_promtool
+def test_of_two_releases_only_the_lost_one_is_absent_and_each_alert_comes_once(tmp_path):
+    """Prometheus evaluates the rules of both releases over the series of both."""
+    series = {}
+    for release, world in (("demo", "1x60"), ("other", "1x10 stale _x50")):
+        (tmp_path / f"{release}.yaml").write_text(yaml.safe_dump(rendered_rules(release)))
+        for role, values in (("world", world), ("cloud", "1x60")):
+            series[series_in_release(f'cloudrc_build_info{{role="{role}"}}', release)] = values
+        slow = series_in_release('cloudrc_real_time_factor{pod="slow"}', release)
+        series[slow] = "0.5x60" if release == "demo" else "1x60"
+    lost = {"namespace": "lab", "role": "world", "release": "other"}
+    slow = in_release({"pod": "slow"}) | {"release": "demo"}
+
+    def expect(name, labels):
+        labels = labels | {"severity": ALERTS[name]["labels"]["severity"]}
+        texts = ALERTS[name]["annotations"]
+        only = [{"exp_labels": labels, "exp_annotations": texts}]
+        return {"eval_time": "4m", "alertname": name, "exp_alerts": only}
+
+    case = {
+        "interval": "5s",
+        "input_series": [{"series": name, "values": values} for name, values in series.items()],
+        "alert_rule_test": [expect("CloudrcAbsent", lost), expect("CloudrcNotRealTime", slow)],
+    }
+    promtool(tmp_path, ["demo.yaml", "other.yaml"], [case])
 
 
 def dashboards(values=None, **where):

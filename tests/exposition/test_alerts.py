@@ -104,7 +104,9 @@ def fired(flight, folder):
         "promql_expr_test": [{"expr": expression, "eval_time": f"{int(flight.now) + AFTER}s"}],
     }
     document = {"rule_files": ["rules.yaml"], "evaluation_interval": "5s", "tests": [test]}
-    shutil.copy(RULES, folder / "rules.yaml")
+    # All series of the flight belong to one release, so that no rule has to select.
+    text = RULES.read_text().replace("{$pods}", "").replace("$pods,", "")
+    (folder / "rules.yaml").write_text(text)
     (folder / "tests.yaml").write_text(yaml.safe_dump(document))
     # The test expects no sample, so promtool lists every sample as unexpected.
     command = ["promtool", "test", "rules", "tests.yaml"]
