@@ -51,6 +51,10 @@ PEERS = {
         "additionalProperties": OBJECT,
     },
 }
+LABELS = {**TEXTS, "propertyNames": {"not": {"pattern": r"^app\.kubernetes\.io/"}}}
+OBJECTS = {"type": "array", "items": OBJECT}
+NAMED = {**OBJECT, "required": ["name"]}
+PORT = {"type": "integer", "minimum": 1, "maximum": 65_535}
 RULES = {
     "fullnameOverride": _text(r"^$|^[a-z]([-a-z0-9]*[a-z0-9])?$"),
     "tag": _text(r"^$|^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$"),
@@ -68,16 +72,23 @@ RULES = {
         },
     },
     "resources": _ref("Resources"),
-    "tolerations": {"type": "array", "items": OBJECT},
+    "tolerations": OBJECTS,
     "affinity": OBJECT,
-    "podLabels": {**TEXTS, "propertyNames": {"not": {"pattern": r"^app\.kubernetes\.io/"}}},
+    "commonLabels": LABELS,
+    "podLabels": LABELS,
+    "priorityClassName": NAME,
+    "runtimeClassName": NAME,
+    "extraEnv": {"type": "array", "items": NAMED},
+    "extraVolumes": {"type": "array", "items": NAMED},
+    "extraVolumeMounts": {"type": "array", "items": {**OBJECT, "required": ["name", "mountPath"]}},
     "recordingSizeLimit": QUANTITY,
     "workers": {"type": "integer", "minimum": 1, "maximum": 64},
     "existingClaim": NAME,
     "existingSecret": NAME,
     "size": QUANTITY,
     "type": _one_of("ClusterIP", "NodePort", "LoadBalancer"),
-    "port": {"type": "integer", "minimum": 1, "maximum": 65_535},
+    "port": PORT,
+    "dnsPort": PORT,
     "leaseSeconds": {"type": "integer", "minimum": 5, "maximum": 3600},
     "allowFrom": PEERS,
     "dns": PEERS,

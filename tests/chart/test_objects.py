@@ -80,6 +80,46 @@ def test_annotations_and_placement_of_the_user_are_used():
         assert pod["metadata"]["annotations"].items() > inject.items()
 
 
+def test_every_container_takes_environment_and_mounts_of_the_user():
+    objects = render(values_of(CHART / "ci" / "everything-values.yaml"))
+    specs = pod_specs(objects)
+    found = [containers(specs[pod]) for pod in ("world", "cloud", "mission")]
+    named = {name: one for pod in found for name, one in pod.items() if name != "load"}
+    assert named.keys() == {"world", "cloud", "teleop", "console", "link", "mission"}
+    for name, one in named.items():
+        assert {"name": "TZ", "value": "UTC"} in one["env"], name
+        assert "certificates" in {mount["name"] for mount in one["volumeMounts"]}, name
+    for pod in ("world", "cloud", "mission"):
+        assert "certificates" in {volume["name"] for volume in specs[pod]["volumes"]}, pod
+    assert specs["world"]["priorityClassName"] == "robots"
+    assert specs["world"]["runtimeClassName"] == "gvisor"
+    assert "priorityClassName" not in specs["cloud"]
+
+
+def test_common_labels_are_on_every_object_and_pod_and_those_of_a_pod_win():
+    values = {
+        "commonLabels": {"team": "robots", "site": "a"},
+        "world": {"podLabels": {"site": "b"}},
+        "mission": {"enabled": True, "podLabels": {"sidecar.istio.io/inject": "false"}},
+        "metrics": {"podMonitor": {"enabled": True, "force": True, "labels": {"team": "ops"}}},
+        "dashboards": {"enabled": True},
+    }
+    objects = render(values)
+    for thing in objects:
+        assert thing["metadata"]["labels"]["site"] == "a"
+    (monitor,) = of_kind(objects, "PodMonitor").values()
+    assert monitor["metadata"]["labels"]["team"] == "ops"
+    deployments = of_kind(objects, "Deployment")
+    labels = deployments["world"]["spec"]["template"]["metadata"]["labels"]
+    assert (labels["team"], labels["site"]) == ("robots", "b")
+    assert deployments["world"]["spec"]["revisionHistoryLimit"] == 10
+    alone = [thing for thing in objects if thing["kind"] == "Pod"]
+    alone += [thing["spec"]["template"] for thing in of_kind(objects, "Job").values()]
+    assert len(alone) == 3  # the mission's, and two of helm test
+    for thing in alone:
+        assert thing["metadata"]["labels"]["sidecar.istio.io/inject"] == "false"
+
+
 def test_the_command_line_accepts_every_containers_arguments():
     load = {"backgroundLoad": {"enabled": True, "workers": 3}}
     more = {"mission": {"enabled": True, "queue": True}, "console": {"enabled": True}}

@@ -9,7 +9,8 @@ jsonschema = pytest.importorskip("jsonschema", reason="comes with kubernetes-val
 DEFAULTS = values_of(CHART / "values.yaml")
 # Values that Helm, Kubernetes or a plug-in defines and checks.
 CONTEXTS = {"podSecurityContext", "containerSecurityContext"}
-OPEN = {"global", "affinity", "tolerations", "allowFrom", "dns"} | CONTEXTS
+EXTRAS = {"extraEnv", "extraVolumes", "extraVolumeMounts"}
+OPEN = {"global", "affinity", "tolerations", "allowFrom", "dns"} | CONTEXTS | EXTRAS
 
 
 def parts(node, path=()):

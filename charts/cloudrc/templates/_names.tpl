@@ -23,12 +23,22 @@ helm.sh/chart: {{ printf "cloudrc-%s" .root.Chart.Version | replace "+" "_" }}
 app.kubernetes.io/version: {{ .root.Chart.AppVersion | quote }}
 app.kubernetes.io/part-of: cloudrc
 app.kubernetes.io/managed-by: {{ .root.Release.Service }}
+{{- include "cloudrc.moreLabels" . }}
 {{- end }}
 
-{{/* Labels of a pod, without the version: a new version alone must not restart the pod. */}}
+{{/* The value commonLabels; labels in the argument `more` win. */}}
+{{- define "cloudrc.moreLabels" -}}
+{{- with merge (deepCopy (.more | default dict)) .root.Values.commonLabels }}
+{{ toYaml . }}
+{{- end }}
+{{- end }}
+
+{{/* Labels of a pod, without the version: a new version alone must not restart the pod. The argument
+     `more` has the pod's own labels. */}}
 {{- define "cloudrc.podLabels" -}}
 {{ include "cloudrc.selector" . }}
 app.kubernetes.io/part-of: cloudrc
+{{- include "cloudrc.moreLabels" . }}
 {{- end }}
 
 {{/* Image of a role, "world" or "cloud", by digest if set, else by tag. */}}

@@ -43,7 +43,27 @@ livenessProbe:
   failureThreshold: 3
 {{- end }}
 
+{{/* Additional environment of a container without one of its own. Argument: its values. */}}
+{{- define "cloudrc.extraEnv" -}}
+{{- with .extraEnv -}}
+env:
+  {{- toYaml . | nindent 2 }}
+{{- end -}}
+{{- end }}
+
+{{- define "cloudrc.extraMounts" -}}
+{{- with .extraVolumeMounts -}}
+{{ toYaml . }}
+{{- end -}}
+{{- end }}
+
 {{- define "cloudrc.placement" -}}
+{{- with .priorityClassName }}
+priorityClassName: {{ . }}
+{{- end }}
+{{- with .runtimeClassName }}
+runtimeClassName: {{ . }}
+{{- end }}
 {{- with .nodeSelector }}
 nodeSelector:
   {{- toYaml . | nindent 2 }}

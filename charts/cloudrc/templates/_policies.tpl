@@ -4,8 +4,8 @@
 - to:
     {{- toYaml .Values.networkPolicy.dns | nindent 4 }}
   ports:
-    - {port: 53, protocol: UDP}
-    - {port: 53, protocol: TCP}
+    - {port: {{ .Values.networkPolicy.dnsPort }}, protocol: UDP}
+    - {port: {{ .Values.networkPolicy.dnsPort }}, protocol: TCP}
 {{- end }}
 
 {{/* The tunnel to or from the other end. Argument: (dict "root" $ "component" PEER "way" "from"|"to"). */}}

@@ -38,6 +38,9 @@
       valueFrom:
         fieldRef:
           fieldPath: {{ .uid }}
+    {{- with .root.Values.mission.extraEnv }}
+    {{- toYaml . | nindent 4 }}
+    {{- end }}
   terminationMessagePolicy: FallbackToLogsOnError
   {{- include "cloudrc.containerSecurity" .root | nindent 2 }}
   resources:
@@ -45,6 +48,7 @@
   volumeMounts:
     - {name: mission, mountPath: /etc/cloudrc-mission, readOnly: true}
     - {name: tokens, mountPath: /etc/cloudrc-tokens, readOnly: true}
+    {{- include "cloudrc.extraMounts" .root.Values.mission | nindent 4 }}
 {{- end }}
 
 {{/* Volumes of a pod that flies a mission. Argument: (dict "root" $ "name" CONFIGMAP). */}}
@@ -58,6 +62,9 @@
     defaultMode: 0440
     items:
       - {key: operator, path: operator}
+{{- with .root.Values.mission.extraVolumes }}
+{{ toYaml . }}
+{{- end }}
 {{- end }}
 
 {{/* Spec of a Job that flies a mission. Argument: (dict "root" $ "name" CONFIGMAP "queue" BOOL). */}}
@@ -76,7 +83,7 @@ ttlSecondsAfterFinished: {{ .root.Values.mission.ttlSecondsAfterFinished }}
 template:
   metadata:
     labels:
-      {{- include "cloudrc.podLabels" (dict "root" .root "component" "mission") | nindent 6 }}
+      {{- include "cloudrc.podLabels" (dict "root" .root "component" "mission" "more" .root.Values.mission.podLabels) | nindent 6 }}
     {{- with .root.Values.mission.podAnnotations }}
     annotations:
       {{- toYaml . | nindent 6 }}
