@@ -9,11 +9,10 @@ from collections.abc import Collection
 from pathlib import Path
 
 from cloudrc.cli.output import print_line
+from cloudrc.cli.parser import KUBECTL_PLUGIN
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 
 RUNS = Path("runs")
-KUBECTL_PLUGIN = "kubectl-cloudrc"
-"""Name of this program when kubectl starts it as a plugin."""
 
 
 def run_argument(parser: argparse.ArgumentParser) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import difflib
 import importlib
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from math import nan
+from pathlib import Path
 from typing import Any, NoReturn
 
 from cloudrc import __version__
@@ -50,6 +52,8 @@ SHARED = {
 }
 """Commands without a module of their own -> the module in `cloudrc/cli` that contains them."""
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
+KUBECTL_PLUGIN = "kubectl-cloudrc"
+"""Name of this program when kubectl starts it as a plug-in."""
 COUNT_MAX = 10_000
 """Largest number of repeats, seeds or processes that a flag accepts."""
 
@@ -136,15 +140,17 @@ def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Pars
     The function imports only the modules of these commands. With `for_completion`, the help also
     contains argparse's list of commands, which the completion script needs.
     """
+    # kubectl starts a plug-in by its file name, which nobody types.
+    typed = "kubectl cloudrc" if Path(sys.argv[0]).name == KUBECTL_PLUGIN else "cloudrc"
     parser = Parser(
-        prog="cloudrc",
-        usage="cloudrc [-h] [--version] [--debug] COMMAND ...",
+        prog=typed,
+        usage=f"{typed} [-h] [--version] [--debug] COMMAND ...",
         description="\n\n".join([ABOUT, *map(_lines, GROUPS)]),
         epilog=EXAMPLES,
     )
     parser.add_argument("--version", action="version", version=f"cloudrc {__version__}")
     shown = "what to do" if for_completion else argparse.SUPPRESS
-    commands = parser.add_subparsers(dest="command", help=shown, prog="cloudrc")
+    commands = parser.add_subparsers(dest="command", help=shown, prog=typed)
     for name, line in COMMANDS.items():
         module = _find_command(name) if name in set(wanted) else None
         command = commands.add_parser(name, help=line, description=_sentence(line))

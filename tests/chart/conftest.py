@@ -89,7 +89,9 @@ def values_of(path):
     return dict(yaml.load(path.read_text(), Loader) or {})  # noqa: S506
 
 
-def render_texts(values=None, *, release="demo", namespace="lab", lookup=nothing, apis=()):
+def render_texts(
+    values=None, *, release="demo", namespace="lab", lookup=nothing, apis=(), upgrade=False
+):
     """Render every template: path -> text; raise if the schema refuses the values."""
     import jsonschema
 
@@ -97,7 +99,13 @@ def render_texts(values=None, *, release="demo", namespace="lab", lookup=nothing
     jsonschema.Draft7Validator(SCHEMA).validate(merged)
     context = {
         "Values": copy.deepcopy(merged),
-        "Release": {"Name": release, "Namespace": namespace, "Service": "Helm", "IsInstall": True},
+        "Release": {
+            "Name": release,
+            "Namespace": namespace,
+            "Service": "Helm",
+            "IsInstall": not upgrade,
+            "IsUpgrade": upgrade,
+        },
         "Chart": {"Version": METADATA["version"], "AppVersion": METADATA["appVersion"]},
         "Capabilities": {"APIVersions": Versions(apis)},
         "Files": Files(),

@@ -86,3 +86,12 @@ def test_a_closed_pipe_is_no_error():
     line = f"{sys.executable} -m cloudrc list -o json | true; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
     assert (done.stdout, done.stderr) == ("0\n", "")
+
+
+def test_the_plugin_of_kubectl_calls_itself_as_it_is_typed(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["/usr/local/bin/kubectl-cloudrc"])
+    with pytest.raises(SystemExit):
+        main(["mission", "--help"])
+    assert capsys.readouterr().out.startswith("usage: kubectl cloudrc mission")
+    assert main(["mision"]) == BadInputError.exit_code
+    assert "see 'kubectl cloudrc --help'" in capsys.readouterr().err
