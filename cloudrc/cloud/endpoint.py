@@ -246,6 +246,8 @@ class CloudEndpoint(TunnelEnd):
         keys = self._session.ring.keys.accepted
         key = keys[self._hellos % len(keys)]
         self._hellos += 1
+        if self._session.epoch == NO_EPOCH:  # the key of the last session was dropped
+            self._handshake.leave()
         self._greet(self._handshake.make_hello(), key)
 
     def _wants_session(self, now_ns: int) -> bool:

@@ -106,7 +106,7 @@ class ServerHandshake:
         if len(self._counters) > CLOUDS_MAX:
             del self._counters[next(iter(self._counters))]
         if hello.nonce == self._incumbent.nonce:
-            if self._keeps_epoch():  # with the epoch's key
+            if self._keeps_epoch(hello):  # with the epoch's key
                 return HelloAnswer("hello", [self._accept()])
         elif now_ns <= self._fresh_until_ns:
             return HelloAnswer(
@@ -125,17 +125,18 @@ class ServerHandshake:
         self._session.begin(self._epoch)
         return self._accept()
 
-    def _keeps_epoch(self) -> bool:
+    def _keeps_epoch(self, hello: Hello) -> bool:
         """Return whether the present epoch continues after a repeated HELLO of the session's cloud.
 
-        A cloud with the epoch's key can use the repeated ACCEPT, so its HELLOs never end the epoch:
-        over a slow link with losses, many are under way before cloud gets the first answer. A HELLO
-        with a newer key ends the epoch, and so do more than REPEATS_MAX HELLOs with another key if
-        nothing else arrives in between: cloud has lost the epoch's key.
+        Over a slow link with losses, many HELLOs are under way before cloud gets the first answer.
+        They do not end the epoch. It ends if an end has left it, which the epoch in `hello` shows
+        for cloud, and after a HELLO with a newer key. More than REPEATS_MAX HELLOs with another key
+        end it, too, if nothing else arrives in between: cloud has lost the epoch's key.
         """
         session, key = self._session, self._session.greeting_key
         is_upgrade = session.is_outdated and key == session.ring.keys.current
-        if is_upgrade or session.epoch == NO_EPOCH:
+        is_left = session.epoch == NO_EPOCH or is_newer(hello.epoch, self._epoch)
+        if is_upgrade or is_left:
             return False
         self._repeated = 0 if key == session.epoch_key else self._repeated + 1
         return self._repeated <= REPEATS_MAX
@@ -167,12 +168,19 @@ class ClientHandshake:
         """Start without a session; `nonce` identifies this process, `clock` the machine's clock."""
         self._seed, self._clock = nonce, clock
         self._nonce, self._nonces = nonce, 0
-        self._epoch = NO_EPOCH  # the newest known epoch
+        self._epoch, self._left = NO_EPOCH, False  # the newest known epoch; whether cloud left it
         self._cookie = NO_COOKIE
         self._replies = 0
         self._cookies: dict[bytes, None] = {}  # received so far, oldest first
         self._world = b""  # nonce of the world process with the session
         self._old_worlds: deque[bytes] = deque(maxlen=WORLDS_MAX)
+
+    def leave(self) -> None:
+        """Leave the newest epoch for good: to join it again would repeat its counters.
+
+        The next HELLO names the epoch after it, so that world begins a later one.
+        """
+        self._left = self._epoch != NO_EPOCH
 
     def make_hello(self) -> bytes:
         """Make the body of a periodic HELLO."""
@@ -218,11 +226,12 @@ class ClientHandshake:
             return None
         if self._world and not known:
             self._old_worlds.append(self._world)  # an ended process does not come back
-        self._world, self._epoch = accept.world_nonce, epoch
+        self._world, self._epoch, self._left = accept.world_nonce, epoch, False
         return accept.nonce + accept.world_nonce
 
     def _hello(self) -> bytes:
-        return codec.encode(Kind.HELLO, self._nonce, self._clock, self._cookie, self._epoch)
+        epoch = self._epoch % EPOCH_MAX + 1 if self._left else self._epoch
+        return codec.encode(Kind.HELLO, self._nonce, self._clock, self._cookie, epoch)
 
 
 VERSION_TEXT = "peer speaks v{}, we speak v{}: run the same version of cloudrc at both ends"

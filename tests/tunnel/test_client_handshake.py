@@ -54,6 +54,18 @@ def test_a_hello_has_nonce_clock_cookie_and_newest_epoch(cloud):
     assert not cloud.handshake.is_refused(b"m" * 16)
 
 
+def test_a_cloud_that_left_its_epoch_asks_for_a_later_one(cloud):
+    """It had lost its key for a moment; counters must not start again with the same keys."""
+    cloud.handshake.leave()
+    assert cloud.hello().epoch == 0, "there was no epoch"
+    assert cloud.accepts(3) is not None
+    cloud.handshake.leave()
+    assert cloud.hello().epoch == 4
+    assert cloud.accepts(3) is None
+    assert cloud.accepts(4) is not None, "which world began meanwhile"
+    assert cloud.hello().epoch == 4
+
+
 def test_repeated_challenges_get_a_limited_number_of_answers(cloud):
     answer = cloud.handshake.answer_challenge
     assert answer(b"0" * 13) is None, "it has not asked"

@@ -116,6 +116,11 @@ def test_an_incumbent_that_asks_gets_its_epoch_again(step):
     assert step.receive_hello(OTHER).opened, "a hello is no sign of life"
 
 
+def test_a_cloud_that_left_its_epoch_gets_a_later_one_once(step):
+    step.receive_hello()
+    assert [step.answer(epoch=2)[1] for _ in range(9)] == [3] * 9
+
+
 def test_a_cloud_that_tries_two_keys_keeps_the_epoch_of_one(step):
     step.world.ring.keys = KeySet(NEW, KEY)
     assert step.receive_hello().opened
