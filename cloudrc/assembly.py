@@ -104,6 +104,14 @@ def fly(experiment: ResolvedExperiment, see: Sink) -> None:
     run.fly(lambda: teleop.over, round(flight_limit(experiment) * 1e9), sink)
 
 
+def step_code(experiment: ResolvedExperiment) -> str:
+    """Say what runs the usual physics steps: "C" with a hash of the machine code, or "Python"."""
+    from cloudrc.world.native.robot import usable
+
+    library = usable()
+    return f"C {library.code}" if library.run and experiment.world.is_nominal else "Python"
+
+
 def virtual_notes(experiment: ResolvedExperiment) -> tuple[str, ...]:
     """Return warnings for the report of a flight in virtual time; () if there are none."""
     return (MEASURED,) if experiment.cloud.compute_measured else ()

@@ -134,6 +134,16 @@ def figure_arguments(parser: argparse.ArgumentParser, width: float) -> None:
     add("--font-size", type=number(5, 24, "points"), default=9.0, metavar="PT", help=about)
 
 
+class _Version(argparse.Action):
+    """Print the version and the hash of the code, which is computed only if it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from cloudrc.source import code_hash
+
+        print(f"cloudrc {__version__} (code {code_hash()})")
+        parser.exit()
+
+
 def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Parser:
     """Build the parser of all commands, with the arguments of the `wanted` commands only.
 
@@ -148,7 +158,9 @@ def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Pars
         description="\n\n".join([ABOUT, *map(_lines, GROUPS)]),
         epilog=EXAMPLES,
     )
-    parser.add_argument("--version", action="version", version=f"cloudrc {__version__}")
+    parser.add_argument(
+        "--version", action=_Version, nargs=0, help="print version and hash of the code"
+    )
     shown = "what to do" if for_completion else argparse.SUPPRESS
     commands = parser.add_subparsers(dest="command", help=shown, prog=typed)
     for name, line in COMMANDS.items():

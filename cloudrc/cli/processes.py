@@ -257,6 +257,7 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     require("a recording", ("record",))
     from cloudrc.drivers.recording import Recorder
     from cloudrc.record.writer import McapWriter
+    from cloudrc.source import code_hash
 
     path: Path = options.record
     kept, size_max = 0, None
@@ -270,7 +271,12 @@ def open_recorder(options: argparse.Namespace, clock: str, clock_id: bytes) -> R
     return Recorder(
         path,
         lambda file: McapWriter(
-            file, clock=clock, clock_id=clock_id.hex(), wall_offset_ns=offset_ns, index=False
+            file,
+            clock=clock,
+            clock_id=clock_id.hex(),
+            wall_offset_ns=offset_ns,
+            code=code_hash(),
+            index=False,
         ),
         size_max=size_max,
     )

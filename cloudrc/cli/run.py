@@ -311,15 +311,16 @@ def _record_virtual(
     """
     from cloudrc import assembly
     from cloudrc.record.columns import Recording, RecordStore
-    from cloudrc.record.writer import McapWriter
+    from cloudrc.record.writer import CODE, McapWriter
     from cloudrc.report.document import Run
     from cloudrc.report.views import views
     from cloudrc.report.write import attachments
+    from cloudrc.source import code_hash
     from cloudrc.world.native.robot import usable
 
     store, interrupted = RecordStore(), False
     # Record during the flight, so that the recording is kept if the run or its report fails.
-    with McapWriter(folder / "mission.mcap", clock="world") as writer:
+    with McapWriter(folder / "mission.mcap", clock="world", code=code_hash()) as writer:
         at_start = attachments(folder)  # the experiment, also for a copy that is cut short
         for name, data in at_start.items():
             writer.attach(name, data)
@@ -338,7 +339,7 @@ def _record_virtual(
             steps = usable().text if experiment.world.is_nominal else NO_C
             run = Run("virtual", "virtual", interrupted, assembly.virtual_notes(experiment), steps)
             writer.note(run.metadata)
-            recording = Recording(records=store)
+            recording = Recording(records=store, metadata={CODE: code_hash()})
             writer.write_views(views(recording, experiment))
             yield recording, experiment, run
         finally:

@@ -37,6 +37,7 @@ from cloudrc.config.overrides import parse_settings
 from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, describe_error
 from cloudrc.files import write_atomically
 from cloudrc.metrics.verdict import EXIT_CODES
+from cloudrc.source import code_hash
 from cloudrc.sweep import store
 from cloudrc.sweep.flight import Row, counts, fly_point, measure
 from cloudrc.sweep.plan import Flight, Plan, pack, read_plan, unpack
@@ -52,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
         folder.mkdir(parents=True, exist_ok=True)  # another shard may be faster
     elif folder is None or not (folder / store.FILE).is_file():
         folder = new_folder(folder, f"sweep-{options.file.stem}", "latest-sweep")
-    before = store.begin(folder, plan)
+    before = store.begin(folder, plan, is_shared=bool(options.shard))
     mine = [*plan.flights.values()][(shard or 1) - 1 :: count]
     missing = [
         each
@@ -113,6 +114,8 @@ def _keep(
     with store.append_rows(folder, shard) as append:
 
         def take(row: Row) -> None:
+            if row["code"] != code_hash():
+                raise BadInputError("the code of cloudrc has changed during the sweep; begin again")
             if row["key"] not in before:
                 append(row)
             see(row)
@@ -162,7 +165,9 @@ def fly_again(options: argparse.Namespace) -> int:
     key, flights = rows[0]["key"], read_plan(options.folder / store.FILE).flights
     changed = f"{key}: a plug-in, the processor or a package has changed since; fly the sweep again"
     if key not in flights:
-        raise InvalidRunError(changed)
+        code = rows[0].get("code") or "without a hash"
+        other = f"{key}: was flown by code {code}, this is code {code_hash()}; fly the sweep again"
+        raise InvalidRunError(changed if code == code_hash() else other)
     report = _fly_into(options.folder / key, flights[key], page=True)
     print_traceback(options, report)
     print_or_drop(summary(report, options.folder / key))

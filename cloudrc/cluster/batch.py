@@ -19,7 +19,7 @@ from cloudrc.cluster.jobs import (
     read_example,
     read_log,
 )
-from cloudrc.errors import to_one_line
+from cloudrc.errors import BadInputError, to_one_line
 
 COMPONENT = "sweep"
 """Label `component` of the Jobs and pods of sweeps, and name of their container."""
@@ -65,14 +65,19 @@ def start(
 def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iterator[str]:
     """Yield the lines of a Job's logs until the Job is complete; then delete the Job.
 
-    `tell` receives sentences for the user. A failed Job is not deleted.
+    `tell` receives sentences for the user. A failed Job is not deleted, unless its pods refuse the
+    flights.
 
     Raises:
+        BadInputError: If a pod refuses the flights, for example because its image has other code.
         ClusterError: If the Job fails, or if a pod will never run.
     """
 
     def describe_end(state: Any) -> str:
         words = to_one_line(state.message) or state.reason
+        if state.exit_code == BadInputError.exit_code:  # the other pods refuse them, too
+            delete_job(release, name)
+            raise BadInputError(f"the pods refuse the flights: {words}")
         return f"a pod failed with exit code {state.exit_code}: {words}" if state.exit_code else ""
 
     yield from read_log(release, name, tell, describe_end)

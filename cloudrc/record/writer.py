@@ -37,6 +37,8 @@ CHUNK_NS = 500_000_000
 """Longest time between the first and the last message of a chunk [ns]."""
 METADATA = "cloudrc"
 """Name of the file's metadata record."""
+CODE = "code"
+"""Metadata key: hash of the sources that have flown (`source.code_hash`)."""
 CLOCK = "clock"
 """Metadata key: the clock of the stamps, "world" or "cloud"."""
 MISSING = "missing"
@@ -60,6 +62,7 @@ class McapWriter:
         clock: str,
         clock_id: str = "",
         wall_offset_ns: int | None = None,
+        code: str = "",
         index: bool = True,
     ) -> None:
         """Open a file, or use a stream that the caller closes; every method may raise an OSError.
@@ -67,6 +70,7 @@ class McapWriter:
         `clock` is "world" or "cloud", the clock of the stamps. `clock_id` identifies the machine's
         clock ("" if unknown); files with the same `clock_id` need no clock offset.
         `wall_offset_ns` is the wall time minus the time of `clock` [ns]; None in virtual time.
+        `code` is the hash of the sources that fly; "" for a copy, whose metadata name it.
         Without `index`, the file gets no index of its chunks, and writing takes constant memory.
         """
         self._owned = isinstance(target, Path)
@@ -93,6 +97,8 @@ class McapWriter:
         self._counts: Counter[str] = Counter()
         self._mcap.start(profile="ros2", library=f"cloudrc {__version__}")
         self.note({CLOCK: clock, "clock_id": clock_id, "version": __version__, COUNTS: ""})
+        if code:
+            self.note({CODE: code})
         if wall_offset_ns is not None:
             self.note({WALL_OFFSET: str(wall_offset_ns)})
 

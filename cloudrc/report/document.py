@@ -63,6 +63,11 @@ class Assessment:
         return next(filter(None, self.flight.recording["/fault"]["traceback"]), None)
 
     @property
+    def code(self) -> str | None:
+        """Hash of the sources that have flown; None for a recording that does not name it."""
+        return self.flight.recording.metadata.get("code")
+
+    @property
     def document(self) -> dict[str, Any]:
         """The content of report.json."""
         recording, numbers = self.flight.recording, self.numbers.items()
@@ -74,6 +79,7 @@ class Assessment:
                 "operator_verdict": self.operator and _verdict_document(self.operator),
                 "experiment": self.experiment.name,
                 "config_sha256": fingerprint(self.experiment),
+                "code": self.code,
                 "mode": self.run.mode,
                 "seed": self.experiment.seed,
                 "shaper": self.run.shaper,
@@ -101,11 +107,11 @@ def clock_offset_document(metadata: Mapping[str, str]) -> dict[str, Any] | None:
     return _known({"method": method, "uncertainty": known})
 
 
-def environment_document(physics_steps: str = "") -> dict[str, Any]:
+def environment_document(physics_steps: str = "", code: str | None = None) -> dict[str, Any]:
     """Describe the software and hardware of this machine, without names of users and hosts.
 
     `physics_steps` names the code of the physics steps, such as "C (compiled by cc)"; "" if this is
-    unknown.
+    unknown. `code` is a hash of the sources that have flown; None if this is unknown.
     """
     packages = {}
     for name in PACKAGES:
@@ -121,6 +127,7 @@ def environment_document(physics_steps: str = "") -> dict[str, Any]:
         "architecture": platform.machine(),
         "processor": _processor(),
         "cores": os.cpu_count(),
+        **({"code": code} if code else {}),
         **({"physics_steps": physics_steps} if physics_steps else {}),
     }
 

@@ -78,7 +78,7 @@ def write_report(
     assessment = assess(recording, experiment, run, own)
     document = assessment.document
     write_json(folder / "report.json", document)
-    environment = _environment(folder / "environment.json", run)
+    environment = _environment(folder / "environment.json", assessment)
     if driven := _driven(assessment.flight):
         write_atomically(folder / DRIVE_FILE, driven.encode())
     if page:
@@ -86,12 +86,12 @@ def write_report(
     return document
 
 
-def _environment(path: Path, run: Run) -> dict[str, Any]:
+def _environment(path: Path, assessment: Assessment) -> dict[str, Any]:
     """Read from `path` which machine flew; without a valid file, write one for this machine."""
     with suppress(OSError, ValueError, RecursionError):
         if not path.is_symlink() and isinstance(known := json.loads(read(path)), dict):
             return known
-    document = environment_document(run.physics_steps)
+    document = environment_document(assessment.run.physics_steps, assessment.code)
     write_json(path, document)
     return document
 

@@ -17,8 +17,9 @@ ERROR = "error"
 """Verdict of a flight that raised an exception, and code of its only failure."""
 Row: TypeAlias = dict[str, Any]
 """Result of a flight: `verdict`; `failures` (codes, the earliest first); `text` (the first failure,
-or why a metric has no value); `numbers` (metric -> value); `records_sha256`; and, if a plug-in
-failed, `traceback`. A row of a sweep also has `key`, `point` and `seed`."""
+or why a metric has no value); `numbers` (metric -> value); `records_sha256`; `physics_steps`, the
+language of the physics steps and a hash of their machine code; and, if a plug-in failed,
+`traceback`. A row of a sweep also has `key`, `point`, `seed` and `code`, a hash of the sources."""
 
 
 def fly_point(experiment: ResolvedExperiment) -> Row:
@@ -33,7 +34,7 @@ def fly_point(experiment: ResolvedExperiment) -> Row:
         if failure := machine_error(error) or _lost_file(experiment):
             raise failure from error
         text, none = describe_error(error), {"numbers": {}, "records_sha256": ""}
-        return {"verdict": ERROR, "failures": [ERROR], "text": text, **none}
+        return {"verdict": ERROR, "failures": [ERROR], "text": text, **none, "physics_steps": ""}
 
 
 def _lost_file(experiment: ResolvedExperiment) -> MissingPrerequisiteError | None:
@@ -55,6 +56,7 @@ def measure(experiment: ResolvedExperiment) -> Row:
         "text": failures[0].text if failures else next(notes, ""),
         "numbers": {name: number.value for name, number in found.numbers.items()},
         "records_sha256": found.records_sha256,
+        "physics_steps": assembly.step_code(experiment),
         **({"traceback": found.traceback} if found.traceback else {}),
     }
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 from pydantic import Field
 
-from cloudrc import __version__, files, metrics, plugin_file, plugins
+from cloudrc import files, metrics, plugin_file, plugins, source
 from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, Source, read_document
 from cloudrc.config.load import ResolvedExperiment, load_experiment, local_files, validate
@@ -32,7 +32,7 @@ from cloudrc.sweep.flight import Row
 
 SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
 """Largest seed, and largest number of seeds."""
-COLUMNS = ("key", "seed", "verdict", "failures")
+COLUMNS = ("key", "seed", "verdict", "failures", "code", "physics_steps")
 """Columns of the table besides the axes and the numbers."""
 _Entry: TypeAlias = tuple[str, Any, Source]
 """A setting's key and value, and their place in the file."""
@@ -68,7 +68,8 @@ class Flight(NamedTuple):
 
     def row(self, flown: Row) -> Row:
         """Return the flight's row in the sweep; `flown` has the results, such as the verdict."""
-        return {"key": self.key, "point": self.point, "seed": self.seed, **flown}
+        of = {"key": self.key, "point": self.point, "seed": self.seed}
+        return {**of, **flown, "code": source.code_hash()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +124,7 @@ def _everything(point: ResolvedExperiment) -> dict[str, Any]:
         for each in named
         for file in plugin_file.sources(Path(each))
     }
-    return {**values, "cloudrc": __version__, "code": code, "files": hashes}
+    return {**values, "cloudrc": source.code_hash(), "code": code, "files": hashes}
 
 
 @cache
@@ -206,14 +207,18 @@ def pack(flights: Iterable[Flight]) -> bytes:
             points[id(flight.resolved)] = len(points)
             shown.append([flight.point, flight.resolved.model_dump(mode="json")])
         chosen.append([points[id(flight.resolved)], flight.seed])
-    text = json.dumps({"points": shown, "flights": chosen})
+    text = json.dumps({"code": source.code_hash(), "points": shown, "flights": chosen})
     return gzip.compress(text.encode(), mtime=0)
 
 
 def unpack(path: Path) -> list[Flight]:
-    """Read the flights from a file made by `pack`; raise a BadInputError if it is unusable."""
+    """Read the flights from a file made by `pack`; raise a BadInputError if it is unusable.
+
+    It is also unusable if other code has packed it: the rows would not be those of the sweep.
+    """
     try:
         content = json.loads(gzip.decompress(files.read(path)))
+        _refuse_other_code(content["code"])
         points = list[tuple[dict[str, Any], ResolvedExperiment, dict[str, Any]]]()
         for point, values in content["points"]:
             resolved = ResolvedExperiment.model_validate_json(json.dumps(values))
@@ -226,3 +231,10 @@ def unpack(path: Path) -> list[Flight]:
     except (OSError, EOFError, ValueError, LookupError, TypeError) as error:
         text = f"is not a file of flights of this version of cloudrc ({type(error).__name__})"
         raise BadInputError(f"{path}: {text}; use an image of the same version") from error
+
+
+def _refuse_other_code(code: str) -> None:
+    """Raise a BadInputError if flights come from another code than that of this image."""
+    if code != (own := source.code_hash()):
+        text = f"the flights come from code {code}, this image has code {own}"
+        raise BadInputError(f"{text}; build the image from the code that runs this command")

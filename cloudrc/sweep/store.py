@@ -9,7 +9,7 @@ import csv
 import io
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
@@ -21,6 +21,7 @@ from cloudrc.config.document import write_yaml
 from cloudrc.errors import BadInputError
 from cloudrc.files import write_atomically
 from cloudrc.renamed import NEW_NAMES
+from cloudrc.source import code_hash
 from cloudrc.sweep.flight import Row, units
 from cloudrc.sweep.plan import Plan
 
@@ -86,15 +87,18 @@ def append_rows(folder: Path, shard: int | None) -> Iterator[Callable[[Row], Non
         yield append
 
 
-def begin(folder: Path, plan: Plan) -> dict[str, Row]:
+def begin(folder: Path, plan: Plan, *, is_shared: bool = False) -> dict[str, Row]:
     """Write the file of a sweep into `folder`; return flight key -> row of earlier flights.
 
+    `is_shared` tells whether shards on other machines may fly into the same folder.
+
     Raises:
-        BadInputError: If the folder has rows of another sweep.
+        BadInputError: If the folder belongs to another sweep or to other code.
     """
     rows, points = read_rows(folder), {key: each.point for key, each in plan.flights.items()}
+    _refuse_other_code(folder, rows.values(), is_shared)
     if any(points.get(key) != row["point"] for key, row in rows.items()):
-        text = "rows of another grid, of other seeds, of changed plug-ins or another version"
+        text = "rows of another grid, of other seeds or of changed plug-ins"
         raise BadInputError(f"--out {folder}: has {text}; name a new folder")
     write_atomically(folder / FILE, write_yaml(plan.file).encode())
     _write_summary(folder, plan, rows)
@@ -102,6 +106,19 @@ def begin(folder: Path, plan: Plan) -> dict[str, Row]:
         for name in (TABLE, PARQUET):
             (folder / name).unlink(missing_ok=True)
     return rows
+
+
+def _refuse_other_code(folder: Path, rows: Iterable[Row], is_shared: bool) -> None:
+    """Raise a BadInputError if flights of other code are in `folder`, or fly into it now."""
+    codes = {row.get("code") for row in rows}
+    if is_shared and (folder / SUMMARY).exists():  # of a shard that may have no row yet
+        codes.add(read_summary(folder).get("code"))
+    for code in codes - {code_hash()}:
+        was = f"code {code}" if code else "code without a hash, of an earlier version"
+        raise BadInputError(
+            f"--out {folder}: its flights are of {was}, this is code {code_hash()}; "
+            "name a new folder, or go on with the code of its flights"
+        )
 
 
 def finish(folder: Path, plan: Plan) -> dict[str, Row]:
@@ -135,6 +152,7 @@ def _columns(rows: list[Row], plan: Plan) -> dict[str, list[Any]]:
         columns[axis] = values if plain else [*map(as_text, values)]
     columns |= {name: [row[name] for row in rows] for name in ("seed", "verdict")}
     columns["failures"] = [" ".join(row["failures"]) for row in rows]
+    columns |= {name: [row.get(name, "") for row in rows] for name in ("code", "physics_steps")}
     names = sorted({name for row in rows for name in row["numbers"]})
     return columns | {name: [row["numbers"].get(name) for row in rows] for name in names}
 
@@ -196,6 +214,7 @@ def _write_summary(folder: Path, plan: Plan, rows: Mapping[str, Row]) -> dict[st
         "schemaVersion": 1,
         "experiment": plan.points[0].name,
         "cloudrc": __version__,
+        "code": code_hash(),
         "overrides": [f"{key}={as_text(value)}" for key, value in plan.file.get("set", {}).items()],
         "axes": plan.axes,
         "seeds": plan.seeds,

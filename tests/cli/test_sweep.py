@@ -17,10 +17,12 @@ import pytest
 
 from cloudrc import assembly
 from cloudrc.assembly import assemble
+from cloudrc.cli import sweep_run
 from cloudrc.cli.sweep import _shard
 from cloudrc.cli.sweep_run import as_table, fly_row, summarise
 from cloudrc.cluster import batch
 from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.source import code_hash
 from cloudrc.sweep.plan import pack, read_plan
 from cloudrc.sweep.store import read_rows
 from tests.cli.conftest import KEYS, SHORT
@@ -90,12 +92,37 @@ def test_a_row_flies_again_to_the_same_hash(write_sweep, call):
     assert "the records are those of the sweep" in call("sweep fly grid", row["key"][:4]).err
     report = json.loads(Path(f"grid/{row['key']}/report.json").read_text())
     assert report["records_sha256"] == row["records_sha256"]
+    assert report["code"] == row["code"] == code_hash()
+    environment = json.loads(Path(f"grid/{row['key']}/environment.json").read_text())
+    assert environment["code"] == row["code"]
     Path("grid/rows.jsonl").write_text(json.dumps(row | {"records_sha256": "f"}) + "\n")
     environment = Path(f"grid/{row['key']}/environment.json")
     environment.write_text("{}")
     for folder, key, code in (("grid", row["key"], 6), ("grid", "x", 2), (".", row["key"], 2)):
         call("sweep fly", folder, key, code=code)
     assert json.loads(environment.read_text()), "it describes the newest flight"
+
+
+def test_a_row_of_other_code_is_not_flown_again(write_sweep, call, monkeypatch):
+    call("sweep run --out grid", write_sweep(ONE))
+    (row,) = rows("grid")
+    for place in ("source.code_hash", "cli.sweep_run.code_hash"):
+        monkeypatch.setattr(f"cloudrc.{place}", lambda: "0123456789abcdef")
+    error = call("sweep fly grid", row["key"], code=6).err
+    assert f"flown by code {row['code']}, this is code 0123456789abcdef" in error
+    call("sweep status grid")
+
+
+def test_code_that_changes_during_a_sweep_ends_it(write_sweep, call, monkeypatch):
+    """A worker that starts later runs the changed sources."""
+    hashes = iter(["0123456789abcdef"])
+    real = sweep_run.fly_row
+    monkeypatch.setattr(sweep_run, "fly_row", lambda flight, **words: (
+        real(flight) | ({"code": next(hashes)} if flight.seed == 2 else {})
+    ))  # fmt: skip
+    error = call("sweep run --out grid", write_sweep(ONE, seeds=3), code=2).err
+    assert "the code of cloudrc has changed during the sweep" in error
+    assert [row["seed"] for row in rows("grid")] == [1]
 
 
 @pytest.mark.usefixtures("no_page")

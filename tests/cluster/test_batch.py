@@ -7,6 +7,7 @@ import pytest
 from cloudrc.cluster import batch
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import UID_LABEL
+from cloudrc.errors import BadInputError
 from tests.cluster.conftest import pod, terminated
 
 WORDS = {"image": "cloudrc/world:0.1.0", "cpu": "1", "queue": None}
@@ -81,6 +82,16 @@ def test_a_failed_job_is_kept_and_named(started, api, release):
     with pytest.raises(ClusterError, match=r"failed indexes \(index 2,5\); see: kubectl"):
         lines(release)
     assert api.jobs()
+
+
+def test_the_first_pod_that_refuses_the_flights_ends_the_job(started, api, release):
+    """For example, the image has other code: no shard of the Job can succeed."""
+    said = "the flights come from code 1, this image has code 2"
+    for name in ("a", "b"):
+        add_pod(api, name, "Failed", "a log", state=terminated(2, said))
+    with pytest.raises(BadInputError, match=f"^the pods refuse the flights: {said}$"):
+        lines(release)
+    assert api.jobs() == []
 
 
 def test_pods_may_wait_for_a_node_but_not_for_an_image(started, api, release):

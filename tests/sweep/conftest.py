@@ -18,7 +18,7 @@ def flown(verdict="success", *failures, **numbers):
     """Return the result of a flight."""
     text = "" if verdict == "success" else "a reason"
     return {"verdict": verdict, "failures": [*failures], "text": text, "numbers": numbers,
-            "records_sha256": ""}  # fmt: skip
+            "records_sha256": "", "physics_steps": "Python"}  # fmt: skip
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ import pytest
 
 from cloudrc.assembly import build_links
 from cloudrc.errors import BadInputError
+from cloudrc.source import code_hash
 from cloudrc.sweep import plan
 from cloudrc.sweep.plan import pack, read_plan, unpack
 from tests.sweep.conftest import SHORT
@@ -147,6 +148,21 @@ def test_100_000_flights_fit_into_a_configmap(flights):
 
 
 OTHER = gzip.compress(b'{"points": [[{}, {}]]}', mtime=0)
+
+
+def test_flights_of_other_code_are_refused_with_both_hashes(flights, tmp_path, monkeypatch):
+    monkeypatch.setattr("cloudrc.source.code_hash", lambda: "0123456789abcdef")
+    (tmp_path / "flights").write_bytes(pack(flights))
+    monkeypatch.undo()
+    said = f"come from code 0123456789abcdef, this image has code {code_hash()}"
+    with pytest.raises(BadInputError, match=said):
+        unpack(tmp_path / "flights")
+
+
+def test_the_key_takes_in_the_code(write_sweep, monkeypatch):
+    before = {*read_plan(write_sweep()).flights}
+    monkeypatch.setattr("cloudrc.source.code_hash", lambda: "0123456789abcdef")
+    assert before.isdisjoint(read_plan(write_sweep()).flights)
 
 
 @pytest.mark.parametrize("content", [b"", b"no gzip", OTHER], ids=["empty", "text", "other"])

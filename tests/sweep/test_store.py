@@ -6,6 +6,7 @@ import json
 import pytest
 
 from cloudrc.errors import BadInputError
+from cloudrc.source import code_hash
 from cloudrc.sweep import store
 from cloudrc.sweep.plan import read_plan
 from tests.sweep.conftest import flown
@@ -44,9 +45,11 @@ def test_the_table_has_the_order_of_the_grid(plan, rows, tmp_path):
         tables.append((folder / "table.csv").read_bytes())
     assert tables[0] == tables[1]
     head, first, *_, last = csv.reader(tables[0].decode().splitlines())
-    assert head[1:] == [*plan.axes, "seed", "verdict", "failures", "duration [s]"]
-    assert first == [rows[0]["key"], "last_sample", "40", "1", "success", "", "0.1"]
-    assert last[1:] == ["constant_velocity", "0", "1", "success", "", ""]
+    names = ["seed", "verdict", "failures", "code", "physics_steps", "duration [s]"]
+    assert head[1:] == [*plan.axes, *names]
+    own = [code_hash(), "Python"]
+    assert first == [rows[0]["key"], "last_sample", "40", "1", "success", "", *own, "0.1"]
+    assert last[1:] == ["constant_velocity", "0", "1", "success", "", *own, ""]
     summary = store.read_summary(folder)
     assert (summary["counts"], summary["flights"]) == ({"success": 4}, 4)
     assert (summary["axes"], summary["seeds"]) == (plan.axes, [1])
@@ -98,6 +101,36 @@ def test_a_changed_plugin_is_not_mixed_with_rows_of_the_old_one(write_sweep, tmp
         file.write("# changed\n")
     with pytest.raises(BadInputError, match=r"has rows of .* changed plug-ins"):
         store.begin(tmp_path, read_plan(path))
+
+
+def test_other_code_flies_nothing_into_the_folder(plan, rows, tmp_path, monkeypatch):
+    """Both hashes are named, so that the user finds the code of the flights."""
+    store.begin(tmp_path, plan)
+    write(tmp_path, rows[:1])
+    monkeypatch.setattr(store, "code_hash", lambda: "0123456789abcdef")
+    said = f"its flights are of code {code_hash()}, this is code 0123456789abcdef"
+    for is_shared in (False, True):
+        with pytest.raises(BadInputError, match=said):
+            store.begin(tmp_path, plan, is_shared=is_shared)
+
+
+def test_shards_of_other_code_are_refused_before_the_first_row(plan, tmp_path, monkeypatch):
+    store.begin(tmp_path, plan, is_shared=True)
+    monkeypatch.setattr(store, "code_hash", lambda: "0123456789abcdef")
+    with pytest.raises(BadInputError, match=f"{code_hash()}, this is code 0123456789abcdef"):
+        store.begin(tmp_path, plan, is_shared=True)
+    store.begin(tmp_path, plan)  # no other process flies into this folder, and it has no row
+
+
+def test_a_folder_from_before_the_hash_is_read_but_not_continued(plan, rows, tmp_path):
+    store.begin(tmp_path, plan)
+    for row in rows:
+        del row["code"], row["physics_steps"]
+    write(tmp_path, rows)
+    found, units, missing = store.read_flights(tmp_path)
+    assert (len(found), units["duration"], missing) == (4, "s", "")
+    with pytest.raises(BadInputError, match=r"of code without a hash, of an earlier version"):
+        store.begin(tmp_path, plan)
 
 
 def test_another_folder_is_refused(tmp_path):

@@ -40,11 +40,13 @@ class Library(NamedTuple):
     """The compiled function `cloudrc_run` of `step.c` in the field `run`; None if it is missing.
 
     `run` takes the address of a `Flight`, the present time [ns] and the end time [ns]; it returns
-    the number of simulated steps. `origin` says where `run` is from, or why it is missing.
+    the number of simulated steps. `origin` says where `run` is from, or why it is missing. `code`
+    is a hash of the machine code, 16 hexadecimal digits; "" without machine code.
     """
 
     run: Callable[[int, int, int], int] | None
     origin: str
+    code: str = ""
 
     @property
     def text(self) -> str:
@@ -136,4 +138,4 @@ def _open(file: Path, origin: str) -> Library:
         return Library(None, f"{file.name} does not load: {error}")
     run.argtypes = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
     run.restype = ctypes.c_int64
-    return Library(run, origin)
+    return Library(run, origin, sha256(file.read_bytes()).hexdigest()[:16])

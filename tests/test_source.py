@@ -1,0 +1,96 @@
+"""The hash of the code depends on all sources that a flight can run, and on nothing else."""
+
+import shutil
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import cloudrc
+from cloudrc import source
+
+PACKAGE = Path(cloudrc.__file__).parent
+
+
+@pytest.fixture
+def hash_of(monkeypatch):
+    """Return a function: path of a package (a folder, or inside a zip file) -> its hash."""
+
+    def compute(package):
+        monkeypatch.setattr(source, "files", lambda name: package)
+        return source.code_hash.__wrapped__()
+
+    return compute
+
+
+@pytest.fixture
+def copy(tmp_path):
+    """Copy the package without what a build or an editor adds."""
+    built = shutil.ignore_patterns("__pycache__", "*.so")
+    return Path(shutil.copytree(PACKAGE, tmp_path / "cloudrc", ignore=built))
+
+
+def test_built_files_and_those_of_an_editor_do_not_count(copy, hash_of):
+    assert hash_of(copy) == source.code_hash()
+    (copy / "__pycache__").mkdir()
+    (copy / "__pycache__/source.cpython-313.pyc").write_bytes(b"built")
+    (copy / "world/native/step-1-cc.so").write_bytes(b"built")
+    (copy / ".#assembly.py").symlink_to("somebody@host.1")
+    (copy / "_chart").mkdir()
+    (copy / "_chart/values.yaml").write_text("a: wheel has the chart\n")
+    (copy / "cli/run.py").write_text("# no flight imports the commands\n")
+    assert hash_of(copy) == source.code_hash()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("world/rotors.py", "world/native/step.c", "world/robots/pelican.xml"),
+        *("link/profiles/paper-p2.yaml", "missions/steps.yaml", "__init__.py"),
+    ],
+)
+def test_each_kind_of_source_counts(name, copy, hash_of):
+    with (copy / name).open("a") as file:
+        file.write("\n")
+    assert hash_of(copy) != source.code_hash()
+
+
+def test_names_count_and_unreadable_files_are_other_code(copy, hash_of, monkeypatch):
+    shutil.move(copy / "missions/steps.yaml", copy / "missions/other.yaml")
+    renamed = hash_of(copy)
+    (copy / "missions/other.yaml").unlink()
+    (copy / "missions/other.yaml").symlink_to("lost.yaml")
+    assert len({source.code_hash(), renamed, hash_of(copy)}) == 3
+
+
+def test_a_package_in_a_zip_file_has_the_same_hash(copy, hash_of, tmp_path):
+    with zipfile.ZipFile(tmp_path / "all.zip", "w") as archive:
+        for path in sorted(copy.rglob("*")):
+            archive.write(path, path.relative_to(tmp_path))
+    assert hash_of(zipfile.Path(tmp_path / "all.zip", "cloudrc/")) == source.code_hash()
+
+
+def test_the_hash_takes_milliseconds(hash_of, figure):
+    def measure():
+        began = time.perf_counter()
+        hash_of(PACKAGE)
+        return time.perf_counter() - began
+
+    figure("hash of the code", min(measure() for _ in range(5)), "<=", 0.1, "s", count=5)
+
+
+def test_a_flight_runs_nothing_from_the_folders_that_do_not_count():
+    program = (
+        "import sys\nfrom cloudrc.config.load import load_experiment\n"
+        "from cloudrc.sweep.flight import fly_point\n"
+        "row = fly_point(load_experiment('steps', ['mission.steps.count=1']))\n"
+        "assert row['verdict'] == 'success', row\n"
+        "print(*(name.split('.')[1] for name in sys.modules if name.startswith('cloudrc.')))"
+    )
+    command = [sys.executable, "-c", program]
+    flown = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+    assert {"world", "cloud", "metrics"} <= {*flown}
+    assert source.NOT_FLOWN.isdisjoint(flown)
