@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit
 
 from cloudrc.cli.output import escape, print_line
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 from cloudrc.files import read_token, warn_if_readable
 
 if TYPE_CHECKING:
@@ -192,24 +192,46 @@ def release_api(release: Release, token: Path | None = None) -> Iterator[Api]:
         yield Api(url, token_reader(token) if token else lambda: known, place)
 
 
-def cancel_mission_of(release: Release, job: str) -> str:
-    """Cancel the mission of a Job, whose UID is the mission's key; return the mission's id.
+def settle_mission(release: Release, key: str, why: str) -> tuple[str, int]:
+    """Cancel the mission of a Job that no longer follows it, if the mission has not ended.
 
-    Return "" if the Job has posted no mission, or if its mission has ended.
+    `key` is the mission's key, `why` the reason. Return a sentence about the mission, and the exit
+    code of its verdict.
     """
-    with release_api(release) as api:
-        mission_id = mission_of(release, job, api)
-        if mission_id:
-            api.post(f"{mission_path(mission_id)}/cancel")
-        return mission_id
+    interrupted = InterruptedRunError.exit_code
+    try:
+        with release_api(release) as api:
+            mission = find_mission(api, key)
+            if mission is None:
+                return f"no mission has begun: {why}", interrupted
+            if mission["verdict"] is None:
+                api.post(f"{mission_path(mission['id'])}/cancel")
+                return f"mission {mission['id']} is cancelled: {why}", interrupted
+            return describe_mission(mission), int(mission["verdict"]["exit_code"])
+    except CloudrcError as error:
+        text = f"{why}; the mission ends with its lease, because it cannot be cancelled: {error}"
+        return text, interrupted
 
 
-def mission_of(release: Release, job: str, api: Api) -> str:
-    """Return the id of the mission of a Job; "" if it has posted none, or if it has ended."""
-    key = release.request("get", "jobs", name=job).metadata.uid
+def find_mission(api: Api, key: str) -> dict[str, Any] | None:
+    """Return the mission with a key; None if there is none."""
     missions = api.get("/v1/missions")["missions"]
-    mine = (each["id"] for each in missions if each["key"] == key and not each["verdict"])
-    return str(next(mine, ""))
+    return next((mission for mission in missions if mission["key"] == key), None)
+
+
+def describe_mission(mission: Mapping[str, Any]) -> str:
+    """Return name, state and waypoint of a mission, and its verdict, as one line of text."""
+    where = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
+    name = f" ({mission['name']})" if mission["name"] else ""
+    verdict = f"; {describe_verdict(mission['verdict'])}" if mission["verdict"] else ""
+    return f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}"
+
+
+def describe_verdict(verdict: Mapping[str, Any]) -> str:
+    """Return the outcome of a mission and the reasons, as one line of text."""
+    failures = [f"{failure['code']}: {failure['text']}" for failure in verdict["failures"]]
+    reasons = "; also ".join(failures) or "every waypoint reached, every criterion met"
+    return f"{verdict['outcome'].upper()}: {reasons}"
 
 
 def token_argument(parser: argparse._ActionsContainer) -> None:

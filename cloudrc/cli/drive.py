@@ -13,8 +13,8 @@ import time
 from contextlib import suppress
 from textwrap import wrap
 
-from cloudrc.cli.client import Api
-from cloudrc.cli.mission import describe_mission, describe_point
+from cloudrc.cli.client import Api, describe_mission
+from cloudrc.cli.mission import describe_point
 from cloudrc.cli.output import escape, print_line
 from cloudrc.console.steering import Steering
 from cloudrc.errors import BadInputError

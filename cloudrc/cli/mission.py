@@ -20,9 +20,12 @@ from cloudrc.cli import client
 from cloudrc.cli.client import (
     Api,
     UnreachableError,
-    mission_of,
+    describe_mission,
+    describe_verdict,
+    find_mission,
     mission_path,
     release_api,
+    settle_mission,
     token_file,
     token_reader,
 )
@@ -217,13 +220,6 @@ class MissionFollower:
             time.sleep(POLL_PERIOD)
 
 
-def describe_verdict(verdict: Mapping[str, Any]) -> str:
-    """Return the outcome of a mission and the reasons, as one line of text."""
-    failures = [f"{failure['code']}: {failure['text']}" for failure in verdict["failures"]]
-    reasons = "; also ".join(failures) or "every waypoint reached, every criterion met"
-    return f"{verdict['outcome'].upper()}: {reasons}"
-
-
 def _run(options: argparse.Namespace, api: Api) -> int:
     """Post a mission, follow it to its verdict, and return the exit code of the verdict.
 
@@ -410,14 +406,6 @@ VERBS: dict[str, tuple[str, Callable[[argparse.Namespace, Api], int]]] = {
 """Verb -> help line, and function that carries it out."""
 
 
-def describe_mission(mission: Json) -> str:
-    """Return name, state and waypoint of a mission, and its verdict, as one line of text."""
-    where = f"waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
-    name = f" ({mission['name']})" if mission["name"] else ""
-    verdict = f"; {describe_verdict(mission['verdict'])}" if mission["verdict"] else ""
-    return f"mission {mission['id']}{name}: {mission['state']}, {where}{verdict}"
-
-
 def describe_point(position: Sequence[float | None]) -> str:
     """Format a position [m]; an unknown coordinate, None, becomes a question mark."""
     return f"({', '.join('?' if value is None else f'{value:.2f}' for value in position)})"
@@ -471,7 +459,7 @@ def _run_job(options: argparse.Namespace) -> int:
     """Create the Job of a mission, follow its log, and return the exit code of the Job."""
     mission, release = read_mission(options.mission, options.name), _release(options)
     from cloudrc.cluster.flight import wait_ready
-    from cloudrc.cluster.jobs import follow, run_job
+    from cloudrc.cluster.jobs import JobGoneError, follow, run_job
     from cloudrc.cluster.pods import find_deployment
 
     find_deployment(release, "cloud")
@@ -480,21 +468,23 @@ def _run_job(options: argparse.Namespace) -> int:
     job = run_job(release, mission, queue=options.queue)
     print_line(f"Job {job} on release '{release.name}' in namespace '{release.namespace}'")
     try:
-        ended = follow(release, job, print_line)
+        return follow(release, job, print_line).exit_code
+    except JobGoneError as gone:
+        words, code = settle_mission(release, gone.key, str(gone))
+        print_line(words)
+        return code
     except KeyboardInterrupt:
         remedy = _cancelling_command(release, job)
         print_line(f"Job {job} is still running; cancel its mission: {remedy}", sys.stderr)
         raise
-    if ended.exit_code is None:
-        print_line(ended.message)
-        return 1
-    return ended.exit_code
 
 
 def _cancelling_command(release: Release, job: str) -> str:
     """Return the command that cancels the mission of a Job."""
+    from cloudrc.cluster.jobs import job_key
+
     with suppress(CloudrcError), release_api(release) as api:
-        if mission_id := mission_of(release, job, api):
+        if mission := find_mission(api, job_key(release, job)):
             flags = " ".join([*release.flags, f"--release={release.name}"])
-            return f"cloudrc mission cancel {mission_id} {flags}"
+            return f"cloudrc mission cancel {mission['id']} {flags}"
     return f"{release.kubectl} delete job {job}"

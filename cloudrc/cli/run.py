@@ -251,7 +251,7 @@ def _local_flight(
 def _cluster_flight(
     experiment: ResolvedExperiment, options: argparse.Namespace, stream: TextIO
 ) -> Flight:
-    from cloudrc.cli.client import Api, cancel_mission_of
+    from cloudrc.cli.client import Api, settle_mission
     from cloudrc.cluster.client import program
     from cloudrc.cluster.flight import fly_in_cluster, refuse_local_files, refuse_second_flight
 
@@ -265,7 +265,7 @@ def _cluster_flight(
         print_line(f"  {text}", stream)
 
     return lambda folder: fly_in_cluster(
-        experiment, folder, release, options.timeout, tell, cancel_mission_of
+        experiment, folder, release, options.timeout, tell, settle_mission
     )
 
 

@@ -53,6 +53,10 @@ class ClusterError(CloudrcError):
     exit_code = 5
 
 
+class NotFoundError(ClusterError):
+    """Report that the cluster does not have an object."""
+
+
 @dataclass(frozen=True)
 class Release:
     """One release of the chart: one robot and its cloud."""
@@ -179,7 +183,8 @@ def explain_errors(doing: str, where: str) -> Iterator[None]:
     try:
         yield
     except ApiException as error:
-        raise ClusterError(f"cannot {doing} {where}: {_refusal(error, doing)}") from error
+        kind = NotFoundError if error.status == 404 else ClusterError
+        raise kind(f"cannot {doing} {where}: {_refusal(error, doing)}") from error
     except (HTTPError, OSError) as error:
         raise ClusterError(
             f"cannot {doing} {where}: the API server does not answer ({_root(error)}); "

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cluster import pods
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, chart_folder, run
-from cloudrc.cluster.jobs import delete_job, failure_of, follow, run_job
-from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
+from cloudrc.cluster.incidents import explain_refusal
+from cloudrc.cluster.jobs import JobGoneError, delete_job, failure_of, follow, job_key, run_job
+from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError, TimedOutError
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
@@ -26,8 +27,9 @@ Tell = Callable[[str], None]
 Ask = Callable[[str, str], Any]
 """Function that gets the state of robot and missions from the API with a given URL and token."""
 
-Cancel = Callable[[Release, str], str]
-"""Function that cancels the mission of the Job with a given name, and returns the mission's id."""
+Settle = Callable[[Release, str, str], tuple[str, int]]
+"""Function that cancels the mission with a given key, for a given reason, if it has not ended; it
+returns a sentence about the mission, and the exit code of its verdict."""
 
 LOOK_PERIOD = 1.0
 """Time between two requests for the state of the pods [s]."""
@@ -105,7 +107,7 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
     status = deployment.status
     for condition in status.conditions or []:  # for example Pod Security or a quota
         if condition.type == "ReplicaFailure" and condition.status == "True":
-            return str(condition.message), True
+            return explain_refusal(str(condition.message), deployment.spec.template.spec), True
     found = pods.list_pods(release, component)
     for pod in found:
         if why := pods.pod_failure(pod):
@@ -149,7 +151,7 @@ def fly_in_cluster(
     release: Release,
     timeout: float,
     tell: Tell,
-    cancel: Cancel,
+    settle: Settle,
 ) -> dict[str, Any]:
     """Fly one experiment in a cluster, fill its run folder, and return the report.
 
@@ -159,7 +161,7 @@ def fly_in_cluster(
         release: The Helm release to use; it is installed if it is missing, and stays afterwards.
         timeout: Time limit for the release to become ready [s].
         tell: Receives the progress, one line per call.
-        cancel: Cancels the mission after Ctrl-C.
+        settle: Cancels the mission after Ctrl-C, or if its Job is gone.
     """
     from cloudrc.config.load import dump
 
@@ -167,11 +169,7 @@ def fly_in_cluster(
     install(release, chart_values(experiment, current_values(release)), timeout, tell)
     took = time.monotonic() - began
     tell(f"release '{release.name}' {release.where} is ready after {took:.0f} s")
-    interrupted = False
-    try:
-        _fly(experiment, release, tell, cancel)
-    except KeyboardInterrupt:
-        interrupted = True
+    interrupted = not _fly(experiment, release, tell, settle)
     (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
     mission = fetch_all(release, folder, tell, want_end=not interrupted)
     return _report(experiment, folder, mission, interrupted)
@@ -205,7 +203,8 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
         )
 
 
-def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell, cancel: Cancel) -> None:
+def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell, settle: Settle) -> bool:
+    """Fly the experiment's mission by a Job; return False if it was interrupted."""
     flown = {"start", "waypoints", "carrot"}
     mission = experiment.mission.model_dump(mode="json", include=flown)
     limit = experiment.criteria.time_limit_s
@@ -213,17 +212,22 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell, cancel: C
     tell(f"Job {job} flies {experiment.name}")
     try:
         ended = follow(release, job, tell)
+    except JobGoneError as gone:
+        words, code = settle(release, gone.key, str(gone))
+        tell(words)
+        return code != InterruptedRunError.exit_code
     except KeyboardInterrupt:
         tell("cancelling the mission")
-        # The pod of a deleted Job does not cancel: teleop would fly on for the mission's lease.
-        for action in (cancel, delete_job):
-            try:
-                action(release, job)
-            except CloudrcError as error:
-                tell(f"cannot cancel: {error}")
-        raise
+        try:
+            # The pod of a deleted Job does not cancel: teleop would fly on for the mission's lease.
+            tell(settle(release, job_key(release, job), "interrupted")[0])
+            delete_job(release, job)
+        except CloudrcError as error:
+            tell(f"cannot cancel: {error}")
+        return False
     if ended.exit_code not in FLOWN:
         raise ClusterError(f"Job {job} did not fly its mission: {ended.message}")
+    return True
 
 
 def fetch_all(release: Release, folder: Path, tell: Tell, *, want_end: bool) -> Recording:

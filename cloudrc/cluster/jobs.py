@@ -10,14 +10,15 @@ from __future__ import annotations
 import json
 import secrets
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from math import ceil
 from typing import Any, NamedTuple
 
 import yaml
 
-from cloudrc.cluster.client import ClusterError, Release, chart_folder
+from cloudrc.cluster.client import ClusterError, NotFoundError, Release, chart_folder
+from cloudrc.cluster.incidents import ReleaseWatch, eviction, explain_refusal
 from cloudrc.cluster.pods import (
     UNSCHEDULED,
     container_statuses,
@@ -31,6 +32,9 @@ COMPONENT = "mission"
 """Label `component` of the Jobs, pods and ConfigMaps of missions, and name of their container."""
 FILE = "mission.yaml"
 """Key in the ConfigMap under which the mission is stored."""
+COMPONENT_LABEL = "app.kubernetes.io/component"
+KILLED_WATCHER = (137, 143)
+"""Exit codes of a watcher that was killed: by SIGKILL, or by SIGTERM."""
 UID_LABEL = "batch.kubernetes.io/controller-uid"
 """Label with the Job's UID, which Kubernetes sets on the Job's pods."""
 TEMPLATE, TEMPLATE_FILE = "mission-job", "job.yaml"
@@ -54,7 +58,7 @@ DELETE_LIMIT = 40.0
 class Ended(NamedTuple):
     """How a mission's Job ended."""
 
-    exit_code: int | None  # of the container; None if the container has not ended
+    exit_code: int  # of the container
     message: str  # verdict in words, or why the Job failed
 
 
@@ -156,6 +160,11 @@ def find_job(release: Release, name: str) -> Any:
     return next(iter(found), None)
 
 
+def job_key(release: Release, name: str) -> str:
+    """Return the UID of a Job, which is the key of its mission."""
+    return str(release.request("get", "jobs", name=name).metadata.uid)
+
+
 def delete_job(release: Release, name: str) -> None:
     """Delete a Job with its pods and ConfigMap; the mission of a Job ends later, with its lease."""
     release.request("delete", "jobs", name=name, propagation_policy="Foreground")
@@ -180,18 +189,33 @@ def failure_of(job: Any) -> str | None:
     return None
 
 
+class JobGoneError(ClusterError):
+    """Report that a Job does not follow its mission: it was deleted or suspended, or has failed."""
+
+    def __init__(self, why: str, key: str) -> None:
+        """Store the Job's UID as `key`: it is the key of the Job's mission."""
+        super().__init__(why)
+        self.key = key
+
+
 def follow(release: Release, name: str, write: Callable[[str], None]) -> Ended:
     """Follow a mission's Job until it has ended; `write` receives each line of the Job's log.
 
-    Kubernetes ends the Job after the Job's time limit. Raise a ClusterError if the Job's pod cannot
-    run; the message names the cause.
+    `write` also receives a sentence about what happens to the pods of the release. Kubernetes ends
+    the Job after the Job's time limit.
+
+    Raises:
+        ClusterError: If the Job's pod cannot run; the message names the cause.
+        JobGoneError: If the Job was deleted or suspended, or has ended without a verdict.
     """
-    states = list[Any]()
-    for line in read_log(release, name, write, states.append):
+    states, watch = list[Any](), ReleaseWatch(release)
+    reader = JobReader(release, name, write, states.append, watch.look)
+    for line in reader.read():
         write(line)
-    code, message = (states[-1].exit_code, states[-1].message) if states else (None, "")
-    cause = failure_of(release.request("get", "jobs", name=name))
-    return Ended(code, to_one_line(message) or cause or "")
+    cause = failure_of(reader.job) or ""
+    if not states or states[-1].exit_code in KILLED_WATCHER:
+        raise JobGoneError(f"its Job has ended without a verdict: {cause}", reader.key)
+    return Ended(states[-1].exit_code, to_one_line(states[-1].message) or cause)
 
 
 def read_log(
@@ -199,47 +223,105 @@ def read_log(
 ) -> Iterator[str]:
     """Yield each different line of the logs of a Job's pods, until the Job has ended.
 
-    `see_end` receives the final state of the container of each pod that ends; it may return a
-    sentence about it. `tell` receives this sentence, and others if a pod waits for a node or if the
-    log of an ended pod cannot be read, each once. Raise a ClusterError if a pod will never run.
+    The parameters are those of `JobReader`. Raise a ClusterError if a pod will never run.
     """
-    told, read, seen = set[str](), set[str](), set[int]()  # seen: hashes of lines
+    yield from JobReader(release, name, tell, see_end).read()
 
-    def tell_once(text: str | None) -> None:
-        if text and text not in told:
-            told.add(text)
-            tell(text)
 
-    while True:
-        job = release.request("get", "jobs", name=name)
-        component = job.metadata.labels["app.kubernetes.io/component"]
-        has_ended, selector = failure_of(job) is not None, f"{UID_LABEL}={job.metadata.uid}"
-        pods = release.request("list", "pods", label_selector=selector)
-        tell_once("" if has_ended else _why_waiting(release, job, pods))
-        for pod in pods:
-            if pod.status.phase == "Pending" or pod.metadata.uid in read:
-                continue
-            # A service mesh may add containers, which end later.
-            own = (each for each in container_statuses(pod) if each.name == component)
-            ended = next((each.state.terminated for each in own), None)
-            is_done = ended is not None or pod.status.phase in ("Succeeded", "Failed")
-            if is_done:
-                read.add(pod.metadata.uid)
-            if ended is not None:
-                tell_once(see_end(ended))
-            try:
-                last = None if is_done else OVERLAP
-                text = pod_log(release, pod.metadata.name, component, last)
-            except ClusterError as error:  # the pod may be gone
-                text = ""
-                tell_once(str(error) if is_done else "")
-            for line in text.splitlines():
-                if hash(line) not in seen:
-                    seen.add(hash(line))
-                    yield line
-        if has_ended:
+class JobReader:
+    """Reads the logs of a Job's pods until the Job has ended; says each sentence only once."""
+
+    def __init__(
+        self,
+        release: Release,
+        name: str,
+        tell: Callable[[str], None],
+        see_end: Callable[[Any], str | None],
+        look: Callable[[], Iterable[str]] = tuple,
+    ) -> None:
+        """Read the Job `name`.
+
+        `see_end` receives the final state of the container of each pod that ends; it may return a
+        sentence about it. `tell` receives this sentence, and others if a pod waits for a node, is
+        evicted, or if the log of an ended pod cannot be read. `tell` also receives the sentences
+        that `look` returns.
+        """
+        self._release, self._name, self._tell = release, name, tell
+        self._see_end, self._look = see_end, look
+        self._told, self._read = set[str](), set[str]()  # sentences; UIDs of pods
+        self._seen = set[int]()  # hashes of lines
+        self.key = ""  # UID of the Job
+        self.job: Any = None  # as it was seen last
+
+    def read(self) -> Iterator[str]:
+        """Yield each different line of the logs of all pods."""
+        while True:
+            self._look_at_job()
+            has_ended = failure_of(self.job) is not None
+            selector = f"{UID_LABEL}={self.key}"
+            pods = self._release.request("list", "pods", label_selector=selector)
+            pods.sort(key=lambda pod: str(pod.metadata.creation_timestamp))
+            self._refuse_suspended(pods)
+            self._tell_once("" if has_ended else _why_waiting(self._release, self.job, pods))
+            for pod in pods:
+                yield from self._read_pod(pod)
+            for sentence in self._look():
+                self._tell(sentence)
+            if has_ended:
+                return
+            time.sleep(LOOK_PERIOD)
+
+    def _look_at_job(self) -> None:
+        try:
+            self.job = self._release.request("get", "jobs", name=self._name)
+        except NotFoundError:
+            if not self.key:
+                raise
+            raise JobGoneError("its Job was deleted", self.key) from None
+        self.key = self.job.metadata.uid
+        if self.job.metadata.deletion_timestamp is not None:
+            raise JobGoneError("its Job was deleted", self.key)
+
+    def _refuse_suspended(self, pods: list[Any]) -> None:
+        """Raise a JobGoneError if the Job is suspended in flight; a queue may suspend a new Job."""
+        if not self.job.spec.suspend:
             return
-        time.sleep(LOOK_PERIOD)
+        if pods or self._read:
+            raise JobGoneError("its Job was suspended", self.key)
+        self._tell_once("waiting: the Job is suspended")
+
+    def _read_pod(self, pod: Any) -> Iterator[str]:
+        """Yield the new lines of a pod's log; tell how the pod has ended."""
+        uid, component = pod.metadata.uid, self.job.metadata.labels[COMPONENT_LABEL]
+        if pod.status.phase == "Pending" or uid in self._read:
+            return
+        # A service mesh may add containers, which end later.
+        own = (each for each in container_statuses(pod) if each.name == component)
+        ended = next((each.state.terminated for each in own), None)
+        is_done = ended is not None or pod.status.phase in ("Succeeded", "Failed")
+        if is_done:
+            self._read.add(uid)
+        if cause := eviction(pod):
+            self._tell_once(f"pod {pod.metadata.name} of the Job ends: {cause}")
+        if ended is not None:
+            self._tell_once(self._see_end(ended))
+        for line in self._log_of(pod, component, is_done).splitlines():
+            if hash(line) not in self._seen:
+                self._seen.add(hash(line))
+                yield line
+
+    def _log_of(self, pod: Any, container: str, is_done: bool) -> str:
+        try:
+            last = None if is_done else OVERLAP
+            return pod_log(self._release, pod.metadata.name, container, last)
+        except ClusterError as error:  # the pod may be gone
+            self._tell_once(str(error) if is_done else "")
+            return ""
+
+    def _tell_once(self, text: str | None) -> None:
+        if text and text not in self._told:
+            self._told.add(text)
+            self._tell(text)
 
 
 def _why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
@@ -251,7 +333,8 @@ def _why_waiting(release: Release, job: Any, pods: list[Any]) -> str:
     if not pods:  # the cluster may refuse them, for example for a quota
         selector = f"involvedObject.uid={job.metadata.uid}"
         events = release.request("list", "events", field_selector=selector)
-        found = [event.message for event in events if event.reason == "FailedCreate"]
+        refusals = (event.message for event in events if event.reason == "FailedCreate")
+        found = [explain_refusal(message, job.spec.template.spec) for message in refusals]
     name = job.metadata.name
     for why in found:
         if why and not why.startswith(UNSCHEDULED):

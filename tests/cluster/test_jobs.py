@@ -108,12 +108,6 @@ def test_follow_ends_when_the_pod_cannot_run(running, release):
         follow(release, "first", print)
 
 
-def test_a_deadline_is_named(running, release):
-    run_job(release, MISSION, name="first")
-    running.end("first", "Failed", reason="DeadlineExceeded", message="too long")
-    assert "DeadlineExceeded: too long" in follow(release, "first", print).message
-
-
 def test_a_job_that_cannot_be_made_leaves_nothing(running, release):
     running.refuse["POST", "configmaps"] = 403, "configmaps is forbidden"
     with pytest.raises(ClusterError, match="can-i create configmaps"):

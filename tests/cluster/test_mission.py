@@ -91,6 +91,40 @@ def test_an_interrupted_run_names_the_mission_of_its_job(running, teleop, call, 
     assert "cloudrc mission cancel m4 --namespace=demo --release=cloudrc\n" in said
 
 
+def forget_jobs(api):
+    for key in [key for key in api.objects if key[0] == "jobs"]:
+        api.objects.pop(key)
+
+
+@pytest.mark.parametrize(
+    ("ended", "words", "code"),
+    [
+        (None, "mission m4 is cancelled: its Job was deleted", 130),
+        ({"outcome": "success", "exit_code": 0, "failures": []}, "SUCCESS: every waypoint", 0),
+    ],
+)
+def test_a_deleted_job_cancels_its_mission_if_it_still_flies(
+    running, teleop, call, ended, words, code
+):
+    def delete():
+        about = {"name": "one", "state": "done", "waypoint": 0, "waypoints": 1, "verdict": ended}
+        missions = [{**mission, **about} for mission in missions_of(running)]
+        teleop.missions = lambda: missions
+        forget_jobs(running)
+
+    running.at_look(3, delete)
+    assert words in call("mission run one.yaml", code=code).out.splitlines()[-1]
+    assert teleop.posted == ([] if ended else ["/v1/missions/m4/cancel"])
+
+
+def test_a_mission_that_cannot_be_cancelled_ends_with_its_lease(running, pretend, call):
+    pretend("kubectl", "echo 'error: pod is gone' >&2; exit 1")
+    running.at_look(3, lambda: forget_jobs(running))
+    last = call("mission run one.yaml", code=130).out.splitlines()[-1]
+    assert last.startswith("its Job was deleted; the mission ends with its lease")
+    assert "pod is gone" in last
+
+
 @pytest.fixture
 def flies_here(tmp_path):
     """A run on this machine whose API does not answer."""

@@ -1,0 +1,181 @@
+"""What happens to pods in flight is told: evictions, killed containers, refusals of a quota."""
+
+import pytest
+
+from cloudrc.cluster.client import ClusterError
+from cloudrc.cluster.flight import wait_ready
+from cloudrc.cluster.incidents import ReleaseWatch
+from cloudrc.cluster.jobs import JobGoneError, follow, run_job
+from tests.cluster.conftest import MISSION, deployment, pod, terminated
+
+DRAINED = {"type": "DisruptionTarget", "status": "True", "reason": "EvictionByEvictionAPI"}
+
+
+def ended(exit_code, reason="Error", message="", at="2026-01-01T00:00:01Z"):
+    state = {"exitCode": exit_code, "reason": reason, "message": message, "finishedAt": at}
+    return {"terminated": state}
+
+
+@pytest.fixture
+def watch(running, release):
+    return ReleaseWatch(release)
+
+
+@pytest.mark.parametrize(
+    ("state", "words"),
+    [
+        (ended(137, "OOMKilled"), "container 'cloud' of the cloud pod was killed, because it used "
+         "more memory than its limit: raise cloud.resources.limits.memory"),
+        (ended(137), "was ended by SIGKILL (exit code 137)"),
+        (ended(139), "was ended by SIGSEGV"),
+        (ended(3, message="starts\nport 9100 is taken\n"), "with exit code 3: port 9100 is taken"),
+        (ended(0, "Completed"), "ended with exit code 0"),
+    ],
+)  # fmt: skip
+def test_a_container_that_ends_in_flight_is_told_once_with_its_cause(running, watch, state, words):
+    assert list(watch.look()) == []
+    running.put("pods", {**pod("cloud-1", "cloud", restarts=1, last=state), **kept(running)})
+    (sentence,) = watch.look()
+    assert words in sentence
+    assert list(watch.look()) == []
+    again = ended(137, at="2026-01-01T00:09:00Z")
+    running.put("pods", {**pod("cloud-1", "cloud", restarts=2, last=again), **kept(running)})
+    assert len(list(watch.look())) == 1, "it was killed a second time"
+
+
+def kept(api, name="cloud-1"):
+    return {"metadata": api.get("pods", name)["metadata"]}
+
+
+def test_what_happened_before_the_flight_is_not_told(running, release):
+    running.put("pods", pod("cloud-1", "cloud", restarts=1, last=ended(137)))
+    assert list(ReleaseWatch(release).look()) == []
+
+
+@pytest.mark.parametrize(
+    ("conditions", "deleted", "words"),
+    [
+        ([DRAINED], True, "evicted: node drained"),
+        ([{**DRAINED, "reason": "PreemptionByScheduler"}], True, "higher priority"),
+        ([{**DRAINED, "reason": "New", "message": "by\nsomebody"}], False, "evicted: by somebody"),
+        ([{**DRAINED, "status": "False"}], True, "it was deleted or replaced"),
+    ],
+)
+def test_a_pod_that_ends_in_flight_is_told_with_its_cause(
+    running, watch, conditions, deleted, words
+):
+    body = pod("world-1", "world", conditions=conditions)
+    body["metadata"] |= kept(running, "world-1")["metadata"]
+    if deleted:
+        body["metadata"]["deletionTimestamp"] = "2026-01-01T00:00:01Z"
+    running.put("pods", body)
+    (sentence,) = watch.look()
+    assert sentence.startswith("the world pod ends: ")
+    assert words in sentence
+    waits = [{"type": "PodScheduled", "status": "False", "message": "0/1 nodes: unschedulable"}]
+    running.put("pods", pod("world-2", "world", ready=False, phase="Pending", conditions=waits))
+    starts, waits = watch.look()
+    assert starts == "a new world pod starts: world-2"
+    assert "no node takes it: 0/1 nodes: unschedulable" in waits
+
+
+def gone(api, release):
+    run_job(release, MISSION, name="first")
+    api.start_pod("first")
+    api.logs["first-x"] = "waypoint 1 of 2 reached\n"
+    return api.get("jobs", "first")
+
+
+def delete(api):
+    api.objects.pop(("jobs", "first"))
+
+
+def mark_deleted(api):
+    api.get("jobs", "first")["metadata"]["deletionTimestamp"] = "2026-01-01T00:00:01Z"
+
+
+def suspend(api):
+    api.get("jobs", "first")["spec"]["suspend"] = True
+
+
+def time_out(api):
+    api.start_pod("first", state=terminated(143, "this watcher is stopped"))
+    api.end("first", "Failed", reason="DeadlineExceeded", message="too long")
+
+
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [
+        (delete, "its Job was deleted"),
+        (mark_deleted, "its Job was deleted"),
+        (suspend, "its Job was suspended"),
+        (time_out, "its Job has ended without a verdict: DeadlineExceeded: too long"),
+    ],
+)
+def test_a_job_that_is_gone_is_not_an_error_of_the_api(running, release, action, words):
+    job = gone(running, release)
+    running.at_look(3, lambda: action(running))
+    with pytest.raises(JobGoneError) as told:
+        follow(release, "first", print)
+    assert (str(told.value), told.value.key) == (words, job["metadata"]["uid"])
+
+
+def test_a_job_that_a_queue_has_suspended_waits(running, release):
+    run_job(release, MISSION, name="first")
+    suspend(running)
+    running.at_look(4, lambda: delete(running))
+    lines = []
+    with pytest.raises(JobGoneError, match="deleted"):
+        follow(release, "first", lines.append)
+    assert lines == ["waiting: the Job is suspended"]
+
+
+def test_the_watcher_of_an_evicted_pod_is_told(running, release):
+    gone(running, release)
+    running.start_pod("first", conditions=[DRAINED], state=terminated(143, "stopped"))
+    running.at_look(3, lambda: delete(running))
+    lines = []
+    with pytest.raises(JobGoneError):
+        follow(release, "first", lines.append)
+    assert lines[0].startswith("pod first-x of the Job ends: evicted: node drained")
+
+
+RANGE = (
+    'pods "x" is forbidden: [minimum cpu usage per Container is 30m, but request is 20m, maximum '
+    "memory usage per Container is 128Mi, but limit is 256Mi]"
+)
+QUOTA = (
+    'pods "x" is forbidden: exceeded quota: small, requested: limits.memory=448Mi,pods=1,'
+    "requests.cpu=80m, used: requests.cpu=50m, limited: requests.cpu=100m"
+)
+
+
+@pytest.mark.parametrize(
+    ("message", "found"),
+    [
+        (RANGE, ["container 'link' has the request 0.02 of cpu, at least 30m is allowed: set "
+                 "link.resources.requests.cpu",
+                 "container 'cloud' has the limit 0.25Gi of memory, at most 128Mi is allowed: set "
+                 "cloud.resources.limits.memory"]),
+        (QUOTA, ["limits.memory of the pod: link 192Mi + cloud 0.25Gi",
+                 "requests.cpu of the pod: link 0.02 + cloud 60m"]),
+        ("minimum cpu usage per Pod is 1, but request is 80m",
+         ["requests.cpu of the pod: link 0.02 + cloud 60m"]),
+        ("exceeded quota: small, requested: pods=1, used: pods=2, limited: pods=2", []),
+        ("violates PodSecurity", []),
+    ],
+)  # fmt: skip
+def test_a_refusal_names_the_container_and_what_it_asks_for(running, release, message, found):
+    refused = {"type": "ReplicaFailure", "status": "True", "message": message}
+    body = deployment("cloud", conditions=[refused])
+    link = {"requests": {"cpu": "0.02"}, "limits": {"memory": "192Mi"}}
+    cloud = {"requests": {"cpu": "60m"}, "limits": {"memory": "0.25Gi"}}
+    body["spec"]["template"]["spec"] = {
+        "initContainers": [{"name": "link", "resources": link}],
+        "containers": [{"name": "cloud", "resources": cloud}, {"name": "teleop"}],
+    }
+    running.put("deployments", body)
+    with pytest.raises(ClusterError) as told:
+        wait_ready(release, timeout=0.03)
+    said = str(told.value).partition(f"cannot run: {message}")[2].split("; ")[1:-1]
+    assert said == found
