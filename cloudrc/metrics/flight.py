@@ -1,7 +1,8 @@
 """Define `Flight`, a recording of one mission, and the metrics of the robot's motion.
 
-A flight begins when the guard first changes to TRACK, because the robot does not move before. It
-ends with the event that ends the mission or, without such an event, with the recording.
+A mission begins when world obeys the operator's request to start it; all times count from there.
+The flight begins when the guard first changes to TRACK, because the robot does not move before.
+Both end with the event that ends the mission or, without such an event, with the recording.
 """
 
 from __future__ import annotations
@@ -52,6 +53,19 @@ class Flight:
         return int(tracking[0]) if len(tracking) else None
 
     @cached_property
+    def mission_ns(self) -> int | None:
+        """Start of the mission [ns], world's clock: its first telemetry; None if never flown.
+
+        If the recording lacks this telemetry, the mission starts with the flight.
+        """
+        if self.start_ns is None:
+            return None
+        telemetry = self.recording["/telemetry"]
+        before = telemetry["stamp_ns"] <= self.start_ns
+        changes = np.flatnonzero(np.diff(telemetry["mission_id"][before]))
+        return int(telemetry["stamp_ns"][changes[-1] + 1]) if len(changes) else self.start_ns
+
+    @cached_property
     def end_ns(self) -> int | None:
         """End of the flight [ns], world's clock; None if the robot never flew."""
         if self.start_ns is None or self.ending is not None:
@@ -61,7 +75,7 @@ class Flight:
 
     @property
     def duration(self) -> float:
-        """Duration of the flight [s]; 0 if the robot never flew."""
+        """Time from the start of the mission to its end [s]; 0 if the robot never flew."""
         return 0.0 if self.end_ns is None else float(self.seconds(self.end_ns))
 
     @cached_property
@@ -75,8 +89,8 @@ class Flight:
         return None
 
     def seconds(self, stamp_ns: Any) -> Any:
-        """Convert stamps on world's clock [ns] to times since the start of the flight [s]."""
-        return (stamp_ns - (self.start_ns or 0)) * 1e-9
+        """Convert stamps on world's clock [ns] to times since the start of the mission [s]."""
+        return (stamp_ns - (self.mission_ns or 0)) * 1e-9
 
     def during(self, topic: str) -> Columns:
         """Select the rows of a topic from the first to the last instant of the flight."""
@@ -256,6 +270,8 @@ add_metrics(
     "Mission",
     ("duration", "s", "Time from the start of the mission to its end.",
      lambda flight: flight.count(flight.duration)),
+    ("start_delay", "s", "Time from the start of the mission until the robot followed its first "
+     "command.", lambda flight: flight.start_ns and float(flight.seconds(flight.start_ns))),
     ("distance_flown", "m", "Length of the path that the robot's base flew.", _distance),
     ("speed_max", "m/s", "Largest true speed of the robot's base.", _speed_max),
 )  # fmt: skip

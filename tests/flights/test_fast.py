@@ -16,11 +16,13 @@ def link(rtt):
 
 @pytest.mark.parametrize("rtt", [*nightly(200, 400), 600])
 @pytest.mark.parametrize("seed", [1, *nightly(*range(2, 31))])
-def test_the_contact_comes_when_it_comes_without_delay(rtt, seed):
+def test_after_the_first_command_the_contact_comes_when_it_comes_without_delay(rtt, seed):
     flight = fly("fast", *link(rtt), f"seed={seed}")
     assert flight.verdict.failures == ()
     n, still = numbers(flight), numbers(fly("fast", "link.profile=ideal"))
-    assert n["contact_time"] / still["contact_time"] == pytest.approx(1.0, abs=0.01)
+    flown, due = (each["contact_time"] - each["start_delay"] for each in (n, still))
+    assert flown / due == pytest.approx(1.0, abs=0.01)
+    assert n["start_delay"] == pytest.approx(rtt * 1e-3, rel=0.2), "the start takes a round trip"
     assert n["min_clearance"] >= 0.9 * still["min_clearance"]
     assert n["hold_count"] == 0
 

@@ -11,7 +11,16 @@ from cloudrc.messages import GuardState
 from cloudrc.metrics import SHIPPED, Flight, measure_all
 from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
-from cloudrc.records import Arrival, Control, Counted, Fault, GuardChange, Lateness, MissionEvent
+from cloudrc.records import (
+    Arrival,
+    Control,
+    Counted,
+    Fault,
+    GuardChange,
+    Lateness,
+    MissionEvent,
+    TelemetrySent,
+)
 from tests.metrics.conftest import (
     ONE_PIPE,
     OPEN_AIR,
@@ -82,6 +91,19 @@ HOLDS = [
 ]
 
 
+def armed_early():
+    """World arms the robot for mission 7 0.4 s before the first command, after mission 6."""
+    log = flown()
+
+    def number(n, sent):
+        mission = 7 if sent.stamp_ns >= at(-0.4) else 6
+        return sent._replace(telemetry=sent.telemetry._replace(mission_id=mission))
+
+    log.change(TelemetrySent, number)
+    log.world.append(touch(8))
+    return log.flight()
+
+
 def resting():
     log = flown(lambda t: (0.97, 0.0, 1.001))
     log.change(Control, lambda n, c: c._replace(setpoint=(1.0, 0.0, 1.0)))
@@ -131,6 +153,7 @@ ON_AXIS = 0.662 - hypot(0.338, 0.0525)
 NUMBERS = {
     straight_flight: {
         "duration": 10.0,
+        "start_delay": 0.0,
         "waypoints_reached": 1.0,
         "speed_max": approx(1.0),
         "distance_flown": approx(10.0),  # 10 s at 1 m/s
@@ -190,6 +213,13 @@ NUMBERS = {
     },
     # Time zero stays the first TRACK. The holds last 1.5 s, and 0.5 s to the end.
     lambda: plus(*HOLDS): {"hold_count": 2.0, "hold_time": approx(2.0), "duration": 10.0},
+    armed_early: {
+        "duration": approx(10.4),  # the mission began with the telemetry of -0.4 s
+        "contact_time": approx(8.4),
+        "start_delay": approx(0.4),
+        "speed_max": approx(1.0),
+        "commands_applied": 251.0,  # the flight begins with TRACK
+    },
     resting: {
         "steady_error_x": approx(0.03),
         "steady_error_y": approx(0.0),

@@ -42,8 +42,8 @@ def test_the_page_says_what_the_flight_did(folder):
     experiment, recording = paper()
     for said in (
         "The mission succeeded.",
-        "waypoints reached7 mission took31.05 s",
-        "arm touches the board at27.78 s",
+        "waypoints reached7 mission took31.14 s",
+        "arm touches the board at27.87 s",
         "least clearance in the pipes0.153 m",
         "cloudrc run config.yaml --mode virtual",
         recording.sha256,

@@ -52,11 +52,11 @@ def test_the_replay_shows_the_flight_and_the_prediction(flight, section):
         if message["type"] == "SetPositionMessage" and message["name"] in places:
             places[message["name"]].append((now, *message["position"]))
     times, *robot = np.array(places["/robot"][1:]).T
-    true = flight.true_position(flight.start_ns + times * 1e9)
+    true = flight.true_position(flight.mission_ns + times * 1e9)
     assert np.nanmax(np.abs(np.transpose(robot) - true)) < 0.03  # a row is at most 10 ms old
     assert len(times) > 0.95 * duration * replay.RATE
     ghost = np.array(places["/ghost"])
-    behind = ghost[:, 1:] - flight.true_position(flight.start_ns + ghost[:, 0] * 1e9)
+    behind = ghost[:, 1:] - flight.true_position(flight.mission_ns + ghost[:, 0] * 1e9)
     assert 0.005 < np.sqrt(np.square(behind).sum(axis=1).mean()) < 0.04
     green = [
         m for _, m in said if m["type"] == "SceneNodeUpdateMessage" and "color" in m["updates"]
