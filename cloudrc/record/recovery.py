@@ -52,7 +52,7 @@ def recover(
     if file.unread:
         missed.insert(0, f"{file.unread} bytes after the last intact part were not read")
     if dropped := _dropped(file):
-        counts = [topic if n is None else f"{n} on {topic}" for topic, n in dropped.items()]
+        counts = [topic if n is None else f"{n} on {topic}" for topic, n in sorted(dropped.items())]
         missed.append(f"messages that are not in the copy: {list_some(counts)}")
     recording.told = "; ".join(filter(None, [recording.told, *missed]))
     recording.write(target)
