@@ -54,8 +54,11 @@ def _check(name: str, ok: bool, found: str, fix: str, modes: tuple[str, ...] = (
     return Check(name, "missing" if modes else "warn", found[:120], fix, modes)
 
 
-def all_checks(mode: str = "local", context: str | None = None) -> Iterator[Check]:
-    """Yield the results of all checks; in mode "cluster" also check the cluster of `context`."""
+def all_checks(options: argparse.Namespace) -> Iterator[Check]:
+    """Yield the results of all checks; in mode "cluster" also check the cluster.
+
+    `options` has the arguments of the command.
+    """
     # Both programs start at once: each takes a large part of a second.
     physics, steps = start(MUJOCO_PROGRAM), start(NATIVE_PROGRAM)
     yield Check("python", "ok", platform.python_version(), "", tuple(MODES))
@@ -64,8 +67,8 @@ def all_checks(mode: str = "local", context: str | None = None) -> Iterator[Chec
     for name, (fix, modes) in PROGRAMS.items():
         path = shutil.which(name)
         yield _check(name, path is not None, path or "not in PATH", fix, modes)
-    if mode in CLUSTER and not missing("kube"):
-        yield from _cluster(context)
+    if options.mode in CLUSTER and not missing("kube"):
+        yield from _cluster(options)
 
 
 def packages(extra: str) -> Check:
@@ -111,35 +114,47 @@ def _cores() -> Check:
     return _check("cores", 2 <= count >= load, f"{count}, load {load:.1f}", fix)
 
 
-def _cluster(context: str | None) -> Iterator[Check]:
-    """Check whether a kubeconfig is valid and its cluster answers."""
+def _cluster(options: argparse.Namespace) -> Iterator[Check]:
+    """Check whether a kubeconfig is valid and its cluster answers; with --cluster survey it."""
     from cloudrc.cluster.client import connect
+    from cloudrc.cluster.survey import survey
 
     name = "kubeconfig"
     try:
-        release = connect(context)
-        where = f"context {context}" if context else "its current context"
+        release = connect(options.context, options.namespace)
+        where = f"context {options.context}" if options.context else "its current context"
         yield _check(name, True, f"{where}, namespace {release.namespace}", "", CLUSTER)
         name = "cluster"
         release.request("list", "pods", limit=1)
+        yield _check(name, True, "the API server answers", "", CLUSTER)
+        name = "survey"
+        if options.cluster:
+            for finding in survey(release, options.registry):
+                yield Check(*finding, CLUSTER)
     except CloudrcError as error:
         found, _, fix = str(error).partition("; ")
         yield _check(name, False, found, fix or MAKE_CLUSTER, CLUSTER)
-        return
-    yield _check(name, True, "the API server answers", "", CLUSTER)
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     about = "the mode to fly in (default: local)"
     parser.add_argument("--mode", choices=MODES, default="local", help=about)
+    about = "mode cluster, and survey the cluster: permissions, admission, quota, nodes, images"
+    parser.add_argument("--cluster", action="store_true", help=about)
+    about = "with --cluster: registry of the images, as the chart's image.registry"
+    parser.add_argument("--registry", metavar="NAME", default="", help=about)
     parser.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
+    about = "namespace (default: the context's, or default)"
+    parser.add_argument("-n", "--namespace", metavar="NAME", help=about)
     output_argument(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Print the results of all checks; return 3 if the requested mode cannot run, else 0."""
-    mode, checks = options.mode, list(all_checks(options.mode, options.context))
+    if options.cluster:
+        options.mode = "cluster"
+    mode, checks = options.mode, list(all_checks(options))
     blocking = [check.name for check in checks if check.state == "missing" and mode in check.modes]
     code = MissingPrerequisiteError.exit_code if blocking else 0
     found, text = [check._asdict() for check in checks], list[str]()

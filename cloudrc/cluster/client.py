@@ -32,6 +32,8 @@ a refused connection or a TLS error, and once if the server does not answer. A r
 object is repeated only after a refused connection or a TLS error."""
 BUSY = (429, 500, 502, 503, 504)
 """HTTP status codes after which the same request may succeed later."""
+ADMISSION = ("exceeded quota", " usage per ", "violates PodSecurity")
+"""Words of a refusal that is about the object and not about the user's permission."""
 PROGRAM_LIMIT = 120.0
 """Time limit for one command of kubectl or helm [s], such as the copy of a recording."""
 STOP_LIMIT = 2.0
@@ -40,6 +42,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 _KINDS = {
     **{name: ("CoreV1Api", name[:-1]) for name in ("pods", "services", "secrets", "events")},
     "configmaps": ("CoreV1Api", "config_map"),
+    "resourcequotas": ("CoreV1Api", "resource_quota"),
     "pods/log": ("CoreV1Api", "pod_log"),
     "jobs": ("BatchV1Api", "job"),
     "deployments": ("AppsV1Api", "deployment"),
@@ -203,7 +206,8 @@ def _refusal(error: Any, doing: str) -> str:
     if error.status == 401 or "system:anonymous" in message:
         return "the API server does not know you; log in to the cluster again"
     remedy = f"; check your permission: kubectl auth can-i {doing}"
-    return message + remedy * (error.status == 403 and "exceeded quota" not in message)
+    by_admission = any(words in message for words in ADMISSION)
+    return message + remedy * (error.status == 403 and not by_admission)
 
 
 def _root(error: BaseException) -> str:

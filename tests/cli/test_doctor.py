@@ -8,6 +8,7 @@ import pytest
 
 from cloudrc.cli import doctor, extras
 from cloudrc.cli.doctor import Check
+from cloudrc.cli.parser import build_parser
 from cloudrc.errors import MissingPrerequisiteError
 
 GOOD = Check("python", "ok", "3.12.1", "", ("local", "virtual"))
@@ -34,7 +35,8 @@ def test_only_a_needed_check_gives_exit_code_3(mode, found, code, monkeypatch, c
 
 def test_every_problem_says_how_to_fix_it(monkeypatch):
     monkeypatch.setitem(extras.EXTRAS, "world", ("no_such_module",))
-    checks = {check.name: check for check in doctor.all_checks()}
+    options = build_parser(["doctor"]).parse_args(["doctor"])
+    checks = {check.name: check for check in doctor.all_checks(options)}
     for check in checks.values():
         assert check.state == "ok" or check.fix, check.name
         assert len(f"  missing  {check.name}  {check.found}") < 160

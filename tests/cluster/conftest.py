@@ -33,6 +33,8 @@ class FakeApi:
         self.objects = {}
         self.logs = {}
         self.refuse = {}
+        self.nodes = ["one"]
+        self.forbidden = set()  # objects that the user may not create or delete
         self.seen = []
         self.hooks = []  # each gets the path that is read; what it returns is the reply
         self.lock = threading.RLock()
@@ -57,6 +59,11 @@ class FakeApi:
 
     def answer(self, method, path, body):
         address = urlsplit(path)
+        if address.path == "/api/v1/nodes":
+            return 200, {"items": [{"metadata": {"name": name}, "spec": {}} for name in self.nodes]}
+        if address.path.endswith("/selfsubjectaccessreviews"):
+            asked = body["spec"]["resourceAttributes"]["resource"]
+            return 201, {"spec": {}, "status": {"allowed": asked not in self.forbidden}}
         parts = address.path.strip("/").split("/")
         _, plural, *rest = parts[parts.index("namespaces") + 1 :]
         name, subresource = (*rest, "", "")[:2]
@@ -68,6 +75,8 @@ class FakeApi:
             replies = [hook(path) for hook in self.hooks if method == "GET"]
             if refused := next(filter(None, replies), None):
                 return refused
+            if method == "POST" and "dryRun" in address.query:
+                return 201, body
             if method == "POST":
                 return 201, self.put(plural, body)
             if not name:

@@ -1,0 +1,313 @@
+"""Survey a cluster before an install: permissions, admission of the pods, quota, nodes, images.
+
+The pods of the chart are sent to the API server as a dry run, so that Pod Security, LimitRanges and
+quotas judge them themselves. A small pod on each node, which is deleted again, shows whether the
+images are there and whether the kernel has netem.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import suppress
+from types import SimpleNamespace
+from typing import Any, Literal, NamedTuple
+
+import yaml
+
+from cloudrc.cluster.client import (
+    REQUEST_TIMEOUT,
+    ClusterError,
+    NotFoundError,
+    Release,
+    chart_folder,
+    explain_errors,
+    run,
+)
+from cloudrc.cluster.incidents import explain_refusal
+from cloudrc.cluster.pods import container_statuses, pod_failure, pod_log
+from cloudrc.errors import to_one_line
+
+NEEDED = {
+    "": "pods services configmaps secrets serviceaccounts persistentvolumeclaims",
+    "apps": "deployments",
+    "batch": "jobs",
+    "networking.k8s.io": "networkpolicies",
+}
+"""API group -> the objects that an install and a mission create and delete."""
+ALSO = (("", "get", "pods/log"), ("", "create", "pods/portforward"), ("", "create", "pods/exec"))
+"""Further permissions, of the commands that fly and look: API group, verb, object."""
+PROBE_LIMIT = 60.0
+"""Time limit for the probe of all nodes [s], in which a node may pull both images."""
+LOOK_PERIOD = 0.5
+"""Time between two looks at the probes [s]."""
+NETEM = "tc qdisc add dev lo root netem delay 1ms && echo has sch_netem || true"
+"""Program of a probe: it tries netem in the pod's own network."""
+HAS_NETEM = "has sch_netem"
+RESOURCES = {
+    "requests": {"cpu": "30m", "memory": "40Mi"},
+    "limits": {"cpu": "500m", "memory": "96Mi"},
+}
+"""Resources of each container of a probe."""
+
+
+class Finding(NamedTuple):
+    """What the survey found about one thing, and how to solve a problem.
+
+    "missing" stops an install, "warn" does not.
+    """
+
+    name: str
+    state: Literal["ok", "warn", "missing"]
+    found: str
+    fix: str = ""
+
+
+def survey(release: Release, registry: str = "") -> Iterator[Finding]:
+    """Check whether the chart can be installed as this release; yield one finding after another.
+
+    `registry` is the value `image.registry`. Raise a ClusterError if the server does not answer.
+    """
+    yield (allowed := permissions(release))
+    if allowed.state != "ok":
+        return
+    pods = pods_of_chart(release, registry)
+    for component, spec in pods.items():
+        try:
+            yield admission(release, component, spec)
+        except NotFoundError as error:
+            fix = f"make the namespace: kubectl create namespace {release.namespace}"
+            yield Finding("namespace", "missing", to_one_line(str(error)), fix)
+            return
+    yield from quotas(release, pods)
+    yield from nodes(release, {name: pod["containers"][0]["image"] for name, pod in pods.items()})
+
+
+def permissions(release: Release) -> Finding:
+    """Ask the API server what the user may do in the namespace."""
+    from kubernetes import client
+
+    api: Any = client.AuthorizationV1Api(release.client)
+    review = api.create_self_subject_access_review
+    wanted = list(ALSO)
+    for group, kinds in NEEDED.items():
+        wanted += [(group, verb, kind) for kind in kinds.split() for verb in ("create", "delete")]
+    refused = []
+    for group, verb, kind in wanted:
+        resource, _, subresource = kind.partition("/")
+        asked = {
+            "namespace": release.namespace,
+            "group": group,
+            "verb": verb,
+            "resource": resource,
+            "subresource": subresource,
+        }
+        with explain_errors("ask for permissions", release.where):
+            answer = review(
+                {"spec": {"resourceAttributes": asked}}, _request_timeout=REQUEST_TIMEOUT
+            )
+        if not answer.status.allowed:
+            refused.append(f"{verb} {kind}")
+    if refused:
+        fix = "ask the administrator for the ClusterRole 'edit' in this namespace"
+        return Finding("permissions", "missing", f"you may not {', '.join(refused)}", fix)
+    return Finding("permissions", "ok", f"enough {release.where}")
+
+
+def pods_of_chart(release: Release, registry: str) -> dict[str, dict[str, Any]]:
+    """Render the chart as `helm install` would; return component -> spec of its pod."""
+    arguments = ["template", release.name, str(chart_folder()), *release.helm_flags]
+    arguments += ["--dry-run=server", f"--set=image.registry={registry}"]
+    rendered = yaml.safe_load_all(run("helm", arguments))
+    return {
+        thing["metadata"]["labels"]["app.kubernetes.io/component"]: {
+            **thing["spec"]["template"]["spec"],
+            "serviceAccountName": "default",  # the chart's own accounts do not exist yet
+        }
+        for thing in rendered
+        if thing and thing["kind"] == "Deployment"
+    }
+
+
+def admission(release: Release, component: str, spec: dict[str, Any]) -> Finding:
+    """Send a pod of the chart as a dry run: nothing is created.
+
+    Raise a NotFoundError if the namespace does not exist.
+    """
+    name = f"{component} pod"
+    try:
+        create_pod(release, component, spec, dry_run="All")
+    except NotFoundError:
+        raise
+    except ClusterError as error:
+        text = to_one_line(str(error))
+        fix = "set these values at install"
+        if "PodSecurity" in text:
+            fix = "--set link.mode=relay, which Pod Security 'restricted' admits"
+        return Finding(name, "missing", explain_refusal(text, _as_object(spec)), fix)
+    return Finding(name, "ok", "is admitted: Pod Security, LimitRanges and quota agree")
+
+
+def _as_object(spec: dict[str, Any]) -> SimpleNamespace:
+    """Convert a pod's spec to the attributes that `explain_refusal` reads."""
+
+    def convert(containers: list[dict[str, Any]]) -> list[SimpleNamespace]:
+        return [
+            SimpleNamespace(name=one["name"], resources=SimpleNamespace(**one.get("resources", {})))
+            for one in containers
+        ]
+
+    first = convert(spec.get("initContainers", []))
+    return SimpleNamespace(init_containers=first, containers=convert(spec["containers"]))
+
+
+def create_pod(release: Release, name: str, spec: dict[str, Any], **how: Any) -> str:
+    """Create a pod with a new name, and return the name."""
+    name = f"cloudrc-doctor-{name}-{secrets.token_hex(3)}"
+    metadata = {"name": name, "labels": {"app.kubernetes.io/name": "cloudrc-doctor"}}
+    release.request("create", "pods", body={"metadata": metadata, "spec": spec}, **how)
+    return name
+
+
+def quotas(release: Release, pods: dict[str, dict[str, Any]]) -> Iterator[Finding]:
+    """Compare the requests and limits of all pods together with what each quota has left."""
+    from kubernetes import utils
+
+    quantity: Any = utils.parse_quantity  # not annotated
+    needed = Counter[str]()
+    for spec in pods.values():
+        for container in [*spec.get("initContainers", []), *spec["containers"]]:
+            for kind, amounts in container.get("resources", {}).items():
+                for resource, amount in amounts.items():
+                    needed[f"{kind}.{resource}"] += quantity(amount)
+    needed |= {"cpu": needed["requests.cpu"], "memory": needed["requests.memory"]}
+    needed |= {"pods": len(pods), "count/pods": len(pods)}
+    for quota in release.request("list", "resourcequotas"):
+        used, hard = quota.status.used or {}, quota.status.hard or {}
+
+        def left(key: str, used: Any = used, hard: Any = hard) -> Any:
+            return quantity(hard[key]) - quantity(used.get(key, 0))
+
+        lacks = [
+            f"{key} {_text(amount)}, and {_text(left(key))} is left"
+            for key, amount in needed.items()
+            if key in hard and amount > left(key)
+        ]
+        name = f"quota {quota.metadata.name}"
+        if lacks:
+            fix = "ask for a larger quota, or set smaller resources of the containers"
+            yield Finding(name, "missing", f"the release needs {', '.join(lacks)}", fix)
+        else:
+            yield Finding(name, "ok", "has enough left for one release")
+
+
+def _text(amount: Any) -> str:
+    """Format cores, bytes or a count: bytes in Mi."""
+    return f"{float(amount) / 2**20:g}Mi" if amount >= 2**20 else f"{float(amount):g}"
+
+
+def nodes(release: Release, images: dict[str, str]) -> Iterator[Finding]:
+    """Start a probe on each node that takes pods; say what it found, and delete it."""
+    names = schedulable_nodes(release)
+    if names is None:
+        yield Finding("nodes", "warn", "you may not list nodes: one probe on any node", "")
+    probes = dict[str, tuple[str, bool]]()
+    try:
+        for node in names if names is not None else [""]:
+            probes[node] = start_probe(release, node, images)
+        until = time.monotonic() + PROBE_LIMIT
+        for node, (pod, netem) in probes.items():
+            yield _finding(release, node or "any", pod, netem, until)
+    except ClusterError as error:
+        yield Finding("nodes", "warn", f"no probe: {error}", "solve the problems above")
+    finally:
+        for pod, _ in probes.values():
+            with suppress(ClusterError):
+                release.request("delete", "pods", name=pod, grace_period_seconds=0)
+
+
+def schedulable_nodes(release: Release) -> list[str] | None:
+    """List the nodes that take pods without a toleration; None if the user may not list nodes."""
+    from kubernetes import client
+
+    api: Any = client.CoreV1Api(release.client)
+    try:
+        with explain_errors("list nodes", release.where):
+            found = api.list_node(_request_timeout=REQUEST_TIMEOUT).items
+    except ClusterError:
+        return None
+    return [
+        node.metadata.name
+        for node in found
+        if not node.spec.unschedulable
+        and not any(taint.effect in ("NoSchedule", "NoExecute") for taint in node.spec.taints or [])
+    ]
+
+
+def start_probe(release: Release, node: str, images: dict[str, str]) -> tuple[str, bool]:
+    """Create a probe; return its name, and whether it may try netem, which needs NET_ADMIN."""
+    restricted = {
+        "allowPrivilegeEscalation": False,
+        "capabilities": {"drop": ["ALL"]},
+        "runAsNonRoot": True,
+        "seccompProfile": {"type": "RuntimeDefault"},
+    }
+    privileged = {"runAsUser": 0, "capabilities": {"drop": ["ALL"], "add": ["NET_ADMIN"]}}
+    for netem in (True, False):
+        containers = [
+            {
+                "name": component,
+                "image": image,
+                "imagePullPolicy": "IfNotPresent",
+                "command": ["sh", "-c", NETEM],
+                "resources": RESOURCES,
+                "securityContext": privileged if netem else restricted,
+            }
+            for component, image in images.items()
+        ]
+        spec = {
+            "restartPolicy": "Never",
+            "automountServiceAccountToken": False,
+            "containers": containers,
+            **({"nodeName": node} if node else {}),
+        }
+        try:
+            return create_pod(release, "node", spec), netem
+        except ClusterError as error:
+            if not netem or "PodSecurity" not in str(error):
+                raise
+    raise AssertionError("unreachable")
+
+
+def _finding(release: Release, node: str, pod: str, netem: bool, until: float) -> Finding:
+    """Wait for a probe until the time `until` [s, monotonic]; say what it shows about its node."""
+    name, why = f"node {node}", "its probe has not ended"
+    while time.monotonic() < until:
+        found = release.request("get", "pods", name=pod)
+        if found.status.phase in ("Succeeded", "Failed"):
+            break
+        if why := pod_failure(found):
+            return Finding(name, "missing", why, "make kind-load, or --registry NAME")
+        time.sleep(LOOK_PERIOD)
+    else:
+        return Finding(name, "warn", why or "its probe has not ended", "kubectl get events")
+    bad = [
+        f"{status.name}: {to_one_line(status.state.terminated.message or 'failed')}"
+        for status in container_statuses(found)
+        if status.state.terminated and status.state.terminated.exit_code
+    ]
+    if bad:
+        return Finding(name, "missing", "; ".join(bad), f"kubectl describe pod {pod}")
+    if not netem:
+        return Finding(name, "ok", "has the images; Pod Security allows link.mode relay alone")
+    component = container_statuses(found)[0].name
+    if HAS_NETEM in pod_log(release, pod, component):
+        return Finding(name, "ok", "has the images, and the kernel has sch_netem")
+    return Finding(
+        name,
+        "warn",
+        "has the images, but the kernel has no sch_netem",
+        "link.mode auto and relay work; for netem, load the module: modprobe sch_netem",
+    )

@@ -1,0 +1,106 @@
+"""`cloudrc doctor --cluster` says what would stop an install, and leaves nothing behind."""
+
+import pytest
+
+from cloudrc.cluster import survey
+from cloudrc.cluster.survey import HAS_NETEM
+
+CHART = """\
+apiVersion: apps/v1
+kind: Deployment
+metadata: {name: x, labels: {app.kubernetes.io/component: COMPONENT}}
+spec:
+  template:
+    spec:
+      serviceAccountName: made-by-the-chart
+      initContainers: [{name: link, image: i, resources: {requests: {cpu: 20m}}}]
+      containers: [{name: COMPONENT, image: i, resources: {requests: {cpu: 60m}}}]
+---
+"""
+CPU = "cannot be: minimum cpu usage per Container is 30m, but request is 20m"
+SECURITY = 'pods "x" is forbidden: violates PodSecurity "restricted:latest"'
+
+
+@pytest.fixture
+def cluster(api, pretend, monkeypatch):
+    """The fake API server, on which pods of the survey run and end."""
+    rendered = "".join(CHART.replace("COMPONENT", each) for each in ("world", "cloud"))
+    pretend("helm", f"cat <<'END'\n{rendered}END")
+    monkeypatch.setattr(survey, "LOOK_PERIOD", 0.01)
+    put = api.put
+    api.log = HAS_NETEM
+
+    def run_at_once(plural, body):
+        made = put(plural, body)
+        if plural == "pods":
+            ended = {"terminated": {"exitCode": 0}}
+            made["status"] = {
+                "phase": "Succeeded",
+                "containerStatuses": [
+                    {"name": "world", "image": "i", "imageID": "", "ready": False}
+                    | {"restartCount": 0, "state": ended}
+                ],
+            }
+            api.logs[made["metadata"]["name"]] = api.log
+        return made
+
+    monkeypatch.setattr(api, "put", run_at_once)
+    return api
+
+
+def found(release):
+    return {one.name: one for one in survey.survey(release)}
+
+
+def test_a_cluster_that_is_fit_has_no_problem_and_keeps_no_pod(cluster, release):
+    cluster.nodes = ["one", "two"]
+    seen = found(release)
+    assert list(seen) == ["permissions", "world pod", "cloud pod", "node one", "node two"]
+    assert {one.state for one in seen.values()} == {"ok"}
+    assert "has sch_netem" in seen["node two"].found
+    assert not [name for kind, name in cluster.objects if kind == "pods"]
+
+
+def test_a_kernel_without_netem_is_told_for_each_node(cluster, release):
+    cluster.log = "Error: Specified qdisc kind is unknown."
+    seen = found(release)["node one"]
+    assert seen.state == "warn"
+    assert "no sch_netem" in seen.found
+
+
+def test_missing_permissions_end_the_survey(cluster, release):
+    cluster.forbidden = {"secrets"}
+    (only,) = found(release).values()
+    assert only.state == "missing"
+    assert "create secrets" in only.found
+    assert "pods" not in only.found
+
+
+def test_a_limit_range_names_container_and_value(cluster, release):
+    cluster.refuse["POST", "pods"] = (403, CPU)
+    seen = found(release)["world pod"]
+    assert seen.state == "missing"
+    assert "link.resources.requests.cpu" in seen.found
+    assert "can-i" not in seen.found, "the user's permission is not the problem"
+
+
+def test_pod_security_leads_to_the_relay(cluster, release):
+    cluster.refuse["POST", "pods"] = (403, SECURITY)
+    assert "link.mode=relay" in found(release)["cloud pod"].fix
+
+
+def test_a_quota_is_compared_with_both_pods_together(cluster, release):
+    status = {"hard": {"requests.cpu": "150m"}, "used": {"requests.cpu": "0"}}
+    cluster.put("resourcequotas", {"metadata": {"name": "small"}, "status": status})
+    seen = found(release)["quota small"]
+    assert seen.state == "missing"
+    assert "needs requests.cpu 0.16, and 0.15 is left" in seen.found
+    status["hard"]["requests.cpu"] = "160m"
+    assert found(release)["quota small"].state == "ok"
+
+
+def test_a_namespace_that_does_not_exist_is_told_once(cluster, release):
+    cluster.refuse["POST", "pods"] = (404, 'namespaces "demo" not found')
+    seen = found(release)
+    assert list(seen) == ["permissions", "namespace"]
+    assert seen["namespace"].fix == "make the namespace: kubectl create namespace demo"
