@@ -61,11 +61,12 @@ FENCE_SPAN = dist(fence.LOW, fence.HIGH)
 
 
 def assemble(
-    experiment: ResolvedExperiment,
+    experiment: ResolvedExperiment, make_loop: Callable[..., ControlLoop] = ControlLoop
 ) -> tuple[WorldEndpoint, CloudEndpoint, Teleop, VirtualRun]:
     """Build world, cloud and teleop, and connect them for a flight in virtual time.
 
-    The mission starts with the flight; `Teleop.over` tells when it is over.
+    The mission starts with the flight; `Teleop.over` tells when it is over. `make_loop` is that of
+    `build_cloud`.
     """
     from cloudrc.drivers.virtual import CPU_CLOCK, Clock, VirtualRun
 
@@ -76,7 +77,14 @@ def assemble(
     of_world = Identity(VIRTUAL_CLOCK, b"world".ljust(16), VIRTUAL_RING, passes)
     of_cloud = Identity(clock_id, b"cloud".ljust(16), VIRTUAL_RING, passes)
     world, teleop = build_world(experiment, of_world), start_mission(experiment, own.at(0))
-    cloud = build_cloud(experiment, of_cloud, teleop, lambda: own.at(0), cpu_clock=CPU_CLOCK)
+    cloud = build_cloud(
+        experiment,
+        of_cloud,
+        teleop,
+        lambda: own.at(0),
+        cpu_clock=CPU_CLOCK,
+        make_loop=make_loop,
+    )
     return world, cloud, teleop, VirtualRun(world, cloud, *links, cloud_clock=own)
 
 
@@ -90,13 +98,17 @@ def start_mission(experiment: ResolvedExperiment, now_ns: int = 0) -> Teleop:
     return teleop
 
 
-def fly(experiment: ResolvedExperiment, see: Sink) -> None:
+def fly(
+    experiment: ResolvedExperiment,
+    see: Sink,
+    make_loop: Callable[..., ControlLoop] = ControlLoop,
+) -> None:
     """Fly in virtual time until the mission is over.
 
     Every 100 ms of virtual time, call `see` with the new records of world and of cloud, both on
-    world's clock.
+    world's clock. `make_loop` is that of `build_cloud`.
     """
-    _, _, teleop, run = assemble(experiment)
+    _, _, teleop, run = assemble(experiment, make_loop)
 
     def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
         see(from_world, run.on_world_clock(from_cloud))

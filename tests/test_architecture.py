@@ -49,12 +49,13 @@ MAY_IMPORT: dict[str, set[str]] = {
     "console": {"config", "exposition", "geometry", "metrics.definitions", "teleop", "world"},
     "cluster": {"config", "link", "record", "report"},
     "sweep": {
-        *("assembly", "config", "files", "metrics", "plugin_file", "plugins", "record", "report")
+        *("assembly", "cloud", "config", "files", "metrics", "plugin_file", "plugins"),
+        *("record", "report"),
     },
     "assembly": EVERYTHING,
     "advice": {"assembly", "config", "link", "tunnel", "world"},
     "api": {"advice", "sweep", "config", "metrics", "record"},
-    "exercise": {"api", "cloud", "plugins"},
+    "exercise": {"cloud", "config", "plugins", "sweep"},
     "faults": EVERYTHING,
     "cli": EVERYTHING,
     "__main__": {"cli"},

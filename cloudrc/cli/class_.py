@@ -1,17 +1,22 @@
 """`cloudrc class`: hand out and score the exercise of docs/exercise.md.
 
-Each part of the exercise runs in its own process, so that a crash costs the points of this part
-only. The process is no sandbox: a student's file has all rights of the user.
+The students' functions run in a process of their own for each part of the exercise, so that a crash
+costs the points of this part only. The process is no sandbox: a student's file has all rights of
+the user.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import select
+import signal
 import subprocess
 import time
+from collections.abc import Sequence
+from contextlib import closing, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from cloudrc.cli.extras import require
@@ -20,8 +25,10 @@ from cloudrc.cli.output import format_document, print_or_drop, print_result, tab
 from cloudrc.cli.parser import add_verbs
 from cloudrc.errors import BadInputError
 
-TIME_LIMIT = 120.0
-"""Time limit of all parts together [s]; the solution needs 5 s."""
+TIME_LIMIT = 60.0
+"""Time limit of each part [s]; the solution needs 2 s."""
+ANSWER_MAX = 64 << 10
+"""Largest size of an answer from the process of a hand-in [bytes]."""
 VERBS = {"new": "write the files that students fill in", "check": "score a student's files"}
 FORMS = ("table", "json", "yaml", "gradescope")
 EPILOG = """\
@@ -70,51 +77,109 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def _new(folder: Path) -> int:
-    from cloudrc.exercise import checks
+    from cloudrc.exercise import hand_in
 
-    names = [file for file, *_ in checks.PARTS.values()]
+    names = [*hand_in.FILES.values()]
     if there := [name for name in names if (folder / name).exists()]:
         raise BadInputError(f"{folder / there[0]}: exists and stays as it is; name another folder")
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
-        (folder / name).write_bytes(Path(checks.__file__).with_name(name).read_bytes())
+        (folder / name).write_bytes(Path(hand_in.__file__).with_name(name).read_bytes())
     print_or_drop(f"fill in {', '.join(names)} in {folder}, then: cloudrc class check {folder}")
     return 0
 
 
+class Process:
+    """The process in which a student's functions run; it has a session of its own."""
+
+    def __init__(self, folder: Path, file: str, limit: float) -> None:
+        """Start the process; it has `limit` [s]. `file` is named if the process fails."""
+        from cloudrc.drivers.machine import interpreter
+        from cloudrc.exercise import hand_in
+
+        self._file, self._limit = file, limit
+        self._until = time.monotonic() + limit
+        self._unread, self._number, self._lost = b"", 0, ""
+        pipe, nowhere = subprocess.PIPE, subprocess.DEVNULL
+        self._process = subprocess.Popen(
+            interpreter("-m", hand_in.__name__, str(folder)),
+            start_new_session=True,
+            stdin=pipe,
+            stdout=pipe,
+            stderr=nowhere,
+        )
+
+    def ask(self, calls: Sequence[Any]) -> tuple[Any, str]:
+        """Send calls to the process; return the result of the last one, and an error or "".
+
+        Raises:
+            HandInError: If the process has ended, is too slow, or sends no answer.
+        """
+        from cloudrc.exercise.remote import HandInError
+
+        if not self._lost:
+            try:
+                return self._ask(calls)
+            except TimeoutError:
+                self._lost = f"no end after {self._limit:g} s"
+            except (OSError, EOFError):
+                self._lost = "ended the process of the check"
+            except (ValueError, TypeError, RecursionError):
+                self._lost = "sent something else than its results"
+            self.close()  # nothing of a lost hand-in runs on
+        raise HandInError(f"{self._file}: {self._lost}")
+
+    def _ask(self, calls: Sequence[Any]) -> tuple[Any, str]:
+        assert self._process.stdin is not None
+        self._number += 1
+        self._process.stdin.write(json.dumps([self._number, calls]).encode() + b"\n")
+        self._process.stdin.flush()
+        number, result, error = json.loads(self._read_line())
+        if number != self._number or not isinstance(error, str):
+            raise ValueError("another answer")
+        return result, error
+
+    def _read_line(self) -> bytes:
+        assert self._process.stdout is not None
+        answers = self._process.stdout.fileno()
+        while b"\n" not in self._unread:
+            left = self._until - time.monotonic()
+            if left <= 0.0:
+                raise TimeoutError
+            if select.select([answers], [], [], min(left, 0.2))[0]:
+                data = os.read(answers, ANSWER_MAX)
+                self._unread += data
+                if not data:
+                    raise EOFError
+            elif self._process.poll() is not None:  # a child keeps the pipe open
+                raise EOFError
+            if len(self._unread) > ANSWER_MAX:
+                raise ValueError("a long answer")
+        line, _, self._unread = self._unread.partition(b"\n")
+        return line
+
+    def close(self) -> None:
+        """Kill the process and all others of its session's process group."""
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout):
+            with suppress(OSError):
+                if pipe is not None:
+                    pipe.close()
+
+
 def check(folder: Path, limit: float = TIME_LIMIT) -> list[dict[str, Any]]:
-    """Score the student's files in a folder within `limit` [s].
+    """Score the student's files in a folder, each part within `limit` [s].
 
     Return one dictionary per test, with the test's name, its points and the result in words.
     """
-    from cloudrc.drivers.machine import interpreter
     from cloudrc.exercise import checks
+    from cloudrc.exercise.hand_in import FILES
+    from cloudrc.exercise.remote import Remote
 
-    found, deadline = list[dict[str, Any]](), time.monotonic() + limit
-    processes: dict[str, subprocess.Popen[bytes]] = {}
-    silent: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
-    with TemporaryDirectory() as answers:
-        try:
-            for part in checks.CHECKS:
-                words = "-m", checks.__name__, part, str(folder), f"{answers}/{part}"
-                processes[part] = subprocess.Popen(
-                    interpreter(*words), start_new_session=True, **silent
-                )
-            for part, process in processes.items():
-                why = "ended the process of the check"
-                try:
-                    process.wait(max(deadline - time.monotonic(), 0.0))
-                except subprocess.TimeoutExpired:
-                    why = f"no end after {limit:g} s"
-                answer = Path(answers, part)
-                if answer.exists():
-                    found += json.loads(answer.read_bytes())
-                else:
-                    file = checks.PARTS.get(part, ("a file",))[0]
-                    lost = [(0.0, f"{file}: {why}")] * len(checks.CHECKS[part])
-                    found += checks.rows(part, lost)
-        finally:
-            for process in processes.values():
-                process.kill()
-                process.wait()
+    found = list[dict[str, Any]]()
+    for part in checks.CHECKS:
+        with closing(Process(folder, FILES.get(part, "a file"), limit)) as process:
+            found += checks.run(part, Remote(process.ask), folder)
     return found

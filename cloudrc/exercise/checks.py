@@ -2,16 +2,13 @@
 
 The exercise has three parts: estimator, predictor and controller. The reference is cloudrc's own
 plug-ins. A flight that scores one part uses the reference for the other two parts, so that an error
-in one part costs no points of another part.
+in one part costs no points of another part. All flights and all points are computed here, in the
+process of the check; the student's functions run in another process (`hand_in`).
 """
 
 from __future__ import annotations
 
-import json
-import os
-import sys
-import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,17 +16,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cloudrc import plugins
-from cloudrc.api import fly
 from cloudrc.cloud.estimators import DelaySample
-from cloudrc.errors import BadInputError, CloudrcError, describe_error, to_one_line
+from cloudrc.cloud.loop import ControlLoop
+from cloudrc.config.load import load_experiment
+from cloudrc.errors import describe_error, machine_error, to_one_line
+from cloudrc.exercise.hand_in import FILES, find_method
+from cloudrc.exercise.remote import HandInError, Remote
 from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
+from cloudrc.plugins import InvalidResultError
+from cloudrc.sweep.flight import fly_in_memory
 
-PARTS = {
-    "estimator": ("delay_estimator.py", "horizon", "running_mean"),
-    "predictor": ("predictor.py", "predict", "constant_velocity"),
-    "controller": ("controller.py", "update", "pid"),
-}
-"""Part -> the student's file, the method that returns its result, and the reference."""
+REFERENCES = {"estimator": "running_mean", "predictor": "constant_velocity", "controller": "pid"}
+"""Part -> cloudrc's plug-in."""
 TOLERANCE = 1e-3
 """Largest difference between a result and that of the reference, in SI units."""
 FAILED = 0.3
@@ -81,13 +79,14 @@ class Formula(NamedTuple):
     points: int
     measure: Callable[[Callable[..., Any]], Any]
 
-    def score(self, files: Mapping[str, str]) -> tuple[float, str]:
+    def score(self, parts: Sequence[str], hand_in: Remote) -> tuple[float, str]:
         """Return 1.0 and "right" if the student's results agree with those of the reference.
 
-        Otherwise raise a BadInputError. `files` has one entry: part -> path of the student's file.
+        Otherwise raise an InvalidResultError. `parts` has one entry.
         """
-        ((part, path),) = files.items()
-        builds = (partial(plugins.load, f"{part}s", name) for name in (path, PARTS[part][2]))
+        (part,) = parts
+        reference = partial(plugins.load, f"{part}s", REFERENCES[part])
+        builds = partial(hand_in.build, part), reference
         seen, wanted = (np.asarray(self.measure(build), dtype=float) for build in builds)
         if seen.shape == wanted.shape:
             wrong = ~np.isclose(seen, wanted, rtol=0.0, atol=TOLERANCE)
@@ -95,7 +94,7 @@ class Formula(NamedTuple):
                 return 1.0, "right"
             first = int(np.argwhere(wrong)[0, 0]) if wrong.ndim > 1 else slice(None)
             seen, wanted = seen[first], wanted[first]
-        raise BadInputError(f"gives {seen.round(3).tolist()}, not {wanted.round(3).tolist()}")
+        raise InvalidResultError(f"gives {seen.round(3).tolist()}, not {wanted.round(3).tolist()}")
 
 
 class Flight(NamedTuple):
@@ -112,17 +111,26 @@ class Flight(NamedTuple):
     full: float  # any unit
     none: float  # any unit
 
-    def score(self, files: Mapping[str, str]) -> tuple[float, str]:
-        """Fly with `files` (plug-in -> path); return the earned share of points [1], and why."""
-        chosen = {f"cloud.{part}": path for part, path in files.items()}
-        result = fly(self.experiment, {**chosen, "link.profile": self.link})
-        value = result.numbers.get(self.metric, self.none)
+    def score(self, parts: Sequence[str], hand_in: Remote) -> tuple[float, str]:
+        """Fly with the student's `parts`; return the earned share of points [1], and why."""
+
+        def make_loop(*own: Any, **limits: Any) -> ControlLoop:
+            plug_ins = dict(zip(REFERENCES, own, strict=True))
+            for part in parts:
+                build = partial(hand_in.build, part)
+                plug_ins[part] = build if part == "estimator" else build()
+            return ControlLoop(*plug_ins.values(), **limits)
+
+        experiment = load_experiment(self.experiment, [f"link.profile={self.link}"])
+        found = fly_in_memory(experiment, make_loop)
+        known = found.numbers.get(self.metric)
+        value = self.none if known is None else known.value
         share = min(max((value - self.none) / (self.full - self.none), 0.0), 1.0)
         seen = f"{self.metric} {value:.3g} (all points: {self.full:g}, none: {self.none:g})"
-        if result.failures:
-            texts = {failure.code: failure.text for failure in result.failures}
+        if failures := found.verdict.failures:
+            texts = {failure.code: failure.text for failure in failures}
             share *= 0.0 if "plugin_failed" in texts else FAILED
-            seen += f"; {texts.get('plugin_failed', result.failures[0].text)}"
+            seen += f"; {texts.get('plugin_failed', failures[0].text)}"
         return share, seen
 
 
@@ -153,51 +161,24 @@ CHECKS: dict[str, tuple[Formula | Flight, ...]] = {
 """Part, or all parts together -> its checks; 100 points in total."""
 
 
-def rows(part: str, scored: Sequence[tuple[float, str]]) -> list[dict[str, Any]]:
-    """Make a row per check of `part` from its score in [0, 1] and a text on the result."""
-    keys = ("part", "test", "points", "max_points", "seen")
-    cells = (
-        (part, check.test, round(check.points * share, 1), check.points, seen)
-        for check, (share, seen) in zip(CHECKS[part], scored, strict=True)
-    )
-    return [dict(zip(keys, cell, strict=True)) for cell in cells]
+def run(part: str, hand_in: Remote, folder: Path) -> list[dict[str, Any]]:
+    """Score the tests of a part, or of all "together"; return a row per test.
 
-
-def run(part: str, folder: Path) -> list[dict[str, Any]]:
-    """Run the checks of a part on the files in `folder`; return a dictionary per check."""
-    names, scored = PARTS if part == "together" else (part,), list[tuple[float, str]]()
-    files = {name: str(folder / PARTS[name][0]) for name in names}
-    for check in CHECKS[part]:
-        name = part
-        try:
-            for name, path in files.items():
-                plugins.load(f"{name}s", path)
-            scored.append(check.score(files))
-        except BaseException as error:  # a student's file may raise anything, SystemExit too
-            seen = to_one_line(_explain(error, name, files)).replace(f"{folder}/", "")
-            scored.append((0.0, seen))
-    return rows(part, scored)
-
-
-def _explain(error: BaseException, part: str, files: Mapping[str, str]) -> str:
-    """Describe an error; begin with FILE:LINE, the place in the student's file that failed.
-
-    If no line of this file failed, the place is the student's method.
+    `hand_in` calls the functions of the files in `folder`. A test that cannot be scored gives 0.
     """
-    while isinstance(error, CloudrcError) and error.__cause__ is not None:
-        error = error.__cause__
-    places = [(each.filename, each.lineno) for each in traceback.extract_tb(error.__traceback__)]
-    if isinstance(error, SyntaxError):
-        places.append((str(error.filename), error.lineno))
-    places = [place for place in places if place[0] in files.values()]
-    if not places and (path := Path(files[part])).is_file():
-        before = path.read_text(errors="replace").partition(f"def {PARTS[part][1]}(")[0]
-        places = [(str(path), before.count("\n") + 1)]
-    text = str(error) if isinstance(error, CloudrcError) else describe_error(error)
-    return f"{places[-1][0]}:{places[-1][1]}: {text}" if places else text
-
-
-if __name__ == "__main__":  # part, folder, file for the rows
-    part, folder, answer = sys.argv[1:]
-    Path(answer).write_text(json.dumps(run(part, Path(folder))))
-    os._exit(0)  # the student's files may have started threads
+    parts = tuple(FILES) if part == "together" else (part,)
+    scored = []
+    for check in CHECKS[part]:
+        try:
+            share, seen = check.score(parts, hand_in)
+        except HandInError as error:
+            share, seen = 0.0, str(error)
+        except Exception as error:  # the answers may be anything
+            if failure := machine_error(error):
+                raise failure from error
+            text = str(error) if isinstance(error, InvalidResultError) else describe_error(error)
+            share, seen = 0.0, f"{find_method(folder, parts[0])}: {text}"
+        points = round(check.points * min(max(share, 0.0), 1.0), 1)
+        scored.append((part, check.test, points, check.points, to_one_line(seen)))
+    keys = ("part", "test", "points", "max_points", "seen")
+    return [dict(zip(keys, row, strict=True)) for row in scored]

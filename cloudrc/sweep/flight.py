@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias
 
 from cloudrc import assembly, metrics, plugins
+from cloudrc.cloud.loop import ControlLoop
 from cloudrc.config.load import ResolvedExperiment, absolute_paths
 from cloudrc.errors import MissingPrerequisiteError, describe_error, machine_error
 from cloudrc.record.columns import Recording, RecordStore
@@ -78,9 +79,14 @@ def units(own: Iterable[str]) -> dict[str, str]:
     return {metric.name: metric.unit for metric in map(metrics.find, names)}
 
 
-def fly_in_memory(experiment: ResolvedExperiment) -> Assessment:
-    """Fly an experiment in virtual time, and measure and judge it, without any file."""
+def fly_in_memory(
+    experiment: ResolvedExperiment, make_loop: Callable[..., ControlLoop] = ControlLoop
+) -> Assessment:
+    """Fly an experiment in virtual time, and measure and judge it, without any file.
+
+    `make_loop` is called in place of `ControlLoop`, for example to use other plug-ins.
+    """
     store = RecordStore()
-    assembly.fly(experiment, store.add)
+    assembly.fly(experiment, store.add, make_loop)
     run = Run("virtual", "virtual", notes=assembly.virtual_notes(experiment))
     return assess(Recording(records=store), experiment, run, experiment.report.metrics)

@@ -153,10 +153,10 @@ def test_failed_flights_are_recorded_if_asked_for(write_sweep, call):
 
 
 def test_an_error_becomes_a_row_and_the_others_fly(write_sweep, monkeypatch, call):
-    def fly(experiment):
+    def fly(experiment, *given):
         if experiment.seed == 2:
             raise RuntimeError("no\x1b luck")
-        return assemble(experiment)
+        return assemble(experiment, *given)
 
     monkeypatch.setattr("cloudrc.assembly.assemble", fly)
     out = call("sweep run --out grid", write_sweep(ONE, seeds=[2, 1]), code=1).out
@@ -184,10 +184,10 @@ def broken_machine(request, monkeypatch):
     """Let the flight with seed 2 meet an error of the machine; return the error's text."""
     error, said = MACHINE[request.param]
 
-    def fly(experiment):
+    def fly(experiment, *given):
         if experiment.seed == 2:
             raise error
-        return assemble(experiment)
+        return assemble(experiment, *given)
 
     monkeypatch.setattr("cloudrc.assembly.assemble", fly)
     return said
@@ -232,9 +232,9 @@ def test_a_file_that_is_lost_during_the_sweep_ends_it(write_sweep, tmp_path, cal
     shutil.copy(Path(assembly.__file__).parent / "world/scenes/empty.xml", scene)
     path = write_sweep({"world.scene": [str(scene), "empty"]})
 
-    def lose(experiment):
+    def lose(experiment, *given):
         scene.unlink(missing_ok=True)
-        return assemble(experiment)
+        return assemble(experiment, *given)
 
     monkeypatch.setattr("cloudrc.assembly.assemble", lose)
     assert f"{scene}: cannot be read any more" in call("sweep run --out grid", path, code=3).err

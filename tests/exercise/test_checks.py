@@ -1,6 +1,13 @@
 """The checks of the exercise: full points for the solution, none for the files to fill in."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from math import inf, nan
 from pathlib import Path
 
 import pytest
@@ -8,17 +15,30 @@ import pytest
 from cloudrc import exercise
 from cloudrc.cli import class_
 from cloudrc.exercise import checks
+from cloudrc.exercise.hand_in import FILES, HandIn
+from cloudrc.exercise.remote import HandInError, Remote
+from tests.conftest import wait_until
 
 SOLUTION = Path(__file__).with_name("solution")
-ALL = {part: [check.test for check in checks.CHECKS[part]] for part in checks.PARTS}
+ALL = {part: [check.test for check in checks.CHECKS[part]] for part in FILES}
 STUBS = Path(exercise.__file__).parent
 
 
-@pytest.mark.parametrize(("folder", "score"), [(STUBS, 0), (SOLUTION, 100)])
+def score(part, folder):
+    """Score a part; the student's functions run in this process."""
+    hand_in = HandIn(folder)
+
+    def ask(calls):
+        return json.loads(json.dumps(hand_in.answer(json.loads(json.dumps(calls)))))
+
+    return checks.run(part, Remote(ask), folder)
+
+
+@pytest.mark.parametrize(("folder", "points"), [(STUBS, 0), (SOLUTION, 100)])
 @pytest.mark.parametrize("part", checks.CHECKS)
-def test_a_stub_scores_nothing_and_the_solution_all(part, folder, score):
-    for row in checks.run(part, folder):
-        assert row["points"] == row["max_points"] * score / 100, row
+def test_a_stub_scores_nothing_and_the_solution_all(part, folder, points):
+    for row in score(part, folder):
+        assert row["points"] == row["max_points"] * points / 100, row
 
 
 # Part, text of the solution, what a student writes instead, lost tests, text of the first one.
@@ -27,7 +47,13 @@ def test_a_stub_scores_nothing_and_the_solution_all(part, folder, score):
     [
         ("estimator", "/ (self.count + 1)", "* 0.05", ["mean", "hold time"], "not"),
         ("estimator", "sample.loop_delay", "sample.rtt", ["hold time", "steps"], "[0.0, 0.06]"),
-        ("estimator", "return self.mean", "return 'x'", ALL["estimator"], "y:14: ValueError: "),
+        (
+            "estimator",
+            "return self.mean",
+            "return 'x'",
+            ALL["estimator"],
+            "y:14: InvalidResultError: ",
+        ),
         ("predictor", "p + v *", "p - v *", ["position", "steps"], "predictor.py:7: gives [0.95"),
         ("predictor", "v * horizon", "v * 1e999", ALL["predictor"][::3], "gives [inf"),
         ("predictor", "horizon):", "horizon)", ALL["predictor"], "predictor.py:7: SyntaxError: "),
@@ -38,11 +64,11 @@ def test_a_stub_scores_nothing_and_the_solution_all(part, folder, score):
     ],
 )
 def test_an_error_costs_the_points_that_it_concerns(part, right, wrong, lost, said, tmp_path):
-    name, *_ = checks.PARTS[part]
+    name = FILES[part]
     text = (SOLUTION / name).read_text()
     assert right in text
     (tmp_path / name).write_text(text.replace(right, wrong))
-    rows = checks.run(part, tmp_path)
+    rows = score(part, tmp_path)
     less = [row for row in rows if row["points"] < row["max_points"]]
     assert [row["test"] for row in less] == lost, rows
     assert said in less[0]["seen"]
@@ -59,9 +85,112 @@ def test_whatever_a_file_does_the_other_parts_are_scored(tmp_path):
         each[0] for part in checks.CHECKS.values() for each in part
     ]
     assert seen["estimator"] == "delay_estimator.py: no end after 10 s"
-    assert seen["predictor"] == "predictor.py:2: SystemExit: no"
+    assert seen["predictor"] == "predictor.py:2: SystemExit: no (sys.exit() was called)"
     assert seen["controller"] == "controller.py: ended the process of the check"
     assert {row["points"] for row in rows} == {0.0}
+
+
+# What a file writes in place of an answer.
+FORGERIES = {
+    "no JSON": b"right, 100 of 100\n",
+    "another number": b'[7, [1e9], ""]\n',
+    "rows": b'[{"points": 1e6}]\n',
+    "no text": b'[1, 1e9, {"points": 1e6}]\n',
+    "deep": b"[" * 60_000 + b"\n",
+    "no end": b"1" * 70_000,
+    "a huge integer": b"1" * 5_000 + b"\n",
+    "the process ends": b"",
+}
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("data", FORGERIES.values(), ids=FORGERIES)
+def test_a_forged_answer_costs_the_part(data, tmp_path):
+    """The file writes to every pipe of its process, and ends it."""
+    write = f"for n in range(3, 9):\n    try: os.write(n, {data!r})\n    except OSError: pass\n"
+    (tmp_path / "predictor.py").write_text(f"import os\n{write}os._exit(0)\n")
+    process = class_.Process(tmp_path, "predictor.py", 20.0)
+    remote = Remote(process.ask)
+    for _ in range(2):
+        with pytest.raises(HandInError, match=r"^predictor.py: (ended|sent) "):
+            remote.build("predictor")
+    process.close()
+
+
+@pytest.mark.parametrize(
+    ("answer", "points"),
+    [
+        (([1e9, [1e9] * 3, [1e9] * 4, [1e9] * 3, [1e9] * 3], ""), 0),
+        (([0, [nan] * 3, [inf] * 4, [None] * 3, ["x"] * 3], ""), 0),
+        ((["1.0", {"x": 1}, [], [[]], [[[1]]]], ""), 0),
+        ((None, ""), 0),
+        ((1e400, "x" * 9_999 + "\ud800\n\x1b"), 0),
+    ],
+)
+def test_whatever_is_answered_the_rows_are_valid(answer, points):
+    rows = checks.run("predictor", Remote(lambda calls: answer), STUBS)
+    assert [row["points"] for row in rows] == [points] * 4
+    json.dumps(rows, allow_nan=False).encode()
+    assert all("\n" not in row["seen"] and len(row["seen"]) < 2500 for row in rows)
+
+
+CHILDREN = {
+    "subprocess": "subprocess.Popen(SLEEP)",
+    "shell": "subprocess.Popen(['sh', '-c', ' '.join(SLEEP) + ' & wait'])",
+    "fork": "os.fork() or os.execvp(SLEEP[0], SLEEP)",
+    "a fork of a fork": "os.fork() or (os.fork() or os.execvp(SLEEP[0], SLEEP)) and os._exit(0)",
+    "a fork, and the end": "os.fork() and os._exit(0)\nos.execvp(SLEEP[0], SLEEP)",
+}
+
+
+def is_running(marker):
+    processes = [path for path in Path("/proc").iterdir() if path.name.isdecimal()]
+    return any(marker in _command_of(path) for path in processes)
+
+
+def _command_of(process):
+    try:
+        return (process / "cmdline").read_bytes().decode().split("\0")[1:]
+    except OSError:  # it has just ended
+        return []
+
+
+def leave(child, folder):
+    """Write a file that leaves a child, and return a text in the child's command line."""
+    marker = f"9{os.getpid()}{time.monotonic_ns() % 10**6}"
+    head = f"import os, subprocess\nSLEEP = ['sleep', '{marker}']\n{child}\n"
+    text = (SOLUTION / "predictor.py").read_text()
+    (folder / "predictor.py").write_text(f"{head}{text}")
+    return marker
+
+
+needs_proc = pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
+
+
+@needs_proc
+@pytest.mark.process
+@pytest.mark.parametrize("child", CHILDREN.values(), ids=CHILDREN)
+def test_no_child_of_a_file_outlives_the_check(child, tmp_path):
+    marker = leave(child, tmp_path)
+    process = class_.Process(tmp_path, "predictor.py", 20.0)
+    with suppress(HandInError):  # some files end their process
+        process.ask([("predictor 1", "build", {})])
+        wait_until(lambda: is_running(marker), 5.0)
+    process.close()
+    wait_until(lambda: not is_running(marker), 5.0)
+
+
+@needs_proc
+@pytest.mark.process
+def test_no_child_outlives_ctrl_c(tmp_path):
+    marker = leave("subprocess.Popen(SLEEP)\nwhile True: pass", tmp_path)
+    (tmp_path / "predictor.py").rename(tmp_path / "delay_estimator.py")
+    line = [sys.executable, "-m", "cloudrc", "class", "check", str(tmp_path)]
+    command = subprocess.Popen(line, stdout=subprocess.DEVNULL)
+    wait_until(lambda: is_running(marker), 60.0)
+    command.send_signal(signal.SIGINT)
+    assert command.wait(20.0) == 130
+    wait_until(lambda: not is_running(marker), 5.0)
 
 
 @pytest.mark.process
