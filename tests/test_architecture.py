@@ -66,7 +66,7 @@ ALWAYS = {"errors", "messages", "records", "renamed", "source", "__version__"}
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it. Ruff checks
 # clocks, sockets, threads, signals, chance, and calls such as `eval` and `print` (pyproject.toml).
 RESERVED: dict[str, tuple[str, ...]] = {
-    "mujoco": ("world/",),
+    "mujoco": ("world/", "geometry/compiled"),
     # The simulator packs forces into MuJoCo's buffers; this is the fastest way.
     "struct": ("tunnel/codec", "record/", "world/simulator", "world/native/robot"),
     "yaml": ("config/", "link/", "record/", "report/", "cli/", "cluster/"),

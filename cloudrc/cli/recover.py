@@ -72,7 +72,7 @@ def _views(recording: Recording) -> list[Message]:
         config = Path(folder) / "config.yaml"
         config.write_bytes(recording.attachments["config.yaml"])
         try:
-            return views(recording, read_experiment(config))
+            return views(recording, read_experiment(config, flown=True))
         except BadInputError as error:
             raise BadInputError(str(error).replace(str(config), "its config.yaml")) from error
         except (ValueError, OSError) as error:  # impossible values

@@ -70,4 +70,4 @@ def _read(run: Path) -> tuple[Recording, ResolvedExperiment]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "config.yaml")
         path.write_bytes(config)
-        return recording, read_experiment(path)
+        return recording, read_experiment(path, flown=True)

@@ -157,7 +157,7 @@ def read_last_mission(folder: Path) -> tuple[Recording, ResolvedExperiment, bool
         (folder / DRIVE_FILE).write_text(write_setpoints(rest), encoding="utf-8")
     config = folder / "config.yaml"
     about = f"Mission {last.id} ({last.order.name}), the last one of a session"
-    experiment = with_order(read_experiment(config), last.order, about)
+    experiment = with_order(read_experiment(config, flown=True), last.order, about)
     config.write_text(dump(experiment), encoding="utf-8")
     recording = merge(folder / "world.mcap", folder / "cloud.mcap")
     cut_to_last_mission(recording)

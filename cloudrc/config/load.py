@@ -27,7 +27,7 @@ from pydantic import (
 from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
 from cloudrc.config.document import Document, KeyPath, write_yaml
-from cloudrc.config.mission_check import check_mission
+from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import (
@@ -135,12 +135,17 @@ class ResolvedExperiment(Experiment):
 
 
 def load_experiment(
-    name: str | Path, settings: Iterable[str] | Settings = (), *, build: bool = True
+    name: str | Path,
+    settings: Iterable[str] | Settings = (),
+    *,
+    build: bool = True,
+    flown: bool = False,
 ) -> ResolvedExperiment:
     """Load an experiment by name or path, and import and check its plug-ins.
 
     `settings` override values of the file; they may be texts `key=value`. Without `build`, the
-    plug-ins are not imported. Raise a BadInputError that lists the experiment's problems.
+    plug-ins are not imported. If the experiment is `flown` already, its mission is not compared
+    with the scene. Raise a BadInputError that lists the experiment's problems.
     """
     name = str(name)
     document = shipped.read("experiment", name, Path())
@@ -170,22 +175,26 @@ def load_experiment(
     found += overrides.resolve_plugins(document, build=build) + _resolve_paths(document)
     experiment = validate(document, ResolvedExperiment, name, found)
     scene, mission = load_scene(experiment.world.scene), experiment.mission
-    wrong = check_mission(mission, scene)
-    below = [problem._replace(path=("mission", *problem.path)) for problem in wrong]
-    problems.raise_problems(document, below, name)
-    criteria = experiment.criteria
-    if criteria.contact is None:
+    contact = experiment.criteria.contact
+    if contact is None:
         contact = scene.board is not None and not (mission.steps or mission.setpoints)
-        criteria = criteria.model_copy(update={"contact": contact})
+    if not flown:
+        wrong = check_mission(mission, scene, contact=contact)
+        below = [problem._replace(path=("mission", *problem.path)) for problem in wrong]
+        problems.raise_problems(document, [*check_scene(scene, contact=contact), *below], name)
+    criteria = experiment.criteria.model_copy(update={"contact": contact})
     return experiment.model_copy(update={"criteria": criteria})
 
 
-def read_experiment(name: str | Path, settings: Iterable[str] = ()) -> ResolvedExperiment:
+def read_experiment(
+    name: str | Path, settings: Iterable[str] = (), *, flown: bool = False
+) -> ResolvedExperiment:
     """Load an experiment without importing its plug-ins, for processes other than cloud.
 
-    The result has only those parameters of plug-ins that the file gives.
+    The result has only those parameters of plug-ins that the file gives. `flown` is that of
+    `load_experiment`.
     """
-    return load_experiment(name, settings, build=False)
+    return load_experiment(name, settings, build=False, flown=flown)
 
 
 def load_profile(name: str | Path) -> Profile:

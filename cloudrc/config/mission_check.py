@@ -1,13 +1,15 @@
 """Check whether the robot can fly a mission in a scene.
 
 Each waypoint must be in the region in which the guard lets the robot fly. The robot must keep a
-distance from the walls of pipes at each waypoint, and on the straight path to the waypoint from the
-spawn point or from the previous waypoint. The board may be on this path, as in the paper's mission.
+distance from the obstacles at each waypoint, and on the straight path to the waypoint from the
+spawn point or from the previous waypoint. The board may be on this path if the mission has to touch
+it, as in the paper's mission.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
 
 import numpy as np
 
@@ -15,14 +17,16 @@ from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Mission, Steps
 from cloudrc.geometry import fence
 from cloudrc.geometry.clearance import Array
+from cloudrc.geometry.obstacles import Obstacle, body_names, obstacles, surface
 from cloudrc.geometry.placement import (
     CLEARANCE_MIN,
-    find_crossed_pipe,
+    find_crossed,
     find_nearest_legal,
-    find_overlapped_pipe,
+    find_overlapped,
     outside_fence,
 )
-from cloudrc.geometry.scene import Scene
+from cloudrc.geometry.scene import BOARD, Pipe, Scene
+from cloudrc.messages import Vector
 
 _YAW = "the onboard controller holds yaw at 0, as the published one does; leave it out"
 _REPORTED = 20
@@ -32,8 +36,40 @@ _INNER = ", ".join(f"{name} {low:g} to {high:g}" for name, low, high in _SPANS) 
 """Text that describes the region in which the guard lets the robot fly, in the world frame."""
 
 
-def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
-    """List the problems of a mission in a scene, each with its path inside the mission."""
+TOUCHING = 1e-3
+"""Distance from an obstacle below which the robot touches it [m]; it covers rounding errors."""
+
+
+def check_scene(scene: Scene, *, contact: bool) -> list[Problem]:
+    """List the problems of a scene for missions that have to touch the board or not (`contact`).
+
+    Their paths are those of the experiment.
+    """
+    names = body_names(scene)
+    if contact and names and BOARD not in names:
+        reason = f"the scene has no body named board to touch; {_named(names)}; name a body board"
+        return [Problem(("criteria", "contact"), "true", f"{reason}, or set it to false")]
+    known, spawn = obstacles(scene, contact=contact), np.array([scene.spawn])
+    (hit,) = find_overlapped(known, spawn, np.zeros(1), TOUCHING)
+    if hit < 0:
+        return []
+    reason = (
+        f"at the spawn, {_point(spawn[0])}, the robot touches {surface(known[hit])}; every body "
+        "but floor is an obstacle: move the spawn, or put what the robot stands on into body floor"
+    )
+    return [Problem(("world", "scene"), scene.name, reason)]
+
+
+def _named(names: Sequence[str]) -> str:
+    near = get_close_matches(BOARD, names, 1)
+    return f"the nearest name is {near[0]}" if near else f"it has {', '.join(names)}"
+
+
+def check_mission(mission: Mission, scene: Scene, *, contact: bool) -> list[Problem]:
+    """List the problems of a mission in a scene, each with its path inside the mission.
+
+    With `contact`, the mission has to touch the board, which is then no obstacle.
+    """
     if mission.setpoints is not None:
         if mission.waypoints or mission.steps or mission.carrot:
             reason = "a mission has setpoints, or waypoints, steps and a carrot; delete one"
@@ -51,60 +87,63 @@ def check_mission(mission: Mission, scene: Scene) -> list[Problem]:
         if mission.waypoints:
             reason = "a mission has waypoints or steps, not both; delete one"
             return [Problem(("steps",), "", reason)]
-        reason = _check_steps(mission.steps, scene)
+        reason = _check_steps(mission.steps, obstacles(scene, contact=contact))
         return [Problem(("steps",), "", reason)] if reason else []
     if not mission.waypoints:
         return [Problem(("waypoints",), "", "none given; give at least one, or steps or setpoints")]
-    return list(_check_waypoints(mission, scene))
+    start = scene.spawn if mission.start == "spawn" else None
+    return list(_check_waypoints(mission, obstacles(scene, contact=contact), start))
 
 
-def _check_waypoints(mission: Mission, scene: Scene) -> Iterator[Problem]:
+def _check_waypoints(
+    mission: Mission, known: Sequence[Obstacle], start: Vector | None
+) -> Iterator[Problem]:
     positions = np.array([waypoint.position_m for waypoint in mission.waypoints])
     yaws = np.radians([waypoint.yaw_deg for waypoint in mission.waypoints])
     # A waypoint may be outside by half its tolerance; the other half is for control errors.
     slack = np.array([0.5 * waypoint.tolerance_m for waypoint in mission.waypoints])
     in_fence = np.all((positions >= fence.LOW) & (positions <= fence.HIGH), axis=1)
     outside = outside_fence(positions, slack) | ~in_fence
-    hit = find_overlapped_pipe(scene, positions, yaws)
+    hit = find_overlapped(known, positions, yaws)
     wrong = np.flatnonzero(outside | (hit >= 0))
     for index in np.flatnonzero(yaws)[:_REPORTED]:
         path = ("waypoints", str(index), "yaw_deg")
         yield Problem(path, f"{mission.waypoints[index].yaw_deg:g}", _YAW)
-    start = scene.spawn if mission.start == "spawn" else None
     for index in wrong[:_REPORTED]:
         if outside[index]:
             reason = (
                 f"beyond the fence, or too near to it; the guard lets the robot fly at {_INNER}"
             )
         else:
-            name = scene.pipes[hit[index]].name
-            reason = f"the robot would be within {CLEARANCE_MIN:g} m of the wall of {name}"
+            reason = (
+                f"the robot would be within {CLEARANCE_MIN:g} m of {surface(known[hit[index]])}"
+            )
         position = mission.waypoints[index].position_m
         before = mission.waypoints[index - 1].position_m if index else start
         legal = None if index - 1 in wrong else before
-        near = find_nearest_legal(scene, position, float(yaws[index]), legal)
+        near = find_nearest_legal(known, position, float(yaws[index]), legal)
         if near is not None:
             reason += f"; nearest legal point found: {_point(np.array(near))}"
         yield _at_point(index, positions[index], reason)
     if not len(wrong):
-        yield from _check_ways(np.vstack([start or positions[0], positions]), scene)
+        yield from _check_ways(np.vstack([start or positions[0], positions]), known)
 
 
-def _check_ways(positions: Array, scene: Scene) -> Iterator[Problem]:
-    """Report straight ways between successive `positions` [m], shape (n, 3), that hit a pipe."""
-    through = find_crossed_pipe(scene, positions[:-1], positions[1:])
+def _check_ways(positions: Array, known: Sequence[Obstacle]) -> Iterator[Problem]:
+    """Report straight ways between successive `positions` [m], shape (n, 3), to an obstacle."""
+    through = find_crossed(known, positions[:-1], positions[1:])
     for index in np.flatnonzero(through >= 0)[:_REPORTED]:
-        name = scene.pipes[through[index]].name
+        obstacle = known[through[index]]
+        around = "around it or through the pipe" if isinstance(obstacle, Pipe) else "around it"
         before = f"waypoint {index - 1}" if index else "the spawn"
         reason = (
-            f"the straight way there from {before} leads through the wall of {name}, or within "
-            f"{CLEARANCE_MIN:g} m of it; add waypoints in between that lead around it or through "
-            "the pipe"
+            f"the straight way there from {before} leads through {surface(obstacle)}, or within "
+            f"{CLEARANCE_MIN:g} m of it; add waypoints in between that lead {around}"
         )
         yield _at_point(index, positions[index + 1], reason)
 
 
-def _check_steps(steps: Steps, scene: Scene) -> str:
+def _check_steps(steps: Steps, known: Sequence[Obstacle]) -> str:
     """Check the box that contains all random setpoints; return the problem, "" if none."""
     axis = np.linspace(-1, 1, 9)
     box = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -115,10 +154,10 @@ def _check_steps(steps: Steps, scene: Scene) -> str:
             "steps reach beyond the fence, or too near to it; the guard lets the robot fly at "
             f"{_INNER}; choose a smaller range_m"
         )
-    hit = find_overlapped_pipe(scene, positions, np.zeros(len(positions))).max()
+    hit = find_overlapped(known, positions, np.zeros(len(positions))).max()
     if hit >= 0:
-        name = scene.pipes[hit].name
-        return f"steps can end in the wall of {name}; choose another centre_m, range_m or scene"
+        where = surface(known[hit])
+        return f"steps can end in {where}; choose another centre_m, range_m or scene"
     return ""
 
 

@@ -217,7 +217,7 @@ class Waypoint(Section):
 
     position_m: Point
     """Position of the base [m], world frame. The guard must allow the point and the straight line
-    to it, and both must be clear of the pipes' walls"""
+    to it, and both must be clear of obstacles"""
     yaw_deg: Finite = 0.0
     """Heading [deg]; only 0 is accepted, because the onboard controller holds the yaw at 0"""
     tolerance_m: Positive = 0.10
@@ -254,8 +254,8 @@ class Steps(Section):
     centre_m: Point = (0.0, 0.0, 1.2)
     """Centre of the box of setpoints [m], world frame"""
     range_m: NotNegatives = (1.0, 1.0, 0.7)
-    """Half the size of the box per axis [m]; the box must be inside the fence and clear of the
-    pipes' walls"""
+    """Half the size of the box per axis [m]; the box must be inside the fence and clear of
+    obstacles"""
 
 
 class Mission(Section):

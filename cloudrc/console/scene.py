@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.geometry.clearance import CLEARANCE_SHOWN, Array
+from cloudrc.geometry.compiled import mujoco
 from cloudrc.geometry.scene import Pipe, Scene, load_scene
 from cloudrc.messages import Vector
-from cloudrc.world.scene import ROBOT_PREFIX, ROTORS, compile_model, mujoco
+from cloudrc.world.scene import ROBOT_PREFIX, ROTORS, compile_model
 
 Colour = tuple[int, int, int]
 GHOST, SETPOINT, REACHED = (0, 114, 178), (213, 94, 0), (0, 158, 115)

@@ -1,4 +1,4 @@
-"""Represent the robot by points, and compute their distance from the walls of the pipes.
+"""Represent the robot by points, and compute their distance from pipes and other obstacles.
 
 A pipe is an ideal hollow cylinder with flat ends. The physics builds each pipe from flat staves,
 which deviate from the cylinder by up to 3.2 mm.
@@ -8,12 +8,15 @@ Source: docs/reference/plant.md, "Robot", "Key points for clearance", "Staves".
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cloudrc.geometry.obstacles import Obstacle
 from cloudrc.geometry.scene import Pipe, Scene
+from cloudrc.geometry.solids import Solid
 
 Array = NDArray[np.float64]
 
@@ -28,6 +31,7 @@ CLEARANCE_SHOWN = 0.40
 
 _CHUNK = 100  # poses per batch: 100 x 225 points fit in the processor's cache
 _STRIDE = 32  # `least_clearance` begins with every 32nd pose
+_FAR = 0.5  # distance above which a lower bound of the distance is enough [m]
 _ROUNDING = 1e-9  # more than the rounding errors of a bound [m]
 
 
@@ -89,28 +93,47 @@ def distance_to_pipe(pipe: Pipe, points: Array) -> Array:
     return nearest
 
 
-def clearance_per_pipe(
-    scene: Scene,
+def clearance_per_obstacle(
+    obstacles: Sequence[Obstacle],
     positions: ArrayLike,
     orientations_wxyz: ArrayLike,
     points: Spheres | None = None,
 ) -> Array:
-    """Compute the robot's distance from the wall of each pipe [m], shape (n, number of pipes).
+    """Compute the robot's distance from each of m obstacles [m], shape (n, m).
 
-    The distance is that of the robot's nearest point; it is negative inside a wall. `positions` [m]
-    and `orientations_wxyz` (unit quaternions) are as for `place_points`. `points` are points of the
-    robot; None: `key_points()`.
+    The distance is that of the robot's nearest point; it is negative inside an obstacle. The true
+    distance from a solid that is far away may be larger. `positions` [m] and `orientations_wxyz`
+    (unit quaternions) are as for `place_points`. `points` are points of the robot; None:
+    `key_points()`.
     """
     points = points or key_points()
     at = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
     facing = np.asarray(orientations_wxyz, dtype=np.float64).reshape(-1, 4)
-    result = np.full((len(at), len(scene.pipes)), np.inf)
-    for start in range(0, len(at) if scene.pipes else 0, _CHUNK):
+    result = np.full((len(at), len(obstacles)), np.inf)
+    for start in range(0, len(at) if obstacles else 0, _CHUNK):
         part = slice(start, start + _CHUNK)
         placed = place_points(points, at[part], facing[part])
-        for index, pipe in enumerate(scene.pipes):
-            distance = distance_to_pipe(pipe, placed) - points.radii
-            result[part, index] = distance.min(axis=1)
+        for index, obstacle in enumerate(obstacles):
+            if isinstance(obstacle, Pipe):
+                distance = distance_to_pipe(obstacle, placed) - points.radii
+                result[part, index] = distance.min(axis=1)
+            else:
+                result[part, index] = _distance_to_solid(obstacle, at[part], placed, points)
+    return result
+
+
+def _distance_to_solid(solid: Solid, at: Array, placed: Array, points: Spheres) -> Array:
+    """Compute the robot's distance from a solid at n poses [m], shape (n,).
+
+    `at` are the base's positions, shape (n, 3), `placed` the robot's points, shape (n, k, 3), in
+    [m], world frame. For a robot further away than `_FAR`, return a lower bound.
+    """
+    reach = solid.radius + np.linalg.norm(points.positions, axis=1).max() + points.radii.max()
+    result: Array = np.linalg.norm(at - solid.centre, axis=1) - reach
+    near = ~(result > _FAR)  # the radius of a plane is infinite
+    if near.any():
+        distance = solid.distance(placed[near]) - points.radii
+        result[near] = distance.min(axis=1)
     return result
 
 
@@ -120,7 +143,7 @@ def clearance(scene: Scene, positions: ArrayLike, orientations_wxyz: ArrayLike) 
     `positions` [m] have the shape (n, 3), `orientations_wxyz` (unit quaternions, body to world) the
     shape (n, 4). Without pipes the distance is infinite.
     """
-    distances = clearance_per_pipe(scene, positions, orientations_wxyz)
+    distances = clearance_per_obstacle(scene.pipes, positions, orientations_wxyz)
     nearest: Array = distances.min(axis=1, initial=np.inf)
     return nearest
 

@@ -1,17 +1,20 @@
-"""Check whether the robot can fly to a position: the guard's limits, and pipes in the way."""
+"""Check whether the robot can fly to a position: the guard's limits, and obstacles in the way."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cloudrc.geometry import fence
-from cloudrc.geometry.clearance import Array, clearance_per_pipe, robot_points
-from cloudrc.geometry.scene import Scene
+from cloudrc.geometry.clearance import Array, clearance_per_obstacle, robot_points
+from cloudrc.geometry.obstacles import Obstacle
+from cloudrc.geometry.scene import Pipe
 from cloudrc.messages import Vector
 
 CLEARANCE_MIN = 0.04
-"""Smallest distance of the whole robot from a pipe's wall, at a waypoint and on the way to it [m].
+"""Smallest distance of the whole robot from an obstacle, at a waypoint and on the way to it [m].
 The value is above 32 mm, the steady error of a hover with the published gains."""
 STEP_MIN = 0.02
 """Shortest step in which a straight way is checked [m]. Near a wall, a check without a
@@ -35,37 +38,39 @@ def outside_fence(positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]
     return outside
 
 
-def find_overlapped_pipe(scene: Scene, positions: Array, yaws: Array) -> NDArray[np.int64]:
-    """Return for each pose the index of the pipe that the robot is too near to, shape (n,).
+def find_overlapped(
+    obstacles: Sequence[Obstacle], positions: Array, yaws: Array, least: float = CLEARANCE_MIN
+) -> NDArray[np.int64]:
+    """Return for each pose the index of the obstacle that the robot is too near to, shape (n,).
 
-    The index is -1 if all pipes are at least `CLEARANCE_MIN` away; the scene's board is ignored.
-    `positions` are those of the base [m], world frame, shape (n, 3); `yaws` are the headings of the
-    level robot [rad], shape (n,).
+    The index is -1 if all obstacles are at least `least` [m] away. `positions` are those of the
+    base [m], world frame, shape (n, 3); `yaws` are the headings of the level robot [rad], shape
+    (n,).
     """
-    if not scene.pipes:
+    if not obstacles:
         return np.full(len(positions), -1, dtype=np.int64)
-    distance = _distances(scene, np.clip(positions, -_FAR, _FAR), yaws)
-    return np.where(distance.min(axis=1) < CLEARANCE_MIN, distance.argmin(axis=1), -1)
+    distance = _distances(obstacles, np.clip(positions, -_FAR, _FAR), yaws)
+    return np.where(distance.min(axis=1) < least, distance.argmin(axis=1), -1)
 
 
-def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.int64]:
-    """Find the first pipe along each of n straight ways to which the robot comes too near.
+def find_crossed(obstacles: Sequence[Obstacle], starts: Array, ends: Array) -> NDArray[np.int64]:
+    """Find the first obstacle along each of n straight ways to which the robot comes too near.
 
     Too near is a distance below `CLEARANCE_MIN`. The robot is level with yaw 0. A way may begin
-    nearer to a wall than `CLEARANCE_MIN` if it leads away from this wall. The board is ignored.
+    nearer to an obstacle than `CLEARANCE_MIN` if it leads away from this obstacle.
 
     `starts` and `ends` are positions of the base [m], world frame, inside or near the fence, shape
-    (n, 3). Return the index of the pipe for each way, -1 if there is none, shape (n,).
+    (n, 3). Return the index of the obstacle for each way, -1 if there is none, shape (n,).
     """
     result = np.full(len(starts), -1, dtype=np.int64)
     length = np.linalg.norm(ends - starts, axis=1)
     flown = np.zeros(len(starts))
     least = np.full(len(starts), np.inf)
-    flying = np.arange(len(starts) if scene.pipes else 0)
+    flying = np.arange(len(starts) if obstacles else 0)
     while len(flying):
         share = flown[flying] / np.maximum(length[flying], 1e-12)
         at = starts[flying] + share[:, None] * (ends - starts)[flying]
-        distances = _distances(scene, at, np.zeros(len(at)))
+        distances = _distances(obstacles, at, np.zeros(len(at)))
         nearest = distances.min(axis=1)
         if np.isinf(least).any():  # a way may begin near a wall
             least = np.minimum(CLEARANCE_MIN, nearest - STEP_MIN)
@@ -79,20 +84,20 @@ def find_crossed_pipe(scene: Scene, starts: Array, ends: Array) -> NDArray[np.in
 
 
 def find_nearest_legal(
-    scene: Scene, position: Vector, yaw: float, before: Vector | None = None
+    obstacles: Sequence[Obstacle], position: Vector, yaw: float, before: Vector | None = None
 ) -> Vector | None:
-    """Find a point that the guard allows and that is clear of pipes; None if none is near.
+    """Find a point that the guard allows and that is clear of obstacles; None if none is near.
 
     The search begins at `position` (of the base, [m], world frame), moved into the guard's limits.
     It goes up to 1.5 m along x, y and z, and towards and away from the axes of the pipes.
     The coordinates of the point are whole centimetres, so that a message can show them exactly.
 
     `yaw` is the heading of the level robot [rad]. If `before` [m] is given, the straight way from
-    there to the point is also clear of pipes.
+    there to the point is also clear of obstacles.
     """
     start = np.clip(position, fence.INNER_LOW, fence.INNER_HIGH)
     directions = [*np.eye(3), *-np.eye(3)]
-    for pipe in scene.pipes:
+    for pipe in (each for each in obstacles if isinstance(each, Pipe)):
         relative = start - np.asarray(pipe.centre)
         radial = relative - (relative @ np.asarray(pipe.axis)) * np.asarray(pipe.axis)
         norm = float(np.linalg.norm(radial))
@@ -102,19 +107,19 @@ def find_nearest_legal(
     around = start + steps[:, None, None] * np.array(directions)
     candidates = np.round(around.reshape(-1, 3), 2)
     legal = ~outside_fence(candidates)
-    legal &= find_overlapped_pipe(scene, candidates, np.full(len(candidates), yaw)) < 0
+    legal &= find_overlapped(obstacles, candidates, np.full(len(candidates), yaw)) < 0
     candidates = candidates[legal]
     candidates = candidates[np.linalg.norm(candidates - start, axis=1).argsort(kind="stable")]
     for part in np.array_split(candidates, max(1, len(candidates) // _AT_ONCE)):
         if before is not None:
-            part = part[find_crossed_pipe(scene, np.tile(before, (len(part), 1)), part) < 0]
+            part = part[find_crossed(obstacles, np.tile(before, (len(part), 1)), part) < 0]
         if len(part):
             x, y, z = part[0].tolist()
             return x, y, z
     return None
 
 
-def _distances(scene: Scene, positions: Array, yaws: Array) -> Array:
+def _distances(obstacles: Sequence[Obstacle], positions: Array, yaws: Array) -> Array:
     facing = np.zeros((len(positions), 4))
     facing[:, 0], facing[:, 3] = np.cos(yaws / 2), np.sin(yaws / 2)
-    return clearance_per_pipe(scene, positions, facing, robot_points())
+    return clearance_per_obstacle(obstacles, positions, facing, robot_points())

@@ -51,13 +51,14 @@ class Board:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """The obstacles of a scene."""
+    """The parts of a scene that its file declares as numbers."""
 
     name: str  # file name without .xml
     pipes: tuple[Pipe, ...] = ()  # in the order of the file
     board: Board | None = None
     floor: float = 0.0  # z of the floor [m], world frame
     spawn: Vector = SPAWN  # position of the base at the start of a mission [m], world frame
+    path: Path | None = None  # of a user's file, which may have more bodies; None: a shipped scene
 
 
 def is_obstacle(body: str, *, contact: bool) -> bool:
@@ -75,7 +76,8 @@ def load_scene(name: str) -> Scene:
     Raise a BadInputError if the file does not exist, or if its numbers do not have the form in the
     table at the top of this module.
     """
-    path = Path(name) if name.endswith(".xml") else SCENES / f"{name}.xml"
+    own = Path(name) if name.endswith(".xml") else None
+    path = own or SCENES / f"{name}.xml"
     try:
         root = ElementTree.parse(path).getroot()
         numerics = [(n.get("name", ""), n.get("data", "")) for n in root.iterfind("custom/numeric")]
@@ -95,7 +97,7 @@ def load_scene(name: str) -> Scene:
         raise BadInputError(f"scene {path.name}: not readable as XML: {error}") from error
     except ValueError as error:
         raise BadInputError(f"scene {path.name}: {error}") from None
-    return Scene(path.stem, pipes, board, floor, (x, y, z))
+    return Scene(path.stem, pipes, board, floor, (x, y, z), own)
 
 
 def _pipe(name: str, data: str) -> Pipe:

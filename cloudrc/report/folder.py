@@ -43,7 +43,7 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     config, merged = folder / "config.yaml", folder / "mission.mcap"
     if not config.is_file():
         raise BadInputError(f"{folder}: has no config.yaml; name the folder of a run")
-    experiment = read_experiment(config)
+    experiment = read_experiment(config, flown=True)
     before = _read_merged(folder)
     recording = before or merge(folder / "world.mcap", folder / "cloud.mcap")
     whole = _is_of_whole_recording(folder / "report.json")

@@ -15,7 +15,8 @@ from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.files import read, write_atomically
-from cloudrc.geometry.scene import load_scene
+from cloudrc.geometry.obstacles import known, obstacles
+from cloudrc.geometry.scene import Pipe, load_scene
 from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
@@ -23,6 +24,12 @@ from cloudrc.report.document import Assessment, Run, environment_document, write
 
 if TYPE_CHECKING:
     from cloudrc.report.figures.style import Look
+
+
+UNKNOWN = "No clearance is known from"
+"""Beginning of a note about obstacles without a declared shape."""
+LISTED = 8
+"""Largest number of obstacles that a note lists."""
 
 
 def assess(
@@ -44,6 +51,7 @@ def assess(
         notes.append(f"The recording is incomplete: {recording.note}.")
     notes += [f"The recording {remark}." for remark in recording.remarks]
     notes += [f"{text[0].upper()}{text[1:]}." for text in recording["/fault"]["text"] if text]
+    notes += _unknown_clearance(flight)
     if flight.ending is not None:
         seen = operator_verdict(flight, evidence, numbers)
         if seen.outcome != verdict.outcome:
@@ -55,6 +63,20 @@ def assess(
     kept = tuple(dict.fromkeys([*notes, *metric_notes]))
     digest = None if recording.note else recording.sha256
     return Assessment(run, experiment, flight, numbers, verdict, operator, kept, digest)
+
+
+def _unknown_clearance(flight: Flight) -> list[str]:
+    """Return a note if the report has no clearance from some obstacles of the scene."""
+    scene, contact = flight.scene, bool(flight.criteria.contact)
+    try:
+        found = obstacles(scene, contact=contact)
+    except BadInputError as error:
+        return [f"{UNKNOWN} all bodies but declared pipes: {error}."]
+    if not known(scene):
+        return [f"{UNKNOWN} all bodies but declared pipes: MuJoCo is not installed."]
+    names = list(dict.fromkeys(each.name for each in found if not isinstance(each, Pipe)))
+    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    return [f"{UNKNOWN} {', '.join(names[:LISTED])}{more}."] if names else []
 
 
 def write_report(

@@ -256,10 +256,10 @@ def read_order(
     if not request.waypoints:  # only an experiment may have steps instead
         raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
     mission = Mission(start=request.start, waypoints=request.waypoints, carrot=request.carrot)
-    if problems := check_mission(mission, scene):
-        raise RefusedError(problems)
     contact = contact and leads_to_board(mission, scene)
     contact = contact if request.contact is None else request.contact
+    if problems := check_mission(mission, scene, contact=contact):
+        raise RefusedError(problems)
     planned = plan(mission, request.time_limit_s)
     lease = request.lease_s or 0.0
     return Order(planned, request.name, request.key, contact, request.queue, lease)
@@ -269,7 +269,9 @@ def read_goto(body: bytes, scene: Scene) -> Leg:
     """Read and check a point in a request's body; raise a RefusedError that lists all problems."""
     request = _parse(body, GoToRequest)
     waypoint = Waypoint(position_m=request.position_m, yaw_deg=request.yaw_deg)
-    problems = check_mission(Mission(start="here", waypoints=(waypoint,)), scene)
+    # Whether the board is an obstacle depends on the mission; the service checks the way.
+    mission = Mission(start="here", waypoints=(waypoint,))
+    problems = check_mission(mission, scene, contact=True)
     if problems:
         raise RefusedError([ConfigProblem(p.path[2:], p.value, p.reason) for p in problems])
     return Leg(request.position_m, radians(request.yaw_deg))

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.placement import find_crossed_pipe
+from cloudrc.geometry.obstacles import obstacles, surface
+from cloudrc.geometry.placement import find_crossed
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState, Setpoint, Start, Vector
 from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, finite_or_none, judge
@@ -94,7 +95,7 @@ class MissionService:
         """Begin with the missions in the store `book`.
 
         `contact_speed_max` limits the speed of the arm's tip when it touches the board [m/s]. With
-        a `scene`, the service refuses straight ways through the walls of pipes.
+        a `scene`, the service refuses straight ways through obstacles.
         """
         self._contact_speed_max, self._scene = contact_speed_max, scene
         self._outputs: list[Output | Fault] = []
@@ -144,7 +145,7 @@ class MissionService:
             raise ConflictError(f"{QUEUE_MAX} missions wait already; cancel one", waiting[0].id)
         self._check_can_fly()
         if order.plan.start is Start.HERE and not waiting and not order.plan.by_hand:
-            self._check_way(order.plan.legs[0])
+            self._check_way(order.plan.legs[0], contact=order.contact)
         mission = self.book.add(order)
         self._renewed_ns[mission.id] = now_ns
         if waiting:
@@ -186,7 +187,8 @@ class MissionService:
         """Continue the held mission, straight to the next waypoint."""
         self._check_can_fly()
         if (mission := self._current) is not None and mission.state == HELD:
-            self._check_way(mission.order.plan.legs[mission.waypoint])
+            leg = mission.order.plan.legs[mission.waypoint]
+            self._check_way(leg, contact=mission.order.contact)
         return self._operate(self._teleop.resume, now_ns)
 
     def go_to(self, leg: Leg, now_ns: int) -> Mission:
@@ -198,7 +200,7 @@ class MissionService:
             return self.create(Order(plan, "goto"), now_ns)[0]
         if waiting[0].state != HELD:
             raise _busy(waiting[0], "hold or cancel it first")
-        self._check_way(leg)
+        self._check_way(leg, contact=waiting[0].order.contact)
         return self._operate(lambda now: self._teleop.go_to(now, leg), now_ns)
 
     def drive(self, velocity: Vector, now_ns: int) -> Mission:
@@ -361,17 +363,21 @@ class MissionService:
                 f"{self._blocked}; find the cause, then: cloudrc mission acknowledge"
             )
 
-    def _check_way(self, leg: Leg) -> None:
-        """Raise ConflictError if a pipe's wall lies between the robot and the waypoint of `leg`."""
+    def _check_way(self, leg: Leg, *, contact: bool) -> None:
+        """Raise ConflictError if an obstacle lies between the robot and the waypoint of `leg`.
+
+        With `contact`, the mission has to touch the board, which is then no obstacle.
+        """
         seen, scene = self.seen, self._scene
         if seen is None or scene is None:
             return
         here, there = np.array([seen.position]), np.array([leg.position])
-        through = int(find_crossed_pipe(scene, here, there)[0])
+        known = obstacles(scene, contact=contact)
+        through = int(find_crossed(known, here, there)[0])
         if through >= 0:
             raise ConflictError(
                 f"the straight way from where the robot is, {_place(seen.position)}, to "
-                f"{_place(leg.position)} leads through the wall of {scene.pipes[through].name}; "
+                f"{_place(leg.position)} leads through {surface(known[through])}; "
                 "go round it first, by another target",
                 self._current.id if self._current else "",
             )

@@ -2,14 +2,10 @@
 
 The robot may be a user's own model. The onboard controller and the rotors are made for the robot
 `pelican`. A model that differs too much from it is refused, and the message lists the differences.
-Other modules of `world` import `mujoco` from here, because this module imports it without OpenGL.
 """
 
 from __future__ import annotations
 
-import logging
-import os
-from itertools import count
 from math import inf, nan
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -18,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cloudrc.config.schema import Plant
-from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.errors import BadInputError
+from cloudrc.geometry.compiled import mujoco, read_scene
 from cloudrc.geometry.scene import WORLD
 from cloudrc.world.low_level import GRAVITY, THRUST_MAX
 from cloudrc.world.plant import Array, Inertia, point_inertia, true_inertia
@@ -36,32 +33,8 @@ Facts: TypeAlias = dict[str, tuple[ArrayLike, ArrayLike]]
 """Name of a quantity, with its unit -> its value and the largest difference that is accepted."""
 
 
-def import_mujoco() -> Any:
-    """Import MuJoCo without OpenGL, which a flight does not need.
-
-    With MUJOCO_GL=egl and no libEGL, `import mujoco` fails. MUJOCO_GL is therefore `disable` during
-    the import. Afterwards it has its old value, for a child process that renders.
-    """
-    wanted = os.environ.get("MUJOCO_GL")
-    os.environ["MUJOCO_GL"] = "disable"
-    try:
-        import mujoco
-    except ImportError as error:
-        raise MissingPrerequisiteError(
-            f"the simulator needs MuJoCo ({error}); run: pip install 'cloudrc[world]'"
-        ) from None
-    finally:
-        del os.environ["MUJOCO_GL"]
-        if wanted is not None:
-            os.environ["MUJOCO_GL"] = wanted
-    return mujoco
-
-
-mujoco = import_mujoco()
 FUSES_WRONG = tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 11)
 """Whether MuJoCo computes a wrong inertia when it fuses static bodies, as it does up to 3.10."""
-# Otherwise MuJoCo writes its warnings to MUJOCO_LOG.TXT in the working directory.
-mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
 
 
 def compile_model(robot: str, scene: str, plant: Plant | None = None) -> Any:
@@ -108,14 +81,7 @@ def _compile(
     `inertia` replaces the robot's inertia; None keeps it.
     """
     try:
-        spec = mujoco.MjSpec.from_file(str(scene_path))
-        _name_geoms(spec.worldbody)
-        if spec.frame("spawn") is None:
-            raise BadInputError(f"{scene_path}: needs a frame named spawn in its worldbody")
-        if spec.body("floor") is None:
-            raise BadInputError(
-                f"{scene_path}: needs a body named floor; other bodies are obstacles"
-            )
+        spec = read_scene(scene_path)
         robot = mujoco.MjSpec.from_file(str(robot_path))
         for number, geom in enumerate(robot.worldbody.geoms):
             geom.name = f"{WORLD}/{number}"
@@ -128,23 +94,6 @@ def _compile(
     except (ValueError, KeyError) as error:
         reason = " ".join(str(error).split())
         raise BadInputError(f"{robot_path} in {scene_path} does not compile: {reason}") from None
-
-
-def _name_geoms(worldbody: Any) -> None:
-    """Give each geom of a scene the name BODY/NUMBER; `worldbody` is that of an `MjSpec`.
-
-    A body without a name belongs to the body around it. In the worldbody, such bodies are numbered.
-    """
-    numbers, unnamed = count(), count(1)
-    waiting = [(WORLD, worldbody)]
-    for name, body in waiting:
-        for geom in body.geoms:
-            geom.name = f"{name}/{next(numbers)}"
-        for child in body.bodies:
-            other = (
-                f"unnamed body {next(unnamed)}" if body is worldbody and not child.name else name
-            )
-            waiting.append((child.name or other, child))
 
 
 def is_of_robot(model: Any) -> Any:

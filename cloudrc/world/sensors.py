@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cloudrc.config import schema
+from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import ZERO, Odometry, Quaternion, Vector
-from cloudrc.world.scene import mujoco
 
 
 class Errors(NamedTuple):

@@ -14,12 +14,13 @@ import numpy as np
 import numpy.typing as npt
 
 from cloudrc.config.schema import Plant
+from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import Odometry, Vector
 from cloudrc.records import Contact
 from cloudrc.world.plant import Wind
 from cloudrc.world.readings import Readings, RotorSpeeds
 from cloudrc.world.rotors import STOPPED, Controls, Rotors
-from cloudrc.world.scene import ROBOT_PREFIX, bodies_of_geoms, compile_model, mujoco
+from cloudrc.world.scene import ROBOT_PREFIX, bodies_of_geoms, compile_model
 
 TOUCH_GAP = 0.1
 """Shortest time without contact before a contact counts as a new contact [s]."""

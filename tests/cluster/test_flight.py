@@ -1,6 +1,7 @@
 """`cloudrc run --mode cluster` from the flags to the report, on a fake cluster."""
 
 import json
+import shutil
 from functools import cache
 from math import nan
 from unittest.mock import Mock
@@ -11,6 +12,7 @@ from cloudrc.cluster import flight, pods
 from cloudrc.cluster.client import ClusterError, connect
 from cloudrc.cluster.jobs import run_job
 from cloudrc.config.load import load_experiment
+from cloudrc.geometry.scene import SCENES
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import LinkChanged
 from tests.cluster.conftest import missions_of, terminated
@@ -197,7 +199,7 @@ def test_files_that_pods_lack_are_refused_before_the_install(
     monkeypatch.chdir(tmp_path)
     plugin = "from cloudrc.cloud.predictors.last_sample import build as build\n"
     (tmp_path / "mine.py").write_text(plugin)
-    (tmp_path / "mine.xml").write_text("<mujoco/>")
+    shutil.copy(SCENES / "empty.xml", tmp_path / "mine.xml")
     fitted = "{time_constant: [1, 1, 1], dead_time: [0, 0, 0], gain: [1, 1, 1]}"
     (tmp_path / "mine.yaml").write_text(fitted)
     assert words in call("run --mode cluster", *settings, code=2).err

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from cloudrc.config import document, shipped
 from cloudrc.config.document import parse_value
 from cloudrc.config.load import dump, fingerprint, load_experiment, load_profile, read_experiment
-from cloudrc.geometry.scene import load_scene
+from cloudrc.errors import BadInputError
+from cloudrc.geometry.scene import SCENES, load_scene
 from cloudrc.link.traces import link_profile
 
 PROFILES = shipped.names("profile")
@@ -92,7 +93,7 @@ def test_a_profile_sets_and_another_resets_the_limits_of_cloud(tmp_path):
         ("steps", [], False),
         ("hover", [], False),
         ("hover", ["criteria.contact=true"], True),
-        ("paper", ["criteria.contact=false"], False),
+        ("paper", ["criteria.contact=false", "mission.waypoints=[{position_m: [1, 0, 1]}]"], False),
     ],
 )
 def test_contact_is_required_only_where_the_scene_has_a_board(name, settings, contact):
@@ -188,3 +189,14 @@ def test_a_configuration_has_the_hash_of_its_file(tmp_path):
     # The chart's experiment has only given parameters; only cloud could complete it.
     path.write_text("seed: 5\n")
     assert fingerprint(read_experiment(str(path))) != fingerprint(load_experiment(path))
+
+
+def test_a_flight_that_is_over_need_not_fit_its_scene(tmp_path):
+    """An earlier version flew it, or the scene has changed since."""
+    text = (SCENES / "empty.xml").read_text()
+    post = '<body name="post" pos="0 0 1"><geom size=".2"/></body>'
+    (tmp_path / "mine.xml").write_text(text.replace("</worldbody>", f"{post}</worldbody>"))
+    settings = [f"world.scene={tmp_path / 'mine.xml'}"]
+    with pytest.raises(BadInputError, match="post"):
+        read_experiment("hover", settings)
+    assert read_experiment("hover", settings, flown=True).world.scene.endswith("mine.xml")

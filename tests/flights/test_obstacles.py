@@ -78,3 +78,14 @@ def test_two_bodies_are_told_apart(flown_into):
     touched = [each.text for each in found.verdict.failures if each.code == "obstacle_touched"]
     names = [text.partition(" (")[0] for text in touched]
     assert sorted(names) == ["the robot touched left", "the robot touched right"]
+
+
+@pytest.mark.parametrize(
+    ("bodies", "named"), [("", []), (f'<body name="post" pos="3 0 0">{GEOM}</body>', ["post"])]
+)
+def test_the_report_names_the_obstacles_from_which_no_clearance_is_known(flown_into, bodies, named):
+    found = flown_into(bodies)
+    assert "min_clearance_flight" not in found.numbers
+    assert [note for note in found.notes if "No clearance is known" in note] == [
+        f"No clearance is known from {name}." for name in named
+    ]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from cloudrc.geometry.clearance import (
     clearance,
-    clearance_per_pipe,
+    clearance_per_obstacle,
     distance_to_pipe,
     key_points,
     least_clearance,
@@ -47,7 +47,7 @@ def test_clearance_on_the_axis_is_that_of_the_plant():
         at = [(*pipe.centre[:2], height) for pipe in PIPES.pipes]
         found = clearance(PIPES, at, [LEVEL] * 3)
         assert found == pytest.approx(expected, abs=2e-3)
-        assert np.array_equal(np.diag(clearance_per_pipe(PIPES, at, [LEVEL] * 3)), found)
+        assert np.array_equal(np.diag(clearance_per_obstacle(PIPES.pipes, at, [LEVEL] * 3)), found)
     for pipe in PIPES.pipes:  # along each pipe it is the same
         yaw = math.atan2(pipe.axis[1], pipe.axis[0])
         facing = (math.cos(yaw / 2), 0, 0, math.sin(yaw / 2))

@@ -7,32 +7,36 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config.mission_check import check_mission
+from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.schema import Mission, Steps, Waypoint
 from cloudrc.geometry.clearance import clearance
+from cloudrc.geometry.obstacles import obstacles
 from cloudrc.geometry.placement import (
     CLEARANCE_MIN,
-    find_crossed_pipe,
+    find_crossed,
     find_nearest_legal,
-    find_overlapped_pipe,
+    find_overlapped,
     outside_fence,
 )
-from cloudrc.geometry.scene import load_scene
+from cloudrc.geometry.scene import SCENES, load_scene
 
 PIPES = load_scene("pipes")
+KNOWN = obstacles(PIPES, contact=True)
 
 
 def hit(position, yaw=0.0):
-    return int(find_overlapped_pipe(PIPES, np.array([position]), np.array([yaw]))[0])
+    return int(find_overlapped(KNOWN, np.array([position]), np.array([yaw]))[0])
 
 
 def crossed(start, end):
-    return int(find_crossed_pipe(PIPES, np.array([start]), np.array([end]))[0])
+    return int(find_crossed(KNOWN, np.array([start]), np.array([end]))[0])
 
 
 def refusals(*positions, start="spawn", scene="pipes", **more):
     waypoints = tuple(Waypoint(position_m=position, **more) for position in positions)
-    problems = check_mission(Mission(start=start, waypoints=waypoints), load_scene(scene))
+    problems = check_mission(
+        Mission(start=start, waypoints=waypoints), load_scene(scene), contact=True
+    )
     return "\n".join(map(str, problems))
 
 
@@ -85,11 +89,11 @@ def test_a_way_touches_a_wall_if_one_of_its_points_does(start, end):
     st.tuples(st.floats(-4, 10), st.floats(-9, 6), st.floats(-1, 3)), st.floats(-math.pi, math.pi)
 )
 def test_the_nearest_legal_point_is_legal(position, yaw):
-    found = find_nearest_legal(PIPES, position, yaw)
+    found = find_nearest_legal(KNOWN, position, yaw)
     assert found is not None
     assert hit(found, yaw) == -1
     assert not outside_fence(np.array([found]))[0]
-    assert find_nearest_legal(PIPES, found, yaw) == found
+    assert find_nearest_legal(KNOWN, found, yaw) == found
 
 
 def test_a_straight_way_leads_to_the_offered_point():
@@ -136,8 +140,68 @@ def test_a_mission_with_a_wall_on_its_way_is_refused(positions, start, reason):
     ],
 )
 def test_steps_that_can_end_in_a_wall_are_refused(steps, scene, reason):
-    (problem,) = check_mission(Mission(steps=Steps(**steps)), load_scene(scene))
+    (problem,) = check_mission(Mission(steps=Steps(**steps)), load_scene(scene), contact=False)
     assert problem.path == ("steps",)
     assert reason in problem.reason
     both = Mission(waypoints=(Waypoint(position_m=(0.0, 0.0, 1.0)),), steps=Steps(**steps))
-    assert "not both" in str(check_mission(both, PIPES)[0])
+    assert "not both" in str(check_mission(both, PIPES, contact=False)[0])
+
+
+POST = '<body name="post" pos="1.2 0 1"><geom type="capsule" size=".05 1"/></body>'
+GROUND = '<geom type="plane" size="5 5 .1"/>'
+
+
+@pytest.fixture
+def own_scene(tmp_path):
+    """Return a function that writes a scene with some bodies, and reads it."""
+
+    def write(bodies):
+        path = tmp_path / "mine.xml"
+        text = (SCENES / "empty.xml").read_text()
+        path.write_text(text.replace("</worldbody>", f"{bodies}</worldbody>"))
+        return load_scene(str(path))
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("bodies", "waypoints", "reason"),
+    [
+        (POST, [(0, 0, 1), (2.4, 0, 1)], "from waypoint 0 leads through post, or within 0.04 m"),
+        (POST, [(0, 0, 1), (1.2, 0.3, 1)], "would be within 0.04 m of post"),
+        (POST, [(0, 0, 1), (0, 2, 1), (2.4, 2, 1), (2.4, 0, 1)], ""),
+        (POST.replace('name="post" ', ""), [(2.4, 0, 1)], "through unnamed body 1, or within"),
+        (f'<body name="hall">{POST}</body>', [(0, 0, 1), (2.4, 0, 1)], "through post, or within"),
+        (POST.replace("<geom", '<geom contype="0" conaffinity="0"'), [(2.4, 0, 1)], ""),
+        (POST.replace('"post"', '"board"'), [(0, 0, 1), (2.4, 0, 1)], "the board, an obstacle"),
+    ],
+)
+def test_every_body_of_a_scene_of_ones_own_is_in_the_way(own_scene, bodies, waypoints, reason):
+    mission = Mission(waypoints=tuple(Waypoint(position_m=each) for each in waypoints))
+    said = "\n".join(map(str, check_mission(mission, own_scene(bodies), contact=False)))
+    assert reason in said if reason else said == ""
+
+
+def test_the_board_is_in_the_way_of_missions_that_need_not_touch_it():
+    before, behind = (Waypoint(position_m=(x, -6.42, 0.7)) for x in (7.5, 8.235))
+    mission = Mission(start="here", waypoints=(before, behind))
+    assert check_mission(mission, PIPES, contact=True) == []
+    (problem,) = check_mission(mission, PIPES, contact=False)
+    assert "within 0.04 m of the board" in problem.reason
+
+
+@pytest.mark.parametrize(
+    ("bodies", "contact", "path", "reason"),
+    [
+        (POST, False, None, ""),
+        (GROUND, False, ("world", "scene"), "touches world, the geoms in the worldbody"),
+        (POST.replace("1.2 0 1", "0 0 1"), False, ("world", "scene"), "touches post"),
+        (POST, True, ("criteria", "contact"), "no body named board to touch; it has floor, post"),
+        (POST.replace("post", "bord"), True, ("criteria", "contact"), "the nearest name is bord"),
+        (POST.replace("post", "board"), True, None, ""),
+    ],
+)
+def test_a_scene_fits_its_missions(own_scene, bodies, contact, path, reason):
+    problems = check_scene(own_scene(bodies), contact=contact)
+    assert [problem.path for problem in problems] == ([path] if path else [])
+    assert all(reason in problem.reason for problem in problems)

@@ -5,10 +5,11 @@ import pytest
 
 from cloudrc.config import schema
 from cloudrc.config.schema import Plant
+from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.world.plant import Wind, point_inertia
 from cloudrc.world.readings import Readings
-from cloudrc.world.scene import FOLDER, compile_model, mujoco, rotation
+from cloudrc.world.scene import FOLDER, compile_model, rotation
 from cloudrc.world.simulator import Simulator
 
 

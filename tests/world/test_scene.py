@@ -8,16 +8,10 @@ from math import pi, tan
 import pytest
 
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.geometry.compiled import import_mujoco, mujoco
 from cloudrc.geometry.scene import load_scene
 from cloudrc.world.rotors import STOPPED
-from cloudrc.world.scene import (
-    FOLDER,
-    PELICAN,
-    bodies_of_geoms,
-    compile_model,
-    import_mujoco,
-    mujoco,
-)
+from cloudrc.world.scene import FOLDER, PELICAN, bodies_of_geoms, compile_model
 from cloudrc.world.simulator import Simulator
 
 ROBOTS = sorted(path.stem for path in (FOLDER / "robots").glob("*.xml"))
@@ -115,7 +109,7 @@ SHIPPED = {"robots": "pelican", "scenes": "empty"}
         ("robots", 'size=".03" pos=".2 0 0"', 'size=".03" pos=".1 0 0"', "tip .m. is 0.3 0 0.17"),
         ("scenes", 'name="spawn"', 'name="start"', "needs a frame named spawn"),
         ("scenes", '<body name="floor">', '<body><freejoint/><geom size="1"/></body>'
-                   '<body name="floor">', "nothing else may move"),
+                   '<body name="floor">', "body without a name has a joint"),
         ("scenes", '<body name="floor">', "<body>", "needs a body named floor"),
         ("scenes", "-9.8066", "-1.62", r"gravity .m/s.2. is 0 0 -1.62, not 0 0 -9.8"),
     ],

@@ -216,7 +216,7 @@ def _impossible(outcome: Outcome, seed: int) -> None:
         try:
             waypoints = tuple({"position_m": point} for point in way)
             mission = Mission.model_validate({"waypoints": waypoints})
-            problems = [str(each) for each in check_mission(mission, scene)]
+            problems = [str(each) for each in check_mission(mission, scene, contact=True)]
         except ValueError as error:
             problems = [str(error)]
         outcome.true(f"{name}: refused", bool(problems))

@@ -19,6 +19,7 @@ import numpy as np
 
 from cloudrc.config.load import ResolvedGuard
 from cloudrc.geometry import fence
+from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import Command, Vector
 from cloudrc.world import low_level, rotors
 from cloudrc.world.guard import limits as rules
@@ -28,7 +29,7 @@ from cloudrc.world.low_level import LowLevel
 from cloudrc.world.native.library import Library, library
 from cloudrc.world.readings import Readings
 from cloudrc.world.robot import STEP, STEP_NS, Robot
-from cloudrc.world.scene import ROBOT_PREFIX, is_of_robot, mujoco
+from cloudrc.world.scene import ROBOT_PREFIX, is_of_robot
 from cloudrc.world.simulator import CONTACT_CHECK_STEPS, Simulator
 
 _POINTERS = (

@@ -12,6 +12,7 @@ import pytest
 from cloudrc import assembly
 from cloudrc.config.load import ResolvedGuard, load_experiment
 from cloudrc.geometry import fence
+from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import Command, GuardState
 from cloudrc.sweep.flight import fly_in_memory
 from cloudrc.tunnel.end import Identity
@@ -22,7 +23,7 @@ from cloudrc.world.native import robot as native
 from cloudrc.world.native.library import SWITCH, Library, library
 from cloudrc.world.native.robot import NativeRobot, make_robot, usable
 from cloudrc.world.robot import Robot
-from cloudrc.world.scene import FOLDER, mujoco
+from cloudrc.world.scene import FOLDER
 from cloudrc.world.simulator import Simulator
 from tests.flights.conftest import CLOCK, ring
 from tests.world.guard.conftest import LIMITS, MS, SECOND, UP, Flight, hostile

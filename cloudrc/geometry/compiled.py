@@ -1,0 +1,156 @@
+"""Read a user's scene with MuJoCo: check its parts, and list its bodies and their shapes."""
+
+from __future__ import annotations
+
+import logging
+import os
+from functools import lru_cache
+from itertools import count
+from math import inf
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.geometry.scene import FLOOR, WORLD
+from cloudrc.geometry.solids import Array, Shape, Solid
+
+
+def import_mujoco() -> Any:
+    """Import MuJoCo without OpenGL, which a flight does not need.
+
+    With MUJOCO_GL=egl and no libEGL, `import mujoco` fails. MUJOCO_GL is therefore `disable` during
+    the import. Afterwards it has its old value, for a child process that renders.
+    """
+    wanted = os.environ.get("MUJOCO_GL")
+    os.environ["MUJOCO_GL"] = "disable"
+    try:
+        import mujoco
+    except ImportError as error:
+        raise MissingPrerequisiteError(
+            f"the simulator needs MuJoCo ({error}); run: pip install 'cloudrc[world]'"
+        ) from None
+    finally:
+        del os.environ["MUJOCO_GL"]
+        if wanted is not None:
+            os.environ["MUJOCO_GL"] = wanted
+    return mujoco
+
+
+mujoco = import_mujoco()
+# Otherwise MuJoCo writes its warnings to MUJOCO_LOG.TXT in the working directory.
+mujoco.set_mju_user_warning(logging.getLogger("mujoco").warning)
+
+_GEOM = mujoco.mjtGeom
+_SHAPES: dict[Any, Shape] = {
+    _GEOM.mjGEOM_BOX: "box",
+    _GEOM.mjGEOM_SPHERE: "sphere",
+    _GEOM.mjGEOM_CAPSULE: "capsule",
+    _GEOM.mjGEOM_CYLINDER: "cylinder",
+    _GEOM.mjGEOM_ELLIPSOID: "ellipsoid",
+    _GEOM.mjGEOM_PLANE: "plane",
+    _GEOM.mjGEOM_MESH: "hull",
+}
+"""Type of a geom -> shape of its solid; all other types become the box around the geom."""
+ROBOT_BITS = 1
+"""Value of contype and conaffinity of the robot's geoms."""
+
+
+class Bodies(NamedTuple):
+    """The bodies of a scene."""
+
+    names: tuple[str, ...]  # of all bodies with geoms; geoms in the worldbody belong to `world`
+    solids: tuple[Solid, ...]  # everything that the robot can touch, except the floor
+
+
+def read_scene(path: Path) -> Any:
+    """Read a scene as `MjSpec`, and name each geom BODY/NUMBER.
+
+    A body without a name belongs to the body around it. In the worldbody, such bodies are numbered.
+
+    Raises:
+        BadInputError: If the scene lacks a part or has a joint.
+        ValueError: If MuJoCo cannot read the file.
+    """
+    spec = mujoco.MjSpec.from_file(str(path))
+    if spec.frame("spawn") is None:
+        raise BadInputError(f"{path}: needs a frame named spawn in its worldbody")
+    if spec.body(FLOOR) is None:
+        raise BadInputError(
+            f"{path}: needs a body named floor that has the ground; all other bodies are obstacles"
+        )
+    _name_geoms(spec.worldbody)
+    for joint in spec.joints:
+        raise BadInputError(
+            f"{path}: body {joint.parent.name or 'without a name'} has a joint; nothing but the "
+            "robot may move: delete the joint"
+        )
+    return spec
+
+
+def _name_geoms(worldbody: Any) -> None:
+    numbers, unnamed = count(), count(1)
+    waiting = [(WORLD, worldbody)]
+    for name, body in waiting:
+        for geom in body.geoms:
+            geom.name = f"{name}/{next(numbers)}"
+        for child in body.bodies:
+            other = (
+                f"unnamed body {next(unnamed)}" if body is worldbody and not child.name else name
+            )
+            waiting.append((child.name or other, child))
+
+
+def read_bodies(path: Path) -> Bodies:
+    """Return the bodies of a scene; raise a BadInputError if its file cannot be flown in."""
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise BadInputError(f"{path}: cannot be read: {error.strerror}") from None
+    return _read_bodies(path, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=16)
+def _read_bodies(path: Path, *version: int) -> Bodies:
+    """Return the bodies of a scene; `version` differs between contents of the file."""
+    try:
+        spec = read_scene(path)
+        spec.compiler.fusestatic = False
+        model = spec.compile()
+    except (ValueError, KeyError) as error:
+        reason = " ".join(str(error).split())
+        raise BadInputError(f"{path} does not compile: {reason}") from None
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    names = [model.geom(geom).name.rpartition("/")[0] for geom in range(model.ngeom)]
+    touchable = (model.geom_contype | model.geom_conaffinity) & ROBOT_BITS
+    solids = [
+        _solid(model, data, geom, name)
+        for geom, name in enumerate(names)
+        if name != FLOOR and touchable[geom]
+    ]
+    return Bodies(tuple(dict.fromkeys(names)), tuple(solids))
+
+
+def _solid(model: Any, data: Any, geom: int, name: str) -> Solid:
+    shape = _SHAPES.get(kind := _GEOM(model.geom_type[geom]), "box")
+    centre, axes = data.geom_xpos[geom].copy(), data.geom_xmat[geom].reshape(3, 3).copy()
+    size, radius, faces = model.geom_size[geom].copy(), float(model.geom_rbound[geom]), None
+    if shape == "plane":
+        radius = inf
+    elif shape == "hull":
+        faces = _faces(model, model.geom_dataid[geom])
+    elif kind not in _SHAPES:
+        middle, size = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:].copy()
+        centre, radius = centre + axes @ middle, float(np.linalg.norm(size))
+    return Solid(name, shape, centre, axes, size, radius, faces)
+
+
+def _faces(model: Any, mesh: int) -> tuple[Array, Array]:
+    """Return normals (m, 3) and offsets (m,) [m] of the faces of a mesh's convex hull."""
+    first, number = model.mesh_polyadr[mesh], model.mesh_polynum[mesh]
+    normals = model.mesh_polynormal[first : first + number].copy()
+    corners = model.mesh_polyvert[model.mesh_polyvertadr[first : first + number]]
+    places = model.mesh_vert[model.mesh_vertadr[mesh] + corners]
+    return normals, np.einsum("ij,ij->i", normals, places)

@@ -1,0 +1,69 @@
+"""List the obstacles of a scene: declared pipes and board, and other bodies of a user's scene."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import TypeAlias
+
+import numpy as np
+
+from cloudrc.geometry.scene import BOARD, WORLD, Board, Pipe, Scene, is_obstacle
+from cloudrc.geometry.solids import Solid
+
+Obstacle: TypeAlias = Pipe | Solid
+BOARD_DEPTH = 0.05
+"""Thickness of a declared board [m], as in the shipped scene `pipes`."""
+_WORDS = {
+    BOARD: "the board, an obstacle without criteria.contact",
+    WORLD: "world, the geoms in the worldbody of the scene",
+}
+"""Name of a body -> words for messages; all other bodies have their names alone."""
+
+
+def obstacles(scene: Scene, *, contact: bool) -> tuple[Obstacle, ...]:
+    """Return all obstacles of a scene; with `contact`, the mission has to touch the board.
+
+    Shapes that the scene declares as numbers are read without MuJoCo, all others with MuJoCo. If it
+    is not installed, the others are missing.
+
+    Raises:
+        BadInputError: If MuJoCo cannot read the scene.
+    """
+    declared = {pipe.name for pipe in scene.pipes}
+    found: list[Obstacle] = [*scene.pipes]
+    if scene.board is not None:
+        declared.add(BOARD)
+        found.append(_as_solid(scene.board))
+    found += [solid for solid in _compiled(scene)[1] if solid.name not in declared]
+    return tuple(each for each in found if is_obstacle(each.name, contact=contact))
+
+
+def surface(obstacle: Obstacle) -> str:
+    """Return how messages name what the robot would touch."""
+    if isinstance(obstacle, Pipe):
+        return f"the wall of {obstacle.name}"
+    return _WORDS.get(obstacle.name, obstacle.name)
+
+
+def body_names(scene: Scene) -> tuple[str, ...] | None:
+    """Return the names of all bodies of a user's scene; None if they are not `known`."""
+    return _compiled(scene)[0] or None
+
+
+def known(scene: Scene) -> bool:
+    """Return whether `obstacles` returns all obstacles of a scene."""
+    return scene.path is None or find_spec("mujoco") is not None
+
+
+def _compiled(scene: Scene) -> tuple[tuple[str, ...], tuple[Solid, ...]]:
+    if scene.path is None or not known(scene):
+        return (), ()
+    from cloudrc.geometry.compiled import read_bodies
+
+    return read_bodies(scene.path)
+
+
+def _as_solid(board: Board) -> Solid:
+    spans = np.array([(board.x, board.x + BOARD_DEPTH), board.y, board.z])
+    half = (spans[:, 1] - spans[:, 0]) / 2
+    return Solid(BOARD, "box", spans.mean(axis=1), np.eye(3), half, float(np.linalg.norm(half)))
