@@ -420,7 +420,10 @@ def _print_robot(seen: Json | None, cloud_age: float | None) -> None:
     where = describe_point(seen["position_m"])
     if seen["guard_for_s"] is None:
         print_line(f"no telemetry for {seen['age_s']:.1f} s; last message from cloud: {heard}")
-        print_line(f"last seen at {where} m, guard {seen['guard']}: {seen['cause']}")
+        print_line(
+            f"last seen {seen['age_s']:.1f} s ago at {where} m, with the guard in {seen['guard']}: "
+            f"{seen['cause']}"
+        )
     else:
         rtt = "" if seen["rtt_s"] is None else f", round trip {seen['rtt_s'] * 1e3:.0f} ms"
         print_line(f"robot at {where} m, seen {seen['age_s']:.2f} s ago{rtt}")

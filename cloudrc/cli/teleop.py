@@ -59,6 +59,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         ("--tokens", "DIR", Path, "folder of the token files 'operator' and 'reader'"),
         ("--audit", "FILE", Path, "log all commands and their callers (JSON lines)"),
         ("--api-file", "FILE", Path, "write the API's URL to this file"),
+        ("--link", "FILE", Path, "state of the link: its changes go to the mission's log"),
     ):
         required = flag in ("--socket", "--api", "--audit")
         parser.add_argument(flag, type=kind, metavar=metavar, required=required, help=text)
@@ -162,6 +163,7 @@ def _fly(
     over: Callable[[], bool],
 ) -> None:
     """Serve missions and API requests until `over()` is true."""
+    from cloudrc.drivers.link_news import LinkNews
     from cloudrc.drivers.process import Feed
     from cloudrc.drivers.teleop import TeleopLoop, UnixPeer
     from cloudrc.records import Counted, Fault
@@ -178,7 +180,12 @@ def _fly(
         if exporter is not None:
             exporter.see(records)
 
+    news = LinkNews(options.link) if options.link else None
+
     def is_over() -> bool:
+        now_ns = time.monotonic_ns()
+        if news is not None and (text := news.look(now_ns)):
+            service.tell_link(text, now_ns)
         if exporter is not None:
             exporter.ready(service.seen is not None)
             counts = {"api_events_dropped": service.book.dropped, **server.counts}

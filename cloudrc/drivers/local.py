@@ -34,6 +34,7 @@ from cloudrc.drivers.teleop import PATH_MAX
 from cloudrc.errors import InvalidRunError, TimedOutError
 from cloudrc.files import make_own_folder, who_may_write
 from cloudrc.link.follow import PROFILE
+from cloudrc.link.state import STATE_FILE
 from cloudrc.records import Fault, Record
 from cloudrc.tunnel.keys import KEY_SIZE, Key, KeySet, write
 
@@ -273,6 +274,7 @@ class LocalRun:
         # Only this user can open the socket of the API: no token is needed.
         given: dict[str, object] = {"api": url, "api-file": folder / API_FILE}
         given |= {"audit": folder / AUDIT_FILE}
+        given |= {"link": folder / LINK_FOLDER / "downlink" / STATE_FILE}
         given |= {"journal": folder / JOURNAL_FILE} if session else {}
         start = () if session else ("--start",)
         self._start("teleop", "teleop", *start, socket=sockets, **given)

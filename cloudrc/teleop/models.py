@@ -133,8 +133,9 @@ class Event(_Answer):
     mission: str = _field("Id of the mission")
     event: str = _field(
         "queued, starting, started, reached, held, resumed, goto, driving, operator_lost, "
-        "restarted, new_session, board_touched, obstacle_touched, paused; at the end done, "
-        f"cancelled, {', '.join(FAILURES)}"
+        "restarted, new_session, no_telemetry, telemetry_again, guard_holds, hold_over, "
+        "link_changed, board_touched, obstacle_touched, paused; at the end done, cancelled, "
+        f"{', '.join(FAILURES)}"
     )
     waypoint: int = _field("Index of the waypoint, from 0")
     text: str = _field("Event in words")

@@ -20,23 +20,24 @@ from cloudrc.geometry.placement import find_crossed
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState, Setpoint, Start, Vector
 from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, finite_or_none, judge
-from cloudrc.records import Fault, MissionEvent
+from cloudrc.records import BY_HAND, Fault, MissionEvent
 from cloudrc.teleop.carrot import HEARTBEAT_NS, SPEED_MAX
+from cloudrc.teleop.interruptions import SILENCE, Interruptions
 from cloudrc.teleop.mission import HELD_LOWEST, Teleop
 from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError
-from cloudrc.teleop.wire import HELD, QUEUED, Leg, Output, Plan, RobotStatus
+from cloudrc.teleop.wire import FLYING, HELD, QUEUED, Leg, Output, Plan, RobotStatus
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 LATCHED, AIRBORNE = (LAND, ESTOP), (TRACK, HOLD, LAND)
 """States of the guard that only an acknowledgement ends; states in which the rotors may turn."""
-SILENCE = 1.0
-"""Age above which telemetry, or the last message from cloud, is too old [s]."""
 SETPOINT_PERIOD_NS = 100_000_000
 """Time between two copies of the setpoint [ns]; a cloud that restarts needs the copies."""
 DRIVE_LIMIT = 3600.0
 """Time limit of a mission that begins with a request to drive [s]."""
 QUEUE_MAX = 16
 """Largest number of missions that wait while another mission flies."""
+STEERED = ("held", *BY_HAND)
+"""Events of a held mission that tell who steers the robot."""
 DRIVEN = "driven"
 """State for `next_step` while the operator drives the robot by hand during a held mission."""
 TAKES_OFF = "a velocity other than zero makes the robot take off, once telemetry has arrived"
@@ -105,6 +106,8 @@ class MissionService:
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
         self._current: Mission | None = None
+        self._began_ns = 0  # when this process began to fly the present mission
+        self._interruptions = Interruptions()  # of the present mission
         self._ends = False  # whether this process ends; the next process flies the queue
         self._trouble = ""  # trouble of the store that was last reported
         self._driven_ns = -HEARTBEAT_NS  # time of the last request to drive
@@ -279,6 +282,10 @@ class MissionService:
             if before is not None and before.epoch != seen.epoch:
                 text = f"cloud has a new session; the mission is {mission.state}"
                 self._note(mission, "new_session", f"{text} {self._teleop.where}", now_ns)
+        if mission is not None:
+            time, flies = self._teleop.elapsed(now_ns), mission.state in (FLYING, HELD)
+            for event, text in self._interruptions.see(seen, time, flies=flies):
+                self._note(mission, event, text, now_ns)
         self._teleop.see(seen, now_ns)
         self._collect(now_ns)
 
@@ -289,6 +296,7 @@ class MissionService:
             self._cancel_unwatched(now_ns)
             blocked = self.seen is None or self.book.trouble or self._blocked
             self._start_next(now_ns, queued=not blocked)
+        self._tell_silence(now_ns)
         self._teleop.handle_deadline(now_ns)
         self._collect(now_ns)
         if self._setpoint is not None and now_ns >= self._setpoint_ns:
@@ -315,7 +323,8 @@ class MissionService:
         age, state = (now_ns - self._seen_ns) * 1e-9, mission.state if mission else None
         control = seen.control
         if mission is not None and state == HELD:
-            last, pause_ns = mission.events[-1]["event"], now_ns - self._driven_ns
+            by_hand = (e["event"] for e in reversed(mission.events) if e["event"] in STEERED)
+            last, pause_ns = next(by_hand, ""), now_ns - self._driven_ns
             back = last == "operator_lost" and pause_ns <= HEARTBEAT_NS
             state = DRIVEN if last == "driving" or back else HELD
         shown["seen"] = {
@@ -407,7 +416,8 @@ class MissionService:
         if queued and mission.state == QUEUED:
             self._note(mission, "starting", ASKED, now_ns)
         if mission.world or (mission.state != QUEUED and not self.book.trouble):
-            self._current = mission
+            self._current, self._began_ns = mission, now_ns
+            self._interruptions = Interruptions()
             self._teleop.start(now_ns, mission)
             if mission.world:  # an earlier teleop has begun it
                 self._note(mission, "restarted", RESTARTED, now_ns)
@@ -424,6 +434,24 @@ class MissionService:
         told, self._trouble = self._trouble, self.book.trouble
         if self._trouble not in ("", told):
             self._outputs.append(Fault(now_ns, "journal", self._trouble))
+
+    def tell_link(self, text: str, now_ns: int) -> None:
+        """Note in the log of the mission under way that the link has changed; `text` says how."""
+        if self._current is not None:
+            self._note(self._current, "link_changed", text, now_ns)
+
+    def _tell_silence(self, now_ns: int) -> None:
+        """Note if the mission under way gets no telemetry."""
+        if (mission := self._current) is None:
+            return
+        cloud_ns = self._began_ns if self._heard_ns is None else self._heard_ns
+        for event, text in self._interruptions.wait(
+            self.seen,
+            self._teleop.elapsed(now_ns),
+            (now_ns - max(self._seen_ns, self._began_ns)) * 1e-9,
+            cloud_is_silent=(now_ns - cloud_ns) * 1e-9 > SILENCE,
+        ):
+            self._note(mission, event, text, now_ns)
 
     def _cancel_unwatched(self, now_ns: int) -> None:
         """Cancel each mission whose watcher has sent no word for the time of its lease.
@@ -453,6 +481,9 @@ class MissionService:
                 contact=mission.order.contact,
                 contact_speed_max=self._contact_speed_max,
             )
+            if event.event != "done":  # an interruption may be the reason
+                told = self._interruptions.failures(self._teleop.elapsed(now_ns))
+                evidence = replace(evidence, violations=(*evidence.violations, *told))
             changed["verdict"] = judge(evidence).as_json()
         self._note(mission, event.event, event.text, now_ns, **changed)
         if mission.ended:

@@ -19,7 +19,7 @@ MOUNTS = {
     "cloud": {
         "link": LINK,
         "cloud": END | {"teleop"},
-        "teleop": {"experiment ro", "teleop", "tokens ro", "journal"},
+        "teleop": {"experiment ro", "run ro", "teleop", "tokens ro", "journal"},
         "load": set(),
     },
     "mission": {"mission": MISSION},

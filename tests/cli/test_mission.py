@@ -220,7 +220,8 @@ NEW = {**SEEN, "age_s": 0.02, "guard_for_s": 4.5, "next_step": "the robot flies"
     ("seen", "cloud_age", "lines"),
     [
         (OLD, 0.1, ["no telemetry for 3.2 s; last message from cloud: 0.1 s ago",
-                    "last seen at (1.00, 2.00, 0.70) m, guard TRACK: fresh command", "next: wait"]),
+                    "last seen 3.2 s ago at (1.00, 2.00, 0.70) m, with the guard in TRACK: "
+                    "fresh command", "next: wait"]),
         (NEW, 0.02, ["robot at (1.00, 2.00, 0.70) m, seen 0.02 s ago, round trip 90 ms",
                      "guard TRACK for 4.5 s: fresh command", "next: the robot flies"]),
         (None, None, ["no telemetry from the robot yet; is the link up? "

@@ -82,7 +82,7 @@ a landing without teleop: create 0.05 queue LAND restart see 0.2
   -> states=failed,queued failure=guard_stopped
 
 # Restarts of cloud
-cloud restarts: create 0.05 A mark cloud 1.0 -> states=flying asked= last=new_session waypoint=1
+cloud restarts: create 0.05 A mark cloud 0.3 -> states=flying asked= last=new_session waypoint=1
 
 # Stops
 a stop: create 0.05 A mark stop 0.05
@@ -187,6 +187,17 @@ def test_a_refusal_says_why(script, action, said):
         ("foreign 0.05", "somebody else has started another mission on the way to waypoint 2 of 3"),
         ("full B 0.1 restart free 0.1", "waypoint 2 of 3 reached, as the robot reports, at"),
         ("queue cancelm2", "mission cancelled before it began"),
+        (
+            "deaf 15.4 link 0.05",
+            "no telemetry since 0.04 s (teleop does not hear cloud); last seen "
+            "at (1.00, 0.00, 1.00) m, with the guard in TRACK",
+        ),
+        ("deaf 15.4 link 0.05", "telemetry again at 15.45 s, after 15.4 s: guard in TRACK"),
+        (
+            "HOLD 3 TRACK 0.05",
+            "guard in HOLD since 0.05 s (fresh command)",
+        ),
+        ("HOLD 3 TRACK 0.05", "guard in TRACK at 3.05 s, after 3.0 s in HOLD"),
     ],
 )
 def test_an_event_says_what_happened_once(script, said):
@@ -194,6 +205,43 @@ def test_an_event_says_what_happened_once(script, said):
     play(flight, script)
     events = flight.teleop.book.events_after(0)
     assert [said in event["text"] for event in events].count(True) == 1
+
+
+def test_short_interruptions_are_not_told():
+    flight, mission_id = service_flying()
+    before = flight.names(mission_id)
+    play(flight, "HOLD 0.4 TRACK 0.1 deaf 0.9 link 0.1 HOLD 0.4 TRACK 0.1")
+    assert flight.names(mission_id) == before
+
+
+@pytest.mark.parametrize(
+    ("script", "codes", "words"),
+    [
+        ("deaf 60", ["timed_out", "no_telemetry"], "no telemetry since 0.04 s"),
+        ("deaf 20 link 5 deaf 10 link 30", ["timed_out", "no_telemetry"],
+         "no telemetry for 30.0 s in all, first from 0.04 s"),
+        ("HOLD 60", ["timed_out", "guard_held"], "the guard was in HOLD for 3.0 s in all"),
+        ("deaf 2 link 1 HOLD 2 LAND 0.1", ["guard_stopped", "no_telemetry", "guard_held"], "first"),
+        ("deaf 5 link B C 0.1", [], ""),
+    ],
+)  # fmt: skip
+def test_the_verdict_of_a_failed_mission_tells_its_interruptions(script, codes, words):
+    flight, mission_id = service_flying()
+    play(flight, script)
+    failures = flight.view(mission_id)["verdict"]["failures"]
+    told = [failure for failure in failures if failure["code"] != "waypoint_not_reached"]
+    assert [failure["code"] for failure in told] == codes
+    assert words in "; ".join(failure["text"] for failure in told)
+
+
+def test_a_change_of_the_link_is_in_the_log_of_the_mission_under_way():
+    flight = ServiceFlight()
+    flight.step()
+    flight.teleop.tell_link("the link has changed", flight.now_ns)
+    mission_id = flight.create()
+    flight.step(seconds=0.05)
+    flight.teleop.tell_link("the link has changed", flight.now_ns)
+    assert flight.names(mission_id)[-1] == "link_changed"
 
 
 def test_every_end_of_a_mission_is_counted_under_its_own_name():
