@@ -75,7 +75,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
         *("drivers/process", "faults/schedule"),
     ),
     **dict.fromkeys(("fastapi", "starlette", "uvicorn"), ("teleop/api", "teleop/auth")),
-    "fcntl": ("drivers/local", "cli/console"),
+    "fcntl": ("drivers/local", "cli/console", "sweep/lock"),
     "matplotlib": ("report/",),
     "viser": ("console/", "report/replay"),
     "mjviser": ("console/scene",),

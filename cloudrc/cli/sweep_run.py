@@ -40,6 +40,7 @@ from cloudrc.metrics.verdict import EXIT_CODES
 from cloudrc.source import code_hash
 from cloudrc.sweep import store
 from cloudrc.sweep.flight import Row, counts, fly_point, measure
+from cloudrc.sweep.lock import lock_folder
 from cloudrc.sweep.plan import Flight, Plan, pack, read_plan, unpack
 from cloudrc.sweep.statistics import median_interval
 
@@ -53,7 +54,17 @@ def run(options: argparse.Namespace) -> int:
         folder.mkdir(parents=True, exist_ok=True)  # another shard may be faster
     elif folder is None or not (folder / store.FILE).is_file():
         folder = new_folder(folder, f"sweep-{options.file.stem}", "latest-sweep")
-    before = store.begin(folder, plan, is_shared=bool(options.shard))
+    with lock_folder(folder, shard, count) as warning:
+        if warning:
+            print_line(f"cloudrc: warning: {warning}", sys.stderr)
+        return _run_locked(options, plan, folder, shard, count)
+
+
+def _run_locked(
+    options: argparse.Namespace, plan: Plan, folder: Path, shard: int | None, count: int
+) -> int:
+    """Fly what is missing in `folder`, which no other command may fly now; return the exit code."""
+    before = store.begin(folder, plan, is_shared=bool(shard))
     mine = [*plan.flights.values()][(shard or 1) - 1 :: count]
     missing = [
         each
@@ -181,6 +192,7 @@ def print_status(options: argparse.Namespace) -> int:
     """Print how many flights of a sweep are done, and how many succeeded per value of an axis."""
     summary = store.read_summary(options.folder)
     rows, values = store.read_rows(options.folder).values(), []
+    store.check_points(options.folder, rows, summary["axes"])
     for axis, choices in summary["axes"].items():
         for value in choices:
             found = [row["verdict"] for row in rows if row["point"][axis] == value]

@@ -13,34 +13,57 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.util import find_spec
+from io import SEEK_END, BufferedReader
 from pathlib import Path
 from typing import Any
 
-from cloudrc import __version__
+from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError
+
+from cloudrc import __version__, files
 from cloudrc.config.document import write_yaml
-from cloudrc.errors import BadInputError
-from cloudrc.files import write_atomically
+from cloudrc.errors import BadInputError, to_one_line
+from cloudrc.files import open_file, write_atomically
 from cloudrc.renamed import NEW_NAMES
 from cloudrc.source import code_hash
 from cloudrc.sweep.flight import Row, units
 from cloudrc.sweep.plan import Plan
 
 FILE, SUMMARY = "sweep.yaml", "sweep.json"
-FIELDS = {"key", "point", "seed", "verdict", "failures", "text", "numbers", "records_sha256"}
-"""Fields of a row."""
 TABLE, PARQUET = "table.csv", "table.parquet"
+LINE_MAX = 1 << 20
+"""Largest length of a row [bytes]."""
+SUMMARY_MAX = 1 << 26
+"""Largest length of the file SUMMARY [bytes]."""
+
+
+class _Document(BaseModel):
+    """A document that is read; it may have more fields."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+
+class _RowDocument(_Document):
+    """The form of a row."""
+
+    key: str
+    point: dict[str, Any]
+    seed: int
+    verdict: str
+    failures: list[str]
+    text: str
+    numbers: dict[str, int | FiniteFloat]
+    records_sha256: str | None
 
 
 def read_rows(folder: Path) -> dict[str, Row]:
     """Read the rows of all files: a flight's key -> row; ignore an unfinished last line.
 
     Raises:
-        BadInputError: If a line is not a row.
+        BadInputError: If a file cannot be read, or if a line is not a row.
     """
     found: dict[str, Row] = {}
     for path in sorted(folder.glob("rows*.jsonl")):
-        *lines, _ = path.read_bytes().split(b"\n")
-        for number, line in enumerate(lines, start=1):
+        for number, line in enumerate(_lines(path), start=1):
             row = parse_row(line)
             if row is None:
                 text = "is not a row of a sweep; delete this line to fly its flight again"
@@ -49,14 +72,26 @@ def read_rows(folder: Path) -> dict[str, Row]:
     return found
 
 
+def _lines(path: Path) -> Iterator[bytes]:
+    """Yield the lines of a file that end; raise a BadInputError for what is no file of rows."""
+    try:
+        with BufferedReader(open_file(path)) as file:
+            while (line := file.readline(LINE_MAX)).endswith(b"\n"):
+                yield line
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "it is not a file"
+        raise BadInputError(f"{path}: cannot be read: {reason}; move it away") from error
+    if len(line) == LINE_MAX:
+        raise BadInputError(f"{path}: has a line above {LINE_MAX} bytes, so it has no rows")
+
+
 def parse_row(line: bytes | str) -> Row | None:
     """Parse a line of JSON as a row; return None if it is not a row."""
-    with suppress(ValueError):
-        row = json.loads(line)
-        if isinstance(row, dict) and FIELDS <= row.keys():
-            row["failures"] = [NEW_NAMES.get(code, code) for code in row["failures"]]
-            row["numbers"] = _with_new_keys(row["numbers"])
-            return row
+    with suppress(ValidationError):
+        row: Row = dict(_RowDocument.model_validate_json(line))
+        row["failures"] = [NEW_NAMES.get(code, code) for code in row["failures"]]
+        row["numbers"] = _with_new_keys(row["numbers"])
+        return row
     return None
 
 
@@ -72,8 +107,9 @@ def append_rows(folder: Path, shard: int | None) -> Iterator[Callable[[Row], Non
     """
     path = folder / ("rows.jsonl" if shard is None else f"rows-{shard}.jsonl")
     with path.open("ab+", buffering=0) as file:
-        file.seek(0)
-        file.truncate(file.read().rfind(b"\n") + 1)  # a killed process may leave half a line
+        start = max(0, file.seek(0, SEEK_END) - LINE_MAX)
+        file.seek(start)
+        file.truncate(start + file.read().rfind(b"\n") + 1)  # a kill may leave half a line
 
         def append(row: Row) -> None:
             rest = memoryview(json.dumps(row, allow_nan=False).encode() + b"\n")
@@ -125,7 +161,7 @@ def finish(folder: Path, plan: Plan) -> dict[str, Row]:
     """Write the summary and, if no flight is missing, the tables; return flight key -> row."""
     rows = read_rows(folder)
     unit_of = _write_summary(folder, plan, rows)
-    if len(rows) == len(plan.flights):
+    if rows.keys() == plan.flights.keys():
         columns = _columns([rows[key] for key in plan.flights], plan)
         write_atomically(folder / TABLE, as_csv(columns, unit_of).encode())
         if find_spec("pyarrow"):
@@ -162,15 +198,28 @@ def as_text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
+class _SummaryDocument(_Document):
+    """The form of the file SUMMARY."""
+
+    axes: dict[str, list[Any]]
+    flights: int
+    units: dict[str, str]
+
+
 def read_summary(folder: Path) -> dict[str, Any]:
     """Read the description of a sweep; raise a BadInputError if `folder` is not that of a sweep."""
-    try:
-        summary: dict[str, Any] = json.loads((folder / SUMMARY).read_bytes())
-        if {"axes", "flights"} <= summary.keys():
-            return summary
-    except (OSError, ValueError, AttributeError):
-        pass
+    with suppress(OSError, ValueError):
+        return dict(_SummaryDocument.model_validate_json(files.read(folder / SUMMARY, SUMMARY_MAX)))
     raise BadInputError(f"{folder}: is not a folder of 'cloudrc sweep run'; name one")
+
+
+def check_points(folder: Path, rows: Iterable[Row], axes: Mapping[str, Sequence[Any]]) -> None:
+    """Raise a BadInputError if a row has another point than those of the sweep in `folder`."""
+    for row in rows:
+        point = row["point"]
+        if point.keys() != axes.keys() or any(point[axis] not in axes[axis] for axis in axes):
+            text = f"the row {row['key']} has another point than those in {SUMMARY}: {point}"
+            raise BadInputError(to_one_line(f"{folder}: {text}; name the folder of one sweep"))
 
 
 def read_flights(folder: Path) -> tuple[list[Row], dict[str, str], str]:
@@ -186,16 +235,19 @@ def read_flights(folder: Path) -> tuple[list[Row], dict[str, str], str]:
     def place(row: Row) -> list[int]:
         return [*(axes[axis].index(value) for axis, value in row["point"].items()), row["seed"]]
 
-    rows = sorted(read_rows(folder).values(), key=place)
+    found = read_rows(folder).values()
+    check_points(folder, found, axes)
+    rows = sorted(found, key=place)
     for row in rows:
         row["point"] = {axis: value if type(value) in (str, int, float) else json.dumps(value)
                         for axis, value in row["point"].items()}  # fmt: skip
     if not rows:
         raise BadInputError(f"{folder}: has no rows; run the sweep again with this --out")
     missing = summary["flights"] - len(rows)
+    unknown = dict.fromkeys((name for row in rows for name in row["numbers"]), "")
     return (
         rows,
-        _with_new_keys(summary["units"]),
+        {**unknown, **_with_new_keys(summary["units"])},
         f"{missing} flights are not done" if missing else "",
     )
 

@@ -23,6 +23,7 @@ from cloudrc.cli.sweep_run import as_table, fly_row, summarise
 from cloudrc.cluster import batch
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.source import code_hash
+from cloudrc.sweep.lock import lock_folder
 from cloudrc.sweep.plan import pack, read_plan
 from cloudrc.sweep.store import read_rows
 from tests.cli.conftest import KEYS, SHORT
@@ -75,6 +76,14 @@ def test_a_sweep_goes_on_where_it_ended(write_sweep, monkeypatch, call):
     assert Path("runs/latest-sweep").resolve() == Path("runs/sweep-grid-1").resolve()
     assert "1 points x 3 seeds: 3 flights, 1 done before" in call(again).out
     assert begun == [1, 2, 2, 3]
+
+
+def test_the_same_sweep_is_not_flown_twice_at_once(write_sweep, call, refused):
+    path = write_sweep(ONE)
+    call("sweep run --out grid", path)
+    with lock_folder(Path("grid")):
+        error = refused("sweep run --out grid", path)
+    assert "--out grid: another command flies into it now; wait for its end" in error
 
 
 def test_alike_warnings_of_many_points_are_counted(write_sweep, monkeypatch, call):

@@ -2,6 +2,8 @@
 
 import csv
 import json
+import os
+from math import nan
 
 import pytest
 
@@ -73,6 +75,59 @@ def test_a_line_that_is_no_row_is_named(rows, tmp_path):
         (tmp_path / "rows-2.jsonl").write_text(f"{json.dumps(rows[1])}\n{line}\n")
         with pytest.raises(BadInputError, match=r"rows-2.jsonl:2: is not a row of a sweep"):
             store.read_rows(tmp_path)
+
+
+def _make_folder(path):
+    path.mkdir()
+
+
+BROKEN = {
+    "folder": (_make_folder, "Is a directory"),
+    "pipe": (os.mkfifo, "it is not a file"),
+    "device": (lambda path: path.symlink_to("/dev/zero"), "it is not a file"),
+    "dangling": (lambda path: path.symlink_to("lost"), "No such file"),
+    "long": (lambda path: path.write_bytes(b"0" * 3_000_000), "a line above 1048576 bytes"),
+    "binary": (lambda path: path.write_bytes(b"\0\xff\n"), ":1: is not a row"),
+    "nested": (lambda path: path.write_bytes(b"[" * 100_000 + b"\n"), ":1: is not a row"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_what_is_no_file_of_rows_is_refused_at_once(kind, tmp_path):
+    make, said = BROKEN[kind]
+    make(tmp_path / "rows.jsonl")
+    with pytest.raises(BadInputError, match=rf"rows\.jsonl.*{said}"):
+        store.read_rows(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({"numbers": []}, {"numbers": {"x": "1"}}, {"numbers": {"x": nan}}, {"point": None}),
+        *({"seed": "1"}, {"seed": True}, {"failures": "x"}, {"verdict": None}, {"key": 1}),
+    ],
+)
+def test_a_row_with_a_field_of_another_type_is_no_row(wrong, rows):
+    assert store.parse_row(json.dumps(rows[0])) == rows[0]
+    assert store.parse_row(json.dumps(rows[0] | wrong)) is None
+
+
+@pytest.mark.parametrize("point", [{}, {"other": 1}, {"link.both.delay_ms": 7}])
+def test_rows_of_another_grid_are_refused(point, plan, rows, tmp_path):
+    store.begin(tmp_path, plan)
+    write(tmp_path, [rows[0] | {"point": point if "other" in point or not point
+                                else rows[0]["point"] | point}])  # fmt: skip
+    with pytest.raises(BadInputError, match="has another point than those in"):
+        store.read_flights(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "text", ["[]", "{}", '{"axes": 3, "flights": 1, "units": {}}', "[" * 100_000, "\0", "NaN"]
+)
+def test_what_is_no_description_of_a_sweep_is_refused(text, tmp_path):
+    (tmp_path / "sweep.json").write_text(text)
+    with pytest.raises(BadInputError, match="is not a folder of"):
+        store.read_summary(tmp_path)
 
 
 def test_a_folder_holds_one_sweep(plan, rows, write_sweep, tmp_path):

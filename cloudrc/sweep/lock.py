@@ -1,0 +1,53 @@
+"""Lock the folder of a sweep, so that no flight is flown by two commands at the same time.
+
+A command that flies all flights locks the folder for itself; shards lock it together, and each its
+own number. The kernel releases the locks when a process ends. Nothing else opens the locked files:
+on NFS, a process loses its lock when it closes any other handle of the file.
+"""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from cloudrc.errors import BadInputError
+
+ALONE, TOGETHER = fcntl.LOCK_EX | fcntl.LOCK_NB, fcntl.LOCK_SH | fcntl.LOCK_NB
+
+
+@contextmanager
+def lock_folder(folder: Path, shard: int | None = None, count: int = 1) -> Iterator[str]:
+    """Lock a folder for shard number `shard` of `count`, or for one command alone if it is None.
+
+    Yield a warning if the file system has no locks, else "".
+
+    Raises:
+        BadInputError: If another command flies the same flights into the folder.
+    """
+    warnings = [""]
+    with ExitStack() as stack:
+
+        def lock(name: str, how: int, who: str) -> None:
+            file = stack.enter_context((folder / name).open("a+"))
+            try:
+                fcntl.flock(file, how)
+            except BlockingIOError:
+                text = f"{who} into it now; wait for its end, or see: cloudrc sweep status {folder}"
+                raise BadInputError(f"--out {folder}: {text}") from None
+            except OSError as error:
+                text = f"{folder}: its file system has no locks ({error.strerror}); do not start "
+                warnings.append(f"{text}the same sweep or shard twice at the same time")
+
+        lock(".lock", TOGETHER if shard else ALONE, "another command flies")
+        if shard:
+            lock(_name(shard, count), ALONE, f"another command flies shard {shard} of {count}")
+            for other in folder.glob(_name("*", "*")):  # has some of our flights
+                if not other.name.endswith(f"-{count}"):
+                    lock(other.name, TOGETHER, f"shards of another number than {count} fly")
+        yield warnings[-1]
+
+
+def _name(shard: int | str, count: int | str) -> str:
+    return f".lock-{shard}-of-{count}"
