@@ -190,6 +190,18 @@ class Control(NamedTuple):
     derivative: Annotated[Vector, "m/s", "term per axis, world frame"]
 
 
+class PlanFollowed(NamedTuple):
+    """Made by cloud: which position a plan had predicted for the newest odometry. Topic /plan.
+
+    The plan is that of the command which the robot followed then: telemetry with this odometry
+    echoes the command. Without plans, and after the end of a plan, there is no such record.
+    """
+
+    stamp_ns: int
+    basis_stamp_ns: Annotated[int, "ns", "stamp of the odometry, world's clock"]
+    position: Annotated[Vector, "m", "of the base at that instant, by the plan, world frame"]
+
+
 BY_HAND = ("goto", "driving", "operator_lost")
 """Events of a held mission while the operator moves the setpoint; the mission stays held."""
 UNDER_WAY = ("started", "reached", "held", "resumed", "paused", *BY_HAND)
@@ -264,6 +276,6 @@ class Lateness(NamedTuple):
 
 Record: TypeAlias = (
     (TelemetrySent | GroundTruth | Arrival | CommandApplied | GuardChange | Contact)
-    | (SessionOpened | Control | MissionEvent | Fault | Counted)
+    | (SessionOpened | Control | PlanFollowed | MissionEvent | Fault | Counted)
     | (LinkChanged | LinkChecked | Lateness)
 )

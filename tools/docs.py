@@ -56,6 +56,8 @@ _STAMPS = {
     ("instant at which this session begins in world or in cloud", "once per event"): "/session",
     ("departure of the command", _PERIOD):
         "/estimated_odometry /setpoint_position /cmd_vel /delay_estimate /pid",
+    ("arrival of the telemetry at cloud", "once per telemetry while the robot follows a plan"):
+        "/plan",
     ("instant of the event", "once per event"): "/mission",
     ("when world or cloud notices the fault", "once per fault; repetitions are counted"): "/fault",
     ("when the counters are read", "1 Hz per counter; counters of a relay 0.5 Hz"): "/count",

@@ -296,6 +296,8 @@ class CloudEndpoint(TunnelEnd):
                 self._loop.expect((now_ns - self._start[1]) * 1e-9)
                 self._start = None
             self._loop.observe(telemetry, now_ns)
+            if (followed := self._loop.plans.look_up(telemetry, now_ns)) is not None:
+                self._records.append(followed)
             self._asked = max(self._asked, telemetry.mission)
             # The last command was made before this telemetry: it has the delay of the one before.
             known, self._uplink_delay = (self._uplink_delay, self._control), delay

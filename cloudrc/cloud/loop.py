@@ -26,6 +26,7 @@ from typing import Any
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
+from cloudrc.cloud.plan_log import PlanLog
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.cloud.results import check_estimate, check_output, refuse, to_vector
 from cloudrc.errors import describe_error
@@ -81,6 +82,7 @@ class ControlLoop:
     Attributes:
         period_ns: Time between two commands [ns].
         faults: Faults since the last `take_faults`.
+        plans: The plans that the robot may still follow.
         counts: Name of an event, such as "frozen" -> how often it happened.
     """
 
@@ -139,6 +141,7 @@ class ControlLoop:
         self._basis: Odometry | None = None
         self._basis_arrival_ns = 0
         self._horizon, self._echoed_ns = 0.0, NEVER_NS
+        self.plans = PlanLog()
 
     def start_mission(self) -> None:
         """Reset the controller at the start of a mission within the session."""
@@ -243,19 +246,21 @@ class ControlLoop:
             self._note("estimator", error)
         horizon = self._horizon
         estimate = self._predict(basis, horizon)
-        plan: tuple[Vector, ...] = ()
+        plan, positions = list[Vector](), list[Vector]()
         if self._is_echo_silent(now_ns, horizon):
             self.counts["frozen"] += 1
             output = STAND_STILL
         else:
             output = self._steer(estimate, setpoint, dt)
             if self._planned:
-                plan = self._plan(moving, output.velocity, now_ns)
+                plan, positions = self._plan(moving, output.velocity, now_ns)
         velocity, yaw_rate, proportional, integral, derivative = output
         hold_ns = now_ns - self._basis_arrival_ns
         planned_ns = basis.stamp_ns + round(horizon * 1e9) if plan else NEVER_NS
-        fields = (now_ns, basis.stamp_ns, hold_ns, velocity, yaw_rate, plan, planned_ns)
+        fields = (now_ns, basis.stamp_ns, hold_ns, velocity, yaw_rate, tuple(plan), planned_ns)
         command = _new(Command, fields)
+        if plan:
+            self.plans.add(command, [estimate.position, *positions])
         self._call("predictor", self._predictor.commanded, command)
         _, position, orientation, predicted_velocity, _ = estimate
         # fmt: off
@@ -286,7 +291,9 @@ class ControlLoop:
             self._note("controller", error)
             return STAND_STILL
 
-    def _plan(self, setpoint: Setpoint, velocity: Vector, now_ns: int) -> tuple[Vector, ...]:
+    def _plan(
+        self, setpoint: Setpoint, velocity: Vector, now_ns: int
+    ) -> tuple[list[Vector], list[Vector]]:
         """Plan the velocities [m/s] that follow a command, by simulating the flight.
 
         Args:
@@ -295,15 +302,15 @@ class ControlLoop:
             now_ns: Time of the command [ns], cloud's clock.
 
         Returns:
-            One velocity per PLAN_STEP after the command. The plan ends before the first velocity
-            that the guard would refuse. It is empty if the predictor has no model, or if a plug-in
-            fails.
+            One velocity [m/s] per PLAN_STEP after the command, and the position [m] for which it
+            was computed. The plan ends before the first velocity that the guard would refuse. It is
+            empty if the predictor has no model, or if a plug-in fails.
         """
-        plan, plug_in = list[Vector](), "predictor"
+        plan, positions, plug_in = list[Vector](), list[Vector](), "predictor"
         try:
             model = self._predictor.model()
             if model is None:
-                return ()
+                return plan, positions
             plug_in = "controller"
             controller = deepcopy(self._controller)
             for k in range(1, self._planned + 1):
@@ -311,6 +318,7 @@ class ControlLoop:
                 state = model.step(velocity, PLAN_STEP)
                 if type(state) is not Odometry:
                     state = check_estimate(state)
+                position = to_vector(state.position, "position")
                 later = setpoint_at(setpoint, now_ns + k * PLAN_STEP_NS)
                 plug_in = "controller"
                 output = controller.update(state, later, PLAN_STEP)
@@ -323,10 +331,11 @@ class ControlLoop:
                 if max(map(abs, velocity)) > PLANNED_MAX:
                     break
                 plan.append(as_planned(velocity))
+                positions.append(position)
         except BaseException as error:
             self._note(plug_in, error, "cloud sends this command without a plan")
-            return ()
-        return tuple(plan)
+            return [], []
+        return plan, positions
 
     def _is_echo_silent(self, now_ns: int, horizon: float) -> bool:
         """Whether the newest echoed command is older than `horizon` + `freeze_after` [s]."""

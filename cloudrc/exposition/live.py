@@ -39,6 +39,7 @@ from cloudrc.records import (
     Lateness,
     LinkChecked,
     MissionEvent,
+    PlanFollowed,
     Record,
     SessionOpened,
     TelemetrySent,
@@ -227,6 +228,7 @@ class CloudEnd(End):
         super().__init__(table.CLOUD, values)
         self._prediction, self._delay = PredictionJudge(), DelayJudge()
         self._echoes, self._used_count = Echoes(), 0
+        self._has_plans = False
 
     def _on_sessionopened(self, record: SessionOpened) -> None:
         super()._on_sessionopened(record)
@@ -236,6 +238,9 @@ class CloudEnd(End):
     def _on_arrival(self, record: Arrival) -> None:
         super()._on_arrival(record)
         self._used_count += record.used
+
+    def _on_planfollowed(self, record: PlanFollowed) -> None:
+        self._has_plans = True  # their horizon is the beginning of the plan, not the true delay
 
     def _on_control(self, record: Control) -> None:
         self._count_age(record.stamp_ns)
@@ -249,7 +254,8 @@ class CloudEnd(End):
         self._delay.sent(record)
         values = self._values
         values["cloudrc_delay_estimate_seconds"] = record.horizon
-        values["cloudrc_delay_estimate_error_seconds"] = self._delay.error
+        delay_error = nan if self._has_plans else self._delay.error
+        values["cloudrc_delay_estimate_error_seconds"] = delay_error
         values["cloudrc_prediction_error_meters"] = self._prediction.error
         values["cloudrc_prediction_error_square_meters_total"] = self._prediction.square
         values["cloudrc_predictions_judged_total"] = self._prediction.judged

@@ -136,7 +136,7 @@ cloudrc_loop_delay_seconds: Round trip of applied commands, with their time in w
     tau.
 cloudrc_delay_estimate_seconds: Clamped delay estimate: how far ahead cloud predicts the odometry.
 cloudrc_delay_estimate_error_seconds: Delay estimate minus the true time from the odometry to the
-    application of the command, for the newest command that the robot confirmed.
+    application of the command, for the newest command that the robot confirmed; absent with plans.
 cloudrc_prediction_error_meters[axis]: Predicted minus measured position for the same instant,
     newest value (`estimate_error_rms` in the report).
 cloudrc_prediction_error_square_meters_total: Sum of the squared lengths of all prediction errors.

@@ -57,6 +57,8 @@ def compare_with_truth(
         instants [ns], shape (m,), and the errors [m], shape (m, 3).
     """
     truth, judge, found = flight.recording["/ground_truth"], PredictionJudge(), []
+    known = np.isfinite(predicted).all(axis=1)  # a plug-in's model may have predicted NaN
+    at_ns, predicted = at_ns[known], predicted[known]
     order = np.argsort(at_ns, kind="stable")
     waiting = deque(zip(at_ns[order].tolist(), predicted[order].tolist(), strict=True))
     # The rows of the true position around these instants.
@@ -77,9 +79,17 @@ def prediction_errors(flight: Flight) -> tuple[PredictionJudge, Array, Array]:
     """Compare each predicted position with the true position when the command was applied.
 
     So an error of the estimated delay adds to the result, which is that of `compare_with_truth`.
+    With plans, compare the position that the plan in use had predicted, at each odometry.
     Source: docs/reference/control.md, "Predictors".
     """
+    if flight.has_plans:
+        plans = flight.during("/plan")
+        return compare_with_truth(flight, plans["basis_stamp_ns"], plans["position"])
     return compare_with_truth(flight, flight.applied["stamp_ns"], flight.applied["position"])
+
+
+def _prediction_error(flight: Flight) -> float | None:
+    return finite(prediction_errors(flight)[0].rms)
 
 
 def _estimate_error(flight: Flight) -> float | None:
@@ -93,9 +103,12 @@ def _estimate_error(flight: Flight) -> float | None:
 def _delay_error(flight: Flight) -> float | None:
     """Compute the RMS difference between estimated (horizon) and true delay of the commands [s].
 
-    Commands before the first measured round trip are left out.
+    Commands before the first measured round trip are left out. None with plans: the horizon is then
+    the time at which the plan begins by definition, whenever the command arrives.
     """
     applied = flight.applied
+    if flight.has_plans:
+        return None
     errors = delay_error(applied["horizon"], applied["basis_stamp_ns"], applied["stamp_ns"])
     return rms(errors[np.isfinite(applied["rtt"])])
 
@@ -149,11 +162,11 @@ add_metrics(
 add_metrics(
     "Estimation and tracking",
     ("prediction_error_rms", "m", "RMS distance from the predicted to the true position when each "
-     "command was applied.", lambda flight: finite(prediction_errors(flight)[0].rms)),
+     "command was applied, or while the robot followed its plan.", _prediction_error),
     ("estimate_error_rms", "m", "RMS distance from the predicted to the true position at the "
      "instant of the prediction.", _estimate_error),
     ("delay_estimate_error_rms", "s", "RMS difference between the horizon and the true delay from "
-     "odometry to applied command, from the first echo on.", _delay_error),
+     "odometry to applied command, from the first echo on; without plans only.", _delay_error),
     ("tracking_rms_measured", "m", "RMS distance between the setpoint and the measured position "
      "that cloud used.",
      lambda flight: rms(tracking_errors(flight, flight.control["measured"]))),

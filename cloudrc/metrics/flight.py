@@ -170,6 +170,11 @@ class Flight:
         planned, stamp = columns["planned_ns"], columns["stamp_ns"]
         return columns | {"stamp_ns": np.where(planned >= 0, planned, stamp)}
 
+    @property
+    def has_plans(self) -> bool:
+        """Whether a command that world applied in the flight had a plan of future velocities."""
+        return bool((self.during("/command_applied")["planned_ns"] >= 0).any())
+
     def _within(self, columns: Columns) -> Columns:
         stamps = columns["stamp_ns"]
         if self.start_ns is None or self.end_ns is None:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloudrc.errors import BadInputError
-from cloudrc.record.topics import BY_SOURCE, TOPICS, Kind, Topic
+from cloudrc.record.topics import ADDED, BY_SOURCE, TOPICS, Kind, Topic
 from cloudrc.records import Arrival, Record
 from cloudrc.renamed import new_name
 
@@ -140,11 +140,14 @@ class Recording:
         """Hash of all tables, as 64 hexadecimal digits; records and their file have the same hash.
 
         The topics are hashed column by column. If both ends write a topic, its rows are hashed in
-        the order of their stamps. Numbers are little-endian. The hash omits the column `ROTATED`.
+        the order of their stamps. Numbers are little-endian. The hash omits the column `ROTATED`,
+        and topics in `ADDED` without rows.
         """
         total = hashlib.sha256()
         for topic in TOPICS.values():
             table = self[topic.name]
+            if topic.name in ADDED and not len(table):
+                continue
             mixed = topic.end == "either"
             rows = np.argsort(table["stamp_ns"], kind="stable") if mixed else slice(None)
             total.update(f"{topic.name} {len(table)}\n".encode())

@@ -130,6 +130,9 @@ _TABLE = (
     Topic("/pid", "cloudrc_msgs/msg/Pid", rec.Control, "cloud",
         "Terms of the controller's velocity command, cloud's clock",
         "waypoint proportional integral derivative"),
+    Topic("/plan", "cloudrc_msgs/msg/PlanFollowed", rec.PlanFollowed, "cloud",
+        "With plans: the position that the plan in use had predicted for the newest odometry,"
+        " cloud's clock"),
     Topic("/mission", "cloudrc_msgs/msg/MissionEvent", rec.MissionEvent, "cloud",
         "An event of the mission, cloud's clock"),
     Topic("/fault", "cloudrc_msgs/msg/Fault", rec.Fault, "either",
@@ -149,6 +152,9 @@ _TABLE = (
 
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _TABLE}
 """Name -> topic, for every topic of a recording."""
+
+ADDED = ("/plan",)
+"""Topics that recordings of version 0.1.0 lack; without rows they do not change a hash."""
 
 VIEWS: dict[str, str] = {
     "/tf": "tf2_msgs/msg/TFMessage",

@@ -32,7 +32,7 @@ def test_plans_predict_to_4_mm_with_fast_gains():
     flight = fly("fast", *settings, "link.profile=paper-p3", "cloud.plan_s=0.4")
     assert flight.verdict.failures == ()
     assert numbers(flight)["prediction_error_rms"] <= 0.004
-    assert numbers(flight)["delay_estimate_error_rms"] <= 1e-9
+    assert "delay_estimate_error_rms" not in numbers(flight), "a plan begins at its horizon"
 
 
 @pytest.mark.parametrize("at", [10.5, 14.0, *nightly(*(6.25 + 0.5 * k for k in range(24)))])

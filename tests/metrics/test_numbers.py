@@ -13,12 +13,14 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.topics import TOPICS
 from cloudrc.records import (
     Arrival,
+    CommandApplied,
     Control,
     Counted,
     Fault,
     GuardChange,
     Lateness,
     MissionEvent,
+    PlanFollowed,
     TelemetrySent,
 )
 from tests.metrics.conftest import (
@@ -31,6 +33,7 @@ from tests.metrics.conftest import (
     flown,
     paper,
     pressing,
+    straight,
     straight_flight,
     touch,
 )
@@ -89,6 +92,17 @@ HOLDS = [
     GuardChange(at(3.5), GuardState.TRACK, "not the start"),
     GuardChange(at(9.5), GuardState.HOLD, "command age"),
 ]
+
+
+def planned():
+    """All commands have plans, which begin 0.1 s early; their position is off at each odometry."""
+    log = flown()
+    log.change(CommandApplied, lambda n, c: c._replace(planned_ns=c.stamp_ns - SECOND // 10))
+    for stamp in range(at(0.0), at(10.0), PERIOD):
+        x, y, z = straight((stamp - START) / SECOND)
+        log.cloud.append(PlanFollowed(stamp + PERIOD, stamp, (x + 0.003, y + 0.004, z)))
+    log.cloud.append(PlanFollowed(at(5.0), at(5.0), (nan, 0.0, 0.0)))  # of a broken plug-in
+    return log.flight()
 
 
 def armed_early():
@@ -213,6 +227,11 @@ NUMBERS = {
     },
     # Time zero stays the first TRACK. The holds last 1.5 s, and 0.5 s to the end.
     lambda: plus(*HOLDS): {"hold_count": 2.0, "hold_time": approx(2.0), "duration": 10.0},
+    planned: {
+        "prediction_error_rms": approx(0.005),  # off by (3, 4, 0) mm
+        "delay_estimate_error_rms": None,
+        "estimate_error_rms": approx(hypot(0.013, 0.004)),
+    },
     armed_early: {
         "duration": approx(10.4),  # the mission began with the telemetry of -0.4 s
         "contact_time": approx(8.4),

@@ -93,6 +93,7 @@ def cloud_records(count, start_ns=0, up_ns=40 * MS):
                 period, 1, n, now - 1, 0.08, 0.07, math.nan, v, v, turn, v, v, 2, v, 0.1, v, v, v
             )
         )
+        records.append(rec.PlanFollowed(period, now, v))
     records.append(rec.MissionEvent(period, "done", 2, "mission done — ça va"))
     records += [rec.Fault(period, "late", ""), rec.Counted(period, "cloud", "", 3)]
     return sorted(records, key=attrgetter("stamp_ns"))
