@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 DURATION_NS = 20_000_000_000
 """Simulated time of the link [ns]."""
+LONG = 3600.0
+"""Duration of a mission that may be meant in milliseconds [s]."""
 SAG_MAX = 0.05
 """Largest steady error of the position that needs no warning [m]."""
 WIND_FORCE = 0.24
@@ -26,6 +28,8 @@ rotors, one third comes from the tilt that this drag causes."""
 
 def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     """Yield a warning for each group of settings that do not fit together."""
+    yield from _loss(experiment)
+    yield from _time(experiment)
     yield from _hover(experiment)
     carrot, cap = experiment.mission.carrot, experiment.guard.speed_max_mps
     if carrot is not None and carrot.speed_mps > cap:
@@ -38,6 +42,40 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     if ages:
         yield from _long_link(experiment, ages, echoes)
         yield from _control(experiment, sum(ages) / len(ages))
+
+
+def _loss(experiment: ResolvedExperiment) -> Iterator[str]:
+    """Yield a warning for each direction whose loss may be meant in percent."""
+    from cloudrc.link.profile import describe_heavy_loss
+    from cloudrc.link.traces import link_profile
+
+    for name, way in (("uplink", experiment.uplink), ("downlink", experiment.downlink)):
+        if heavy := describe_heavy_loss(link_profile(way), name):
+            yield f"{heavy} (link.{name}.loss)"
+
+
+def _time(experiment: ResolvedExperiment) -> Iterator[str]:
+    """Yield a warning if the mission lasts longer than its time limit, or very long."""
+    from cloudrc.assembly import build_plan
+
+    mission, plan = experiment.mission, build_plan(experiment)
+    if plan.track:
+        what, lasts = "the setpoints of mission.setpoints last", plan.track[-1][0]
+    else:
+        what, lasts = (
+            "the dwell times of the mission add up to",
+            sum(leg.dwell for leg in plan.legs),
+        )
+        if mission.steps:
+            what = "the steps of mission.steps last"
+    limit = experiment.criteria.time_limit_s
+    if limit is not None and lasts > limit:
+        yield (
+            f"{what} {lasts:,.6g} s, longer than criteria.time_limit_s {limit:g}; give times in"
+            f" seconds, or a longer limit: --set criteria.time_limit_s={ceil(1.2 * lasts)}"
+        )
+    elif lasts > LONG:
+        yield f"{what} {lasts:,.6g} s: this is {lasts / 3600:.3g} hours; give times in seconds"
 
 
 def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]:

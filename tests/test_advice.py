@@ -53,6 +53,51 @@ def test_what_does_not_fit_is_named_and_the_named_value_fits(settings, words):
         assert list(advise(load_experiment("paper", changed))) == []
 
 
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (["link.uplink.loss=1"], "the uplink loses 100 % of its packets: "),
+        (["link.downlink.loss=0.6"], "the downlink loses 60 % of its packets: "),
+        (["link.uplink.changes=[{at_s: 3, loss: 1}]"], "100 % of its packets at times: "),
+        (["link.uplink.loss={bad_start: 1, bad_end: 0.5}"], "the uplink loses 66.7 % of"),
+        (["link.uplink.loss=0.4", "link.uplink.blackouts=[{start_s: 2, duration_s: 1}]"], ""),
+    ],
+)
+def test_a_loss_that_may_be_meant_in_percent_is_named(settings, words):
+    told = [text for text in advise(load_experiment("paper", settings)) if "1 % is 0.01" in text]
+    assert bool(told) == bool(words)
+    assert all(words in text for text in told)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (["criteria.time_limit_s=60"], "last 9,900 s, longer than criteria.time_limit_s 60;"),
+        (["criteria.time_limit_s=null"], "last 9,900 s: this is 2.75 hours;"),
+        (["criteria.time_limit_s=20000"], "last 9,900 s: this is 2.75 hours;"),
+    ],
+)
+def test_setpoints_with_times_in_milliseconds_are_named(settings, words, tmp_path):
+    rows = [f"{time},0,0,1" for time in (0, 5000, 9900)]
+    (tmp_path / "d.csv").write_text("\n".join(["time_s,x_m,y_m,z_m", *rows]))
+    flown = load_experiment("hover", [f"mission.setpoints={tmp_path / 'd.csv'}", *settings])
+    (text,) = [text for text in advise(flown) if "mission.setpoints" in text]
+    assert words in text
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (["mission.waypoints.0.dwell_s=500"], "dwell times of the mission add up to 500 s, longer"),
+        (["mission=hover", "mission.waypoints.0.dwell_s=5"], ""),
+    ],
+)
+def test_dwell_times_longer_than_the_mission_are_named(settings, words):
+    told = [text for text in advise(load_experiment("hover", settings)) if "dwell" in text]
+    assert bool(told) == bool(words)
+    assert all(words in text for text in told)
+
+
 @pytest.mark.parametrize("profile", shipped.names("profile"))
 def test_each_shipped_profile_is_flown_without_a_warning(profile):
     assert list(advise(load_experiment("paper", [f"link.profile={profile}"]))) == []

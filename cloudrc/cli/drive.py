@@ -10,6 +10,7 @@ import curses
 import select
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from textwrap import wrap
 
@@ -25,15 +26,27 @@ SPEED = 0.5
 FIRST_HOLD, NEXT_HOLD = 0.5, 0.3
 """Time for which a key counts as held after its first press, and after each repetition [s]. Most
 terminals repeat a key first after 0.2 to 0.5 s, and then at least 10 times a second."""
-KEYS: dict[int, tuple[str, Vector]] = {
+KEYS: dict[str | int, tuple[str, Vector]] = {
     curses.KEY_UP: ("x", (SPEED, 0.0, 0.0)),
     curses.KEY_DOWN: ("x", (-SPEED, 0.0, 0.0)),
     curses.KEY_LEFT: ("y", (0.0, SPEED, 0.0)),
     curses.KEY_RIGHT: ("y", (0.0, -SPEED, 0.0)),
-    ord("w"): ("z", (0.0, 0.0, SPEED)),
-    ord("s"): ("z", (0.0, 0.0, -SPEED)),
+    "w": ("z", (0.0, 0.0, SPEED)),
+    "s": ("z", (0.0, 0.0, -SPEED)),
 }
 """Key -> its axis and its velocity [m/s]."""
+PLACES = {
+    **{"ц": "w", "ы": "s", "і": "s", "р": "h", "й": "q", "Ч": "X"},  # noqa: RUF001
+    **{"ς": "w", "σ": "s", "η": "h", "Χ": "X"},  # noqa: RUF001
+}
+"""Letter of a Cyrillic or Greek keyboard -> Latin letter in the same place."""
+PASTE_ON, PASTE_OFF = "\x1b[?2004h", "\x1b[?2004l"
+"""Ask the terminal to mark pasted text, and no longer to mark it."""
+PASTE_BEGINS, PASTE_ENDS = "\x1b[200~", "\x1b[201~"
+PASTE_GAP = 1.0
+"""Longest pause within pasted text [s]; later, a key counts even without the mark of the end."""
+SEQUENCE_MAX = 16
+"""Largest number of characters in a sequence that begins with Esc."""
 HELP = (
     "arrows: x and y, w and s: up and down, space: stop moving, h: hold, q: quit",
     "X (capital): emergency stop, the robot falls",
@@ -47,40 +60,125 @@ def drive(api: Api) -> int:
     steering = Steering(api)
     steering.start()
     try:
+        print(PASTE_ON, end="", flush=True)
         curses.wrapper(_handle_keys, steering, api)
     except curses.error as error:
         raise BadInputError(f"mission drive: {error}; set TERM, for example to xterm") from None
     finally:
+        print(PASTE_OFF, end="", flush=True)
         steering.end_drive()
     print_line("the drive has ended; to see what the robot does next: cloudrc mission status")
     return 0
 
 
+class KeyReader:
+    """Finds keys in what a terminal sends; leaves out pasted text and unknown sequences."""
+
+    def __init__(self) -> None:
+        """Begin outside of pasted text."""
+        self.note = ""  # what was left out, in words
+        self._sequence, self._is_paste, self._until = "", False, 0.0
+
+    def take(self, key: str | int, now: float) -> str | int | None:
+        """Return the key that is meant; None if there is none. `now` is the time [s]."""
+        if now > self._until:
+            self._sequence, self._is_paste = "", False
+        self._until = now + PASTE_GAP
+        if isinstance(key, str) and self._belongs_to_sequence(key):
+            return None
+        self._sequence = ""
+        if self._is_paste:
+            return None
+        self.note = ""
+        return meant_key(key)
+
+    def _belongs_to_sequence(self, key: str) -> bool:
+        """Return whether a character is a part of a sequence; obey the marks of pasted text."""
+        before = self._sequence
+        if key == "\x1b":
+            self._sequence = key
+        elif not before or len(before) >= SEQUENCE_MAX or (len(before) == 1 and key not in "[O"):
+            return False  # Esc with another key means this key
+        else:
+            self._sequence += key
+            if len(before) > 1 and (key.isalpha() or key == "~"):
+                self._end_sequence()
+        return True
+
+    def _end_sequence(self) -> None:
+        if self._sequence == PASTE_BEGINS:
+            self._is_paste, self.note = True, "pasted text has no effect"
+        elif self._sequence == PASTE_ENDS:
+            self._is_paste = False
+        self._sequence = ""
+
+
+def meant_key(key: str | int) -> str | int:
+    """Return the key on a Latin keyboard, of letters the small one; only X differs from x."""
+    if isinstance(key, int):
+        return key
+    latin = PLACES.get(key) or PLACES.get(key.lower()) or key
+    return latin if latin == "X" else latin.lower()
+
+
 def _handle_keys(screen: curses.window, steering: Steering, api: Api) -> None:
     curses.curs_set(0)
+    reader, note = KeyReader(), ""
+    while not _is_gone():
+        for sent in _sent(screen):
+            key = reader.take(sent, time.monotonic())
+            if key == "q":
+                return
+            note = reader.note if key is None else _obey(key, sent, steering)
+        _draw(screen, _lines(steering, api, note))
+
+
+def _sent(screen: curses.window) -> Iterator[str | int]:
+    """Yield what the terminal has sent, after at most 50 ms."""
     screen.timeout(50)
-    while (key := screen.getch()) != ord("q") and not _is_gone():
-        if key in KEYS:
-            axis, velocity = KEYS[key]
-            before = steering.velocity(time.monotonic())
-            is_repeated = any(a == b != 0.0 for a, b in zip(before, velocity, strict=True))
-            steering.hold_key(axis, velocity, NEXT_HOLD if is_repeated else FIRST_HOLD)
-        elif key in (ord(" "), ord("h"), ord("X")):
-            steering.release_keys()
-        if key == ord("h"):
-            steering.ask("holding", "/v1/hold")
-        elif key == ord("X"):
-            steering.stop()
-        screen.erase()
-        height, width = screen.getmaxyx()
-        lines = [part for line in _lines(steering, api) for part in wrap(line, width - 1) or [""]]
-        for row, line in enumerate(lines[:height]):
-            with suppress(curses.error):  # the window was made smaller
-                screen.addnstr(row, 0, line, width - 1, curses.A_BOLD if row == 0 else 0)
-        screen.refresh()
+    with suppress(curses.error):  # nothing more was sent
+        while True:
+            yield screen.get_wch()
+            screen.timeout(0)
 
 
-def _lines(steering: Steering, api: Api) -> list[str]:
+def _obey(key: str | int, sent: str | int, steering: Steering) -> str:
+    """Do what a key means; return a note about the key, "" if it needs none."""
+    if key in KEYS:
+        axis, velocity = KEYS[key]
+        before = steering.velocity(time.monotonic())
+        is_repeated = any(a == b != 0.0 for a, b in zip(before, velocity, strict=True))
+        steering.hold_key(axis, velocity, NEXT_HOLD if is_repeated else FIRST_HOLD)
+    elif key == "X":
+        steering.release_keys()
+        steering.stop()
+        return ""
+    elif key == "h":
+        steering.release_keys()
+        steering.ask("holding", "/v1/hold")
+    elif key == " ":
+        steering.release_keys()
+    elif isinstance(key, int):  # such as a changed size of the window
+        return ""
+    else:
+        also = "; X is the emergency stop (with Caps Lock: x without Shift)" * (key == "x")
+        return f"the key {sent!r} has no meaning{also}"
+    if isinstance(sent, str) and sent.isupper():
+        return "Caps Lock is on: x without Shift is now the emergency stop"
+    return ""
+
+
+def _draw(screen: curses.window, texts: Sequence[str]) -> None:
+    screen.erase()
+    height, width = screen.getmaxyx()
+    lines = [part for text in texts for part in wrap(text, width - 1) or [""]]
+    for row, line in enumerate(lines[:height]):
+        with suppress(curses.error):  # the window was made smaller
+            screen.addnstr(row, 0, line, width - 1, curses.A_BOLD if row == 0 else 0)
+    screen.refresh()
+
+
+def _lines(steering: Steering, api: Api, note: str) -> list[str]:
     """Return the text of the screen, important lines first: a small window cuts off the last."""
     mission, seen = steering.state.get("mission"), steering.state.get("seen")
     text, is_refusal, _ = steering.answer
@@ -94,6 +192,7 @@ def _lines(steering: Steering, api: Api) -> list[str]:
             f"guard: {seen['cause']}, seen {seen['age_s']:.1f} s ago, round trip {rtt}",
         ]
     lines.insert(1, f"refused: {text}" if is_refusal else text)
+    lines[1:1] = [note] if note else []
     lines.append(describe_mission(mission) if mission else "no mission is under way")
     lines += ["", *HELP, f"cloudrc mission drive {api.place or api.url}"]
     return [escape(line) for line in lines]

@@ -47,6 +47,7 @@ from cloudrc.config.schema import (
 from cloudrc.config.setpoints import read_setpoints
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
+from cloudrc.link.profile import describe_heavy_loss
 from cloudrc.link.traces import read_table, read_trace
 
 HORIZON_MAX_S = 1.0
@@ -428,7 +429,11 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
         restart |= keys[0] in TIME_LINE_KEYS
         notes += _drop_from_time_line(document, way, keys[0])
     overrides.apply_overrides(document, changes)
-    values = check_profile(document, _HERE).model_dump(mode="json", exclude_defaults=True)
+    new_profile = check_profile(document, _HERE)
+    for way in DIRECTIONS:
+        if heavy := describe_heavy_loss(getattr(new_profile, way), way):
+            notes.append(heavy)
+    values = new_profile.model_dump(mode="json", exclude_defaults=True)
     words = [f"profile {profile}"] if profile else []
     return Edit(values, ", ".join([*words, *settings]), restart, notes)
 

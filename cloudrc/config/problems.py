@@ -66,7 +66,9 @@ def expectation(model: type[BaseModel], path: KeyPath) -> str:
         return f"must be one of {', '.join(map(repr, get_args(kind)))}"
     words = [_TYPES[plain] for plain in dict.fromkeys(_types(kind)) if plain in _TYPES]
     if words and words[0].endswith("number"):
-        words[0] = " ".join([words[0], " and ".join(dict.fromkeys(_limits(field)))]).strip()
+        limits = " and ".join(dict.fromkeys(_limits(field)))
+        share = "(1 % is 0.01)" if limits == ">= 0 and <= 1" else ""
+        words[0] = " ".join([words[0], limits, share]).strip()
     if any(_models(kind)):
         words.append("a mapping of keys")
     if _is_list(kind) and not path[-1].isdecimal():
