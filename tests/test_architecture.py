@@ -90,7 +90,8 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "subprocess": ("drivers/", "cli/", "cluster/", "world/native/library"),
     "multiprocessing": ("drivers/", "cli/"),
     "concurrent": ("cli/", "cluster/", "teleop/"),
-    **dict.fromkeys(("secrets", "uuid"), ("drivers/", "cluster/", "cli/")),
+    **dict.fromkeys(("secrets", "uuid"), ("console/", "drivers/", "cluster/", "cli/")),
+    "websockets": ("console/handed",),
     **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),
 }
 # Imported package -> its name in pyproject.toml.

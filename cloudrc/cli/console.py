@@ -29,11 +29,13 @@ examples:
   cloudrc console runs/hover-local-seed1 --port 8080 --no-open
   cloudrc console --cluster -n demo      a release with console.enabled=true
   cloudrc console my-release             the same, by the name of the release
+  cloudrc console --allow-origin https://hub.example.org     behind a proxy
 
-The page is served on this machine only. The first browser steers; others read.
-Keys: arrows fly along x and y, W and S up and down, while they are held; Space
-holds; Shift+X stops the rotors. No key turns the robot: the published onboard
-controller holds the yaw at 0."""
+The page is served on this machine only; the printed address has its token. The
+first browser steers, the others read; every page has STOP. Keys: arrows fly
+along x and y, W and S up and down, while they are held; Space holds; Shift+X
+stops the rotors. No key turns the robot: the published onboard controller holds
+the yaw at 0."""
 LINK_SET = "link set "
 """Start of a line that a pod's console prints to request a change of the link."""
 RETRY_PERIOD = 0.2
@@ -53,12 +55,23 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     about = "show the page of a release, and carry out its changes of the link until Ctrl-C"
     add("--cluster", action="store_true", help=about)
     add("--no-open", action="store_true", help="print the page's address, open no browser")
+    about = "origin of a proxy that serves the page, such as https://hub.example.org; repeatable"
+    add("--allow-origin", type=_origin, action="append", default=[], metavar="ORIGIN", help=about)
     release_arguments(parser)
     pod = parser.add_argument_group("in the container of the chart")
     pod.add_argument("--config", type=Path, metavar="FILE", help="experiment file")
     pod.add_argument("--profile", type=Path, metavar="FILE", help="file of the link profile")
     pod.add_argument("--api", metavar="URL", help="the API of teleop")
     token_argument(pod)
+
+
+def _origin(text: str) -> str:
+    from cloudrc.console.access import ORIGIN
+
+    if ORIGIN.fullmatch(text) is None:
+        about = "give scheme and host as the browser shows them, such as https://hub.example.org"
+        raise argparse.ArgumentTypeError(f"'{text}' is no origin; {about}")
+    return text
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -73,7 +86,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.config and not (options.api and options.profile):
         raise BadInputError("--config is for the chart's container: give --api and --profile, too")
     flight = _in_pod(options) if options.config else _local(options)
-    _serve(options.port, flight, with_browser=not (options.no_open or options.config))
+    _serve(options, flight)
     print_line("the flight has ended", sys.stderr)
     return 0
 
@@ -85,13 +98,14 @@ class Flight(NamedTuple):
     api: Api  # of teleop
     link: Link  # reads and changes the link
     has_ended: Callable[[], bool]
+    token: Callable[[], str] | None = None  # of the page; None: a new one, which is printed
 
 
-def _serve(port: int, flight: Flight, *, with_browser: bool) -> None:
+def _serve(options: argparse.Namespace, flight: Flight) -> None:
     with ExitStack() as opened:
         from cloudrc.console.page import Page
 
-        page = Page(port)
+        page = Page(options.port, flight.token, options.allow_origin)
         opened.callback(page.close)
         config = opened.enter_context(flight.config.open())
         try:
@@ -101,8 +115,11 @@ def _serve(port: int, flight: Flight, *, with_browser: bool) -> None:
             raise BadInputError(text) from None
         except OSError:  # a network file system may refuse the lock: then nothing is checked
             pass
-        print_line(f"console: {page.url}")
-        if with_browser:
+        if flight.token:  # the log of a pod is read by many
+            print_line(f"console: port {page.port}; to open it: cloudrc console --cluster")
+        else:
+            print_line(f"console: {page.url}")
+        if not (options.no_open or options.config):
             open_page(page.url)
         from cloudrc.config.load import read_experiment
         from cloudrc.console.feed import FlightFeed
@@ -153,6 +170,7 @@ def _in_pod(options: argparse.Namespace) -> Flight:
     operator asks for, and `cloudrc console --cluster` carries them out with its user's rights.
     """
     from cloudrc.config.document import read_document
+    from cloudrc.console.access import page_token
     from cloudrc.console.steering import Link
 
     own: dict[str, tuple[float, float]] = {}  # key -> last requested value, and when [s]
@@ -170,9 +188,16 @@ def _in_pod(options: argparse.Namespace) -> Flight:
         own.update({key: (float(value), time.monotonic()) for key, value in pairs})
         print_line(f"{LINK_SET}{' '.join(settings)}")
 
-    api = Api(options.api, token_reader(token_file(options)))
+    file = token_file(options)
+    operator = token_reader(file)
     note = " requested; only 'cloudrc console --cluster' carries it out"
-    return Flight(options.config, api, Link(read, change, note), lambda: False)
+    return Flight(
+        options.config,
+        Api(options.api, operator),
+        Link(read, change, note),
+        has_ended=lambda: False,
+        token=(lambda: page_token(operator())) if file else None,
+    )
 
 
 def _show_release(options: argparse.Namespace) -> int:
@@ -180,10 +205,16 @@ def _show_release(options: argparse.Namespace) -> int:
     if options.run:
         raise BadInputError("RUN names a run here, the other flags a cluster; give one")
     release = release_from_flags(options)
+    if options.allow_origin:
+        raise BadInputError("--allow-origin: not with a release, whose page no proxy serves")
     from cloudrc.cluster.link import keep, read_link, send
-    from cloudrc.cluster.pods import follow_page
+    from cloudrc.cluster.pods import follow_page, operator_token
+    from cloudrc.console.access import PARAMETER, page_token
 
-    def ready(url: str) -> None:
+    def ready(address: str) -> None:
+        file = token_file(options)
+        operator = token_reader(file)() if file else operator_token(release)
+        url = f"{address}/?{PARAMETER}={page_token(operator)}"
         print_line(f"console: {url}")
         if not options.no_open:
             open_page(url)

@@ -1,16 +1,20 @@
 """Serve the console's page: all browsers show the flight, one browser can control it.
 
-viser draws and serves the page. It reports the release of a button, but not the release of a key.
-Therefore, while the user holds a key, a script on the page holds the button of the same direction.
+The door (`console/door.py`) serves the page and its STOP, viser draws the scene and the panels.
+viser reports the release of a button, but not the release of a key. Therefore, while the user holds
+a key, a script of the page (`console/web/scene.js`) holds the button of the same direction.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import suppress
+from functools import partial
 from math import inf
+from pathlib import Path
+from secrets import token_hex
 from typing import Any
 
 import numpy as np
@@ -18,9 +22,11 @@ import rich
 import viser
 
 from cloudrc.config.load import ResolvedExperiment
+from cloudrc.console.access import PARAMETER, Access
+from cloudrc.console.door import Desk, Door, scene_page
 from cloudrc.console.feed import STALE, FlightFeed
+from cloudrc.console.handed import viser_behind
 from cloudrc.console.steering import SLIDERS, Steering, is_drive
-from cloudrc.errors import BadInputError
 from cloudrc.geometry import fence
 from cloudrc.geometry.clearance import Array
 from cloudrc.geometry.scene import SPAWN, load_scene
@@ -32,8 +38,6 @@ ANSWER_SHOWN = 8.0
 """Time for which an answer is shown [s]."""
 PANEL_WIDTH = 330
 """Width of each panel beside the scene [px]."""
-NARROW = 900
-"""Width of the window below which the charts start collapsed [px]."""
 ASPECT = (1280 - 2 * PANEL_WIDTH) / 800
 """Width divided by height of the scene between the panels, in a window of 1280 x 800 px."""
 BLUE, RED, GREEN = "#0072b2", "#d55e00", "#009e73"
@@ -56,64 +60,42 @@ KEYS: dict[str, tuple[str, Vector]] = {
 """Key, as browsers name it -> label of its button, and direction of the drive."""
 RELEASED = 0.3
 """Time after the last call from a held button at which its key counts as released [s]."""
-STOP, HOLD = "STOP", "Hold"
-SCRIPT = """
-const drive = %s;
-const find = text =>
-  [...document.querySelectorAll('button')].find(b => b.textContent.trim() === text);
-const press = (kind, code) => find(drive[code])?.dispatchEvent(
-  new PointerEvent(kind, {bubbles: true, button: 0, pointerId: 9}));
-const held = new Set();
-const release = code => held.delete(code) && (press('pointerup', code), find(drive[code])?.click());
-const seize = e => (e.preventDefault(), e.stopImmediatePropagation());
-document.title = 'cloudrc';
-if (!window.cloudrc) {
-  window.cloudrc = true;
-  if (innerWidth < %d) document.querySelector('[aria-label="Collapse panel area"]')?.click();
-  window.addEventListener('keydown', e => {
-    if (e.ctrlKey || e.altKey || e.metaKey || !find('STOP')) return;
-    if (e.code === 'KeyX' && e.shiftKey) return seize(e), find('STOP').click();
-    if (e.target.closest('input, textarea')) return;
-    if (e.code === 'Space') return seize(e), e.repeat || find('Hold').click();
-    if (!(e.code in drive)) return;
-    seize(e);
-    if (!held.has(e.code)) held.add(e.code), press('pointerdown', e.code);
-  }, true);
-  window.addEventListener('keyup', e => {
-    if (e.code in drive || e.code === 'Space') seize(e), release(e.code);
-  }, true);
-  window.addEventListener('blur', () => [...held].forEach(release));
-}"""
-STYLE = """
-button[style*='red-filled'] {height: 60px !important; font-size: 24px; letter-spacing: 3px;
-  background: #c4140c !important}
-div:has(> button[style*='red-filled']) {position: sticky; top: 0; z-index: 9}
-div:has(> button[style*='gray-filled']) {display: inline-block; width: 33.3%;
-  margin: 0 !important; padding: 0 6px 6px !important}
-div:has(+ div button[style*='red-filled']):not(:has(canvas)) {pointer-events: none;
-  & :is(button, [role='button']) {visibility: hidden}}
-.mantine-Notifications-root {z-index: 4 !important}
-"""
-"""Looks of the buttons. Of the last two rules, the first keeps the panel of STOP from being
-collapsed or moved, the second keeps notifications from covering STOP."""
+HOLD = "Hold"
+BELOW_STOP = '<div style="height: 36px"></div>'
+"""Keeps the panel's first lines below STOP, which lies over the panel."""
 
 
 class Page:
     """The console's web page of one flight, at `url`; this process is its server."""
 
-    def __init__(self, port: int) -> None:
-        """Serve a page on this machine only; port 0 means any free port.
+    def __init__(
+        self,
+        port: int,
+        token: Callable[[], str] | None = None,
+        origins: Collection[str] = (),
+    ) -> None:
+        """Serve a page on this machine only.
+
+        Args:
+            port: TCP port; 0 means any free port.
+            token: Function that returns the page's present token; None makes one.
+            origins: Origins of proxies that may serve the page.
 
         Raises:
-            BadInputError: If another program uses the port.
+            BadInputError: If the port cannot be opened.
         """
+        own = token_hex(16)
+        self._access = Access(token or (lambda: own), origins)
+        acts = {name.lower(): partial(self._answer, act) for name, act in self._acts().items()}
+        desk = Desk(self._stop, acts, self._describe_plainly, lambda: self._pilot is not None)
+        self._filled = threading.Event()
+        viser_page = Path(viser.__file__).parent / "client" / "build" / "index.html"
+        labels = {code: label for code, (label, _) in KEYS.items()}
+        scene = scene_page(viser_page.read_text(encoding="utf-8"), labels)
+        self._door = Door(port, self._access, desk, scene)
         rich.get_console().quiet = True  # viser prints about itself
-        self._server = viser.ViserServer("127.0.0.1", port, label="cloudrc", verbose=False)
-        found = self._server.get_port()
-        if found != port and port:  # viser has taken the next free port
-            self._server.stop()
-            raise BadInputError(f"--port {port}: is in use; name another port, or none")
-        self.url = f"http://127.0.0.1:{found}"
+        with viser_behind(self._door.pages, self._door.count_out):
+            self._server = viser.ViserServer("127.0.0.1", 0, label="cloudrc", verbose=False)
         self._server.gui.configure_theme(show_share_button=False, show_logo=False)
         self._lock = threading.Lock()
         self._pilot: int | None = None  # the client that has the controls
@@ -122,6 +104,17 @@ class Page:
         self._sliders: dict[str, Any] = {}
         self._target: tuple[Any, Any] | None = None  # gizmo and its numbers, until somebody moves
         self._drawn = 0  # number of drawn points of the trail
+        self._door.start()
+
+    @property
+    def port(self) -> int:
+        """The TCP port of the page."""
+        return self._door.address[1]
+
+    @property
+    def url(self) -> str:
+        """The page's address, with the token."""
+        return f"http://127.0.0.1:{self.port}/?{PARAMETER}={self._access.token()}"
 
     def fill(self, experiment: ResolvedExperiment, feed: FlightFeed, steering: Steering) -> None:
         """Build the scene and the panels; only one browser at a time gets the controls."""
@@ -132,6 +125,7 @@ class Page:
         gui = self._server.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_WIDTH)
+        gui.add_html(BELOW_STOP, order=-1)
         self._status = gui.add_markdown("waiting for the robot", order=2)
         if load_scene(experiment.world.scene).pipes:
             gui.add_html(LEGEND, order=2.5)
@@ -142,6 +136,7 @@ class Page:
         panel.set_width(PANEL_WIDTH)
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(self._succeed)
+        self._filled.set()
 
     def update(self, now: float) -> None:
         """Show the present state; `now` is the time [s], on the clock of the feed."""
@@ -176,7 +171,14 @@ class Page:
 
     def close(self) -> None:
         """Stop serving the page."""
+        self._door.close()
         self._server.stop()
+
+    def _stop(self) -> bool:
+        """Stop the rotors, do not wait; return False before the page is filled."""
+        if self._filled.is_set():
+            self._steering.stop()
+        return self._filled.is_set()
 
     def _add_chart(self, title: str) -> Any:
         _, span, curves = CHARTS[title]
@@ -259,16 +261,7 @@ class Page:
             self._welcome(other)
 
     def _add_controls(self, client: viser.ClientHandle) -> None:
-        gui, steering = client.gui, self._steering
-        script = SCRIPT % ({code: label for code, (label, _) in KEYS.items()}, NARROW)
-        shown = script.replace("&", "&amp;").replace('"', "&quot;")
-        gui.add_html(f'<style onload="{shown}">{STYLE}</style>', order=9)
-        stop = gui.add_button(STOP, color="red", order=0, hint="Stop the rotors (Shift+X)")
-
-        @stop.on_click
-        async def _(_: object) -> None:  # in the server's loop: it does not wait for other calls
-            steering.stop()
-
+        gui = client.gui
         tabs = gui.add_tab_group(order=3)
         with tabs.add_tab("Fly"):
             self._add_mission(gui)
@@ -278,14 +271,7 @@ class Page:
             self._add_link(gui)
 
     def _add_mission(self, gui: viser.GuiApi) -> None:
-        steering = self._steering
-        acts: dict[str, Callable[[], object]] = {
-            "Start": self._start_mission,
-            HOLD: lambda: steering.ask("holding", "/v1/hold"),
-            "Resume": steering.resume,
-            "Cancel": steering.cancel,
-            "Acknowledge": lambda: steering.ask("acknowledged", "/v1/acknowledge"),
-        }
+        acts = self._acts()
         names = list(acts)
         for label, some in (("Mission", names[:3]), (" ", names[3:])):
             group = gui.add_button_group(label, some)
@@ -293,6 +279,31 @@ class Page:
             @group.on_click
             def _(event: Any) -> None:
                 acts[event.target.value]()
+
+    def _acts(self) -> dict[str, Callable[[], object]]:
+        """Return the label of each button of a mission, and what it does."""
+        return {
+            "Start": self._start_mission,
+            HOLD: lambda: self._steering.ask("holding", "/v1/hold"),
+            "Resume": lambda: self._steering.resume(),
+            "Cancel": lambda: self._steering.cancel(),
+            "Acknowledge": lambda: self._steering.ask("acknowledged", "/v1/acknowledge"),
+        }
+
+    def _answer(self, act: Callable[[], object]) -> str:
+        """Do what a button of the plain page asks for; return the answer in words."""
+        if not self._filled.is_set():
+            return "the console starts; ask again"
+        act()
+        text, is_refusal, _ = self._steering.answer
+        return f"Refused: {text}" if is_refusal else text
+
+    def _describe_plainly(self) -> list[str]:
+        """Return the lines of the state, without marks."""
+        if not self._filled.is_set():
+            return ["the console starts"]
+        text = self._describe(time.monotonic()).replace("**", "")
+        return text.split("  \n")
 
     def _start_mission(self) -> None:
         experiment, mission = self._experiment, self._experiment.mission

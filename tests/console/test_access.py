@@ -1,0 +1,231 @@
+"""The console answers its own page with its token, nobody else: over HTTP and by WebSocket."""
+
+import base64
+import socket
+
+import pytest
+
+from cloudrc.cli import console
+from cloudrc.config.load import load_experiment
+from cloudrc.console.access import ORIGIN, Access, page_token, parse_head
+from cloudrc.console.feed import FlightFeed
+from cloudrc.console.page import Page
+from cloudrc.console.steering import Steering
+from cloudrc.geometry.scene import Scene
+
+TOKEN = "0123456789abcdef" * 2
+PROXY = "https://hub.example.org"
+
+
+@pytest.fixture(scope="module")
+def served():
+    """A page with a token, behind a proxy or not; and an API that notes what it is asked for."""
+    posted = []
+
+    class Api:
+        def post(self, path, body=None):
+            posted.append(path)
+
+    page = Page(0, lambda: TOKEN, [PROXY])
+    page.fill(load_experiment("hover"), FlightFeed(Scene("empty")), Steering(Api()))
+    yield page, posted
+    page.close()
+
+
+def ask(page, lines, target="/", method="GET", *, upgrade=False):
+    """Send a request with these header lines; return the status of the answer and its head."""
+    head = [f"{method} {target} HTTP/1.1", *lines]
+    if upgrade:
+        key = base64.b64encode(bytes(16)).decode()
+        head += ["Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"]
+        head += [f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Protocol: viser-v1.1.1"]
+    with socket.create_connection(("127.0.0.1", page.port), 10) as connection:
+        connection.sendall(("\r\n".join(head) + "\r\n\r\n").encode("latin-1"))
+        said = connection.recv(65_536).decode("latin-1")
+    return int(said.split(" ")[1]), said.partition("\r\n\r\n")[0]
+
+
+def both_doors(page, lines, query=""):
+    """Return the statuses of the two doors: the page over HTTP, and its WebSocket."""
+    target = f"/{query}"
+    return ask(page, lines, target)[0], ask(page, lines, target, upgrade=True)[0]
+
+
+def names(page):
+    """Return the own host, and the line of the cookie with the token."""
+    return f"127.0.0.1:{page.port}", f"Cookie: {page._access.cookie}={TOKEN}"
+
+
+def foreign_origins(port):
+    own = f"http://127.0.0.1:{port}"
+    return [
+        *("https://example.org", "http://example.org", f"http://example.org:{port}"),
+        *("null", "", "*", "about:blank", "file://", "data:", "blob:", "undefined", "none"),
+        *(f"https://127.0.0.1:{port}", f"ws://127.0.0.1:{port}", f"wss://127.0.0.1:{port}"),
+        *("http://127.0.0.1", "http://127.0.0.1:1", f"http://127.0.0.1:{port}0"),
+        *(f"{own}/", f"{own}/x", f"{own}?", f"{own}#", f"{own},{own}", f"{own} {own}"),
+        *(f"HTTP://127.0.0.1:{port}", f"127.0.0.1:{port}", f"//127.0.0.1:{port}"),
+        *(f"http://127.0.0.1.:{port}", f"http://127.0.0.1.example.org:{port}"),
+        *(f"http://user@127.0.0.1:{port}", f"http://127.0.0.1:{port}@example.org"),
+        *(f"http://example.org/127.0.0.1:{port}", f"http://127.0.0.1%2eexample.org:{port}"),
+        *(f"http://2130706433:{port}", f"http://0x7f000001:{port}", f"http://127.1:{port}"),
+        *(f"http://0177.0.0.1:{port}", f"http://127.0.0.2:{port}", f"http://0.0.0.0:{port}"),
+        *(f"http://[::1]:{port}", f"http://[::ffff:127.0.0.1]:{port}", f"http://[::]:{port}"),
+        *(f"http://localhost:{port}", f"http://localhost.:{port}", f"http://LOCALHOST:{port}"),
+        *(f"http://x.localhost:{port}", f"http://localhost.example.org:{port}"),
+        *(f"http://\xb9\xb227.0.0.1:{port}", f"http://127.0.0.1:0{port}"),
+        *("http://hub.example.org", f"{PROXY}:443", f"{PROXY}/", "https://hub.example.org."),
+        *("https://x.hub.example.org", "https://hub.example.org.evil.example"),
+        *("https://evil-hub.example.org", "https://HUB.example.org", "https://hub_example.org"),
+        "chrome-extension://abcdefghijklmnop",
+    ]
+
+
+def foreign_hosts(port):
+    return [
+        *("example.org", f"example.org:{port}", "", " ", ":", f":{port}", "*", "null"),
+        *(f"127.0.0.1.:{port}", f"localhost.:{port}", f"LOCALHOST:{port}", f"x.localhost:{port}"),
+        *(f"127.0.0.1.example.org:{port}", f"localhost.example.org:{port}"),
+        *(f"user@127.0.0.1:{port}", f"127.0.0.1:{port}@example.org", f"127.0.0.1:{port}/"),
+        *(f"2130706433:{port}", f"0x7f000001:{port}", f"127.1:{port}", f"0177.0.0.1:{port}"),
+        *(f"127.0.0.2:{port}", f"0.0.0.0:{port}", f"[::1]:{port}", f"[::ffff:127.0.0.1]:{port}"),
+        *(f"[::ffff:7f00:1]:{port}", f"::1:{port}", f"127.0.0.1:{port},example.org"),
+        *(f"127.0.0.1:{port} example.org", "127.0.0.1:", "127.0.0.1:x", "127.0.0.1:123456"),
+        *(
+            f"http://127.0.0.1:{port}",
+            f"127.0.0.1%00:{port}",
+            f"\xb9\xb227.0.0.1:{port}",
+        ),
+        *("hub.example.org:8000", "x.hub.example.org", "hub.example.org.", "HUB.example.org"),
+    ]
+
+
+WRONG_TOKENS = [
+    *("", "x", "null", "undefined", "0", "*", TOKEN[:-1], f"{TOKEN}0", TOKEN.upper(), TOKEN[::-1]),
+    *(f" {TOKEN}", f"{TOKEN}%20", f"%20{TOKEN}", f"{TOKEN}%00", f"+{TOKEN}", f'"{TOKEN}"'),
+    *(f"%30{TOKEN[1:]}", "".join(f"%{ord(each):02x}" for each in TOKEN), f"{TOKEN};", f"{TOKEN}#"),
+    *(f"{TOKEN}&token=", f"{TOKEN}&token=x", f"x&token={TOKEN}", f"{TOKEN},{TOKEN}", "0" * 32),
+    *(f"token={TOKEN}", f"{TOKEN}/", f"\xe9{TOKEN}", "0" * 12_000),
+]
+
+
+def test_the_own_page_connects_with_the_token(served):
+    page, _ = served
+    own, cookie = names(page)
+    for host, origin in (
+        (own, None),
+        (own, f"http://{own}"),
+        ("localhost:8000", "http://localhost:8000"),  # a tunnel
+        ("127.0.0.1", "http://127.0.0.1"),
+        ("hub.example.org", PROXY),
+        ("hub.example.org", None),
+        (own, PROXY),  # a proxy that changes the host
+    ):
+        lines = [f"Host: {host}", cookie, *([f"Origin: {origin}"] if origin else [])]
+        assert both_doors(page, lines) == (200, 101), lines
+        assert ask(page, lines[:1] + lines[2:], f"/?token={TOKEN}", upgrade=True)[0] == 101
+    cookies = f"Cookie: theme=dark; {cookie.removeprefix('Cookie: ')}; cloudrc-0123=x"
+    assert both_doors(page, [f"Host: {own}", cookies]) == (200, 101)
+
+
+def test_no_foreign_origin_host_or_token_connects(served):
+    """More than 100 shapes; each has everything right but the one."""
+    page, _ = served
+    own, cookie = names(page)
+    host, origin = f"Host: {own}", f"Origin: http://{own}"
+    shapes = [([host, cookie, f"Origin: {each}"], "") for each in foreign_origins(page.port)]
+    shapes += [([f"Host: {each}", cookie], "") for each in foreign_hosts(page.port)]
+    shapes += [([host, origin], f"?token={each}") for each in WRONG_TOKENS]
+    name = page._access.cookie
+    shapes += [
+        ([host, origin, f"Cookie: {name}={each}"], "") for each in WRONG_TOKENS if each[-1:] != ";"
+    ]
+    shapes += [
+        ([host, origin], ""),
+        ([host, origin, "Cookie: "], ""),
+        ([host, origin, f"Cookie: cloudrc-000000000000={TOKEN}"], ""),  # of another console
+        ([host, origin, f"Cookie: cloudrc={TOKEN}; token={TOKEN}; {name.upper()}={TOKEN}"], ""),
+        ([host, origin, f"Cookie: {name}={TOKEN}; {name}=x"], ""),
+        ([host, origin, f"Cookie: {name}={TOKEN}", f"Cookie: {name}=x"], ""),
+        ([host, origin, f"Authorization: token {TOKEN}", f"X-Token: {TOKEN}"], ""),
+        ([host, origin], f"?TOKEN={TOKEN}&Token={TOKEN}"),
+        ([host, origin], f"?x?token={TOKEN}"),
+        ([host, origin], f"token={TOKEN}"),
+        ([cookie, origin], ""),  # no host
+        ([cookie, host, host], ""),
+        ([cookie, host, "Host: example.org"], ""),
+        ([cookie, "Host: example.org", host], ""),
+        ([cookie, host, origin, origin], ""),
+        ([cookie, host, origin, "Origin: https://example.org"], ""),
+        ([cookie, host, "Origin: https://example.org", origin], ""),
+        ([cookie, host, f"Origin: http://{own}", " https://example.org"], ""),  # folded
+        ([cookie, host, "Origin : https://example.org"], ""),
+        ([cookie, "Host: example.org", f"X-Forwarded-Host: {own}", f"Forwarded: host={own}"], ""),
+        ([cookie, "Host: hub.example.org", f"Origin: http://{own}"], ""),
+        ([cookie, "Host: hub.example.org", "Origin: http://hub.example.org"], ""),
+    ]
+    assert len(shapes) > 100
+    accepted = [shape for shape in shapes if {*both_doors(page, *shape)} & {101, 200, 202, 303}]
+    assert not accepted
+
+
+def test_a_foreign_page_cannot_stop_and_the_own_page_can(served):
+    page, posted = served
+    own, cookie = names(page)
+    for lines in (
+        [f"Host: {own}", cookie, "Origin: https://example.org"],
+        [f"Host: {own}", f"Origin: http://{own}"],
+        ["Host: example.org", cookie],
+    ):
+        assert ask(page, lines, "/stop", "POST")[0] == 403
+        assert ask(page, lines, "/hold", "POST")[0] == 403
+        assert ask(page, lines, "/state")[0] == 403
+    assert ask(page, [f"Host: {own}", cookie], "/stop")[0] == 404, "no link stops"
+    assert not page._steering._stops.is_set()
+    assert ask(page, [f"Host: {own}", cookie, f"Origin: http://{own}"], "/stop", "POST")[0] == 202
+    assert page._steering._stops.is_set()
+    assert posted == []  # the thread that asks the API does not run here
+
+
+def test_the_token_moves_from_the_address_to_a_cookie_of_this_console(served):
+    page, _ = served
+    host = f"Host: 127.0.0.1:{page.port}"
+    status, head = ask(page, [host], f"/?fixedDpr=0.25&token={TOKEN}")
+    assert status == 303
+    assert "Location: ./?fixedDpr=0.25\r\n" in head
+    assert f"Set-Cookie: {page._access.cookie}={TOKEN}; HttpOnly; SameSite=Lax\r\n" in head
+    assert "Path=" not in head, "behind a proxy, the browser takes the path of the page"
+    assert Access(lambda: TOKEN[::-1]).cookie != page._access.cookie
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        *("", "GET /", "GET / HTTP/1.0", "GET / HTTP/2", "GET  / HTTP/1.1", "GET x HTTP/1.1"),
+        *("GET / HTTP/1.1\r\nHost", "GET / HTTP/1.1\r\n a: b", "GET / HTTP/1.1\r\na\nb: c"),
+        *("GET / HTTP/1.1\r\na: b\nHost: c", "GET / HTTP/1.1\r\na: b\x00", "GET /\xe9 HTTP/1.1"),
+        "G(T / HTTP/1.1",
+    ],
+)
+def test_a_request_that_is_not_valid_is_refused(head):
+    with pytest.raises(ValueError, match="no request"):
+        parse_head(head.encode("latin-1"))
+
+
+@pytest.mark.parametrize(
+    "origin",
+    ["hub.example.org", "https://hub.example.org/", "https://", "*", "null", "https://HUB.org", ""],
+)
+def test_allow_origin_asks_for_an_origin(refused, origin):
+    assert "is no origin; give scheme and host" in refused("console --allow-origin", origin)
+    assert ORIGIN.fullmatch("https://hub.example.org:8443")
+
+
+def test_the_token_of_a_release_s_page_follows_from_that_of_its_api(tmp_path):
+    secret = tmp_path / "operator"
+    secret.write_text("o" * 32)
+    assert page_token("o" * 32) != page_token("p" * 32)
+    assert "o" * 8 not in page_token("o" * 32)
+    flags = {"config": secret, "profile": secret, "api": "http://127.0.0.1:1"}
+    options = type("Options", (), {**flags, "token_file": secret})
+    assert console._in_pod(options).token() == page_token("o" * 32)

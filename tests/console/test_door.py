@@ -1,0 +1,207 @@
+"""The door answers without viser: STOP, the plain page, and what a browser may send."""
+
+import json
+import os
+import socket
+import threading
+import time
+import urllib.error
+import urllib.request
+from contextlib import ExitStack
+
+import msgspec
+import pytest
+import viser
+import websockets.asyncio.server
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from cloudrc.config.load import load_experiment
+from cloudrc.console import door, handed
+from cloudrc.console.door import scene_page
+from cloudrc.console.feed import FlightFeed
+from cloudrc.console.handed import HandedSockets, viser_behind
+from cloudrc.console.page import Page
+from cloudrc.console.steering import Steering
+from cloudrc.errors import BadInputError
+from cloudrc.geometry.scene import Scene
+from tests.conftest import wait_until
+
+VERSION = f"viser-v{viser.__version__}"
+
+
+@pytest.fixture
+def page(api):
+    api.answers["/v1/state"] = {"mission": None, "seen": {"next_step": "start a mission"}}
+    page = Page(0)
+    steering = Steering(api)
+    steering.watch()
+    page.fill(load_experiment("hover"), FlightFeed(Scene("empty")), steering)
+    yield page
+    page.close()
+
+
+def call(page, path, method="GET"):
+    """Send a request with the token in the cookie; return status and body."""
+    headers = {"Cookie": f"{page._access.cookie}={page._access.token()}"}
+    url = f"http://127.0.0.1:{page.port}/{path}"
+    request = urllib.request.Request(url, method=method, headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=10) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode()
+
+
+def scene(page):
+    """Open the WebSocket of a page with the scene."""
+    url = page.url.replace("http://", "ws://")
+    return connect(url, subprotocols=[VERSION], max_size=None, compression=None, proxy=None)
+
+
+def read_to_the_end(connection):
+    while connection.recv(timeout=10):
+        pass
+
+
+def resident():
+    """Return the memory of this process [MB]."""
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") * 1e-6
+
+
+def test_stop_does_not_wait_for_viser(page):
+    """viser's loop stands still, as if it drew for many pages."""
+    over = threading.Event()
+    page._server.get_event_loop().call_soon_threadsafe(over.wait)
+    try:
+        assert call(page, "stop", "POST")[0] == 202
+        assert page._steering._stops.is_set()
+        assert call(page, "plain")[0] == 200
+        assert '<form id="stop"' in call(page, "")[1], "the page with the scene has STOP itself"
+    finally:
+        over.set()
+
+
+def test_stop_does_not_wait_for_a_request_without_an_end(page):
+    with ExitStack() as stack:
+        for _ in range(100):
+            other = socket.create_connection(("127.0.0.1", page.port))
+            stack.enter_context(other).sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1")
+        began = time.monotonic()
+        assert call(page, "stop", "POST")[0] == 202
+        assert time.monotonic() - began < 2.0
+
+
+def test_a_request_without_an_end_is_ended(page, monkeypatch):
+    monkeypatch.setattr(door, "HEAD_TIME", 0.1)
+    with socket.create_connection(("127.0.0.1", page.port), 10) as other:
+        other.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1")
+        with pytest.raises(ConnectionResetError):
+            other.recv(100)
+    with socket.create_connection(("127.0.0.1", page.port), 10) as other:
+        other.sendall(b"GET / HTTP/1.1\r\nA: " + b"a" * door.HEAD_MAX)
+        assert b" 400 " in other.recv(100)
+
+
+def test_stop_before_the_console_is_ready_is_asked_again(api):
+    page = Page(0)
+    try:
+        assert call(page, "stop", "POST")[0] == 503
+        assert json.loads(call(page, "state")[1])["lines"] == ["the console starts"]
+        assert call(page, "hold", "POST")[1] == "the console starts; ask again"
+    finally:
+        page.close()
+
+
+def test_the_plain_page_shows_the_state_and_its_buttons_act(page, api):
+    assert "waiting for the robot" in call(page, "plain")[1]
+    state = json.loads(call(page, "state")[1])
+    assert state["acts"] == ["start", "hold", "resume", "cancel", "acknowledge"]
+    assert call(page, "hold", "POST") == (200, "holding")
+    assert api.posted == [("/v1/hold", None)]
+    api.refused["/v1/resume"] = "nothing is held"
+    assert call(page, "resume", "POST") == (200, "Refused: nothing is held")
+    assert call(page, "fly", "POST")[0] == 404
+    page._pilot = 0  # a page with the scene steers
+    assert call(page, "hold", "POST")[0] == 409
+    state = json.loads(call(page, "state")[1])
+    assert (state["acts"], state["lines"][0][:9]) == ([], "Read only")
+    assert call(page, "stop", "POST")[0] == 202
+
+
+def test_some_pages_have_the_scene_and_every_further_one_the_plain_page(page, monkeypatch):
+    monkeypatch.setattr(door, "PAGES_MAX", 2)
+    with scene(page) as first:
+        with scene(page):
+            assert 'id="acts"' in call(page, "")[1]
+            with pytest.raises(InvalidStatus, match="503"):
+                scene(page)
+            assert call(page, "stop", "POST")[0] == 202
+        wait_until(lambda: "root" in call(page, "")[1])
+        with scene(page) as second:
+            assert first.recv()
+            assert second.recv()
+
+
+def test_a_message_is_at_most_one_megabyte_and_memory_is_bounded(page):
+    """An unfinished frame of 48 MB is refused at its head; one below 1 MB ends by its limit."""
+    before = resident()
+    with ExitStack() as stack:
+        pages = [stack.enter_context(scene(page)) for _ in range(12)]
+        for each in pages:
+            each.socket.sendall(b"\x82\xff" + (48 << 20).to_bytes(8, "big") + bytes(4))
+        for each in pages:
+            with pytest.raises(ConnectionClosed, match="1009"):
+                read_to_the_end(each)
+    assert resident() - before < 50
+    wait_until(lambda: page._door._open == 0)
+
+
+@pytest.mark.parametrize(
+    "start", [b"\x82\xff" + (1 << 19).to_bytes(8, "big") + bytes(99), b"\x02\x80" + bytes(4)]
+)
+def test_an_unfinished_message_ends_the_connection(page, monkeypatch, start):
+    """A frame without its end, and a message without its last frame."""
+    monkeypatch.setattr(handed, "MESSAGE_TIME", 0.1)
+    with scene(page) as one:
+        one.socket.sendall(start)
+        with pytest.raises(ConnectionClosed):
+            read_to_the_end(one)
+
+
+def test_parts_of_many_messages_are_not_an_unfinished_one(page, monkeypatch):
+    """Each packet has the end of a message and the start of the next."""
+    monkeypatch.setattr(handed, "MESSAGE_TIME", 0.2)
+    body = msgspec.msgpack.encode({"type": "ReplayDoneMessage"})
+    message = bytes([0x82, 0x80 + len(body)]) + bytes(4) + body  # masked with 0
+    with scene(page) as one:
+        one.socket.sendall(message[:4])
+        for _ in range(8):
+            time.sleep(0.05)
+            one.socket.sendall(message[4:] + message[:4])
+        assert one.recv(timeout=10)
+
+
+def test_viser_uses_the_replaced_server():
+    """If a new viser opens its port in another way, its port would be open to everybody."""
+    listener = HandedSockets(("127.0.0.1", 1))
+    with viser_behind(listener, lambda: None):
+        server = viser.ViserServer(verbose=False)
+    assert server.get_port() == 1, "it has opened no port"
+    server.stop()
+    assert websockets.asyncio.server.serve is handed._serve
+    with (
+        pytest.raises(RuntimeError, match=r"see cloudrc/console/handed\.py"),
+        viser_behind(listener, lambda: None),
+    ):
+        pass
+    with pytest.raises(RuntimeError, match="viser's page"):
+        scene_page("<html></html>", {})
+
+
+def test_a_port_in_use_is_an_error():
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(BadInputError, match=f"--port {port}: is in use"):
+            Page(port)
