@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from pathlib import Path
+from typing import NamedTuple
 
 from cloudrc import __version__
 from cloudrc.cli.cluster_flags import release_arguments
@@ -30,12 +31,32 @@ examples:
   cloudrc sweep run grid.yaml --on kubernetes --shards 8 -n lab
 
 docs/sweeps.md describes the file of a sweep and the shards of a cluster."""
-ARRAYS = {
-    "SLURM_ARRAY_TASK_ID": ("SLURM_ARRAY_TASK_COUNT", "SLURM_ARRAY_TASK_MIN"),
-    "JOB_COMPLETION_INDEX": ("JOB_COMPLETIONS", ""),
-}
-"""Environment variable with the index of a process -> variables with the number of processes and
-with the first index ("": it is 0)."""
+
+
+class JobArray(NamedTuple):
+    """The environment variables in which a scheduler numbers the jobs of an array ("": none)."""
+
+    this: str  # number of this job
+    all: str = ""  # number of all jobs
+    first: str = ""  # number of the first job
+    last: str = ""  # number of the last job
+    begin: int = 1  # number of the first job, if no variable has it
+
+
+LSF = JobArray("LSB_JOBINDEX")
+ARRAYS = (
+    JobArray(
+        "SLURM_ARRAY_TASK_ID",
+        "SLURM_ARRAY_TASK_COUNT",
+        "SLURM_ARRAY_TASK_MIN",
+        "SLURM_ARRAY_TASK_MAX",
+        begin=0,
+    ),
+    JobArray("PBS_ARRAY_INDEX"),
+    LSF,
+    JobArray("JOB_COMPLETION_INDEX", "JOB_COMPLETIONS", begin=0),
+)
+"""The job arrays of Slurm, PBS, LSF and Kubernetes."""
 IMAGE = f"cloudrc/world:{__version__}"
 
 
@@ -49,7 +70,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument("--jobs", type=read_count, default=COUNT_MAX, metavar="N", help=about)
     about = "fly the failed or all flights again with a recording, into DIR/KEY"
     run.add_argument("--record", choices=("failed", "all"), help=about)
-    about = "fly only part I of N; 'auto' takes I and N from Slurm or Kubernetes"
+    about = "fly only part I of N; 'auto' takes I and N from the variables of a job array"
     run.add_argument("--shard", type=_shard, metavar="I/N", help=about)
     rows.add_argument("file", type=Path, metavar="FILE", help="file of flights, of a Job")
     rows.add_argument("--shard", type=_shard, default=(1, 1), metavar="I/N", help=about)
@@ -84,19 +105,46 @@ def _shard(text: str) -> tuple[int, int]:
     "auto" reads I and N from the environment variables of a job array, "auto/N" only I.
     """
     index, _, count = text.partition("/")
-    first = "1"
     if index == "auto":
-        name = next((name for name in ARRAYS if name in os.environ), "")
-        if not name:
-            raise argparse.ArgumentTypeError(f"auto needs {' or '.join(ARRAYS)}; give I/N")
-        index, (of, begin) = os.environ[name], ARRAYS[name]
-        count, first = count or os.environ.get(of, ""), os.environ.get(begin, "0")
-        if not count:
-            raise argparse.ArgumentTypeError(f"{of} is not set; give auto/N")
-    valid = all(word.isdecimal() for word in (index, count, first))
-    if not valid or not 0 <= int(index) - int(first) < int(count):
-        raise argparse.ArgumentTypeError(f"'{text}' is not I/N with I from 1 to N, or auto")
-    return int(index) - int(first) + 1, int(count)
+        return _shard_of_array(count)
+    if index.isdecimal() and count.isdecimal() and 1 <= int(index) <= int(count):
+        return int(index), int(count)
+    raise argparse.ArgumentTypeError(f"'{text}' is not I/N with I from 1 to N, or auto")
+
+
+def _shard_of_array(count: str) -> tuple[int, int]:
+    """Return the shard of this job of an array; `count` is the number of shards, if it is given.
+
+    An array that has not all of its jobs, such as the failed jobs alone, is refused: other numbers
+    would belong to its jobs, and flights would be left out without a word.
+    """
+    array = _find_array()
+    names = (array.this, array.all, array.first, array.last)
+    seen = {name: os.environ[name] for name in names if os.environ.get(name)}
+    shown = ", ".join(f"{name}={value}" for name, value in seen.items())
+    count = count or seen.get(array.all, "")
+    if not count:
+        lacks = f"{array.all} is not set" if array.all else "no variable has their number"
+        raise argparse.ArgumentTypeError(f"auto: {shown}, but {lacks}; give auto/N")
+    if all(value.isdecimal() for value in [*seen.values(), count]):
+        total, first = int(count), int(seen.get(array.first, array.begin))
+        last, index = int(seen.get(array.last, first + total - 1)), int(seen[array.this])
+        is_whole = int(seen.get(array.all, total)) == total == last - first + 1
+        if is_whole and first <= index <= last:
+            return index - first + 1, total
+    raise argparse.ArgumentTypeError(
+        f"auto: {shown} is no job of an array with all of its {count} jobs; give the shard itself, "
+        "such as --shard 7/16, or leave out --shard to fly what is missing"
+    )
+
+
+def _find_array() -> JobArray:
+    for array in ARRAYS:
+        index = os.environ.get(array.this, "")
+        if index and (array, index) != (LSF, "0"):  # LSF gives 0 to a job that is in no array
+            return array
+    known = ", ".join(array.this for array in ARRAYS)
+    raise argparse.ArgumentTypeError(f"auto needs one of {known}; give I/N")
 
 
 def execute(options: argparse.Namespace) -> int:
