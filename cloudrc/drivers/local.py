@@ -19,6 +19,7 @@ import secrets
 import selectors
 import shutil
 import signal
+import socket
 import subprocess
 import tempfile
 import time
@@ -153,6 +154,7 @@ def flight_files() -> dict[Path, FlightFile]:
                 found[Path(flight["run"])] = about
             else:  # not locked: the process of this flight was killed
                 path.unlink()
+                _remove_sockets(str(json.load(file)["api"]))
     return found
 
 
@@ -397,6 +399,26 @@ def link_words(folder: Path, way: str) -> list[str]:
 
 
 def socket_folder() -> str:
-    """Choose a folder for temporary files whose path is short enough for Unix sockets."""
+    """Choose a folder for the sockets of a run: on this machine, with a short path, not cleaned.
+
+    Some machines clean /tmp during a flight; then no command could stop the robot. Therefore the
+    folder is beside the flight files, if Unix sockets are possible there.
+    """
+    own = flights_folder().parent
+    with contextlib.suppress(OSError):
+        if own.is_absolute() and not make_own_folder(own):
+            with (
+                tempfile.TemporaryDirectory(prefix="cloudrc-", dir=own) as folder,
+                socket.socket(socket.AF_UNIX) as probe,
+            ):
+                probe.bind(f"{folder}/teleop.sock")  # the longest name
+            return str(own)
     given = tempfile.gettempdir()
     return given if len(os.fsencode(given)) + len(SOCKET_NAME) <= PATH_MAX else "/tmp"
+
+
+def _remove_sockets(api: str) -> None:
+    """Remove the socket folder of a killed run, if it is beside the flight files."""
+    folder = Path(api.removeprefix("unix:")).parent
+    if folder.parent == flights_folder().parent and folder.name.startswith("cloudrc-"):
+        shutil.rmtree(folder, ignore_errors=True)

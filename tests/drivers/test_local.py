@@ -1,5 +1,6 @@
 """Flight files, and the supervisor of a local run: feeds, sockets, deadlines, the key."""
 
+import json
 import os
 import stat
 import tempfile
@@ -110,10 +111,31 @@ def test_a_bad_feed_line_ends_no_flight(tmp_path):
     assert child.ready
 
 
-def test_sockets_lie_in_a_folder_with_a_short_path(monkeypatch):
+def test_sockets_lie_beside_the_flight_files_where_nobody_cleans(flights):
+    assert socket_folder() == str(flights.parent)
+    assert [*flights.parent.iterdir()] == [], "the trial leaves nothing"
+
+
+def test_sockets_lie_in_a_folder_with_a_short_path(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / ("x" * 90)))
+    (tmp_path / ("x" * 90)).mkdir()
     for folder, chosen in (("/short", "/short"), ("/" + "x" * 90, "/tmp")):
         monkeypatch.setattr(tempfile, "tempdir", folder)
         assert socket_folder() == chosen
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.setenv("HOME", "/proc/no-home")  # nothing can be made there
+    assert socket_folder() == "/tmp"
+
+
+def test_the_sockets_of_a_killed_run_are_removed(flights, tmp_path):
+    sockets, other = flights.parent / "cloudrc-1234", tmp_path / "cloudrc-5678"
+    for number, folder in enumerate((sockets, other)):
+        folder.mkdir(parents=True)
+        flights.mkdir(exist_ok=True, mode=0o700)
+        flight = {"run": "/r", "api": f"unix:{folder}/api.sock", "kind": "run", "pid": 1}
+        (flights / f"{number}.json").write_text(json.dumps(flight))
+    assert local.flight_files() == {}
+    assert (sockets.exists(), other.exists()) == (False, True)
 
 
 def test_a_deadline_does_not_count_the_time_of_a_pause():
