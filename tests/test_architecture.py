@@ -49,7 +49,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "console": {"config", "exposition", "geometry", "metrics.definitions", "teleop", "world"},
     "cluster": {"config", "link", "record", "report"},
     "sweep": {
-        *("assembly", "cloud", "config", "files", "metrics", "plugin_file", "plugins"),
+        *("advice", "assembly", "cloud", "config", "files", "metrics", "plugin_file", "plugins"),
         *("record", "report"),
     },
     "assembly": EVERYTHING,

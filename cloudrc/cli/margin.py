@@ -1,42 +1,47 @@
-"""`cloudrc margin KEY`: find the largest value of KEY at which all flights succeed."""
+"""`cloudrc margin KEY`: up to which value of KEY is the loop stable, and do flights succeed?"""
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from cloudrc.advice import simulate_ages
 from cloudrc.cli.compare import flight_arguments
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.interrupts import interrupt_on_signals
-from cloudrc.cli.output import output_argument, print_or_drop, print_result
+from cloudrc.cli.output import escape, output_argument, print_or_drop, print_result
 from cloudrc.cli.pool import map_in_order
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.sweep.margin import Found
 
 EPILOG = """\
 examples:
   cloudrc margin link.both.delay_ms
   cloudrc margin link.both.delay_ms --set cloud.predictor=last_sample --seeds 6
+  cloudrc margin guard.command_age_max_ms --max 500
   cloudrc margin link.uplink.loss --resolution 0.05 -o json
 
-A value is stable if the flights of all seeds succeed. With a key of the link,
-the command also raises cloud.horizon_max_s, cloud.freeze_after_s and
+Two answers. The loop is stable if the response to a step of 0.1 m per axis dies
+out, in the scene 'empty'. It settles in time if the flights of the experiment
+succeed with all seeds. The search begins at the present value and goes up and
+down. It raises cloud.horizon_max_s, cloud.freeze_after_s and
 guard.command_age_max_ms as the delays need it, unless --set gives them."""
-SLACK = 0.1
-"""Reserve between the largest age of `simulate_ages` and the limits of cloud and guard [s]."""
-STEPS_MAX = 100
-"""Default of --max, as a multiple of the first value."""
-
+QUESTIONS = {
+    "stable": "is the loop stable? a step of {small:g} m per axis in the scene {scene}",
+    "settles": "does it settle in time? flights of {experiment}",
+}
+"""Name of a question -> the question in words."""
+NOT_IN_STEP = "mission.", "criteria.", "report."
+"""Keys that begin so do not change the step, so that stability does not depend on them."""
 
 Trial: TypeAlias = dict[str, Any]
-"""Result of the flights with one value: `value`, `stable`, the guard's `speed_max_mps`; for a delay
-`rtt_ms`; after a failure `code` ("refused": invalid value), `text` and `seed`."""
+"""Result of the flights with one value: `value`, the guard's `speed_max_mps`, and the answer as
+`stable` or `settles`; for a delay `rtt_ms`; after a failure `code`, `text` and `seed`."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,143 +49,269 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("key", metavar="KEY", help="key of the experiment whose value is a number")
     flight_arguments(parser, seeds=3)
-    about = "largest value to try (default: 100 times the first, which is the present one)"
+    about = "largest value to try (default: 32 times the first, which is the present one)"
     add("--max", type=float, metavar="X", help=about)
-    about = "try multiples of R (default: 10 for a key in ms, else 0.01)"
+    about = "try multiples of R (default: 10 for a key in ms, 1 for whole numbers, else 0.01)"
     add("--resolution", type=float, metavar="R", help=about)
     output_argument(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
-    """Print the largest value of KEY at which all flights succeed; return 0, or 1 if none."""
-    from cloudrc.cli.run import load, refuse_seed
-
+    """Print both answers; return 0, or 1 if no value is stable (or, without that, none settles)."""
     interrupt_on_signals()
     require("margin", MODES["virtual"])
-    key, size, limit = options.key, options.resolution, options.max
-    refuse_seed([*options.set, f"{key}=0"])
-    if size is None:
-        size = 10.0 if key.endswith("_ms") else 0.01
-    present = _present(load(options.experiment, options.set), key)
-    first = max(1, round(present / size)) if 0 < size < math.inf else 1
-    limit = STEPS_MAX * first * size if limit is None else limit
-    if not 0 < size <= limit < math.inf:
-        raise BadInputError(f"--resolution {size:g} must be above 0, --max {limit:g} not below it")
-    top = math.floor(limit / size + 1e-9)
-    tried: dict[int, Trial] = {}
-
-    def works(step: int) -> bool:
-        if step not in tried:
-            tried[step] = _try(options, round(step * size, 9), first=not tried)
-            if options.output == "table":
-                print_or_drop(f"{_value(key, tried[step]):<26}{_result(tried[step])}")
-        return bool(tried[step]["stable"])
-
-    low, high = largest_stable(works, min(first, top), top)
-    # The search assumes that all smaller values are stable: check two of them.
-    odd = [step for step in (low - 1, low * 3 // 4) if step > 0 and not works(step)]
-    document = {
-        **{"key": key, "experiment": options.experiment},
-        **{"overrides": options.set, "seeds": options.seeds, "resolution": size},
-        "stable_up_to": tried[low]["value"] if low else None,
-        "fails_at": tried[high]["value"] if high else None,
-        "fails_below": [tried[step]["value"] for step in odd],
-        "trials": [tried[step] for step in sorted(tried)],
+    trials = Trials(options)
+    asked = [name for name in QUESTIONS if name == "settles" or trials.step_depends]
+    document: dict[str, Any] = {
+        **{"key": options.key, "experiment": options.experiment},
+        **{"overrides": options.set, "seeds": options.seeds, "resolution": trials.size},
+        **{"smallest": trials.value(trials.bottom), "largest": trials.value(trials.top)},
+        "largest_why": trials.top_why,
     }
-    answer = f"stable up to {_value(key, tried[low])}" if low else "no value is stable"
-    if not high:
-        answer += ", the largest value tried; raise --max"
-    for step in [*([high] if high else []), *odd]:
-        answer += f"; fails at {_value(key, tried[step])}: {_result(tried[step])}"
-    print_result(options.output, document, f"\n{answer}")
-    return 0 if low else 1
+    lines = []
+    for name in QUESTIONS:
+        found = trials.search(name) if name in asked else None
+        document |= _entries(name, found, trials)
+        lines.append(_answer(name, found, trials))
+    if large := trials.large_step(document["stable_up_to"]):
+        document["large_step"] = large
+        lines.insert(1, _large(large))
+    print_result(options.output, document, "\n" + "\n".join(map(escape, lines)))
+    return 0 if document[f"{asked[0]}_up_to"] is not None else 1
 
 
-def largest_stable(works: Callable[[int], bool], start: int, top: int) -> tuple[int, int]:
-    """Find the largest n from 1 to `top` for which `works(n)` is true: double `start`, then bisect.
+class Trials:
+    """The values of the key that are tried, each at most once per question.
 
-    Return n and n + 1. The first is 0 if no number works; the second is 0 if `top` works.
+    Attributes:
+        size: All values are multiples of this one.
+        present: The number of the first value: the value divided by `size`.
+        bottom: Number of the smallest value that is tried.
+        top: Number of the largest value that is tried.
+        top_why: Why no larger value is tried, in words.
+        step_depends: Whether the response to a step depends on the key.
     """
-    low, high = 0, start
-    while works(high):
-        if high == top:
-            return top, 0
-        low, high = high, min(2 * high, top)
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if works(middle) else (low, middle)
-    return low, high
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        """Read the present value and the range of the search; refuse a key that has no range."""
+        from cloudrc.cli.run import load, refuse_seed
+        from cloudrc.sweep.margin import STEPS_MAX, present_value
+
+        self._options, self._load = options, load
+        key = options.key
+        refuse_seed([*options.set, f"{key}=0"])
+        self.step_depends = not key.startswith(NOT_IN_STEP)
+        now = present_value(load(options.experiment, options.set), key)
+        if now is None and options.max is None:
+            load(options.experiment, [*options.set, f"{key}=1"])  # names an unknown key
+            raise BadInputError(f"{key}: has no value now; name the largest one to try with --max")
+        self.size = options.resolution or (1.0 if isinstance(now, int) else 0.01)
+        if options.resolution is None and key.endswith("_ms"):
+            self.size = 10.0
+        # Without a value the key has no effect, as a large value has: begin there.
+        self.present = self._number(options.max if now is None else now)
+        given = STEPS_MAX * self.present * self.size if options.max is None else options.max
+        if not 0 < self.size <= given < math.inf:
+            raise BadInputError(
+                f"--resolution {self.size:g} must be above 0, --max {given:g} not below it"
+            )
+        self._done: dict[tuple[str, int], Trial] = {}
+        self._ready: dict[int, tuple[ResolvedExperiment | None, str]] = {}
+        self._find_range(math.floor(given / self.size + 1e-9))
+
+    def _number(self, value: float) -> int:
+        return max(1, round(value / self.size)) if 0 < self.size < math.inf else 1
+
+    def _find_range(self, top: int) -> None:
+        """Limit the search to values that the experiment allows, around the present one."""
+        from cloudrc.sweep.margin import bisect
+
+        def allowed(number: int) -> bool:
+            return self.experiment(number)[0] is not None
+
+        self.present = min(self.present, top)
+        if not allowed(self.present):
+            raise BadInputError(self.experiment(self.present)[1])
+        self.top, self.bottom = top, 1
+        self.top_why = "the largest value tried; raise --max"
+        if not allowed(top):
+            self.top, beyond = bisect(allowed, self.present, top)
+            self.top_why = f"the largest value possible: {self.experiment(beyond)[1]}"
+        if not allowed(1):
+            self.bottom, _ = bisect(allowed, self.present, 1)
+
+    def value(self, number: int | None) -> float | None:
+        """Return the value of a number; None for None."""
+        return None if number is None else round(number * self.size, 9)
+
+    def experiment(self, number: int) -> tuple[ResolvedExperiment | None, str]:
+        """Return the experiment with a value, and limits that fit; or why there is none."""
+        if number not in self._ready:
+            self._ready[number] = self._prepare(number)
+        return self._ready[number]
+
+    def _prepare(self, number: int) -> tuple[ResolvedExperiment | None, str]:
+        from cloudrc.sweep.margin import LIMIT_MAX, limits
+
+        options = self._options
+        settings = [*options.set, f"{options.key}={self.value(number):.12g}"]
+        try:
+            experiment = self._load(options.experiment, settings)
+        except BadInputError as error:
+            return None, str(error)
+        given = [text.partition("=")[0].strip() for text in settings]
+        more, needed = limits(experiment, given)
+        if needed > LIMIT_MAX and "guard.command_age_max_ms" not in given:
+            age = f"a command would be {needed:g} s old"
+            age = age if needed < math.inf else "no command arrives within 20 s"
+            return None, f"{age}, and guard.command_age_max_ms ends at {LIMIT_MAX:g} s"
+        return (self._load(options.experiment, [*settings, *more]) if more else experiment), ""
+
+    def search(self, question: str) -> Found:
+        """Find the range of values in which the answer to a question is yes."""
+        from cloudrc.sweep.margin import search
+        from cloudrc.sweep.stability import SCENE, SMALL
+
+        options = self._options
+        if options.output == "table":
+            facts = {"small": SMALL, "scene": SCENE, "experiment": options.experiment}
+            text = QUESTIONS[question].format(**facts)
+            print_or_drop(escape(f"{text}, seeds 1 to {options.seeds}"))
+
+        def works(number: int) -> bool:
+            trial = self._try(question, number)
+            if options.output == "table":
+                print_or_drop(escape(f"  {self.name(number):<26}{_result(question, trial)}"))
+            return bool(trial[question])
+
+        return search(works, self.present, self.bottom, self.top)
+
+    def trial(self, question: str, number: int) -> Trial:
+        """Return a trial that has been flown."""
+        return self._done[question, number]
+
+    def trials(self, question: str) -> list[Trial]:
+        """Return all trials of a question, the smallest value first."""
+        return [self._done[key] for key in sorted(self._done) if key[0] == question]
+
+    def _try(self, question: str, number: int) -> Trial:
+        if (question, number) not in self._done:
+            experiment, why = self.experiment(number)
+            trial: Trial = {"value": self.value(number), question: experiment is not None}
+            if experiment is None:
+                trial |= {"code": "refused", "text": why}
+            else:
+                if self._options.key.endswith("delay_ms"):
+                    trial["rtt_ms"] = experiment.uplink.delay_ms + experiment.downlink.delay_ms
+                trial["speed_max_mps"] = experiment.guard.speed_max_mps
+                ask = _ask_stable if question == "stable" else _ask_settles
+                trial |= self._fly(experiment, ask, question)
+            self._done[question, number] = trial
+        return self._done[question, number]
+
+    def _fly(
+        self, experiment: ResolvedExperiment, ask: Callable[..., Iterable[Trial]], question: str
+    ) -> Trial:
+        """Fly one seed after the other, until an answer is no; return what is new in the trial."""
+        seeds = range(1, self._options.seeds + 1)
+        jobs = [experiment.model_copy(update={"seed": seed}) for seed in seeds]
+        result: Trial = {}
+        for seed, answer in zip(seeds, ask(jobs), strict=False):
+            result = answer
+            if not answer[question]:
+                return result | {"seed": seed}
+        return result
+
+    def large_step(self, value: float | None) -> Trial:
+        """Fly a step of 1 m per axis at the stable `value` [any unit]; {} if it is None."""
+        from cloudrc.sweep.stability import LARGE, fly_step
+
+        experiment = None if value is None else self.experiment(self._number(value))[0]
+        if experiment is None:
+            return {}
+        found = fly_step(experiment.model_copy(update={"seed": 1}), LARGE)
+        return {"size_m": LARGE, "speed_max_mps": experiment.guard.speed_max_mps, **found}
+
+    def name(self, number: int) -> str:
+        """Return the value of a number with its unit and, for a delay, the round trip."""
+        experiment, _ = self.experiment(number)
+        key, rtt = self._options.key, ""
+        if key.endswith("delay_ms") and experiment is not None:
+            rtt = f" (RTT {experiment.uplink.delay_ms + experiment.downlink.delay_ms:g} ms)"
+        return f"{self.value(number):.12g}{' ms' if key.endswith('_ms') else ''}{rtt}"
 
 
-def _present(experiment: ResolvedExperiment, key: str) -> float:
-    """Return the present value of a key; 0 if the value is null or the key is unknown."""
-    from cloudrc.config.document import child
+def _ask_stable(jobs: list[ResolvedExperiment]) -> Iterable[Trial]:
+    from cloudrc.sweep.stability import fly_step
 
-    value: Any = experiment.model_dump(mode="json")
-    for name in key.replace("link.both.", "link.uplink.").split("."):
-        value = child(value, name)
-    if isinstance(value, str | bool | dict | list):
-        raise BadInputError(f"{key}: is no number; name a key such as link.both.delay_ms")
-    return float(value or 0.0)
+    # A worker takes as long to start as some flights.
+    with closing(map_in_order(fly_step, jobs, len(jobs) // 4)) as answers:
+        yield from answers
 
 
-def _try(options: argparse.Namespace, value: float, *, first: bool) -> Trial:
-    """Fly one seed after the other with the key set to `value`, until a flight fails.
-
-    An invalid `value` gives a trial that is not stable. If `value` is the `first` one of the
-    search, raise a BadInputError instead, because then the key is wrong.
-    """
-    from cloudrc.cli.run import load
+def _ask_settles(jobs: list[ResolvedExperiment]) -> Iterable[Trial]:
     from cloudrc.sweep.flight import fly_point
 
-    settings = [*options.set, f"{options.key}={value:.12g}"]
-    try:
-        experiment = load(options.experiment, settings)
-    except BadInputError as error:
-        if first:  # the key is wrong, not its size
-            raise
-        return {"value": value, "stable": False, "code": "refused", "text": str(error)}
-    trial: Trial = {"value": value, "stable": True}
-    if options.key.startswith("link."):
-        given = {text.partition("=")[0].strip() for text in options.set}
-        settings += [text for text in _limits(experiment) if text.partition("=")[0] not in given]
-        experiment = load(options.experiment, settings)
-        if options.key.endswith("delay_ms"):
-            trial["rtt_ms"] = experiment.uplink.delay_ms + experiment.downlink.delay_ms
-    trial["speed_max_mps"] = experiment.guard.speed_max_mps
-    jobs = [experiment.model_copy(update={"seed": n + 1}) for n in range(options.seeds)]
-    # A worker takes as long to start as three flights of `steps`.
     with closing(map_in_order(fly_point, jobs, len(jobs) // 4)) as flights:
-        for seed, flight in enumerate(flights, start=1):
-            if flight["verdict"] != "success":
+        for flight in flights:
+            if flight["verdict"] == "success":
+                yield {"settles": True}
+            else:
                 code = (*flight["failures"], flight["verdict"])[0]
-                failed = {"stable": False, "code": code, "text": flight["text"], "seed": seed}
-                return trial | failed
-    return trial
+                yield {"settles": False, "code": code, "text": flight["text"]}
 
 
-def _limits(experiment: ResolvedExperiment) -> list[str]:
-    """Return time limits of cloud and guard, as KEY=VALUE, that are long enough for the link."""
-    from cloudrc.config.load import COMMAND_AGE_MAX_MS, FREEZE_AFTER_S, HORIZON_MAX_S
-    from cloudrc.config.schema import COMMAND_AGE_MS
-
-    ages, echoes = simulate_ages(experiment)
-    needed = math.ceil((max([*ages, *echoes], default=0.0) + SLACK) * 10) / 10
-    needed = min(needed, COMMAND_AGE_MS[1] * 1e-3)
-    return [
-        f"cloud.horizon_max_s={max(needed, HORIZON_MAX_S):g}",
-        f"cloud.freeze_after_s={max(needed, FREEZE_AFTER_S):g}",
-        f"guard.command_age_max_ms={max(needed * 1e3, COMMAND_AGE_MAX_MS):g}",
-    ]
-
-
-def _value(key: str, trial: Trial) -> str:
-    rtt = f" (RTT {trial['rtt_ms']:g} ms)" if "rtt_ms" in trial else ""
-    return f"{trial['value']:.12g}{' ms' if key.endswith('_ms') else ''}{rtt}"
+def _entries(name: str, found: Found | None, trials: Trials) -> dict[str, Any]:
+    """Return the part of the document about one question; `found` is None if it is not asked."""
+    if found is None:
+        return {f"{name}_up_to": None, f"{name}_trials": []}
+    elsewhere = [[trials.value(a), trials.value(b)] for a, b in found.elsewhere]
+    return {
+        f"{name}_from": trials.value(found.first),
+        f"{name}_up_to": trials.value(found.last),
+        f"{name}_fails_below": trials.value(found.below),
+        f"{name}_fails_at": trials.value(found.above),
+        f"{name}_elsewhere": elsewhere,
+        f"{name}_trials": trials.trials(name),
+    }
 
 
-def _result(trial: Trial) -> str:
-    if trial["stable"]:
-        return "stable"
+def _answer(name: str, found: Found | None, trials: Trials) -> str:
+    """Return the answer to one question in one line."""
+    if found is None:
+        return f"{name}: not asked, because the step does not depend on this key"
+    if found.first is None or found.last is None:
+        first = trials.bottom
+        failed = _result(name, trials.trial(name, first))
+        return f"no value {_verb(name)}; {trials.name(first)} fails: {failed}"
+    start = f" from {trials.name(found.first)}" if found.below is not None else ""
+    text = f"{name}{start} up to {trials.name(found.last)}"
+    if found.above is None:
+        text += f", {trials.top_why}"
+    for number in (found.above, found.below):
+        if number is not None:
+            failed = _result(name, trials.trial(name, number))
+            text += f"; fails at {trials.name(number)}: {failed}"
+    for first, last in found.elsewhere:
+        reach = trials.name(first) + (f" to {trials.name(last)}" if last > first else "")
+        text += f"; beyond values that fail, {reach} {_verb(name)}, too"
+    return text
+
+
+def _verb(name: str) -> str:
+    return "is stable" if name == "stable" else "settles"
+
+
+def _result(question: str, trial: Trial) -> str:
+    if trial[question]:
+        return "yes"
     where = f", seed {trial['seed']}" if "seed" in trial else ""
     return f"{trial['code']}{where}: {trial['text'].partition(';')[0]}"
+
+
+def _large(large: Trial) -> str:
+    """Say whether a step of 1 m dies out at the largest stable value, and whether it saturates."""
+    dies = "dies out, too" if large["stable"] else f"does not die out ({large['text']})"
+    text = f"with this value a step of {large['size_m']:g} m per axis {dies}; the guard's speed cap"
+    cap, share = f"of {large['speed_max_mps']:.3g} m/s", large.get("speed_limited", 0.0)
+    return f"{text} {cap} shortens " + (f"{share:.1%} of the commands" if share else "no command")

@@ -27,7 +27,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "identify": "fit the model of the velocity loop to a recorded flight",
         "recover": "write a clean copy of a damaged recording",
         "compare": "say whether a setting differs from another, and how sure that is",
-        "margin": "find the largest delay, or other value, with which flights succeed",
+        "margin": "find the delay, or other value, up to which the loop is stable",
         "bench": "measure how fast the simulation runs here",
         "faults": "inject faults and check that the system handles them",
         "class": "hand out and score the exercise for students",

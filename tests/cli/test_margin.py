@@ -1,51 +1,63 @@
-"""`cloudrc margin`: the largest value of a key with which the flights of all seeds succeed."""
+"""`cloudrc margin KEY`: the values with which the loop is stable, and with which it settles."""
 
 import json
 
 import pytest
 
-from cloudrc.cli.margin import largest_stable
 from tests.cli.conftest import SHORT
 
 KEY = "link.uplink.delay_ms"
-FAILED = {"verdict": "failure", "failures": ["unstable"], "text": "the loop is unstable; lower it"}
-UNSTABLE = "unstable, seed 1: the loop is unstable"
+FAILED = {"verdict": "failure", "failures": ["not_settled"], "text": "it is late; lower it"}
+GROWS = {"stable": False, "code": "unstable", "text": "z swings; lower it"}
+LATE = "not_settled, seed 1: it is late"
+UNSTABLE = "unstable, seed 1: z swings"
 
 
 @pytest.fixture
-def fly_with(replace_flights):
-    """Replace flights: they succeed if `works(experiment)`."""
+def fly_with(replace_flights, monkeypatch):
+    """Replace flights: they succeed if `works(experiment)`, and die out if `stable(experiment)`."""
 
-    def use(works):
+    def use(works, stable=None):
+        def fly_step(found, size=0.1):
+            if not (stable or works)(found):
+                return GROWS
+            return {"stable": True, "left": 0.0, "speed_limited": 0.25 if size == 1.0 else 0.0}
+
         replace_flights(lambda found: {"verdict": "success"} if works(found) else FAILED)
+        monkeypatch.setattr("cloudrc.sweep.stability.fly_step", fly_step)
 
     return use
 
 
-@pytest.mark.parametrize("start", [1, 7, 64, 100])
-@pytest.mark.parametrize("limit", [0, 1, 6, 7, 63, 64, 99])
-def test_the_search_finds_each_border(start, limit):
-    assert largest_stable(lambda step: step <= limit, start, 100) == (limit, limit + 1)
-    assert largest_stable(lambda step: True, start, 100) == (100, 0)
+def uplink(limit):
+    return lambda found: found.uplink.delay_ms <= limit
 
 
 @pytest.mark.parametrize(
     ("arguments", "works", "code", "answer"),
     [
         (KEY, lambda found: found.uplink.delay_ms <= 228 - 3 * (found.seed == 2), 0,
-         "stable up to 220 ms (RTT 290 ms); fails at 230 ms (RTT 300 ms): unstable, seed 1"),
-        (f"{KEY} --resolution 20", lambda found: found.uplink.delay_ms <= 228, 0,
-         "stable up to 220 ms (RTT 290 ms); fails at 240 ms"),
+         "settles up to 220 ms (RTT 290 ms); fails at 230 ms (RTT 300 ms): not_settled, seed 1:"),
+        (f"{KEY} --resolution 20", uplink(228), 0,
+         "settles up to 220 ms (RTT 290 ms); fails at 240 ms"),
         (f"{KEY} --max 80", lambda found: True, 0,
-         "stable up to 80 ms (RTT 150 ms), the largest value tried; raise --max"),
+         "settles up to 80 ms (RTT 150 ms), the largest value tried; raise --max"),
         (f"{KEY} --max 80", lambda found: False, 1,
-         f"no value is stable; fails at 10 ms (RTT 80 ms): {UNSTABLE}"),
-        # The schema refuses a loss above 1.
+         f"no value settles; 10 ms (RTT 80 ms) fails: {LATE}"),
+        # The experiment allows no loss above 1: that is no failure of the loop.
         ("link.uplink.loss --resolution 0.3", lambda found: True, 0,
-         "stable up to 0.9; fails at 1.2: refused: --set: link.uplink.loss"),
+         "settles up to 0.9, the largest value possible: --set: link.uplink.loss: 1.2:"),
         # A large value is flown with all digits.
         ("link.uplink.rate_kbit --max 1234567 --resolution 1 --seeds 1",
-         lambda found: found.uplink.rate_kbit <= 1234567, 0, "stable up to 1234567,"),
+         lambda found: found.uplink.rate_kbit <= 1234567, 0, "settles up to 1234567,"),
+        # The stable side is above.
+        ("guard.command_age_max_ms --max 500",
+         lambda found: found.guard.command_age_max_ms > 117, 0,
+         f"settles from 120 ms up to 500 ms, the largest value tried; raise --max; "
+         f"fails at 110 ms: {LATE}"),
+        # Whole numbers are tried, one by one.
+        ("cloud.command_rate_hz --max 120", lambda found: found.cloud.command_rate_hz < 111, 0,
+         "settles up to 110; fails at 111: "),
     ],
 )  # fmt: skip
 def test_the_last_line_names_the_border(arguments, works, code, answer, fly_with, call):
@@ -53,10 +65,33 @@ def test_the_last_line_names_the_border(arguments, works, code, answer, fly_with
     assert call(f"margin {arguments}", code=code).out.splitlines()[-1].startswith(answer)
 
 
-def test_a_second_border_below_is_told(fly_with, call):
-    fly_with(lambda found: found.uplink.delay_ms in (70, 140, 210, 200))
+def test_stability_and_settling_are_two_answers(fly_with, call):
+    fly_with(uplink(150), stable=uplink(400))
+    lines = call(f"margin {KEY}").out.splitlines()[-3:]
+    border = f"fails at 410 ms (RTT 480 ms): {UNSTABLE}"
+    assert lines[0] == f"stable up to 400 ms (RTT 470 ms); {border}"
+    assert lines[1].startswith("with this value a step of 1 m per axis dies out, too;")
+    assert lines[1].endswith("m/s shortens 25.0% of the commands")
+    assert lines[2].startswith("settles up to 150 ms")
     found = json.loads(call(f"margin {KEY} -o json").out)
-    assert (found["stable_up_to"], found["fails_at"], found["fails_below"]) == (210, 220, [150])
+    assert (found["stable_up_to"], found["settles_up_to"]) == (400, 150)
+    assert (found["large_step"]["stable"], found["large_step"]["speed_limited"]) == (True, 0.25)
+
+
+def test_an_island_above_a_failing_value_is_told(fly_with, call):
+    fly_with(uplink(9999), stable=lambda found: not 100 <= found.uplink.delay_ms < 500)
+    found = json.loads(call(f"margin {KEY} -o json").out)
+    assert (found["stable_up_to"], found["stable_fails_at"]) == (90, 100)
+    assert found["stable_elsewhere"] == [[560, 2240]]
+    stable = call(f"margin {KEY}").out.splitlines()[-3]
+    assert stable.endswith("; beyond values that fail, 560 ms (RTT 630 ms) to 2240 ms "
+                           "(RTT 2310 ms) is stable, too")  # fmt: skip
+
+
+def test_a_key_of_the_mission_has_no_answer_about_the_step(fly_with, call):
+    fly_with(lambda found: found.mission.steps.period_s >= 3.0, stable=lambda found: 1 / 0)
+    found = json.loads(call("margin mission.steps.period_s -o json --resolution 0.25").out)
+    assert (found["stable_up_to"], found["settles_from"]) == (None, 3.0)
 
 
 def test_the_limits_of_cloud_and_guard_follow_the_delay(fly_with, call):
@@ -71,13 +106,34 @@ def test_the_limits_of_cloud_and_guard_follow_the_delay(fly_with, call):
     assert seen[70].guard.command_age_max_ms == 400
 
 
+def test_limits_of_the_experiment_that_are_long_enough_stay(fly_with, call):
+    seen = {}
+    fly_with(lambda found: seen.update({found.uplink.delay_ms: found}) or True)
+    call(f"margin {KEY} --of fast --max 100 --seeds 1")
+    assert seen[70].guard.command_age_max_ms == 700
+
+
+def test_the_end_of_the_limits_is_no_failure_of_the_loop(fly_with, call):
+    """Limits of guard and cloud end at 10 s, so that a longer round trip cannot be flown."""
+    fly_with(lambda found: True)
+    found = json.loads(call("margin link.both.delay_ms --max 20000 --seeds 1 -o json").out)
+    assert found["stable_up_to"] == found["largest"]
+    assert 4800 <= found["largest"] <= 4950
+    assert "guard.command_age_max_ms ends at 10 s" in found["largest_why"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
         ("link.uplink.delay", "unknown key; did you mean delay_ms"),
+        ("link.uplink.delay --max 3", "unknown key; did you mean delay_ms"),
         ("seed", "seed: each flight has its own seed"),
         (f"{KEY} --set seed=2", "seed: each flight has its own seed"),
         ("link.profile", "is no number; name a key such as"),
+        ("cloud.controller.gain_p", "is no number; name a key such as"),
+        ("world.odometry_rate_hz", "allows only 20, 25, 50, 100, 125, 250, 500; fly a sweep"),
+        ("link.uplink.rate_kbit", "has no value now; name the largest one to try with --max"),
+        ("cloud.command_rate_hz --resolution 0.3", "cloud.command_rate_hz: 99.9: must be"),
         (f"{KEY} --max 5", "--resolution 10 must be above 0, --max 5 not below it"),
         *((f"{KEY} --resolution {text}", f"--resolution {text} must") for text in ("-1", "nan")),
         *((f"{KEY} --max {text}", f"--max {text} not") for text in ("nan", "0")),
@@ -89,5 +145,22 @@ def test_a_search_that_cannot_begin_is_refused(arguments, text, refused):
 
 def test_a_short_flight_has_a_margin(call):
     """One second of flight with the settling judged: no delay lets the robot arrive."""
-    out = call(f"margin {KEY} -o json --seeds 1 --max 80", *SHORT[:2], code=1).out
-    assert json.loads(out)["trials"][0]["code"] == "not_settled"
+    command = f"margin {KEY} -o json --seeds 1 --max 20"
+    found = json.loads(call(command, *SHORT[:2]).out)
+    assert found["settles_trials"][0]["code"] == "not_settled"
+    assert (found["stable_up_to"], found["settles_up_to"]) == (20, None)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("predictor", "least", "most"),
+    [("last_sample", 0.8, 1.0), ("constant_velocity", 0.6, 0.7), ("command_history", 3.0, 3.0)],
+)
+def test_predictors_differ_in_the_round_trip_at_which_the_loop_is_stable(
+    predictor, least, most, call
+):
+    """With the published gains; a predictor that replays the commands has no limit up to 3 s."""
+    command = "margin link.both.delay_ms -o json --seeds 1 --max 1500 --set link.profile=ideal"
+    found = json.loads(call(f"{command} --set cloud.predictor={predictor}").out)
+    assert least <= 2e-3 * found["stable_up_to"] <= most
+    assert found["stable_elsewhere"] == []

@@ -1,0 +1,29 @@
+"""The search for the range of values in which an answer is yes."""
+
+import pytest
+
+from cloudrc.sweep.margin import Found, grid, search
+
+
+@pytest.mark.parametrize("present", [1, 7, 64, 100])
+@pytest.mark.parametrize("limit", [1, 6, 7, 63, 64, 99])
+def test_the_search_finds_each_border(present, limit):
+    up = search(lambda number: number <= limit, present, 1, 100)
+    assert up == Found(1, limit, None, limit + 1, [])
+    down = search(lambda number: number > limit, present, 1, 100)
+    assert down == Found(limit + 1, 100, limit, None, [])
+
+
+def test_a_search_without_border_says_so():
+    assert search(lambda number: True, 7, 1, 100) == Found(1, 100, None, None, [])
+    assert search(lambda number: False, 7, 1, 100) == Found(None, None, None, 1, [])
+
+
+def test_the_range_around_the_present_value_is_searched_and_others_are_told():
+    found = search(lambda number: number in range(5, 31) or number >= 60, 12, 1, 100)
+    assert found == Found(5, 30, 4, 31, [(96, 100)])
+
+
+def test_the_grid_doubles_and_halves_the_present_value():
+    assert grid(12, 2, 100) == [2, 3, 6, 12, 24, 48, 96, 100]
+    assert grid(1, 1, 1) == [1]
