@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.parser import number
-from cloudrc.cluster.client import DEFAULT_RELEASE
+from cloudrc.cluster.client import DEFAULT_RELEASE as DEFAULT_RELEASE
 
 if TYPE_CHECKING:
     from cloudrc.cluster.client import Release
@@ -17,8 +17,10 @@ READY_LIMIT = 300.0
 """Default time limit for the pods of a release to become ready [s]."""
 
 
-def release_arguments(parser: argparse.ArgumentParser) -> Callable[..., argparse.Action]:
-    """Declare `--context` and `--namespace`, as in kubectl, and `--release`.
+def release_arguments(
+    parser: argparse.ArgumentParser, default: str = "the only one of the namespace"
+) -> Callable[..., argparse.Action]:
+    """Declare `--context` and `--namespace`, as in kubectl, and `--release` with a default.
 
     Return a function that adds another flag to the same group of the help.
     """
@@ -26,7 +28,7 @@ def release_arguments(parser: argparse.ArgumentParser) -> Callable[..., argparse
     group.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
     about = "namespace (default: the context's, or default)"
     group.add_argument("-n", "--namespace", metavar="NAME", help=about)
-    about = f"Helm release (default: {DEFAULT_RELEASE})"
+    about = f"Helm release (default: {default})"
     group.add_argument("--release", metavar="NAME", help=about)
     return group.add_argument
 
@@ -51,3 +53,16 @@ def release_from_flags(options: argparse.Namespace) -> Release:
     from cloudrc.cluster.client import connect
 
     return connect(options.context, options.namespace, options.release or DEFAULT_RELEASE)
+
+
+def flown_release(options: argparse.Namespace) -> Release:
+    """Return the release that the flags name; without `--release`, the only one of the namespace.
+
+    Raise a BadInputError if the namespace has several, a ClusterError if it has none.
+    """
+    release = release_from_flags(options)
+    if options.release:
+        return release
+    from cloudrc.cluster.releases import only_release
+
+    return only_release(release)

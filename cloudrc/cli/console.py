@@ -13,7 +13,7 @@ from secrets import token_hex
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc.cli.client import Api, token_argument, token_file, token_reader
-from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
+from cloudrc.cli.cluster_flags import flown_release, release_arguments
 from cloudrc.cli.extras import require
 from cloudrc.cli.find_run import find_local_run
 from cloudrc.cli.output import open_page, print_line
@@ -204,9 +204,9 @@ def _show_release(options: argparse.Namespace) -> int:
     """Forward a release's console page to this machine; apply link changes made on the page."""
     if options.run:
         raise BadInputError("RUN names a run here, the other flags a cluster; give one")
-    release = release_from_flags(options)
     if options.allow_origin:
         raise BadInputError("--allow-origin: not with a release, whose page no proxy serves")
+    release = flown_release(options)
     from cloudrc.cluster.link import keep, read_link, send
     from cloudrc.cluster.pods import follow_page, operator_token
     from cloudrc.console.access import PARAMETER, page_token

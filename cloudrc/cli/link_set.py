@@ -7,15 +7,15 @@ import json
 import secrets
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from time import monotonic, sleep
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.cluster_flags import release_arguments, release_from_flags
+from cloudrc.cli.cluster_flags import flown_release, release_arguments
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
 from cloudrc.cli.output import escape, output_argument, print_line, print_result, table
-from cloudrc.cluster.client import DEFAULT_RELEASE, ClusterError, Release
+from cloudrc.cluster.client import ClusterError, Release
 from cloudrc.errors import BadInputError, MissingPrerequisiteError, TimedOutError
 
 if TYPE_CHECKING:
@@ -67,8 +67,9 @@ def execute(options: argparse.Namespace) -> int:
     else:
         from cloudrc.cluster.link import keep, send
 
-        place = Release(options.context, options.namespace, options.release or DEFAULT_RELEASE)
+        place = Release(options.context, options.namespace, options.release or "")
         link = _link_of(options, place)
+        place = replace(place, name=link.release)
         sent = send(place, link, options.profile, options.settings, number)
         took = monotonic() - began
         keep(place, link, sent)
@@ -144,7 +145,7 @@ def _link_of(options: argparse.Namespace, where: Release) -> LinkParts:
         return read_link(where)
     except (ClusterError, MissingPrerequisiteError):  # such as kubectl
         try:
-            release = release_from_flags(options)
+            release = flown_release(options)
             for part in ("world", "cloud"):
                 find_pod(release, part)  # raises the most precise error
         except MissingPrerequisiteError as error:

@@ -24,7 +24,7 @@ from math import inf, nan
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from cloudrc.cli.cluster_flags import release_from_flags
+from cloudrc.cli.cluster_flags import flown_release
 from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.link import VERIFY_DEFAULT
 from cloudrc.cli.link_run import prepare_link, run_tool
@@ -307,7 +307,7 @@ def _pods(options: argparse.Namespace) -> Iterator[Pods]:
         return
     from cloudrc.cluster.pods import find_pod, forwarded
 
-    pods, release = {}, release_from_flags(options)
+    pods, release = {}, flown_release(options)
     with contextlib.ExitStack() as stack:
         for end in ("world", "cloud"):
             pod = find_pod(release, end).metadata.name

@@ -29,7 +29,7 @@ from cloudrc.cli.client import (
     token_file,
     token_reader,
 )
-from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
+from cloudrc.cli.cluster_flags import flown_release, release_arguments, timeout_argument
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
 from cloudrc.cli.output import escape, output_argument, print_line, print_result, table
 from cloudrc.cli.parser import add_verbs, number
@@ -444,7 +444,7 @@ def _print_events(events: Iterable[Json]) -> None:
 
 def _release(options: argparse.Namespace) -> Release:
     try:
-        return release_from_flags(options)
+        return flown_release(options)
     except MissingPrerequisiteError as error:
         raise no_run_error(options, error, "--run, --api") from None
 

@@ -15,7 +15,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from cloudrc.advice import advise
-from cloudrc.cli.cluster_flags import release_arguments, release_from_flags, timeout_argument
+from cloudrc.cli.cluster_flags import (
+    DEFAULT_RELEASE,
+    release_arguments,
+    release_from_flags,
+    timeout_argument,
+)
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.find_run import RUNS
 from cloudrc.cli.interrupts import interrupt_on_signals
@@ -76,7 +81,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     about = "fly seeds 1 to N on all cores and print a table"
     many.add_argument("--seeds", type=read_count, metavar="N", help=about)
     output_argument(parser, "json, yaml: print only the report")
-    release_arguments(parser)
+    release_arguments(parser, DEFAULT_RELEASE)
     timeout_argument(parser)
 
 

@@ -40,7 +40,10 @@ STOP_LIMIT = 2.0
 """Time from SIGTERM to SIGKILL, in which a program can end by itself [s]."""
 PACKAGE = Path(__file__).resolve().parents[1]
 _KINDS = {
-    **{name: ("CoreV1Api", name[:-1]) for name in ("pods", "services", "secrets", "events")},
+    **{
+        name: ("CoreV1Api", name[:-1])
+        for name in ("pods", "services", "secrets", "events", "namespaces")
+    },
     "configmaps": ("CoreV1Api", "config_map"),
     "resourcequotas": ("CoreV1Api", "resource_quota"),
     "pods/log": ("CoreV1Api", "pod_log"),
@@ -71,8 +74,12 @@ class Release:
     @property
     def where(self) -> str:
         """Namespace and context as a phrase for messages."""
-        context = f" of context '{self.context}'" if self.context else ""
-        return f"in namespace '{self.namespace}'{context}"
+        return f"in namespace '{self.namespace}'{self.of_context}"
+
+    @property
+    def of_context(self) -> str:
+        """Context as the end of a phrase for messages; "" for the current one."""
+        return f" of context '{self.context}'" if self.context else ""
 
     @property
     def flags(self) -> list[str]:
@@ -116,7 +123,8 @@ class Release:
         """Send a request about objects in the release's namespace; return the client's answer.
 
         Args:
-            verb: "list", which returns a list; or "get", "create" or "delete".
+            verb: "list" or, in all namespaces, "list all", which return a list; or "get", "create"
+                or "delete".
             kind: Kind of the objects, such as "pods".
             arguments: Arguments of the Kubernetes client, such as `name`.
 
@@ -126,11 +134,17 @@ class Release:
         from kubernetes import client
 
         name, noun = _KINDS[kind]
+        scope, where = {"namespace": self.namespace}, self.where
         method = f"{'read' if verb == 'get' else verb}_namespaced_{noun}"
+        if verb == "list all":
+            scope, where = {}, f"in all namespaces{self.of_context}"
+            method = f"list_{noun}_for_all_namespaces"
+        elif kind == "namespaces":
+            scope, method = {}, method.replace("_namespaced", "")
         call = getattr(getattr(client, name)(self.client), method)
-        with explain_errors(f"{verb} {kind}", self.where):
-            answer = call(namespace=self.namespace, _request_timeout=REQUEST_TIMEOUT, **arguments)
-        return answer.items if verb == "list" else answer
+        with explain_errors(f"{verb.partition(' ')[0]} {kind}", where):
+            answer = call(_request_timeout=REQUEST_TIMEOUT, **scope, **arguments)
+        return answer.items if verb.startswith("list") else answer
 
     def find(self, kind: str, component: str) -> list[Any]:
         """List the objects of one kind, such as "pods", that belong to a component."""

@@ -15,12 +15,13 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, run
+from cloudrc.cluster.releases import INSTANCE, several_releases
 from cloudrc.config.document import read_document, write_yaml
 from cloudrc.config.load import DIRECTIONS, FILE_READERS, Edit, edit_profile
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
@@ -48,6 +49,7 @@ _LOOK_PERIOD = 0.02
 class LinkParts:
     """The parts of a release's emulated link: its ConfigMap and the pods with link containers."""
 
+    release: str  # name of the release
     name: str  # of the ConfigMap that the link containers follow
     files: dict[str, str]  # of the ConfigMap: profile, traces, record of the last change
     pods: dict[str, str]  # component -> name of its newest running pod
@@ -56,11 +58,19 @@ class LinkParts:
 def read_link(release: Release) -> LinkParts:
     """Read a release's link with one kubectl command.
 
-    Raise a ClusterError if the release has no link, or if a pod does not run.
+    If the name of `release` is "", read the link of the only release in the namespace. Raise a
+    BadInputError if there are several, a ClusterError if the release has no link, or if a pod does
+    not run.
     """
-    selector = f"app.kubernetes.io/name=cloudrc,app.kubernetes.io/instance={release.name}"
+    selector = "app.kubernetes.io/name=cloudrc"
+    selector += f",{INSTANCE}={release.name}" if release.name else ""
     words = [*release.flags, "get", "configmaps,pods", f"--selector={selector}", "--output=json"]
     found = json.loads(run("kubectl", words))["items"]
+    links = (each for each in found if PROFILE in each.get("data", {}))
+    names = {each["metadata"]["labels"].get(INSTANCE, release.name) for each in links}
+    if len(names) > 1:
+        raise several_releases(release, list(names))
+    release = replace(release, name=next(iter(names), release.name))
     # The newest pod comes last, and replaces older pods in the dictionary below.
     found.sort(key=lambda item: str(item["metadata"]["creationTimestamp"]))
     maps = [each for each in found if PROFILE in each.get("data", {})]
@@ -78,7 +88,7 @@ def read_link(release: Release) -> LinkParts:
             f"release '{release.name}' has no link to change; is it a release of cloudrc? see: "
             "helm list --all-namespaces"
         )
-    return LinkParts(maps[0]["metadata"]["name"], maps[0]["data"], pods)
+    return LinkParts(release.name, maps[0]["metadata"]["name"], maps[0]["data"], pods)
 
 
 APPLY_SCRIPT = f"""\

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from cloudrc.cluster.client import ClusterError, Release, end_process, last_words, program, run
+from cloudrc.cluster.releases import no_release
 from cloudrc.errors import BadInputError, TimedOutError, to_one_line
 
 FATAL = {
@@ -73,7 +74,7 @@ def find_pod(release: Release, component: str) -> Any:
     """Find the newest running pod of a component; else raise a ClusterError with the cause."""
     pods = list_pods(release, component)
     if not pods:
-        raise _no_release(release)
+        raise no_release(release)
     running = [pod for pod in pods if pod.status.phase == "Running"]
     if not running:
         why = pod_failure(pods[0]) or f"it is {pods[0].status.phase}"
@@ -88,16 +89,8 @@ def find_deployment(release: Release, component: str) -> Any:
     """Find the Deployment of a component; raise a ClusterError if the release does not exist."""
     found = release.find("deployments", component)
     if not found:
-        raise _no_release(release)
+        raise no_release(release)
     return found[0]
-
-
-def _no_release(release: Release) -> ClusterError:
-    return ClusterError(
-        f"no release '{release.name}' {release.where}; install it: "
-        f"helm install {release.name} charts/cloudrc {' '.join(release.helm_flags)}, "
-        "or name another: --release NAME -n NAMESPACE"
-    )
 
 
 def pod_failure(pod: Any) -> str:

@@ -192,3 +192,12 @@ CLOSED = "No Prometheus may scrape"
 def test_the_notes_warn_of_what_will_not_work(values, words, warns):
     """The guard's limit is in the experiment, because a change of the link restarts nothing."""
     assert (words in notes(values)) is warns
+
+
+def test_helm_keeps_the_journal_only_if_asked_to_and_the_notes_say_so():
+    for keep in (False, True):
+        values = {"teleop": {"journal": {"keep": keep}}}
+        (claim,) = of_kind(render(values), "PersistentVolumeClaim").values()
+        annotations = claim["metadata"].get("annotations", {})
+        assert (annotations.get("helm.sh/resource-policy") == "keep") is keep
+        assert ("teleop.journal.keep=true" in notes(values)) is not keep

@@ -49,6 +49,7 @@ class FakeApi:
     def put(self, plural, body):
         stamp = f"2026-01-01T00:00:{next(self._clock) % 60:02d}Z"
         made = {"uid": str(uuid.uuid4()), "generation": 1, "creationTimestamp": stamp}
+        made["namespace"] = "demo"
         body = {"status": {}, **body, "metadata": {**made, **body["metadata"]}}
         with self.lock:
             self.objects[plural, body["metadata"]["name"]] = body
@@ -65,7 +66,11 @@ class FakeApi:
             asked = body["spec"]["resourceAttributes"]["resource"]
             return 201, {"spec": {}, "status": {"allowed": asked not in self.forbidden}}
         parts = address.path.strip("/").split("/")
-        _, plural, *rest = parts[parts.index("namespaces") + 1 :]
+        in_namespace = parts[parts.index("namespaces") + 1 :] if "namespaces" in parts else []
+        if in_namespace[1:]:
+            _, plural, *rest = in_namespace
+        else:  # a namespace, or objects of all namespaces
+            plural, rest = ("namespaces", in_namespace) if in_namespace else (parts[-1], [])
         name, subresource = (*rest, "", "")[:2]
         self.seen.append(f"{method} {plural}{'/' + name if name else ''}")
         if (method, plural) in self.refuse:
@@ -87,6 +92,7 @@ class FakeApi:
                     body
                     for (kind, _), body in self.objects.items()
                     if kind == plural
+                    and (not in_namespace or body["metadata"]["namespace"] == in_namespace[0])
                     and labels.items() <= body["metadata"].get("labels", {}).items()
                     and all(_value(body, path) == value for path, value in fields.items())
                 ]
@@ -258,6 +264,7 @@ CONFIG_PLACE = "kubernetes.config.kube_config.KUBE_CONFIG_DEFAULT_LOCATION"
 @pytest.fixture
 def api(tmp_path, monkeypatch):
     server = FakeApi()
+    server.put("namespaces", {"metadata": {"name": "demo"}})
     path = tmp_path / "kubeconfig"
     path.write_text(kubeconfig(server.url))
     monkeypatch.setattr(CONFIG_PLACE, str(path))

@@ -97,6 +97,16 @@ def test_a_change_reaches_both_pods_and_the_configmap(cluster, call):
     assert "downlink   netem" in out
 
 
+def test_of_several_releases_none_is_guessed(cluster, refused):
+    for name in ("cloudrc", "other"):
+        link = item("ConfigMap", f"{name}-link", "link", data={"profile.yaml": PROFILE})
+        link["metadata"]["labels"]["app.kubernetes.io/instance"] = name
+        cluster.items.append(link)
+    del cluster.items[0]
+    assert "several releases in namespace 'demo': cloudrc, other; name one" in refused(LINE)
+    assert not cluster.kept
+
+
 def test_a_local_trace_is_stored_beside_the_profile(cluster, tmp_path, monkeypatch, call):
     (tmp_path / "my trace.csv").write_text(TRACE)
     setting = [f"uplink.trace={tmp_path / 'my trace.csv'}"]

@@ -2,6 +2,8 @@
 
 import pytest
 
+from cloudrc.config import shipped
+from cloudrc.config.load import load_experiment
 from cloudrc.teleop import models
 
 POINT = {"position_m": [0.5, 0.0, 1.0]}
@@ -101,3 +103,8 @@ def test_a_mission_from_here_begins_with_a_free_way(api):
     assert api.post("/v1/missions", order)[0] == 200, "the mission is known, whatever the place"
     later = {**order, "key": "later", "queue": True}
     assert api.post("/v1/missions", later)[0] == 201, "it may begin elsewhere"
+
+
+@pytest.mark.parametrize("name", [name for name in shipped.names("mission") if name != "steps"])
+def test_each_shipped_mission_flies_on_the_default_release(name):
+    load_experiment("paper", [f"mission={name}"])  # an error if a pipe is in the way
