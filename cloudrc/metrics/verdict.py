@@ -324,6 +324,7 @@ class Observations:
     """Contacts in a mission, and lag of world's clock (slip), as telemetry reports them."""
 
     obstacle_contacts: int = 0  # number of contacts with obstacles
+    first_contact: str = ""  # the first of them in words: when, where, next to what
     touch_speed: float | None = None  # of the arm's tip at its first touch of the board [m/s]
     slip_ns: int = 0  # time by which world's clock fell behind while teleop ran [ns]
 
@@ -333,7 +334,9 @@ class Observations:
         `elapsed` is the present mission time [s].
         """
         if self.obstacle_contacts > before.obstacle_contacts:
-            yield "obstacle_touched", f"the robot touched an obstacle at {elapsed:.2f} s"
+            first = not before.obstacle_contacts
+            where = self.first_contact if first else f"again, at {elapsed:.2f} s"
+            yield "obstacle_touched", f"the robot touched an obstacle {where}"
         if self.touch_speed != before.touch_speed:
             text = f"board touched at {elapsed:.2f} s with {self.touch_speed:.2f} m/s"
             yield "board_touched", text
@@ -349,7 +352,9 @@ class Observations:
             ending=ending,
             end=Moment(elapsed),
             touch=None if self.touch_speed is None else (self.touch_speed, UNKNOWN),
-            violations=(_obstacle_touched("an obstacle", count),) if count else (),
+            violations=(_obstacle_touched(f"an obstacle {self.first_contact}", count),)
+            if count
+            else (),
             slow=_too_slow(real_time_factor(elapsed - slip, slip)) if elapsed > 0 else "",
             **known,
         )

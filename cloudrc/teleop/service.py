@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from cloudrc.errors import BadInputError
+from cloudrc.geometry.clearance import clearance_per_obstacle
 from cloudrc.geometry.obstacles import obstacles, surface
 from cloudrc.geometry.placement import find_crossed
 from cloudrc.geometry.scene import Scene
@@ -274,6 +275,7 @@ class MissionService:
             mission.witness = replace(
                 known,
                 obstacle_contacts=seen.obstacle_contacts,
+                first_contact=known.first_contact or self._describe_contact(seen, now_ns),
                 touch_speed=finite_or_none(seen.touch_speed),
                 slip_ns=known.slip_ns + (seen.slip_ns - before.slip_ns if before else 0),
             )
@@ -371,6 +373,21 @@ class MissionService:
             raise ConflictError(
                 f"{self._blocked}; find the cause, then: cloudrc mission acknowledge"
             )
+
+    def _describe_contact(self, seen: RobotStatus, now_ns: int) -> str:
+        """Describe in words where the robot touches an obstacle; "" if it has touched none.
+
+        Telemetry counts contacts, but does not name the bodies. The text names the nearest one.
+        """
+        mission, scene = self._current, self._scene
+        if not seen.obstacle_contacts or mission is None:
+            return ""
+        text = f"at {self._teleop.elapsed(now_ns):.2f} s, {_place(seen.position)} m"
+        known = () if scene is None else obstacles(scene, contact=mission.order.contact)
+        if not known:
+            return text
+        away = clearance_per_obstacle(known, [seen.position], [seen.orientation_wxyz])[0]
+        return f"{text}, next to {known[away.argmin()].name}"
 
     def _check_way(self, leg: Leg, *, contact: bool) -> None:
         """Raise ConflictError if an obstacle lies between the robot and the waypoint of `leg`.

@@ -8,6 +8,7 @@ import pytest
 
 from cloudrc.drivers.teleop import STALL_NS, TeleopLoop
 from cloudrc.exposition.table import MISSION_OUTCOMES
+from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import Cause, GuardState, Setpoint, Start
 from cloudrc.teleop.api import Bridge
 from cloudrc.teleop.service import NO_CLOUD, NOT_HEARD, QUEUE_MAX, next_step
@@ -339,6 +340,25 @@ def test_what_the_robot_touched_decides(seen, codes, exit_code, restarted):
     verdict = flight.view(mission_id)["verdict"]
     assert verdict["exit_code"] == exit_code
     assert [failure["code"] for failure in verdict["failures"]] == codes
+
+
+def test_the_operator_learns_when_and_where_the_robot_touched_an_obstacle_first():
+    """Telemetry counts contacts without names; the nearest obstacle is named."""
+    flight = ServiceFlight(load_scene("pipes"))
+    mission_id = flight.create()
+    flight.step(seconds=0.05)
+    flight.obstacle_contacts = 1
+    flight.step(position=(0.1, 2.0, 0.7), seconds=0.05)
+    flight.obstacle_contacts = 2
+    flight.step(position=(3.0, -6.4, 0.7), seconds=0.05)
+    flight.teleop.cancel(mission_id, flight.now_ns)
+    first = r"the robot touched an obstacle at 0.0\d s, \[0.10, 2.00, 0.70\] m, next to pipe_1"
+    view = flight.view(mission_id)
+    told = [each["text"] for each in view["events"] if each["event"] == "obstacle_touched"]
+    assert re.fullmatch(first, told[0])
+    assert re.fullmatch(r"the robot touched an obstacle again, at 0.\d\d s", told[1])
+    (text,) = (f["text"] for f in view["verdict"]["failures"] if f["code"] == "obstacle_touched")
+    assert re.fullmatch(first + r" \(2 times\)", text)
 
 
 def test_after_a_stall_the_stop_belongs_to_the_stopped_mission():
