@@ -275,40 +275,55 @@ class WorldEndpoint(TunnelEnd):
         old, or if the request may have waited in the socket during a stall. Raise "future" if this
         odometry is later than world's clock.
         """
-        kind, guard, tick_ns = request.request, self.robot.guard, self._tick_ns
-        starts = kind is Request.START
-        if kind is not Request.PROGRESS:
+        starts = request.request is Request.START
+        is_progress = request.request is Request.PROGRESS
+        if not is_progress:
             if request.number <= self._number:
                 return
-            if starts:
-                self._refuse_old(tick_ns - request.basis_stamp_ns, now_ns)
-                # Telemetry does not confirm this request: the operator has to acknowledge first.
-                if guard.latched:
-                    self.counts["start_refused"] += 1
-                    return
+            if starts and not self._may_start(request, now_ns):
+                return
             self._number = request.number
-        if starts and (request.mission_id != self._mission_id or request.start is Start.SPAWN):
-            self._mission_id, self._reached = request.mission_id, 0
-            self._obstacles, self._touch_speed = 0, nan
         if starts:
-            self._contact = request.contact
+            self._note_mission(request)
         if request.mission_id == self._mission_id:  # stored on board for a restarted cloud
             self._reached = max(self._reached, request.reached)
-        if kind is Request.END:
-            guard.end_mission(tick_ns)
-        elif kind is Request.ESTOP:
-            guard.stop(tick_ns)
-        elif kind is Request.ACKNOWLEDGE:
-            guard.acknowledge(tick_ns)
-        elif starts:
-            if request.start is Start.SPAWN:
-                self.robot.put_on_ground(tick_ns, "mission starts from spawn")
-                self._queue([self._door.begin_next_epoch(now_ns)])
-                self._begin_epoch("mission starts from spawn")
-            guard.start_mission(tick_ns)
-        if kind is not Request.PROGRESS:
-            for observer in self.robot.observers:
-                observer.see_request(request, tick_ns)
+        if not is_progress:
+            self._obey(request, now_ns)
+
+    def _may_start(self, request: OperatorRequest, now_ns: int) -> bool:
+        """Return whether the robot may start a mission; count a refusal, raise DecodeErrors."""
+        self._refuse_old(self._tick_ns - request.basis_stamp_ns, now_ns)
+        if not self.robot.guard.latched:
+            return True
+        # Telemetry does not confirm this request: the operator has to acknowledge first.
+        self.counts["start_refused"] += 1
+        return False
+
+    def _note_mission(self, request: OperatorRequest) -> None:
+        """Store which mission starts; for a new mission, forget what the last one touched."""
+        if request.mission_id != self._mission_id or request.start is Start.SPAWN:
+            self._mission_id, self._reached = request.mission_id, 0
+            self._obstacles, self._touch_speed = 0, nan
+        self._contact = request.contact
+
+    def _obey(self, request: OperatorRequest, now_ns: int) -> None:
+        """Carry out a request other than PROGRESS, and inform the observers."""
+        guard, tick_ns = self.robot.guard, self._tick_ns
+        match request.request:
+            case Request.END:
+                guard.end_mission(tick_ns)
+            case Request.ESTOP:
+                guard.stop(tick_ns)
+            case Request.ACKNOWLEDGE:
+                guard.acknowledge(tick_ns)
+            case Request.START:
+                if request.start is Start.SPAWN:
+                    self.robot.put_on_ground(tick_ns, "mission starts from spawn")
+                    self._queue([self._door.begin_next_epoch(now_ns)])
+                    self._begin_epoch("mission starts from spawn")
+                guard.start_mission(tick_ns)
+        for observer in self.robot.observers:
+            observer.see_request(request, tick_ns)
 
     def _refuse_old(self, age_ns: int, now_ns: int) -> None:
         age_max_ns = max(START_AGE_MAX_NS, self._command_age_max_ns)
