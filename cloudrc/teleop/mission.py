@@ -268,14 +268,27 @@ class Teleop:
         if seen.guard is ESTOP:
             self.stopping = False
         new_session = not before or before.epoch != seen.epoch or before.world != seen.world
-        last, onboard, legs = self._setpoint, self._onboard, self._plan.legs
+        changed = new_session or (before is not None and before.mission_id != seen.mission_id)
+        last, onboard = self._setpoint, self._onboard
+        self._follow_robot(seen, now_ns, changed=changed)
+        self._follow_way(seen, onboard, now_ns)
+        if new_session and last is self._setpoint:
+            self._repeat_setpoint(now_ns)
+        self._seen_ns = now_ns
+
+    def _follow_robot(self, seen: RobotStatus, now_ns: int, *, changed: bool) -> None:
+        """Begin or end the mission as telemetry shows.
+
+        If session or mission have `changed` while this teleop has no mission, keep the robot in
+        place.
+        """
         confirmed = self.requests.see(seen, now_ns)
         started = self.state == STARTING and confirmed is Request.START
         if self.state == STARTING and not self._expected and self._plan.start is Start.HERE:
             # The mission was ordered before the first telemetry.
             self._expected = (seen.mission_id, self._mission_id)
         if self.state not in UNDER_WAY:
-            if new_session or (before and before.mission_id != seen.mission_id):
+            if changed:
                 self._stop_foreign_mission(seen)
         elif failure := self._find_failure(seen):
             self._end(*failure, now_ns, where=True)
@@ -283,6 +296,13 @@ class Teleop:
             self._begin(seen, now_ns)
         elif self._is_pending:
             self._select_early(now_ns)
+
+    def _follow_way(self, seen: RobotStatus, onboard: int, now_ns: int) -> None:
+        """Go on to the next waypoint if the robot has reached one; move the setpoint.
+
+        `onboard` is the number of waypoints that the robot has stored as reached.
+        """
+        legs = self._plan.legs
         while self.leg < onboard and self.state in (FLYING, HELD):
             self._advance("reached, as the robot reports,", now_ns)  # the event was lost
         if self.state == FLYING and legs[self.leg].speed:
@@ -291,9 +311,6 @@ class Teleop:
             self._select_here()
         while self.state == FLYING and self._is_reached(legs[self.leg], seen, now_ns):
             self._advance("reached", now_ns)
-        if new_session and last is self._setpoint:
-            self._repeat_setpoint(now_ns)
-        self._seen_ns = now_ns
 
     def handle_deadline(self, now_ns: int) -> None:
         """Check the time limits, move the setpoint along a track, and repeat a request if due."""
