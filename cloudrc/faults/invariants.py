@@ -161,8 +161,7 @@ class RobotInvariants:
 
     def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
         """Implement `Observer.see_step`: check all invariants."""
-        guard, steps, was = self._guard, self._simulator.steps, self._was
-        state, reference, position = guard.state, guard.reference, readings.position
+        steps, was, state = self._simulator.steps, self._was, self._guard.state
         if now_ns != self._next_ns or steps != self._steps + 1:
             self._note(now_ns, "tick", "a step of the physics without a tick of the guard")
         self._next_ns, self._steps = now_ns + STEP_NS, steps
@@ -170,28 +169,17 @@ class RobotInvariants:
             self._check_change(was, state, now_ns)
         self._check_wait(state, now_ns)
         self._check_rotors(state, readings.velocity, rotor_speeds, now_ns)
-        self._check_fence(state, position, readings.velocity, now_ns)
+        self._check_fence(state, readings.position, readings.velocity, now_ns)
         if was is TRACK and state is not TRACK:
             self._leave_track(readings, now_ns)
         if state in FLOWN:
-            self._comes_down = state is LAND
-            self._check_stop(position, reference, state is LAND, now_ns)
-            if not abs(guard.yaw_rate) <= self._limits.yaw_rate_max_radps:  # or it is NaN
-                self._note(now_ns, "cap", f"reference turns by {guard.yaw_rate:.3f} rad/s")
-            if reference is not self._before:
-                self._check_caps(reference, state is TRACK, now_ns)
-            if state is TRACK:
-                late = (now_ns - self._fresh_until_ns) * 1e-9
-                if late > 0.0:
-                    self._note(now_ns, "stale", f"TRACK, {late:.3f} s after the last fresh command")
-            elif any(rotor_speeds):
-                self._check_rest(position, now_ns)
+            self._check_flight(state, readings.position, any(rotor_speeds), now_ns)
         elif any(rotor_speeds):
             self._note(now_ns, "latch", f"rotors turn in {state.name}")
         if state is LAND:
             self._landed_ns = now_ns
         self._check_touches(state, now_ns)
-        self._was, self._state, self._before = state, state, reference
+        self._was, self._state, self._before = state, state, self._guard.reference
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
         """Implement `Observer.see_command`: check an accepted command's age, count invalid ones."""
@@ -246,6 +234,22 @@ class RobotInvariants:
         self._invalid_ns.clear()
 
     # Position and velocity reference.
+
+    def _check_flight(self, state: GuardState, position: Vector, turns: bool, now_ns: int) -> None:
+        """Check the reference in TRACK, HOLD or LAND; `turns` tells whether the rotors turn."""
+        guard, reference = self._guard, self._guard.reference
+        self._comes_down = state is LAND
+        self._check_stop(position, reference, state is LAND, now_ns)
+        if not abs(guard.yaw_rate) <= self._limits.yaw_rate_max_radps:  # or it is NaN
+            self._note(now_ns, "cap", f"reference turns by {guard.yaw_rate:.3f} rad/s")
+        if reference is not self._before:
+            self._check_caps(reference, state is TRACK, now_ns)
+        if state is TRACK:
+            late = (now_ns - self._fresh_until_ns) * 1e-9
+            if late > 0.0:
+                self._note(now_ns, "stale", f"TRACK, {late:.3f} s after the last fresh command")
+        elif turns:
+            self._check_rest(position, now_ns)
 
     def _check_fence(
         self, state: GuardState, position: Vector, velocity: Vector, now_ns: int
