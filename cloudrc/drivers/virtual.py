@@ -17,13 +17,12 @@ from cloudrc.endpoint import Endpoint
 from cloudrc.link.model import LinkDirection
 from cloudrc.messages import Datagram, Passed
 from cloudrc.records import Record
-from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind, peek
+from cloudrc.tunnel.codec import datagram_size, peek
 
 Sink = Callable[[list[Record], list[Record]], None]
 """Function that is called with the new records of world and the new records of cloud."""
 CPU_CLOCK = time.thread_time_ns
 """Clock of this thread's processor time [ns]; a flight that depends on it is not repeatable."""
-COMMAND = int(Kind.COMMAND)  # looking up a member of an enum is slow
 PERIOD_NS = 100_000_000
 """Virtual time between two calls of `sink` and of `until` [ns]."""
 
@@ -130,12 +129,8 @@ class VirtualRun:
 
     def _send(self, datagrams: list[Datagram], link: LinkDirection, *, to_world: bool) -> None:
         for data in datagrams:
-            if type(data) is Passed:
-                kind, epoch, counter, message = data
-                size = COMMAND_SIZES[len(message.plan)] if kind == COMMAND else SIZES[kind]
-            else:
-                (kind, epoch, counter), size = peek(data), len(data)
-            arrivals = link.send(epoch, kind, counter, size, self.now_ns)
+            kind, epoch, counter = data[:3] if type(data) is Passed else peek(data)
+            arrivals = link.send(epoch, kind, counter, datagram_size(data), self.now_ns)
             if link.corrupts and arrivals:
                 data = link.corrupted(epoch, kind, counter, data)
             for arrival_ns in arrivals:

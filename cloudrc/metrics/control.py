@@ -6,6 +6,7 @@ from collections import deque
 
 import numpy as np
 
+from cloudrc.messages import GuardState
 from cloudrc.metrics.definitions import (
     Echoes,
     PredictionJudge,
@@ -40,6 +41,28 @@ def _age_of_information(flight: Flight) -> float | None:
     if not np.isfinite(flight.during("/uplink_delay")["delay"]).any():
         return None
     return mean(age(flight.control["stamp_ns"], flight.control["basis_stamp_ns"]))
+
+
+STEP_NS = 2_000_000
+"""Time between two steps of the low-level controller [ns]."""
+
+
+def ages_at_actuator(flight: Flight) -> Array:
+    """Compute the age of information at the actuator in each step of the low-level controller [s].
+
+    It is the age of the odometry on which the command in use is based: world's clock alone gives
+    it. Steps without a command in use, as in HOLD, have none.
+    Source: S. Kaul, R. Yates, M. Gruteser, "Real-time status: how often should one update?",
+    IEEE INFOCOM 2012: the age of the newest information that a receiver uses.
+    """
+    applied, guard = flight.during("/command_applied"), flight.during("/guard")
+    if flight.start_ns is None or flight.end_ns is None:
+        return np.zeros(0)
+    steps_ns = np.arange(flight.start_ns, flight.end_ns, STEP_NS)
+    newest = applied["stamp_ns"].searchsorted(steps_ns, "right") - 1
+    state = guard["state"][guard["stamp_ns"].searchsorted(steps_ns, "right") - 1]
+    in_use = (newest >= 0) & (state == GuardState.TRACK)
+    return np.asarray(age(steps_ns[in_use], applied["basis_stamp_ns"][newest[in_use]]))
 
 
 def compare_with_truth(
@@ -156,6 +179,13 @@ add_metrics(
      "the paper's tau_n.", lambda flight: mean(round_trips(flight)["loop_delay"])),
     ("age_of_information_mean", "s", "Mean age of cloud's newest odometry when it computes a "
      "command.", _age_of_information),
+    ("age_at_actuator_mean", "s", "Mean age of information at the actuator: of the odometry behind "
+     "the command that the robot follows.",
+     lambda flight: mean(ages_at_actuator(flight))),
+    ("age_at_actuator_p99", "s", "Age of information at the actuator: 99th percentile.",
+     lambda flight: percentile(ages_at_actuator(flight), 99.0)),
+    ("age_at_actuator_peak", "s", "Largest age of information at the actuator.",
+     lambda flight: percentile(ages_at_actuator(flight), 100.0)),
     ("commands_applied", "1", "Number of commands that reached the low-level controller.",
      lambda flight: flight.count(len(flight.during("/command_applied")["epoch"]))),
 )  # fmt: skip

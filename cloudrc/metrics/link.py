@@ -16,6 +16,8 @@ WAYS = {"uplink": "from world to cloud", "downlink": "from cloud to world"}
 """Direction -> words for the direction in the description of a metric."""
 SENT = {"uplink": "/telemetry", "downlink": "/delay_estimate"}
 """Direction -> topic with one row for each datagram that is sent in this direction."""
+SENDER = {"uplink": "world", "downlink": "cloud"}
+"""Direction -> the end that sends in this direction."""
 SETTLING_NS = 2_000_000_000
 """Time after sending from which on a missing datagram counts as lost [ns]."""
 PERCENTILES = {"p50": "median", "p99": "99th percentile", "p999": "99.9th percentile"}
@@ -59,6 +61,28 @@ def loss(flight: Flight, way: str) -> float | None:
     return finite(tally.loss)
 
 
+def _sent(flight: Flight, way: str, name: str) -> float | None:
+    """Return by how much the sender's counter `name` rose in the flight [1].
+
+    The counter is recorded once a second. Between the records, and in less than a second before the
+    first and after the last one, it is taken to rise evenly.
+    """
+    count = flight.recording["/count"]
+    rows = (count["end"] == SENDER[way]) & (count["name"] == name)
+    stamps, totals = count["stamp_ns"][rows], count["total"][rows]
+    if flight.start_ns is None or flight.end_ns is None or len(stamps) < 2:
+        return None
+    grown = np.diff(totals)
+    grown = np.where(grown < 0, totals[1:], grown)  # a process that restarts counts from 0
+    sums = np.cumsum([0, *grown])
+    at = (stamps - stamps[0]) * 1e-9
+    at = np.array([2 * at[0] - at[1], *at, 2 * at[-1] - at[-2]])
+    sums = np.array([2 * sums[0] - sums[1], *sums, 2 * sums[-1] - sums[-2]])
+    ends = (np.array([flight.start_ns, flight.end_ns]) - stamps[0]) * 1e-9
+    before, after = np.interp(ends, at, sums)
+    return float(np.rint(after - before))
+
+
 def _add_direction(way: str, words: str) -> None:
     """Add the metrics of the direction `way`; `words` name the direction in descriptions."""
 
@@ -70,6 +94,10 @@ def _add_direction(way: str, words: str) -> None:
         "Link and loop",
         (f"{way}_delay_mean", "s", f"Mean one-way delay {words} of all datagrams that arrived, "
          "late ones included.", partial(_delay_mean, way=way)),
+        (f"packets_sent_{way}", "1", f"Number of datagrams sent {words} in the flight.",
+         partial(_sent, way=way, name="sent")),
+        (f"bytes_sent_{way}", "B", f"UDP payload of the datagrams sent {words} in the flight.",
+         partial(_sent, way=way, name="sent_bytes")),
         (f"late_{way}", "1", f"Share of the arrived datagrams {words} that were too late to be "
          "used.", partial(_late, way=way)),
         (f"loss_{way}", "1", f"Share of the datagrams {words} that never arrived.",

@@ -112,7 +112,16 @@ COMMAND_SIZES = tuple(
 )
 """Number of velocities in a command's plan -> size of the datagram [bytes]."""
 _size_of = SIZES.get
+_COMMAND_KIND = int(Kind.COMMAND)  # looking up a member of an enum is slow
 _unpack_header: Callable[[bytes], Header] = _HEADER.unpack_from
+
+
+def datagram_size(data: Datagram) -> int:
+    """Return the size of a datagram [bytes]; a passed message has the size that it would have."""
+    if type(data) is not Passed:
+        return len(data)
+    kind, _, _, message = data
+    return COMMAND_SIZES[len(message.plan)] if kind == _COMMAND_KIND else SIZES[kind]
 
 
 def encode_header(kind: int, direction: int, epoch: int, counter: int) -> bytes:

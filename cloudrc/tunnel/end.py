@@ -10,7 +10,7 @@ from cloudrc.messages import Command, Datagram, Telemetry
 from cloudrc.records import Fault, Record
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.channel import Channel
-from cloudrc.tunnel.codec import Direction, encode_command, encode_telemetry
+from cloudrc.tunnel.codec import Direction, datagram_size, encode_command, encode_telemetry
 from cloudrc.tunnel.handshake import KEY_TEXT, VERSION_TEXT
 from cloudrc.tunnel.keys import KeyRing
 from cloudrc.tunnel.session import Session
@@ -82,12 +82,10 @@ class TunnelEnd:
             self._tell("key", KEY_TEXT, now_ns)
 
     def _send(self, kind: int, body: bytes) -> None:
-        self._datagrams.append(self._session.seal(kind, body))
-        self.counts["sent"] += 1
+        self._queue([self._session.seal(kind, body)])
 
     def _send_message(self, kind: int, message: Telemetry | Command) -> None:
-        self._datagrams.append(self._make_datagram(kind, message))
-        self.counts["sent"] += 1
+        self._queue([self._make_datagram(kind, message)])
 
     def _encode(self, kind: int, message: Telemetry | Command) -> bytes:
         encode: Any = encode_command if isinstance(message, Command) else encode_telemetry
@@ -96,3 +94,4 @@ class TunnelEnd:
     def _queue(self, datagrams: list[Datagram]) -> None:
         self._datagrams += datagrams
         self.counts["sent"] += len(datagrams)
+        self.counts["sent_bytes"] += sum(map(datagram_size, datagrams))

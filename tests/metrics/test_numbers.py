@@ -43,6 +43,7 @@ REAL_TIME = {
     *("real_time_factor", "world_slip", "world_lateness_p99", "cloud_lateness_p99"),
     "missed_periods",
 }
+TRAFFIC = {f"{unit}_sent_{way}" for unit in ("packets", "bytes") for way in WAYS}
 OF_RELAYS = {
     *(f"release_error_{share}_{way}" for share in ("p50", "p99", "p999") for way in WAYS),
     *(f"{name}_{way}" for name in ("relay_overflow", "relay_stalled") for way in WAYS),
@@ -92,6 +93,31 @@ HOLDS = [
     GuardChange(at(3.5), GuardState.TRACK, "not the start"),
     GuardChange(at(9.5), GuardState.HOLD, "command age"),
 ]
+
+
+def traffic():
+    """World sends 100 datagrams per second, cloud 50; cloud restarts 6 s after the start."""
+    log = flown()
+    for n in range(10):
+        log.world += [
+            Counted(at(n + 0.5), "world", "sent", 7 + 100 * n),
+            Counted(at(n + 0.5), "world", "sent_bytes", 20_000 * n),
+        ]
+        log.cloud.append(Counted(at(n + 0.5), "cloud", "sent", 50 * (n if n < 6 else n - 5)))
+    log.cloud.append(Counted(at(1.0), "cloud", "sent_bytes", 3))
+    return log.flight()
+
+
+def held():
+    """In HOLD, from 2 s to 5 s, the robot follows no command."""
+    log = flown()
+    log.world += [
+        GuardChange(at(2.0), GuardState.HOLD, "no fresh commands"),
+        GuardChange(at(5.0), GuardState.TRACK, "fresh commands again"),
+    ]
+    within = range(at(2.0), at(5.0))
+    log.change(CommandApplied, lambda n, c: None if c.stamp_ns in within else c)
+    return log.flight()
 
 
 def planned():
@@ -183,6 +209,9 @@ NUMBERS = {
         "uplink_delay_mean": approx(0.05),
         "downlink_delay_mean": approx(0.04),
         "age_of_information_mean": approx(0.05),
+        # Applied 90 ms after the measurement, in use for 40 ms, in 20 steps.
+        "age_at_actuator_mean": approx(0.109),
+        **dict.fromkeys(("age_at_actuator_p99", "age_at_actuator_peak"), approx(0.128)),
         "commands_applied": 251.0,  # 25 per second for 10 s, both ends included
         # The HOLD after the mission's end does not count.
         **dict.fromkeys(("hold_count", "hold_time", "fault_count", "obstacle_contacts"), 0.0),
@@ -191,7 +220,7 @@ NUMBERS = {
         **dict.fromkeys(("contact_time", "tip_speed", "steady_contact_force", "contact_impulse")),
         **dict.fromkeys(("peak_contact_force", "min_clearance", "min_clearance_flight")),
         **dict.fromkeys(("steady_error_x", "recorder_dropped")),
-        **dict.fromkeys(REAL_TIME | OF_RELAYS),
+        **dict.fromkeys(REAL_TIME | OF_RELAYS | TRAFFIC),
     },
     contact: {
         "contact_time": approx(8.0),
@@ -227,6 +256,13 @@ NUMBERS = {
     },
     # Time zero stays the first TRACK. The holds last 1.5 s, and 0.5 s to the end.
     lambda: plus(*HOLDS): {"hold_count": 2.0, "hold_time": approx(2.0), "duration": 10.0},
+    traffic: {
+        "packets_sent_uplink": 1000.0,
+        "bytes_sent_uplink": 200_000.0,
+        "packets_sent_downlink": 500.0,
+        "bytes_sent_downlink": None,
+    },
+    held: {"age_at_actuator_mean": approx(0.109, abs=1e-3), "age_at_actuator_peak": approx(0.128)},
     planned: {
         "prediction_error_rms": approx(0.005),  # off by (3, 4, 0) mm
         "delay_estimate_error_rms": None,
@@ -278,7 +314,7 @@ def test_the_paper_flight_has_all_numbers_of_virtual_flight():
     resting = {f"steady_error_{axis}" for axis in "xyz"}
     assert set(SHIPPED) - set(numbers) == REAL_TIME | OF_RELAYS | resting | {"recorder_dropped"}
     for name, number in numbers.items():
-        assert set(number.unit) <= set("smN12^/ "), name
+        assert set(number.unit) <= set("smNB12^/ "), name
         assert number.meaning[0].isupper(), name
         assert number.meaning.endswith("."), name
         assert isfinite(number.value), name

@@ -82,7 +82,7 @@ def test_a_later_report_measures_a_file_only_if_named(folder):
         (["bad.py"], "import sys; sys.exit(0)", "cannot be imported: SystemExit: 0"),
         (["duration.py"], OVERSHOOT, "duration is a metric already; rename the file"),
         (["bad.py", "mine/../bad.py"], OVERSHOOT, "2 metrics are named bad"),
-        (["overshoot"], "", "no metric named 'overshoot'; available: age_of_"),
+        (["overshoot"], "", "no metric named 'overshoot'; available: age_at_"),
     ],
 )
 def test_an_invalid_metric_is_refused_in_one_line(folder, refused, names, text, reason):
