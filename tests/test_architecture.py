@@ -20,6 +20,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "messages": set(),
     "records": set(),
     "renamed": set(),
+    "rounding": set(),
     "source": set(),
     "endpoint": set(),
     "files": set(),
@@ -61,7 +62,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "__main__": {"cli"},
     "__init__": {"api"},
 }
-ALWAYS = {"errors", "messages", "records", "renamed", "source", "__version__"}
+ALWAYS = {"errors", "messages", "records", "renamed", "source", "__version__", "rounding"}
 
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it. Ruff checks
 # clocks, sockets, threads, signals, chance, and calls such as `eval` and `print` (pyproject.toml).

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cloudrc.config.schema import Loss
 from cloudrc.link.draws import BLOCK, OVERTAKES, Fate, bit_flips, impairments, stream_key
 from cloudrc.link.profile import Conditions, DirectionProfile, Timeline
+from cloudrc.rounding import differences
 
 HEADER_BYTES = 28  # size of the IPv4 and UDP headers (RFC 791, RFC 768), also on the wire [bytes]
 _TABLES = 64  # number of blocks of impairments that are kept in memory
@@ -221,7 +222,7 @@ def numbers(stream: Stream) -> Numbers:
         delays = np.array([np.nan])
     both = arrived[1:] & arrived[:-1]
     pairs = stream.delays[:-1][both], stream.delays[1:][both]
-    varies = len(pairs[0]) > 2 and min(np.std(pairs[0]), np.std(pairs[1])) > 0
+    varies = len(pairs[0]) > 2 and all(_varies(each) for each in pairs)
     arrival = np.rint((stream.sent + stream.delays)[arrived] * 1e9).astype(np.int64)
     # Packets with the same arrival time keep their order.
     earliest_after = np.minimum.accumulate(arrival[::-1])[::-1][1:]
@@ -229,7 +230,7 @@ def numbers(stream: Stream) -> Numbers:
     least, middle, p99, most = np.quantile(delays, (0.0, 0.5, 0.99, 1.0)).tolist()
     return Numbers(
         mean=float(np.mean(delays)),
-        deviation=float(np.std(delays)),
+        deviation=float(np.std(delays)) if _varies(delays) else 0.0,
         least=least,
         median=middle,
         p99=p99,
@@ -240,6 +241,11 @@ def numbers(stream: Stream) -> Numbers:
         overtaken=float(np.mean(overtaken)) if len(overtaken) else float("nan"),
         duplicated=float(np.mean(stream.copies > 1)),
     )
+
+
+def _varies(delays: Array) -> bool:
+    """Return whether delays [s], shape (n,), differ by more than rounding."""
+    return bool(differences(delays.min(), delays.max()))
 
 
 def loss_runs(stream: Stream) -> tuple[int, ...]:

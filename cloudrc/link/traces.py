@@ -18,6 +18,7 @@ from cloudrc.config.schema import Direction
 from cloudrc.errors import BadInputError
 from cloudrc.files import read
 from cloudrc.link.profile import DirectionProfile, Trace
+from cloudrc.rounding import differences
 
 SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a second
 START_MAX = 600.0  # if the first row is later, times count from the first row [s]
@@ -85,7 +86,7 @@ def read_table(path: Path, size_max: int = SIZE_MAX) -> tuple[float, ...]:
     delays = [delay for delay, loss in zip(trace.delays, losses, strict=True) if loss < 1.0]
     mean = fsum(delays) / max(len(delays), 1)
     deviation = sqrt(fsum((delay - mean) ** 2 for delay in delays) / max(len(delays), 1))
-    if deviation <= 1e-9 * mean:
+    if not delays or not differences(min(delays), max(delays)):
         raise BadInputError(
             f"table {path}: needs at least two different delays; give a trace with more rows, "
             "or another distribution"

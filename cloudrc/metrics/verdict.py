@@ -29,6 +29,7 @@ from cloudrc.metrics.definitions import real_time_factor
 from cloudrc.metrics.mission import first_touch, obstacle_contacts, reported
 from cloudrc.metrics.response import steps
 from cloudrc.records import REAL_TIME_FACTOR_MIN
+from cloudrc.rounding import exceeds, format_beside
 
 SLIP_MAX = 0.25
 """Largest time that world's clock may lose in a valid flight [s]: the guard's default limit on the
@@ -118,10 +119,10 @@ class Evidence:
 def judge(evidence: Evidence) -> Verdict:
     """Judge a mission by its evidence; the verdict lists all violations and unmet goals."""
     violations, limit = evidence.violations, evidence.contact_speed_max
-    if evidence.contact and evidence.touch is not None and evidence.touch[0] >= limit:
+    if evidence.contact and evidence.touch is not None and not exceeds(limit, evidence.touch[0]):
         speed, moment = evidence.touch
         key = f"criteria.contact_speed_max_mps {limit:g}"
-        text = f"the tip met the board at {speed:.2f} m/s, not below {key}"
+        text = f"the tip met the board at {format_beside(speed, limit)} m/s, not below {key}"
         violations = (Failure("contact_too_fast", text, *moment), *violations)
     if evidence.ending.code in BROKEN_OFF:
         return Verdict("interrupted", (Failure(*evidence.ending, *evidence.end), *violations))
@@ -145,9 +146,9 @@ def _unmet_goals(evidence: Evidence) -> Iterator[Failure]:
     if evidence.contact and evidence.touch is None:
         text = "the arm never touched the board, which criteria.contact requires"
         yield Failure("board_not_touched", text)
-    if end.time is not None and end.time > evidence.time_limit:
+    if end.time is not None and exceeds(end.time, evidence.time_limit):
         key = f"criteria.time_limit_s {evidence.time_limit:g}"
-        text = f"the mission took {end.time:.1f} s, more than {key}"
+        text = f"the mission took {format_beside(end.time, evidence.time_limit)} s, more than {key}"
         yield Failure("time_limit_exceeded", text, *end)
 
 
@@ -269,12 +270,13 @@ def _plugins(flight: Flight) -> Iterator[Failure]:
 def _responses(flight: Flight, settle: float) -> Iterator[Failure]:
     """Yield a failure if a step did not settle to `settle` [m]; another for an unstable loop."""
     found, unit = steps(flight), "step" if flight.mission.steps else "waypoint"
-    far = [step for step in found if step.last_error > settle]
+    far = [step for step in found if exceeds(step.last_error, settle)]
     if far and flight.mission.steps:
         first = far[0]
+        error = format_beside(first.last_error, settle)
         text = (
             f"{len(far)} of {len(found)} steps did not settle: in step {first.waypoint + 1} the "
-            f"robot was {first.last_error:.2f} m from the setpoint in the last 0.5 s, above "
+            f"robot was {error} m from the setpoint in the last 0.5 s, above "
             f"criteria.settle_m {settle:g} m"
         )
         yield Failure("not_settled", text, first.start)

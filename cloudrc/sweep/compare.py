@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from cloudrc.errors import BadInputError
 from cloudrc.plugins import unknown_name_text
+from cloudrc.rounding import differences
 from cloudrc.sweep import store
 from cloudrc.sweep.flight import Row, counts
 from cloudrc.sweep.statistics import LEVEL, paired, sign_test, wilson_interval
@@ -88,7 +89,7 @@ def _number(pairs: Sequence[Pair], name: str, unit: str) -> dict[str, Any]:
         "unit": unit,
         "a_median": median(a for a, _ in both),
         "b_median": median(b for _, b in both),
-        **asdict(paired([b - a for a, b in both])),
+        **asdict(paired(differences(*zip(*both, strict=True)).tolist())),
         "left_out": len(pairs) - len(both),
     }
 

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cloudrc import rounding
+
 LEVEL = 0.05
 """Significance level of the tests: an effect is decided if its p-value is below this value [1]."""
 POWER = 0.80
@@ -87,8 +89,7 @@ def signed_rank_test(differences: Sequence[float]) -> float:
     values = np.array([value for value in differences if value], dtype=float)
     if not len(values):
         return 1.0
-    _, kinds, counts = np.unique(np.abs(values), return_inverse=True, return_counts=True)
-    doubled = (2 * np.cumsum(counts) - counts + 1)[kinds]  # twice the rank: a whole number
+    doubled = _doubled_ranks(np.abs(values))
     total = int(doubled[values > 0].sum())
     smaller = min(total, int(doubled.sum()) - total)
     if len(doubled) > EXACT_MAX:
@@ -97,6 +98,18 @@ def signed_rank_test(differences: Sequence[float]) -> float:
     else:
         p = float(_sums(doubled)[: smaller + 1].sum())
     return min(1.0, 2 * p)
+
+
+def _doubled_ranks(sizes: NDArray[Any]) -> NDArray[Any]:
+    """Return twice the rank of each size, a whole number; equal sizes share their ranks."""
+    order = np.argsort(sizes)
+    ordered = sizes[order]
+    group = np.cumsum(rounding.differences(ordered[:-1], ordered[1:]) > 0.0, dtype=np.int64)
+    kinds = np.concatenate(([0], group))
+    counts = np.bincount(kinds)
+    doubled = np.empty(len(sizes), dtype=np.int64)
+    doubled[order] = (2 * np.cumsum(counts) - counts + 1)[kinds]
+    return doubled
 
 
 def _sums(ranks: NDArray[Any]) -> NDArray[Any]:
@@ -140,11 +153,13 @@ def paired(differences: Sequence[float]) -> Paired:
     """
     values = np.sort(np.asarray(differences, dtype=float))
     n, lower, higher = len(values), int((values < 0).sum()), int((values > 0).sum())
-    means = np.sort(np.concatenate([(values[i:] + values[i]) / 2 for i in range(n)]))
+    means = np.sort(
+        np.concatenate([rounding.differences(-values[i], values[i:]) / 2 for i in range(n)])
+    )
     cut = _cut(n)
     interval = (float(means[cut]), float(means[-1 - cut])) if cut >= 0 else None
     p = signed_rank_test(values.tolist())
-    decided = interval is not None and interval[0] * interval[1] > 0 and p < LEVEL
+    decided = interval is not None and p < LEVEL and (interval[0] > 0 or interval[1] < 0)
     needed = _pairs_needed(values, means, PAIRS_MIN if decided else max(PAIRS_MIN, n + 1))
     middle, p_sign = float(np.median(means)), sign_test(lower, higher)
     return Paired(n, lower, higher, middle, interval, p, p_sign, decided, needed)

@@ -280,3 +280,11 @@ def test_statistics_of_losses_copies_and_of_nothing():
     nothing = measured(profile_of(loss=1.0), 10)
     assert (nothing.loss, nothing.runs) == (1.0, (10,))
     assert all(isnan(value) for value in (nothing.mean, nothing.p99, nothing.correlation))
+
+
+@pytest.mark.parametrize("delay_ms", [0.1, 45.0, 270.3])
+def test_a_constant_delay_has_no_deviation_and_no_correlation(delay_ms):
+    profile = profile_of(delay_ms * 1e-3)
+    found = numbers(sample(link(profile), 3, range(0, 1000 * PERIOD_NS, PERIOD_NS), 191))
+    assert found.deviation == 0.0
+    assert isnan(found.correlation)

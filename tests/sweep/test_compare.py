@@ -55,3 +55,11 @@ def test_numbers_of_a_plugin_that_failed_do_not_count():
     assert (found["pairs"], found["left_out"]) == (1, 1)
     with pytest.raises(BadInputError, match="plug-in failed: a reason"):
         compare(pairs((ok, failed)), UNITS)
+
+
+def test_numbers_that_differ_by_rounding_are_equal():
+    both = [(flown(iae_mean=0.3), flown(iae_mean=0.1 + 0.2)) for _ in range(8)]
+    found = compare(pairs(*both), UNITS)["numbers"]["iae_mean"]
+    assert (found["difference"], found["interval"]) == (0.0, (0.0, 0.0))
+    assert (found["lower"], found["higher"], found["decided"]) == (0, 0, False)
+    assert (found["p_wilcoxon"], found["p_sign"]) == (1.0, 1.0)

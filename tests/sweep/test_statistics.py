@@ -112,3 +112,11 @@ def test_few_pairs_or_no_effect_decide_nothing(values):
     found = paired(values)
     assert not found.decided
     assert found.pairs_needed is None or found.pairs_needed > len(values)
+
+
+def test_differences_that_are_equal_up_to_rounding_share_their_ranks_and_cancel():
+    rounded = [0.1 + 0.2, -0.3, 0.3, 0.7, -0.7, 0.1 + 0.6]
+    exact = [0.3, -0.3, 0.3, 0.7, -0.7, 0.7]
+    assert signed_rank_test(rounded) == signed_rank_test(exact)
+    found = paired([0.1 + 0.2, -0.3] * 4)
+    assert (found.difference, found.decided, found.pairs_needed) == (0.0, False, None)

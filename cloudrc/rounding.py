@@ -1,0 +1,33 @@
+"""What is equal up to rounding is equal: one rule for every comparison of computed numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+ROUNDING = 1e-9
+"""Two numbers are equal if they differ by less than this share of the larger one [1]."""
+DECIMALS = 2, 15
+"""Smallest and largest number of decimals of `format_beside`."""
+
+
+def differences(a: ArrayLike, b: ArrayLike) -> NDArray[Any]:
+    """Return b - a, any unit and shape; 0 where a and b are equal up to rounding."""
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    found = b - a
+    tied = np.abs(found) < ROUNDING * np.maximum(np.abs(a), np.abs(b))
+    return np.where(tied, 0.0, found)
+
+
+def exceeds(value: float, limit: float) -> bool:
+    """Return whether `value` is above `limit`, both in any unit, by more than rounding."""
+    return bool(differences(limit, value) > 0.0)
+
+
+def format_beside(value: float, limit: float) -> str:
+    """Format `value` with two decimals, or with as many as tell it from `limit` [any unit]."""
+    first, last = DECIMALS
+    texts = [f"{value:.{digits}f}" for digits in range(first, last + 1)]
+    return next((text for text in texts if differences(limit, float(text))), texts[0])

@@ -1,0 +1,45 @@
+"""Numbers that are equal up to rounding are equal."""
+
+from math import inf, nan
+
+import numpy as np
+import pytest
+
+from cloudrc.rounding import differences, exceeds, format_beside
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "difference"),
+    [
+        (0.3, 0.1 + 0.2, 0.0),
+        (1e6, 1e6 + 1e-4, 0.0),
+        (-5.0, -5.0 - 1e-9, 0.0),
+        (1.0, 1.5, 0.5),
+        (0.0, 1e-300, 1e-300),  # a share of the larger number, not a fixed size
+        (0.0, 0.0, 0.0),
+        (1e-12, -1e-12, -2e-12),
+    ],
+)
+def test_a_difference_below_rounding_is_none(a, b, difference):
+    assert differences(a, b) == difference
+    assert exceeds(b, a) == (difference > 0.0)
+    assert exceeds(a, b) == (difference < 0.0)
+
+
+def test_differences_of_arrays_are_taken_one_by_one():
+    assert differences([0.3, 1.0], [0.1 + 0.2, 2.0]).tolist() == [0.0, 1.0]
+    assert np.isnan(differences(nan, 1.0))
+    assert not exceeds(3.0, inf)
+
+
+@pytest.mark.parametrize(
+    ("value", "limit", "text"),
+    [
+        (0.31, 0.15, "0.31"),
+        (0.1504, 0.15, "0.1504"),
+        (60.0004, 60.0, "60.0004"),
+        (0.25, 0.25, "0.25"),
+    ],
+)
+def test_a_value_beside_its_limit_does_not_look_equal(value, limit, text):
+    assert format_beside(value, limit) == text
