@@ -294,7 +294,11 @@ def _inline_profile(document: Document) -> None:
     """Fill in the values of the link that the experiment omits, from the link profile."""
     _default(document, ("link", "profile"), Experiment().link.profile)
     name = document.get("link", "profile")
-    if not isinstance(name, str) or _has_all_values(document):
+    if not isinstance(name, str):
+        return
+    if _has_all_values(document):
+        if any(document.get(*path) is None for path in _implied(Profile())):  # set to null again
+            _default_all(document, _implied(_present_profile(document)))
         return
     source = document.source(("link", "profile"))
     file = shipped.read("profile", name, source.folder)
@@ -311,8 +315,19 @@ def _inline_profile(document: Document) -> None:
                 if key[:1] == (way,) and not (own and key[1:2] and key[1] in own)
             }
             document.sources = inserted | document.sources
-    for path, value in _implied(profile).items():
+    _default_all(document, _implied(profile))
+
+
+def _default_all(document: Document, values: dict[KeyPath, float]) -> None:
+    for path, value in values.items():
         _default(document, path, value)
+
+
+def _present_profile(document: Document) -> Profile:
+    """Return the profile of a resolved experiment; an empty one if its file no longer exists."""
+    with suppress(BadInputError):
+        return load_profile(str(document.get("link", "profile")))
+    return Profile()
 
 
 def _implied(profile: Profile) -> dict[KeyPath, float]:
@@ -350,10 +365,7 @@ def _remove_derived(document: Document, *, new_profile: bool) -> None:
     with suppress(TypeError):  # a value is missing, or no number
         derived["guard", "speed_max_mps"] = speed_cap(*limits)
     if new_profile:
-        profile = Profile()
-        with suppress(BadInputError):  # the profile's file may no longer exist
-            profile = load_profile(str(document.get("link", "profile")))
-        derived |= _implied(profile)
+        derived |= _implied(_present_profile(document))
         for way in DIRECTIONS:
             del document.tree["link"][way]
     for (section, key), value in derived.items():

@@ -100,7 +100,7 @@ def apply_overrides(document: Document, settings: Settings) -> None:
             _check_index(document, path[:depth], source)
             default = child(default, key)
             present = document.get(*path[:depth])
-            node = copy.deepcopy(default) if present is None else present
+            node = _beginning(default) if present is None else present
             if path[0] == "cloud" and path[1] in KINDS and depth == 2 and isinstance(node, str):
                 node = {"name": node}  # not by `set_value`: the name keeps its source
                 document.tree["cloud"][key] = node
@@ -110,6 +110,14 @@ def apply_overrides(document: Document, settings: Settings) -> None:
                 document.set_value(path[:depth], node, document.source(path[:depth]))
         _check_index(document, path, source)
         document.set_value(path, copy.deepcopy(value), source)
+
+
+def _beginning(default: Any) -> Any:
+    """Return what to change if the document has no value, from the value's default.
+
+    A section begins empty: its defaults would look like values that somebody has set.
+    """
+    return {} if isinstance(default, dict) else copy.deepcopy(default)
 
 
 def _check_index(document: Document, path: KeyPath, source: Source) -> None:

@@ -1,0 +1,124 @@
+"""Two valid settings together load, or are refused by a line that names one of them.
+
+A pair may fail although each of its settings loads alone, for example because a derived value is
+taken for one that the user has set. The tests load every pair, without plug-ins: that takes 1 ms.
+"""
+
+import json
+import re
+from itertools import combinations, product
+
+import pytest
+
+from cloudrc.config import problems
+from cloudrc.config.load import dump, load_experiment
+from cloudrc.config.schema import Experiment
+from cloudrc.errors import BadInputError
+from tests.conftest import nightly
+
+OWN = """\
+mission: {waypoints: [{position_m: [0, 0, 1.0]}]}
+world: {scene: empty}
+criteria: {contact: false, time_limit_s: 40}
+"""
+NAMES = {
+    **{"robot": "pelican", "scene": "empty", "profile": "paper-p2", "mission": "hover"},
+    **{"estimator": "ewma", "predictor": "kalman", "controller": "pid"},
+}
+"""Last part of a key -> a name that fits it."""
+CHOSEN = [
+    *((key, None) for key in ("cloud", "link", "guard", "link.uplink", "cloud.horizon_max_s")),
+    *(("link.profile", name) for name in ("ideal", "satellite", "handover")),
+    *(("guard.command_age_max_ms", 2000), ("guard.speed_max_mps", 5), ("guard.plan_max_s", 0.8)),
+    *(("cloud.freeze_after_s", None), ("guard.command_age_max_ms", None), ("guard.plan_max_s", 0)),
+    *(("cloud.horizon_max_s", 2), ("cloud.plan_s", 0.4), ("cloud.controller.speed_max", 2)),
+    *(("cloud", {"controller": "pid"}), ("cloud.predictor", {"name": "last_sample"})),
+    *(("link", {"profile": "paper-p3"}), ("link.uplink", {"delay_ms": 30}), ("guard", {})),
+    *(("link.both.delay_ms", 300), ("link.uplink.loss", {"bad_start": 0.1, "bad_end": 0.3})),
+    ("link.uplink.changes", [{"at_s": 3, "delay_ms": 50}]),
+    ("link.downlink.blackouts", [{"start_s": 3, "duration_s": 0.4}]),
+    *(("mission", "steps"), ("mission.carrot", {"speed_mps": 2}), ("criteria.contact", True)),
+]
+"""Settings that depend on each other, or replace many values."""
+
+
+def values(key):
+    """Yield values for a key, one of which should be valid."""
+    words = problems.expectation(Experiment, tuple(key.split(".")))
+    yield from filter(None, [NAMES.get(key.rpartition(".")[2])])
+    yield from re.findall(r"one of '([^']*)'", words)
+    yield from (True, 1, 0.5, 0, 100, [0.5, 0.5, 0.5], [1, 0], "x")
+
+
+def load(file, *settings):
+    texts = [f"{key}={json.dumps(value)}" for key, value in settings]
+    return load_experiment(file, texts, build=False)
+
+
+def loads(file, *settings):
+    try:
+        load(file, *settings)
+    except BadInputError:
+        return False
+    return True
+
+
+def valid_settings(file):
+    """Return a setting for each key that has a value with which the experiment loads."""
+    keys = [".".join(path) for path, _ in problems.leaves(Experiment) if "downlink" not in path]
+    tried = ((key, value) for key in keys for value in values(key))
+    return [*dict(one for one in tried if loads(file, one)).items()]
+
+
+def blames_another_key(file, *settings):
+    """Return the error of a pair if one of its lines names neither of the keys; else ""."""
+    try:
+        load(file, *settings)
+    except BadInputError as error:
+        lines = str(error).splitlines()[1:] or [str(error)]
+        keys = {key.replace(".both", "") for key, _ in settings}
+        keys |= {key.rpartition(".")[2] for key in keys}
+        if not all(any(key in line for key in keys) for line in lines):
+            return f"{settings}: {error}"
+    return ""
+
+
+@pytest.fixture(params=["own", "resolved"])
+def file(request, tmp_path):
+    """A small experiment without the sections cloud and link, also with all values."""
+    path = tmp_path / "own.yaml"
+    path.write_text(OWN)
+    if request.param == "resolved":
+        path.write_text(dump(load_experiment(path)))
+    return path
+
+
+@pytest.mark.parametrize("step", [10, *nightly(1)])
+def test_every_pair_of_valid_settings_loads_or_names_one_of_them(file, step):
+    """Of pairs without a chosen setting, try one of `step`."""
+    single = valid_settings(file)
+    assert [one for one in CHOSEN if not loads(file, one)] == []
+    assert len(single) > 60
+    others = [*combinations(single, 2)][::step]
+    pairs = (*combinations(CHOSEN, 2), *product(CHOSEN, single), *others)
+    apart = [(one, two) for one, two in pairs if one[0] != two[0]]
+    assert [text for pair in apart if (text := blames_another_key(file, *pair))] == []
+
+
+def test_null_means_again_what_the_profile_gives(tmp_path):
+    path = tmp_path / "resolved.yaml"
+    path.write_text(dump(load_experiment("hover", ["link.profile=satellite"])))
+    keys = ("cloud.horizon_max_s", "cloud.freeze_after_s", "guard.command_age_max_ms")
+    before, after = load(path), load(path, *((key, None) for key in keys))
+    assert (after.cloud, after.guard) == (before.cloud, before.guard)
+
+
+def test_a_setting_of_another_section_leaves_the_link_to_its_profile(tmp_path):
+    path = tmp_path / "own.yaml"
+    path.write_text(OWN)
+    profile = ("link.profile", "satellite")
+    alone = load(path, profile)
+    assert alone.uplink.delay_ms == 300
+    for one in valid_settings(path):
+        if not one[0].startswith(("link", "mission")):
+            assert load(path, profile, one).link == alone.link, one
