@@ -30,13 +30,15 @@ if TYPE_CHECKING:
 ENDINGS = ("done", "cancelled", "timed_out")
 PLAIN_PERIOD = 30.0
 """Time between two lines of progress of a sweep that is not shown on a terminal [s]."""
+PLAN_WAIT = 1.0
+"""Time after which the check of a sweep shows its progress [s]."""
 
 
 class FlightView:
     """Prints the events of a flight to a stream and, on a terminal, updates a status line."""
 
     def __init__(self, stream: TextIO, waypoints: int) -> None:
-        """Set the stream and the number of waypoints (0: unknown); print nothing yet."""
+        """Set the stream and the number of waypoints (0: unknown); show a status line at once."""
         self._stream, self._waypoints = stream, waypoints
         self._first_ns = self._now_ns = NEVER_NS
         self._began = self._seen = monotonic()
@@ -47,37 +49,40 @@ class FlightView:
         if is_live(stream):
             terminal = Console(file=stream)
             self._status = Live(console=terminal, transient=True, get_renderable=self.line)
+            self._status.start()  # before the flight, whose preparation takes a second
 
     def see(self, records: Iterable[Record]) -> None:
         """Show new records of world or cloud, in the order of time."""
-        if self._status:
-            self._status.start()
         for record in records:
             match record:
                 case TelemetrySent():
-                    if self._first_ns == NEVER_NS:
-                        self._first_ns, self._began = record.stamp_ns, monotonic()
-                    self._now_ns, self._seen = record.stamp_ns, monotonic()
-                    self._position = record.telemetry.odometry.position
+                    self._see_telemetry(record)
                 case Control():
                     # The horizon is 0 and meaningless before the first round trip.
                     self._delay = math.nan if math.isnan(record.rtt) else record.horizon
                     self._waypoint = record.waypoint
                 case GuardChange():
-                    self._guard = record.state
-                    # The robot holds its position after every mission: do not print this.
-                    is_usual = self._ended and record.state is GuardState.HOLD
-                    if record.state > GuardState.TRACK and not is_usual:
-                        self._event(f"{record.state.name}: {record.cause}")
-                    if record.state > GuardState.HOLD and not self._waypoints:
-                        self.say(
-                            "  to fly again, find the cause, then: cloudrc mission acknowledge"
-                        )
+                    self._see_guard(record)
                 case MissionEvent():
                     self._ended = record.event in ENDINGS
                     self._event(record.text)
                 case Fault() | LinkChanged():
                     self._event(in_words(record))
+
+    def _see_telemetry(self, record: TelemetrySent) -> None:
+        if self._first_ns == NEVER_NS:
+            self._first_ns, self._began = record.stamp_ns, monotonic()
+        self._now_ns, self._seen = record.stamp_ns, monotonic()
+        self._position = record.telemetry.odometry.position
+
+    def _see_guard(self, record: GuardChange) -> None:
+        self._guard = record.state
+        # The robot holds its position after every mission: do not print this.
+        is_usual = self._ended and record.state is GuardState.HOLD
+        if record.state > GuardState.TRACK and not is_usual:
+            self._event(f"{record.state.name}: {record.cause}")
+        if record.state > GuardState.HOLD and not self._waypoints:
+            self.say("  to fly again, find the cause, then: cloudrc mission acknowledge")
 
     def line(self) -> Text:
         """Return the status line; it ends with the least important part, which may be cropped."""
@@ -121,18 +126,71 @@ def _joined(cells: Iterable[str]) -> str:
     return "  ".join(cell for cell in cells if cell).rstrip()
 
 
-class SweepView:
+class CountView:
+    """Shows how much of a long work is done: on a terminal in a status line, else in some lines."""
+
+    def __init__(self, stream: TextIO, total: int, unit: str, wait: float) -> None:
+        """Set the amount of work `total` and its `unit`, such as "flights".
+
+        After `wait` [s], and then every `PLAIN_PERIOD`, print a line if the stream is no terminal.
+        """
+        self._stream, self._total, self._unit = stream, total, unit
+        self._began = monotonic()
+        self._next = self._began + wait
+        self._status = Console(file=stream).status(f"0/{total}") if is_live(stream) else None
+        if self._status:
+            self._status.start()
+
+    def count(self, done: int, more: str = "") -> None:
+        """Show that `done` pieces of work are done; `more` ends the line."""
+        rate = done / max(monotonic() - self._began, 1e-3)
+        left = (self._total - done) / max(rate, 1e-9)
+        time = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
+        line = f"{done}/{self._total}  {rate:.1f} {self._unit}/s, {time} left{more}"
+        if self._status:
+            self._status.update(line)
+        elif monotonic() >= self._next:
+            self._next = monotonic() + PLAIN_PERIOD
+            print_or_drop(line, self._stream)
+
+    def close(self) -> None:
+        """Erase the status line on a terminal."""
+        if self._status:
+            self._status.stop()
+
+
+class PlanView:
+    """Shows how many points of a sweep are checked, if that takes longer than a second."""
+
+    def __init__(self, stream: TextIO) -> None:
+        """Print nothing yet."""
+        self._stream, self._view = stream, list[CountView]()
+        self._began = monotonic()
+
+    def see(self, done: int, points: int, seeds: int) -> None:
+        """Show that `done` points of a sweep are checked."""
+        if monotonic() - self._began < PLAN_WAIT or done == points:
+            return
+        if not self._view:
+            text = f"checks {points:,} points x {seeds:,} seeds: {points * seeds:,} flights"
+            print_or_drop(text, self._stream)
+            self._view.append(CountView(self._stream, points, "points", PLAIN_PERIOD))
+        self._view[0].count(done)
+
+    def close(self) -> None:
+        """Erase the status line on a terminal."""
+        for view in self._view:
+            view.close()
+
+
+class SweepView(CountView):
     """Shows how many flights are done: on a terminal in a status line, else in a line per 30 s."""
 
     def __init__(self, stream: TextIO, head: str, total: int) -> None:
         """Print the headline `head`; set `total`, the number of flights to fly."""
-        self._stream, self._total = stream, total
-        self._done, self._failed, self._told = 0, 0, set[str]()
-        self._began = self._printed = monotonic()
         print_or_drop(escape(head), stream)
-        self._status = Console(file=stream).status("") if is_live(stream) else None
-        if self._status:
-            self._status.start()
+        super().__init__(stream, total, "flights", PLAIN_PERIOD)
+        self._done, self._failed, self._told = 0, 0, set[str]()
 
     def see(self, row: Row) -> None:
         """Count a finished flight; print its failure or note if it is the first of its verdict."""
@@ -142,18 +200,4 @@ class SweepView:
             self._told.add(row["verdict"])
             text = f"{row['key']}: {row['verdict']}: {row['text']}"
             print_or_drop(escape(text), self._stream)
-        rate = self._done / max(monotonic() - self._began, 1e-3)
-        left = (self._total - self._done) / rate
-        time = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
-        line = f"{self._done}/{self._total}  {rate:.1f} flights/s, {time} left"
-        line += f", {self._failed} failed" if self._failed else ""
-        if self._status:
-            self._status.update(line)
-        elif monotonic() - self._printed >= PLAIN_PERIOD:
-            self._printed = monotonic()
-            print_or_drop(line, self._stream)
-
-    def close(self) -> None:
-        """Erase the status line on a terminal."""
-        if self._status:
-            self._status.stop()
+        self.count(self._done, f", {self._failed} failed" if self._failed else "")

@@ -50,6 +50,8 @@ Ready = Callable[[Path, Callable[[str], None], contextlib.ExitStack, str, dict[s
 """Function that a session calls when it is ready. Arguments: the run's folder, a function that
 prints a line, a stack that closes at the end, the API's URL, process -> HOST:PORT of metrics."""
 
+ADVISED_MAX = 50
+"""Number of points of a sweep for which warnings are looked for."""
 WARNINGS_MAX = 3
 """Largest number of warnings that are printed about more than two experiments."""
 NO_C = "Python (wind, or a robot that differs from its model)"
@@ -125,9 +127,13 @@ def load(name: str, overrides: Iterable[str], seed: int | None = None) -> Resolv
 def warn(*experiments: ResolvedExperiment) -> None:
     """Print the warnings of `advise` on stderr, each once.
 
-    For three or more experiments, such as the points of a sweep, print at most `WARNINGS_MAX`.
+    For three or more experiments, such as the points of a sweep, print at most `WARNINGS_MAX`. Of
+    many experiments, only the first, the last and some between them are looked at, because each
+    takes some milliseconds: together about `ADVISED_MAX`.
     """
-    advice = list(dict.fromkeys(text for each in experiments for text in advise(each)))
+    some = dict.fromkeys(range(0, len(experiments), len(experiments) // ADVISED_MAX + 1))
+    some[len(experiments) - 1] = None
+    advice = list(dict.fromkeys(text for index in some for text in advise(experiments[index])))
     if len(experiments) > 2 and len(advice) > WARNINGS_MAX:
         advice[WARNINGS_MAX:] = [f"{len(advice)} warnings; the others are alike"]
     for text in advice:

@@ -11,7 +11,7 @@ from cloudrc import __version__
 from cloudrc.cli.cluster_flags import release_arguments
 from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import output_argument
-from cloudrc.cli.parser import COUNT_MAX, add_verbs, figure_arguments, read_count
+from cloudrc.cli.parser import COUNT_MAX, add_verbs, figure_arguments, read_count, whole_number
 from cloudrc.renamed import new_name
 
 VERBS = {
@@ -57,6 +57,8 @@ ARRAYS = (
     JobArray("JOB_COMPLETION_INDEX", "JOB_COMPLETIONS", begin=0),
 )
 """The job arrays of Slurm, PBS, LSF and Kubernetes."""
+FLIGHTS_MAX = 100_000
+"""Default limit of flights: a sweep is a product, and one axis too many is hours of work."""
 IMAGE = f"cloudrc/world:{__version__}"
 
 
@@ -68,6 +70,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     run.add_argument("--out", type=Path, metavar="DIR", help=about)
     about = "number of parallel processes (default: one per usable core)"
     run.add_argument("--jobs", type=read_count, default=COUNT_MAX, metavar="N", help=about)
+    about = f"refuse a sweep with more flights (default: {FLIGHTS_MAX:,})"
+    limit = whole_number(1, 10**9)
+    run.add_argument("--max-flights", type=limit, default=FLIGHTS_MAX, metavar="N", help=about)
     about = "fly the failed or all flights again with a recording, into DIR/KEY"
     run.add_argument("--record", choices=("failed", "all"), help=about)
     about = "fly only part I of N; 'auto' takes I and N from the variables of a job array"

@@ -26,7 +26,7 @@ from cloudrc.cli.output import (
     table,
 )
 from cloudrc.cli.pool import map_in_order, take_each
-from cloudrc.cli.progress import SweepView
+from cloudrc.cli.progress import PlanView, SweepView
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.cli.run import fly, load, new_folder, refuse_seed, warn
 from cloudrc.cluster import batch
@@ -41,7 +41,7 @@ from cloudrc.source import code_hash
 from cloudrc.sweep import store
 from cloudrc.sweep.flight import Row, counts, fly_point, measure
 from cloudrc.sweep.lock import lock_folder
-from cloudrc.sweep.plan import Flight, Plan, pack, read_plan, unpack
+from cloudrc.sweep.plan import Flight, Plan, pack, read_flight, read_plan, unpack
 from cloudrc.sweep.statistics import median_interval
 
 METHOD = "95 % interval of the median, by order statistics"
@@ -101,7 +101,9 @@ def _plan(options: argparse.Namespace) -> Plan:
         raise BadInputError("--on kubernetes has no --record and no --shard; see --shards")
     if options.shard and options.out is None:
         raise BadInputError("--shard needs --out, the folder that all shards share")
-    plan = read_plan(options.file)
+    stream = sys.stdout if options.output == "table" else sys.stderr
+    with closing(PlanView(stream)) as view:
+        plan = read_plan(options.file, flights_max=options.max_flights, see=view.see)
     if options.on:
         for point in plan.points:
             refuse_local_files(point.model_dump(mode="json"), "or fly without --on")
@@ -173,16 +175,17 @@ def fly_again(options: argparse.Namespace) -> int:
     if len(rows) != 1:
         text = f"{len(rows)} rows have a key that begins like this; give one key"
         raise BadInputError(f"{options.folder}: {options.key}: {text}")
-    key, flights = rows[0]["key"], read_plan(options.folder / store.FILE).flights
+    (row,), key = rows, rows[0]["key"]
+    flight = read_flight(options.folder / store.FILE, row["point"], row["seed"])
     changed = f"{key}: a plug-in, the processor or a package has changed since; fly the sweep again"
-    if key not in flights:
-        code = rows[0].get("code") or "without a hash"
+    if flight is None or flight.key != key:
+        code = row.get("code") or "without a hash"
         other = f"{key}: was flown by code {code}, this is code {code_hash()}; fly the sweep again"
         raise InvalidRunError(changed if code == code_hash() else other)
-    report = _fly_into(options.folder / key, flights[key], page=True)
+    report = _fly_into(options.folder / key, flight, page=True)
     print_traceback(options, report)
     print_or_drop(summary(report, options.folder / key))
-    if rows[0]["records_sha256"] != report["records_sha256"]:
+    if row["records_sha256"] != report["records_sha256"]:
         raise InvalidRunError(changed)
     print_or_drop("\nthe records are those of the sweep", sys.stderr)
     return 0

@@ -6,6 +6,7 @@ Scalars follow the core schema of YAML 1.2, not YAML 1.1 as in PyYAML: `1e-3` is
 
 from __future__ import annotations
 
+import copy
 import os
 import re
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from cloudrc import files
+from cloudrc.config.reuse import reuse
 from cloudrc.errors import BadInputError
 
 KeyPath = tuple[str, ...]
@@ -216,7 +218,8 @@ def read_document(path: Path, name: str) -> Document:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error).removeprefix(f"{path}: ")
         raise BadInputError(f"{name}: cannot be read: {reason}; name a YAML file") from error
-    tree, lines = parse_yaml(text, name)
+    parsed, lines = reuse(("yaml", text, name), lambda: parse_yaml(text, name))
+    tree = copy.deepcopy(parsed)
     if not isinstance(tree, dict):
         raise BadInputError(f"{name}: must be a mapping of keys to values")
     folder = path.resolve().parent

@@ -30,6 +30,7 @@ from cloudrc.config.document import Document, KeyPath, write_yaml
 from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import Problem
+from cloudrc.config.reuse import reuse
 from cloudrc.config.schema import (
     Change,
     Cloud,
@@ -46,7 +47,7 @@ from cloudrc.config.schema import (
 )
 from cloudrc.config.setpoints import read_setpoints
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.scene import load_scene
+from cloudrc.geometry.scene import Scene, load_scene
 from cloudrc.link.profile import describe_heavy_loss
 from cloudrc.link.traces import read_table, read_trace
 
@@ -175,16 +176,26 @@ def load_experiment(
         document.tree["report"]["metrics"] = [names]
     found += overrides.resolve_plugins(document, build=build) + _resolve_paths(document)
     experiment = validate(document, ResolvedExperiment, name, found)
-    scene, mission = load_scene(experiment.world.scene), experiment.mission
+    mission = experiment.mission
+    scene = reuse(("scene", experiment.world.scene), lambda: load_scene(experiment.world.scene))
     contact = experiment.criteria.contact
     if contact is None:
         contact = scene.board is not None and not (mission.steps or mission.setpoints)
     if not flown:
-        wrong = check_mission(mission, scene, contact=contact)
-        below = [problem._replace(path=("mission", *problem.path)) for problem in wrong]
-        problems.raise_problems(document, [*check_scene(scene, contact=contact), *below], name)
+        problems.raise_problems(document, _check_flown(mission, scene, contact), name)
     criteria = experiment.criteria.model_copy(update={"contact": contact})
     return experiment.model_copy(update={"criteria": criteria})
+
+
+def _check_flown(mission: Mission, scene: Scene, contact: bool) -> list[Problem]:
+    """List the problems of a mission in a scene, with their paths in the experiment."""
+
+    def check() -> list[Problem]:
+        wrong = check_mission(mission, scene, contact=contact)
+        below = [problem._replace(path=("mission", *problem.path)) for problem in wrong]
+        return [*check_scene(scene, contact=contact), *below]
+
+    return reuse(("mission", mission.model_dump_json(), repr(scene), contact), check)
 
 
 def read_experiment(
@@ -391,9 +402,14 @@ def _resolve_paths(document: Document) -> list[Problem]:
                 name = shipped.model_path(key, name, source.folder)
             else:
                 name = str(source.absolute(name))
-                FILE_READERS.get(key, Path)(Path(name))
+                _check_file(key, name)
             document.set_value(path, name, source)
     return found
+
+
+def _check_file(key: str, path: str) -> None:
+    """Read a data file, or raise an error; a large trace takes long, so read it once a sweep."""
+    reuse(("file", key, path), lambda: bool(FILE_READERS.get(key, Path)(Path(path))))
 
 
 CHANGEABLE_KEYS = Change.model_fields.keys() - {"at_s"}

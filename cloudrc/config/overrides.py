@@ -27,6 +27,7 @@ from cloudrc import plugins
 from cloudrc.config import problems
 from cloudrc.config.document import Document, KeyPath, Source, child, parse_value
 from cloudrc.config.problems import Problem
+from cloudrc.config.reuse import reuse
 from cloudrc.config.schema import Experiment, PlugIn
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
@@ -149,7 +150,7 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
             name = str(document.source((*path, "name")).absolute(name))
         try:
             if build:
-                parameters = _complete(document, path, name, parameters)
+                parameters = _complete_once(document, path, name, parameters)
         except ValidationError as error:
             found += problems.from_pydantic(error, parameter_model(kind, name), path)
         except BadInputError as error:
@@ -158,6 +159,16 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
             # Not by `set_value`: the parameters keep their sources.
             document.tree["cloud"][key] = {"name": name, **parameters}
     return found
+
+
+def _complete_once(
+    document: Document, path: KeyPath, name: str, given: dict[str, Any]
+) -> dict[str, Any]:
+    """Call `_complete`, but once only for the points of a sweep that share the plug-in."""
+    folders = [str(document.source((*path, parameter)).folder) for parameter in given]
+    plan = document.get("cloud", "plan_s")
+    key = ("plug-in", path, name, json.dumps([given, folders, plan]))
+    return copy.deepcopy(reuse(key, lambda: _complete(document, path, name, given)))
 
 
 def _complete(
@@ -169,7 +180,8 @@ def _complete(
     BadInputError about a wrong parameter or a plug-in that fails.
     """
     kind = KINDS[path[-1]]
-    model, parameters = parameter_model(kind, name), dict(given)
+    model = reuse(("parameters", kind, name), lambda: parameter_model(kind, name))
+    parameters = dict(given)
     for parameter, field in model.model_fields.items():
         place = (*path, parameter)
         if field.annotation == Path | None and isinstance(document.get(*place), str):

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from cloudrc.config.document import Document, read_document
+from cloudrc.config.reuse import reuse
 from cloudrc.errors import BadInputError
 from cloudrc.plugins import suggest_name, unknown_name_text
 
@@ -47,7 +48,7 @@ def read(kind: str, name: str, folder: Path) -> Document:
 
 def check_name(kind: str, name: str) -> None:
     """Raise a BadInputError if no shipped file of this kind has that name."""
-    if name not in (available := names(kind)):
+    if name not in (available := reuse(("names", kind), lambda: names(kind))):
         raise BadInputError(unknown_name_text(kind, name, available))
 
 

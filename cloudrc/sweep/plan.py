@@ -9,12 +9,13 @@ from __future__ import annotations
 import gzip
 import inspect
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from itertools import chain, product
+from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -26,6 +27,7 @@ from cloudrc.config.document import Document, Source, read_document
 from cloudrc.config.load import ResolvedExperiment, load_experiment, local_files, validate
 from cloudrc.config.overrides import KINDS, collect_settings
 from cloudrc.config.problems import Problem
+from cloudrc.config.reuse import reuse, reuse_results
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError
 from cloudrc.sweep.flight import Row
@@ -34,6 +36,8 @@ SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
 """Largest seed, and largest number of seeds."""
 COLUMNS = ("key", "seed", "verdict", "failures", "code", "physics_steps")
 """Columns of the table besides the axes and the numbers."""
+See: TypeAlias = Callable[[int, int, int], None]
+"""Function that shows how far a sweep is checked: points checked, points, seeds."""
 _Entry: TypeAlias = tuple[str, Any, Source]
 """A setting's key and value, and their place in the file."""
 
@@ -83,12 +87,74 @@ class Plan:
     flights: dict[str, Flight]  # key -> flight; all seeds of a point follow each other
 
 
-def read_plan(path: Path) -> Plan:
+class _Grid(NamedTuple):
+    """The content of a sweep's file, whose points are not checked yet."""
+
+    name: str
+    file: dict[str, Any]
+    experiment: str
+    common: list[_Entry]
+    axes: dict[str, list[tuple[Any, list[_Entry]]]]
+    seeds: tuple[int, ...]
+
+    def resolve(self, choices: Iterable[tuple[Any, list[_Entry]]]) -> ResolvedExperiment:
+        """Return the checked experiment of a point, which has one choice of each axis."""
+        return _resolve(self.experiment, chain(self.common, *(entries for _, entries in choices)))
+
+
+def read_plan(
+    path: Path, *, flights_max: int | None = None, see: See = lambda done, points, seeds: None
+) -> Plan:
     """Read the file of a sweep, and check all of its points.
 
+    Call `see` with the number of points that are checked, that of all points, and that of seeds:
+    once before the first point, and after each.
+
     Raises:
-        BadInputError: If the file or one of its points has problems, with file and line of each.
+        BadInputError: If the file or one of its points has problems, with file and line of each; or
+            if the sweep has more than `flights_max` flights.
     """
+    grid = _read_grid(path)
+    count, seeds = prod(len(choices) for choices in grid.axes.values()), len(grid.seeds)
+    if flights_max is not None and count * seeds > flights_max:
+        text = f"{count:,} points x {seeds:,} seeds: {count * seeds:,} flights are more than "
+        text += f"{flights_max:,}; take fewer values or seeds, or give --max-flights"
+        raise BadInputError(f"{grid.name}: {text} {count * seeds}")
+    see(0, count, seeds)
+    points, flights = list[ResolvedExperiment](), dict[str, Flight]()
+    with reuse_results():
+        for choices in product(*grid.axes.values()):
+            point = {axis: label for axis, (label, _) in zip(grid.axes, choices, strict=True)}
+            points.append(grid.resolve(choices))
+            everything = _everything(points[-1])
+            for seed in grid.seeds:
+                key = _key(everything, seed)
+                if key in flights:
+                    same = f"{point} is the same as {flights[key].point}; remove one of them"
+                    raise BadInputError(f"{grid.name}: {same}")
+                flights[key] = Flight(key, point, seed, points[-1])
+            see(len(points), count, seeds)
+    labels = {axis: [label for label, _ in choices] for axis, choices in grid.axes.items()}
+    return Plan(grid.file, labels, grid.seeds, points, flights)
+
+
+def read_flight(path: Path, point: Mapping[str, Any], seed: int) -> Flight | None:
+    """Read one flight of a sweep, without the others; None if the sweep does not have it."""
+    grid = _read_grid(path)
+    if point.keys() != grid.axes.keys() or seed not in grid.seeds:
+        return None
+    choices = []
+    for axis, among in grid.axes.items():
+        found = [choice for choice in among if choice[0] == point[axis]]
+        if not found:
+            return None
+        choices.append(found[0])
+    resolved = grid.resolve(choices)
+    return Flight(_key(_everything(resolved), seed), dict(point), seed, resolved)
+
+
+def _read_grid(path: Path) -> _Grid:
+    """Read the file of a sweep, and check all but its points; raise a BadInputError."""
     name, document = str(path), read_document(path, str(path))
     file = validate(document, SweepFile, name)
     folder = Path(file.folder or path.resolve().parent)
@@ -100,31 +166,29 @@ def read_plan(path: Path) -> Plan:
     problems.raise_problems(document, found, name)
     is_path = shipped.is_path(file.experiment)
     experiment = str(folder / file.experiment) if is_path else file.experiment
-    points, flights = list[ResolvedExperiment](), dict[str, Flight]()
-    for choices in product(*axes.values()):
-        point = {axis: label for axis, (label, _) in zip(axes, choices, strict=True)}
-        points.append(_resolve(experiment, chain(common, *(entries for _, entries in choices))))
-        everything = _everything(points[-1])
-        for seed in seeds:
-            key = _key(everything, seed)
-            if key in flights:
-                same = f"{point} is the same as {flights[key].point}; remove one of them"
-                raise BadInputError(f"{name}: {same}")
-            flights[key] = Flight(key, point, seed, points[-1])
-    labels = {axis: [label for label, _ in choices] for axis, choices in axes.items()}
-    return Plan(document.tree | {"folder": str(folder)}, labels, seeds, points, flights)
+    content = document.tree | {"folder": str(folder)}
+    return _Grid(name, content, experiment, common, axes, seeds)
 
 
-def _everything(point: ResolvedExperiment) -> dict[str, Any]:
+def _everything(point: ResolvedExperiment) -> bytes:
+    """Return all that decides a flight, except its seed, as JSON."""
     values = point.model_dump(mode="json")
+    named = local_files(values).values() if '"/' in json.dumps(values) else ()
     code = [_code(kind, getattr(point.cloud, key).name) for key, kind in KINDS.items()]
-    named = local_files(values).values()
-    hashes = {
-        str(file): sha256(file.read_bytes()).hexdigest()
-        for each in named
-        for file in plugin_file.sources(Path(each))
-    }
-    return {**values, "cloudrc": source.code_hash(), "code": code, "files": hashes}
+    hashes = {file: each for path in named for file, each in _hashes(path)}
+    everything = {**values, "cloudrc": source.code_hash(), "code": code, "files": hashes}
+    return json.dumps(everything, sort_keys=True).encode()
+
+
+def _hashes(path: str) -> list[tuple[str, str]]:
+    """Return the paths and hashes of a file and, if it is a plug-in, of the modules beside it."""
+    return reuse(
+        ("hashes", path),
+        lambda: [
+            (str(file), sha256(file.read_bytes()).hexdigest())
+            for file in plugin_file.sources(Path(path))
+        ],
+    )
 
 
 @cache
@@ -140,10 +204,9 @@ def _code(kind: str, name: str) -> str:
     return ""
 
 
-def _key(everything: Mapping[str, Any], seed: int) -> str:
+def _key(everything: bytes, seed: int) -> str:
     """Return the key of a flight: a hash of its seed and of everything else that decides it."""
-    text = json.dumps({**everything, "seed": seed}, sort_keys=True)
-    return sha256(text.encode()).hexdigest()[:16]
+    return sha256(everything + f" seed {seed}".encode()).hexdigest()[:16]
 
 
 def _seeds(given: Any) -> tuple[int, ...]:
@@ -190,7 +253,8 @@ def _resolve(experiment: str, entries: Iterable[_Entry]) -> ResolvedExperiment:
         source = settings["seed",].source
         raise BadInputError(f"{source.label}: seed: give the seeds with the key 'seeds'")
     resolved = load_experiment(experiment, settings)
-    metrics.check(resolved.report.metrics)
+    own = resolved.report.metrics
+    reuse(("metrics", own), lambda: metrics.check(own))
     return resolved
 
 
@@ -219,7 +283,7 @@ def unpack(path: Path) -> list[Flight]:
     try:
         content = json.loads(gzip.decompress(files.read(path)))
         _refuse_other_code(content["code"])
-        points = list[tuple[dict[str, Any], ResolvedExperiment, dict[str, Any]]]()
+        points = list[tuple[dict[str, Any], ResolvedExperiment, bytes]]()
         for point, values in content["points"]:
             resolved = ResolvedExperiment.model_validate_json(json.dumps(values))
             points.append((point, resolved, _everything(resolved)))

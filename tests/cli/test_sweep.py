@@ -86,6 +86,27 @@ def test_the_same_sweep_is_not_flown_twice_at_once(write_sweep, call, refused):
     assert "--out grid: another command flies into it now; wait for its end" in error
 
 
+def test_a_sweep_that_is_too_large_is_refused_before_it_is_checked(write_sweep, refused, call):
+    axes = {f"guard.{key}": list(range(1, 1001)) for key in ("hold_max_s", "speed_max_mps")}
+    error = refused("sweep run --out grid", write_sweep(axes, seeds=5))
+    assert "1,000,000 points x 5 seeds: 5,000,000 flights are more than 100,000" in error
+    assert error.endswith("or give --max-flights 5000000\n")
+    assert not Path("grid").exists()
+    small = write_sweep(ONE, seeds=3)
+    refused("sweep run --out grid --max-flights 2", small)
+    call("sweep run --out grid --max-flights 3", small)
+
+
+def test_a_check_of_more_than_a_second_says_how_far_it_is(write_sweep, call, monkeypatch):
+    """Without a terminal it prints one line, not one for each point."""
+    monkeypatch.setattr("cloudrc.cli.progress.PLAN_WAIT", 0.0)
+    lines = call("sweep run --out grid --shard 5/5", write_sweep()).out.splitlines()
+    assert lines[:2] == [
+        "checks 4 points x 1 seeds: 4 flights",
+        "steps: 4 points x 1 seeds, shard 5 of 5: 0 flights",
+    ]
+
+
 def test_alike_warnings_of_many_points_are_counted(write_sweep, monkeypatch, call):
     monkeypatch.setattr("cloudrc.cli.run.advise", lambda point: [f"{point.uplink.delay_ms} ms"])
     grid = {"link.both.delay_ms": [0, 1, 2, 3, 4]}

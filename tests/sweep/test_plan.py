@@ -6,15 +6,17 @@ A file of flights gives the same flights in a pod that has none of the user's fi
 import gzip
 import inspect
 import re
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from cloudrc.assembly import build_links
+from cloudrc.config import document, load, overrides
 from cloudrc.errors import BadInputError
 from cloudrc.source import code_hash
 from cloudrc.sweep import plan
-from cloudrc.sweep.plan import pack, read_plan, unpack
+from cloudrc.sweep.plan import pack, read_flight, read_plan, unpack
 from tests.sweep.conftest import SHORT
 
 
@@ -157,6 +159,59 @@ def test_flights_of_other_code_are_refused_with_both_hashes(flights, tmp_path, m
     said = f"come from code 0123456789abcdef, this image has code {code_hash()}"
     with pytest.raises(BadInputError, match=said):
         unpack(tmp_path / "flights")
+
+
+def test_what_points_share_is_read_and_checked_once(write_sweep, tmp_path, monkeypatch):
+    """A sweep of 2,000 points took 25 s: each point parsed files, and flew its mission in mind."""
+    counts = Counter()
+
+    def count(place, name):
+        real = getattr(place, name)
+        monkeypatch.setattr(place, name, lambda *given, **words: (
+            counts.update([name]) or real(*given, **words)
+        ))  # fmt: skip
+
+    for place, name in ((document, "parse_yaml"), (load, "check_mission"), (load, "load_scene"),
+                        (overrides, "parameter_model")):  # fmt: skip
+        count(place, name)
+    axes = {"link.both.delay_ms": [*range(20)], "guard.hold_max_s": [1, 2]}
+    plan = read_plan(write_sweep(axes))
+    assert len(plan.points) == 40
+    # The sweep, the experiment, the mission and the profile; three plug-ins.
+    assert counts == {"parse_yaml": 4, "check_mission": 1, "load_scene": 1, "parameter_model": 3}
+
+
+def test_points_that_share_results_are_independent(write_sweep):
+    gains = {"cloud.controller.gain_p": [[1, 1, 1], [2, 2, 2]], "cloud.predictor": ["kalman"]}
+    first, second = read_plan(write_sweep(gains)).points
+    assert first.cloud.controller.gain_p == [1.0, 1.0, 1.0]
+    assert second.cloud.controller.gain_p == [2.0, 2.0, 2.0]
+
+
+def test_nothing_is_kept_after_the_plan(write_sweep, tmp_path):
+    """A notebook may edit a mission, and read its sweep again."""
+    (tmp_path / "mine.yaml").write_text("waypoints: [{position_m: [0, 0, 1]}]\n")
+    keys = {"set": {"mission": "./mine.yaml", "criteria.contact": False, "world.scene": "empty"}}
+    path = write_sweep({}, **keys)
+    before = read_plan(path).points[0].mission.waypoints[0].position_m
+    (tmp_path / "mine.yaml").write_text("waypoints: [{position_m: [0, 0, 2]}]\n")
+    assert (before[2], read_plan(path).points[0].mission.waypoints[0].position_m[2]) == (1.0, 2.0)
+
+
+def test_one_flight_is_read_without_the_others(write_sweep):
+    path = write_sweep(seeds=2)
+    flights = read_plan(path).flights
+    for flight in flights.values():
+        assert read_flight(path, flight.point, flight.seed) == flight
+    point = next(iter(flights.values())).point
+    for other, seed in ((point, 3), ({}, 1), (point | {"cloud.predictor": "kalman"}, 1)):
+        assert read_flight(path, other, seed) is None
+
+
+def test_the_progress_is_told_for_each_point(write_sweep):
+    seen = []
+    read_plan(write_sweep(seeds=3), see=lambda *counts: seen.append(counts))
+    assert seen == [(done, 4, 3) for done in range(5)]
 
 
 def test_the_key_takes_in_the_code(write_sweep, monkeypatch):
