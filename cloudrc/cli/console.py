@@ -38,6 +38,9 @@ stops the rotors. No key turns the robot: the published onboard controller holds
 the yaw at 0."""
 LINK_SET = "link set "
 """Start of a line that a pod's console prints to request a change of the link."""
+SWITCH_PERIOD = 5e-4
+"""Time after which a thread of this process lets another one run [s]. With Python's 5 ms, the 90th
+percentile of the answers to STOP doubles while 50 pages have the scene."""
 RETRY_PERIOD = 0.2
 """Time between two attempts to read the robot's status from the API [s]."""
 OWN_S = 150.0
@@ -105,6 +108,7 @@ def _serve(options: argparse.Namespace, flight: Flight) -> None:
     with ExitStack() as opened:
         from cloudrc.console.page import Page
 
+        sys.setswitchinterval(SWITCH_PERIOD)
         page = Page(options.port, flight.token, options.allow_origin)
         opened.callback(page.close)
         config = opened.enter_context(flight.config.open())

@@ -1,0 +1,132 @@
+"""How long STOP takes, from the click in a browser to rotors that are off: nightly.
+
+The end of a trial is the first status of teleop's API that tells ESTOP. The measured time contains
+the telemetry's way back, so that the rotors stop earlier.
+"""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from contextlib import ExitStack, contextmanager
+
+import numpy as np
+import pytest
+
+from cloudrc.cli.client import Api
+from cloudrc.drivers.local import under_way
+from cloudrc.messages import GuardState
+from tests.conftest import wait_until
+from tests.console.conftest import LIMIT
+from tests.console.test_page import answers, start
+
+pytestmark = [pytest.mark.process, pytest.mark.alone, pytest.mark.full]
+CLICKS = int(os.environ.get("CLOUDRC_STOP_CLICKS", "200"))
+"""Clicks on the ground in each row; a tenth of them in flight."""
+ROWS = {
+    # name -> pages with the scene, plain pages, a busy process per core, bound of p99 [s]
+    "idle": (0, 0, False, 0.150),
+    "20 clients, busy processors": (20, 0, True, 0.400),
+    "200 clients": (50, 150, False, 0.400),
+}
+CLICK = """() => {
+  const at = performance.timeOrigin + performance.now();
+  document.querySelector('#stop button').click();
+  return at;
+}"""
+
+
+class Watch:
+    """Reads the robot's statuses; knows when the guard last changed [s], wall clock."""
+
+    def __init__(self, url):
+        self.guard, self.position, self.since = None, None, 0.0
+        self._url = url
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self):
+        for status in Api(self._url).robot():
+            if status is None:
+                continue
+            self.position = status.position
+            if status.guard is not self.guard:
+                self.since, self.guard = time.time(), status.guard
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """A session, its API, its watch, and the address of its console."""
+    folder = tmp_path_factory.mktemp("session")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.getbasetemp()))
+        session = start(folder, "up", "hover", "--set", "link.profile=wifi")
+        wait_until(lambda: under_way() or session.poll() is not None)
+        ((run, url),) = under_way().items()
+        api = Api(url)
+        wait_until(lambda: answers(api))
+        console = start(folder, "console", run, "--no-open")
+    yield api, Watch(url), console.stdout.readline().split()[-1]
+    session.terminate()
+    console.communicate(timeout=LIMIT)
+    session.communicate(timeout=LIMIT)
+
+
+@contextmanager
+def child(*words, **kinds):
+    process = subprocess.Popen([sys.executable, *words], **kinds)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@contextmanager
+def load(address, scenes, plains, is_busy):
+    """Open pages that read, and keep all processors busy."""
+    with ExitStack() as stack:
+        if scenes + plains:
+            words = ("-m", "tests.console.readers", address, str(scenes), str(plains))
+            readers = stack.enter_context(child(*words, stdout=subprocess.PIPE, text=True))
+            assert readers.stdout.readline() == "ready\n"
+        for _ in range(os.cpu_count() if is_busy else 0):
+            stack.enter_context(child("-c", "while True: pass"))
+        time.sleep(3.0)
+        yield
+
+
+def land(api, watch):
+    """Acknowledge the stop; the robot is on the ground afterwards."""
+    wait_until(lambda: watch.guard is GuardState.ESTOP)
+    wait_until(lambda: not api.get("/v1/state")["mission"])
+    api.post("/v1/acknowledge")
+    wait_until(lambda: watch.guard is not GuardState.ESTOP)
+
+
+def fly(api, watch):
+    """Fly 0.5 m above the ground."""
+    order = {"waypoints": [{"position_m": (0.0, 0.0, 0.8)}, {"position_m": (0.5, 0.0, 0.8)}]}
+    api.post("/v1/missions", order)
+    wait_until(lambda: watch.guard is GuardState.TRACK and watch.position[2] > 0.5)
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_stop_is_quick_on_the_ground_and_in_flight(name, session, browse, figure):
+    api, watch, address = session
+    scenes, plains, is_busy, bound = ROWS[name]
+    page = browse(address.replace("/?", "/plain?"))
+    with load(address, scenes, plains, is_busy):
+        for where, count in (("on the ground", CLICKS), ("in flight", max(1, CLICKS // 10))):
+            took = []
+            for _ in range(count):
+                if where == "in flight":
+                    fly(api, watch)
+                at = page.evaluate(CLICK) * 1e-3
+                wait_until(lambda: watch.guard is GuardState.ESTOP)
+                took.append(watch.since - at)
+                land(api, watch)
+            middle, worst = np.percentile(took, [50, 99])
+            print(f"STOP, {name}, {where}: p50 {middle:.3f} s, p99 {worst:.3f} s, {count} clicks")
+            figure(f"STOP, {name}, {where}: p50", middle, "<=", bound, "s", count=count)
+            figure(f"STOP, {name}, {where}: p99", worst, "<=", bound, "s", count=count)
