@@ -19,12 +19,15 @@ from cloudrc.cluster.jobs import (
     read_example,
     read_log,
 )
+from cloudrc.cluster.pods import UNSCHEDULED
 from cloudrc.errors import BadInputError, to_one_line
 
 COMPONENT = "sweep"
 """Label `component` of the Jobs and pods of sweeps, and name of their container."""
 FILE = "flights.json.gz"
 """Key in the ConfigMap under which the flights are stored."""
+QUOTA = "then repeat the command with a smaller request, such as --cpu 500m, or with fewer --shards"
+"""What a user can do if the namespace's quota does not allow the pods."""
 
 
 def start(
@@ -80,7 +83,18 @@ def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iter
             raise BadInputError(f"the pods refuse the flights: {words}")
         return f"a pod failed with exit code {state.exit_code}: {words}" if state.exit_code else ""
 
-    yield from read_log(release, name, tell, describe_end)
+    remedy = (
+        f"if no other pod frees it: {release.kubectl} delete job {name}, and repeat the command "
+        "with a smaller request, such as --cpu 500m, or with fewer --shards"
+    )
+
+    def tell_all(text: str) -> None:
+        tell(f"{text}; {remedy}" if UNSCHEDULED in text else text)
+
+    try:
+        yield from read_log(release, name, tell_all, describe_end)
+    except ClusterError as error:
+        raise (ClusterError(f"{error}; {QUOTA}") if "quota" in str(error) else error) from None
     if ending := failure_of(release.request("get", "jobs", name=name)):
         see = f"see: {release.kubectl} describe job {name}; then repeat the command"
         raise ClusterError(f"Job '{name}' failed: {ending}; {see}")
