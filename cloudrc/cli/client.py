@@ -1,8 +1,9 @@
 """Call the HTTP API of teleop, the process that commands missions.
 
 The API is at http://HOST:PORT, which needs a token, or at unix:PATH, a socket file that only its
-owner can open. The token is read from a file, because a token on the command line would appear in
-the list of processes and in the history of the shell.
+owner can open. Behind a proxy, a path may follow http://HOST:PORT. The token is read from a file,
+because a token on the command line would appear in the list of processes and in the history of the
+shell.
 """
 
 from __future__ import annotations
@@ -37,6 +38,11 @@ ROBOT_TIMEOUT = 1.0
 API sends data 30 times a second."""
 RETRY_STATUSES = (408, 429, 502, 503, 504)
 """HTTP status codes after which the same request may succeed later."""
+FOREIGN = (
+    "a proxy or another program is there, or a proxy changes paths; give the API's address, with"
+    " the path of a proxy: --api http://HOST:PORT/PATH"
+)
+"""What to do if the answer is not from teleop."""
 UNIX = "unix:"
 VARIABLE = "CLOUDRC_TOKEN_FILE"
 
@@ -55,16 +61,17 @@ class Api:
     """Call teleop's API at one address."""
 
     def __init__(self, url: str, token: Callable[[], str] = lambda: "", place: str = "") -> None:
-        """Check and store the address, "http://HOST:PORT" or "unix:PATH".
+        """Check and store the address, "http://HOST:PORT[/PATH]" or "unix:PATH".
 
         `token` is called for each request; it returns the current token, or "" for none. `place`
         is the name of the run or release in printed texts; "" if the user gave the address.
         """
         self.url, self._token, self.place = url.rstrip("/"), token, place
+        self._prefix = ""  # path of the API behind a proxy
         try:
             self._connection(REQUEST_TIMEOUT)
         except (ValueError, KeyError, http.client.InvalidURL):
-            raise BadInputError(f"--api {url}: give http://HOST:PORT or unix:PATH") from None
+            raise BadInputError(f"--api {url}: give http://HOST:PORT[/PATH] or unix:PATH") from None
 
     def say(self, text: str) -> None:
         """Print a text after the name of the run or release; without a name, only the text."""
@@ -73,7 +80,7 @@ class Api:
     def get(self, path: str) -> Any:
         """Send a GET request; result and errors are those of `post`."""
         with self._answer("GET", path, None, REQUEST_TIMEOUT) as answer:
-            return json.loads(answer.read())
+            return self._read(answer)
 
     def post(self, path: str, body: Mapping[str, Any] | None = None) -> Any:
         """Send a POST request; return the decoded JSON of the answer.
@@ -85,7 +92,7 @@ class Api:
         """
         data = b"" if body is None else json.dumps(body).encode()
         with self._answer("POST", path, data, REQUEST_TIMEOUT) as answer:
-            return json.loads(answer.read())
+            return self._read(answer)
 
     def events(self, after: int = 0) -> Iterator[dict[str, Any]]:
         """Yield the events with an id above `after`, of all missions, until teleop ends."""
@@ -115,14 +122,31 @@ class Api:
             headers["Authorization"] = f"Bearer {token}"
         with closing(self._connection(limit)) as connection:
             try:
-                connection.request(method, path, body, headers)
+                connection.request(method, self._prefix + path, body, headers)
                 answer = connection.getresponse()
+                if answer.status < 400 and not _is_from_api(answer):
+                    answer.close()
+                    raise self._foreign(answer)
                 if not 200 <= answer.status < 300:
                     raise _refusal(answer, self.place, with_token=bool(token))
                 yield answer
             except (OSError, ValueError, http.client.HTTPException) as error:
                 why = getattr(error, "strerror", None) or error
                 raise UnreachableError(f"the API at {self.url} does not answer ({why})") from None
+
+    def _read(self, answer: http.client.HTTPResponse) -> Any:
+        """Decode the JSON of an answer; raise an ApiError if it is none."""
+        text = answer.read()
+        try:
+            return json.loads(text)
+        except ValueError:
+            raise self._foreign(answer) from None
+
+    def _foreign(self, answer: http.client.HTTPResponse) -> ApiError:
+        """Return an error which says that another program has answered."""
+        target, kind = answer.headers.get("Location"), answer.headers.get_content_type()
+        said = f"{answer.status} {answer.reason} {f'to {target}' if target else f'and {kind}'}"
+        return ApiError(escape(f"{self.url} answers with {said}: {FOREIGN}"))
 
     def _connection(self, limit: float) -> http.client.HTTPConnection:
         """Make a connection without a proxy: the API is on this machine or in the cluster."""
@@ -133,8 +157,9 @@ class Api:
             "http": http.client.HTTPConnection,
             "https": http.client.HTTPSConnection,
         }
-        if not parts.hostname or parts.port == 0 or parts.username or parts.path or parts.query:
+        if not parts.hostname or parts.port == 0 or parts.username or parts.query:
             raise ValueError(self.url)
+        self._prefix = quote(parts.path, safe="/%")
         kind = kinds[parts.scheme]
         # Without a port, http.client would read one from an IPv6 address.
         return kind(parts.hostname, parts.port or kind.default_port, timeout=limit)
@@ -158,12 +183,21 @@ def mission_path(mission_id: str) -> str:
     return f"/v1/missions/{quote(mission_id, safe='', errors='surrogateescape')}"
 
 
+def _is_from_api(answer: http.client.HTTPResponse) -> bool:
+    """Return whether an answer without an error can be that of teleop."""
+    return answer.status < 300 and answer.headers.get_content_type() != "text/html"
+
+
 def _refusal(answer: http.client.HTTPResponse, place: str, *, with_token: bool) -> CloudrcError:
     try:
         body = json.loads(answer.read())
         detail, problems = str(body["detail"]), body.get("problems") or []
     except (OSError, ValueError, TypeError, KeyError, http.client.HTTPException):
         detail, problems = f"the API answered {answer.status} {answer.reason}", []
+        if answer.status not in RETRY_STATUSES:
+            detail += f": {FOREIGN}"
+    if (answer.status, detail) == (404, "Not Found"):  # for a path, not for a mission
+        detail = f"the API answered 404 {answer.reason}: {FOREIGN}"
     detail = escape(detail)
     if len(problems) > 1:
         parts = ([p[k] for k in ("path", "value", "reason") if p[k]] for p in problems)

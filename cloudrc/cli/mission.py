@@ -96,7 +96,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     verbs = add_verbs(parser, {name: line for name, (line, _) in VERBS.items()})
     for name, verb in verbs.items():
-        url = "http://HOST:PORT or unix:PATH of a run or release"
+        url = "http://HOST:PORT[/PATH] or unix:PATH of a run or release"
         verb.add_argument("--api", metavar="URL", help=url)
         client.token_argument(verb)
         if name != "fly":

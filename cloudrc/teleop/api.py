@@ -229,10 +229,21 @@ async def _body(request: Request) -> bytes:
 def _takes(model: type[Section]) -> dict[str, Any]:
     """Return the OpenAPI description of a request body: the schema and an example of `model`."""
     schema = model.model_json_schema()
-    if parts := schema.pop("$defs", None):
-        schema["properties"]["waypoints"]["items"] = parts["Waypoint"]
+    schema = _inline(schema, schema.pop("$defs", {}))
     content = {"application/json": {"schema": schema, "example": models.EXAMPLES[model]}}
     return {"requestBody": {"required": True, "content": content}}
+
+
+def _inline(value: Any, parts: dict[str, Any]) -> Any:
+    """Replace each reference in a schema by the part of `parts` to which it refers."""
+    if isinstance(value, list):
+        return [_inline(item, parts) for item in value]
+    if not isinstance(value, dict):
+        return value
+    own = {key: _inline(item, parts) for key, item in value.items() if key != "$ref"}
+    if "$ref" not in value:
+        return own
+    return {**_inline(parts[value["$ref"].rpartition("/")[2]], parts), **own}
 
 
 Body = Annotated[bytes, Depends(_body)]

@@ -371,6 +371,30 @@ def test_a_socket_file_is_for_its_owner_and_needs_no_token(tmp_path):
         Api(f"unix:{tmp_path}/none").get("/v1/state")
 
 
+def references(value):
+    """Yield every reference in a document."""
+    for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+        if key == "$ref":
+            yield item
+        elif isinstance(item, dict | list):
+            yield from references(item)
+
+
+def test_every_reference_of_the_openapi_document_leads_somewhere(api):
+    document = api.get("/openapi.json")
+    found = set(references(document))
+    assert found
+    for reference in found:
+        start, *keys = reference.split("/")
+        assert start == "#"
+        place = document
+        for key in keys:
+            place = place[key]
+    post = document["paths"]["/v1/missions"]["post"]
+    properties = post["requestBody"]["content"]["application/json"]["schema"]["properties"]
+    assert "speed_mps" in json.dumps(properties["carrot"])
+
+
 def test_the_openapi_document_describes_everything(api):
     document = api.get("/openapi.json")
     ((scheme, meaning),) = document["components"]["securitySchemes"].items()
