@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from cloudrc.link.verify.monitor import LinkMonitor
     from cloudrc.tunnel.end import Identity
 
+IN_POD = "KUBERNETES_SERVICE_HOST"
+"""Environment variable that Kubernetes sets in each container of a pod."""
+
 TRACE_MAX = 2 << 20
 """Maximum size of a trace file whose name comes from the link process [bytes]. World and cloud do
 not trust this process. In a cluster, traces come from a ConfigMap, which holds at most 1 MiB."""
@@ -147,7 +150,9 @@ def _addresses(name: str, family: int) -> list[str]:
 
 
 def warn_if_exposed(listen: Address) -> None:
-    """Print a warning if other machines can send to the address `listen`."""
+    """Print a warning if other machines can send to `listen`; in a pod, that is the purpose."""
+    if IN_POD in os.environ:
+        return
     if not listen[0].startswith("127.") and listen[0] not in ("localhost", "::1"):
         print(f"cloudrc: warning: {listen[0]} can be reached from outside", file=sys.stderr)
 

@@ -36,6 +36,8 @@ LOOK_PERIOD = 1.0
 FAILURE_TIME = 5.0
 """Time for which a pod's failure must last before it is reported [s]: at first, Kubernetes may not
 yet have made all objects that the pod needs."""
+MISSING = ("not found", "non-existent")
+"""Words of Kubernetes about a volume, such as a Secret, that somebody has to make."""
 FLUSH = 1.0
 """Time after which a recorder has certainly written its buffer of half a second [s]."""
 FETCHES = 4
@@ -86,19 +88,27 @@ def wait_ready(release: Release, *, timeout: float, tell: Tell = lambda text: No
         if not words:
             return
         now = time.monotonic()
-        fatal = [f"the {c} pod cannot run: {why}" for c, (why, bad) in states.items() if bad]
+        fatal = _why_never({each: why for each, (why, bad) in states.items() if bad})
         failing_since = (failing_since or now) if fatal else None
         if failing_since is not None and now - failing_since >= FAILURE_TIME:
-            raise ClusterError(f"{'; '.join(fatal)}; {see}")
+            raise ClusterError(f"{fatal}; {see}")
         if now > until:
             raise TimedOutError(
                 f"release '{release.name}' is not ready after {timeout:g} s: {words}; "
                 f"{see}, or wait longer: --timeout"
             )
-        if words != last:
+        if not fatal and words != last:  # what is fatal becomes an error
             tell(words)
             last = words
         time.sleep(LOOK_PERIOD)
+
+
+def _why_never(causes: Mapping[str, str]) -> str:
+    """Say why pods can never run: component -> cause; a cause of both pods is told once."""
+    words = {c: why.replace(f"container '{c}'", "the main container") for c, why in causes.items()}
+    if len(words) > 1 and len(set(words.values())) == 1:
+        return f"the pods of {' and '.join(words)} cannot run: {next(iter(words.values()))}"
+    return "; ".join(f"the {each} pod cannot run: {why}" for each, why in causes.items())
 
 
 def _state(release: Release, component: str) -> tuple[str, bool]:
@@ -111,14 +121,26 @@ def _state(release: Release, component: str) -> tuple[str, bool]:
     found = pods.list_pods(release, component)
     for pod in found:
         if why := pods.pod_failure(pod):
-            return why, True
+            return why + _secret_in(why, deployment.spec.template.spec), True
     current = (status.observed_generation or 0) >= deployment.metadata.generation
     if not (current and status.updated_replicas == 1 and status.replicas == 1 and found):
         return "its pod is being created", False
     if any(c.type == "Ready" and c.status == "True" for c in found[0].status.conditions or []):
         return "", False
+    if found[0].status.phase == "Pending" and (why := pods.mount_failure(release, found[0])):
+        return why, any(words in why for words in MISSING)
     waiting = [each.name for each in pods.container_statuses(found[0]) if not each.ready]
     return f"container {' and '.join(waiting)} is not ready yet", False
+
+
+def _secret_in(why: str, pod: Any) -> str:
+    """Name the Secret whose folder in a pod an error names; "" if it names none."""
+    secrets = {v.name: v.secret.secret_name for v in pod.volumes or [] if v.secret is not None}
+    for container in pod.containers:
+        for mount in container.volume_mounts or []:
+            if mount.name in secrets and f"{mount.mount_path}" in why:
+                return f"; {mount.mount_path} has the content of Secret '{secrets[mount.name]}'"
+    return ""
 
 
 def refuse_second_flight(release: Release, ask: Ask) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from cloudrc.cluster.client import COMPONENTS, Release
-from cloudrc.cluster.pods import container_statuses, pod_failure
+from cloudrc.cluster.pods import container_statuses, error_in, pod_failure
 from cloudrc.errors import to_one_line
 
 EVICTIONS = {
@@ -95,7 +95,7 @@ def describe_end(container: str, ended: Any) -> str:
         name = signal.Signals(code - KILLED).name
     except ValueError:
         *_, last = (ended.message or "").strip().splitlines() or [""]
-        return f"ended with exit code {code}" + (f": {to_one_line(last)}" if last else "")
+        return f"ended with exit code {code}" + (f": {error_in(last)}" if last else "")
     return f"was ended by {name} (exit code {code})"
 
 

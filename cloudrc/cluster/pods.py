@@ -102,7 +102,7 @@ def pod_failure(pod: Any) -> str:
             reason = "CrashLoopBackOff"
         if reason in FATAL:
             message = to_one_line(waiting and waiting.message)
-            end = f" (exit code {ended.exit_code}): {to_one_line(ended.message)}" if ended else ""
+            end = f" (exit code {ended.exit_code}): {error_in(ended.message)}" if ended else ""
             words = {"name": status.name, "image": status.image, "reason": reason}
             return FATAL[reason].format(**words, message=message, end=end.removesuffix(": "))
     for condition in pod.status.conditions or []:
@@ -112,6 +112,19 @@ def pod_failure(pod: Any) -> str:
         if (condition.type, condition.status) == ("PodScheduled", "False") and not waits_for_volume:
             return f"{UNSCHEDULED}: {message}"
     return ""
+
+
+def error_in(output: str | None) -> str:
+    """Return the error in the last output of one of our commands, as one line; else the output."""
+    return to_one_line((output or "").rpartition("cloudrc: error: ")[2])
+
+
+def mount_failure(release: Release, pod: Any) -> str:
+    """Return why a volume of a pod, such as a Secret, cannot be mounted; "" if none has failed."""
+    selector = f"involvedObject.uid={pod.metadata.uid}"
+    events = release.request("list", "events", field_selector=selector)
+    failed = [to_one_line(event.message) for event in events if event.reason == "FailedMount"]
+    return failed[-1] if failed else ""
 
 
 def refuse_local_files(values: Mapping[str, Any], remedy: str) -> None:

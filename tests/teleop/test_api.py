@@ -10,6 +10,7 @@ import time
 import pytest
 
 from cloudrc.cli.client import Api, UnreachableError
+from cloudrc.cli.processes import warn_if_exposed
 from cloudrc.cli.teleop import api_address, serve_api
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
@@ -341,6 +342,12 @@ def test_a_network_address_needs_tokens(where, host, warns, tmp_path, capsys):
     with pytest.raises(BadInputError, match="needs --tokens DIR"):
         serve_api(options, load_experiment("hover"), load_scene("empty"))
     assert ("can be reached from outside" in capsys.readouterr().err) is warns
+
+
+def test_a_pod_is_not_warned_that_others_reach_it(monkeypatch, capsys):
+    monkeypatch.setenv("KUBERNETES_SERVICE_HOST", "10.96.0.1")
+    warn_if_exposed(("::", 8080))
+    assert capsys.readouterr().err == ""
 
 
 def test_an_unusable_address_is_one_sentence(api, tmp_path):
