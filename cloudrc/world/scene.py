@@ -82,11 +82,11 @@ def _compile(
     """
     try:
         spec = read_scene(scene_path)
-        robot = mujoco.MjSpec.from_file(str(robot_path))
-        for number, geom in enumerate(robot.worldbody.geoms):
-            geom.name = f"{WORLD}/{number}"
-        # An empty prefix would make MuJoCo write MUJOCO_LOG.TXT into the working directory.
-        spec.attach(robot, prefix=ROBOT_PREFIX, frame="spawn")
+        # An empty prefix would make MuJoCo write MUJOCO_LOG.TXT into the working directory, and
+        # MuJoCo 3.3 crashes if a variable keeps the robot.
+        spec.attach(mujoco.MjSpec.from_file(str(robot_path)), prefix=ROBOT_PREFIX, frame="spawn")
+        for number, geom in enumerate(spec.worldbody.geoms):
+            geom.name = f"{WORLD}/{number}"  # also geoms in the worldbody of the robot's file
         spec.compiler.fusestatic = fuse
         if inertia is not None:
             _set_inertia(spec.joints[0].parent, *inertia)
@@ -104,13 +104,10 @@ def is_of_robot(model: Any) -> Any:
 
 def bodies_of_geoms(model: Any) -> list[str]:
     """Return the name of the body of each geom in a compiled model, "" for geoms of the robot."""
-    names = []
-    for number, is_robot in enumerate(is_of_robot(model)):
-        name = model.geom(number).name
-        if name.startswith(f"{ROBOT_PREFIX}{WORLD}/"):  # it stands in the worldbody of the robot
-            name = name.removeprefix(ROBOT_PREFIX)
-        names.append("" if is_robot else name.rpartition("/")[0])
-    return names
+    return [
+        "" if is_robot else model.geom(number).name.rpartition("/")[0]
+        for number, is_robot in enumerate(is_of_robot(model))
+    ]
 
 
 def _inertia(model: Any) -> Inertia:
