@@ -147,8 +147,11 @@ add_metrics(
      lambda flight: max((step.overshoot for step in steps(flight)), default=None)),
     ("rise_time_mean", "s", "Mean time from 10 % to 90 % of a step.",
      partial(_mean_of, name="rise_time")),
-    ("settling_time_mean", "s", "Mean time until the error stays within 5 % of the step; steps "
-     "that did not settle do not count.", partial(_mean_of, name="settling_time")),
+    ("settling_time_mean", "s", "Mean time until the error stays within 5 % of the step, over the "
+     "steps that settled; unsettled_steps counts the others.",
+     partial(_mean_of, name="settling_time")),
+    ("unsettled_steps", "1", "Number of steps whose error does not stay within 5 % of the step.",
+     lambda flight: flight.count(sum(step.settling_time is None for step in steps(flight)))),
     ("iae_mean", "m s", "Integral of the error over time, mean of the steps.",
      partial(_mean_of, name="iae")),
     ("ise_mean", "m^2 s", "Integral of the squared error over time, mean of the steps.",

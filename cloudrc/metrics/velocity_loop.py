@@ -83,7 +83,8 @@ def identify(given: Array, measured: Array, name: str) -> Fit:
     if given.std() < DEVIATION_MIN:
         raise BadInputError(
             f"{name}: the commanded velocity hardly changes (standard deviation {given.std():.2g} "
-            f"m/s, below {DEVIATION_MIN:g}); record a flight with steps, as 'cloudrc run steps'"
+            f"m/s, below {DEVIATION_MIN:g}); record a flight with more steps, as 'cloudrc run "
+            "steps --mode virtual --set mission.steps.count=40'"
         )
 
     def residuals(theta: Array) -> Array:

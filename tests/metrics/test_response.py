@@ -81,3 +81,10 @@ def test_random_steps_must_settle_and_null_switches_it_off():
     assert "in step 1 the robot was 0.30 m from the setpoint" in text
     assert "criteria.settle_m 0.15 m" in text
     assert "not_settled" not in judged(flight(*far, mission=mission, settle_m=None))
+
+
+def test_steps_that_do_not_settle_are_counted_beside_the_mean():
+    slow, quick = flight(growing), flight(second_order(0.7))
+    assert SHIPPED["unsettled_steps"].measure(slow) == 1.0
+    assert SHIPPED["settling_time_mean"].measure(slow) is None
+    assert SHIPPED["unsettled_steps"].measure(quick) == 0.0
