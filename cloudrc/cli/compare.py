@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import (
+    FAILED_MARK,
+    FAILED_NOTE,
     format_number,
     output_argument,
     print_or_drop,
@@ -41,8 +43,8 @@ examples:
     --set link.profile=handover --number delay_estimate_error_rms
   cloudrc compare last_sample constant_velocity --in runs/sweep-steps-1"""
 TITLES = (
-    *("number", "A median", "B median", "B - A", "95 % interval", "B lower in", "p", "decided"),
-    "unit",
+    *("number", "A median", "B median", "B - A", "95 % interval", "B lower in", "p", "p sign"),
+    *("decided", "unit"),
 )
 
 
@@ -153,20 +155,32 @@ def as_text(document: Mapping[str, Any]) -> str:
         + (f"; {left_out} left out with {LEFT_OUT}" if left_out else ""),
         *("", table([TITLES, *body], right=(1, 2, 3)), ""),
         f"success: {', '.join(rates)}, p = {success['p_mcnemar']:.2g}",
-        *(document["method"], "", _answer(document)),
+        document["method"],
+        *([FAILED_NOTE] if any(_failed(entry) for entry in document["numbers"].values()) else []),
+        *("", _answer(document)),
     ]
     return "\n".join(lines)
 
 
 def _row(name: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
     factor, unit = _scaled(entry)
-    values = [entry[key] * factor for key in ("a_median", "b_median", "difference")]
+    values = [format_number(entry[key] * factor) for key in ("a_median", "b_median", "difference")]
+    for place, side in enumerate("ab"):
+        values[place] += FAILED_MARK if entry[f"{side}_failed"] else ""
     between = " .. ".join(format_number(bound * factor) for bound in entry["interval"] or ())
     return (
-        *(name, *map(format_number, values), between or "-"),
-        *(f"{entry['lower']} of {entry['count']}", f"{entry['p_wilcoxon']:.2g}"),
+        *(name, *values, between or "-", f"{entry['lower']} of {entry['count']}"),
+        *(f"{entry['p_wilcoxon']:.2g}", f"{entry['p_sign']:.2g}"),
         *("yes" if entry["decided"] else f"no: {_needed(entry)}", unit),
     )
+
+
+def _failed(entry: Mapping[str, Any]) -> str:
+    """Return in words how many flights behind a number failed; "" if none did."""
+    failed = [
+        f"{entry[f'{side}_failed']} of {side.upper()}'s" for side in "ab" if entry[f"{side}_failed"]
+    ]
+    return f"{' and '.join(failed)} {entry['count']} flights failed" if failed else ""
 
 
 def _scaled(entry: Mapping[str, Any]) -> tuple[float, str]:
@@ -196,7 +210,9 @@ def _answer(document: Mapping[str, Any]) -> str:
     name, entry = next(iter(document["numbers"].items()))
     p, count = f"p = {entry['p_wilcoxon']:.2g}", entry["count"]
     if not entry["decided"]:
-        return f"{text}Undecided: {name} after {count} pairs, {p}; {_needed(entry)}."
+        return (
+            f"{text}Undecided: {name} after {count} pairs, {p}; {_needed(entry)}.{_cautions(entry)}"
+        )
     sign, word = (1, "higher") if entry["difference"] > 0 else (-1, "lower")
     factor, unit = _scaled(entry)
     size, low, high = (
@@ -205,5 +221,20 @@ def _answer(document: Mapping[str, Any]) -> str:
     )
     return (
         f"{text}B has a {word} {name}: by {size}{unit and ' '}{unit} ({low} .. {high}), {p}, "
-        f"in {entry[word]} of {count} pairs."
+        f"in {entry[word]} of {count} pairs.{_cautions(entry)}"
     )
+
+
+def _cautions(entry: Mapping[str, Any]) -> str:
+    """Say what weakens the answer about a metric, each in a sentence after a space."""
+    from cloudrc.sweep.statistics import LEVEL
+
+    text = ""
+    if entry["decided"] and entry["p_sign"] >= LEVEL:
+        text += (
+            " This holds if the differences are symmetric; the sign test, which does not assume "
+            f"it, does not confirm it (p = {entry['p_sign']:.2g})."
+        )
+    if failed := _failed(entry):
+        text += f" {failed}, and their numbers count."
+    return text

@@ -16,6 +16,13 @@ from cloudrc.errors import DISK_FULL
 
 _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1"}
 
+FAILED_MARK = "*"
+"""Mark of a number in a table if some of its flights failed."""
+FAILED_NOTE = (
+    f"{FAILED_MARK} contains flights that failed: a robot that hardly moves has small errors, too"
+)
+"""Note below a table with such a mark."""
+
 
 def output_argument(parser: argparse.ArgumentParser, what: str = "output format") -> None:
     """Declare the flag `--output`; `what` is its help text."""

@@ -18,6 +18,8 @@ from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.mission import TERMINATION_LOG
 from cloudrc.cli.output import (
+    FAILED_MARK,
+    FAILED_NOTE,
     escape,
     format_number,
     print_line,
@@ -319,10 +321,12 @@ def summarise(rows: Sequence[Row], units: Mapping[str, str]) -> dict[str, Any]:
     measurements are left out. `units`: metric -> unit.
     """
     numbers, measured = {}, [row["numbers"] for row in rows if counts(row)]
+    failed = [row["numbers"] for row in rows if counts(row) and row["verdict"] != "success"]
     for name in dict.fromkeys(name for each in measured for name in each):
         found = [each[name] for each in measured if name in each]
         middle = {"median": statistics.median(found), "interval": median_interval(found)}
-        numbers[name] = {**middle, "unit": units[name], "count": len(found)}
+        marks = {"unit": units[name], "count": len(found), "failed": sum(name in n for n in failed)}
+        numbers[name] = middle | marks
     done = sum(row["verdict"] == "success" for row in rows)
     return {"done": done, "count": len(rows), "method": METHOD, "numbers": numbers}
 
@@ -334,8 +338,11 @@ def as_table(summary: Mapping[str, Any]) -> str:
         between = " .. ".join(map(format_number, entry["interval"] or ())) or "-"
         unit = "" if entry["unit"] == "1" else entry["unit"]
         note = "" if entry["count"] == summary["count"] else f"  ({entry['count']} runs)"
-        rows.append((name, format_number(entry["median"]), between, unit + note))
+        mark = FAILED_MARK if entry["failed"] else ""
+        rows.append((name, format_number(entry["median"]) + mark, between, unit + note))
     method = METHOD if summary["count"] >= 6 else "an interval needs 6 seeds or more"
+    if any(entry["failed"] for entry in summary["numbers"].values()):
+        method += f"\n{FAILED_NOTE}"
     return f"{table(rows, right=(1, 2))}\n\n{method}\ndone {summary['done']}/{summary['count']}"
 
 

@@ -14,16 +14,17 @@ from cloudrc.plugins import unknown_name_text
 from cloudrc.rounding import differences
 from cloudrc.sweep import store
 from cloudrc.sweep.flight import Row, counts
-from cloudrc.sweep.statistics import LEVEL, paired, sign_test, wilson_interval
+from cloudrc.sweep.statistics import LEVEL, exact_interval, paired, sign_test
 
 NUMBERS = (
     *("prediction_error_rms", "tracking_error_p95", "iae_mean", "settling_time_mean"),
-    *("overshoot_mean", "delay_estimate_error_rms", "min_clearance"),
+    *("unsettled_steps", "overshoot_mean", "delay_estimate_error_rms", "min_clearance"),
 )
 """Metrics that are compared by default."""
 METHOD = (
-    "B - A: Hodges-Lehmann estimate, 95 % interval and p of the exact Wilcoxon signed-rank test; "
-    "success: Wilson intervals, p of the exact McNemar test"
+    "B - A: Hodges-Lehmann estimate, 95 % interval and p of the exact Wilcoxon signed-rank test, "
+    "which assumes symmetric differences; p sign: the exact sign test, which does not; "
+    "success: Clopper-Pearson intervals, p of the exact McNemar test"
 )
 LEFT_OUT = "a flight that did not end or whose plug-in failed"
 
@@ -83,13 +84,15 @@ def check_names(names: Iterable[str], known: Collection[str]) -> None:
 
 
 def _number(pairs: Sequence[Pair], name: str, unit: str) -> dict[str, Any]:
-    both = [(a["numbers"][name], b["numbers"][name]) for _, a, b in pairs
-            if name in a["numbers"] and name in b["numbers"]]  # fmt: skip
+    known = [pair for pair in pairs if name in pair.a["numbers"] and name in pair.b["numbers"]]
+    both = [(a["numbers"][name], b["numbers"][name]) for _, a, b in known]
     return {
         "unit": unit,
         "a_median": median(a for a, _ in both),
         "b_median": median(b for _, b in both),
         **asdict(paired(differences(*zip(*both, strict=True)).tolist())),
+        "a_failed": sum(pair.a["verdict"] != "success" for pair in known),
+        "b_failed": sum(pair.b["verdict"] != "success" for pair in known),
         "left_out": len(pairs) - len(both),
     }
 
@@ -102,8 +105,8 @@ def _success(pairs: Sequence[Pair]) -> dict[str, Any]:
     only_b = b - (a - only_a)
     p = sign_test(only_a, only_b)
     return {
-        **{"count": count, "a": a, "a_interval": wilson_interval(a, count)},
-        **{"b": b, "b_interval": wilson_interval(b, count)},
+        **{"count": count, "a": a, "a_interval": exact_interval(a, count)},
+        **{"b": b, "b_interval": exact_interval(b, count)},
         **{"only_a": only_a, "only_b": only_b, "p_mcnemar": p, "decided": p < LEVEL},
     }
 

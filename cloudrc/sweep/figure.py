@@ -14,7 +14,7 @@ from cloudrc.report.figures.bands import Panel, Point, draw
 from cloudrc.report.figures.style import Look
 from cloudrc.sweep.compare import NUMBERS, check_names
 from cloudrc.sweep.flight import Row, counts
-from cloudrc.sweep.statistics import median_interval, wilson_interval
+from cloudrc.sweep.statistics import exact_interval, median_interval
 from cloudrc.sweep.store import values_of
 
 COLUMN = Look(width=3.5)
@@ -70,7 +70,7 @@ def draw_sweep(
         panels.append(Panel("success", "%", _lines(groups, at, _rate)))
     caption = (
         "Median of each point, with its 95 % interval from 6 flights on; success: share and "
-        "Wilson's 95 % interval. Open markers: some flights failed."
+        "Clopper and Pearson's 95 % interval. Open markers: some flights failed."
         + (f" Each point pools all values of {', '.join(pooled)}." if pooled else "")
     )
     return draw(panels, x, [] if is_numeric else list(map(str, along)), by, look=look), caption
@@ -123,7 +123,7 @@ def _rate(point: Sequence[Row]) -> tuple[float, float, float]:
     if not point:
         return nan, nan, nan
     done = sum(row["verdict"] == "success" for row in point)
-    low, high = wilson_interval(done, len(point))
+    low, high = exact_interval(done, len(point))
     return 100 * done / len(point), 100 * low, 100 * high
 
 

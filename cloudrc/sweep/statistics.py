@@ -48,19 +48,33 @@ def _outermost(n: int) -> int:
     return int(np.searchsorted(chances, LEVEL / 2, side="right"))
 
 
-def wilson_interval(successes: int, count: int) -> tuple[float, float]:
+def exact_interval(successes: int, count: int) -> tuple[float, float]:
     """Return the 95 % confidence interval of a success rate, in [0, 1]; `count` is at least 1.
 
-    Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
-    1927.
+    The lower bound is the rate with which `successes` or more of `count` flights succeed with a
+    probability of 2.5 %; the upper bound is that for `successes` or fewer. The interval contains
+    the true rate with a probability of at least 95 % for every rate and count.
+
+    Source: C. J. Clopper, E. S. Pearson, "The use of confidence or fiducial limits illustrated in
+    the case of the binomial", 1934.
     """
-    share, spread = successes / count, Z * Z / count
-    middle = share + spread / 2
-    half = math.sqrt(spread * (share * (1 - share) + spread / 4))
-    # The bounds of no and of all successes are exactly 0 and 1; rounding may miss them.
-    low = (middle - half) / (1 + spread) if successes else 0.0
-    high = (middle + half) / (1 + spread) if successes < count else 1.0
+    low = _rate(successes - 1, count, 1.0 - LEVEL / 2) if successes else 0.0
+    high = _rate(successes, count, LEVEL / 2) if successes < count else 1.0
     return low, high
+
+
+def _rate(most: int, count: int, chance: float) -> float:
+    """Return the rate with which at most `most` of `count` flights succeed with this chance [1]."""
+    numbers = range(most + 1)
+    whole = math.lgamma(count + 1)
+    ways = [whole - math.lgamma(k + 1) - math.lgamma(count - k + 1) for k in numbers]
+    done, failed = np.array(numbers), count - np.array(numbers)
+    low, high = 0.0, 1.0
+    while high - low > 1e-12:
+        middle = (low + high) / 2
+        logarithms = ways + done * math.log(middle) + failed * math.log1p(-middle)
+        low, high = (middle, high) if np.exp(logarithms).sum() > chance else (low, middle)
+    return (low + high) / 2
 
 
 def sign_test(less: int, more: int) -> float:

@@ -474,6 +474,14 @@ def test_numbers_may_be_missing_and_failed_plugins_do_not_count():
     assert "(2 runs)" in as_table(summary)
 
 
+def test_a_median_with_flights_that_failed_is_marked():
+    rows = [flown(x=1.0), flown("failure", "not_settled", x=5e-7)]
+    shown = as_table(summarise(rows, {"x": "m"}))
+    assert "0.5000*" in shown
+    assert "* contains flights that failed" in shown
+    assert "*" not in as_table(summarise(rows[:1], {"x": "m"}))
+
+
 @pytest.mark.process
 def test_a_signal_ends_a_sweep_at_once(folder):
     command = [sys.executable, "-m", "cloudrc", "run", "paper", "--seeds", "40", "--out", "sweep"]

@@ -1,5 +1,7 @@
 """Intervals and tests have the values of published tables."""
 
+from math import comb
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,11 +9,11 @@ from hypothesis import strategies as st
 
 from cloudrc.sweep import statistics
 from cloudrc.sweep.statistics import (
+    exact_interval,
     median_interval,
     paired,
     sign_test,
     signed_rank_test,
-    wilson_interval,
 )
 
 MAIZE = [6, 8, 14, 16, 23, 24, 28, 29, 41, -48, 49, 56, 60, -67, 75]
@@ -31,11 +33,11 @@ def test_the_interval_of_the_median_has_the_bounds_of_textbooks(values):
 
 @pytest.mark.parametrize(
     ("successes", "count", "low", "high"),
-    [(0, 10, 0, 0.2775), (5, 10, 0.2366, 0.7634), (10, 10, 0.7225, 1), (81, 263, 0.2553, 0.3662)],
+    [(0, 10, 0, 0.3085), (5, 10, 0.1871, 0.8129), (10, 10, 0.6915, 1), (81, 263, 0.2527, 0.3676)],
 )
-def test_wilson_s_interval_has_published_values(successes, count, low, high):
-    """R. G. Newcombe, 1998, table I, method 3 has 81 of 263."""
-    assert wilson_interval(successes, count) == pytest.approx((low, high), abs=5e-5)
+def test_the_exact_interval_has_published_values(successes, count, low, high):
+    """R. G. Newcombe, 1998, table I, method 5 has 81 of 263."""
+    assert exact_interval(successes, count) == pytest.approx((low, high), abs=5e-5)
 
 
 @pytest.mark.parametrize(
@@ -120,3 +122,22 @@ def test_differences_that_are_equal_up_to_rounding_share_their_ranks_and_cancel(
     assert signed_rank_test(rounded) == signed_rank_test(exact)
     found = paired([0.1 + 0.2, -0.3] * 4)
     assert (found.difference, found.decided, found.pairs_needed) == (0.0, False, None)
+
+
+@pytest.mark.parametrize(("count", "rate"), [(10, 0.98), (10, 0.9), (10, 0.5), (20, 0.15)])
+def test_the_exact_interval_contains_the_true_rate_often_enough(count, rate):
+    """The probability that the interval contains the rate, summed over all outcomes."""
+    chances = [comb(count, k) * rate**k * (1 - rate) ** (count - k) for k in range(count + 1)]
+    bounds = [exact_interval(k, count) for k in range(count + 1)]
+    inside = [chance for chance, (low, high) in zip(chances, bounds, strict=True)
+              if low <= rate <= high]  # fmt: skip
+    assert sum(inside) >= 0.95
+
+
+def test_the_sign_test_holds_its_level_for_skewed_differences():
+    """The signed-rank test does not: it assumes symmetric differences."""
+    rng = np.random.default_rng(1)
+    samples = rng.exponential(1.0, (400, 50)) - np.log(2.0)  # the median is 0
+    found = [paired(sample.tolist()) for sample in samples]
+    assert np.mean([each.p_sign < 0.05 for each in found]) < 0.06
+    assert np.mean([each.p_wilcoxon < 0.05 for each in found]) > 0.1
