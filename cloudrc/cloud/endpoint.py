@@ -176,6 +176,17 @@ class CloudEndpoint(TunnelEnd):
             self._note_missed(missed, now_ns)
         self._tick_ns += (missed + 1) * self._period_ns
         self._session.follow_keys()
+        self._ask_for_session_if_due(now_ns)
+        self._follow_teleop(now_ns)
+        if self._session.epoch:
+            self._send_command_or_alive(now_ns)
+        if now_ns >= self._count_ns:
+            self._record_counts(now_ns)
+        if self._loop.faults:
+            self._records += self._loop.take_faults()
+
+    def _ask_for_session_if_due(self, now_ns: int) -> None:
+        """Ask for a session while there is none, and for a new one after a change of the key."""
         if self._wants_session(now_ns):
             self._say_hello_if_due(now_ns)
             if now_ns - self._heard_ns > PATIENCE_NS:
@@ -183,21 +194,23 @@ class CloudEndpoint(TunnelEnd):
         elif self._session.is_outdated:
             self._hellos = 0  # the next hello has the new key
             self._say_hello_if_due(now_ns, KEY_PERIOD_NS)
+
+    def _follow_teleop(self, now_ns: int) -> None:
+        """Take teleop's messages; repeat an emergency stop that the robot has not confirmed."""
         self.teleop.handle_deadline(now_ns)
         if self.teleop.outputs:
             self._take_from_teleop()
         if self._alarm.sounds and self._session.epoch:
             if (alarm := self._alarm.due(self._asked, now_ns)) is not None:
                 self._relay(alarm)
-        if self._session.epoch and self._loop.ready and self._setpoint is not None:
+
+    def _send_command_or_alive(self, now_ns: int) -> None:
+        """Send the command of this period; while there is none, send ALIVE if it is due."""
+        if self._loop.ready and self._setpoint is not None:
             self._send_command(self._setpoint, now_ns)
-        elif self._session.epoch and now_ns >= self._alive_ns:
+        elif now_ns >= self._alive_ns:
             self._alive_ns = now_ns + ALIVE_PERIOD_NS
             self._send(Kind.ALIVE, b"")
-        if now_ns >= self._count_ns:
-            self._record_counts(now_ns)
-        if self._loop.faults:
-            self._records += self._loop.take_faults()
 
     def receive_datagram(self, data: Datagram, now_ns: int) -> None:
         """Handle a datagram that arrived at `now_ns` [ns]; count and drop an invalid datagram."""

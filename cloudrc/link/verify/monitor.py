@@ -140,15 +140,7 @@ class LinkMonitor:
             with suppress(Exception):  # an invalid profile; the link's process may be hostile
                 self.follow(self._load(self._news.popleft()))
         for record in records:
-            if isinstance(record, Arrival):
-                self._fresh |= record.epoch != self._epoch
-                self._epoch = record.epoch
-                self._arrivals.append(record)
-            elif isinstance(record, Lateness):
-                self._lates.append(record.lateness + record.busy)
-            elif isinstance(record, Control):
-                if self._echoes.take(record.rtt, record.loop_delay):
-                    self._trips.append(record.rtt)
+            self._store(record)
         if self._asked is None:
             return []
         if self._fresh:  # a running time line is not judged, because its start is not known here
@@ -162,6 +154,17 @@ class LinkMonitor:
             return []
         self._due_ns = now_ns + CHECK_NS
         return self._report(self._rows(), now_ns)
+
+    def _store(self, record: Record) -> None:
+        if isinstance(record, Arrival):
+            self._fresh |= record.epoch != self._epoch
+            self._epoch = record.epoch
+            self._arrivals.append(record)
+        elif isinstance(record, Lateness):
+            self._lates.append(record.lateness + record.busy)
+        elif isinstance(record, Control):
+            if self._echoes.take(record.rtt, record.loop_delay):
+                self._trips.append(record.rtt)
 
     def _forget(self) -> None:
         for kept in (self._arrivals, self._trips, self._lates):

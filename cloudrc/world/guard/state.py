@@ -196,38 +196,46 @@ class Guard:
         It is "stale" if the odometry from which cloud computed the command is too old, and "future"
         if this odometry is later than `now_ns`.
         """
-        velocity, yaw_rate = command.velocity, command.yaw_rate
-        x, y, z = velocity
-        most = COMMAND_MAX
-        if not (abs(x) <= most and abs(y) <= most and abs(z) <= most and abs(yaw_rate) <= most):
+        reason = self._reason_to_reject(command, now_ns)
+        if reason is None:
+            if self.armed:
+                self._obey(command, now_ns)
+        elif reason != "stale":  # a slow link is no sign of a hostile cloud
             self._note_invalid(now_ns)
+        return reason
+
+    def _reason_to_reject(self, command: Command, now_ns: int) -> str | None:
+        x, y, z = command.velocity
+        most, yaw_rate = COMMAND_MAX, command.yaw_rate
+        if not (abs(x) <= most and abs(y) <= most and abs(z) <= most and abs(yaw_rate) <= most):
             return "range"
         age_ns = now_ns - command.basis_stamp_ns
         if age_ns < 0:
-            self._note_invalid(now_ns)
             return "future"
         if age_ns > self.command_age_max_ns:
             return "stale"
         if command.plan and not self._is_plan_possible(command):
-            self._note_invalid(now_ns)
             return "range"
-        if self.armed:
-            fresh_until_ns = command.basis_stamp_ns + self.command_age_max_ns
-            self._play(command, now_ns)
-            self.yaw_rate = rules.clamp(yaw_rate, -self._yaw_rate_max, self._yaw_rate_max)
-            if self.yaw_rate != yaw_rate:
-                self.counts["limited_yaw_rate"] += 1
-            if self.state is GROUND:
-                self._alone_ns = now_ns
-                if self._settled(now_ns, fresh_until_ns):
-                    self._enter(TRACK, now_ns, Cause.COMMAND)
-            elif self.state is HOLD:
-                self._leave_hold(now_ns, fresh_until_ns)
-            if self.state is TRACK:
-                self._track_until_ns = fresh_until_ns
-                if command.plan:
-                    self._track_until_ns = max(fresh_until_ns, self._plan_end_ns(command, now_ns))
         return None
+
+    def _obey(self, command: Command, now_ns: int) -> None:
+        """Take an accepted command of the mission; change to TRACK if it is time."""
+        fresh_until_ns = command.basis_stamp_ns + self.command_age_max_ns
+        self._play(command, now_ns)
+        yaw_rate = command.yaw_rate
+        self.yaw_rate = rules.clamp(yaw_rate, -self._yaw_rate_max, self._yaw_rate_max)
+        if self.yaw_rate != yaw_rate:
+            self.counts["limited_yaw_rate"] += 1
+        if self.state is GROUND:
+            self._alone_ns = now_ns
+            if self._settled(now_ns, fresh_until_ns):
+                self._enter(TRACK, now_ns, Cause.COMMAND)
+        elif self.state is HOLD:
+            self._leave_hold(now_ns, fresh_until_ns)
+        if self.state is TRACK:
+            self._track_until_ns = fresh_until_ns
+            if command.plan:
+                self._track_until_ns = max(fresh_until_ns, self._plan_end_ns(command, now_ns))
 
     def _is_plan_possible(self, command: Command) -> bool:
         ahead_ns = command.planned_ns - command.basis_stamp_ns
