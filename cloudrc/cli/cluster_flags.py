@@ -24,13 +24,21 @@ def release_arguments(
 
     Return a function that adds another flag to the same group of the help.
     """
-    group = parser.add_argument_group("in a cluster (uses KUBECONFIG)")
-    group.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
-    about = "namespace (default: the context's, or default)"
-    group.add_argument("-n", "--namespace", metavar="NAME", help=about)
+    group = cluster_arguments(parser, "(default: the context's, or default)")
     about = f"Helm release (default: {default})"
     group.add_argument("--release", metavar="NAME", help=about)
     return group.add_argument
+
+
+def cluster_arguments(parser: argparse.ArgumentParser, namespace: str) -> argparse._ArgumentGroup:
+    """Declare `--context` and `--namespace`; the help of the latter ends with `namespace`.
+
+    Return the group of the help, to which further flags may be added.
+    """
+    group = parser.add_argument_group("in a cluster (uses KUBECONFIG)")
+    group.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
+    group.add_argument("-n", "--namespace", metavar="NAME", help=f"namespace {namespace}")
+    return group
 
 
 def timeout_argument(parser: argparse.ArgumentParser) -> None:
@@ -52,7 +60,8 @@ def release_from_flags(options: argparse.Namespace) -> Release:
     require("a cluster", ("kube",))
     from cloudrc.cluster.client import connect
 
-    return connect(options.context, options.namespace, options.release or DEFAULT_RELEASE)
+    name = getattr(options, "release", None) or DEFAULT_RELEASE
+    return connect(options.context, options.namespace, name)
 
 
 def flown_release(options: argparse.Namespace) -> Release:

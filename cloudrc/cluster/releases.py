@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import replace
 from typing import Any, NamedTuple
+
+import yaml
 
 from cloudrc.cluster.client import ClusterError, NotFoundError, Release
 from cloudrc.errors import BadInputError
 
 INSTANCE = "app.kubernetes.io/instance"
 """Label with the name of the release."""
+COMPONENT = "app.kubernetes.io/component"
+CLOUDRC = "app.kubernetes.io/name=cloudrc"
 SELECTOR = "app.kubernetes.io/name=cloudrc,app.kubernetes.io/component=cloud"
 """Selects the one Deployment that each release has for its cloud."""
 
@@ -28,10 +33,67 @@ def find_releases(release: Release, *, everywhere: bool) -> list[Place]:
     """
     verb = "list all" if everywhere else "list"
     found = release.request(verb, "deployments", label_selector=SELECTOR)
-    return sorted(
-        Place(each.metadata.namespace, (each.metadata.labels or {}).get(INSTANCE, ""))
-        for each in found
-    )
+    return sorted(map(_place, found))
+
+
+class ReleaseView(NamedTuple):
+    """What `cloudrc list releases` shows of a release, except its mission."""
+
+    name: str
+    namespace: str
+    robot: str
+    link: str
+    state: str
+
+
+def look(release: Release, *, everywhere: bool) -> list[ReleaseView]:
+    """Describe the releases in the namespace of `release`, or in all namespaces.
+
+    Raise a ClusterError if the user may not list Deployments or ConfigMaps there.
+    """
+    verb, chosen = "list all" if everywhere else "list", {"label_selector": CLOUDRC}
+    deployments = release.request(verb, "deployments", **chosen)
+    files = defaultdict[Place, dict[str, str]](dict)
+    for each in release.request(verb, "configmaps", **chosen):
+        if each.metadata.labels.get(COMPONENT) in ("experiment", "link"):
+            files[_place(each)] |= each.data or {}
+    waits = defaultdict[Place, list[str]](list)
+    for each in deployments:
+        not_ready = [] if each.status.available_replicas else [each.metadata.labels[COMPONENT]]
+        waits[_place(each)] += not_ready
+    return [
+        ReleaseView(
+            place.name,
+            place.namespace,
+            _robot(files[place].get("experiment.yaml", "")),
+            _link(files[place].get("profile.yaml", "")),
+            f"{' and '.join(sorted(waits[place]))} not ready" if waits[place] else "ready",
+        )
+        for place in sorted(waits)
+    ]
+
+
+def _place(thing: Any) -> Place:
+    return Place(thing.metadata.namespace, thing.metadata.labels.get(INSTANCE, ""))
+
+
+def _robot(experiment: str) -> str:
+    from cloudrc.config.schema import World
+
+    return str((yaml.safe_load(experiment) or {}).get("world", {}).get("robot") or World().robot)
+
+
+def _link(profile: str) -> str:
+    """Describe a profile: delay and jitter of both directions, and what else is set."""
+    ways = [(yaml.safe_load(profile) or {}).get(way) or {} for way in ("uplink", "downlink")]
+    texts = [_way(way) for way in ways]
+    return texts[0] if texts[0] == texts[1] else " / ".join(texts)
+
+
+def _way(way: dict[str, Any]) -> str:
+    jitter = f"\u00b1{way['jitter_ms']:g}" if way.get("jitter_ms") else ""
+    more = [key for key in way if key not in ("delay_ms", "jitter_ms")]
+    return ", ".join([f"{way.get('delay_ms') or 0:g}{jitter} ms", *more])
 
 
 def only_release(release: Release) -> Release:
@@ -62,7 +124,7 @@ def no_release(release: Release, what: str = "") -> ClusterError:
     `what` is the beginning of its text, by default "no release 'NAME' in namespace ...".
     """
     what = what or f"no release '{release.name}' {release.where}"
-    if not _namespace_exists(release):
+    if not namespace_exists(release):
         what = f"no namespace '{release.namespace}'{release.of_context}"
     known = _known(release)
     if known:
@@ -87,7 +149,7 @@ def _known(release: Release) -> str:
     return ", ".join([*shown[:10], *(["..."] if len(shown) > 10 else [])])
 
 
-def _namespace_exists(release: Release) -> bool:
+def namespace_exists(release: Release) -> bool:
     """Return False if the namespace certainly does not exist; many users may not ask for it."""
     try:
         release.request("get", "namespaces", name=release.namespace)

@@ -1,12 +1,16 @@
 """Which release a command means: the named one, or the only one of the namespace; never a guess."""
 
+import json
+from contextlib import contextmanager
+from unittest.mock import Mock
+
 import pytest
 
 from cloudrc.cluster.client import ClusterError, connect
 from cloudrc.cluster.pods import find_deployment
 from cloudrc.cluster.releases import only_release
 from cloudrc.errors import BadInputError
-from tests.cluster.conftest import deployment
+from tests.cluster.conftest import deployment, labels
 
 
 def put(api, name, namespace="demo"):
@@ -55,3 +59,57 @@ def test_a_user_of_one_namespace_is_not_asked_for_more_rights(api, release):
         ClusterError, match=r"^no release 'cloudrc' .*: 'other' in namespace 'demo'"
     ):
         find_deployment(release, "cloud")
+
+
+def release_in(api, name, namespace, *, ready, robot="", profile="uplink: {delay_ms: 40}"):
+    """Put the objects of a release that `cloudrc list releases` reads."""
+    for component in ("world", "cloud"):
+        available = 1 if ready or component == "world" else 0
+        body = deployment(component, availableReplicas=available)
+        body["metadata"]["labels"]["app.kubernetes.io/instance"] = name
+        body["metadata"] |= {"name": f"{namespace}-{name}-{component}", "namespace": namespace}
+        api.put("deployments", body)
+    experiment = f"world: {{robot: {robot}}}" if robot else "{}"
+    for kind, data in (("experiment", experiment), ("link", profile)):
+        file = {"experiment": "experiment.yaml", "link": "profile.yaml"}[kind]
+        about = {**labels(kind), "app.kubernetes.io/instance": name}
+        metadata = {"name": f"{namespace}-{name}-{kind}", "namespace": namespace, "labels": about}
+        api.put("configmaps", {"metadata": metadata, "data": {file: data}})
+
+
+JITTER = "{uplink: {delay_ms: 45, jitter_ms: 25}, downlink: {delay_ms: 45, jitter_ms: 25}}"
+
+
+def test_the_releases_of_all_namespaces_are_listed(api, call, monkeypatch):
+    release_in(api, "b", "lab", ready=False, robot="heavy", profile=JITTER)
+    release_in(api, "a", "demo", ready=True, profile="{uplink: {delay_ms: 40, loss: 0.1}}")
+    flies = {"id": "m3", "state": "flying", "reached": [{}, {}], "waypoints": 7}
+    missions = {"a": flies, "b": None}
+
+    @contextmanager
+    def answers(release):
+        yield Mock(get=lambda path: {"mission": missions[release.name]})
+
+    monkeypatch.setattr("cloudrc.cli.releases.release_api", answers)
+    rows = json.loads(call("list releases -o json").out)["releases"]
+    assert [list(row.values()) for row in rows] == [
+        ["a", "demo", "pelican", "40 ms, loss / 0 ms", "ready", "m3 flying 2/7"],
+        ["b", "lab", "heavy", "45\u00b125 ms", "cloud not ready", "-"],
+    ]
+    assert [line.split()[0] for line in call("list releases -n lab").out.splitlines()] == [
+        "NAME", "b",
+    ]  # fmt: skip
+
+
+def test_a_release_that_does_not_answer_is_listed(api, call, monkeypatch):
+    release_in(api, "a", "demo", ready=False)
+    monkeypatch.setattr("cloudrc.cli.releases.release_api", Mock(side_effect=ClusterError("gone")))
+    captured = call("list releases")
+    assert captured.out.splitlines()[1].split()[-1] == "?"
+    assert "release 'a' in namespace 'demo': gone" in captured.err
+
+
+def test_a_list_without_releases_says_so(api, call, refused):
+    assert "no releases" in call("list releases").out
+    assert "no namespace 'nope'" in refused("list releases -n nope", code=5)
+    assert "are for 'cloudrc list releases'" in refused("list profiles -n demo")
