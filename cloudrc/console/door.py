@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from cloudrc.console.access import PARAMETER, Access, Request, parse_head
 from cloudrc.console.handed import HandedSockets
@@ -244,12 +244,13 @@ class Door:
             return Answer(HTTPStatus.NOT_FOUND)
         return Answer(HTTPStatus.OK, text.encode(), "text/html; charset=utf-8")
 
-    def _state(self) -> dict[str, list[str]]:
-        """Return the state, and the names of the buttons that the plain page may use."""
+    def _state(self) -> dict[str, Any]:
+        """Return the state, the buttons of the plain page, and whether all scenes are taken."""
         is_read_only = self._desk.has_pilot()
         lines = ["Read only: another browser steers."] if is_read_only else []
         acts = [] if is_read_only else list(self._desk.acts)
-        return {"lines": lines + self._desk.describe(), "acts": acts}
+        lines += self._desk.describe()
+        return {"lines": lines, "acts": acts, "is_full": self._open >= PAGES_MAX}
 
     async def _act(self, name: str) -> Answer:
         """Carry out what a page asks for."""

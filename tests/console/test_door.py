@@ -25,7 +25,9 @@ from cloudrc.console.page import Page
 from cloudrc.console.steering import Steering
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import Scene
+from cloudrc.messages import ZERO
 from tests.conftest import wait_until
+from tests.console.conftest import LIMIT
 
 VERSION = f"viser-v{viser.__version__}"
 
@@ -142,6 +144,68 @@ def test_some_pages_have_the_scene_and_every_further_one_the_plain_page(page, mo
         with scene(page) as second:
             assert first.recv()
             assert second.recv()
+
+
+@pytest.mark.process
+def test_a_page_without_a_place_and_one_without_webgl_become_plain(page, browse, monkeypatch):
+    def refuse():
+        page._door._open = door.PAGES_MAX
+        return False
+
+    monkeypatch.setattr(page._door, "_count_in", refuse)
+    late = browse(page.url)
+    late.get_by_role("button", name="Hold", exact=True).wait_for(timeout=LIMIT * 1e3)
+    assert late.url.endswith("/plain")
+    late.keyboard.press("Shift+X")
+    wait_until(page._steering._stops.is_set)
+    page._steering._stops.clear()
+    page._door._open = 0
+    late.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    late.goto(page.url)
+    late.get_by_role("button", name="STOP", exact=True).click()
+    wait_until(page._steering._stops.is_set)
+    late.wait_for_url("**/plain")
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("key", "code"), [("X", "KeyX"), ("x", "KeyX"), ("X", "KeyB"), ("Q", "KeyX"), ("Ч", "KeyX")]
+)
+def test_shift_and_x_stops_by_letter_or_by_place(page, browse, key, code):
+    """On a US keyboard, with Caps Lock, by Dvorak's letter and place, and on a Cyrillic one."""
+    opened = browse(page.url.replace("/?", "/plain?"))
+    script = "names => document.body.dispatchEvent(new KeyboardEvent('keydown', names))"
+    names = {"key": key, "code": code, "bubbles": True, "cancelable": True}
+    opened.evaluate(script, names)
+    opened.evaluate(script, {**names, "shiftKey": True, "key": "y", "code": "KeyY"})
+    assert not page._steering._stops.is_set()
+    opened.evaluate(script, {**names, "shiftKey": True})
+    wait_until(page._steering._stops.is_set)
+
+
+@pytest.mark.process
+def test_held_keys_count_as_released_when_meta_changes_at_blur_and_when_hidden(page, browse):
+    """macOS tells no release of a key while Command is held, a page without focus none at all."""
+    opened = browse(f"{page.url}&fixedDpr=0.25")
+    opened.get_by_role("button", name="Hold", exact=True).wait_for(timeout=LIMIT * 1e3)
+    keys = opened.keyboard
+
+    def speed():
+        return page._steering.velocity(time.monotonic())
+
+    for change in (
+        lambda: (keys.down("Meta"), keys.up("Meta")),
+        lambda: opened.evaluate("dispatchEvent(new Event('blur'))"),
+        lambda: opened.evaluate("document.dispatchEvent(new Event('visibilitychange'))"),
+    ):
+        keys.down("ArrowUp")
+        wait_until(lambda: speed() != ZERO)
+        change()
+        wait_until(lambda: speed() == ZERO, limit=30.0)
+        keys.down("ArrowUp")  # the keyboard repeats the key, which is still down
+        time.sleep(0.5)
+        assert speed() == ZERO
+        keys.up("ArrowUp")
 
 
 def test_a_message_is_at_most_one_megabyte_and_memory_is_bounded(page):

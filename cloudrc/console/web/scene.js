@@ -2,6 +2,18 @@ if (!document.createElement('canvas').getContext('webgl2')) {
   location.replace(`${place}plain`);
 }
 
+// viser's page waits for ever if the door has no place for one more page with the scene.
+const looking = setInterval(async () => {
+  if (document.querySelector('#root [role=tab]')) {
+    clearInterval(looking);  // viser's panels: this page has a place
+    return;
+  }
+  const state = await fetch(`${place}state`).then(answer => answer.json()).catch(() => null);
+  if (state?.is_full) {
+    location.replace(`${place}plain`);
+  }
+}, 2000);
+
 // viser's buttons tell that they are held, its keys do not: a held key holds the button of its name.
 const drive = KEYS;
 const held = new Set();
