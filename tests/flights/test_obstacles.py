@@ -1,8 +1,12 @@
 """The robot flies straight into a body of a user's scene: the verdict names the body."""
 
+import sys
+from pathlib import Path
+
 import pytest
 
 from cloudrc.config.load import load_experiment
+from cloudrc.report.write import assess
 from cloudrc.sweep.flight import fly_in_memory
 from cloudrc.world.scene import FOLDER
 
@@ -89,3 +93,20 @@ def test_the_report_names_the_obstacles_from_which_no_clearance_is_known(flown_i
     assert [note for note in found.notes if "No clearance is known" in note] == [
         f"No clearance is known from {name}." for name in named
     ]
+
+
+def clearance_notes(found):
+    again = assess(found.flight.recording, found.experiment, found.run)
+    return [note for note in again.notes if note.startswith("No clearance is known from")]
+
+
+def test_a_report_needs_neither_mujoco_nor_a_scene_that_compiles(flown_into, monkeypatch):
+    found = flown_into(f'<body name="post" pos="3 0 0">{GEOM}</body>')
+    scene = Path(found.experiment.world.scene)
+    scene.write_text(scene.read_text().replace('type="box"', 'type="bix"'))
+    (note,) = clearance_notes(found)
+    assert "all bodies but declared pipes: " in note
+    assert "mine.xml does not compile" in note
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    (note,) = clearance_notes(found)
+    assert note.endswith("all bodies but declared pipes: MuJoCo is not installed.")
