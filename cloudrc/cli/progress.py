@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 ENDINGS = ("done", "cancelled", "timed_out")
 PLAIN_PERIOD = 30.0
 """Time between two lines of progress of a sweep that is not shown on a terminal [s]."""
+REPORT_AFTER = 1.0
+"""Time without a record after the end of a mission, from which on the report is written [s]."""
 PLAN_WAIT = 1.0
 """Time after which the check of a sweep shows its progress [s]."""
 
@@ -49,7 +51,7 @@ class FlightView:
         if is_live(stream):
             terminal = Console(file=stream)
             self._status = Live(console=terminal, transient=True, get_renderable=self.line)
-            self._status.start()  # before the flight, whose preparation takes a second
+            self._status.start(refresh=True)  # now: the preparation takes a second
 
     def see(self, records: Iterable[Record]) -> None:
         """Show new records of world or cloud, in the order of time."""
@@ -86,6 +88,8 @@ class FlightView:
 
     def line(self) -> Text:
         """Return the status line; it ends with the least important part, which may be cropped."""
+        if self._ended and monotonic() - self._seen > REPORT_AFTER:
+            return Text("the mission is over: writes the report")
         elapsed, flown = self._seen - self._began, (self._now_ns - self._first_ns) * 1e-9
         number = self._waypoint + 1
         cells = (

@@ -79,6 +79,21 @@ def test_events_are_plain_lines_or_wrapped_on_a_terminal():
     assert terminal.getvalue().endswith("\x1b[2K"), "the status line is erased"
 
 
+def test_a_terminal_shows_what_happens_before_and_after_the_flight(monkeypatch):
+    """MuJoCo loads for a second, and the report takes several; a file gets no line about them."""
+    file, terminal = io.StringIO(), Terminal()
+    for stream in (file, terminal):
+        view = FlightView(stream, 7)
+        assert ("GROUND" in stream.getvalue()) is (stream is terminal)
+        view.see([MissionEvent(0, "done", 6, "mission done")])
+        assert "GROUND" in str(view.line())
+        monkeypatch.setattr("cloudrc.cli.progress.REPORT_AFTER", -1.0)
+        assert str(view.line()) == "the mission is over: writes the report"
+        monkeypatch.undo()
+        view.close()
+    assert file.getvalue().split() == ["mission", "done"]
+
+
 def test_a_full_disk_is_told(folder):
     with open("/dev/full", "w") as full:
         command = [sys.executable, "-m", "cloudrc", "list", "-o", "json"]
