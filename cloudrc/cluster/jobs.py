@@ -223,9 +223,13 @@ def read_log(
 ) -> Iterator[str]:
     """Yield each different line of the logs of a Job's pods, until the Job has ended.
 
-    The parameters are those of `JobReader`. Raise a ClusterError if a pod will never run.
+    The parameters are those of `JobReader`. Raise a ClusterError if a pod will never run, or if the
+    Job is deleted.
     """
-    yield from JobReader(release, name, tell, see_end).read()
+    try:
+        yield from JobReader(release, name, tell, see_end).read()
+    except JobGoneError:
+        raise ClusterError(f"Job '{name}' was deleted; repeat the command") from None
 
 
 class JobReader:
@@ -283,10 +287,14 @@ class JobReader:
             raise JobGoneError("its Job was deleted", self.key)
 
     def _refuse_suspended(self, pods: list[Any]) -> None:
-        """Raise a JobGoneError if the Job is suspended in flight; a queue may suspend a new Job."""
+        """Raise a JobGoneError if a mission's Job is suspended in flight.
+
+        A queue, such as Kueue, may suspend a new Job, and the Job of a sweep at any time.
+        """
         if not self.job.spec.suspend:
             return
-        if pods or self._read:
+        is_mission = self.job.metadata.labels[COMPONENT_LABEL] == COMPONENT
+        if is_mission and (pods or self._read):
             raise JobGoneError("its Job was suspended", self.key)
         self._tell_once("waiting: the Job is suspended")
 

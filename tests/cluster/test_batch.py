@@ -117,3 +117,22 @@ def test_pods_may_wait_for_a_node_but_not_for_an_image(started, api, release):
     add_pod(api, "b", "Pending", state={"waiting": {"reason": "ImagePullBackOff"}})
     with pytest.raises(ClusterError, match="cannot start"):
         lines(release)
+
+
+def test_a_sweep_that_a_queue_suspends_in_flight_waits(started, api, release):
+    add_pod(api, "a", "Running", "row 1\n")
+    spec = api.get("jobs", "sweep-1")["spec"]
+    spec["suspend"] = True
+
+    def resume():
+        spec["suspend"] = False
+        api.end("sweep-1", "Complete")
+
+    api.at_look(3, resume)
+    assert lines(release) == (["row 1"], ["waiting: the Job is suspended"])
+
+
+def test_a_deleted_job_of_a_sweep_is_named(started, api, release):
+    api.at_look(2, lambda: api.objects.pop(("jobs", "sweep-1")))
+    with pytest.raises(ClusterError, match=r"^Job 'sweep-1' was deleted; repeat the command$"):
+        lines(release)
