@@ -84,6 +84,17 @@ class Parser(argparse.ArgumentParser):
         """Raise an error with the message of argparse and the command that prints the help."""
         raise BadInputError(f"{message}; see '{self.prog} --help'")
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse unknown arguments here: argparse would name the help of the first command."""
+        known, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            near = difflib.get_close_matches(
+                unknown[0], self._option_string_actions, n=1, cutoff=0.8
+            )
+            hint = f" (did you mean {near[0]}?)" if near else ""
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+        return known, unknown
+
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Refuse an unknown choice and suggest the most similar one; argparse would list all."""
         if action.choices is not None and value not in action.choices:

@@ -79,6 +79,9 @@ def parse_yaml(text: str, name: str) -> tuple[Any, dict[KeyPath, int]]:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f"{name}:{mark.line + 1}" if mark else name
+        at = text.splitlines()[mark.line : mark.line + 1] if mark else []
+        if at and "\t" in at[0][: -len(at[0].lstrip())]:
+            raise BadInputError(f"{place}: a tab indents this line; YAML needs spaces") from error
         raise BadInputError(f"{place}: {error.problem}; fix the YAML there") from error
     except (yaml.YAMLError, ValueError, KeyError) as error:
         reason = " ".join(str(error).split())

@@ -48,7 +48,8 @@ def test_help_fits_80_columns(command, capsys):
     [
         ("rnu", "did you mean 'run'"),
         ("doctor --mode vitual", "did you mean 'virtual'"),
-        ("doctor --nonsense", "--nonsense"),
+        ("doctor --nonsense", "--nonsense; see 'cloudrc doctor --help'"),
+        ("link show --sed 3", "--sed (did you mean --seed?); see 'cloudrc link show --help'"),
         ("list predictor", "did you mean 'predictors'"),
         ("console --config hover", "give --api and --profile"),
         ("run steps --seeds 2 --set seed=5", "seed: each flight has its own seed"),

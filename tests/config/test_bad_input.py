@@ -46,6 +46,13 @@ def test_all_problems_are_listed_with_their_lines(mine):
     ])  # fmt: skip
 
 
+def test_a_tab_in_an_indentation_is_named(mine):
+    told = "a tab indents this line; YAML needs spaces"
+    assert refused_text(mine, "seed: 1\nlink:\n\tprofile: wifi\n") == f"mine.yaml:3: {told}"
+    assert refused_text(mine, "link:\n  \tuplink: {}\n").startswith("mine.yaml:2: ")
+    assert told not in refused_text(mine, "seed: [1\n")
+
+
 def test_fifty_problems_at_most_are_listed(mine):
     points = ", ".join(["{position_m: [0, 0, 1], dwell_s: -1}"] * 2000)
     text = refused_text(mine, f"mission: {{waypoints: [{points}]}}\n")
