@@ -18,6 +18,7 @@ import difflib
 import importlib
 import inspect
 import pkgutil
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from importlib.metadata import EntryPoint, entry_points
@@ -33,7 +34,7 @@ from cloudrc.errors import (
     describe_error,
     to_one_line,
 )
-from cloudrc.plugin_file import load_file
+from cloudrc.plugin_file import PREFIX, load_file
 
 PACKAGES = {
     "estimators": "cloudrc.cloud.estimators",
@@ -121,6 +122,17 @@ def refuse_failure(what: str) -> Iterator[None]:
     except BaseException as error:
         check_failure(error, what)
         raise BadInputError(f"{what}: {_explain(error)}") from error
+
+
+def locate(error: BaseException) -> str:
+    """Return file, line and function where a plug-in failed.
+
+    Prefer the last line of a plug-in's own file to that of a library that it calls.
+    """
+    frames = [*traceback.walk_tb(error.__traceback__)]
+    own = [each for each in frames if str(each[0].f_globals.get("__name__")).startswith(PREFIX)]
+    frame, line = (own or frames)[-1]
+    return f"{Path(frame.f_code.co_filename).name}:{line} in {frame.f_code.co_name}"
 
 
 class InvalidResultError(ValueError):

@@ -21,7 +21,6 @@ from collections import Counter, deque
 from collections.abc import Callable
 from copy import deepcopy
 from math import isfinite, nan
-from pathlib import Path
 from typing import Any
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
@@ -41,7 +40,13 @@ from cloudrc.messages import (
     Vector,
     plan_length,
 )
-from cloudrc.plugins import InvalidResultError, check_failure, refuse_failure, to_number
+from cloudrc.plugins import (
+    InvalidResultError,
+    check_failure,
+    locate,
+    refuse_failure,
+    to_number,
+)
 from cloudrc.records import Control, Fault
 from cloudrc.teleop.carrot import setpoint_at
 from cloudrc.tunnel.codec import as_planned
@@ -364,14 +369,9 @@ class ControlLoop:
         code = f"{kind}_failed"
         self.counts[code] += 1
         if self.counts[code] == 1:
-            where = "" if isinstance(error, InvalidResultError) else f", {_locate(error)}"
+            where = "" if isinstance(error, InvalidResultError) else f", {locate(error)}"
             what = f"the {kind} failed ({describe_error(error)}{where})"
             text = f"{what}; {instead or INSTEAD[kind]}; fix cloud.{kind} or choose another"
             frames = "".join(traceback.format_tb(error.__traceback__))[-TRACEBACK_MAX:]
             trace = frames.encode(errors="replace").decode() + describe_error(error)
             self.faults.append(Fault(self._now_ns, code, text, trace))
-
-
-def _locate(error: BaseException) -> str:
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{Path(frame.filename).name}:{frame.lineno} in {frame.name}"

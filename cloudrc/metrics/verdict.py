@@ -28,6 +28,7 @@ from cloudrc.metrics import Flight, Number
 from cloudrc.metrics.definitions import real_time_factor
 from cloudrc.metrics.mission import first_touch, obstacle_contacts, reported
 from cloudrc.metrics.response import steps
+from cloudrc.record.columns import Recording
 from cloudrc.records import REAL_TIME_FACTOR_MIN
 from cloudrc.rounding import exceeds, format_beside
 
@@ -195,7 +196,7 @@ def _violations(flight: Flight) -> Iterator[Failure]:
     yield from _obstacles(flight)
     yield from _interventions(flight)
     yield from _restarts(flight)
-    yield from _plugins(flight)
+    yield from plugin_failures(flight.recording)
     if flight.criteria.settle_m is not None:
         yield from _responses(flight, flight.criteria.settle_m)
 
@@ -252,11 +253,13 @@ def _restarts(flight: Flight) -> Iterator[Failure]:
             yield Failure("world_restarted", text, *_moment(flight, int(stamp_ns)))
 
 
-def _plugins(flight: Flight) -> Iterator[Failure]:
+def plugin_failures(recording: Recording) -> Iterator[Failure]:
     """Yield a failure for each plug-in that failed in too many control periods."""
-    periods, faults = len(flight.recording["/delay_estimate"]), flight.recording["/fault"]
+    periods, faults = len(recording["/delay_estimate"]), recording["/fault"]
+    count = recording["/count"]
     for kind in ("estimator", "predictor", "controller"):
-        share = (flight.last_total(f"{kind}_failed") or 0.0) / max(periods, 1)
+        totals = count["total"][count["name"] == f"{kind}_failed"]
+        share = float(totals[-1] if len(totals) else 0.0) / max(periods, 1)
         if share > PLUGIN_FAILURES_MAX:
             first = faults["text"][faults["code"] == f"{kind}_failed"]
             why = f": {first[0]}" if len(first) else ""

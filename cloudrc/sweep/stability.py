@@ -23,7 +23,7 @@ from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.schema import Criteria, Mission, Waypoint
 from cloudrc.errors import describe_error, machine_error
 from cloudrc.messages import GuardState
-from cloudrc.metrics.verdict import NOT_STARTED
+from cloudrc.metrics.verdict import NOT_STARTED, plugin_failures
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.records import Control, Counted, Fault, GroundTruth, GuardChange, MissionEvent, Record
 
@@ -173,6 +173,8 @@ def _limited(recording: Recording, since_ns: int) -> float:
 
 def _problem(recording: Recording, step_ns: int) -> tuple[str, str] | None:
     """Return code and text of why a flight shows no response to the step at `step_ns` [ns]."""
+    for failure in plugin_failures(recording):  # the response is not that of the plug-in
+        return failure.code, failure.text
     guard, mission = recording["/guard"], recording["/mission"]
     if not (guard["state"] == GuardState.TRACK).any():
         return "not_started", NOT_STARTED

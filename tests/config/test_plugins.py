@@ -106,6 +106,13 @@ def test_every_exception_of_a_plug_in_becomes_one_error(error):
         raise error
 
 
+def test_a_failure_is_at_the_line_of_the_plug_in_not_of_a_library(share):
+    share.write_text(f"{SOURCE}\ndef fail():\n    import statistics\n    statistics.mean([])\n")
+    with pytest.raises(ValueError, match="mean requires") as caught:
+        plugins.find("predictors", str(share)).fail()
+    assert plugins.locate(caught.value) == f"share.py:{len(share.read_text().splitlines())} in fail"
+
+
 def test_a_plug_in_is_not_blamed_for_ctrl_c_and_for_a_lack_of_memory(share):
     with pytest.raises(KeyboardInterrupt), plugins.refuse_failure("it failed"):
         raise KeyboardInterrupt

@@ -123,6 +123,20 @@ def test_a_robot_that_does_not_follow_is_not_stable():
     assert fly_step(aged)["code"] in ("held", "not_started")
 
 
+FAILING = """
+from cloudrc.cloud.predictors import Predictor
+class build(Predictor):
+    def predict(self, odometry, horizon):
+        return None
+"""
+
+
+def test_a_plug_in_that_fails_is_not_stable(tmp_path):
+    (tmp_path / "mine.py").write_text(FAILING)
+    found = fly_step(flown(f"cloud.predictor={tmp_path / 'mine.py'}"))
+    assert (found["stable"], found["code"]) == (False, "plugin_failed")
+
+
 def test_the_step_of_a_mission_with_pipes_is_flown_in_free_air():
     assert fly_step(flown(of="paper"))["stable"]
 
