@@ -48,7 +48,7 @@ from cloudrc.plugins import (
     to_number,
 )
 from cloudrc.records import Control, Fault
-from cloudrc.teleop.carrot import setpoint_at
+from cloudrc.teleop.carrot import path_of, setpoint_at
 from cloudrc.tunnel.codec import as_planned
 
 PERIOD_NS = 10_000_000
@@ -317,23 +317,23 @@ class ControlLoop:
             if model is None:
                 return plan, positions
             plug_in = "controller"
-            controller = deepcopy(self._controller)
+            controller, later, most = deepcopy(self._controller), path_of(setpoint), PLANNED_MAX
             for k in range(1, self._planned + 1):
                 plug_in = "predictor"
                 state = model.step(velocity, PLAN_STEP)
                 if type(state) is not Odometry:
                     state = check_estimate(state)
                 position = to_vector(state.position, "position")
-                later = setpoint_at(setpoint, now_ns + k * PLAN_STEP_NS)
+                goal = later(now_ns + k * PLAN_STEP_NS)
                 plug_in = "controller"
-                output = controller.update(state, later, PLAN_STEP)
-                velocity = to_vector(output.velocity, "planned velocity")
-                if not isfinite(sum(velocity)):
-                    plug_in = "predictor"
-                    check_estimate(state)  # a wrong state is the model's failure
-                    plug_in = "controller"
-                    refuse("planned velocity", *velocity)
-                if max(map(abs, velocity)) > PLANNED_MAX:
+                output = controller.update(state, goal, PLAN_STEP)
+                velocity = x, y, z = to_vector(output.velocity, "planned velocity")
+                if not (abs(x) <= most and abs(y) <= most and abs(z) <= most):
+                    if not isfinite(sum(velocity)):
+                        plug_in = "predictor"
+                        check_estimate(state)  # a wrong state is the model's failure
+                        plug_in = "controller"
+                        refuse("planned velocity", *velocity)
                     break
                 plan.append(as_planned(velocity))
                 positions.append(position)

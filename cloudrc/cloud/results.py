@@ -60,9 +60,11 @@ def check_output(output: Any) -> ControlOutput:
 
 def to_vector(numbers: Any, name: str) -> Vector:
     """Return three numbers as a tuple of floats; `name` names the value in the error's text."""
+    if type(numbers) is tuple and len(numbers) == 3:  # the usual case, which must be fast
+        x, y, z = numbers
+        if float is type(x) is type(y) is type(z):
+            return numbers
     x, y, z = _unpack(numbers, 3, name)
-    if float is type(x) is type(y) is type(z):
-        return numbers if type(numbers) is tuple else (x, y, z)
     return to_number(x, name), to_number(y, name), to_number(z, name)
 
 

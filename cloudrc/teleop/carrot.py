@@ -10,6 +10,8 @@ other request follows, the setpoint brakes to rest, even if teleop has ended.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from math import dist, sqrt
 
 from cloudrc.geometry.fence import INNER_HIGH, INNER_LOW
@@ -33,12 +35,26 @@ def arrival_ns(setpoint: Setpoint) -> int:
 
 def setpoint_at(setpoint: Setpoint, now_ns: int) -> Setpoint:
     """Return the setpoint with its position and velocity at `now_ns` [ns], cloud's clock."""
+    return setpoint if setpoint.motion is None else path_of(setpoint)(now_ns)
+
+
+def path_of(setpoint: Setpoint) -> Callable[[int], Setpoint]:
+    """Return `setpoint_at` for this setpoint: a function of the time [ns], cloud's clock.
+
+    It takes less time if the setpoint is needed for many instants.
+    """
     motion = setpoint.motion
     if motion is None:
-        return setpoint
+        return lambda now_ns: setpoint
     if type(motion) is Drive:
-        return _driven(setpoint, motion, now_ns)
-    distance, ramp, total = _profile(setpoint)
+        return partial(_driven, setpoint, motion)
+    return partial(_moved, setpoint, *_profile(setpoint))
+
+
+def _moved(setpoint: Setpoint, distance: float, ramp: float, total: float, now_ns: int) -> Setpoint:
+    """Return a setpoint with a `Motion` at `now_ns`; the times and distance are its `_profile`."""
+    motion = setpoint.motion
+    assert isinstance(motion, Motion), "the setpoint rests, or is driven"
     since, acceleration = (now_ns - motion.begin_ns) * 1e-9, motion.acceleration
     if since >= total or not distance:
         return setpoint

@@ -25,6 +25,7 @@ SILENCE_NS = 200_000_000
 """Time without a new command after which the mean shift starts again [ns]."""
 FOLLOWED_NS = 1_000_000_000
 """Longest time for which the robot follows a command or its plan without a newer command [ns]."""
+_new = tuple.__new__  # makes a named tuple twice as fast as its class does
 NO_COMMAND = Command(0, 0, 0, ZERO, 0.0)
 
 
@@ -172,13 +173,9 @@ class Body(Model):
     def odometry(self) -> Odometry:
         """Return the predicted state; its orientation follows from a constant angular velocity."""
         _, _, orientation, _, rate = self.basis
-        return Odometry(
-            self.basis.stamp_ns + round(self.horizon * 1e9),
-            self.position,
-            rotate_ahead(orientation, rate, self.horizon),
-            self.velocity,
-            rate,
-        )
+        stamp_ns = self.basis.stamp_ns + round(self.horizon * 1e9)
+        orientation = rotate_ahead(orientation, rate, self.horizon)
+        return _new(Odometry, (stamp_ns, self.position, orientation, self.velocity, rate))
 
 
 class Replay(Predictor):
