@@ -50,7 +50,8 @@ def test_values_of_numpy_and_mappings_are_settings():
 
 
 def test_a_failed_mission_is_a_result():
-    result = cloudrc.fly("steps", {**SHORT, "link.downlink.loss": 1.0}, seed=1)
+    with pytest.warns(UserWarning, match="loses 100 %"):
+        result = cloudrc.fly("steps", {**SHORT, "link.downlink.loss": 1.0}, seed=1)
     assert result.verdict == "failure"
     assert result.failures[0].text in repr(result)
 
