@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 DURATION_NS = 20_000_000_000
 """Simulated time of the link [ns]."""
+FAR = 1.0
+"""Tolerance of a waypoint that may be meant in cm or mm [m]."""
 LONG = 3600.0
 """Duration of a mission that may be meant in milliseconds [s]."""
 SAG_MAX = 0.05
@@ -30,6 +32,13 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     """Yield a warning for each group of settings that do not fit together."""
     yield from _loss(experiment)
     yield from _time(experiment)
+    for number, waypoint in enumerate(experiment.mission.waypoints, start=1):
+        if waypoint.tolerance_m >= FAR:
+            yield (
+                f"waypoint {number} counts as reached {waypoint.tolerance_m:g} m away; give"
+                f" mission.waypoints.{number - 1}.tolerance_m in metres"
+            )
+            break  # the others are alike
     yield from _hover(experiment)
     carrot, cap = experiment.mission.carrot, experiment.guard.speed_max_mps
     if carrot is not None and carrot.speed_mps > cap:

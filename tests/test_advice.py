@@ -98,6 +98,14 @@ def test_dwell_times_longer_than_the_mission_are_named(settings, words):
     assert all(words in text for text in told)
 
 
+@pytest.mark.parametrize(("tolerance", "count"), [(10, 1), (0.5, 0)])
+def test_a_tolerance_that_may_be_meant_in_centimetres_is_named(tolerance, count):
+    settings = [f"mission.waypoints.0.tolerance_m={tolerance}"]
+    told = [text for text in advise(load_experiment("hover", settings)) if "waypoint 1" in text]
+    assert len(told) == count
+    assert all("10 m away; give mission.waypoints.0.tolerance_m in metres" in text for text in told)
+
+
 @pytest.mark.parametrize("profile", shipped.names("profile"))
 def test_each_shipped_profile_is_flown_without_a_warning(profile):
     assert list(advise(load_experiment("paper", [f"link.profile={profile}"]))) == []
