@@ -337,6 +337,10 @@ class ControlLoop:
                     break
                 plan.append(as_planned(velocity))
                 positions.append(position)
+            plug_in = "predictor"
+            if not isfinite(sum(map(sum, positions))):
+                for position in positions:
+                    refuse("planned position", *position)
         except BaseException as error:
             self._note(plug_in, error, "cloud sends this command without a plan")
             return [], []

@@ -138,6 +138,7 @@ class Impatient(Integrating):
         (Modelled(), Impatient(), "controller", "in update"),
         (Modelled(), Breaking(nan), "controller", "its planned velocity is (1, nan, 0)"),
         (Modelled(), Breaking("1"), "controller", "its planned velocity is str '1'"),
+        (Lost(NOWHERE), Integrating(), "predictor", "its planned position is (nan, 0, 0)"),
         (Lost(None), Following(), "predictor", "its result is NoneType None, not 5 values"),
         (Lost(NOWHERE), Following(), "predictor", "its position is (nan, 0, 0)"),
     ],
