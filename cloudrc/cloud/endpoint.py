@@ -221,20 +221,26 @@ class CloudEndpoint(TunnelEnd):
             elif kind == Kind.ACCEPT:
                 self._receive_accept(epoch, Accept(*codec.decode(Kind.ACCEPT, body)), now_ns)
             elif kind == Kind.CHALLENGE:
-                (cookie,) = codec.decode(Kind.CHALLENGE, body)
-                hello = self._handshake.answer_challenge(cookie)
-                asks = self._wants_session(now_ns) or self._session.is_outdated
-                if hello is not None and asks:
-                    self._greet(hello, self._session.greeting_key)
+                self._receive_challenge(codec.decode(Kind.CHALLENGE, body)[0], now_ns)
             elif kind == Kind.BUSY:
-                (nonce,) = codec.decode(Kind.BUSY, body)
-                if self._handshake.is_refused(nonce) and self._wants_session(now_ns):
-                    self.counts["busy"] += 1
-                    self._tell("busy", BUSY_TEXT, now_ns)
+                self._receive_busy(codec.decode(Kind.BUSY, body)[0], now_ns)
             elif kind != Kind.ALIVE:
                 raise DecodeError("malformed")
         except DecodeError as error:
             self._refuse(str(error), data, now_ns)
+
+    def _receive_challenge(self, cookie: bytes, now_ns: int) -> None:
+        """Answer a challenge with a hello that has its cookie, while cloud asks for a session."""
+        hello = self._handshake.answer_challenge(cookie)
+        asks = self._wants_session(now_ns) or self._session.is_outdated
+        if hello is not None and asks:
+            self._greet(hello, self._session.greeting_key)
+
+    def _receive_busy(self, nonce: bytes, now_ns: int) -> None:
+        """Tell the user that another cloud has the session, if cloud's hello was refused."""
+        if self._handshake.is_refused(nonce) and self._wants_session(now_ns):
+            self.counts["busy"] += 1
+            self._tell("busy", BUSY_TEXT, now_ns)
 
     def _refuse(self, outcome: str, data: bytes, now_ns: int) -> None:
         self.counts[outcome] += 1
@@ -303,20 +309,27 @@ class CloudEndpoint(TunnelEnd):
         if outcome == LATE:
             self._loop.observe_late(telemetry, now_ns)
         if used:
-            self.telemetry = telemetry
-            self._alarm.see(telemetry.guard, telemetry.mission)
-            if self._start is not None and telemetry.mission >= self._start[0]:
-                self._loop.expect((now_ns - self._start[1]) * 1e-9)
-                self._start = None
-            self._loop.observe(telemetry, now_ns)
-            if (followed := self._loop.plans.look_up(telemetry, now_ns)) is not None:
-                self._records.append(followed)
-            self._asked = max(self._asked, telemetry.mission)
-            # The last command was made before this telemetry: it has the delay of the one before.
-            known, self._uplink_delay = (self._uplink_delay, self._control), delay
-            self.teleop.see(make_robot_status(telemetry, epoch, self._world, *known), now_ns)
-            if self.teleop.outputs:
-                self._take_from_teleop()
+            self._use_telemetry(telemetry, epoch, delay, now_ns)
+
+    def _use_telemetry(self, telemetry: Telemetry, epoch: int, delay: float, now_ns: int) -> None:
+        """Give telemetry, newer than all before, to the loop and to teleop.
+
+        `delay` is its one-way delay [s]; NaN if it is unknown.
+        """
+        self.telemetry = telemetry
+        self._alarm.see(telemetry.guard, telemetry.mission)
+        if self._start is not None and telemetry.mission >= self._start[0]:
+            self._loop.expect((now_ns - self._start[1]) * 1e-9)
+            self._start = None
+        self._loop.observe(telemetry, now_ns)
+        if (followed := self._loop.plans.look_up(telemetry, now_ns)) is not None:
+            self._records.append(followed)
+        self._asked = max(self._asked, telemetry.mission)
+        # The last command was made before this telemetry: it has the delay of the one before.
+        known, self._uplink_delay = (self._uplink_delay, self._control), delay
+        self.teleop.see(make_robot_status(telemetry, epoch, self._world, *known), now_ns)
+        if self.teleop.outputs:
+            self._take_from_teleop()
 
     def _take_from_teleop(self) -> None:
         for message in self.teleop.take_outputs():
@@ -345,13 +358,16 @@ class CloudEndpoint(TunnelEnd):
         if request.number == 0 and request.request is Request.ESTOP:
             self._alarm.sound()
         elif self._session.epoch and (may_start or request.request is not Request.START):
-            if request.request is Request.ACKNOWLEDGE:
-                self._alarm.acknowledge()
-            elif request.request is Request.START and request.number > self._asked:
-                self._start = request.number, self._tick_ns
-            self._asked = max(self._asked, request.number)
-            stamped = request._replace(basis_stamp_ns=self._loop.basis_stamp_ns)
-            self._send(Kind.OPERATOR, codec.encode_operator(stamped))
+            self._send_request(request)
+
+    def _send_request(self, request: OperatorRequest) -> None:
+        if request.request is Request.ACKNOWLEDGE:
+            self._alarm.acknowledge()
+        elif request.request is Request.START and request.number > self._asked:
+            self._start = request.number, self._tick_ns
+        self._asked = max(self._asked, request.number)
+        stamped = request._replace(basis_stamp_ns=self._loop.basis_stamp_ns)
+        self._send(Kind.OPERATOR, codec.encode_operator(stamped))
 
     def _send_command(self, setpoint: Setpoint, now_ns: int) -> None:
         elapsed_ns = now_ns - self._commanded_ns if self._commanded_ns >= 0 else self._period_ns

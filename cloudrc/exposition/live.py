@@ -343,6 +343,16 @@ def _places(metrics: Iterable[Metric], values: Values) -> dict[str, list[tuple[V
     return places
 
 
+def _handlers(*parts: Any) -> dict[type, Callable[[Any], None]]:
+    """Map classes of records to methods: `_on_NAME` of a part handles those of the class NAME."""
+    return {
+        kind: getattr(part, name)
+        for part in parts
+        for kind in get_args(Record)
+        if hasattr(part, name := f"_on_{kind.__name__.lower()}")
+    }
+
+
 class LiveMetrics:
     """Current metrics of one process. One thread calls `see`, any other thread may call `read`."""
 
@@ -357,13 +367,7 @@ class LiveMetrics:
         self.link = Link(values) if role == table.LINK else None
         mission = Mission(values) if role == table.TELEOP else None
         self._places = _places(metrics, values)
-        # The method `_on_NAME` of a part handles the records of the class NAME.
-        self._handlers: dict[type, Callable[[Any], None]] = {
-            kind: getattr(part, name)
-            for part in (self, self.end, self.end and self.end.check, mission)
-            for kind in get_args(Record)
-            if hasattr(part, name := f"_on_{kind.__name__.lower()}")
-        }
+        self._handlers = _handlers(self, self.end, self.end and self.end.check, mission)
 
     def _on_counted(self, record: Counted) -> None:
         for values, key in self._places.get(record.name, ()):

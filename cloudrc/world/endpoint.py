@@ -340,14 +340,7 @@ class WorldEndpoint(TunnelEnd):
         if outcome != REPEATED:
             self._door.hear(now_ns)
         if outcome == USED:
-            self._advance(world_ns)
-            if now_ns == self._stalled_wake_ns:
-                outcome = "stale"
-            else:
-                rejection = guard.accept_command(command, self._tick_ns)
-                outcome = rejection or USED
-                for observer in self.robot.observers:
-                    observer.see_command(command, rejection, self._tick_ns)
+            outcome = self._offer_command(command, now_ns, world_ns)
         used = outcome == USED
         delay = (now_ns - command.stamp_ns) * 1e-9 if self._clock_is_shared else nan
         if outcome != REPEATED or not self._channel.is_flooded:
@@ -355,3 +348,16 @@ class WorldEndpoint(TunnelEnd):
         if used and guard.state is TRACK:
             self._waiting = (epoch, counter, command)
         self.counts[outcome] += 1
+
+    def _offer_command(self, command: Command, now_ns: int, world_ns: int) -> str:
+        """Simulate up to `world_ns` [ns], and offer a command to the guard; return its outcome.
+
+        A command that may have waited in the socket during a stall is "stale".
+        """
+        self._advance(world_ns)
+        if now_ns == self._stalled_wake_ns:
+            return "stale"
+        rejection = self.robot.guard.accept_command(command, self._tick_ns)
+        for observer in self.robot.observers:
+            observer.see_command(command, rejection, self._tick_ns)
+        return rejection or USED

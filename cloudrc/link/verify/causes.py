@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 from math import inf, isnan
 from typing import Any, NamedTuple
 
@@ -143,10 +144,14 @@ def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
         yield read
         if read[0] != "throttled":
             return
+    yield from islice(_by_numbers(off), 1)
+
+
+def _by_numbers(off: Mapping[str, Row]) -> Iterator[tuple[str, str]]:
+    """Yield code and text of each cause that the measured values show, the most certain first."""
     for code, name, low, high, text in _BY_NUMBERS:
         if name in off and low <= _ratio(off[name]) <= high:
             yield (code, describe(off[name]) + text)
-            return
 
 
 def _of_machine(known: Evidence, off: Mapping[str, Row], lost: float) -> Iterator[tuple[str, str]]:

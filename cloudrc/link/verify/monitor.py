@@ -177,31 +177,40 @@ class LinkMonitor:
             rows = [row._replace(verdict="open") if row.name in off else row for row in rows]
             self._forget()
         self._suspects = off
-        found: list[Record] = [LinkChecked(now_ns, self._uplink, *row, count) for row in rows]
+        checked = [LinkChecked(now_ns, self._uplink, *row, count) for row in rows]
+        return [*checked, *self._complain(rows, now_ns)]
+
+    def _complain(self, rows: list[Row], now_ns: int) -> list[Record]:
+        """Report a link that differs from its profile, when the verdict becomes "off"."""
         before, self._complained = self._complained, verdict_of(rows) == "off"
-        if self._complained and not before:
-            way = "uplink" if self._uplink else "downlink"
-            wrong = ", ".join(describe(row) for row in rows if row.verdict == "off")
-            text = f"the {way} differs from its profile: {wrong}; see 'cloudrc link verify'"
-            found.append(Fault(now_ns, "link", text))
-        return found
+        if before or not self._complained:
+            return []
+        way = "uplink" if self._uplink else "downlink"
+        wrong = ", ".join(describe(row) for row in rows if row.verdict == "off")
+        text = f"the {way} differs from its profile: {wrong}; see 'cloudrc link verify'"
+        return [Fault(now_ns, "link", text)]
 
     def _rows(self) -> list[Row]:
         """Judge all quantities; the row "time_line" tells that a profile changes over time."""
         stream, first, timed = _in_order(self._arrivals, self._period)
-        judged = timed and (self._uplink or not self._computes)
-        rows, skipped = list[Row](), UNJUDGED if judged else UNJUDGED | DELAYS
-        if len(stream.sent) >= FEWEST:
-            rows = self._plans[0].judge(stream, self._epoch, first)
-        elif self._arrivals:  # a new session or profile ends the old verdict
-            rows = [told("loss", nan)._replace(verdict="open")]
-        rows = [row for row in rows if row.name not in skipped]
+        rows = self._rows_of_flow(stream, first, timed)
         if not timed and not self._computes and len(self._trips) >= FEWEST:
             rows.append(self._round_trip())
         rows = [self._excuse(row) for row in rows]
         if any(Timeline(one).only() is None for one in self._asked or ()):
             rows.append(told("time_line", 1))
         return rows
+
+    def _rows_of_flow(self, stream: Stream, first: int, timed: bool) -> list[Row]:
+        """Judge the received flow; its delays only if they are `timed` and without compute time."""
+        rows, skipped = list[Row](), UNJUDGED
+        if not timed or (self._computes and not self._uplink):
+            skipped = UNJUDGED | DELAYS
+        if len(stream.sent) >= FEWEST:
+            rows = self._plans[0].judge(stream, self._epoch, first)
+        elif self._arrivals:  # a new session or profile ends the old verdict
+            rows = [told("loss", nan)._replace(verdict="open")]
+        return [row for row in rows if row.name not in skipped]
 
     def _round_trip(self) -> Row:
         """Judge the mean round trip; datagrams that a later datagram overtook are left out."""
@@ -224,16 +233,24 @@ class LinkMonitor:
         return row._replace(verdict="open") if slow and row.measured <= row.high + added else row
 
 
+def _decided(arrivals: Sequence[Arrival]) -> tuple[list[Arrival], int, int]:
+    """Select the arrivals in the range of counters in which a missing one counts as lost.
+
+    Also return the first and the last counter of the range.
+    """
+    last = max((one.counter for one in arrivals), default=0) - WINDOW
+    known = [one for one in arrivals if last - KEPT < one.counter <= last]
+    first = known[0].counter if known else last + 1
+    return [one for one in known if one.counter >= first], first, last
+
+
 def _in_order(arrivals: Sequence[Arrival], period: float) -> tuple[Stream, int, bool]:
     """Sort arrivals by counter, and mark missing counters between them as lost.
 
     Return the stream, the first counter, and whether world and cloud share a clock. Without a
     shared clock, the delays have an unknown constant offset.
     """
-    last = max((one.counter for one in arrivals), default=0) - WINDOW
-    arrivals = [one for one in arrivals if last - KEPT < one.counter <= last]
-    first = arrivals[0].counter if arrivals else last + 1
-    arrivals = [one for one in arrivals if one.counter >= first]
+    arrivals, first, last = _decided(arrivals)
     count = last - first + 1
     delays, copies = np.full(count, nan), np.zeros(count, int)
     if not arrivals:
