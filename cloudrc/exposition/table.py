@@ -87,6 +87,7 @@ world cloud
 cloudrc_session_epoch: Epoch number of the current session.
 cloudrc_sessions_opened_total: Sessions opened since this process started.
 cloudrc_datagrams_total[direction, outcome]: Datagrams by outcome; updated once a second.
+cloudrc_sent_bytes_total = sent_bytes: UDP payload of the datagrams that this process has sent.
 cloudrc_datagrams_expected_total[direction]: Datagrams that have arrived or count as lost.
 cloudrc_datagrams_lost_total[direction]: Datagrams that had not arrived when the peer had sent 128
     newer ones.
