@@ -160,6 +160,8 @@ class Trials:
         except BadInputError as error:
             return None, str(error)
         given = [text.partition("=")[0].strip() for text in settings]
+        if options.key == "guard.speed_max_mps":  # a longer limit would lower the largest speed
+            given.append("guard.command_age_max_ms")
         more, needed = limits(experiment, given)
         if needed > LIMIT_MAX and "guard.command_age_max_ms" not in given:
             age = f"a command would be {needed:g} s old"

@@ -179,8 +179,12 @@ def _problem(recording: Recording, step_ns: int) -> tuple[str, str] | None:
     if not (guard["state"] == GuardState.TRACK).any():
         return "not_started", NOT_STARTED
     if not len(mission["event"]) or mission["event"][-1] != "done":
-        cause = guard["cause"][-1]
-        return "guard_stopped", f"the flight ended early: {cause}"
+        code, text = (
+            ("not_ended", "")
+            if not len(mission["event"])
+            else (mission["event"][-1], mission["text"][-1])
+        )
+        return str(code), f"the flight ended early: {text or guard['cause'][-1]}"
     end_ns = int(mission["stamp_ns"][-1])
     begins = np.clip(guard["stamp_ns"], step_ns, end_ns)
     lasts = np.diff(begins, append=end_ns)

@@ -55,6 +55,9 @@ def uplink(limit):
          lambda found: found.guard.command_age_max_ms > 117, 0,
          f"settles from 120 ms up to 500 ms, the largest value tried; raise --max; "
          f"fails at 110 ms: {LATE}"),
+        # The limits of the delay would lower the largest speed.
+        ("guard.speed_max_mps --max 7 --resolution 1", lambda found: True, 0,
+         "settles up to 6, the largest value possible: --set: guard.speed_max_mps: must be at"),
         # Whole numbers are tried, one by one.
         ("cloud.command_rate_hz --max 120", lambda found: found.cloud.command_rate_hz < 111, 0,
          "settles up to 110; fails at 111: "),
