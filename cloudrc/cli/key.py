@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from pathlib import Path
 
 from cloudrc.cli.output import print_line
@@ -31,7 +30,6 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     new, drop = add_verbs(parser, VERBS).values()
     new.add_argument("file", type=Path, metavar="FILE", help="key file to write, with mode 0600")
-    new.add_argument("--overlap", metavar="SECONDS", help="ignored: see 'drop'")
     drop.add_argument("file", type=Path, metavar="FILE", help="key file made by 'new'")
 
 
@@ -44,9 +42,6 @@ def execute(options: argparse.Namespace) -> int:
     path, makes = options.file, options.verb == "new"
     old = None if makes and not path.exists() else read_keys(path, "")
     if makes or old is None:
-        if options.overlap is not None:
-            text = "--overlap is ignored: the old key is accepted until 'cloudrc key drop'"
-            print(f"cloudrc: {text}", file=sys.stderr)
         keys = KeySet(Key(os.urandom(KEY_SIZE)), old.current if old else None)
         said = f", beside {keys.previous.name} until 'cloudrc key drop'" if keys.previous else ""
     else:
