@@ -87,9 +87,9 @@ def test_a_terminal_shows_what_happens_before_and_after_the_flight(monkeypatch):
         assert ("GROUND" in stream.getvalue()) is (stream is terminal)
         view.see([MissionEvent(0, "done", 6, "mission done")])
         assert "GROUND" in str(view.line())
-        monkeypatch.setattr("cloudrc.cli.progress.REPORT_AFTER", -1.0)
-        assert str(view.line()) == "the mission is over: writes the report"
-        monkeypatch.undo()
+        with monkeypatch.context() as later:
+            later.setattr("cloudrc.cli.progress.REPORT_AFTER", -1.0)
+            assert str(view.line()) == "the mission is over: writes the report"
         view.close()
     assert file.getvalue().split() == ["mission", "done"]
 

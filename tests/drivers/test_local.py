@@ -111,9 +111,12 @@ def test_a_bad_feed_line_ends_no_flight(tmp_path):
     assert child.ready
 
 
-def test_sockets_lie_beside_the_flight_files_where_nobody_cleans(flights):
-    assert socket_folder() == str(flights.parent)
-    assert [*flights.parent.iterdir()] == [], "the trial leaves nothing"
+def test_sockets_lie_beside_the_flight_files_where_nobody_cleans(monkeypatch):
+    with tempfile.TemporaryDirectory(prefix="s", dir="/tmp") as short:  # as /run/user/1000
+        monkeypatch.setenv("XDG_RUNTIME_DIR", short)
+        own = local.flights_folder().parent
+        assert socket_folder() == str(own)
+        assert [*own.iterdir()] == [], "the trial leaves nothing"
 
 
 def test_sockets_lie_in_a_folder_with_a_short_path(monkeypatch, tmp_path):
