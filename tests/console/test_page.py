@@ -96,6 +96,7 @@ def page(browse, flight):
     opened = browse(f"{flight[1]}&fixedDpr=0.25")
     opened.set_default_timeout(LIMIT * 1e3)
     button(opened, "STOP").wait_for()
+    button(opened, "Send").wait_for()  # STOP is there before the scene is connected
     return opened
 
 
