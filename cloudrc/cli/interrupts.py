@@ -8,6 +8,8 @@ under way. A library may also catch the exception, so commands with much work as
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 IMPORTER = "<frozen importlib._bootstrap"
@@ -24,6 +26,7 @@ class _Interrupt:
 
     def __init__(self) -> None:
         self.asked = False
+        self.only_notes = False
         self._looks = 0
 
     def ask(self, number: int, frame: FrameType | None) -> None:
@@ -32,6 +35,8 @@ class _Interrupt:
             # The shell and the kernel each send one; the second must not interrupt the report.
             signal.signal(signal.SIGHUP, signal.SIG_IGN)
         first, self.asked = not self.asked, True
+        if self.only_notes:
+            return
         if first and _is_importing(frame):
             self._looks = 0
             signal.signal(signal.SIGALRM, self._look)
@@ -69,6 +74,19 @@ def interrupt_on_signals() -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if number == signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _interrupt.ask)
+
+
+@contextmanager
+def noted_interrupts() -> Iterator[None]:
+    """Raise no exception on a signal inside the block, which has to ask `raise_if_interrupted`.
+
+    An exception at any line would leave a lock of `concurrent.futures` taken for ever.
+    """
+    before, _interrupt.only_notes = _interrupt.only_notes, True
+    try:
+        yield
+    finally:
+        _interrupt.only_notes = before
 
 
 def is_interrupted() -> bool:

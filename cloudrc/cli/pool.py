@@ -7,13 +7,14 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from itertools import chain, islice
+from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
-from cloudrc.cli.interrupts import is_interrupted, raise_if_interrupted
+from cloudrc.cli.interrupts import is_interrupted, noted_interrupts, raise_if_interrupted
 from cloudrc.drivers.machine import usable_cores
 from cloudrc.errors import InterruptedRunError, InvalidRunError, machine_error
 
@@ -22,6 +23,10 @@ Result = TypeVar("Result")
 CHUNK = 5_000
 """Number of calls that wait for a worker at once. Before Python 3.11.6, a pool of processes hangs
 with more than 16,384 of them (cpython issue 105829)."""
+
+
+PERIOD = 0.1
+"""Longest time between a signal and the end of a wait for a worker [s]."""
 
 
 class WorkerDiedError(InvalidRunError):
@@ -77,6 +82,17 @@ def map_in_order(
             raise_if_interrupted()
             yield result
         return
+    with noted_interrupts():
+        yield from _map_in_workers(function, chunk, rest, workers, in_order)
+
+
+def _map_in_workers(
+    function: Callable[[Work], Result],
+    chunk: list[Work],
+    rest: Iterator[Work],
+    workers: int,
+    in_order: bool,
+) -> Generator[Result]:
     # Spawn, do not fork: libraries may have started threads in this process.
     context = multiprocessing.get_context("spawn")
     with isolated_start():  # starts multiprocessing's resource tracker
@@ -85,7 +101,7 @@ def map_in_order(
         while chunk:
             with isolated_start():  # submit() starts the workers
                 futures = [pool.submit(function, each) for each in chunk]
-            for future in futures if in_order else as_completed(futures):
+            for future in _ended(futures, in_order):
                 result = future.result()
                 raise_if_interrupted()
                 yield result
@@ -99,6 +115,28 @@ def map_in_order(
         raise
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _ended(futures: list[Future[Result]], in_order: bool) -> Iterator[Future[Result]]:
+    """Yield each future once it has ended; raise KeyboardInterrupt soon after a signal."""
+    if in_order:
+        for future in futures:
+            while not wait([future], PERIOD).done:
+                raise_if_interrupted()
+            yield future
+        return
+    ended = SimpleQueue[Future[Result]]()
+    for future in futures:
+        future.add_done_callback(ended.put)
+    left = len(futures)
+    while left:
+        try:
+            future = ended.get(timeout=PERIOD)
+        except Empty:
+            raise_if_interrupted()
+            continue
+        left -= 1
+        yield future
 
 
 def take_each(

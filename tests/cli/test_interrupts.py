@@ -139,3 +139,14 @@ def test_results_before_the_signal_are_kept():
 
     assert take_each(map_in_order(work, range(3), 1), results.append) == ("interrupted", 130)
     assert results == ["0"]
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_is_only_noted_where_an_exception_would_leave_a_lock_taken(number):
+    interrupts.interrupt_on_signals()
+    with interrupts.noted_interrupts():
+        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), number)
+        assert interrupts.is_interrupted()
+    with pytest.raises(KeyboardInterrupt):
+        interrupts.raise_if_interrupted()
