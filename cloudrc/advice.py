@@ -7,13 +7,13 @@ A warning never prevents the flight.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from heapq import heappop, heappush
 from itertools import pairwise
 from math import ceil
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
+    from cloudrc.link.model import LinkDirection
 
 DURATION_NS = 20_000_000_000
 """Simulated time of the link [ns]."""
@@ -94,31 +94,26 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
     follows, and of the newest command that telemetry has confirmed. Both have an age for each
     datagram that is sent, at its departure.
     """
-    from cloudrc.link.model import LinkDirection
-    from cloudrc.link.traces import link_profile
+    from cloudrc.link.queue import PacketQueue
     from cloudrc.messages import plan_length
     from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
 
     plan = plan_length(experiment.cloud.plan_s)
     newest_wins = experiment.tunnel.order == "newest" or plan > 0
     sizes = SIZES[Kind.TELEMETRY], COMMAND_SIZES[plan]
-    links = [
-        LinkDirection(
-            link_profile(way.model_copy(update={"blackouts": ()})), experiment.seed, uplink
-        )
-        for way, uplink in ((experiment.uplink, True), (experiment.downlink, False))
-    ]
+    links = [_always_up(experiment, uplink=True), _always_up(experiment, uplink=False)]
     # Per direction: the newest arrived datagram: its stamp, and the stamp that it confirms [ns].
     arrived: list[tuple[int, int] | None] = [None, None]
-    pending: list[tuple[int, int, tuple[int, int]]] = []
+    in_flight = PacketQueue()
     ages, echoes = list[float](), list[float]()
     compute_ns = round(experiment.cloud.compute_ms * 1e6)
     rates = experiment.world.odometry_rate_hz, experiment.cloud.command_rate_hz
     periods_ns = [round(1e9 / rate) for rate in rates]
     times_ns = sorted({t for period_ns in periods_ns for t in range(0, DURATION_NS, period_ns)})
     for now_ns, next_ns in pairwise(times_ns):
-        while pending and pending[0][0] <= now_ns:
-            _, way, datagram = heappop(pending)
+        while in_flight.next_ns <= now_ns:
+            _, link, datagram = in_flight.pop()
+            way = links.index(link)
             newest = arrived[way]
             if newest is None or datagram[0] > newest[0] or not newest_wins:
                 arrived[way] = datagram
@@ -133,9 +128,18 @@ def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[flo
             if early_ns == 0:
                 datagram = now_ns, -1 if last is None else last[0]
                 leaves_ns = now_ns + way * compute_ns
-                for at_ns in links[way].send(1, kind, period, sizes[way], leaves_ns):
-                    heappush(pending, (at_ns, way, datagram))
+                in_flight.send(links[way], (kind, 1, period), sizes[way], datagram, leaves_ns)
     return ages, echoes
+
+
+def _always_up(experiment: ResolvedExperiment, *, uplink: bool) -> LinkDirection:
+    """Return a direction of the experiment's link without blackouts and without damage."""
+    from cloudrc.link.model import LinkDirection
+    from cloudrc.link.traces import link_profile
+
+    way = experiment.uplink if uplink else experiment.downlink
+    way = way.model_copy(update={"blackouts": (), "corrupt": 0.0})
+    return LinkDirection(link_profile(way), experiment.seed, uplink)
 
 
 def _hover(experiment: ResolvedExperiment) -> Iterator[str]:

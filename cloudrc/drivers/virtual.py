@@ -11,10 +11,10 @@ import gc
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from heapq import heappop, heappush
 
 from cloudrc.endpoint import Endpoint
 from cloudrc.link.model import LinkDirection
+from cloudrc.link.queue import PacketQueue
 from cloudrc.messages import Datagram, Passed
 from cloudrc.records import Record
 from cloudrc.tunnel.codec import datagram_size, peek
@@ -64,8 +64,7 @@ class VirtualRun:
         self._world, self._cloud = world, cloud
         self._uplink, self._downlink = uplink, downlink
         self.cloud_clock = cloud_clock
-        self._arrivals: list[tuple[int, int, bool, Datagram]] = []
-        self._sent = 0
+        self._in_flight = PacketQueue()
         self.now_ns = 0
 
     def fly(self, until: Callable[[], bool], limit_ns: int, sink: Sink) -> None:
@@ -94,17 +93,17 @@ class VirtualRun:
 
     def _advance(self, end_ns: int) -> None:
         """Handle all events up to and including `end_ns` [ns]."""
-        world, cloud, arrivals = self._world, self._cloud, self._arrivals
+        world, cloud, in_flight = self._world, self._cloud, self._in_flight
         clock = None if self.cloud_clock == Clock() else self.cloud_clock  # None takes less time
         world_ns, cloud_ns = world.next_deadline_ns(), cloud.next_deadline_ns()
         cloud_ns = clock.when(cloud_ns) if clock else cloud_ns
         while True:
             deadline_ns = world_ns if world_ns <= cloud_ns else cloud_ns
-            if arrivals and arrivals[0][0] <= deadline_ns:
-                if arrivals[0][0] > end_ns:
+            if in_flight.next_ns <= deadline_ns:
+                if in_flight.next_ns > end_ns:
                     break
-                self.now_ns, _, to_world, data = heappop(arrivals)
-                if to_world:
+                self.now_ns, link, data = in_flight.pop()
+                if to_world := link is self._downlink:
                     world.receive_datagram(data, self.now_ns)
                 else:
                     cloud.receive_datagram(data, clock.at(self.now_ns) if clock else self.now_ns)
@@ -119,20 +118,15 @@ class VirtualRun:
             if to_world:
                 world_ns = world.next_deadline_ns()
                 if datagrams := world.take_datagrams():
-                    self._send(datagrams, self._uplink, to_world=False)
+                    self._send(datagrams, self._uplink)
             else:
                 cloud_ns = cloud.next_deadline_ns()
                 cloud_ns = clock.when(cloud_ns) if clock else cloud_ns
                 if datagrams := cloud.take_datagrams():
-                    self._send(datagrams, self._downlink, to_world=True)
+                    self._send(datagrams, self._downlink)
         self.now_ns = end_ns
 
-    def _send(self, datagrams: list[Datagram], link: LinkDirection, *, to_world: bool) -> None:
+    def _send(self, datagrams: list[Datagram], link: LinkDirection) -> None:
         for data in datagrams:
-            kind, epoch, counter = data[:3] if type(data) is Passed else peek(data)
-            arrivals = link.send(epoch, kind, counter, datagram_size(data), self.now_ns)
-            if link.corrupts and arrivals:
-                data = link.corrupted(epoch, kind, counter, data)
-            for arrival_ns in arrivals:
-                self._sent += 1
-                heappush(self._arrivals, (arrival_ns, self._sent, to_world, data))
+            header = data[:3] if type(data) is Passed else peek(data)
+            self._in_flight.send(link, header, datagram_size(data), data, self.now_ns)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import ctypes
 import gc
-import heapq
 import os
 import select
 import socket
@@ -21,12 +20,12 @@ import sys
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from itertools import count
 from time import monotonic_ns, time_ns
 from typing import TypeAlias
 
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.queue import PacketQueue
 
 Address: TypeAlias = tuple[str, int]
 Peek: TypeAlias = Callable[[bytes], tuple[int, int, int]]
@@ -155,11 +154,9 @@ class Relay:
         self._inside.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
         self._peer: Address | None = None
         self._direction, self._peek = direction, peek
-        # Due time [ns], a number that keeps the order of equal times, data.
-        self._in_flight: list[tuple[int, int, bytes]] = []
-        self._numbers = count()
+        self._in_flight = PacketQueue(IN_FLIGHT_MAX)
         self._stamps, self._stalled = Stamps(), 0
-        outcomes = ("received", "forwarded", "lost", "malformed", "overflow", "unsent")
+        outcomes = ("received", "forwarded", "malformed", "unsent")
         self._counts = dict.fromkeys(outcomes, 0)
         self._errors = ReleaseErrors()
         self._past: deque[ReleaseErrors] = deque([ReleaseErrors()], maxlen=_RECENT)
@@ -200,7 +197,12 @@ class Relay:
         recent = ReleaseErrors(errors - self._past[0]).in_ns()
         self._past.append(errors)
         recent.pop("released", None)
-        outcomes = {**self._counts, "unread": self._stamps.dropped}
+        outcomes = {
+            **self._counts,
+            "lost": self._in_flight.lost,
+            "overflow": self._in_flight.overflow,
+            "unread": self._stamps.dropped,
+        }
         return {**outcomes, **recent, "released_early": errors[_EARLY]}
 
     def released(self) -> dict[str, int]:
@@ -212,7 +214,7 @@ class Relay:
             `AGE_MAX_NS` or longer to be read (`stalled`); and percentiles of the lateness, such as
             `release_error_p99_ns` [ns]. Empty before the first datagram leaves.
         """
-        more = {"overflow": self._counts["overflow"], "stalled": self._stalled}
+        more = {"overflow": self._in_flight.overflow, "stalled": self._stalled}
         return told | more if (told := self._errors.in_ns()) else {}
 
     def close(self) -> None:
@@ -222,11 +224,10 @@ class Relay:
 
     def _step_once(self, timeout: float) -> None:
         """Wait at most `timeout` [s] until datagrams arrive or are due; read and send them."""
-        due_ns = self._in_flight[0][0] if self._in_flight else 0
-        if due_ns:
-            timeout = min(timeout, max(0.0, (due_ns - SPIN_NS - monotonic_ns()) * 1e-9))
+        due_ns = self._in_flight.next_ns
+        timeout = min(timeout, max(0.0, (due_ns - SPIN_NS - monotonic_ns()) * 1e-9))
         readable, _, _ = select.select([self._inside], (), (), timeout)
-        if due_ns and due_ns - monotonic_ns() <= SPIN_NS:
+        if due_ns - monotonic_ns() <= SPIN_NS:
             while monotonic_ns() < due_ns:
                 pass
             self._release()  # before reading: new datagrams have a time stamp and can wait
@@ -253,30 +254,15 @@ class Relay:
             except ValueError:
                 self._counts["malformed"] += 1
             else:
-                self._put_on_link(data, *header, received_ns)
-
-    def _put_on_link(
-        self, data: bytes, kind: int, epoch: int, counter: int, received_ns: int
-    ) -> None:
-        """Keep a datagram until the link delivers it: never if it is lost, twice if duplicated."""
-        releases = self._direction.send(epoch, kind, counter, len(data), received_ns)
-        if not releases:
-            self._counts["lost"] += 1
-        elif self._direction.corrupts:
-            data = self._direction.corrupted(epoch, kind, counter, data)
-        for due_ns in releases:
-            if len(self._in_flight) >= IN_FLIGHT_MAX:
-                self._counts["overflow"] += 1
-            else:
-                heapq.heappush(self._in_flight, (due_ns, next(self._numbers), data))
+                self._in_flight.send(self._direction, header, len(data), data, received_ns)
 
     def _release(self) -> None:
         """Send up to `BATCH` datagrams that are due."""
         for _ in range(BATCH):
             now_ns = monotonic_ns()
-            if not self._in_flight or self._in_flight[0][0] > now_ns:
+            if self._in_flight.next_ns > now_ns:
                 return
-            due_ns, _, data = heapq.heappop(self._in_flight)
+            due_ns, _, data = self._in_flight.pop()
             try:
                 if self._peer is None:
                     raise OSError("no peer yet")
