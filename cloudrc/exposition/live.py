@@ -20,6 +20,7 @@ from cloudrc.metrics.definitions import (
     DatagramTally,
     DelayJudge,
     Echoes,
+    Holds,
     PredictionJudge,
     age,
     real_time_factor,
@@ -170,7 +171,7 @@ class WorldEnd(End):
         super().__init__(table.WORLD, values)
         values["cloudrc_guard_state"] = GuardState.GROUND
         self._reason = GuardState.GROUND, Cause.SPAWN
-        self._basis_ns = NEVER_NS
+        self._basis_ns, self._holds = NEVER_NS, Holds()
         # Samples of world's clock and of its lag behind the machine's clock [ns].
         self._instants: deque[tuple[int, int]] = deque(maxlen=STEPS + 1)
 
@@ -198,6 +199,7 @@ class WorldEnd(End):
             self._reason = reason
         if record.telemetry.guard is GuardState.TRACK:  # no other state uses commands
             self._observe("command_age", age(record.stamp_ns, self._basis_ns))
+        self._values["cloudrc_guard_held_seconds_total"] = self._holds.time(record.stamp_ns)
 
     def _on_guardchange(self, record: GuardChange) -> None:
         state, values = record.state, self._values
@@ -205,6 +207,8 @@ class WorldEnd(End):
             # A record with the state LAND at touch-down is no change of the state.
             values["cloudrc_guard_transitions_total"][table.GUARD_STATES[state]] += 1
         values["cloudrc_guard_state"] = state
+        self._holds.take(*record)
+        values["cloudrc_guard_holds_total"] = self._holds.count
 
     def _on_contact(self, record: Contact) -> None:
         contacts = self._values["cloudrc_contacts_total"]

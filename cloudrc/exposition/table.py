@@ -115,12 +115,13 @@ cloudrc_tip_force_newtons: Force on the touch sensor at the arm's tip.
 cloudrc_command_age_seconds: Age of the current command in TRACK, sampled every period: time since
     the odometry from which cloud computed the command, on world's clock.
 cloudrc_guard_state: State of the guard: {numbered(GUARD_STATES)}.
-cloudrc_guard_transitions_total[state]: Changes of the guard's state, by new state.
+cloudrc_guard_transitions_total[state]: Changes of the guard's state, by new state; those to HOLD
+    include the HOLD after each mission.
 cloudrc_guard_causes_total[cause]: Changes of the guard's state, by cause.
+cloudrc_guard_holds_total: HOLDs that interrupted a mission (`hold_count` in the report).
 cloudrc_guard_limited_total[limit] = limited_*: Commands that a limit changed; for
     the fence, physics steps in which it changed the velocity.
-cloudrc_guard_held_seconds_total = held_seconds: Time in HOLD during missions; updated once a
-    second.
+cloudrc_guard_held_seconds_total: Time in these HOLDs (`hold_time` in the report).
 cloudrc_guard_starts_refused_total = start_refused: Mission starts refused in LAND or ESTOP.
 cloudrc_contacts_total[body]: Contacts of the robot with bodies of the scene, by kind of body.
 cloudrc_real_time_factor: Simulated time divided by machine time over the last 10 s; below 0.95 a
@@ -161,7 +162,8 @@ cloudrc_loop_missed_periods_total = missed_periods: Periods without a command be
 teleop
 cloudrc_mission_state: State of the mission: {numbered(MISSION_STATES)}.
 cloudrc_mission_waypoint: Index of the next waypoint; -1 if none.
-cloudrc_waypoints_reached_total: Waypoints reached.
+cloudrc_waypoints_reached_total: Waypoints reached, as teleop sees it; `waypoints_reached` in the
+    report also checks the true position.
 cloudrc_missions_total[outcome]: Missions ended, by outcome.
 cloudrc_api_requests_total = api_served: Requests that the API has served.
 cloudrc_api_rejected_total[reason] = api_*: Requests that the API rejected, by reason.

@@ -11,7 +11,7 @@ from heapq import heappop, heappush
 from math import nan, sqrt
 from typing import Any
 
-from cloudrc.messages import Vector
+from cloudrc.messages import Cause, GuardState, Vector
 from cloudrc.records import Control
 
 # Delays. Stamps are subtracted only from stamps of the same clock.
@@ -250,6 +250,49 @@ class DatagramTally:
 
 
 # Time.
+
+
+class Holds:
+    """Measures the HOLDs that interrupt a mission's flight.
+
+    Such a HOLD follows TRACK, and its cause is not the end of the mission. It lasts until the next
+    change of the guard, or until the mission ends.
+
+    Attributes:
+        count: Number of these HOLDs.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._state = GuardState.GROUND
+        self._since_ns: int | None = None  # start of the present HOLD
+        self._over_ns = 0  # total time in the earlier ones
+
+    def take(self, stamp_ns: int, state: GuardState, cause: str) -> list[tuple[int, int]]:
+        """Process a change of the guard at `stamp_ns` [ns], with the words of its cause.
+
+        Return start and end [ns] of the HOLD that this change ends, if any.
+        """
+        over = self.end(stamp_ns)
+        interrupts = self._state == GuardState.TRACK and cause != Cause.ENDED.words
+        if state == GuardState.HOLD and interrupts:
+            self.count += 1
+            self._since_ns = stamp_ns
+        self._state = state
+        return over
+
+    def end(self, now_ns: int) -> list[tuple[int, int]]:
+        """End the mission at `now_ns` [ns]; return start and end [ns] of the HOLD that lasts."""
+        if self._since_ns is None:
+            return []
+        since_ns, self._since_ns = self._since_ns, None
+        self._over_ns += now_ns - since_ns
+        return [(since_ns, now_ns)]
+
+    def time(self, now_ns: int) -> float:
+        """Return the total time in these HOLDs up to `now_ns` [s]; no change may be later."""
+        present_ns = 0 if self._since_ns is None else now_ns - self._since_ns
+        return (self._over_ns + present_ns) * 1e-9
 
 
 def real_time_factor(simulated: float, slip: float) -> float:

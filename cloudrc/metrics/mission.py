@@ -9,7 +9,7 @@ import numpy as np
 
 from cloudrc.config.schema import Waypoint
 from cloudrc.geometry.scene import BOARD, is_obstacle
-from cloudrc.messages import GuardState
+from cloudrc.metrics.definitions import Holds
 from cloudrc.metrics.flight import Array, Flight, Measure, add_metrics, mean, select
 
 IMPACT_NS = 100_000_000
@@ -37,16 +37,19 @@ def first_touch(flight: Flight) -> dict[str, Array] | None:
 
 
 def holds(flight: Flight) -> list[tuple[int, int]]:
-    """List start and end of each interval in which the guard was in HOLD [ns], world's clock."""
-    if flight.end_ns is None:
-        return []
-    guard = flight.during("/guard")
-    ends = [*guard["stamp_ns"][1:], flight.end_ns]
-    return [
-        (int(start), int(end))
-        for start, end, state in zip(guard["stamp_ns"], ends, guard["state"], strict=True)
-        if state == GuardState.HOLD
-    ]
+    """List start and end of each HOLD that interrupted the flight [ns], world's clock."""
+    return _measure_holds(flight)[1]
+
+
+def _measure_holds(flight: Flight) -> tuple[Holds, list[tuple[int, int]]]:
+    """Measure the HOLDs that interrupted the flight; also return start and end of each [ns]."""
+    measured, found, guard = Holds(), list[tuple[int, int]](), flight.during("/guard")
+    rows = zip(guard["stamp_ns"].tolist(), guard["state"], guard["cause"], strict=True)
+    for stamp_ns, state, cause in rows:
+        found += measured.take(stamp_ns, state, cause)
+    if flight.end_ns is not None:
+        found += measured.end(flight.end_ns)
+    return measured, found
 
 
 def reported(flight: Flight) -> dict[int, int]:
@@ -196,9 +199,9 @@ add_metrics(
 add_metrics(
     "Guard and faults",
     ("hold_count", "1", "Number of times that the guard went to HOLD because fresh commands were "
-     "missing.", lambda flight: flight.count(len(holds(flight)))),
+     "missing.", lambda flight: flight.count(_measure_holds(flight)[0].count)),
     ("hold_time", "s", "Total time in HOLD, in which the guard flies without commands.",
-     lambda flight: flight.count(sum(end - start for start, end in holds(flight)) * 1e-9)),
+     lambda flight: flight.count(_measure_holds(flight)[0].time(flight.end_ns or 0))),
     ("fault_count", "1", "Number of faults that did not stop the flight, such as an exception in a "
      "predictor.", _fault_count),
     ("recorder_dropped", "1", "Number of records that the recorder dropped because the loop must "

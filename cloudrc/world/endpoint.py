@@ -56,7 +56,7 @@ CATCH_UP_NS = 50_000_000
 COUNT_PERIOD_NS = 1_000_000_000
 """Time between two records of the counters [ns]."""
 SLOW_TEXT = "simulated time is slower than real time; give world more processor time"
-TRACK, HOLD = GuardState.TRACK, GuardState.HOLD  # looking up a member of an enum is slow
+TRACK = GuardState.TRACK  # looking up a member of an enum is slow
 COMMAND, TELEMETRY = int(Kind.COMMAND), int(Kind.TELEMETRY)  # looked up in every period
 _new = tuple.__new__  # makes a named tuple in half the time of its own constructor
 
@@ -230,9 +230,8 @@ class WorldEndpoint(TunnelEnd):
 
     def _record_counts(self, now_ns: int) -> None:
         """Record the counters of world and guard; report a slow simulation once per session."""
-        guard, before_ns = self.robot.guard, self._counted_slip_ns
+        before_ns = self._counted_slip_ns
         self._count_ns, self._counted_slip_ns = self._count_ns + COUNT_PERIOD_NS, self._slip_ns
-        self.counts["held_seconds"] += guard.armed and guard.state is HOLD
         for name, count in sorted(self.counts.items()):
             self._records.append(Counted(now_ns, "world", name, count))
         lost_ns = self._slip_ns - (before_ns or 0)

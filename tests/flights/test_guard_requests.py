@@ -2,7 +2,8 @@
 
 import pytest
 
-from cloudrc.messages import ZERO, GuardState, Request, Start
+from cloudrc.exposition.live import LiveMetrics
+from cloudrc.messages import ZERO, Cause, GuardState, Request, Start
 from cloudrc.records import CommandApplied, Contact, GuardChange, SessionOpened, TelemetrySent
 from tests.flights.conftest import MS, Bare, ring, talking
 
@@ -113,13 +114,23 @@ def test_the_board_is_an_obstacle_of_missions_that_need_not_touch_it(talk, conta
     assert (telemetry.obstacle_contacts, telemetry.touch_speed) == (counted, 0.0)
 
 
-def test_holds_are_counted_during_missions_only(talk):
+def test_the_end_of_a_mission_ends_the_hold_that_interrupts_it(talk):
+    """The robot holds on, for no mission."""
     talk.wait(3_000)
-    held = talk.counts()["held_seconds"]
-    assert 2 <= held <= 4
-    ask(talk, 2, Request.END)
+    before = talk.take(GuardChange)[-1]
+    for number in (2, 3):
+        ask(talk, number, Request.END)
+    ended = talk.take(GuardChange)[-1]
+    assert talk.take(GuardChange).count(ended) == 1
+    assert (ended.state, ended.cause) == (GuardState.HOLD, Cause.ENDED.words)
+    assert talk.take(TelemetrySent)[-1].telemetry.cause is Cause.ENDED
     talk.wait(4_000)
-    assert talk.counts()["held_seconds"] == held
+    live = LiveMetrics("world")
+    live.see(talk.records)
+    assert live.read()["cloudrc_guard_holds_total"] == {(): 1}
+    held = (ended.stamp_ns - before.stamp_ns) * 1e-9
+    assert live.read()["cloudrc_guard_held_seconds_total"] == {(): pytest.approx(held)}
+    assert 2 < held < 4
 
 
 def test_commands_of_an_earlier_cloud_do_not_count(talk):

@@ -223,6 +223,35 @@ def test_the_real_time_factor_of_ten_seconds_is_equal_live_and_in_the_report():
     assert factor == measured(log.flight(), "real_time_factor") < 0.98
 
 
+HELD = [
+    GuardChange(at(2.0), GuardState.HOLD, "command age"),
+    GuardChange(at(3.5), GuardState.TRACK, "fresh commands again"),
+    GuardChange(at(4.01), GuardState.HOLD, "new session"),
+    GuardChange(at(6.02), GuardState.LAND, "held too long without the cloud"),
+    GuardChange(at(7.0), GuardState.HOLD, "acknowledged before touch-down"),
+]
+
+
+@pytest.mark.parametrize("first", [0, 2, 3, 5])
+def test_the_holds_of_a_flight_are_equal_live_and_in_the_report(first):
+    """A HOLD after LAND, or after the mission, interrupts no mission."""
+    log, live = flown(), LiveMetrics("world")
+    log.world += HELD[first:]
+    live.see(log.ends()[0])
+    found = live.read()
+    assert found["cloudrc_guard_holds_total"][()] == measured(log.flight(), "hold_count")
+    held = found["cloudrc_guard_held_seconds_total"][()]
+    assert held == measured(log.flight(), "hold_time")
+    assert held == pytest.approx({0: 3.51, 2: 2.01}.get(first, 0.0))
+
+
+def test_the_time_in_hold_rises_with_every_telemetry():
+    log, live = flown(), LiveMetrics("world")
+    log.world.append(GuardChange(at(2.0), GuardState.HOLD, "command age"))
+    live.see([record for record in log.ends()[0] if record.stamp_ns <= at(2.25)])
+    assert live.read()["cloudrc_guard_held_seconds_total"][()] == pytest.approx(0.25, abs=0.011)
+
+
 def test_delay_errors_of_a_flight_match_its_ground_truth():
     experiment = load_experiment("hover", ["link.profile=paper-p2", "cloud.clock_offset_s=5"])
     world, cloud = records(experiment)

@@ -166,9 +166,12 @@ class Guard:
 
     def end_mission(self, now_ns: int) -> None:
         """End the mission: hold the position until the operator starts the next mission."""
-        self.armed = False
+        was_armed, self.armed = self.armed, False
         if self.state is TRACK:
             self._enter(HOLD, now_ns, Cause.ENDED)
+        elif self.state is HOLD and was_armed:  # from now on this HOLD interrupts no mission
+            self.cause = Cause.ENDED
+            self.changes.append(GuardChange(now_ns, HOLD, Cause.ENDED.words))
 
     def stop(self, now_ns: int) -> None:
         """Stop the rotors at once, in any state."""
