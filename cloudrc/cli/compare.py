@@ -73,6 +73,7 @@ def flight_arguments(parser: argparse.ArgumentParser, seeds: int) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Compare A and B, print the result, and return the exit code: 0 if all flights were flown."""
+    interrupt_on_signals()
     from cloudrc.sweep.compare import compare, of_sweep
 
     stopped, code = "", 0
@@ -108,7 +109,6 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
     for text in (options.a, options.b):
         if "=" not in text:
             raise BadInputError(f"{text}: is not KEY=VALUE; for a value of a sweep, add --in DIR")
-    interrupt_on_signals()
     require("compare", MODES["virtual"])
     # A comma separates settings only before KEY=: a list may contain commas.
     texts = [re.split(r",(?=[\w.]+=)", text) for text in (options.a, options.b)]

@@ -31,6 +31,7 @@ from cloudrc.cli.client import (
 )
 from cloudrc.cli.cluster_flags import flown_release, release_arguments, timeout_argument
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
+from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import escape, output_argument, print_line, print_result, table
 from cloudrc.cli.parser import add_verbs, number
 from cloudrc.drivers.machine import Deadline
@@ -225,6 +226,7 @@ def _run(options: argparse.Namespace, api: Api) -> int:
 
     After Ctrl-C the mission goes on.
     """
+    interrupt_on_signals()
     follower = MissionFollower(api, RUN_TIMEOUT)
     order = read_mission(options.mission, options.name)
     mission_id = follower.post({**order, "queue": options.queue})
@@ -460,6 +462,7 @@ def _forwarded_api(options: argparse.Namespace) -> Iterator[Api]:
 
 def _run_job(options: argparse.Namespace) -> int:
     """Create the Job of a mission, follow its log, and return the exit code of the Job."""
+    interrupt_on_signals()
     mission, release = read_mission(options.mission, options.name), _release(options)
     from cloudrc.cluster.flight import wait_ready
     from cloudrc.cluster.jobs import JobGoneError, follow, run_job

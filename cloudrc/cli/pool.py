@@ -49,18 +49,18 @@ def _end_with_parent() -> None:
 def isolated_start() -> Iterator[None]:
     """Isolate worker processes that start inside the block.
 
-    The workers ignore SIGINT and SIGHUP, because the parent process ends them. They import no
+    The workers block SIGINT and SIGHUP, because the parent process ends them. They import no
     module from the working folder: a file there may be somebody else's, and importing runs it.
     """
-    before = {n: signal.signal(n, signal.SIG_IGN) for n in (signal.SIGINT, signal.SIGHUP)}
+    # The workers inherit the mask. A signal to this process reaches its handler after the block.
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
     safe_path = os.environ.get("PYTHONSAFEPATH", "")
     os.environ["PYTHONSAFEPATH"] = "1"
     try:
         yield
     finally:
         os.environ["PYTHONSAFEPATH"] = safe_path  # empty: not set
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def map_in_order(

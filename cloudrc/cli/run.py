@@ -23,7 +23,7 @@ from cloudrc.cli.cluster_flags import (
 )
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.find_run import RUNS
-from cloudrc.cli.interrupts import interrupt_on_signals
+from cloudrc.cli.interrupts import interrupt_on_signals, raise_if_interrupted
 from cloudrc.cli.output import (
     escape,
     is_live,
@@ -337,6 +337,7 @@ def _record_virtual(
             writer.attach(name, data)
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
+            raise_if_interrupted()  # a plug-in may have caught the exception
             writer.write(heapq.merge(from_world, from_cloud, key=attrgetter("stamp_ns")))
             store.add(from_world, from_cloud)
             see(from_cloud)

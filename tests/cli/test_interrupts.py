@@ -10,13 +10,15 @@ import os
 import signal
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import interrupts, sweep_run
+from cloudrc.cli import interrupts, run, sweep_run
 from cloudrc.cli.interrupts import interrupt_on_signals, is_interrupted
-from cloudrc.cli.pool import map_in_order, take_each
+from cloudrc.cli.pool import isolated_start, map_in_order, take_each
+from cloudrc.config.load import load_experiment
 from cloudrc.sweep.plan import pack, read_plan
 from cloudrc.sweep.store import read_rows
 from tests.sweep.conftest import write_sweep
@@ -139,6 +141,28 @@ def test_results_before_the_signal_are_kept():
 
     assert take_each(map_in_order(work, range(3), 1), results.append) == ("interrupted", 130)
     assert results == ["0"]
+
+
+def test_a_flight_ends_after_a_signal_that_a_plugin_caught(tmp_path, monkeypatch):
+    def fly(experiment, see):
+        with suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGTERM)
+        see([], [])
+        pytest.fail("the flight goes on")
+
+    interrupt_on_signals()
+    monkeypatch.setattr("cloudrc.assembly.fly", fly)
+    experiment = load_experiment("hover")
+    with run._record_virtual(experiment, tmp_path, lambda records: None) as (_, _, facts):
+        assert facts.interrupted
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_a_signal_while_workers_start_counts_afterwards(number):
+    interrupt_on_signals()
+    with interrupts.noted_interrupts(), isolated_start():
+        os.kill(os.getpid(), number)
+    assert is_interrupted()
 
 
 @pytest.mark.parametrize("number", SIGNALS)
