@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -85,7 +86,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--shards", type=read_count, default=8, metavar="N", help="number of pods (default: 8)")
     about = f"image of the pods (default: {IMAGE})"
     add("--image", default=IMAGE, metavar="IMAGE", help=about)
-    add("--cpu", default="1", metavar="CPU", help="CPU request of a pod (default: 1)")
+    about = "CPU request of a pod, such as 500m or 2 (default: 1)"
+    add("--cpu", type=_cpu, default="1", metavar="CPU", help=about)
     add("--queue", metavar="NAME", help="queue of Kueue that admits the Job")
     for each in (status, fly, figure):
         each.add_argument("folder", type=Path, metavar="DIR", help="folder of a sweep")
@@ -102,6 +104,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     about = "path of the files, with or without a suffix (default: DIR/figure)"
     add("--out", type=Path, metavar="FILE", help=about)
     figure_arguments(figure, 3.5)
+
+
+def _cpu(text: str) -> str:
+    """Check a CPU request as Kubernetes writes it: a number of cores, or of thousandths."""
+    if re.fullmatch(r"[0-9]+m|[0-9]+(\.[0-9]{1,3})?", text) is None:
+        about = "give a number of cores, such as 2 or 0.5, or of thousandths, such as 500m"
+        raise argparse.ArgumentTypeError(f"'{text}' is no CPU request; {about}")
+    return text
 
 
 def _shard(text: str) -> tuple[int, int]:

@@ -28,6 +28,11 @@ FILE = "flights.json.gz"
 """Key in the ConfigMap under which the flights are stored."""
 QUOTA = "then repeat the command with a smaller request, such as --cpu 500m, or with fewer --shards"
 """What a user can do if the namespace's quota does not allow the pods."""
+OUT_OF_MEMORY = (
+    "it used more memory than the limit of its container (OOMKilled); "
+    "fly shorter missions, or without --on"
+)
+"""How a pod has ended whose flight needs too much memory."""
 
 
 def start(
@@ -75,13 +80,18 @@ def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iter
         BadInputError: If a pod refuses the flights, for example because its image has other code.
         ClusterError: If the Job fails, or if a pod will never run.
     """
+    failures = list[str]()
 
     def describe_end(state: Any) -> str:
         words = to_one_line(state.message) or state.reason
         if state.exit_code == BadInputError.exit_code:  # the other pods refuse them, too
             delete_job(release, name)
             raise BadInputError(f"the pods refuse the flights: {words}")
-        return f"a pod failed with exit code {state.exit_code}: {words}" if state.exit_code else ""
+        if not state.exit_code:
+            return ""
+        words = OUT_OF_MEMORY if state.reason == "OOMKilled" else words
+        failures.append(f"a pod failed with exit code {state.exit_code}: {words}")
+        return failures[-1]
 
     remedy = (
         f"if no other pod frees it: {release.kubectl} delete job {name}, and repeat the command "
@@ -97,5 +107,6 @@ def read_lines(release: Release, name: str, tell: Callable[[str], None]) -> Iter
         raise (ClusterError(f"{error}; {QUOTA}") if "quota" in str(error) else error) from None
     if ending := failure_of(release.request("get", "jobs", name=name)):
         see = f"see: {release.kubectl} describe job {name}; then repeat the command"
-        raise ClusterError(f"Job '{name}' failed: {ending}; {see}")
+        causes = [f"Job '{name}' failed: {ending}", *failures[-1:], see]
+        raise ClusterError("; ".join(causes))
     delete_job(release, name)

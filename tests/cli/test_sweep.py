@@ -437,6 +437,14 @@ def test_files_that_no_pod_has_are_refused(write_sweep, tmp_path, call):
     assert not Path("grid").exists()
 
 
+@pytest.mark.parametrize("cpu", ["abc", "500mi", "-1", "", "1e3", "m", "2 "])
+def test_a_cpu_request_that_kubernetes_refuses_is_bad_input(cpu, write_sweep, refused):
+    path = write_sweep({"cloud.predictor": ["last_sample"]})
+    said = refused(f"sweep run --on kubernetes {path}", f"--cpu={cpu}")
+    assert "--cpu" in said
+    assert "500m" in said
+
+
 # `cloudrc run --seeds N`.
 
 

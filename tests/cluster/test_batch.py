@@ -84,6 +84,21 @@ def test_a_failed_job_is_kept_and_named(started, api, release):
     assert api.jobs()
 
 
+def test_a_failed_job_says_how_its_last_pod_failed(started, api, release):
+    add_pod(api, "a", "Failed", state=terminated(3, "a package cannot be imported"))
+    api.end("sweep-1", "Failed", reason="FailedIndexes", message="Job has failed indexes")
+    with pytest.raises(ClusterError, match="failed with exit code 3: a package cannot be imp"):
+        lines(release)
+
+
+def test_a_pod_without_memory_is_told_as_that(started, api, release):
+    killed = {"terminated": {"exitCode": 137, "reason": "OOMKilled", "message": ""}}
+    add_pod(api, "a", "Failed", state=killed)
+    api.end("sweep-1", "Complete")
+    (said,) = lines(release)[1]
+    assert "more memory than the limit" in said
+
+
 def test_the_first_pod_that_refuses_the_flights_ends_the_job(started, api, release):
     """For example, the image has other code: no shard of the Job can succeed."""
     said = "the flights come from code 1, this image has code 2"
