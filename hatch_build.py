@@ -1,4 +1,4 @@
-"""Put the machine code of `cloudrc/world/native/step.c` into a wheel, if CLOUDRC_NATIVE is 1.
+"""Put the machine code of the Pelican's steps, `step.c`, into a wheel, if CLOUDRC_NATIVE is 1.
 
 Otherwise the wheel is pure Python, and a machine with a compiler makes the code when it flies.
 """
@@ -26,7 +26,7 @@ class NativeStep(BuildHookInterface):  # type: ignore[type-arg]
         if os.environ.get("CLOUDRC_NATIVE") != "1" or version == "editable":
             return
         sys.path.insert(0, str(ROOT))
-        from cloudrc.world.native.library import ADVICE, built_file, compile_to, compilers
+        from cloudrc.robots.pelican.native.library import ADVICE, built_file, compile_to, compilers
 
         command = next((command for _, command in compilers()), None)
         if command is None:

@@ -118,7 +118,7 @@ def fly(
 
 def step_code(experiment: ResolvedExperiment) -> str:
     """Say what runs the usual physics steps: "C" with a hash of the machine code, or "Python"."""
-    from cloudrc.world.native.robot import usable
+    from cloudrc.robots.pelican.native.robot import usable
 
     library = usable()
     return f"C {library.code}" if library.run and experiment.world.is_nominal else "Python"
@@ -142,10 +142,10 @@ def build_world(
     `clock` returns the monotonic time [ns]. It is called last, at the start of world's time, so
     that the duration of compiling the scene does not count.
     """
+    from cloudrc.robots.pelican.native.robot import make_robot
+    from cloudrc.robots.pelican.onboard import LowLevel
     from cloudrc.world.endpoint import WorldEndpoint
     from cloudrc.world.guard.state import Guard
-    from cloudrc.world.low_level import LowLevel
-    from cloudrc.world.native.robot import make_robot
     from cloudrc.world.plant import Wind
     from cloudrc.world.robot import Robot
     from cloudrc.world.sensors import Sensors

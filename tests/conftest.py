@@ -1,4 +1,4 @@
-"""Fixtures of all tests: commands, a browser, checked numbers, signals as in a new process."""
+"""Fixtures of all tests: commands, a browser, scenes, numbers, signals as in a new process."""
 
 from __future__ import annotations
 
@@ -15,12 +15,16 @@ import pytest
 
 from cloudrc.cli.interrupts import forget_interrupt
 from cloudrc.cli.main import main
+from cloudrc.config.shipped import file_of
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
 """The browser of Debian (`apt-get install chromium`), or that of GitHub's machines."""
 # WebGL by the processor: a test machine has no graphics card.
 CHROMIUM_FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+
+SPAWN = 'name="spawn" pos="0 0 .1"'
+"""Spawn of the shipped scenes, as in their files."""
 
 # A shell that starts the tests in the background lets them and their children ignore Ctrl-C, but
 # some tests check that a child ends on Ctrl-C.
@@ -198,3 +202,17 @@ def browse(chromium):
     elsewhere = [url for url in requests if not url.split("://")[-1].startswith(inside)]
     assert not errors
     assert not elsewhere
+
+
+@pytest.fixture
+def scene_at(tmp_path):
+    """Return a function that writes a shipped scene with its spawn at (x, y, z) [m]."""
+
+    def write(x, y, z, scene="pipes"):
+        text = file_of("scene", scene).read_text()
+        assert SPAWN in text
+        path = tmp_path / f"{scene}_{x}_{y}_{z}.xml"
+        path.write_text(text.replace(SPAWN, f'name="spawn" pos="{x} {y} {z}"'))
+        return str(path)
+
+    return write

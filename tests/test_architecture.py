@@ -31,6 +31,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "link": {"config", "files", "exposition", "metrics.definitions", "tunnel"},
     "config": {"plugins", "geometry", "link", "files"},
     "world": {
+        "robots",
         "endpoint",
         "tunnel",
         "config",
@@ -39,6 +40,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "files",
         "metrics.definitions",
     },
+    "robots": {"world", "config", "geometry", "files"},
     "cloud": {"endpoint", "tunnel", "config", "plugins", "teleop"},
     "teleop": {"config", "files", "geometry", "metrics"},
     "exposition": {"metrics.definitions"},
@@ -54,7 +56,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         *("record", "report"),
     },
     "assembly": EVERYTHING,
-    "advice": {"assembly", "config", "link", "tunnel", "world"},
+    "advice": {"assembly", "config", "link", "robots", "tunnel"},
     "api": {"advice", "sweep", "config", "metrics", "record"},
     "exercise": {"cloud", "config", "plugins", "sweep"},
     "faults": EVERYTHING,
@@ -69,7 +71,7 @@ ALWAYS = {"errors", "messages", "records", "renamed", "source", "__version__", "
 RESERVED: dict[str, tuple[str, ...]] = {
     "mujoco": ("world/", "geometry/compiled"),
     # The simulator packs forces into MuJoCo's buffers; this is the fastest way.
-    "struct": ("tunnel/codec", "record/", "world/simulator", "world/native/robot"),
+    "struct": ("tunnel/codec", "record/", "world/simulator", "robots/pelican/native/robot"),
     "yaml": ("config/", "link/", "record/", "report/", "cli/", "cluster/"),
     "pydantic": (
         *("config/", "link/", "cli/", "teleop/", "sweep/", "report/folder"),
@@ -88,7 +90,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "importlib.metadata": ("plugins", "cli/", "report/"),
     "pkgutil": ("plugins",),
     # A compiler makes the machine code of the usual step.
-    "subprocess": ("drivers/", "cli/", "cluster/", "world/native/library"),
+    "subprocess": ("drivers/", "cli/", "cluster/", "robots/pelican/native/library"),
     "multiprocessing": ("drivers/", "cli/"),
     "concurrent": ("cli/", "cluster/", "teleop/"),
     **dict.fromkeys(("secrets", "uuid"), ("console/", "drivers/", "cluster/", "cli/")),

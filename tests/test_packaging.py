@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import cloudrc
-from cloudrc.world.native.library import built_file, compilers
+from cloudrc.robots.pelican.native.library import built_file, compilers
 from tools.pack_chart import pack
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -60,7 +60,7 @@ def test_a_platform_wheel_holds_the_machine_code(tmp_path, monkeypatch):
     monkeypatch.setenv("CLOUDRC_NATIVE", "1")
     name, packed = build_wheel(tmp_path)
     assert "-py3-none-any" not in name
-    assert f"cloudrc/world/native/{built_file().name}" in packed
+    assert f"cloudrc/robots/pelican/native/{built_file().name}" in packed
     assert not built_file().exists()
 
 

@@ -37,7 +37,7 @@ def test_built_files_and_those_of_an_editor_do_not_count(copy, hash_of):
     assert hash_of(copy) == source.code_hash()
     (copy / "__pycache__").mkdir()
     (copy / "__pycache__/source.cpython-313.pyc").write_bytes(b"built")
-    (copy / "world/native/step-1-cc.so").write_bytes(b"built")
+    (copy / "robots/pelican/native/step-1-cc.so").write_bytes(b"built")
     (copy / ".#assembly.py").symlink_to("somebody@host.1")
     (copy / "_chart").mkdir()
     (copy / "_chart/values.yaml").write_text("a: wheel has the chart\n")
@@ -48,7 +48,7 @@ def test_built_files_and_those_of_an_editor_do_not_count(copy, hash_of):
 @pytest.mark.parametrize(
     "name",
     [
-        *("world/rotors.py", "world/native/step.c", "world/robots/pelican.xml"),
+        *("robots/pelican/rotors.py", "robots/pelican/native/step.c", "robots/pelican/robot.xml"),
         *("link/profiles/paper-p2.yaml", "missions/steps.yaml", "__init__.py"),
     ],
 )

@@ -45,8 +45,8 @@ def execute(options: argparse.Namespace) -> int:
     """Run all measurements; print for each the processor time per physics step [us]."""
     require("the bench", ("world",))
     from cloudrc.config.load import load_experiment
+    from cloudrc.robots.pelican.native.robot import usable
     from cloudrc.sweep.flight import fly_point
-    from cloudrc.world.native.robot import usable
 
     experiment = load_experiment("paper")
     replay = _replay(experiment)

@@ -30,7 +30,7 @@ MUJOCO_PROGRAM = (
     "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
     f"mujoco.mj_step(m, mujoco.MjData(m)); print('{WORKS}')"
 )
-NATIVE_PROGRAM = "from cloudrc.world.native.robot import usable; print(usable().text)"
+NATIVE_PROGRAM = "from cloudrc.robots.pelican.native.robot import usable; print(usable().text)"
 COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
 
 

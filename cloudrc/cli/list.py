@@ -82,6 +82,6 @@ def _comment(kind: str, name: str) -> str:
     """Describe a robot or scene by the first sentence of the first comment in its XML file."""
     from cloudrc.config import shipped
 
-    text = (shipped.FOLDERS[kind] / f"{name}.xml").read_text("utf-8")
+    text = shipped.file_of(kind, name).read_text("utf-8")
     comment = re.search(r"<!--(.*?)-->", text, re.DOTALL)
     return " ".join(comment[1].split()).partition(". ")[0] if comment else ""

@@ -326,8 +326,8 @@ def _record_virtual(
     from cloudrc.report.document import Run
     from cloudrc.report.views import views
     from cloudrc.report.write import attachments
+    from cloudrc.robots.pelican.native.robot import usable
     from cloudrc.source import code_hash
-    from cloudrc.world.native.robot import usable
 
     store, interrupted = RecordStore(), False
     # Record during the flight, so that the recording is kept if the run or its report fails.
@@ -390,7 +390,7 @@ def _record_local(
     from cloudrc.report.document import Run
     from cloudrc.report.views import views
     from cloudrc.report.write import attachments
-    from cloudrc.world.native.library import library
+    from cloudrc.robots.pelican.native.library import library
 
     _prepare(experiment, folder)
     local = LocalRun(folder, see, session=session)

@@ -16,14 +16,27 @@ FOLDERS = {
     "mission": _PACKAGE / "missions",
     "profile": _PACKAGE / "link" / "profiles",
     "scene": _PACKAGE / "world" / "scenes",
-    "robot": _PACKAGE / "world" / "robots",
+    "robot": _PACKAGE / "robots",
 }
-"""Kind of file -> folder of the shipped files."""
+"""Kind of file -> folder of the shipped files; each robot has a folder of its own in it."""
+ROBOT_MODEL = "robot.xml"
+"""Name of a robot's model in its folder."""
 
 
 def names(kind: str) -> list[str]:
     """List the names of the shipped files of a kind, such as "profile", in alphabetical order."""
-    return sorted(path.stem for path in FOLDERS[kind].iterdir() if path.suffix in (".yaml", ".xml"))
+    folder = FOLDERS[kind]
+    if kind == "robot":
+        return sorted(path.parent.name for path in folder.glob(f"*/{ROBOT_MODEL}"))
+    return sorted(path.stem for path in folder.iterdir() if path.suffix in (".yaml", ".xml"))
+
+
+def file_of(kind: str, name: str) -> Path:
+    """Return the MJCF file of a robot or scene, given by its name or by the path of the file."""
+    if name.endswith(".xml"):
+        return Path(name)
+    folder = FOLDERS[kind]
+    return folder / name / ROBOT_MODEL if kind == "robot" else folder / f"{name}.xml"
 
 
 def describe(kind: str, name: str) -> str:

@@ -45,9 +45,9 @@ from cloudrc.messages import (
     Vector,
 )
 from cloudrc.records import CommandApplied, Record, SessionOpened
+from cloudrc.robots.pelican.rotors import STOPPED
 from cloudrc.world.readings import Readings, RotorSpeeds
 from cloudrc.world.robot import STEP, STEP_NS, Robot
-from cloudrc.world.rotors import STOPPED
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 FLOWN, LATCHED = (TRACK, HOLD, LAND), (LAND, ESTOP)

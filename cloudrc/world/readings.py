@@ -1,7 +1,7 @@
 """The interface between the physics and the onboard part: sensor readings and rotor speeds.
 
-The physics (`simulator`) and the onboard part (`low_level`, `guard`, `sensors`) exchange nothing
-else.
+The physics (`simulator`) and the onboard part (`guard`, `sensors`, the robot's controller) exchange
+nothing else.
 """
 
 from __future__ import annotations

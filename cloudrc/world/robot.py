@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Protocol
 
 from cloudrc.messages import Command, GuardState, OperatorRequest
+from cloudrc.robots.pelican.onboard import LowLevel
+from cloudrc.robots.pelican.rotors import STOPPED
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.low_level import LowLevel
 from cloudrc.world.readings import Readings, RotorSpeeds
-from cloudrc.world.rotors import STOPPED
 from cloudrc.world.simulator import Simulator
 
 STEP_NS = 2_000_000

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cloudrc.config.schema import Plant
+from cloudrc.config.shipped import file_of
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.compiled import mujoco, read_scene
 from cloudrc.geometry.scene import WORLD
-from cloudrc.world.low_level import GRAVITY, THRUST_MAX
+from cloudrc.robots.pelican.onboard import GRAVITY, THRUST_MAX
 from cloudrc.world.plant import Array, Inertia, point_inertia, true_inertia
 
 ROBOT_PREFIX = "robot/"
@@ -26,8 +27,7 @@ ROTORS = ("rotor_front", "rotor_left", "rotor_back", "rotor_right")
 """Names of a robot's actuators. Every tuple of four rotor values has the same order."""
 TIMESTEP = 0.002
 """Step of the physics [s]. Source: docs/reference/plant.md, "Physics step"."""
-FOLDER = Path(__file__).parent
-PELICAN = FOLDER / "robots" / "pelican.xml"
+PELICAN = file_of("robot", "pelican")
 """The robot for which the onboard controller is made."""
 Facts: TypeAlias = dict[str, tuple[ArrayLike, ArrayLike]]
 """Name of a quantity, with its unit -> its value and the largest difference that is accepted."""
@@ -48,7 +48,7 @@ def compile_model(robot: str, scene: str, plant: Plant | None = None) -> Any:
     After the check of the files, `plant` changes mass, inertia and thrust: the true robot may
     differ from its file.
     """
-    paths = _path("robots", robot), _path("scenes", scene)
+    paths = file_of("robot", robot), file_of("scene", scene)
     model = _compile_nominal(*paths)
     gravity: Facts = {"gravity [m/s^2]": (model.opt.gravity, 0.0)}
     _refuse_differences(paths[1], gravity, {"gravity [m/s^2]": ((0.0, 0.0, -GRAVITY), 0.2)})
@@ -58,10 +58,6 @@ def compile_model(robot: str, scene: str, plant: Plant | None = None) -> Any:
         model = _compile(*paths, true_inertia(plant, _inertia(model)))
         model.actuator_gainprm[:, 0] *= plant.thrust_factor
     return model
-
-
-def _path(kind: str, name: str) -> Path:
-    return Path(name) if name.endswith(".xml") else FOLDER / kind / f"{name}.xml"
 
 
 def _compile_nominal(robot_path: Path, scene_path: Path) -> Any:

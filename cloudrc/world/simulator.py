@@ -17,9 +17,9 @@ from cloudrc.config.schema import Plant
 from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import Odometry, Vector
 from cloudrc.records import Contact
+from cloudrc.robots.pelican.rotors import STOPPED, Controls, Rotors
 from cloudrc.world.plant import Wind
 from cloudrc.world.readings import Readings, RotorSpeeds
-from cloudrc.world.rotors import STOPPED, Controls, Rotors
 from cloudrc.world.scene import ROBOT_PREFIX, bodies_of_geoms, compile_model
 
 TOUCH_GAP = 0.1

@@ -7,7 +7,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.faults.invariants import FLOWN, TRACK, Watch
 from cloudrc.messages import ZERO, Command, OperatorRequest, Request, Start
 from cloudrc.records import Contact
-from cloudrc.world.rotors import STOPPED
+from cloudrc.robots.pelican.rotors import STOPPED
 
 MS = 1_000_000
 TURNING = (900.0,) * 4

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from cloudrc.config.load import load_experiment
+from cloudrc.config.shipped import file_of
 from cloudrc.report.write import assess
 from cloudrc.sweep.flight import fly_in_memory
-from cloudrc.world.scene import FOLDER
 
 TRACK = "time_s,x_m,y_m,z_m\n0,0,0,1\n1.5,0,0,1\n2.5,1.5,0,1\n4,1.5,0,1\n"
 """Up, and then 1.5 m ahead. Setpoints of a file are not checked before the flight."""
@@ -19,7 +19,7 @@ def flown_into(tmp_path):
     """Return a function that flies into a body 0.8 m ahead, and returns the assessment."""
 
     def fly(body, *settings):
-        text = (FOLDER / "scenes" / "empty.xml").read_text()
+        text = file_of("scene", "empty").read_text()
         scene, track = tmp_path / "mine.xml", tmp_path / "track.csv"
         scene.write_text(text.replace("</worldbody>", f"{body}</worldbody>"))
         track.write_text(TRACK)

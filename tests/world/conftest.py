@@ -1,25 +1,6 @@
-"""Scenes with another spawn, so that a test can start in the air or beside the board."""
+"""Helpers of the tests of world."""
 
 import numpy as np
-import pytest
-
-from cloudrc.world.scene import FOLDER
-
-SPAWN = 'name="spawn" pos="0 0 .1"'
-
-
-@pytest.fixture
-def scene_at(tmp_path):
-    """Return a function that writes a shipped scene with its spawn at (x, y, z) [m]."""
-
-    def write(x, y, z, scene="pipes"):
-        text = (FOLDER / "scenes" / f"{scene}.xml").read_text()
-        assert SPAWN in text
-        path = tmp_path / f"{scene}_{x}_{y}_{z}.xml"
-        path.write_text(text.replace(SPAWN, f'name="spawn" pos="{x} {y} {z}"'))
-        return str(path)
-
-    return write
 
 
 def normalised(quaternion):

@@ -7,15 +7,15 @@ from math import pi, tan
 
 import pytest
 
+from cloudrc.config.shipped import file_of, names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.geometry.compiled import import_mujoco, mujoco
 from cloudrc.geometry.scene import load_scene
-from cloudrc.world.rotors import STOPPED
-from cloudrc.world.scene import FOLDER, PELICAN, bodies_of_geoms, compile_model
+from cloudrc.robots.pelican.rotors import STOPPED
+from cloudrc.world.scene import PELICAN, bodies_of_geoms, compile_model
 from cloudrc.world.simulator import Simulator
 
-ROBOTS = sorted(path.stem for path in (FOLDER / "robots").glob("*.xml"))
-SCENES = sorted(path.stem for path in (FOLDER / "scenes").glob("*.xml"))
+ROBOTS, SCENES = names("robot"), names("scene")
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ BODIES = """
 def test_each_geom_has_the_name_of_its_body_and_the_robot_none(tmp_path):
     """MuJoCo fuses static bodies, but not those that `exclude` or mocap names."""
     scene, robot = tmp_path / "scene.xml", tmp_path / "robot.xml"
-    text = (FOLDER / "scenes" / "empty.xml").read_text()
+    text = file_of("scene", "empty").read_text()
     scene.write_text(text.replace("</worldbody>", BODIES))
     text = PELICAN.read_text()
     robot.write_text(text.replace("<worldbody>", '<worldbody><geom size=".1" pos="0 0 2"/>'))
@@ -90,33 +90,33 @@ def test_each_geom_has_the_name_of_its_body_and_the_robot_none(tmp_path):
     assert names.count("") == 7
 
 
-SHIPPED = {"robots": "pelican", "scenes": "empty"}
+SHIPPED = {"robot": "pelican", "scene": "empty"}
 
 
 @pytest.mark.parametrize(
     ("kind", "old", "new", "message"),
     [
-        ("robots", 'size=".05 .05 .10"', 'size=".05 nan .10"', "does not compile"),
-        ("robots", 'name="rotor_left" site', 'name="rotor_5" site', "needs the actuators"),
-        ("robots", '<freejoint name="base"/>', "", "freejoint"),
+        ("robot", 'size=".05 .05 .10"', 'size=".05 nan .10"', "does not compile"),
+        ("robot", 'name="rotor_left" site', 'name="rotor_5" site', "needs the actuators"),
+        ("robot", '<freejoint name="base"/>', "", "freejoint"),
         # What the controller is not made for:
-        ("robots", 'mass="1.0"', 'mass="1.265"', r"mass .kg. is 1.325, not 1.06 \+- 0.1"),
-        ("robots", ".01 .01 .02", ".02 .01 .02", "inertia .kg m.2. is 0.0215"),
-        ("robots", '"0 .21 .05" childclass', '"0 .21 .05" euler="9 0 0" childclass', "left gear"),
-        ("robots", 'ctrllimited="false"', 'ctrlrange="0 13"', "range .N. is 0 13, not 0 33.74"),
-        ("robots", 'ctrllimited="false"', 'ctrlrange="1 40"', "range .N. is 1 33.74, not 0 33"),
-        ("robots", 'ctrllimited="false"', 'dyntype="filter" dynprm="1"', "dyntype is 2, not 0"),
-        ("robots", 'size=".03" pos=".2 0 0"', 'size=".03" pos=".1 0 0"', "tip .m. is 0.3 0 0.17"),
-        ("scenes", 'name="spawn"', 'name="start"', "needs a frame named spawn"),
-        ("scenes", '<body name="floor">', '<body><freejoint/><geom size="1"/></body>'
+        ("robot", 'mass="1.0"', 'mass="1.265"', r"mass .kg. is 1.325, not 1.06 \+- 0.1"),
+        ("robot", ".01 .01 .02", ".02 .01 .02", "inertia .kg m.2. is 0.0215"),
+        ("robot", '"0 .21 .05" childclass', '"0 .21 .05" euler="9 0 0" childclass', "left gear"),
+        ("robot", 'ctrllimited="false"', 'ctrlrange="0 13"', "range .N. is 0 13, not 0 33.74"),
+        ("robot", 'ctrllimited="false"', 'ctrlrange="1 40"', "range .N. is 1 33.74, not 0 33"),
+        ("robot", 'ctrllimited="false"', 'dyntype="filter" dynprm="1"', "dyntype is 2, not 0"),
+        ("robot", 'size=".03" pos=".2 0 0"', 'size=".03" pos=".1 0 0"', "tip .m. is 0.3 0 0.17"),
+        ("scene", 'name="spawn"', 'name="start"', "needs a frame named spawn"),
+        ("scene", '<body name="floor">', '<body><freejoint/><geom size="1"/></body>'
                    '<body name="floor">', "body without a name has a joint"),
-        ("scenes", '<body name="floor">', "<body>", "needs a body named floor"),
-        ("scenes", "-9.8066", "-1.62", r"gravity .m/s.2. is 0 0 -1.62, not 0 0 -9.8"),
+        ("scene", '<body name="floor">', "<body>", "needs a body named floor"),
+        ("scene", "-9.8066", "-1.62", r"gravity .m/s.2. is 0 0 -1.62, not 0 0 -9.8"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_flown_is_refused_by_name(tmp_path, monkeypatch, kind, old, new, message):
     monkeypatch.chdir(tmp_path)
-    path, good = tmp_path / "mine.xml", (FOLDER / kind / f"{SHIPPED[kind]}.xml").read_text()
+    path, good = tmp_path / "mine.xml", file_of(kind, SHIPPED[kind]).read_text()
     assert old in good
     path.write_text(good.replace(old, new))
     with pytest.raises(BadInputError, match=f"mine.xml[^\n]*{message}") as error:

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.messages import UPRIGHT, ZERO
-from cloudrc.world.low_level import LowLevel
+from cloudrc.robots.pelican.onboard import LowLevel
+from cloudrc.robots.pelican.rotors import STOPPED, Rotors
 from cloudrc.world.readings import Readings
-from cloudrc.world.rotors import STOPPED, Rotors
 from cloudrc.world.simulator import Simulator, replay
 from tests.world.conftest import normalised
 

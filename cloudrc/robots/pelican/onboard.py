@@ -15,8 +15,8 @@ from math import sqrt
 from typing import TypeAlias
 
 from cloudrc.messages import ZERO, Vector
+from cloudrc.robots.pelican.rotors import ARM, SPEED_MAX, THRUST_COEFFICIENT, TORQUE_RATIO
 from cloudrc.world.readings import Readings, RotorSpeeds
-from cloudrc.world.rotors import ARM, SPEED_MAX, THRUST_COEFFICIENT, TORQUE_RATIO
 
 MASS = 1.05
 """Mass that the controller assumes [kg]; the robot's mass is 1.06 kg.

@@ -21,12 +21,12 @@ from cloudrc.config.load import ResolvedGuard
 from cloudrc.geometry import fence
 from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import Command, Vector
-from cloudrc.world import low_level, rotors
+from cloudrc.robots.pelican import onboard, rotors
+from cloudrc.robots.pelican.native.library import Library, library
+from cloudrc.robots.pelican.onboard import LowLevel
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard import state
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.low_level import LowLevel
-from cloudrc.world.native.library import Library, library
 from cloudrc.world.readings import Readings
 from cloudrc.world.robot import STEP, STEP_NS, Robot
 from cloudrc.world.scene import ROBOT_PREFIX, is_of_robot
@@ -54,7 +54,7 @@ UNUSED_WITHOUT_CONTACTS = sum(
 """Parts of MuJoCo that do nothing while the robot touches nothing."""
 _CONSTANTS = {
     rotors: "thrust_coefficient torque_ratio drag_coefficient arm height",
-    low_level: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
+    onboard: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
     "thrust_max tiny nose_cosine_min yaw_sine_max",
     state: "overturned_cosine",
     rules: "sink_lead_max fence_reaction reaction stop_coefficient",

@@ -8,7 +8,13 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from cloudrc.messages import UPRIGHT, ZERO
-from cloudrc.world.low_level import NOSE_COSINE_MIN, YAW_SINE_MAX, LowLevel, allocate, attitude
+from cloudrc.robots.pelican.onboard import (
+    NOSE_COSINE_MIN,
+    YAW_SINE_MAX,
+    LowLevel,
+    allocate,
+    attitude,
+)
 from cloudrc.world.readings import Readings
 from tests.world.conftest import normalised
 

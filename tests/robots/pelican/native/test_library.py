@@ -4,8 +4,15 @@ import sys
 
 import pytest
 
-from cloudrc.world.native import library as module
-from cloudrc.world.native.library import FLAGS, POD, SWITCH, built_file, compile_to, compilers
+from cloudrc.robots.pelican.native import library as module
+from cloudrc.robots.pelican.native.library import (
+    FLAGS,
+    POD,
+    SWITCH,
+    built_file,
+    compile_to,
+    compilers,
+)
 
 COMPILERS = dict(compilers())
 

@@ -1,0 +1,1 @@
+"""The robots that ship with cloudrc, each in a folder: its model, its controller, its actuators."""

@@ -1,0 +1,1 @@
+"""The quadrotor of the paper: AscTec Pelican class, with a rigid arm."""
