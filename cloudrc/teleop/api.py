@@ -348,7 +348,10 @@ async def stop_rotors(bridge: Bridged) -> Any:
 
 @router.post("/acknowledge", response_model=models.Acknowledged)
 async def acknowledge(bridge: Bridged) -> Any:
-    """Allow the robot to fly the next mission after an emergency stop or a landing."""
+    """Allow the robot to fly the next mission after an emergency stop or a landing.
+
+    The answer is 409 while an emergency stop is on its way to the robot.
+    """
     await bridge.move(MissionService.acknowledge)
     return {"state": "acknowledged"}
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from cloudrc.messages import GuardState, OperatorRequest, Request, Start
 from cloudrc.teleop.wire import RobotStatus
 
-GROUND, HOLD = GuardState.GROUND, GuardState.HOLD  # to look up a member takes time
+# To look up a member takes time.
+GROUND, HOLD, ESTOP = GuardState.GROUND, GuardState.HOLD, GuardState.ESTOP
 
 REPEAT_NS = 100_000_000
 """Time between two copies of a request [ns]."""
@@ -143,6 +144,8 @@ class RequestSender:
     def _is_acknowledged(self, pending: OperatorRequest, seen: RobotStatus) -> bool:
         if pending.number == UNNUMBERED or seen.mission != pending.number:
             return False
+        if pending.request is Request.ACKNOWLEDGE and seen.guard is ESTOP:
+            return False  # cloud has given the same number to another copy of the stop
         # Telemetry of the old epoch was sent before the reset to the spawn.
         from_spawn = pending.request is Request.START and pending.start is Start.SPAWN
         return not from_spawn or seen.epoch != self._asked_epoch

@@ -48,6 +48,7 @@ REST = "after a stop or a landing only when it has stood still, at least 0.5 m i
 BY_ITSELF = "without commands the robot holds its position, then lands, by itself"
 NOT_HEARD = f"cloud has no telemetry from the robot: check the link and world; {BY_ITSELF}"
 NO_CLOUD = f"teleop does not hear cloud, so there is no telemetry: check cloud; {BY_ITSELF}"
+STOP_IS_SENT = "an emergency stop is on its way to the robot"
 ALONE = {
     GROUND: f"the robot waits for a mission; it takes off, {REST}",
     TRACK: "teleop is telling the robot that its mission is over; then the robot holds",
@@ -244,9 +245,15 @@ class MissionService:
         return mission
 
     def acknowledge(self, now_ns: int) -> None:
-        """Let the robot fly again after a landing or a stop, if no mission is under way."""
+        """Let the robot fly again after a landing or a stop, if no mission is under way.
+
+        Raise a ConflictError while a stop is repeated: the next copy would stop the robot again.
+        """
         if self._current is not None:
             raise _busy(self._current, "there is nothing to acknowledge")
+        if self._stop_is_sent:
+            text = "acknowledge again once 'cloudrc mission status' shows ESTOP"
+            raise ConflictError(f"{STOP_IS_SENT}; {text}")
         self._interrupted = True
         self._teleop.acknowledge(now_ns)
         self._collect(now_ns)
@@ -357,10 +364,15 @@ class MissionService:
         return self.book.stopped() if unknown else None
 
     @property
+    def _stop_is_sent(self) -> bool:
+        """Whether telemetry does not show yet that the robot has obeyed an emergency stop."""
+        return self._teleop.stopping or self._inherits_stop is not None
+
+    @property
     def _blocked(self) -> str:
         """Why the robot cannot fly until the operator's acknowledgement; "" if it can fly."""
-        if self._teleop.stopping or self._inherits_stop:
-            return "an emergency stop is on its way to the robot"
+        if self._stop_is_sent:
+            return STOP_IS_SENT
         seen = self.seen
         if seen is None or seen.guard not in LATCHED:
             return ""

@@ -215,7 +215,7 @@ def test_a_stop_stops_the_robot_with_or_without_a_slash(api, path):
     api.flight.create()
     assert api.post(path) == (200, {"id": "m1", "state": "stopping"})
     assert len(api.alarms) == 1
-    api.until(lambda: api.flight.guard is GuardState.ESTOP)
+    api.until(lambda: api.get("/v1/state")["seen"]["guard"] == "ESTOP")
     assert api.post("/v1/acknowledge/") == (200, {"state": "acknowledged"})
     api.bridge.closed = "teleop ends"
     assert api.post(path) == (503, {"detail": "teleop ends"})

@@ -150,3 +150,21 @@ def test_a_stop_leaves_at_once_and_is_told_until_it_is_seen():
     flight.step(seconds=0.5)
     assert flight.said.count(ALARM) <= 11
     assert flight.guard is ESTOP
+
+
+def test_a_stop_with_the_number_of_an_acknowledgement_does_not_confirm_it():
+    flight = Flight()
+    flight.step()
+    for verb in ("stop", "acknowledge"):
+        flight.operate(verb)
+        flight.step(seconds=0.3)
+    flight.operate("stop")
+    flight.step(seconds=0.3)
+    flight.downlink = False  # cloud's last copy of the stop overtakes the acknowledgement
+    flight.operate("acknowledge")
+    flight.step()
+    flight.mission = flight.requests[-1].number
+    flight.step()
+    flight.downlink = True
+    flight.step(seconds=0.3)
+    assert flight.guard is GuardState.GROUND

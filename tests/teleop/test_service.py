@@ -97,15 +97,17 @@ a landing has to be acknowledged, too: create 0.05 LAND 0.05 !create !goto ack 0
   -> states=failed,flying
 a stop that was not heard is repeated: create 0.05 A mute stop 0.2 cloud restart !queue link 0.3
   -> guard=ESTOP failure=emergency_stopped
-though acknowledged before: create 0.05 A mute restart stop 0.2 cloud restart ack link 0.5
+though acknowledged before: create 0.05 A mute restart stop 0.2 cloud restart !ack link 0.5
   -> guard=ESTOP last=emergency_stopped
 not after an acknowledgement: create 0.05 A stop 0.2 ack 0.2 mark restart 0.5
   -> guard=HOLD asked=END
 not in another world: create 0.05 A stop 0.2 world mark restart 0.5 -> guard=GROUND asked=
 a stop before telemetry stops any flight: create 0.05 A TRACK foreign restart stop 0.2
   -> guard=ESTOP failure=emergency_stopped
-a stop after an acknowledgement counts: create 0.05 A stop ack stop 0.3
+a stop after an acknowledgement counts: create 0.05 A stop 0.2 ack stop 0.3
   -> guard=ESTOP last=emergency_stopped
+none while a stop is on its way: create 0.05 A mute stop !ack 0.2 !ack link 0.3 ack 0.2
+  -> guard=GROUND
 
 # The end of teleop
 in flight it holds: create 0.05 A away pause 0.5
