@@ -1,14 +1,20 @@
-"""Statuses of the robot, as teleop's API sends them, and an API that a test answers."""
+"""Sessions with a console, statuses of the robot, and an API that a test answers."""
 
+import subprocess
+import sys
+from contextlib import contextmanager, suppress
 from math import nan
 
 import pytest
 
+from cloudrc.cli.client import Api, ApiError
+from cloudrc.drivers.local import under_way
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import UPRIGHT, ZERO, GuardState
 from cloudrc.records import Control
 from cloudrc.teleop.wire import RobotStatus
+from tests.conftest import wait_until
 
 LIMIT = 120.0
 """Time limit for what has no number of its own [s]: a browser without a graphics card is slow."""
@@ -28,6 +34,56 @@ def status(at, position=(0.0, 0.0, 1.0), control=None, **fields):
     """Make a status of the robot from telemetry of `at` [s]."""
     known = {"epoch": 1, "mission": 0, "guard": GuardState.TRACK, "stamp_ns": round(at * 1e9)}
     return RobotStatus(position=position, control=control, **{**known, **fields})
+
+
+def start(folder, *words):
+    """Start a command of cloudrc in `folder`; return the process."""
+    command = [sys.executable, "-m", "cloudrc", *map(str, words)]
+    kinds = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    return subprocess.Popen(command, cwd=folder, **kinds)
+
+
+def answers(api):
+    """Return the newest telemetry in the API's answer; False if nobody answers."""
+    try:
+        return api.get("/v1/state")["seen"]
+    except Exception:
+        return False
+
+
+@contextmanager
+def session_with_console(tmp_path_factory, *flags):
+    """Fly a session of the hover: yield its API, the run's folder, and the console's process.
+
+    `flags` are those of the console, which has to end with the session.
+    """
+    folder = tmp_path_factory.mktemp("session")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.getbasetemp()))
+        session = start(folder, "up", "hover", "--set", "link.profile=wifi")
+        wait_until(lambda: under_way() or session.poll() is not None)
+        ((run, url),) = under_way().items()
+        api = Api(url)
+        wait_until(lambda: answers(api))
+        patch.setenv("BROWSER", "echo opens %s")
+        console = start(folder, "console", run, *flags)
+    yield api, run, console
+    session.terminate()
+    said, _ = console.communicate(timeout=LIMIT)
+    assert console.returncode == 0, said
+    session.communicate(timeout=LIMIT)
+
+
+def acknowledge(api):
+    """Acknowledge a stop, and again while the API says that the stop is still on its way."""
+
+    def is_accepted():
+        with suppress(ApiError):
+            api.post("/v1/acknowledge")
+            return True
+        return False
+
+    wait_until(is_accepted)
 
 
 class FakeApi:

@@ -1,8 +1,6 @@
 """The console in a browser, on a session of real processes."""
 
 import io
-import subprocess
-import sys
 import threading
 import urllib.request
 from argparse import Namespace
@@ -12,43 +10,29 @@ import pytest
 from PIL import Image
 
 from cloudrc.cli import console, extras
-from cloudrc.cli.client import Api
 from cloudrc.config.load import load_experiment
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import PANEL_WIDTH, Page, _with_gaps
 from cloudrc.console.steering import Steering
-from cloudrc.drivers.local import under_way
 from cloudrc.geometry.scene import Scene, load_scene
 from tests.conftest import wait_until
-from tests.console.conftest import LIMIT, status
-
-
-def start(folder, *words):
-    command = [sys.executable, "-m", "cloudrc", *map(str, words)]
-    kinds = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    return subprocess.Popen(command, cwd=folder, **kinds)
+from tests.console.conftest import (
+    LIMIT,
+    acknowledge,
+    answers,
+    session_with_console,
+    start,
+    status,
+)
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     """A session with the hover's scene: the API, the console's address, and the run's folder."""
-    folder = tmp_path_factory.mktemp("session")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.getbasetemp()))
-        session = start(folder, "up", "hover", "--set", "link.profile=wifi")
-        wait_until(lambda: under_way() or session.poll() is not None)
-        ((run, url),) = under_way().items()
-        api = Api(url)
-        wait_until(lambda: answers(api))
-        patch.setenv("BROWSER", "echo opens %s")
-        console = start(folder, "console", run)
-    address, opened = (console.stdout.readline().split()[-1] for _ in range(2))
-    assert opened == address
-    yield api, address, run
-    session.terminate()
-    said, _ = console.communicate(timeout=LIMIT)
-    assert console.returncode == 0, said  # it ends with the run
-    session.communicate(timeout=LIMIT)
+    with session_with_console(tmp_path_factory) as (api, run, console):
+        address, opened = (console.stdout.readline().split()[-1] for _ in range(2))
+        assert opened == address
+        yield api, address, run
 
 
 @pytest.fixture
@@ -56,7 +40,7 @@ def flight(session):
     """The session, whose robot is at the spawn and has no mission."""
     api = session[0]
     if api.get("/v1/state")["seen"]["guard"] == "ESTOP":
-        api.post("/v1/acknowledge")
+        acknowledge(api)
     elif mission := api.get("/v1/state")["mission"]:
         api.post(f"/v1/missions/{mission['id']}/cancel")
     wait_until(lambda: not api.get("/v1/state")["mission"] and answers(api)["guard"] != "ESTOP")
@@ -78,13 +62,6 @@ def filled(api):
 
     yield fill
     page.close()
-
-
-def answers(api):
-    try:
-        return api.get("/v1/state")["seen"]
-    except Exception:
-        return False
 
 
 def button(page, name):
@@ -212,8 +189,13 @@ def test_the_second_browser_reads_and_stop_works_under_load(browse, flight, page
         for thread in threads:
             thread.join()
     figure("stop under load", took, "<=", 1.0, "s")
-    button(page, "Acknowledge").click()
-    wait_until(lambda: api.get("/v1/state")["seen"]["guard"] != "ESTOP")
+
+    def acknowledged():
+        button(page, "Acknowledge").click()  # refused while the stop is on its way
+        page.wait_for_timeout(1000)
+        return api.get("/v1/state")["seen"]["guard"] != "ESTOP"
+
+    wait_until(acknowledged)
     second.keyboard.press("Shift+X")
     wait_until(lambda: api.get("/v1/state")["seen"]["guard"] == "ESTOP")
     page.close()

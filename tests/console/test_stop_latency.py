@@ -9,17 +9,15 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 
 import numpy as np
 import pytest
 
 from cloudrc.cli.client import Api
-from cloudrc.drivers.local import under_way
 from cloudrc.messages import GuardState
 from tests.conftest import wait_until
-from tests.console.conftest import LIMIT
-from tests.console.test_page import answers, start
+from tests.console.conftest import acknowledge, session_with_console
 
 pytestmark = [pytest.mark.process, pytest.mark.alone, pytest.mark.full]
 CLICKS = int(os.environ.get("CLOUDRC_STOP_CLICKS", "200"))
@@ -57,19 +55,8 @@ class Watch:
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
     """A session, its API, its watch, and the address of its console."""
-    folder = tmp_path_factory.mktemp("session")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.getbasetemp()))
-        session = start(folder, "up", "hover", "--set", "link.profile=wifi")
-        wait_until(lambda: under_way() or session.poll() is not None)
-        ((run, url),) = under_way().items()
-        api = Api(url)
-        wait_until(lambda: answers(api))
-        console = start(folder, "console", run, "--no-open")
-    yield api, Watch(url), console.stdout.readline().split()[-1]
-    session.terminate()
-    console.communicate(timeout=LIMIT)
-    session.communicate(timeout=LIMIT)
+    with session_with_console(tmp_path_factory, "--no-open") as (api, _, console):
+        yield api, Watch(api.url), console.stdout.readline().split()[-1]
 
 
 @contextmanager
@@ -97,16 +84,11 @@ def load(address, scenes, plains, is_busy):
 
 
 def land(api, watch):
-    """Acknowledge the stop; the robot is on the ground afterwards.
-
-    An acknowledgement within 50 ms of the stop may be without effect: the stop is still repeated.
-    """
+    """Acknowledge the stop; the robot is on the ground afterwards."""
     wait_until(lambda: watch.guard is GuardState.ESTOP)
     wait_until(lambda: not api.get("/v1/state")["mission"])
-    while watch.guard is GuardState.ESTOP:
-        api.post("/v1/acknowledge")
-        with suppress(AssertionError):
-            wait_until(lambda: watch.guard is not GuardState.ESTOP, limit=1.0)
+    acknowledge(api)
+    wait_until(lambda: watch.guard is not GuardState.ESTOP)
 
 
 def fly(api, watch):
