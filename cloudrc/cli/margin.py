@@ -95,14 +95,16 @@ class Trials:
     def __init__(self, options: argparse.Namespace) -> None:
         """Read the present value and the range of the search; refuse a key that has no range."""
         from cloudrc.cli.run import load, refuse_seed
-        from cloudrc.sweep.margin import STEPS_MAX, present_value
+        from cloudrc.sweep.margin import STEPS_MAX, check_largest, present_value
 
         self._options, self._load = options, load
         key = options.key
         refuse_seed([*options.set, f"{key}=0"])
         self.step_depends = not key.startswith(NOT_IN_STEP)
         now = present_value(load(options.experiment, options.set), key)
-        if now is None and options.max is None:
+        if options.max is not None:
+            check_largest(key, options.max)
+        elif now is None:
             load(options.experiment, [*options.set, f"{key}=1"])  # names an unknown key
             raise BadInputError(f"{key}: has no value now; name the largest one to try with --max")
         self.size = options.resolution or (1.0 if isinstance(now, int) else 0.01)

@@ -123,16 +123,32 @@ def _is_list(annotation: Any) -> bool:
     return any(get_origin(kind) in (tuple, list, Sequence) for kind in kinds)
 
 
-def _limits(part: Any) -> Iterator[str]:
-    """Yield the limits in a field or an annotation, such as ">= 0"."""
+def exceeds(model: type[BaseModel], path: KeyPath, value: float) -> bool:
+    """Return whether `value` [any unit] is above the largest that the schema allows at `path`."""
+    bounds = list(_bounds(field_at(model, path)))
+    return any(
+        (isinstance(bound, Le) and value > bound.le)  # type: ignore[operator]
+        or (isinstance(bound, Lt) and value >= bound.lt)  # type: ignore[operator]
+        for bound in bounds
+    )
+
+
+def _limits(field: FieldInfo) -> Iterator[str]:
+    """Yield the limits of a field in words, such as ">= 0"."""
+    for bound in _bounds(field):
+        yield f"{_SIGNS[type(bound)]} {getattr(bound, type(bound).__name__.lower())}"
+
+
+def _bounds(part: Any) -> Iterator[Ge | Gt | Le | Lt]:
+    """Yield the limits in a field or an annotation."""
     if isinstance(part, FieldInfo):
         inner = (*part.metadata, part.annotation)
     else:
         inner = (*getattr(part, "__metadata__", ()), *get_args(part))
-    if type(part) in _SIGNS:
-        yield f"{_SIGNS[type(part)]} {getattr(part, type(part).__name__.lower())}"
+    if isinstance(part, Ge | Gt | Le | Lt):
+        yield part
     for item in inner:
-        yield from _limits(item)
+        yield from _bounds(item)
 
 
 def _unit(field: FieldInfo) -> str:

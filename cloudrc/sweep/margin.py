@@ -14,7 +14,8 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args, get_origin
 from cloudrc.advice import simulate_ages
 from cloudrc.config.document import child
 from cloudrc.config.load import ResolvedExperiment
-from cloudrc.config.schema import COMMAND_AGE_MS
+from cloudrc.config.problems import exceeds, expectation
+from cloudrc.config.schema import COMMAND_AGE_MS, Experiment
 from cloudrc.errors import BadInputError
 
 SLACK = 0.1
@@ -94,13 +95,25 @@ def bisect(works: Works, yes: int, no: int) -> tuple[int, int]:
     return yes, no
 
 
+def check_largest(key: str, largest: float) -> None:
+    """Raise a BadInputError if the schema allows no value of `key` as `largest` [any unit]."""
+    path = tuple(_one_way(key).split("."))
+    if exceeds(Experiment, path, largest):
+        raise BadInputError(f"--max {largest:g}: {key} {expectation(Experiment, path)}")
+
+
+def _one_way(key: str) -> str:
+    """Return the uplink's key for a key of both directions of the link."""
+    return key.replace("link.both.", "link.uplink.")
+
+
 def present_value(experiment: ResolvedExperiment, key: str) -> int | float | None:
     """Return the present value of a key; None if it is null or does not exist.
 
     Raises:
         BadInputError: If the value is no number, or if only some numbers are allowed.
     """
-    names = key.replace("link.both.", "link.uplink.").split(".")
+    names = _one_way(key).split(".")
     value: Any = experiment.model_dump(mode="json")
     for name in names:
         value = child(value, name)
