@@ -55,6 +55,7 @@ def execute(options: argparse.Namespace) -> int:
         return _new(options.folder)
     if not options.folder.is_dir():
         raise BadInputError(f"{options.folder}: no such folder; 'cloudrc class new' makes one")
+    _refuse_other_folder(options)
     require("a check", ("world",))
     interrupt_on_signals()
     rows = check(options.folder.resolve())
@@ -74,6 +75,19 @@ def execute(options: argparse.Namespace) -> int:
     text = f"{table(cells, right=(2,))}\n\nscore {score:g} of {of}"
     print_result(options.output, {"score": score, "max_score": of, "checks": rows}, text)
     return 0
+
+
+def _refuse_other_folder(options: argparse.Namespace) -> None:
+    """Raise a BadInputError if a folder has none of the files, except for a hand-in at Gradescope.
+
+    Gradescope shows results only, so that a hand-in without the files has to get 0 points there.
+    """
+    from cloudrc.exercise.hand_in import FILES
+
+    names = FILES.values()
+    if options.output != "gradescope" and not any((options.folder / n).exists() for n in names):
+        text = f"has none of {', '.join(names)}; name the folder that 'cloudrc class new' made"
+        raise BadInputError(f"{options.folder}: {text}")
 
 
 def _new(folder: Path) -> int:

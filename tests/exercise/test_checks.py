@@ -209,3 +209,5 @@ def test_files_are_not_overwritten_and_a_folder_must_exist(tmp_path, refused):
     refused("class new", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["controller.py"]
     refused("class check", tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    assert "has none of delay_estimator.py" in refused("class check", tmp_path / "empty")
