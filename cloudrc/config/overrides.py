@@ -193,6 +193,9 @@ def _complete(
     # Check the defaults as `build_plugin` will do.
     checked = model.model_validate_json(json.dumps(values))
     plugin = plugins.load(kind, name, **dict(checked))
+    if kind != "estimators":
+        with plugins.refuse_failure(f"{path[-1]} {name!r}: its reset() failed"):
+            plugin.reset()
     if kind == "predictors" and document.get("cloud", "plan_s"):
         _check_model(plugin, name)
     return values

@@ -80,6 +80,8 @@ def test_parameters_are_checked_against_build(share, setting, reason):
          "cannot be built: CancelledError"),
         ("def build():\n    return build()", "cannot be built: RecursionError: "),
         ("def build(): ...", "build() returned NoneType, which has no method predict()"),
+        ("class A:\n    def reset(self): 1 / 0\n    predict = reset\ndef build(): return A()",
+         "its reset() failed: ZeroDivisionError"),
         ("def build(share=object()): ...", "has a default that YAML cannot contain: "),
         ("class A: ...\ndef build(a: A = None): ...", "must be an object of a class, which YAML"),
     ],
