@@ -48,7 +48,11 @@ def read_run(folder: Path) -> tuple[Recording, ResolvedExperiment, Run]:
     recording = before or merge(folder / "world.mcap", folder / "cloud.mcap")
     whole = _is_of_whole_recording(folder / "report.json")
     for lack in _lacking(recording, config, whole=whole):
-        raise BadInputError(f"{merged}: {lack}; no report is written")
+        text = f"{merged}: {lack}; no report is written"
+        if lack == recording.lacking and "damaged" in lack:
+            damaged = merged if before else folder / f"{lack.partition(':')[0]}.mcap"
+            text += f"; to copy what is readable: cloudrc recover {damaged}"
+        raise BadInputError(text)
     run = _read_facts(recording)
     if before is None:
         run = replace(run, interrupted=True)  # the command was killed before it wrote mission.mcap

@@ -73,6 +73,12 @@ def recorded(*, more=0, config=b""):
     return change
 
 
+def damage(source, target):
+    data = bytearray(source.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    target.write_bytes(data)
+
+
 OTHER = b"seed: 2\nmission: pipes\n"
 
 
@@ -85,6 +91,7 @@ OTHER = b"seed: 2\nmission: pipes\n"
         ),
         (filtered(rename=lambda topic: f"/r1{topic}"), "does not record: /r1/cmd_vel, "),
         (cut, "cut short: .* but report.json describes the whole"),
+        (damage, "damaged .*: cloudrc recover .*mission.mcap"),
         (recorded(more=40), "on /ground_truth that are not later than the row before"),
         (recorded(config=OTHER), "is the recording of an experiment with other values for: "),
         (lambda source, target: target.write_bytes(b"PK"), "is not an MCAP file"),
