@@ -329,7 +329,7 @@ def _record_virtual(
     from cloudrc.robots.pelican.native.robot import usable
     from cloudrc.source import code_hash
 
-    store, interrupted = RecordStore(), False
+    store, interrupted, see = RecordStore(), False, _interruptible(see)
     # Record during the flight, so that the recording is kept if the run or its report fails.
     with McapWriter(folder / "mission.mcap", clock="world", code=code_hash()) as writer:
         at_start = attachments(folder)  # the experiment, also for a copy that is cut short
@@ -337,7 +337,6 @@ def _record_virtual(
             writer.attach(name, data)
 
         def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
-            raise_if_interrupted()  # a plug-in may have caught the exception
             writer.write(heapq.merge(from_world, from_cloud, key=attrgetter("stamp_ns")))
             store.add(from_world, from_cloud)
             see(from_cloud)
@@ -372,6 +371,16 @@ def _prepare(experiment: ResolvedExperiment, folder: Path) -> None:
     prepare_link(folder / LINK_FOLDER, experiment)
 
 
+def _interruptible(see: See) -> See:
+    """Return a function that first looks for a signal: a library may have caught the exception."""
+
+    def look(records: list[Record]) -> None:
+        raise_if_interrupted()
+        see(records)
+
+    return look
+
+
 @contextlib.contextmanager
 def _record_local(
     experiment: ResolvedExperiment,
@@ -393,7 +402,7 @@ def _record_local(
     from cloudrc.robots.pelican.native.library import library
 
     _prepare(experiment, folder)
-    local = LocalRun(folder, see, session=session)
+    local = LocalRun(folder, _interruptible(see), session=session)
     broken, interrupted = None, True
     try:
         local.fly(inf if session else flight_limit(experiment))

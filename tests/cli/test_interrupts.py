@@ -12,8 +12,10 @@ import sys
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Annotated
 
 import pytest
+from pydantic import Discriminator, Tag, create_model
 
 from cloudrc.cli import interrupts, run, sweep_run
 from cloudrc.cli.interrupts import interrupt_on_signals, is_interrupted
@@ -59,6 +61,21 @@ def test_a_signal_during_an_import_interrupts_after_the_import(number, make_modu
     module = importlib.import_module(make_module(number))
     assert module.ended
     assert is_interrupted()
+    with pytest.raises(KeyboardInterrupt):
+        time.sleep(60.0)
+
+
+def test_a_signal_in_a_function_that_pydantic_calls_interrupts_after_the_call():
+    """Pydantic turns an exception of a discriminator into a warning."""
+
+    def kind(value):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return "whole"
+
+    either = Annotated[int, Tag("whole")] | Annotated[float, Tag("part")]
+    model = create_model("Sample", value=(Annotated[either, Discriminator(kind)], 0))
+    interrupt_on_signals()
+    assert model().model_dump() == {"value": 0}
     with pytest.raises(KeyboardInterrupt):
         time.sleep(60.0)
 
