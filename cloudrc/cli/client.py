@@ -43,6 +43,11 @@ FOREIGN = (
     " the path of a proxy: --api http://HOST:PORT/PATH"
 )
 """What to do if the answer is not from teleop."""
+SOCKET_GONE = (
+    "its socket file is gone; if the flight goes on, stop it with Ctrl-C in its terminal "
+    "or, if it is a session, with 'cloudrc down'"
+)
+"""Says how to stop a robot whose API nobody can reach any more."""
 UNIX = "unix:"
 VARIABLE = "CLOUDRC_TOKEN_FILE"
 
@@ -131,8 +136,11 @@ class Api:
                     raise _refusal(answer, self.place, with_token=bool(token))
                 yield answer
             except (OSError, ValueError, http.client.HTTPException) as error:
+                text = f"the API at {self.url} does not answer"
+                if isinstance(error, FileNotFoundError):  # the flight is over, or goes on without
+                    raise UnreachableError(f"{text}: {SOCKET_GONE}") from None
                 why = getattr(error, "strerror", None) or error
-                raise UnreachableError(f"the API at {self.url} does not answer ({why})") from None
+                raise UnreachableError(f"{text} ({why})") from None
 
     def _read(self, answer: http.client.HTTPResponse) -> Any:
         """Decode the JSON of an answer; raise an ApiError if it is none."""

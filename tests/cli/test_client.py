@@ -83,3 +83,9 @@ def test_a_proxy_whose_server_is_away_is_worth_waiting_for(proxy):
     answers[STATE] = 502, "text/html", PAGE, {}
     with pytest.raises(UnreachableError, match="the API answered 502 Bad Gateway"):
         Api(url).get(STATE)
+
+
+def test_who_finds_no_socket_learns_how_to_stop_the_robot_without_it(tmp_path):
+    """Somebody may have removed the folder with the sockets."""
+    with pytest.raises(UnreachableError, match="'cloudrc down'"):
+        Api(f"unix:{tmp_path}/gone.sock").post("/v1/estop")
