@@ -23,7 +23,7 @@ from cloudrc.cli.cluster_flags import (
 )
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.find_run import RUNS
-from cloudrc.cli.interrupts import interrupt_on_signals, raise_if_interrupted
+from cloudrc.cli.interrupts import interrupt_on_signals, is_interrupted, raise_if_interrupted
 from cloudrc.cli.output import (
     escape,
     is_live,
@@ -183,6 +183,8 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
     try:
         report = flight(folder)
     except (CloudrcError, KeyboardInterrupt) as error:
+        if isinstance(error, BadInputError) and is_interrupted():
+            error = KeyboardInterrupt()  # a library has converted the exception
         if in_cluster:  # the folder stays empty until the mission has flown
             with contextlib.suppress(OSError):
                 folder.rmdir()
@@ -191,7 +193,7 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
             if isinstance(error, KeyboardInterrupt):
                 text += f"; 'cloudrc report {folder}' writes its report"
             print_line(text, sys.stderr)
-        raise
+        raise error
     finally:
         if in_cluster and options.out is None and folder.exists():
             point_to(folder, "latest")

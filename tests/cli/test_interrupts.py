@@ -21,6 +21,7 @@ from cloudrc.cli import interrupts, run, sweep_run
 from cloudrc.cli.interrupts import interrupt_on_signals, is_interrupted
 from cloudrc.cli.pool import isolated_start, map_in_order, take_each
 from cloudrc.config.load import load_experiment
+from cloudrc.errors import BadInputError
 from cloudrc.sweep.plan import pack, read_plan
 from cloudrc.sweep.store import read_rows
 from tests.sweep.conftest import write_sweep
@@ -172,6 +173,19 @@ def test_a_flight_ends_after_a_signal_that_a_plugin_caught(tmp_path, monkeypatch
     experiment = load_experiment("hover")
     with run._record_virtual(experiment, tmp_path, lambda records: None) as (_, _, facts):
         assert facts.interrupted
+
+
+def test_a_signal_that_a_library_turned_into_an_error_of_the_report_interrupts(monkeypatch, call):
+    """Matplotlib turns the exception into a ValueError."""
+
+    def fly(folder):
+        with suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGTERM)
+        raise BadInputError("the recorded values cannot be drawn")
+
+    monkeypatch.setattr(run, "_local_flight", lambda *words: fly)
+    error = call("run hover --mode virtual --out r", code=130).err
+    assert error == "the recording is in r; 'cloudrc report r' writes its report\n"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
