@@ -51,7 +51,7 @@ shows the value in the profile's file, which Kubernetes has updated by then."""
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     add = parser.add_argument
-    about = "folder of the flying run (default: ./runs/latest, else the only one), or a release"
+    about = "folder of the flying run (default: the only run in flight), or a release"
     add("run", nargs="?", type=Path, metavar="RUN|RELEASE", help=about)
     port = "port of the page on 127.0.0.1 (default: any free port)"
     add("--port", type=whole_number(0, 65_535), default=0, metavar="N", help=port)
