@@ -132,7 +132,8 @@ def of_sweep(folder: Path, a: str, b: str) -> Found:
     ]
     found = [(axis, x, y) for axis, x in sides[0] for other, y in sides[1] if axis == other]
     if len(found) != 1 or found[0][1] == found[0][2]:
-        known = "; ".join(f"{axis}: {', '.join(map(str, values))}" for axis, values in axes.items())
+        listed = [f"{axis}: {', '.join(map(str, values))}" for axis, values in axes.items()]
+        known = "; ".join(listed) or "none"
         raise BadInputError(
             f"{folder}: A and B must be two values of one axis, VALUE or AXIS=VALUE; axes: {known}"
         )

@@ -85,7 +85,11 @@ def _choose(
     axis, the axis of the lines (None if no axis is left), and the other axes.
     """
     values = values_of(rows)
-    for axis in (x, by, *([] if values else ["of any name"])):
+    if not values:
+        raise BadInputError(
+            "this sweep has no axis; give its file a grid, or see its metrics in table.csv"
+        )
+    for axis in (x, by):
         if axis is not None and axis not in values:
             raise BadInputError(unknown_name_text("axis", axis, sorted(values)))
     free = [axis for axis in values if len(values[axis]) > 1 and axis != by] or list(values)
