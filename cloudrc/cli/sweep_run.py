@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> int:
     plan, folder, (shard, count) = _plan(options), options.out, options.shard or (None, 1)
     if options.shard:
         folder.mkdir(parents=True, exist_ok=True)  # another shard may be faster
-    elif folder is None or not (folder / store.FILE).is_file():
+    elif folder is None or not store.is_begun(folder):
         folder = new_folder(folder, f"sweep-{options.file.stem}", "latest-sweep")
     with lock_folder(folder, shard, count) as warning:
         if warning:

@@ -14,6 +14,8 @@ from pathlib import Path
 
 from cloudrc.errors import BadInputError
 
+LOCK = ".lock"
+"""File that each command locks; the names of further locks begin so."""
 ALONE, TOGETHER = fcntl.LOCK_EX | fcntl.LOCK_NB, fcntl.LOCK_SH | fcntl.LOCK_NB
 
 
@@ -40,7 +42,7 @@ def lock_folder(folder: Path, shard: int | None = None, count: int = 1) -> Itera
                 text = f"{folder}: its file system has no locks ({error.strerror}); do not start "
                 warnings.append(f"{text}the same sweep or shard twice at the same time")
 
-        lock(".lock", TOGETHER if shard else ALONE, "another command flies")
+        lock(LOCK, TOGETHER if shard else ALONE, "another command flies")
         if shard:
             lock(_name(shard, count), ALONE, f"another command flies shard {shard} of {count}")
             for other in folder.glob(_name("*", "*")):  # has some of our flights
@@ -50,4 +52,4 @@ def lock_folder(folder: Path, shard: int | None = None, count: int = 1) -> Itera
 
 
 def _name(shard: int | str, count: int | str) -> str:
-    return f".lock-{shard}-of-{count}"
+    return f"{LOCK}-{shard}-of-{count}"

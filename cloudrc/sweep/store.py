@@ -26,6 +26,7 @@ from cloudrc.files import open_file, write_atomically
 from cloudrc.renamed import NEW_NAMES
 from cloudrc.source import code_hash
 from cloudrc.sweep.flight import Row, units
+from cloudrc.sweep.lock import LOCK
 from cloudrc.sweep.plan import Plan
 
 FILE, SUMMARY = "sweep.yaml", "sweep.json"
@@ -121,6 +122,17 @@ def append_rows(folder: Path, shard: int | None) -> Iterator[Callable[[Row], Non
                 raise
 
         yield append
+
+
+def is_begun(folder: Path) -> bool:
+    """Return whether a folder is that of a sweep.
+
+    Before a command writes the file of the sweep, it has locked the folder. So a folder with a lock
+    alone also counts.
+    """
+    names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
+    is_locked = all(name.startswith((LOCK, f".{FILE}.")) for name in names)
+    return FILE in names or bool(names and is_locked)
 
 
 def begin(folder: Path, plan: Plan, *, is_shared: bool = False) -> dict[str, Row]:

@@ -78,6 +78,22 @@ def test_a_sweep_goes_on_where_it_ended(write_sweep, monkeypatch, call):
     assert begun == [1, 2, 2, 3]
 
 
+def test_a_folder_that_was_only_locked_is_still_free(write_sweep, call, refused):
+    """Ctrl-C came before the file of the sweep was written."""
+    with lock_folder(Path()):
+        pass
+    Path("a").mkdir()
+    Path(".lock").rename("a/.lock")
+    file = write_sweep(ONE)
+    with lock_folder(Path("a")):
+        assert "another command flies into it now" in refused("sweep run --out a", file)
+    call("sweep run --out a", file)
+    Path("b").mkdir()
+    Path("b/.lock").touch()
+    Path("b/notes.txt").touch()
+    assert "already exists" in refused("sweep run --out b", file)
+
+
 def test_the_same_sweep_is_not_flown_twice_at_once(write_sweep, call, refused):
     path = write_sweep(ONE)
     call("sweep run --out grid", path)
