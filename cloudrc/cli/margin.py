@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Callable, Iterable
 from contextlib import closing
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -177,15 +178,15 @@ class Trials:
         from cloudrc.sweep.stability import SCENE, SMALL
 
         options = self._options
-        if options.output == "table":
-            facts = {"small": SMALL, "scene": SCENE, "experiment": options.experiment}
-            text = QUESTIONS[question].format(**facts)
-            print_or_drop(escape(f"{text}, seeds 1 to {options.seeds}"))
+        stream = sys.stdout if options.output == "table" else sys.stderr
+        facts = {"small": SMALL, "scene": SCENE, "experiment": options.experiment}
+        text = QUESTIONS[question].format(**facts)
+        print_or_drop(escape(f"{text}, seeds 1 to {options.seeds}"), stream)
 
         def works(number: int) -> bool:
             trial = self._try(question, number)
-            if options.output == "table":
-                print_or_drop(escape(f"  {self.name(number):<26}{_result(question, trial)}"))
+            line = f"  {self.name(number):<26}{_result(question, trial)}"
+            print_or_drop(escape(line), stream)
             return bool(trial[question])
 
         return search(works, self.present, self.bottom, self.top)

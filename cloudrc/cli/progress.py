@@ -28,8 +28,10 @@ if TYPE_CHECKING:
     from cloudrc.sweep.flight import Row
 
 ENDINGS = ("done", "cancelled", "timed_out")
-PLAIN_PERIOD = 30.0
-"""Time between two lines of progress of a sweep that is not shown on a terminal [s]."""
+FIRST_WAIT = 4.0
+"""Time until the first line of progress on a stream that is no terminal [s]."""
+FLIGHTS_PERIOD, CHECK_PERIOD = 30.0, 10.0
+"""Time between two further lines [s]: while flights are flown, and while points are checked."""
 REPORT_AFTER = 1.0
 """Time without a record after the end of a mission, from which on the report is written [s]."""
 PLAN_WAIT = 1.0
@@ -133,14 +135,14 @@ def _joined(cells: Iterable[str]) -> str:
 class CountView:
     """Shows how much of a long work is done: on a terminal in a status line, else in some lines."""
 
-    def __init__(self, stream: TextIO, total: int, unit: str, wait: float) -> None:
+    def __init__(self, stream: TextIO, total: int, unit: str, period: float) -> None:
         """Set the amount of work `total` and its `unit`, such as "flights".
 
-        After `wait` [s], and then every `PLAIN_PERIOD`, print a line if the stream is no terminal.
+        If the stream is no terminal, print a line after `FIRST_WAIT`, and then every `period` [s].
         """
-        self._stream, self._total, self._unit = stream, total, unit
+        self._stream, self._total, self._unit, self._period = stream, total, unit, period
         self._began = monotonic()
-        self._next = self._began + wait
+        self._next = self._began + FIRST_WAIT
         self._status = Console(file=stream).status(f"0/{total}") if is_live(stream) else None
         if self._status:
             self._status.start()
@@ -154,7 +156,7 @@ class CountView:
         if self._status:
             self._status.update(line)
         elif monotonic() >= self._next:
-            self._next = monotonic() + PLAIN_PERIOD
+            self._next = monotonic() + self._period
             print_or_drop(line, self._stream)
 
     def close(self) -> None:
@@ -178,7 +180,7 @@ class PlanView:
         if not self._view:
             text = f"checks {points:,} points x {seeds:,} seeds: {points * seeds:,} flights"
             print_or_drop(text, self._stream)
-            self._view.append(CountView(self._stream, points, "points", PLAIN_PERIOD))
+            self._view.append(CountView(self._stream, points, "points", CHECK_PERIOD))
         self._view[0].count(done)
 
     def close(self) -> None:
@@ -193,15 +195,42 @@ class SweepView(CountView):
     def __init__(self, stream: TextIO, head: str, total: int) -> None:
         """Print the headline `head`; set `total`, the number of flights to fly."""
         print_or_drop(escape(head), stream)
-        super().__init__(stream, total, "flights", PLAIN_PERIOD)
+        super().__init__(stream, total, "flights", FLIGHTS_PERIOD)
         self._done, self._failed, self._told = 0, 0, set[str]()
 
     def see(self, row: Row) -> None:
-        """Count a finished flight; print its failure or note if it is the first of its verdict."""
+        """Count a finished flight; print its failure if it is the first of its verdict.
+
+        Print why a metric has no value once per text.
+        """
         self._done += 1
         self._failed += row["verdict"] != "success"
-        if row["text"] and row["verdict"] not in self._told:
-            self._told.add(row["verdict"])
+        kind = row["verdict"] if row["failures"] else row["text"]
+        if row["text"] and kind not in self._told:
+            self._told.add(kind)
             text = f"{row['key']}: {row['verdict']}: {row['text']}"
             print_or_drop(escape(text), self._stream)
         self.count(self._done, f", {self._failed} failed" if self._failed else "")
+
+
+class SeedsView:
+    """Prints a line per flight with its seed, its verdict and why it failed."""
+
+    def __init__(self, stream: TextIO, head: str, total: int) -> None:
+        """Print the headline `head`; set `total`, the number of flights to fly."""
+        print_or_drop(escape(head), stream)
+        self._stream, self._total = stream, total
+        self._done, self._told = 0, set[str]()
+
+    def see(self, row: Row) -> None:
+        """Print the line of a finished flight; say why a metric has no value once per text."""
+        self._done += 1
+        count = f"{self._done}/{self._total}"
+        line = f"{count:>7}  seed {row['seed']}  {row['verdict']}"
+        if row["failures"] or row["text"] not in ("", *self._told):
+            line += f": {row['text']}"
+        self._told.add(row["text"])
+        print_or_drop(escape(line), self._stream)
+
+    def close(self) -> None:
+        """Do nothing: each line is final."""

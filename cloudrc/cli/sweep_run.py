@@ -28,7 +28,7 @@ from cloudrc.cli.output import (
     table,
 )
 from cloudrc.cli.pool import map_in_order, take_each
-from cloudrc.cli.progress import PlanView, SweepView
+from cloudrc.cli.progress import PlanView, SeedsView, SweepView
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.cli.run import fly, load, new_folder, refuse_seed, warn
 from cloudrc.cluster import batch
@@ -360,20 +360,20 @@ def fly_seeds(options: argparse.Namespace) -> int:
     file = {"experiment": options.experiment, "set": settings, "seeds": options.seeds}
     (folder / store.FILE).write_text(write_yaml(file | {"folder": str(Path.cwd())}), "utf-8")
     plan, seen = read_plan(folder / store.FILE), list[Row]()
-    for_people, work = options.output == "table", [*plan.flights.values()]
+    work = [*plan.flights.values()]
+    head = f"{name}: mode virtual, seeds 1 to {options.seeds}, link {experiment.link.profile}"
+    for_people = options.output == "table"
+    make, stream = (SeedsView, sys.stdout) if for_people else (SweepView, sys.stderr)
 
     def see(row: Row) -> None:
         seen.append(row)
-        failure = f": {row['text']}" if row["failures"] else ""
-        count = f"{len(seen)}/{len(work)}"
-        line = f"{count:>7}  seed {row['seed']}  {row['verdict']}{failure}"
-        if for_people or sys.stderr.isatty():
-            print_or_drop(escape(line), sys.stdout if for_people else sys.stderr)
+        view.see(row)
         if not any("traceback" in earlier for earlier in seen[:-1]):
             print_traceback(options, row)
 
-    flown = map_in_order(fly_seed, work, len(work))
-    _, stopped, code = _keep(flown, folder, plan, None, store.begin(folder, plan), see)
+    with closing(make(stream, head, len(work))) as view:
+        flown = map_in_order(fly_seed, work, len(work))
+        _, stopped, code = _keep(flown, folder, plan, None, store.begin(folder, plan), see)
     if stopped:
         text = f"\ncloudrc: {stopped}: {len(seen)} of {len(work)} seeds are finished"
         print_or_drop(text, sys.stderr)
@@ -381,7 +381,7 @@ def fly_seeds(options: argparse.Namespace) -> int:
         **{"experiment": name, "mode": "virtual", "interrupted": bool(stopped)},
         "overrides": list(options.set),
         **summarise(seen, store.read_summary(folder)["units"]),
-        "runs": [{key: row[key] for key in ("seed", "verdict", "key")} for row in seen],
+        "runs": [{key: row[key] for key in ("seed", "verdict", "key", "text")} for row in seen],
     }
     text = f"\n{as_table(document)}\n\n{folder / store.SUMMARY}"
     print_result(options.output, document, text)

@@ -18,7 +18,7 @@ ERROR = "error"
 """Verdict of a flight that raised an exception, and code of its only failure."""
 Row: TypeAlias = dict[str, Any]
 """Result of a flight: `verdict`; `failures` (codes, the earliest first); `text` (the first failure,
-or why a metric has no value); `numbers` (metric -> value); `records_sha256`; `physics_steps`, the
+and why a metric has no value); `numbers` (metric -> value); `records_sha256`; `physics_steps`, the
 language of the physics steps and a hash of their machine code; and, if a plug-in failed,
 `traceback`. A row of a sweep also has `key`, `point`, `seed` and `code`, a hash of the sources."""
 
@@ -54,7 +54,7 @@ def measure(experiment: ResolvedExperiment) -> Row:
     return {
         "verdict": found.verdict.outcome,
         "failures": [failure.code for failure in failures],
-        "text": failures[0].text if failures else next(notes, ""),
+        "text": "; ".join([*(failure.text for failure in failures[:1]), *notes]),
         "numbers": {name: number.value for name, number in found.numbers.items()},
         "records_sha256": found.records_sha256,
         "physics_steps": assembly.step_code(experiment),

@@ -8,8 +8,9 @@ import sys
 import pytest
 import yaml
 
+from cloudrc.cli import progress
 from cloudrc.cli.output import format_number, is_live, paint, table
-from cloudrc.cli.progress import FlightView
+from cloudrc.cli.progress import CountView, FlightView
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.records import Fault, GuardChange, MissionEvent, TelemetrySent
 
@@ -53,6 +54,17 @@ def test_yaml_has_the_content_of_json(line, call):
     document = json.loads(call(f"{line} -o json").out)
     assert yaml.safe_load(call(f"{line} -o yaml").out) == document
     assert document["schemaVersion"] == 1
+
+
+def test_a_file_gets_the_first_rate_soon_and_then_one_per_period(monkeypatch):
+    now, file = [0.0], io.StringIO()
+    monkeypatch.setattr(progress, "monotonic", lambda: now[0])
+    view = CountView(file, 200, "flights", 30.0)
+    for done in range(1, 101):
+        now[0] = float(done)
+        view.count(done)
+    lines = [line.split("  ")[0] for line in file.getvalue().splitlines()]
+    assert lines == ["4/200", "34/200", "64/200", "94/200"]
 
 
 def test_events_are_plain_lines_or_wrapped_on_a_terminal():

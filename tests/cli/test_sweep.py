@@ -470,7 +470,8 @@ def test_many_seeds_become_one_table_and_a_sweep(folder, call):
     line = "run steps --seeds 2 --set criteria.contact=true"
     lines = call(line, *SHORT, code=1).out.splitlines()
     assert lines[-1] == "runs/steps-virtual-2seeds-1/sweep.json"
-    assert lines[0].startswith("    1/2  seed 1  failure: the arm never touched the board")
+    assert lines[0] == "steps: mode virtual, seeds 1 to 2, link paper-p3"
+    assert lines[1].startswith("    1/2  seed 1  failure: the arm never touched the board")
     assert "done 0/2" in lines
     assert any(line.startswith("prediction_error_rms") for line in lines)
     assert not (folder / "runs/latest").exists()
@@ -487,6 +488,31 @@ def test_programs_get_a_document(call):
     assert (document["done"], document["count"], document["interrupted"]) == (1, 1, False)
     assert document["overrides"] == list(KEYS)
     assert [(run["seed"], run["verdict"]) for run in document["runs"]] == [(1, "success")]
+
+
+@pytest.fixture
+def broken_metrics(folder):
+    """Two metrics that fail, as a setting of an experiment."""
+    for name, ends in (("met_a", "raise SystemExit(0)"), ("met_b", "1 / 0")):
+        text = f'"""A metric."""\nUNIT = "1"\ndef measure(flight):\n    {ends}\n'
+        (folder / f"{name}.py").write_text(text)
+    return ["./met_a.py", "./met_b.py"]
+
+
+def test_each_metric_that_fails_is_told_once_and_to_programs(broken_metrics, call):
+    flags = "--seeds", "2", *SHORT, f"--set=report.metrics={json.dumps(broken_metrics)}"
+    first, second = call("run steps --out a", *flags).out.splitlines()[1:3]
+    assert "success: metric met_a failed: SystemExit: 0" in first
+    assert "; metric met_b failed: ZeroDivisionError" in first
+    assert second == "    2/2  seed 2  success"
+    said = call("run steps --out b -o json", *flags)
+    assert all("met_a failed" in run["text"] for run in json.loads(said.out)["runs"])
+    assert said.err.count("met_a failed") == 1
+
+
+def test_a_sweep_tells_a_metric_that_fails_once(broken_metrics, write_sweep, call):
+    file = write_sweep(ONE, seeds=2, set={"report.metrics": broken_metrics})
+    assert call("sweep run --out grid", file).out.count("metric met_a failed: SystemExit") == 1
 
 
 def test_numbers_may_be_missing_and_failed_plugins_do_not_count():
@@ -510,6 +536,7 @@ def test_a_median_with_flights_that_failed_is_marked():
 def test_a_signal_ends_a_sweep_at_once(folder):
     command = [sys.executable, "-m", "cloudrc", "run", "paper", "--seeds", "40", "--out", "sweep"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process.stdout.readline()
     assert "1/40" in process.stdout.readline()
     process.terminate()
     _, errors = process.communicate(timeout=20)  # returns only once no worker holds the pipes
