@@ -464,6 +464,7 @@ def _run_job(options: argparse.Namespace) -> int:
     """Create the Job of a mission, follow its log, and return the exit code of the Job."""
     interrupt_on_signals()
     mission, release = read_mission(options.mission, options.name), _release(options)
+    from cloudrc.cluster.client import NoAnswerError
     from cloudrc.cluster.flight import wait_ready
     from cloudrc.cluster.jobs import JobGoneError, follow, run_job
     from cloudrc.cluster.pods import find_deployment
@@ -479,6 +480,9 @@ def _run_job(options: argparse.Namespace) -> int:
         words, code = settle_mission(release, gone.key, str(gone))
         print_line(words)
         return code
+    except NoAnswerError as error:
+        log = f"{release.kubectl} logs --follow job/{job}"
+        raise NoAnswerError(f"{error}; Job {job} goes on without this command: {log}") from None
     except KeyboardInterrupt:
         remedy = _cancelling_command(release, job)
         print_line(f"Job {job} is still running; cancel its mission: {remedy}", sys.stderr)

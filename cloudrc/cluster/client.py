@@ -63,6 +63,10 @@ class NotFoundError(ClusterError):
     """Report that the cluster does not have an object."""
 
 
+class NoAnswerError(ClusterError):
+    """Report that the API server does not answer; what runs in the cluster goes on."""
+
+
 @dataclass(frozen=True)
 class Release:
     """One release of the chart: one robot and its cloud."""
@@ -203,7 +207,7 @@ def explain_errors(doing: str, where: str) -> Iterator[None]:
         kind = NotFoundError if error.status == 404 else ClusterError
         raise kind(f"cannot {doing} {where}: {_refusal(error, doing)}") from error
     except (HTTPError, OSError) as error:
-        raise ClusterError(
+        raise NoAnswerError(
             f"cannot {doing} {where}: the API server does not answer ({_root(error)}); "
             "is the cluster up? ask it: kubectl cluster-info"
         ) from error

@@ -51,6 +51,8 @@ LOOK_PERIOD = 1.0
 """Time between two requests for the state of a Job and its pods [s]."""
 OVERLAP = 10
 """Age of the oldest lines that are read from the log of a running pod [s]."""
+NO_LOG = "unable to retrieve container logs for "
+"""What the kubelet sends in place of the log of a container that is gone."""
 DELETE_LIMIT = 40.0
 """Time limit for a deleted Job to end [s]; Kubernetes gives the Job's pods 30 s."""
 
@@ -321,7 +323,8 @@ class JobReader:
     def _log_of(self, pod: Any, container: str, is_done: bool) -> str:
         try:
             last = None if is_done else OVERLAP
-            return pod_log(self._release, pod.metadata.name, container, last)
+            log = pod_log(self._release, pod.metadata.name, container, last)
+            return "" if log.startswith(NO_LOG) else log
         except ClusterError as error:  # the pod may be gone
             self._tell_once(str(error) if is_done else "")
             return ""

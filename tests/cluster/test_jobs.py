@@ -95,6 +95,16 @@ def test_follow_writes_each_line_once_and_returns_the_verdict(running, release):
     assert ended == (1, "the verdict")
 
 
+def test_an_evicted_pod_without_a_log_adds_no_line(running, release):
+    run_job(release, MISSION, name="first")
+    running.start_pod("first", state=terminated(0, "done"))
+    running.logs["first-x"] = "unable to retrieve container logs for containerd://a3aa5b"
+    running.end("first", "Complete")
+    lines: list[str] = []
+    assert follow(release, "first", lines.append).exit_code == 0
+    assert lines == []
+
+
 def test_follow_ends_when_the_pod_cannot_run(running, release):
     run_job(release, MISSION, name="first")
     about = {"involvedObject": {"uid": running.get("jobs", "first")["metadata"]["uid"]}}

@@ -9,6 +9,7 @@ import pytest
 from cloudrc.cli import mission as command
 from cloudrc.cli.main import main
 from cloudrc.cluster import jobs
+from cloudrc.cluster.client import NoAnswerError
 from cloudrc.drivers import local
 from tests.cluster.conftest import TOKEN, missions_of, pod, terminated
 
@@ -82,6 +83,15 @@ def test_an_interrupted_run_says_that_the_job_continues(running, call, monkeypat
     said = call("mission run one.yaml", code=130).err
     (job,) = running.jobs()
     assert f"kubectl --namespace=demo delete job {job['metadata']['name']}\n" in said
+
+
+def test_a_run_that_loses_the_api_server_says_that_the_job_continues(running, call, monkeypatch):
+    lost = NoAnswerError("cannot list pods: the API server does not answer")
+    monkeypatch.setattr(jobs, "follow", Mock(side_effect=lost))
+    said = call("mission run one.yaml", code=5).err
+    (job,) = running.jobs()
+    assert "the API server does not answer; Job" in said
+    assert said.endswith(f"kubectl --namespace=demo logs --follow job/{job['metadata']['name']}\n")
 
 
 def test_an_interrupted_run_names_the_mission_of_its_job(running, teleop, call, monkeypatch):

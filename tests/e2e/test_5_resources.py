@@ -5,7 +5,19 @@ import json
 import pytest
 import yaml
 
-from tests.e2e.conftest import CHART, EXAMPLES, NAME, NAMESPACE, cloudrc, helm, metrics, pace, value
+from cloudrc.cluster.flight import wait_ready
+from tests.e2e.conftest import (
+    CHART,
+    EXAMPLES,
+    NAME,
+    NAMESPACE,
+    cloudrc,
+    helm,
+    metrics,
+    pace,
+    place,
+    value,
+)
 
 SHORT = ["--set", "mission.waypoints.0.dwell_s=6"]
 """Setting of `hover` that makes the flight long enough to be throttled."""
@@ -30,6 +42,7 @@ def constrained(installed, values, tmp_path):
 
     yield fly
     helm("upgrade", NAME, str(CHART), f"--values={values}")
+    wait_ready(place(), timeout=120.0)
 
 
 def throttled(component):
