@@ -45,8 +45,8 @@ from cloudrc.messages import (
     Vector,
 )
 from cloudrc.records import CommandApplied, Record, SessionOpened
-from cloudrc.robots.pelican.rotors import STOPPED
-from cloudrc.world.readings import Readings, RotorSpeeds
+from cloudrc.world.onboard import Commands
+from cloudrc.world.readings import Readings
 from cloudrc.world.robot import STEP, STEP_NS, Robot
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -129,6 +129,7 @@ class RobotInvariants:
 
     def __init__(self, robot: Robot, watch: Watch, start_ns: int, honest: bool) -> None:
         self._guard, self._simulator, self._honest = robot.guard, robot.simulator, honest
+        self._stopped = robot.onboard.stopped
         self._watch, self._note, self._limits = watch, watch.note, watch.limits
         self._age_ns = round(watch.limits.command_age_max_ms * 1e6)
         self._plan_ns = round(watch.limits.plan_max_s * 1e9)
@@ -159,7 +160,7 @@ class RobotInvariants:
 
     # Calls of the robot.
 
-    def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
+    def see_step(self, now_ns: int, readings: Readings, commands: Commands) -> None:
         """Implement `Observer.see_step`: check all invariants."""
         steps, was, state = self._simulator.steps, self._was, self._guard.state
         if now_ns != self._next_ns or steps != self._steps + 1:
@@ -168,13 +169,13 @@ class RobotInvariants:
         if state is not was:
             self._check_change(was, state, now_ns)
         self._check_wait(state, now_ns)
-        self._check_rotors(state, readings.velocity, rotor_speeds, now_ns)
+        self._check_rotors(state, readings.velocity, commands, now_ns)
         self._check_fence(state, readings.position, readings.velocity, now_ns)
         if was is TRACK and state is not TRACK:
             self._leave_track(readings, now_ns)
         if state in FLOWN:
-            self._check_flight(state, readings.position, any(rotor_speeds), now_ns)
-        elif any(rotor_speeds):
+            self._check_flight(state, readings.position, any(commands), now_ns)
+        elif any(commands):
             self._note(now_ns, "latch", f"rotors turn in {state.name}")
         if state is LAND:
             self._landed_ns = now_ns
@@ -336,14 +337,14 @@ class RobotInvariants:
         self._seen = len(touches)
 
     def _check_rotors(
-        self, state: GuardState, velocity: Vector, rotor_speeds: RotorSpeeds, now_ns: int
+        self, state: GuardState, velocity: Vector, commands: Commands, now_ns: int
     ) -> None:
         """Check that the rotors stop only on a request, after a collision, or without motion.
 
         Hard braking also commands rotor speeds of 0. Therefore the check looks for the object
-        `STOPPED` itself, which is commanded only to stop the rotors.
+        `Onboard.stopped` itself, which is commanded only to stop the rotors.
         """
-        turns, asked = rotor_speeds is not STOPPED, self._is_asked
+        turns, asked = commands is not self._stopped, self._is_asked
         is_hit = state is ESTOP and self._was is not ESTOP and not asked
         if is_hit and self._honest and not self._just_touched:
             self._note(now_ns, "collision", "stopped by a hit although nothing was touched")

@@ -1,7 +1,7 @@
-"""The interface between the physics and the onboard part: sensor readings and rotor speeds.
+"""The interface between the physics and the onboard part: readings of ideal sensors.
 
-The physics (`simulator`) and the onboard part (`guard`, `sensors`, the robot's controller) exchange
-nothing else.
+The onboard part (`guard`, `sensors`, the robot's controller) sees nothing else of the physics
+(`simulator`).
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ from typing import NamedTuple, TypeAlias
 
 from cloudrc.messages import Quaternion, Vector
 
-RotorSpeeds: TypeAlias = tuple[float, float, float, float]
-"""Speeds of the front, left, back and right rotor [rad/s], >= 0."""
 Axes: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
 _new = tuple.__new__
 

@@ -1,18 +1,17 @@
-"""The robot: in every step, guard and low-level controller turn readings into rotor speeds."""
+"""The robot: in every step, guard and onboard controller turn readings into commands."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
 from cloudrc.messages import Command, GuardState, OperatorRequest
-from cloudrc.robots.pelican.onboard import LowLevel
-from cloudrc.robots.pelican.rotors import STOPPED
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.readings import Readings, RotorSpeeds
+from cloudrc.world.onboard import Commands, Onboard
+from cloudrc.world.readings import Readings
 from cloudrc.world.simulator import Simulator
 
 STEP_NS = 2_000_000
-"""Duration of one step of physics, low-level controller and guard [ns].
+"""Duration of one step of physics, onboard controller and guard [ns].
 Source: docs/reference/plant.md, "Physics step"."""
 STEP = STEP_NS * 1e-9
 """Duration of one step [s]."""
@@ -22,8 +21,8 @@ TRACK = GuardState.TRACK  # looking up a member of an enum is slow
 class Observer(Protocol):
     """Object that a `Robot` informs of its steps and inputs. Times are on world's clock [ns]."""
 
-    def see_step(self, now_ns: int, readings: Readings, rotor_speeds: RotorSpeeds) -> None:
-        """Observe a physics step that begins at `now_ns` with these readings and rotor speeds."""
+    def see_step(self, now_ns: int, readings: Readings, commands: Commands) -> None:
+        """Observe a physics step that begins at `now_ns` with these readings and commands."""
 
     def see_command(self, command: Command, rejection: str | None, now_ns: int) -> None:
         """Observe a command and the guard's answer; `rejection` is None if the guard accepts it."""
@@ -36,36 +35,36 @@ class Observer(Protocol):
 
 
 class Robot:
-    """Runs physics, guard and low-level controller step by step, and informs `observers`."""
+    """Runs physics, guard and onboard controller step by step, and informs `observers`."""
 
-    def __init__(self, simulator: Simulator, low_level: LowLevel, guard: Guard) -> None:
+    def __init__(self, simulator: Simulator, onboard: Onboard, guard: Guard) -> None:
         self.simulator = simulator
+        self.onboard = onboard
         self.guard = guard
         self.observers: list[Observer] = []
-        self._low_level = low_level
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
-        """Reset the robot to its spawn with stopped rotors, and record the reason `cause`."""
+        """Reset the robot to its spawn, stopped, and record the reason `cause`."""
         self.simulator.reset()
-        self._low_level.reset()
+        self.onboard.reset()
         self.guard.put_on_ground(now_ns, cause)
 
     def run(self, tick_ns: int, until_ns: int) -> int:
         """Run steps from `tick_ns` up to `until_ns`; return the time of the next step [ns]."""
-        simulator, guard, low_level = self.simulator, self.guard, self._low_level
+        simulator, guard, onboard = self.simulator, self.guard, self.onboard
         observers = self.observers
         ticks = range(tick_ns, until_ns, STEP_NS)
         for now_ns in ticks:
             readings = simulator.readings
             reference = guard.step(now_ns, readings, STEP)
             if reference is None:
-                low_level.reset()
-                speeds = STOPPED
+                onboard.reset()
+                commands = onboard.stopped
             elif guard.state is TRACK or not guard.brakes:
-                speeds = low_level.update(readings, reference)
+                commands = onboard.update(readings, reference, guard.yaw_rate)
             else:
-                speeds = low_level.brake(readings, reference)
-            simulator.step(speeds)
+                commands = onboard.brake(readings, reference)
+            simulator.step(commands)
             for observer in observers:
-                observer.see_step(now_ns, readings, speeds)
+                observer.see_step(now_ns, readings, commands)
         return tick_ns + len(ticks) * STEP_NS

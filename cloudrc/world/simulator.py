@@ -1,4 +1,4 @@
-"""Simulate the physics: turn commanded rotor speeds into readings and contacts.
+"""Simulate the physics: turn the commands of the actuators into readings and contacts.
 
 The module writes to MuJoCo's arrays with `struct` and memory views. For four elements, this takes a
 quarter of the time of a numpy slice assignment.
@@ -17,9 +17,9 @@ from cloudrc.config.schema import Plant
 from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import Odometry, Vector
 from cloudrc.records import Contact
-from cloudrc.robots.pelican.rotors import STOPPED, Controls, Rotors
+from cloudrc.world.onboard import Actuators, Commands, Inputs
 from cloudrc.world.plant import Wind
-from cloudrc.world.readings import Readings, RotorSpeeds
+from cloudrc.world.readings import Readings
 from cloudrc.world.scene import ROBOT_PREFIX, bodies_of_geoms, compile_model
 
 TOUCH_GAP = 0.1
@@ -29,7 +29,6 @@ CONTACT_CHECK_STEPS = 5
 check takes as long as a step."""
 
 _mj_step = mujoco.mj_step
-_pack_ctrl = Struct("4d").pack_into
 _pack_applied = Struct("6d").pack_into
 _unpack_pose, _unpack_twist = Struct("7d").unpack_from, Struct("6d").unpack_from
 _new = tuple.__new__
@@ -48,7 +47,8 @@ class Simulator:
         tip_force_peak: Largest force on the arm's tip since the last call of `take_tip_force` [N].
         tip_impulse: Integral over time of the force on the tip since that call [N s].
         touches: Contacts that began since the last call of `take_contacts`.
-        tape: Controls of every step since the last reset, for `replay`; None unless a caller sets
+        actuators: Physics of the robot's actuators.
+        tape: Inputs of every step since the last reset, for `replay`; None unless a caller sets
             a list.
     """
 
@@ -58,19 +58,23 @@ class Simulator:
         scene: str = "pipes",
         plant: Plant | None = None,
         wind: Wind | None = None,
+        *,
+        actuators: Actuators,
     ) -> None:
         """Compile `robot` in `scene` (names or paths) and put the robot at its spawn.
 
         `plant` tells how the true robot differs from its model; None: not at all. Without `wind`
-        the air is at rest. Raise a BadInputError if a file is missing or does not fit the onboard
-        controller.
+        the air is at rest. `actuators` are those of the robot. Raise a BadInputError if a file is
+        missing or does not fit the onboard controller.
         """
         self.model = model = compile_model(robot, scene, plant)
         self._wind = wind
         self.dt: float = model.opt.timestep
-        self.tape: list[Controls] | None = None
+        self.tape: list[Inputs] | None = None
         self.data = data = mujoco.MjData(model)
-        self._rotors = Rotors(self.dt)
+        self.actuators = actuators
+        self._inputs: int = model.nu
+        self._pack_ctrl = Struct(f"{model.nu}d").pack_into
 
         self._qpos, self._qvel = memoryview(data.qpos), memoryview(data.qvel)
         self._ctrl, self._applied = memoryview(data.ctrl), memoryview(data.qfrc_applied)
@@ -84,10 +88,10 @@ class Simulator:
         self.reset()
 
     def reset(self) -> None:
-        """Reset the robot to its spawn, at rest, with stopped rotors."""
+        """Reset the robot to its spawn, at rest, with still actuators."""
         mujoco.mj_resetData(self.model, self.data)
         mujoco.mj_forward(self.model, self.data)
-        self._rotors.speeds = STOPPED
+        self.actuators.reset()
         self.steps = self.contacts = 0
         self.tip_force_peak = self.tip_impulse = 0.0
         if self.tape is not None:
@@ -97,20 +101,19 @@ class Simulator:
         self._last_touch: dict[tuple[str, bool], int] = {("floor", False): 0}
         self._readings: Readings | None = None
 
-    def step(self, rotor_speeds: RotorSpeeds) -> None:
-        """Advance by `dt` with these commanded rotor speeds [rad/s], shape (4,).
+    def step(self, commands: Commands) -> None:
+        """Advance by `dt` with these commands to the actuators.
 
-        Thrust and drag use the rotor speeds at the end of the step. The drag uses the velocity at
-        the beginning of the step, relative to the air.
+        The physics uses what the actuators do at the end of the step. The actuators get the
+        readings at the beginning of the step, with the velocity relative to the air.
         """
         before, data, wind = self.readings, self.data, self._wind
         in_air = before if wind is None else wind.seen_from(before, self.dt)
-        controls = self._rotors.step(rotor_speeds, in_air)
-        front, left, back, right, fx, fy, fz, tx, ty, tz = controls
-        _pack_ctrl(self._ctrl, 0, front, left, back, right)
-        _pack_applied(self._applied, 0, fx, fy, fz, tx, ty, tz)
+        inputs, count = self.actuators.step(commands, in_air), self._inputs
+        self._pack_ctrl(self._ctrl, 0, *inputs[:count])
+        _pack_applied(self._applied, 0, *inputs[count:])
         if self.tape is not None:
-            self.tape.append(controls)
+            self.tape.append(inputs)
 
         _mj_step(self.model, data)
         self.steps += 1
@@ -121,20 +124,20 @@ class Simulator:
 
     def take_over(
         self,
-        rotor_speeds: RotorSpeeds,
+        speeds: Commands,
         tip_force_peak: float,
         tip_impulse: float,
         contacts: int,
         steps: int,
         before: Readings | None,
     ) -> None:
-        """Take over the state after steps that `native/step.c` has run on `data`.
+        """Take over the state after steps that other code has run on `data`.
 
-        `rotor_speeds` are the actual speeds [rad/s], shape (4,). `tip_force_peak` [N],
+        `speeds` are those of the actuators. `tip_force_peak` [N],
         `tip_impulse` [N s], `contacts` and `steps` are the new values of the attributes. If
         `before`, the readings before the last step, is given, store the contacts of that step.
         """
-        self._rotors.speeds, self._readings = rotor_speeds, None
+        self.actuators.speeds, self._readings = speeds, None
         self.tip_force_peak, self.tip_impulse = tip_force_peak, tip_impulse
         self.contacts, self.steps = contacts, steps
         if before:
@@ -159,11 +162,6 @@ class Simulator:
     def touch_age(self) -> float:
         """Time since the robot's last contact, or since the last reset [s]."""
         return (self.steps - max(self._last_touch.values())) * self.dt
-
-    @property
-    def rotor_speeds(self) -> RotorSpeeds:
-        """Actual rotor speeds [rad/s], shape (4,)."""
-        return self._rotors.speeds
 
     def tip_force(self) -> float:
         """Return the normal force on the arm's tip at the beginning of the last step [N]."""

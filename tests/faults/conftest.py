@@ -26,6 +26,7 @@ class FakeRobot:
     def __init__(self, *, yaw_rate=0.0, honest=False, hold_ms=60_000):
         self.guard = SimpleNamespace(state=TRACK, reference=ZERO, yaw_rate=yaw_rate)
         self.simulator = SimpleNamespace(steps=0, touch_age=float("inf"), touches=[])
+        self.onboard = SimpleNamespace(stopped=STOPPED)
         self.observers = []
         self.position, self.velocity = (1.0, 1.0, 1.0), ZERO
         self.now_ns = 0

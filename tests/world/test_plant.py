@@ -11,7 +11,7 @@ from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.world.plant import Wind, point_inertia
 from cloudrc.world.readings import Readings
 from cloudrc.world.scene import compile_model, rotation
-from cloudrc.world.simulator import Simulator
+from tests.world.conftest import simulate
 
 
 def model(**keys):
@@ -54,7 +54,7 @@ def test_a_payload_is_what_mujoco_makes_of_a_second_body():
 def test_a_changed_robot_touches_what_the_model_touches(scene_at):
     """MuJoCo's boxes around the robot lie in the frame of its inertia."""
     plant = Plant(payload_kg=0.5, payload_offset_m=(0.3, 0.2, -0.3))
-    robots = [Simulator("pelican", scene_at(-1.0, 0.0, 0.8), one) for one in (None, plant)]
+    robots = [simulate("pelican", scene_at(-1.0, 0.0, 0.8), one) for one in (None, plant)]
     for robot in robots:
         for _ in range(400):
             robot.step((0.0,) * 4)

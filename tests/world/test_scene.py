@@ -13,7 +13,7 @@ from cloudrc.geometry.compiled import import_mujoco, mujoco
 from cloudrc.geometry.scene import load_scene
 from cloudrc.robots.pelican.rotors import STOPPED
 from cloudrc.world.scene import PELICAN, bodies_of_geoms, compile_model
-from cloudrc.world.simulator import Simulator
+from tests.world.conftest import simulate
 
 ROBOTS, SCENES = names("robot"), names("scene")
 
@@ -59,7 +59,7 @@ def test_staves_are_tangent_to_the_pipe(pipes, pipe):
     ],
 )
 def test_what_the_robot_touches(scene_at, place, touched):
-    simulator = Simulator("pelican", scene_at(*place))
+    simulator = simulate("pelican", scene_at(*place))
     simulator.step(STOPPED)
     assert {(touch.body, touch.tip) for touch in simulator.take_contacts()} == touched
 
@@ -125,7 +125,7 @@ def test_what_cannot_be_flown_is_refused_by_name(tmp_path, monkeypatch, kind, ol
     assert list(tmp_path.iterdir()) == [path], "MuJoCo wrote a log"
 
 
-FLIES = "from cloudrc.world.simulator import Simulator; Simulator('pelican', 'pipes')"
+FLIES = "from cloudrc.world.scene import compile_model; compile_model('pelican', 'pipes')"
 
 
 @pytest.mark.parametrize("wanted", [None, "egl"])

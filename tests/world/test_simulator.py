@@ -11,8 +11,8 @@ from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.robots.pelican.onboard import LowLevel
 from cloudrc.robots.pelican.rotors import STOPPED, Rotors
 from cloudrc.world.readings import Readings
-from cloudrc.world.simulator import Simulator, replay
-from tests.world.conftest import normalised
+from cloudrc.world.simulator import replay
+from tests.world.conftest import normalised, simulate
 
 AT_REST = Readings.of((*ZERO, *UPRIGHT), (*ZERO, *ZERO))
 
@@ -58,9 +58,9 @@ def test_thrust_and_drag_are_those_of_the_rotors(speeds, quaternion, velocity, r
 
 
 def test_it_stands_at_its_spawn_and_falls_from_the_air(scene_at):
-    simulator = Simulator("pelican", "pipes")
+    simulator = simulate("pelican", "pipes")
     assert simulator.readings == Readings.of((0.0, 0.0, 0.1, *UPRIGHT), (*ZERO, *ZERO))
-    falling = Simulator("pelican", scene_at(0, 0, 5, "empty"))
+    falling = simulate("pelican", scene_at(0, 0, 5, "empty"))
     for _ in range(100):
         simulator.step((0.0,) * 4)
         falling.step((0.0,) * 4)
@@ -71,7 +71,7 @@ def test_it_stands_at_its_spawn_and_falls_from_the_air(scene_at):
 
 
 def test_a_velocity_is_followed(scene_at):
-    simulator = Simulator("pelican", scene_at(0, 0, 3, "empty"))
+    simulator = simulate("pelican", scene_at(0, 0, 3, "empty"))
     fly(simulator, LowLevel(integral_limit_xy=0.3), (0.5, -0.3, 0.2), 8.0)
     assert simulator.readings.velocity == pytest.approx((0.5, -0.3, 0.2), abs=0.05)
     # The arm's moment of .01 kg * .2 m * 9.81 m/s^2 tilts the robot by .0196 rad (k_R = 1),
@@ -82,7 +82,7 @@ def test_a_velocity_is_followed(scene_at):
 
 
 def test_reset_gives_the_same_flight_again(scene_at):
-    simulator, ends = Simulator("pelican", scene_at(8.0, -6.42, 0.9)), set()
+    simulator, ends = simulate("pelican", scene_at(8.0, -6.42, 0.9)), set()
     for _ in range(2):
         simulator.reset()
         assert len(fly(simulator, LowLevel(), (0.2, 0.0, 0.0), 2.0)) == 1
@@ -93,7 +93,7 @@ def test_reset_gives_the_same_flight_again(scene_at):
 @pytest.mark.parametrize("before", [0.2, 1.5])
 def test_the_tape_replays_to_the_same_bits_through_contact(scene_at, before):
     # The tape starts before the tip touches the board, or while it presses on it.
-    simulator, low_level = Simulator("pelican", scene_at(8.0, -6.42, 0.9)), LowLevel()
+    simulator, low_level = simulate("pelican", scene_at(8.0, -6.42, 0.9)), LowLevel()
     fly(simulator, low_level, (0.2, 0.0, 0.0), before)
     assert (simulator.tip_force() > 0.0) == (before > 1.0)
     start, simulator.tape = simulator.state(), []
@@ -113,7 +113,7 @@ def test_the_tape_replays_to_the_same_bits_through_contact(scene_at, before):
 @pytest.fixture
 def at_the_board(scene_at):
     """The robot hovers with its tip about 6 cm before the board."""
-    simulator, low_level = Simulator("pelican", scene_at(8.07, -6.42, 0.9)), LowLevel()
+    simulator, low_level = simulate("pelican", scene_at(8.07, -6.42, 0.9)), LowLevel()
     assert fly(simulator, low_level, ZERO, 0.3) == []
     return simulator, low_level
 
@@ -146,7 +146,7 @@ def test_peak_force_and_impulse_of_the_tip_include_every_step(at_the_board):
 
 
 def test_the_floor_is_a_new_contact_only_after_a_flight():
-    simulator, low_level = Simulator("pelican", "empty"), LowLevel()
+    simulator, low_level = simulate("pelican", "empty"), LowLevel()
     for _ in range(200):
         simulator.step(STOPPED)
     assert fly(simulator, low_level, (0.0, 0.0, 0.5), 1.0) == []

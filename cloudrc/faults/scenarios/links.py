@@ -93,7 +93,7 @@ def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
     fallen = [-r.odometry.velocity[2] for r in flight.trajectory() if r.stamp_ns >= landed * 1e9]
     fastest = max(fallen, default=nan)
     outcome.most(f"{where}: deviation of the descent from 0.5 m/s", abs(fastest - 0.5), 0.05, "m/s")
-    rotor = max(flight.robot.simulator.rotor_speeds)
+    rotor = max(flight.robot.simulator.actuators.speeds)
     outcome.most(f"{where}: fastest rotor", rotor, 1.0, "rad/s")
     outcome.true(f"{where}: touched down", flight.changes[-1].cause == Cause.DOWN.words)
     outcome.true(f"{where}: stays in LAND", flight.guard_now()[0] is GuardState.LAND)

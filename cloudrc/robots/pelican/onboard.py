@@ -15,8 +15,16 @@ from math import sqrt
 from typing import TypeAlias
 
 from cloudrc.messages import ZERO, Vector
-from cloudrc.robots.pelican.rotors import ARM, SPEED_MAX, THRUST_COEFFICIENT, TORQUE_RATIO
-from cloudrc.world.readings import Readings, RotorSpeeds
+from cloudrc.robots.pelican.rotors import (
+    ARM,
+    SPEED_MAX,
+    STOPPED,
+    THRUST_COEFFICIENT,
+    TORQUE_RATIO,
+    RotorSpeeds,
+)
+from cloudrc.world.onboard import Commands
+from cloudrc.world.readings import Readings
 
 MASS = 1.05
 """Mass that the controller assumes [kg]; the robot's mass is 1.06 kg.
@@ -53,7 +61,10 @@ class LowLevel:
         limits: Limit of the integrated error in x and y [m], its limit in z [m], time step [s].
         integral: Integrated velocity error [m], shape (3,).
         error: Velocity error of the last update [m/s], shape (3,); None after a reset.
+        stopped: Rotor speeds while the guard has stopped the robot.
     """
+
+    stopped: Commands = STOPPED
 
     def __init__(
         self,
@@ -85,22 +96,23 @@ class LowLevel:
         self.integral = ZERO
         self.error: Vector | None = None
 
-    def update(self, readings: Readings, velocity_reference: Vector) -> RotorSpeeds:
+    def update(self, readings: Readings, velocity: Vector, yaw_rate: float = 0.0) -> RotorSpeeds:
         """Compute the rotor speeds that make the robot follow a velocity; call once per `dt`.
 
-        `velocity_reference` is the wanted velocity [m/s], world frame, shape (3,).
+        `velocity` is the wanted velocity [m/s], world frame, shape (3,). The published controller
+        holds the yaw at 0, so `yaw_rate` has no effect.
         """
-        force = self.force(readings.velocity, velocity_reference)
+        force = self.force(readings.velocity, velocity)
         return allocate(attitude(force, readings))
 
-    def brake(self, readings: Readings, velocity_reference: Vector) -> RotorSpeeds:
-        """Follow `velocity_reference` [m/s] as `update` does, but keep the integral constant.
+    def brake(self, readings: Readings, velocity: Vector) -> RotorSpeeds:
+        """Follow `velocity` [m/s] as `update` does, but keep the integral constant.
 
         Deviation: the published controller always integrates. Its integral winds up while the robot
         brakes, and pushes the robot back for a second afterwards.
         """
         integral = self.integral
-        speeds = self.update(readings, velocity_reference)
+        speeds = self.update(readings, velocity)
         self.integral = integral
         return speeds
 

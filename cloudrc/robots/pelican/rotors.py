@@ -10,7 +10,8 @@ from __future__ import annotations
 from math import exp
 from typing import TypeAlias
 
-from cloudrc.world.readings import Readings, RotorSpeeds
+from cloudrc.world.onboard import Commands
+from cloudrc.world.readings import Readings
 
 THRUST_COEFFICIENT = 9.9865e-6
 """kf: thrust per speed squared [N s^2]."""
@@ -27,12 +28,14 @@ ARM = 0.21
 HEIGHT = 0.05
 """Height of the rotors above the base's origin [m]."""
 
+RotorSpeeds: TypeAlias = tuple[float, float, float, float]
+"""Speeds of the front, left, back and right rotor [rad/s], >= 0."""
 STOPPED: RotorSpeeds = (0.0, 0.0, 0.0, 0.0)
 
 _DRAG_ARM = DRAG_COEFFICIENT * ARM
 _ARM_SQUARED = ARM * ARM
 
-Controls: TypeAlias = tuple[float, float, float, float, float, float, float, float, float, float]
+RotorInputs: TypeAlias = tuple[float, float, float, float, float, float, float, float, float, float]
 """Input to MuJoCo: four thrusts [N], then the drag at the base's origin as a force in the world
 frame [N] and a torque in the body frame [N m], as MuJoCo's free joint requires."""
 
@@ -48,9 +51,13 @@ class Rotors:
         """Begin with stopped rotors; `dt` is the duration of a step [s]."""
         self.up = 1.0 - exp(-dt / TIME_CONSTANT_UP)
         self.down = 1.0 - exp(-dt / TIME_CONSTANT_DOWN)
+        self.speeds: Commands = STOPPED
+
+    def reset(self) -> None:
+        """Stop all rotors."""
         self.speeds = STOPPED
 
-    def step(self, commands: RotorSpeeds, readings: Readings) -> Controls:
+    def step(self, commands: Commands, readings: Readings) -> RotorInputs:
         """Advance the rotor speeds by one step towards `commands`; return thrusts and drag.
 
         Lag: w(t + dt) = w + (command - w) · (1 - exp(-dt/T)), with T = 12.5 ms for a rotor that

@@ -21,7 +21,7 @@ from cloudrc.robots.pelican.onboard import LowLevel
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.readings import Readings
 from cloudrc.world.robot import Robot
-from cloudrc.world.simulator import Simulator
+from tests.world.conftest import simulate
 
 MS = 1_000_000
 TICK = 2 * MS
@@ -104,7 +104,7 @@ def states(guard):
 
 @pytest.fixture(scope="module")
 def simulator():
-    return Simulator("pelican", "empty")
+    return simulate("pelican", "empty")
 
 
 UP = (0.0, 0.0, 1.0)

@@ -211,6 +211,7 @@ class NativeRobot(Robot):
 
     def __init__(self, simulator: Simulator, low_level: LowLevel, guard: Guard) -> None:
         super().__init__(simulator, low_level, guard)
+        self._low_level = low_level
         self._flight = make_flight(simulator, low_level, guard)
         self._address = ctypes.addressof(self._flight)
         run = library().run
@@ -266,7 +267,7 @@ class NativeRobot(Robot):
         if not self._in_c:
             integral, error = self._low_level.integral, self._low_level.error
             memory = (*integral, *(error or integral), error is not None)
-            _pack_memory(self._flight, _MEMORY, 0, *simulator.rotor_speeds, *memory)
+            _pack_memory(self._flight, _MEMORY, 0, *simulator.actuators.speeds, *memory)
 
     def _before(self) -> Readings:
         numbers = _unpack_before(self._flight, _BEFORE)
@@ -277,7 +278,10 @@ class NativeRobot(Robot):
 def _self_test() -> str:
     """Fly in C and in Python; return how the results differ, in words; "" if they are equal."""
     limits = ResolvedGuard()
-    parts = [(Simulator("pelican", "empty"), LowLevel(), Guard(limits)) for _ in range(2)]
+    parts = [
+        (Simulator("pelican", "empty", actuators=rotors.Rotors(STEP)), LowLevel(), Guard(limits))
+        for _ in range(2)
+    ]
     wrong = ""
     try:
         if _fly(Robot(*parts[0])) != _fly(NativeRobot(*parts[1])):
@@ -299,5 +303,5 @@ def _fly(robot: Robot) -> list[object]:
         velocity = (2.0 * share, 1.0 - share, 3.0 if share < 0.5 else -0.1)
         robot.guard.accept_command(Command(0, now_ns, 0, velocity, 0.0), now_ns)
         robot.run(now_ns, now_ns + 5 * STEP_NS)
-        seen += [robot.simulator.readings, robot.guard.reference, robot.simulator.rotor_speeds]
+        seen += [robot.simulator.readings, robot.guard.reference, robot.simulator.actuators.speeds]
     return seen

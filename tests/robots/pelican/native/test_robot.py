@@ -24,15 +24,15 @@ from cloudrc.tunnel.end import Identity
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.robot import Robot
-from cloudrc.world.simulator import Simulator
 from tests.flights.conftest import CLOCK, ring
+from tests.world.conftest import simulate
 from tests.world.guard.conftest import LIMITS, MS, SECOND, UP, Flight, hostile
 
 pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
 
 
 def robot_of(kind, scene="empty", limits=LIMITS, model="pelican"):
-    parts = Simulator(model, scene), LowLevel(), Guard(limits)
+    parts = simulate(model, scene), LowLevel(), Guard(limits)
     return kind(*parts)
 
 
@@ -64,7 +64,7 @@ class Pilot(Flight):
 
     def look(self):
         simulator, guard = self.robot.simulator, self.guard
-        self.seen += [simulator.readings, simulator.rotor_speeds, simulator.steps]
+        self.seen += [simulator.readings, simulator.actuators.speeds, simulator.steps]
         self.seen += [guard.state, guard.reference, dict(guard.counts)]
         self.seen += [simulator.take_tip_force(), simulator.take_contacts()]
 
@@ -176,7 +176,7 @@ def nearest(robot, position):
 
 @pytest.mark.parametrize("kind", ["margin", "gap"])
 def test_where_c_looks_for_no_contact_there_is_none(kind):
-    parts = Simulator("pelican", "pipes"), LowLevel(), Guard(LIMITS)
+    parts = simulate("pelican", "pipes"), LowLevel(), Guard(LIMITS)
     model, data = parts[0].model, parts[0].data
     rng, free = np.random.default_rng(1), 0
     getattr(model, f"geom_{kind}")[:] = rng.choice([0.0, 0.1], model.ngeom)
@@ -205,7 +205,7 @@ def test_a_tether_holds_the_robot_in_c_too(tmp_path):
 
 @pytest.mark.parametrize("setting", [{"density": 1.2}, {"viscosity": 1e-5}])
 def test_in_air_that_acts_on_geoms_c_uses_the_whole_model(setting):
-    parts = Simulator("pelican", "empty"), LowLevel(), Guard(LIMITS)
+    parts = simulate("pelican", "empty"), LowLevel(), Guard(LIMITS)
     for name, value in setting.items():
         setattr(parts[0].model.opt, name, value)
     assert NativeRobot(*parts)._flight.robot_radius == inf
@@ -238,7 +238,7 @@ def test_what_c_cannot_simulate_is_flown_in_python(setting):
 
 
 def test_the_number_of_contacts_is_found_in_the_memory_of_mujoco():
-    simulator = Simulator("pelican", "empty")
+    simulator = simulate("pelican", "empty")
     data, contacts = simulator.data, simulator.data.ncon
     number = c_int.from_address(data._address + native._contacts_offset(data))
     assert number.value == data.ncon == contacts > 0
@@ -291,7 +291,7 @@ def test_a_failed_self_test_means_python_and_one_warning(what, value, text, monk
     monkeypatch.setattr(native, what, value)
     with caplog.at_level(logging.WARNING):
         assert usable() == Library(None, text)
-        robot = make_robot(Simulator("pelican", "empty"), LowLevel(), Guard(LIMITS))
+        robot = make_robot(simulate("pelican", "empty"), LowLevel(), Guard(LIMITS))
     assert not isinstance(robot, NativeRobot)
     (warning,) = [record.message for record in caplog.records]
     assert warning == f"all steps run in Python: {text}; report this"
