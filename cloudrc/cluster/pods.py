@@ -74,7 +74,11 @@ def find_pod(release: Release, component: str) -> Any:
     """Find the newest running pod of a component; else raise a ClusterError with the cause."""
     pods = list_pods(release, component)
     if not pods:
-        raise no_release(release)
+        name = find_deployment(release, component).metadata.name
+        raise ClusterError(
+            f"release '{release.name}' {release.where} has no {component} pod now: it is replaced, "
+            f"or cannot be made; see: {release.kubectl} describe deployment {name}"
+        )
     running = [pod for pod in pods if pod.status.phase == "Running"]
     if not running:
         why = pod_failure(pods[0]) or f"it is {pods[0].status.phase}"

@@ -57,6 +57,13 @@ def test_the_newest_pod_of_the_release_is_found(api, release):
     assert find_pod(release, "cloud").metadata.name == "new"
 
 
+def test_a_pod_that_is_being_replaced_is_no_missing_release(running, release):
+    running.get("pods", "cloud-1")["metadata"]["deletionTimestamp"] = "2026-01-01T00:00:59Z"
+    with pytest.raises(ClusterError, match=r"has no cloud pod now.*describe deployment") as raised:
+        find_pod(release, "cloud")
+    assert "no release" not in str(raised.value)
+
+
 def test_only_a_short_outage_is_waited_for(running, release):
     run_job(release, MISSION, name="first")
     running.start_pod("first", state=terminated(0, "done"))
