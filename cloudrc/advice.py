@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import pairwise
-from math import ceil
+from math import ceil, floor
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
     from cloudrc.link.model import LinkDirection
+    from cloudrc.link.profile import DirectionProfile
 
 DURATION_NS = 20_000_000_000
 """Simulated time of the link [ns]."""
@@ -30,7 +31,7 @@ rotors, one third comes from the tilt that this drag causes."""
 
 def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     """Yield a warning for each group of settings that do not fit together."""
-    yield from _loss(experiment)
+    yield from _units(experiment)
     yield from _time(experiment)
     for number, waypoint in enumerate(experiment.mission.waypoints, start=1):
         if waypoint.tolerance_m >= FAR:
@@ -42,30 +43,81 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     yield from _hover(experiment)
     carrot, cap = experiment.mission.carrot, experiment.guard.speed_max_mps
     if carrot is not None and carrot.speed_mps > cap:
-        fits = f"--set mission.carrot.speed_mps={int(cap * 10) / 10:g}"
+        fits = f"--set mission.carrot.speed_mps={floor(cap * 100) / 100:g}"
         yield (
             f"the carrot moves at {cap:.3g} instead of {carrot.speed_mps:g} m/s, because the guard "
             f"caps the speed; a value that fits: {fits}"
         )
     ages, echoes = simulate_ages(experiment)
-    if ages:
+    low_rates = list(_low_rates(experiment))
+    yield from low_rates
+    if not ages:
+        yield from _late(experiment)
+    elif not low_rates:  # else the queue fills, so the delays depend on the simulated time
         yield from _long_link(experiment, ages, echoes)
         yield from _control(experiment, sum(ages) / len(ages))
 
 
-def _loss(experiment: ResolvedExperiment) -> Iterator[str]:
-    """Yield a warning for each direction whose loss may be meant in percent."""
-    from cloudrc.link.profile import describe_heavy_loss
+def _units(experiment: ResolvedExperiment) -> Iterator[str]:
+    """Yield a warning for each share and each trace of the link that may be in another unit."""
+    from cloudrc.link.doubts import describe_heavy_shares, describe_trace
+
+    for name, profile in _directions(experiment).items():
+        yield from describe_heavy_shares(profile, name)
+        if doubt := describe_trace(profile.rows):
+            yield f"link.{name}.trace {profile.trace}: {doubt}"
+
+
+def _directions(experiment: ResolvedExperiment) -> dict[str, DirectionProfile]:
+    """Return name -> profile of both directions of the link, with the contents of their files."""
     from cloudrc.link.traces import link_profile
 
-    for name, way in (("uplink", experiment.uplink), ("downlink", experiment.downlink)):
-        if heavy := describe_heavy_loss(link_profile(way), name):
-            yield f"{heavy} (link.{name}.loss)"
+    return {way: link_profile(getattr(experiment, way)) for way in ("uplink", "downlink")}
+
+
+def _low_rates(experiment: ResolvedExperiment) -> Iterator[str]:
+    """Yield a warning for each direction whose bottleneck is slower than its packets need."""
+    from cloudrc.link.doubts import describe_low_rate
+    from cloudrc.link.model import HEADER_BYTES
+    from cloudrc.messages import plan_length
+    from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
+
+    command = COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
+    needs = (
+        ("uplink", "telemetry", SIZES[Kind.TELEMETRY], experiment.world.odometry_rate_hz),
+        ("downlink", "the stream of commands", command, experiment.cloud.command_rate_hz),
+    )
+    for name, what, size, rate in needs:
+        needed = (size + HEADER_BYTES) * 8.0 * rate
+        if doubt := describe_low_rate(getattr(experiment, name), name, needed, what):
+            yield doubt
+
+
+def _late(experiment: ResolvedExperiment) -> Iterator[str]:
+    """Yield a warning if delays are the reason why no command arrives in the simulated time."""
+    from cloudrc.config.schema import COMMAND_AGE_MS
+    from cloudrc.link.profile import Timeline
+
+    parts, total = list[str](), 0.0
+    for name, profile in _directions(experiment).items():
+        delay = min(piece.delay_ns for piece in Timeline(profile).pieces) * 1e-9
+        total += delay
+        if delay >= 1.0:
+            value = f"delay_ms is {delay * 1e3:g} ({delay:g} s)"
+            if profile.rows:
+                value = f"trace has delays from {delay:g} s"
+            parts.append(f"link.{name}.{value}")
+    if total >= COMMAND_AGE_MS[1] * 1e-3:
+        yield (
+            f"{' and '.join(parts)}: no command arrives within {DURATION_NS * 1e-9:g} s of its "
+            "odometry, so the robot never flies; give delays in milliseconds"
+        )
 
 
 def _time(experiment: ResolvedExperiment) -> Iterator[str]:
     """Yield a warning if the mission lasts longer than its time limit, or very long."""
     from cloudrc.assembly import build_plan
+    from cloudrc.config.schema import DURATION_MAX
 
     mission, plan = experiment.mission, build_plan(experiment)
     if plan.track:
@@ -78,10 +130,11 @@ def _time(experiment: ResolvedExperiment) -> Iterator[str]:
         if mission.steps:
             what = "the steps of mission.steps last"
     limit = experiment.criteria.time_limit_s
+    longer = min(ceil(1.2 * lasts), DURATION_MAX)
     if limit is not None and lasts > limit:
         yield (
             f"{what} {lasts:,.6g} s, longer than criteria.time_limit_s {limit:g}; give times in"
-            f" seconds, or a longer limit: --set criteria.time_limit_s={ceil(1.2 * lasts)}"
+            f" seconds, or a longer limit: --set criteria.time_limit_s={longer}"
         )
     elif lasts > LONG:
         yield f"{what} {lasts:,.6g} s: this is {lasts / 3600:.3g} hours; give times in seconds"
@@ -175,6 +228,8 @@ def _long_link(
     which cloud computed the command that the robot follows. `echoes` has the age of the newest
     command that telemetry has confirmed.
     """
+    from cloudrc.config.schema import CLOUD_TIME_MAX, COMMAND_AGE_MS
+
     age_max, cloud = experiment.guard.command_age_max_ms * 1e-3, experiment.cloud
     mean, longest = sum(ages) / len(ages), max(ages)
     lasts = max(age_max, min(ages) + min(cloud.plan_s, experiment.guard.plan_max_s))
@@ -183,16 +238,26 @@ def _long_link(
         how = "never flies" if min(ages) > age_max else "holds again and again"
         yield (
             f"{delay}, after {longest * 1e3:.0f} ms at most, and the guard refuses commands after "
-            f"{age_max * 1e3:.0f} ms, so the robot {how}; a value that fits: "
-            f"--set guard.command_age_max_ms={_round_up(longest, 0.01) * 1e3:.0f}"
+            f"{age_max * 1e3:.0f} ms, so the robot {how}; "
+            + _fit("guard.command_age_max_ms", longest, 0.01, COMMAND_AGE_MS[1], 1e3)
         )
     silence = max(echoes, default=0.0) - min(mean, cloud.horizon_max_s)
     if mean > cloud.horizon_max_s:
-        fits = f"--set cloud.horizon_max_s={_round_up(longest, 0.1):g}"
-        yield f"{delay}, which is more than cloud predicts; a value that fits: {fits}"
+        fits = _fit("cloud.horizon_max_s", longest, 0.1, CLOUD_TIME_MAX)
+        yield f"{delay}, which is more than cloud predicts; {fits}"
     elif silence > cloud.freeze_after_s:
-        fits = f"--set cloud.freeze_after_s={_round_up(silence, 0.1):g}"
-        yield f"{delay}, and cloud freezes at times; a value that fits: {fits}"
+        fits = _fit("cloud.freeze_after_s", silence, 0.1, CLOUD_TIME_MAX)
+        yield f"{delay}, and cloud freezes at times; {fits}"
+
+
+def _fit(key: str, needed: float, step: float, most: float, scale: float = 1.0) -> str:
+    """Name a value of `key` above `needed` [s], or say that its largest one, `most`, is too small.
+
+    `step` is that of `_round_up` [s], `scale` the key's unit per second.
+    """
+    if needed * scale > most:
+        return f"{key} is at most {most:g}"
+    return f"a value that fits: --set {key}={min(_round_up(needed, step) * scale, most):g}"
 
 
 def _round_up(value: float, step: float) -> float:

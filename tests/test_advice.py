@@ -61,10 +61,52 @@ def test_what_does_not_fit_is_named_and_the_named_value_fits(settings, words):
         (["link.uplink.changes=[{at_s: 3, loss: 1}]"], "100 % of its packets at times: "),
         (["link.uplink.loss={bad_start: 1, bad_end: 0.5}"], "the uplink loses 66.7 % of"),
         (["link.uplink.loss=0.4", "link.uplink.blackouts=[{start_s: 2, duration_s: 1}]"], ""),
+        (["link.uplink.corrupt=1"], "the uplink damages 100 % of its packets: its corrupt is a"),
+        (["link.downlink.duplicate=1"], "duplicates 100 % of its packets: its duplicate is a"),
+        (["link.uplink.reorder=1"], "reorders 100 % of its packets: its reorder is a share"),
+        (["link.uplink={corrupt: 0.1, duplicate: 0.1, reorder: 0.1}"], ""),
     ],
 )
-def test_a_loss_that_may_be_meant_in_percent_is_named(settings, words):
+def test_a_share_that_may_be_meant_in_percent_is_named(settings, words):
     told = [text for text in advise(load_experiment("paper", settings)) if "1 % is 0.01" in text]
+    assert bool(told) == bool(words)
+    assert all(words in text for text in told)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (both(45_000, 0), "uplink.delay_ms is 45000 (45 s) and link.downlink.delay_ms is 45000"),
+        (["link.uplink.delay_ms=45000"], "link.uplink.delay_ms is 45000 (45 s): no command"),
+        (["link.uplink.rate_kbit=0.05"], "rate_kbit 0.05 is below the 185.6 kbit/s that telemetry"),
+        (["link.downlink.rate_kbit=0.05"], "below the 92.8 kbit/s that the stream of commands"),
+        (
+            ["world.odometry_rate_hz=500", "link.uplink.rate_kbit=900"],
+            "rate_kbit 900 is below the 928 kbit/s that telemetry needs",
+        ),
+        (["link.uplink.changes=[{at_s: 3, rate_kbit: 1}]"], "rate_kbit 1 is at times below"),
+        (both(6000, 0), "guard.command_age_max_ms is at most 10000"),
+    ],
+)
+def test_a_link_that_no_setting_fits_is_named_without_one(settings, words):
+    texts = list(advise(load_experiment("steps", settings)))
+    assert words in texts[0]
+    assert "--set" not in " ".join(texts)
+
+
+@pytest.mark.parametrize(
+    ("times", "words"),
+    [
+        (range(0, 30_000, 10), "t.csv: one packet in 10 s, if time_s is in the unit that its"),
+        (range(0, 90, 10), ""),  # nine rows may be typed by hand
+        (range(3000), ""),
+    ],
+)
+def test_a_trace_with_times_in_milliseconds_is_named(times, words, tmp_path):
+    rows = [f"{time},{30 + time % 7}" for time in times]
+    (tmp_path / "t.csv").write_text("\n".join(["time_s,delay_ms", *rows]))
+    flown = load_experiment("steps", [f"link.uplink.trace={tmp_path / 't.csv'}"])
+    told = [text for text in advise(flown) if "link.uplink.trace" in text]
     assert bool(told) == bool(words)
     assert all(words in text for text in told)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import re
+import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from math import isnan, nan
@@ -204,6 +205,7 @@ def _way(
 
     If the conditions are constant, the statistics come from more packets than the figure shows.
     """
+    from cloudrc.link.doubts import describe_trace
     from cloudrc.link.model import numbers
     from cloudrc.link.profile import Timeline
     from cloudrc.link.traces import link_profile
@@ -225,6 +227,8 @@ def _way(
     many = shown
     if timeline.only() is not None:
         many = send(range(0, options.packets * period_ns, period_ns))
+    if doubt := describe_trace(profile.rows):
+        print_line(f"cloudrc: warning: {asked.trace}: {doubt}", sys.stderr)
     return DirectionSample(asked, shown.sent, shown.delays, many.delays), numbers(many)
 
 

@@ -48,7 +48,7 @@ from cloudrc.config.schema import (
 from cloudrc.config.setpoints import read_setpoints
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import Scene, load_scene
-from cloudrc.link.profile import describe_heavy_loss
+from cloudrc.link.doubts import describe_heavy_shares
 from cloudrc.link.traces import read_table, read_trace
 
 HORIZON_MAX_S = 1.0
@@ -459,8 +459,7 @@ def edit_profile(before: Document, profile: str | None, settings: Sequence[str])
     overrides.apply_overrides(document, changes)
     new_profile = check_profile(document, _HERE)
     for way in DIRECTIONS:
-        if heavy := describe_heavy_loss(getattr(new_profile, way), way):
-            notes.append(heavy)
+        notes += describe_heavy_shares(getattr(new_profile, way), way)
     values = new_profile.model_dump(mode="json", exclude_defaults=True)
     words = [f"profile {profile}"] if profile else []
     return Edit(values, ", ".join([*words, *settings]), restart, notes)

@@ -35,7 +35,9 @@ COMMAND_AGE_MS = 1, 10_000
 CommandAge = Annotated[float, Field(ge=COMMAND_AGE_MS[0], le=COMMAND_AGE_MS[1])]
 Speed = Annotated[float, Field(ge=0.01, le=10)]
 Acceleration = Annotated[float, Field(ge=0.1, le=100)]
-CloudTime = Annotated[float, Field(gt=0, le=10)]
+CLOUD_TIME_MAX = 10
+"""Largest value of cloud.horizon_max_s and of cloud.freeze_after_s [s]."""
+CloudTime = Annotated[float, Field(gt=0, le=CLOUD_TIME_MAX)]
 PlanTime = Annotated[float, Field(ge=0, le=0.8)]
 PlanMax = Annotated[float, Field(ge=0, le=2)]
 HoldTime = Annotated[float, Field(ge=0.1, le=3600)]

@@ -21,28 +21,6 @@ def mean_loss(loss: Loss) -> float:
     return bad * loss.loss_bad + (1.0 - bad) * loss.loss_good
 
 
-HEAVY_LOSS = 0.5
-"""Share of lost packets from which a loss may be meant in percent [1]."""
-
-
-def describe_heavy_loss(direction: Direction, name: str) -> str:
-    """Warn in words of a loss of which 100 times less may be meant; "" for a usual loss.
-
-    `name` is "uplink" or "downlink".
-    """
-    first, later = mean_loss(direction.loss), [c.loss for c in direction.changes if c.loss]
-    if isinstance(direction, DirectionProfile) and direction.rows and direction.rows.losses:
-        first = sum(direction.rows.losses) / len(direction.rows.losses)
-    worst = max([first, *map(mean_loss, later)])
-    if worst < HEAVY_LOSS:
-        return ""
-    when = " at times" * (worst > first)
-    return (
-        f"the {name} loses {worst * 100:.3g} % of its packets{when}: its loss is a share from 0 to"
-        " 1, so 1 % is 0.01"
-    )
-
-
 @dataclass(frozen=True, slots=True)
 class Trace:
     """Measured conditions over time: each row applies until the time of the next row.

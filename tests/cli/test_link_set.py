@@ -34,7 +34,7 @@ def traced(tmp_path):
         ("uplink.loss=0.02", "downlink", TIMED["downlink"], []),
         ("uplink.loss=1", "uplink", {"delay_ms": 40.0, "loss": 1.0},
          ["the uplink loses 100 % of its packets: its loss is a share from 0 to 1, so 1 % is"
-          " 0.01"]),
+          " 0.01 (link.uplink.loss)"]),
         ("downlink.delay_ms=120", "downlink",
          {"delay_ms": 120.0, "changes": [{"at_s": 9.0, "jitter_ms": 20.0}, CHANGES[1]]},
          ["the time line of the downlink no longer changes delay_ms"]),
