@@ -43,7 +43,8 @@ BROKEN_OFF = ("interrupted", "cancelled", "disk_full")
 """Codes of an `Ending` that interrupts a mission; the goals then need not be met."""
 NOT_STARTED = (
     "the robot never left the ground, because it got no fresh commands or no request to"
-    " start; look at the link: its loss, and its delays beside guard.command_age_max_ms"
+    " start; look at the link: its loss, its damage (corrupt), and its delays beside"
+    " guard.command_age_max_ms"
 )
 ADVICE = "close other programs or give the run more cores"
 

@@ -234,8 +234,12 @@ class ClientHandshake:
         return codec.encode(Kind.HELLO, self._nonce, self._clock, self._cookie, epoch)
 
 
-VERSION_TEXT = "peer speaks v{}, we speak v{}: run the same version of cloudrc at both ends"
-KEY_TEXT = "the peer uses another key: give both ends the same key file"
+DAMAGE = "or the link damages packets (link.*.corrupt)"
+"""What else a datagram with another version or key may mean: one bit of it was flipped."""
+VERSION_TEXT = (
+    f"peer speaks v{{}}, we speak v{{}}: run the same version of cloudrc at both ends, {DAMAGE}"
+)
+KEY_TEXT = f"the peer uses another key: give both ends the same key file, {DAMAGE}"
 BUSY_TEXT = "another cloud controls the robot: this one waits until the other is silent"
 SILENCE_TEXT = (
     "world does not answer: is it running, is the link up, do both ends have the same key?"

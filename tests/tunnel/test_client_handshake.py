@@ -135,6 +135,7 @@ def test_another_version_or_key_is_logged_once(code, text):
         bare.world.receive_datagram(data, 0)
     (fault,) = [one for one in bare.world.take_records() if isinstance(one, Fault)]
     assert (fault.code, text in fault.text) == (code, True)
+    assert "link.*.corrupt" in fault.text, "a flipped bit looks alike"
     assert bare.world.take_datagrams() == []
     bare.send(bare.cloud("a").hello())
     bare.world.take_records()
