@@ -24,6 +24,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from cloudrc.errors import BadInputError
+from cloudrc.link.doubts import describe_period
 from cloudrc.link.model import Array, Stream
 from cloudrc.link.profile import Trace
 from cloudrc.link.traces import LATEST, Row, looks_lost, read_rows
@@ -32,7 +33,7 @@ Direction: TypeAlias = Literal["uplink", "downlink"]
 Entry: TypeAlias = tuple[float, float]
 """Time of sending [s] and delay [s]; the delay is NaN if the packet was lost."""
 LONGEST = 5.0  # largest plausible median delay [s]; a larger median suggests that the unit is wrong
-RARE, OFTEN = 86_400.0, 1e-4  # implausible time between packets [s]: more than, less than
+RARE = 86_400.0  # implausible time between packets [s]: a longer one is refused
 UNUSABLE_MAX = 0.01  # largest share of rows that may be left out, in [0, 1]
 GAP, GAP_MIN, BACK_MAX = 5, 0.1, 1.0
 """A gap between packets, or a jump back, is reported if it is longer than GAP_MIN [s] and longer
@@ -324,7 +325,7 @@ def read_csv(lines: Iterable[str], name: str, *, halve: bool, trust_units: bool)
     log = Log(name, halved=delay.startswith("rtt"))
     if log.halved and not halve:
         raise BadInputError(f"{name}, column {delay}: has round trips; {HALVE}")
-    loss = next((column for column in LOSSES if column in columns), None)
+    loss = _find_loss(columns, name)
     raw = list[Entry]()
     for row in rows:
         try:
@@ -345,7 +346,7 @@ def _check_units(packets: Packets, time: str, delay: str, unit: str, name: str) 
     factor, found = 1 / SCALES[unit], ""
     top, middle = np.nanmax(packets.delays), np.nanmedian(packets.delays)
     period = float(np.median(np.diff(packets.sent))) if len(packets.sent) > 1 else 1.0
-    note = f"one packet in {period:.4g} s, if {time} is in the unit that its name says"
+    note = describe_period(period, time)
     if unit != "s" and 0.0 < top * factor < 1.0:
         found = f"{delay} is at most {top * factor:.4g} {unit}, which looks like seconds"
     elif middle > LONGEST:
@@ -357,7 +358,7 @@ def _check_units(packets: Packets, time: str, delay: str, unit: str, name: str) 
         raise BadInputError(
             f"{name}: {found}; name the column after its unit, or use --trust-units"
         )
-    return packets if OFTEN <= period <= LONGEST else replace(packets, notes=(*packets.notes, note))
+    return replace(packets, notes=(*packets.notes, note)) if note else packets
 
 
 def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, str]:
@@ -377,6 +378,23 @@ def _find(columns: list[str], kinds: tuple[str, ...], name: str) -> tuple[str, s
     raise BadInputError(f"{name}: no column {kinds[0]}, found {shown}; name them {COLUMNS}")
 
 
+def _find_loss(columns: list[str], name: str) -> str | None:
+    """Return the column that marks lost packets; None without one.
+
+    Raise an error if the only such column has another name, such as loss_percent.
+    """
+    for column in LOSSES:
+        if column in columns:
+            return column
+    for column in columns:
+        if any(word in column for word in LOSSES):
+            raise BadInputError(
+                f"{name}: column {column} is not read; call it loss and give 0 or 1 for a packet, "
+                "or remove it"
+            )
+    return None
+
+
 def _no_unit(column: str) -> str:
     names = ", ".join(f"{column}_{unit}" for unit in ("s", "ms", "us"))
     return f"column {column} does not say its unit; call it {names} or {column}_ns"
@@ -389,11 +407,23 @@ def _csv_time(row: Row, column: str, unit: str) -> float:
         try:
             return datetime.fromisoformat(text).timestamp()
         except ValueError:
-            raise BadInputError(f"{row.where}: {_no_unit(column)}") from None
+            if _is_number(row, column):
+                raise BadInputError(f"{row.where}: {_no_unit(column)}") from None
+            shown = repr(text[:40]) if text else "nothing"
+            wanted = "give date and time as 2024-01-20T10:00:00.5"
+            raise BadInputError(f"{row.where}: {column} is {shown}; {wanted}") from None
     value = row.number(column)
     if value * SCALES[unit] > LATEST:
         raise BadInputError(f"{row.where}: {column} is {text}, a finer unit than {unit}; rename it")
     return value
+
+
+def _is_number(row: Row, column: str) -> bool:
+    try:
+        row.number(column)
+    except BadInputError:
+        return False
+    return True
 
 
 def _csv_delay(row: Row, column: str, loss: str | None) -> float:

@@ -23,6 +23,7 @@ from cloudrc.rounding import differences
 SIZE_MAX = 64 << 20  # size limit of a file [bytes]: half a day at 100 packets a second
 START_MAX = 600.0  # if the first row is later, times count from the first row [s]
 LATEST = 1e11  # largest plausible time since 1970 [s]; a larger time has another unit
+_GZIP = b"\x1f\x8b"  # first bytes of a compressed file (RFC 1952)
 _SCALES = {"delay_ms": 1e-3, "delay_us": 1e-6}
 _ROWS_TO_JUDGE = 10  # with fewer rows, delays of 0 are accepted, as a user may have typed them
 
@@ -52,13 +53,18 @@ def link_profile(direction: Direction, file_max: int = SIZE_MAX) -> DirectionPro
 
 
 def read_lines(path: Path, name: str, remedy: str, size_max: int = SIZE_MAX) -> list[str]:
-    """Read the lines of a text file; if that fails, raise a BadInputError with `remedy`.
+    """Read the lines of a text file; if that fails, raise a BadInputError with a remedy.
+
+    `remedy` is that of all failures but a file which is compressed with gzip, as irtt writes it.
 
     Accepted encodings are UTF-8, UTF-16 with a byte order mark (Windows writes it if output is
     redirected), and one byte per character.
     """
     try:
-        return _decode(read(path, size_max))
+        data = read(path, size_max)
+        if data.startswith(_GZIP):
+            raise BadInputError(f"{name}: is compressed with gzip; unpack it first with gunzip")
+        return _decode(data)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error).removeprefix(f"{path}: ")
     raise BadInputError(f"{name}: {reason}; {remedy}")

@@ -45,7 +45,8 @@ def test_a_recording_of_the_world_alone_gives_no_trace(folder, refused):
     [
         ("a.csv", b"time_s,delay_ms\n0,0.045\n", "looks like seconds"),
         ("a.json", b'{"round_trips": []}', "choose --direction uplink"),
-        ("a.json.gz", b"\x1f\x8b\0", "a.json.gz: it is not a text file; give a run, a log of ping"),
+        ("a.json", b"{\0", "a.json: it is not a text file; give a run, a log of ping"),
+        ("a.json.gz", b"\x1f\x8b\x08", "a.json.gz: is compressed with gzip; unpack it first with"),
         ("a.mcap", b"\x89MCAP0\r\n", "a.mcap"),
         ("pipe", None, "pipe: no such file or folder"),
         (".", None, "has no mission.mcap"),

@@ -111,6 +111,17 @@ def test_round_trips_are_halved_only_on_request():
         ("time_s,delay_ms,loss\n0,45,maybe", "line 2: loss is 'maybe'"),
         ("time_s,delay_ms\n0,45\n1,-3", "arrived 3 ms before it was sent: the two clocks differ;"),
         ("time_s,rtt_ms\n0,45\n1,-3\n2,-1", "rtt_ms is -3, which is no round trip"),
+        (
+            "time,delay_ms\n20.01.2024 10:00:00.000,45",
+            "time is '20.01.2024 10:00:00.000'; give date",
+        ),
+        ("time,delay_ms\n01/20/2024 10:00,45", "line 2: time is '01/20/2024 10:00'; give date and"),
+        (
+            "time,delay_ms\n,45",
+            "line 2: time is nothing; give date and time as 2024-01-20T10:00:00",
+        ),
+        ("time_s,delay_ms,loss_percent\n0,45,2", "column loss_percent is not read; call it loss"),
+        ("time_s,delay_ms,Packet loss\n0,45,2", "column packet_loss is not read; call it loss"),
         ("time_s,delay_ms", "no packet arrived"),
         ("sent_ms,delay_ms\n" + "1.7212E+12,20\n" * 50, "49 of 50 packets have the same time"),
         ("time_s,delay_ms\n98,4\n99,4\n100,4\n0,4\n1,4", "after row 3 the times go back by 100 s"),
