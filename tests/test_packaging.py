@@ -1,6 +1,7 @@
 """The package: dependencies, version, licence and the files of the wheel."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pytest
 import cloudrc
 from cloudrc.robots.pelican.native.library import built_file, compilers
 from tools.pack_chart import pack
+from tools.set_registry import set_registry
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -105,6 +107,25 @@ def test_two_packed_charts_are_byte_equal_and_helm_reads_them(copied, tmp_path):
     (chart,) = (tmp_path / "a").iterdir()
     read = subprocess.run(["helm", "template", "x", chart], check=True, capture_output=True)
     assert b"kind: Deployment" in read.stdout
+
+
+@pytest.mark.skipif(not shutil.which("helm"), reason="no helm here")
+def test_every_image_of_a_releases_chart_is_in_the_registry_that_it_publishes_to(copied, tmp_path):
+    set_registry(copied / "charts" / "cloudrc", "ghcr.io/me")
+    build(copied, tmp_path, "wheel")
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path / "wheel")
+    chart = tmp_path / "wheel" / "cloudrc" / "_chart"
+    parts = "mission.enabled", "console.enabled", "cloud.backgroundLoad.enabled"
+    more = [f"--set={part}=true" for part in parts]
+    command = ["helm", "template", "x", pack(chart, tmp_path, 0), *more]
+    rendered = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    for text in (rendered, *(path.read_text() for path in (chart / "examples").glob("*-job.yaml"))):
+        images = set(re.findall(r"\bimage: (\S+)", text))
+        roles = {f"ghcr.io/me/cloudrc/{role}:{cloudrc.__version__}" for role in ("world", "cloud")}
+        assert images
+        assert images <= roles
 
 
 class Fresh:

@@ -8,7 +8,6 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
-from cloudrc import __version__
 from cloudrc.cli.cluster_flags import release_arguments
 from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import output_argument
@@ -60,7 +59,6 @@ ARRAYS = (
 """The job arrays of Slurm, PBS, LSF and Kubernetes."""
 FLIGHTS_MAX = 100_000
 """Default limit of flights: a sweep is a product, and one axis too many is hours of work."""
-IMAGE = f"cloudrc/world:{__version__}"
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -84,8 +82,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     about = "fly in the pods of a Job instead of on this machine"
     add("--on", choices=("kubernetes",), help=about)
     add("--shards", type=read_count, default=8, metavar="N", help="number of pods (default: 8)")
-    about = f"image of the pods (default: {IMAGE})"
-    add("--image", default=IMAGE, metavar="IMAGE", help=about)
+    about = "image of the pods (default: cloudrc/world of this version, as the chart names it)"
+    add("--image", metavar="IMAGE", help=about)
     about = "CPU request of a pod, such as 500m or 2 (default: 1)"
     add("--cpu", type=_cpu, default="1", metavar="CPU", help=about)
     add("--queue", metavar="NAME", help="queue of Kueue that admits the Job")

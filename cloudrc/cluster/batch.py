@@ -41,15 +41,16 @@ def start(
     flights: bytes,
     shards: int,
     *,
-    image: str,
+    image: str | None,
     cpu: str,
     queue: str | None,
 ) -> None:
     """Create the Job `name` with `shards` pods that fly `flights`.
 
     A failed Job of this name is replaced; a Job that runs or is complete stays as it is. `flights`
-    is a file made by `sweep.plan.pack`, `image` an image with the simulator, `cpu` the CPU request
-    of a pod, and `queue` a queue of Kueue. The Job belongs to no Helm release.
+    is a file made by `sweep.plan.pack`, `image` an image with the simulator (None: the image of the
+    chart's example), `cpu` the CPU request of a pod, and `queue` a queue of Kueue. The Job belongs
+    to no Helm release.
 
     Raises:
         ClusterError: If the cluster refuses the Job, for example because the sweep is too large.
@@ -64,7 +65,8 @@ def start(
         job["metadata"]["labels"] = {**labels, "kueue.x-k8s.io/queue-name": queue}
     job["spec"] |= {"completions": shards, "parallelism": shards}
     (container,) = job["spec"]["template"]["spec"]["containers"]
-    container["image"], container["args"][-1] = image, f"--shard=auto/{shards}"
+    container["image"] = image or container["image"]
+    container["args"][-1] = f"--shard=auto/{shards}"
     container["resources"]["requests"]["cpu"] = cpu
     files["binaryData"] = {FILE: base64.b64encode(flights).decode()}
     create_job(release, job, files)

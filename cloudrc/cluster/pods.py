@@ -26,8 +26,8 @@ FATAL = {
     **dict.fromkeys(
         ("ErrImagePull", "ImagePullBackOff", "ErrImageNeverPull", "InvalidImageName"),
         "the image {image} of container '{name}' is not on the node and cannot be pulled "
-        "({reason}); load it: make kind-load, or name another: --set image.registry=... "
-        "--set image.tag=...",
+        "({reason}); name one that the nodes can pull: --set image.registry=... "
+        "--set image.tag=..., or load your own into kind: make kind-load",
     ),
     **dict.fromkeys(
         ("CreateContainerConfigError", "CreateContainerError", "RunContainerError"),

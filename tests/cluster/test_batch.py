@@ -4,13 +4,14 @@ import base64
 
 import pytest
 
+from cloudrc import __version__
 from cloudrc.cluster import batch
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.jobs import UID_LABEL
 from cloudrc.errors import BadInputError
 from tests.cluster.conftest import pod, terminated
 
-WORDS = {"image": "cloudrc/world:0.1.0", "cpu": "1", "queue": None}
+WORDS = {"image": "my/world:1", "cpu": "1", "queue": None}
 
 
 @pytest.fixture
@@ -37,10 +38,13 @@ def test_the_job_flies_each_index_with_its_flights(started, api, release):
     spec = job["spec"]
     assert (spec["completionMode"], spec["completions"], spec["parallelism"]) == ("Indexed", 4, 4)
     (container,) = spec["template"]["spec"]["containers"]
+    assert container["image"] == "my/world:1"
     assert container["args"] == ["sweep", "rows", "/flights/flights.json.gz", "--shard=auto/4"]
     assert "kueue.x-k8s.io/queue-name" not in job["metadata"]["labels"]
-    batch.start(release, "sweep-2", b"flights", 4, **{**WORDS, "queue": "lab"})
+    batch.start(release, "sweep-2", b"flights", 4, **{**WORDS, "image": None, "queue": "lab"})
     queued = api.get("jobs", "sweep-2")
+    (container,) = queued["spec"]["template"]["spec"]["containers"]
+    assert container["image"] == f"cloudrc/world:{__version__}", "the image of the chart's example"
     assert queued["metadata"]["labels"]["kueue.x-k8s.io/queue-name"] == "lab"
     pods = queued["spec"]["template"]["metadata"]["labels"]
     assert "kueue.x-k8s.io/queue-name" not in pods, "the queue takes the whole Job"
