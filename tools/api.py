@@ -20,7 +20,7 @@ PAGE = ROOT / "docs" / "api.md"
 
 def public_modules(page: str) -> set[str]:
     """Return the modules in the first column of a table of docs/api.md."""
-    return set(re.findall(r"^\| `(cloudrc(?:\.\w+)+)` \|", page, re.MULTILINE))
+    return set(re.findall(r"^\| `(cloudrc(?:\.\w+)*)` \|", page, re.MULTILINE))
 
 
 def last_release() -> str | None:
@@ -35,9 +35,11 @@ def breaking_changes(
 ) -> Iterator[str]:
     """Describe each difference between two packages that breaks a caller of `modules`."""
     for change in griffe.find_breaking_changes(before, now):
-        whole = change.obj.kind is griffe.Kind.MODULE
-        module = change.obj.path if whole else change.obj.module.path
-        if module in modules:
+        # Upwards by parents: `module` of an imported name is where the name was defined.
+        module = change.obj
+        while module.kind is not griffe.Kind.MODULE and module.parent is not None:
+            module = module.parent
+        if module.path in modules:
             yield change.explain(griffe.ExplanationStyle.ONE_LINE)
 
 
