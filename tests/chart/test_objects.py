@@ -120,6 +120,18 @@ def test_common_labels_are_on_every_object_and_pod_and_those_of_a_pod_win():
         assert thing["metadata"]["labels"]["sidecar.istio.io/inject"] == "false"
 
 
+def test_every_container_takes_environment_variables_and_mounts_of_its_own():
+    pods = pod_specs(render(values_of(CHART / "ci" / "everything-values.yaml")))
+    parts = [(name, pod, part) for name, pod in pods.items() for part in containers(pod).values()]
+    assert len(parts) == 10
+    for name, pod, part in parts:
+        where = name, part["name"]
+        assert {"name": "TZ", "value": "UTC"} in part.get("env", []), where
+        mounts = {mount["name"] for mount in part.get("volumeMounts", [])}
+        assert "certificates" in mounts, where
+        assert mounts <= {volume["name"] for volume in pod.get("volumes", [])}, where
+
+
 def test_the_command_line_accepts_every_containers_arguments():
     load = {"backgroundLoad": {"enabled": True, "workers": 3}}
     more = {"mission": {"enabled": True, "queue": True}, "console": {"enabled": True}}
