@@ -129,24 +129,31 @@ def _cluster(options: argparse.Namespace) -> Iterator[Check]:
         yield _check(name, True, "the API server answers", "", CLUSTER)
         name = "survey"
         if options.cluster:
-            for finding in survey(release, options.registry):
+            values = [f"--values={path}" for path in options.values]
+            values += [f"--set={text}" for text in options.set]
+            for finding in survey(release, values):
                 yield Check(*finding, CLUSTER)
     except CloudrcError as error:
         found, _, fix = str(error).partition("; ")
-        yield _check(name, False, found, fix or MAKE_CLUSTER, CLUSTER)
+        if not fix:
+            fix = MAKE_CLUSTER if name != "survey" else "correct the values given to this command"
+        yield _check(name, False, found, fix, CLUSTER)
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
+    add = parser.add_argument
     about = "the mode to fly in (default: local)"
-    parser.add_argument("--mode", choices=MODES, default="local", help=about)
+    add("--mode", choices=MODES, default="local", help=about)
     about = "mode cluster, and survey the cluster: permissions, admission, quota, nodes, images"
-    parser.add_argument("--cluster", action="store_true", help=about)
-    about = "with --cluster: registry of the images, as the chart's image.registry"
-    parser.add_argument("--registry", metavar="NAME", default="", help=about)
-    parser.add_argument("--context", metavar="NAME", help="kubeconfig context (default: current)")
+    add("--cluster", action="store_true", help=about)
+    about = "with --cluster: a value of the chart, as in helm install; repeatable"
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help=about)
+    about = "with --cluster: a file of the chart's values, as in helm install; repeatable"
+    add("-f", "--values", action="append", default=[], metavar="FILE", help=about)
+    add("--context", metavar="NAME", help="kubeconfig context (default: current)")
     about = "namespace (default: the context's, or default)"
-    parser.add_argument("-n", "--namespace", metavar="NAME", help=about)
+    add("-n", "--namespace", metavar="NAME", help=about)
     output_argument(parser)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any, Literal, NamedTuple
@@ -36,8 +36,14 @@ NEEDED = {
     "batch": "jobs",
     "networking.k8s.io": "networkpolicies",
 }
-"""API group -> the objects that an install and a mission create and delete."""
-ALSO = (("", "get", "pods/log"), ("", "create", "pods/portforward"), ("", "create", "pods/exec"))
+"""API group -> the objects that an install, an upgrade and a mission create, change and delete."""
+VERBS = ("create", "patch", "delete")
+ALSO = (
+    ("", "get", "pods/log"),
+    ("", "create", "pods/portforward"),
+    ("", "create", "pods/exec"),
+    ("", "list", "events"),
+)
 """Further permissions, of the commands that fly and look: API group, verb, object."""
 PROBE_LIMIT = 60.0
 """Time limit for the probe of all nodes [s], in which a node may pull both images."""
@@ -65,15 +71,16 @@ class Finding(NamedTuple):
     fix: str = ""
 
 
-def survey(release: Release, registry: str = "") -> Iterator[Finding]:
+def survey(release: Release, values: Sequence[str] = ()) -> Iterator[Finding]:
     """Check whether the chart can be installed as this release; yield one finding after another.
 
-    `registry` is the value `image.registry`. Raise a ClusterError if the server does not answer.
+    `values` are options of helm that set the chart's values, such as "--set=link.mode=relay". Raise
+    a ClusterError if the server does not answer.
     """
     yield (allowed := permissions(release))
     if allowed.state != "ok":
         return
-    pods = pods_of_chart(release, registry)
+    pods = pods_of_chart(release, values)
     for component, spec in pods.items():
         try:
             yield admission(release, component, spec)
@@ -82,7 +89,7 @@ def survey(release: Release, registry: str = "") -> Iterator[Finding]:
             yield Finding("namespace", "missing", to_one_line(str(error)), fix)
             return
     yield from quotas(release, pods)
-    yield from nodes(release, {name: pod["containers"][0]["image"] for name, pod in pods.items()})
+    yield from nodes(release, pods)
 
 
 def permissions(release: Release) -> Finding:
@@ -93,7 +100,7 @@ def permissions(release: Release) -> Finding:
     review = api.create_self_subject_access_review
     wanted = list(ALSO)
     for group, kinds in NEEDED.items():
-        wanted += [(group, verb, kind) for kind in kinds.split() for verb in ("create", "delete")]
+        wanted += [(group, verb, kind) for kind in kinds.split() for verb in VERBS]
     refused = []
     for group, verb, kind in wanted:
         resource, _, subresource = kind.partition("/")
@@ -116,10 +123,10 @@ def permissions(release: Release) -> Finding:
     return Finding("permissions", "ok", f"enough {release.where}")
 
 
-def pods_of_chart(release: Release, registry: str) -> dict[str, dict[str, Any]]:
+def pods_of_chart(release: Release, values: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Render the chart as `helm install` would; return component -> spec of its pod."""
     arguments = ["template", release.name, str(chart_folder()), *release.helm_flags]
-    arguments += ["--dry-run=server", f"--set=image.registry={registry}"]
+    arguments += ["--dry-run=server", *values]
     rendered = yaml.safe_load_all(run("helm", arguments))
     return {
         thing["metadata"]["labels"]["app.kubernetes.io/component"]: {
@@ -208,7 +215,7 @@ def _text(amount: Any) -> str:
     return f"{float(amount) / 2**20:g}Mi" if amount >= 2**20 else f"{float(amount):g}"
 
 
-def nodes(release: Release, images: dict[str, str]) -> Iterator[Finding]:
+def nodes(release: Release, pods: dict[str, dict[str, Any]]) -> Iterator[Finding]:
     """Start a probe on each node that takes pods; say what it found, and delete it."""
     names = schedulable_nodes(release)
     if names is None:
@@ -216,7 +223,7 @@ def nodes(release: Release, images: dict[str, str]) -> Iterator[Finding]:
     probes = dict[str, tuple[str, bool]]()
     try:
         for node in names if names is not None else [""]:
-            probes[node] = start_probe(release, node, images)
+            probes[node] = start_probe(release, node, pods)
         until = time.monotonic() + PROBE_LIMIT
         for node, (pod, netem) in probes.items():
             yield _finding(release, node or "any", pod, netem, until)
@@ -246,8 +253,12 @@ def schedulable_nodes(release: Release) -> list[str] | None:
     ]
 
 
-def start_probe(release: Release, node: str, images: dict[str, str]) -> tuple[str, bool]:
-    """Create a probe; return its name, and whether it may try netem, which needs NET_ADMIN."""
+def start_probe(release: Release, node: str, pods: dict[str, dict[str, Any]]) -> tuple[str, bool]:
+    """Create a probe with the images of `pods`: component -> spec.
+
+    Returns:
+        Its name, and whether it may try netem, which needs NET_ADMIN.
+    """
     restricted = {
         "allowPrivilegeEscalation": False,
         "capabilities": {"drop": ["ALL"]},
@@ -259,18 +270,19 @@ def start_probe(release: Release, node: str, images: dict[str, str]) -> tuple[st
         containers = [
             {
                 "name": component,
-                "image": image,
+                "image": pod["containers"][0]["image"],
                 "imagePullPolicy": "IfNotPresent",
                 "command": ["sh", "-c", NETEM],
                 "resources": RESOURCES,
                 "securityContext": privileged if netem else restricted,
             }
-            for component, image in images.items()
+            for component, pod in pods.items()
         ]
         spec = {
             "restartPolicy": "Never",
             "automountServiceAccountToken": False,
             "containers": containers,
+            "imagePullSecrets": pods["cloud"].get("imagePullSecrets", []),
             **({"nodeName": node} if node else {}),
         }
         try:
@@ -289,7 +301,7 @@ def _finding(release: Release, node: str, pod: str, netem: bool, until: float) -
         if found.status.phase in ("Succeeded", "Failed"):
             break
         if why := pod_failure(found):
-            return Finding(name, "missing", why, "make kind-load, or --registry NAME")
+            return Finding(name, "missing", why, "make kind-load, or --set image.registry=...")
         time.sleep(LOOK_PERIOD)
     else:
         return Finding(name, "warn", why or "its probe has not ended", "kubectl get events")

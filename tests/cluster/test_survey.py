@@ -68,11 +68,28 @@ def test_a_kernel_without_netem_is_told_for_each_node(cluster, release):
     assert "no sch_netem" in seen.found
 
 
+def test_the_charts_values_go_to_helm_and_its_pull_secrets_to_the_probes(
+    cluster, release, tmp_path, pretend, monkeypatch
+):
+    secret = "      imagePullSecrets: [{name: lab}]\n---"
+    rendered = "".join(CHART.replace("COMPONENT", each) for each in ("world", "cloud"))
+    rendered = rendered.replace("---", secret)
+    pretend("helm", f"echo \"$@\" >{tmp_path}/asked; cat <<'END'\n{rendered}END")
+    made = []
+    keep = survey.create_pod
+    monkeypatch.setattr(survey, "create_pod", lambda *a, **k: made.append(a[2]) or keep(*a, **k))
+    values = ["--values=my.yaml", "--set=image.registry=r.example/me"]
+    assert {one.state for one in survey.survey(release, values)} == {"ok"}
+    assert (tmp_path / "asked").read_text().split()[-2:] == values
+    assert [spec["imagePullSecrets"] for spec in made] == [[{"name": "lab"}]] * 3
+
+
 def test_missing_permissions_end_the_survey(cluster, release):
-    cluster.forbidden = {"secrets"}
+    cluster.forbidden = {"secrets", "events"}
     (only,) = found(release).values()
     assert only.state == "missing"
-    assert "create secrets" in only.found
+    assert "create secrets, patch secrets, delete secrets" in only.found
+    assert "list events" in only.found
     assert "pods" not in only.found
 
 
