@@ -52,8 +52,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "console": {"config", "exposition", "geometry", "metrics.definitions", "teleop", "world"},
     "cluster": {"config", "link", "record", "report"},
     "sweep": {
-        *("advice", "assembly", "cloud", "config", "files", "metrics", "plugin_file", "plugins"),
-        *("record", "report"),
+        *("advice", "assembly", "cloud", "config", "files", "geometry", "metrics", "plugin_file"),
+        *("plugins", "record", "report"),
     },
     "assembly": EVERYTHING,
     "advice": {"assembly", "config", "link", "robots", "tunnel"},

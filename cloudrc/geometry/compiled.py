@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.geometry.model_files import model_files
 from cloudrc.geometry.scene import FLOOR, WORLD
 from cloudrc.geometry.solids import Array, Shape, Solid
 
@@ -105,15 +106,16 @@ def _name_geoms(worldbody: Any) -> None:
 def read_bodies(path: Path) -> Bodies:
     """Return the bodies of a scene; raise a BadInputError if its file cannot be flown in."""
     try:
-        status = path.stat()
+        states = [(str(file), file.stat()) for file in model_files(path)]
     except OSError as error:
         raise BadInputError(f"{path}: cannot be read: {error.strerror}") from None
-    return _read_bodies(path, status.st_mtime_ns, status.st_size)
+    version = [(file, state.st_mtime_ns, state.st_size) for file, state in states]
+    return _read_bodies(path, *version)
 
 
 @lru_cache(maxsize=16)
-def _read_bodies(path: Path, *version: int) -> Bodies:
-    """Return the bodies of a scene; `version` differs between contents of the file."""
+def _read_bodies(path: Path, *version: tuple[str, int, int]) -> Bodies:
+    """Return the bodies of a scene; `version` differs between contents of its files."""
     try:
         spec = read_scene(path)
         spec.compiler.fusestatic = False

@@ -30,6 +30,7 @@ from cloudrc.config.problems import Problem
 from cloudrc.config.reuse import reuse, reuse_results
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError
+from cloudrc.geometry.model_files import model_files
 from cloudrc.sweep.flight import Row
 
 SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
@@ -181,13 +182,14 @@ def _everything(point: ResolvedExperiment) -> bytes:
 
 
 def _hashes(path: str) -> list[tuple[str, str]]:
-    """Return the paths and hashes of a file and, if it is a plug-in, of the modules beside it."""
+    """Return the paths and hashes of a file, and of the files that it needs.
+
+    A plug-in needs the modules that it imports. A robot or scene needs the files that it names.
+    """
+    needs = model_files if path.endswith(".xml") else plugin_file.sources
     return reuse(
         ("hashes", path),
-        lambda: [
-            (str(file), sha256(file.read_bytes()).hexdigest())
-            for file in plugin_file.sources(Path(path))
-        ],
+        lambda: [(str(file), sha256(file.read_bytes()).hexdigest()) for file in needs(Path(path))],
     )
 
 

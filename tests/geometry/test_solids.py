@@ -86,3 +86,11 @@ def test_a_changed_file_is_read_again(tmp_path):
     path.unlink()
     with pytest.raises(BadInputError, match=r"mine\.xml: cannot be read"):
         read_bodies(path)
+
+
+def test_a_changed_include_is_read_again(tmp_path):
+    path = scene(tmp_path, '<include file="part.xml"/>')
+    for name in ("a", "another"):
+        body = f'<body name="{name}"><geom size=".1"/></body>'
+        (tmp_path / "part.xml").write_text(f"<mujoco>{body}</mujoco>")
+        assert read_bodies(path).names == ("floor", name)

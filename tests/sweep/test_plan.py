@@ -14,6 +14,7 @@ import pytest
 from cloudrc.assembly import build_links
 from cloudrc.config import document, load, overrides
 from cloudrc.errors import BadInputError
+from cloudrc.geometry.scene import SCENES
 from cloudrc.source import code_hash
 from cloudrc.sweep import plan
 from cloudrc.sweep.plan import pack, read_flight, read_plan, unpack
@@ -67,6 +68,24 @@ def test_a_key_depends_on_the_code_of_a_named_plugin(write_sweep, monkeypatch, t
     plan._code.cache_clear()
     assert found[0][0] != found[1][0]
     assert found[0][1] == found[1][1]
+
+
+@pytest.mark.parametrize("key", ["robot", "scene"])
+def test_a_key_depends_on_what_a_model_includes(write_sweep, tmp_path, key):
+    """A resumed sweep had two scenes in one table."""
+    shipped = {"robot": "robots/pelican/robot.xml", "scene": "world/scenes/empty.xml"}[key]
+    text = (
+        (SCENES.parents[1] / shipped)
+        .read_text()
+        .replace("<worldbody>", '<worldbody><include file="b.xml"/>')
+    )
+    (tmp_path / "mine.xml").write_text(text)
+    path, found = write_sweep({f"world.{key}": ["./mine.xml"]}), []
+    for radius in (".1", ".1", ".2"):
+        part = f'<mujoco><site name="one" pos="0 9 5" size="{radius}"/></mujoco>'
+        (tmp_path / "b.xml").write_text(part)
+        found.append([*read_plan(path).flights])
+    assert found[0] == found[1] != found[2]
 
 
 def test_points_with_one_seed_meet_the_same_draws(write_sweep):

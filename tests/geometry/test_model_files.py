@@ -1,0 +1,84 @@
+"""All files of which a robot or a scene consists are found."""
+
+import struct
+
+import pytest
+
+from cloudrc.geometry.compiled import mujoco
+from cloudrc.geometry.model_files import model_files
+
+
+def place(folder, name, content):
+    file = folder / name
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return file
+
+
+def mjcf(inner):
+    return f"<mujoco>{inner}</mujoco>"
+
+
+CORNERS = b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+HILLS = struct.pack("2i4f", 2, 2, 0, 1, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("compiler", "name", "mesh"),
+    [
+        ("", "m.obj", "m.obj"),
+        ("", "m.obj", "sub/m.obj"),
+        ('meshdir="shapes"', "shapes/m.obj", "m.obj"),
+        ('assetdir="shapes"', "shapes/m.obj", "m.obj"),
+        ('meshdir="{folder}/shapes"', "shapes/m.obj", "m.obj"),
+        ('meshdir="../{name}/shapes"', "shapes/m.obj", "m.obj"),
+        ('strippath="true"', "m.obj", "/somewhere/else/m.obj"),
+    ],
+)
+def test_a_mesh_is_found_where_mujoco_reads_it(tmp_path, compiler, name, mesh):
+    compiler = compiler.format(folder=tmp_path, name=tmp_path.name)
+    file = place(tmp_path, "sub/m.obj" if mesh.startswith("sub") else name, CORNERS)
+    asset = f'<compiler {compiler}/><asset><mesh name="m" file="{mesh}"/></asset>'
+    scene = place(tmp_path, "scene.xml", mjcf(asset))
+    mujoco.MjModel.from_xml_path(str(scene))
+    assert model_files(scene) == sorted([scene, file])
+
+
+def test_a_height_field_of_the_mesh_folder_is_found(tmp_path):
+    file = place(tmp_path, "shapes/h.bin", HILLS)
+    asset = '<asset><hfield name="h" file="h.bin" size="1 1 1 1"/></asset>'
+    scene = place(tmp_path, "scene.xml", mjcf(f'<compiler meshdir="shapes"/>{asset}'))
+    mujoco.MjModel.from_xml_path(str(scene))
+    assert model_files(scene) == sorted([scene, file])
+
+
+def test_nested_includes_and_attached_models_are_found(tmp_path):
+    files = [
+        place(tmp_path, "parts/one.xml", mjcf('<include file="deep/two.xml"/>')),
+        place(tmp_path, "parts/deep/two.xml", mjcf('<asset><mesh name="m" file="m.obj"/></asset>')),
+        place(tmp_path, "dirs.xml", mjcf('<compiler meshdir="shapes"/>')),
+        place(tmp_path, "shapes/m.obj", CORNERS),
+        place(tmp_path, "other.xml", mjcf("")),
+        place(tmp_path, "sky/right.png", b""),
+    ]
+    sky = '<texture name="t" type="cube" fileright="right.png"/>'
+    inner = f'<compiler texturedir="sky"/><asset><model name="o" file="other.xml"/>{sky}</asset>'
+    includes = '<include file="parts/one.xml"/><include file="dirs.xml"/>'
+    scene = place(tmp_path, "scene.xml", mjcf(inner + includes))
+    assert model_files(scene) == sorted([scene, *files])
+
+
+@pytest.mark.parametrize(
+    "inner",
+    [
+        '<include file="scene.xml"/>',
+        '<include file="missing.xml"/>',
+        '<include file=""/><compiler meshdir=""/>',
+        '<asset><mesh file="/dev/null"/></asset>',
+        f'<include file="{"x" * 5000}"/>',
+        "<broken",
+    ],
+)
+def test_a_file_that_names_no_other_stands_alone(tmp_path, inner):
+    scene = place(tmp_path, "scene.xml", mjcf(inner))
+    assert model_files(scene) == [scene]
