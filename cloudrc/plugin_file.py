@@ -11,6 +11,7 @@ from __future__ import annotations
 import ast
 import builtins
 import importlib
+import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from hashlib import sha256
@@ -120,19 +121,22 @@ class _Finder(MetaPathFinder):
 
 
 def sources(path: Path) -> list[Path]:
-    """Return the file of a plug-in and all files beside it that its import statements name."""
+    """Return the file of a plug-in and all files beside it that it names.
+
+    It names modules in its import statements, and data files as texts, such as "gains.json".
+    """
     file = path.resolve()
     found, left = {file: path}, [file]
     while left:
-        for other in _imported(left.pop(), file.parent):
+        for other in _named(left.pop(), file.parent):
             if other not in found:
                 found[other] = other
                 left.append(other)
     return list(found.values())
 
 
-def _imported(file: Path, folder: Path) -> Iterator[Path]:
-    """Yield the files in `folder` that the import statements in `file` name."""
+def _named(file: Path, folder: Path) -> Iterator[Path]:
+    """Yield the files that the source `file` names: modules in `folder`, data files beside it."""
     try:
         nodes = [*ast.walk(ast.parse(file.read_bytes()))] if file.suffix == ".py" else []
     except (OSError, SyntaxError, ValueError, RecursionError):
@@ -145,6 +149,10 @@ def _imported(file: Path, folder: Path) -> Iterator[Path]:
             above = [*file.parents][: node.level][-1] if node.level else folder
             for alias in node.names:
                 yield from _files(above, f"{node.module or ''}.{alias.name}".lstrip("."))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            data = os.path.join(file.parent, node.value)
+            if not os.path.isabs(node.value) and os.path.isfile(data):  # unlike Path, never raises
+                yield Path(data).resolve()
 
 
 def _files(folder: Path, name: str) -> Iterator[Path]:

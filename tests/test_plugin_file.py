@@ -3,6 +3,7 @@
 import statistics
 import sys
 from pathlib import Path
+from textwrap import dedent
 
 import pytest
 
@@ -149,3 +150,22 @@ def test_the_sources_of_a_plug_in_are_all_files_that_it_imports(write):
     assert sources(folder / "trace.csv") == [folder / "trace.csv"]
     write(mine="def build(:")
     assert sources(folder / "mine.py") == [folder / "mine.py"]
+
+
+def test_data_files_that_a_plug_in_names_are_sources(write):
+    """A sweep went on with other gains, because its keys did not depend on them."""
+    text = """
+        import helper
+        gains = HERE / "gains.json"
+        nested = "data/weights.npz"
+        missing, folder, absolute = "missing.csv", "data", "/etc/hostname"
+        odd = "a\\0b", "\\ud800", "", "x" * 5000, b"bytes.bin"
+    """
+    outer = write(inside__mine=dedent(text), inside__helper='other = "../shared.csv"', unnamed="")
+    folder = outer / "inside"
+    (folder / "data").mkdir()
+    for name in ("gains.json", "data/weights.npz", "../shared.csv", "bytes.bin", "log.txt"):
+        (folder / name).touch()
+    inside = {"data/weights.npz", "gains.json", "helper.py", "mine.py"}
+    wanted = {f"inside/{name}" for name in inside} | {"shared.csv"}
+    assert names(sources(folder / "mine.py"), outer) == wanted

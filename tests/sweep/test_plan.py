@@ -88,6 +88,21 @@ def test_a_key_depends_on_what_a_model_includes(write_sweep, tmp_path, key):
     assert found[0] == found[1] != found[2]
 
 
+@pytest.mark.parametrize("named", ["in the source", "in a parameter"])
+def test_a_key_depends_on_the_data_of_a_plug_in(write_sweep, tmp_path, named):
+    base = "from pathlib import Path\nfrom cloudrc.cloud.predictors import Predictor\n"
+    file = '"gains.json"' if named == "in the source" else "None"
+    build = f"def build(file: Path | None = {file}):\n    return Predictor()\n"
+    (tmp_path / "mine.py").write_text(base + build)
+    settings = {} if named == "in the source" else {"cloud.predictor.file": "gains.json"}
+    path = write_sweep({"cloud.predictor": ["./mine.py"]}, set={**SHORT, **settings})
+    found = []
+    for gains in ("1", "1", "2"):
+        (tmp_path / "gains.json").write_text(gains)
+        found.append([*read_plan(path).flights])
+    assert found[0] == found[1] != found[2]
+
+
 def test_points_with_one_seed_meet_the_same_draws(write_sweep):
     def delays(experiment):
         return [link.send(1, 2, n, 100, 0) for link in build_links(experiment) for n in range(300)]
