@@ -108,9 +108,11 @@ class Trials:
         elif now is None:
             load(options.experiment, [*options.set, f"{key}=1"])  # names an unknown key
             raise BadInputError(f"{key}: has no value now; name the largest one to try with --max")
-        self.size = options.resolution or (1.0 if isinstance(now, int) else 0.01)
-        if options.resolution is None and key.endswith("_ms"):
+        self.size = 1.0 if isinstance(now, int) else 0.01
+        if key.endswith("_ms"):
             self.size = 10.0
+        if options.resolution is not None:
+            self.size = options.resolution
         # Without a value the key has no effect, as a large value has: begin there.
         self.present = self._number(options.max if now is None else now)
         given = STEPS_MAX * self.present * self.size if options.max is None else options.max

@@ -140,7 +140,10 @@ def test_the_end_of_the_limits_is_no_failure_of_the_loop(fly_with, call):
         (f"{KEY} --max 5", "--resolution 10 must be above 0, --max 5 not below it"),
         ("link.both.loss --max 50", "--max 50: link.both.loss must be a number >= 0 and <= 1 (1 %"),
         ("guard.command_age_max_ms --max 2e4", "--max 20000: guard.command_age_max_ms must be a"),
-        *((f"{KEY} --resolution {text}", f"--resolution {text} must") for text in ("-1", "nan")),
+        *(
+            (f"{KEY} --resolution {text}", f"--resolution {text} must")
+            for text in ("-1", "0", "nan")
+        ),
         *((f"{KEY} --max {text}", f"--max {text} not") for text in ("nan", "0")),
     ],
 )
