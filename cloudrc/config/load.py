@@ -157,7 +157,7 @@ def load_experiment(
     if _has_all_values(document):
         _remove_derived(document, new_profile=bool(changes.keys() & _PROFILE_KEYS))
     outer = {path: value for path, value in changes.items() if path not in inner}
-    overrides.apply_overrides(document, outer)
+    overrides.apply_overrides(document, outer, build=build)
     for key in ("world", "guard", "link", "cloud", "report"):
         _default(document, (key,), {})
     found: list[Problem] = []

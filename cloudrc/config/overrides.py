@@ -5,7 +5,8 @@
   order the user gives them.
 - A parameter turns the name of a plug-in into a mapping: if the file has `controller: pid`, then
   `cloud.controller.speed_max=2` gives `{name: pid, speed_max: 2}`.
-- An index one above the last index of a list appends to it.
+- An index changes one entry of a list; one above the last index appends. If the file does not have
+  the list, its other entries are those of the default.
 
 Types and defaults of a plug-in's parameters come from the signature of its `build`.
 """
@@ -16,6 +17,7 @@ import copy
 import inspect
 import json
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import reduce
 from itertools import pairwise
 from pathlib import Path
@@ -28,13 +30,16 @@ from cloudrc.config import problems
 from cloudrc.config.document import Document, KeyPath, Source, child, parse_value
 from cloudrc.config.problems import Problem
 from cloudrc.config.reuse import reuse
-from cloudrc.config.schema import Experiment, PlugIn
+from cloudrc.config.schema import Experiment, PlugIn, Steps
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
 
 KINDS = {"estimator": "estimators", "predictor": "predictors", "controller": "controllers"}
 """Key under `cloud` -> kind of plug-in."""
-_DEFAULTS = Experiment().model_dump(mode="json")
+_DEFAULTS = {
+    **Experiment().model_dump(mode="json"),
+    "mission": {"steps": Steps().model_dump(mode="json")},
+}
 
 
 class Setting(NamedTuple):
@@ -93,8 +98,12 @@ def parse_settings(texts: Iterable[str], label: str = "--set") -> Settings:
     return collect_settings(given)
 
 
-def apply_overrides(document: Document, settings: Settings) -> None:
-    """Set values in a document; raise a BadInputError if an index is beyond the end of its list."""
+def apply_overrides(document: Document, settings: Settings, *, build: bool = False) -> None:
+    """Set values in a document; raise a BadInputError if an index is beyond the end of its list.
+
+    An index changes one entry of a list; the others keep their values, also if these are defaults.
+    Without `build`, the defaults of plug-ins' parameters are unknown: they are not imported.
+    """
     for path, (value, source) in settings.items():
         default: Any = _DEFAULTS
         for depth, (key, below) in enumerate(pairwise(path), start=1):
@@ -102,6 +111,8 @@ def apply_overrides(document: Document, settings: Settings) -> None:
             default = child(default, key)
             present = document.get(*path[:depth])
             node = _beginning(default) if present is None else present
+            if build and present is None and _is_parameter(path[:depth]):
+                node = _default_of_parameter(document, path[:depth])
             if path[0] == "cloud" and path[1] in KINDS and depth == 2 and isinstance(node, str):
                 node = {"name": node}  # not by `set_value`: the name keeps its source
                 document.tree["cloud"][key] = node
@@ -119,6 +130,29 @@ def _beginning(default: Any) -> Any:
     A section begins empty: its defaults would look like values that somebody has set.
     """
     return {} if isinstance(default, dict) else copy.deepcopy(default)
+
+
+def _is_parameter(path: KeyPath) -> bool:
+    """Return whether a key is the parameter of a plug-in, such as cloud.controller.gain_p."""
+    return len(path) == 3 and path[0] == "cloud" and path[1] in KINDS and path[2] != "name"
+
+
+def _default_of_parameter(document: Document, path: KeyPath) -> Any:
+    """Return the default of a plug-in's parameter if it is a list or mapping, else None."""
+    section, key, parameter = path
+    choice = document.get(section, key) or _DEFAULTS[section][key]
+    name = choice.get("name") if isinstance(choice, dict) else choice
+    if not isinstance(name, str):
+        return None
+    if plugins.is_path(name):
+        place = (section, key, "name") if isinstance(choice, dict) else (section, key)
+        name = str(document.source(place).absolute(name))
+    # `resolve_plugins` meets a problem of the plug-in or of its default again, and reports it.
+    with suppress(BadInputError, TypeError, ValueError):
+        field = _parameters_of(KINDS[key], name).model_fields.get(parameter)
+        if field is not None and isinstance(field.default, tuple | list | dict):
+            return json.loads(json.dumps(field.default))
+    return None
 
 
 def _check_index(document: Document, path: KeyPath, source: Source) -> None:
@@ -180,7 +214,7 @@ def _complete(
     BadInputError about a wrong parameter or a plug-in that fails.
     """
     kind = KINDS[path[-1]]
-    model = reuse(("parameters", kind, name), lambda: parameter_model(kind, name))
+    model = _parameters_of(kind, name)
     parameters = dict(given)
     for parameter, field in model.model_fields.items():
         place = (*path, parameter)
@@ -199,6 +233,10 @@ def _complete(
     if kind == "predictors" and document.get("cloud", "plan_s"):
         _check_model(plugin, name)
     return values
+
+
+def _parameters_of(kind: str, name: str) -> type[BaseModel]:
+    return reuse(("parameters", kind, name), lambda: parameter_model(kind, name))
 
 
 def _check_model(predictor: Any, name: str) -> None:

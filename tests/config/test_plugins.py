@@ -153,3 +153,32 @@ def test_installed_packages_add_plug_ins(share, monkeypatch):
     # An installed package cannot replace a shipped plug-in.
     assert "share" not in plugins.signature("predictors", "last_sample").parameters
     sys.modules.pop("share", None)
+
+
+@pytest.mark.parametrize(
+    ("settings", "gain_p"),
+    [
+        (["cloud.controller.gain_p.1=3"], [0.8, 3.0, 1.5]),
+        (["cloud.controller.gain_p.2=3", "cloud.controller.gain_p.0=2"], [2.0, 0.8, 3.0]),
+        (["cloud.controller=pid", "cloud.controller.gain_p.0=2"], [2.0, 0.8, 1.5]),
+        (["cloud.controller={name: pid}", "cloud.controller.gain_p.0=2"], [2.0, 0.8, 1.5]),
+        (["cloud.controller.gain_p=[1, 1, 1]"], [1.0, 1.0, 1.0]),
+    ],
+)
+def test_an_index_keeps_the_default_of_the_other_entries(settings, gain_p):
+    controller = load_experiment("steps", settings).cloud.controller
+    assert controller.model_extra["gain_p"] == gain_p
+
+
+def test_an_index_keeps_the_defaults_of_plug_ins_by_path_and_of_steps(share, tmp_path, monkeypatch):
+    monkeypatch.chdir(share.parent)
+    (tmp_path / "own.yaml").write_text("steps: {count: 2}")
+    settings = ["cloud.predictor=./share.py", "cloud.predictor.axes.2=true", "mission=./own.yaml"]
+    experiment = load_experiment("steps", [*settings, "mission.steps.centre_m.0=0.1"])
+    assert experiment.cloud.predictor.model_extra["axes"] == [True, True, True]
+    assert experiment.mission.steps.centre_m == (0.1, 0.0, 1.2)
+
+
+def test_an_index_into_an_unknown_parameter_is_refused_as_the_parameter_is():
+    reason = "cloud.controller.gain_q: unknown key; did you mean gain_p?"
+    assert reason in refused("steps", "cloud.controller.gain_q.1=3")
