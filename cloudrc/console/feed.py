@@ -39,7 +39,7 @@ class Sample(NamedTuple):
     downlink: float = nan  # one-way delay [s]
     estimate: float = nan  # delay by which cloud predicts ahead [s]
     error: float = nan  # distance from measured position to setpoint [m]
-    prediction_error: float = nan  # distance from predicted to measured position [m]
+    estimate_error: float = nan  # distance from predicted to measured position [m]
     speed: float = nan  # [m/s]
 
 

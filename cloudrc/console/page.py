@@ -44,7 +44,7 @@ BLUE, RED, GREEN = "#0072b2", "#d55e00", "#009e73"
 CHARTS: dict[str, tuple[float, float, dict[str, tuple[int, str]]]] = {
     "Delay [ms]": (1e3, 150, {"up": (1, BLUE), "down": (2, RED), "estimate": (3, GREEN)}),
     "Tracking error [m]": (1.0, 0.2, {"error": (4, BLUE)}),
-    "Prediction error [mm]": (1e3, 20, {"error": (5, BLUE)}),
+    "Estimate error [mm]": (1e3, 20, {"error": (5, BLUE)}),
     "Speed [m/s]": (1.0, 0.5, {"speed": (6, BLUE)}),
 }
 """Title of a chart -> factor from SI units, smallest range of its axis, and its curves: name ->

@@ -260,8 +260,8 @@ class CloudEnd(End):
         values["cloudrc_delay_estimate_seconds"] = record.horizon
         delay_error = nan if self._has_plans else self._delay.error
         values["cloudrc_delay_estimate_error_seconds"] = delay_error
-        values["cloudrc_prediction_error_meters"] = self._prediction.error
-        values["cloudrc_prediction_error_square_meters_total"] = self._prediction.square
+        values["cloudrc_estimate_error_meters"] = self._prediction.error
+        values["cloudrc_estimate_error_square_meters_total"] = self._prediction.square
         values["cloudrc_predictions_judged_total"] = self._prediction.judged
         values["cloudrc_tracking_error_meters"] = tracking_error(record.setpoint, record.measured)
         values["cloudrc_setpoint_meters"] = record.setpoint

@@ -139,9 +139,10 @@ cloudrc_loop_delay_seconds: Round trip of applied commands, with their time in w
 cloudrc_delay_estimate_seconds: Clamped delay estimate: how far ahead cloud predicts the odometry.
 cloudrc_delay_estimate_error_seconds: Delay estimate minus the true time from the odometry to the
     application of the command, for the newest command that the robot confirmed; absent with plans.
-cloudrc_prediction_error_meters[axis]: Predicted minus measured position for the same instant,
-    newest value (`estimate_error_rms` in the report).
-cloudrc_prediction_error_square_meters_total: Sum of the squared lengths of all prediction errors.
+cloudrc_estimate_error_meters[axis]: Predicted minus measured position at the instant of the
+    prediction, newest value.
+cloudrc_estimate_error_square_meters_total: Sum of the squared lengths of all estimate errors
+    since the process started.
 cloudrc_predictions_judged_total: Predictions compared with a measurement.
 cloudrc_tracking_error_meters[axis]: Setpoint minus measured position, in the newest period.
 cloudrc_setpoint_meters[axis]: Position setpoint, world frame.

@@ -115,12 +115,20 @@ def _prediction_error(flight: Flight) -> float | None:
     return finite(prediction_errors(flight)[0].rms)
 
 
-def _estimate_error(flight: Flight) -> float | None:
-    """Compute the RMS distance [m] from predicted to true positions at the predicted times."""
+def estimate_errors(flight: Flight) -> tuple[PredictionJudge, Array, Array]:
+    """Compare each predicted position with the true position at the instant of the prediction.
+
+    Live metrics show these errors, too, but against the measured position (`PredictionJudge.take`).
+    The result is that of `compare_with_truth`.
+    """
     control = flight.control
     each = zip(control["basis_stamp_ns"].tolist(), control["horizon"].tolist(), strict=True)
     at_ns = np.array([target_ns(*one) for one in each], dtype=np.int64)
-    return finite(compare_with_truth(flight, at_ns, control["position"])[0].rms)
+    return compare_with_truth(flight, at_ns, control["position"])
+
+
+def _estimate_error(flight: Flight) -> float | None:
+    return finite(estimate_errors(flight)[0].rms)
 
 
 def _delay_error(flight: Flight) -> float | None:

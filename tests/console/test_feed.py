@@ -38,8 +38,8 @@ def test_a_prediction_is_compared_at_its_own_instant(feed):
         at, x = 0.03 * step, 0.03 * step
         ahead = control(at, at, measured=(x, 0, 1), position=(x + 0.08, 0, 1), horizon=0.06)
         feed.take(status(at, control=ahead), 1.0 + at)
-    assert isnan(feed.samples[0].prediction_error)
-    assert feed.samples[-1].prediction_error == pytest.approx(0.020)
+    assert isnan(feed.samples[0].estimate_error)
+    assert feed.samples[-1].estimate_error == pytest.approx(0.020)
 
 
 def test_no_prediction_is_judged_across_two_sessions(feed):
@@ -47,7 +47,7 @@ def test_no_prediction_is_judged_across_two_sessions(feed):
         at = 0.03 * step
         feed.take(status(at, control=control(at, at, horizon=0.06)), 1.0 + at)
     feed.take(status(0.12, control=control(0.12, 0.12, measured=(5, 5, 5)), epoch=2), 1.12)
-    assert isnan(feed.samples[-1].prediction_error)
+    assert isnan(feed.samples[-1].estimate_error)
 
 
 def test_error_and_estimate_are_unknown_without_control(feed):

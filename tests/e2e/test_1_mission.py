@@ -103,14 +103,14 @@ def mean(name):
     ("query", "series", "low", "high"),
     [
         ("max by (component) (up)", 2, 1, 1),
-        ("max_over_time(max by (axis) (abs(cloudrc_prediction_error_meters))[2m:2s])", 3, 0, 0.5),
+        ("max_over_time(max by (axis) (abs(cloudrc_estimate_error_meters))[2m:2s])", 3, 0, 0.5),
         ("max_over_time(max by (axis, term) (abs(cloudrc_pid_output))[2m:2s])", 9, 0, 6.0),
         (mean("uplink_delay"), 1, 0.04, 0.05),
         (mean("downlink_delay"), 1, 0.04, 0.05),
         (mean("rtt"), 1, 0.05, 0.1),
         ("min(min_over_time(cloudrc_real_time_factor[1m]))", 1, 0.95, 1.05),
     ],
-    ids=["pods", "prediction error", "PID terms", "uplink", "downlink", "rtt", "real time"],
+    ids=["pods", "estimate error", "PID terms", "uplink", "downlink", "rtt", "real time"],
 )
 def test_prometheus_answers(asked, query, series, low, high):
     answers = [float(sample["value"][1]) for sample in asked(query)]

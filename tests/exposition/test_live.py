@@ -96,7 +96,7 @@ def test_control_periods_give_delays_errors_and_terms():
     assert value(live, "cloudrc_tracking_error_meters", "x") == 1.0
     assert value(live, "cloudrc_tracking_error_meters", "y") == -0.5
     assert value(live, "cloudrc_pid_output", "derivative", "z") == -0.7
-    assert "cloudrc_prediction_error_meters" not in live.read(), "no prediction compared yet"
+    assert "cloudrc_estimate_error_meters" not in live.read(), "no prediction compared yet"
 
 
 @pytest.mark.parametrize(
