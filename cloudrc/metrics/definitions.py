@@ -1,7 +1,9 @@
 """Define the quantities that a flight's report, its live metrics and the console all show.
 
 Each quantity is computed step by step. Live metrics and console do so while the records arrive, the
-report does so afterwards, with the same functions: the same records give the same value.
+report does so afterwards, with the same functions. So the same records give the same value, except
+for two quantities of which the report knows more: it waits longer for a missing datagram before it
+counts the datagram as lost (`WINDOW_MAX`), and it knows the true positions (`PredictionJudge`).
 """
 
 from __future__ import annotations

@@ -62,6 +62,14 @@ def test_what_has_left_the_window_is_lost_until_an_epoch_begins():
     assert (stream.expected, stream.lost) == (1001 + WINDOW, 999), "an epoch has its own window"
 
 
+@pytest.mark.parametrize(("window", "lost"), [(WINDOW, 1), (WINDOW_MAX, 0)])
+def test_a_datagram_between_the_two_windows_is_lost_live_and_not_in_the_report(window, lost):
+    stream = DatagramTally(window)
+    for counter in (0, *range(2, 200), 1):
+        stream.take(1, counter)
+    assert (stream.lost, stream.reordered) == (lost, 1 - lost)
+
+
 def test_a_report_waits_as_long_as_the_receiver_remembers():
     assert WINDOW_MAX == REMEMBERED
 
