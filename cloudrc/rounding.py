@@ -1,4 +1,8 @@
-"""What is equal up to rounding is equal: one rule for every comparison of computed numbers."""
+"""What is equal up to rounding is equal: one rule for every comparison of computed numbers.
+
+The rule holds wherever a number of a flight is compared with a limit of a user or of the verdict,
+or with a number of another flight. Loop, link, guard and physics compare exactly.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +27,8 @@ def differences(a: ArrayLike, b: ArrayLike) -> NDArray[Any]:
 
 def exceeds(value: float, limit: float) -> bool:
     """Return whether `value` is above `limit`, both in any unit, by more than rounding."""
-    return bool(differences(limit, value) > 0.0)
+    above = value - limit  # in plain floats: teleop asks for each telemetry
+    return above > 0.0 and above >= ROUNDING * max(abs(value), abs(limit))
 
 
 def format_beside(value: float, limit: float) -> str:

@@ -11,6 +11,7 @@ from cloudrc.config.schema import Waypoint
 from cloudrc.geometry.scene import BOARD, is_obstacle
 from cloudrc.metrics.definitions import Holds
 from cloudrc.metrics.flight import Array, Flight, Measure, add_metrics, mean, select
+from cloudrc.rounding import differences
 
 IMPACT_NS = 100_000_000
 """Time from the first touch over which the impulse is summed [ns]: the impact and its bounces."""
@@ -78,7 +79,7 @@ def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
     truth, dwell = flight.truth, 0.0 if flight.mission.carrot else waypoint.dwell_s
     rows = truth["stamp_ns"] <= until_ns
     distance = np.linalg.norm(truth["position"][rows] - waypoint.position_m, axis=1)
-    near = np.append(distance <= waypoint.tolerance_m, [False])
+    near = np.append(differences(waypoint.tolerance_m, distance) <= 0.0, [False])
     edges = np.flatnonzero(np.diff(near, prepend=[False]))
     stamps = np.append(truth["stamp_ns"][rows], until_ns)
     stays_ns = stamps[edges[1::2] - 1] - stamps[edges[::2]]

@@ -14,6 +14,7 @@ import numpy as np
 
 from cloudrc.metrics.control import tracking_errors
 from cloudrc.metrics.flight import Array, Flight, add_metrics, mean, percentile
+from cloudrc.rounding import differences
 
 SHORTEST_NS = 500_000_000
 """Shortest duration of a step, and its last part, in which the robot must have settled [ns]."""
@@ -107,7 +108,7 @@ def _rise_time(times: Array, share: Array) -> float | None:
 
 
 def _settling_time(times: Array, sizes: Array, band: float) -> float | None:
-    outside = np.flatnonzero(sizes > band)
+    outside = np.flatnonzero(differences(band, sizes) > 0.0)
     if not len(outside):
         return 0.0
     return float(times[outside[-1] + 1]) if outside[-1] + 1 < len(times) else None

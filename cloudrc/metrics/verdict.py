@@ -160,9 +160,10 @@ def _obstacle_touched(name: str, count: int, moment: Moment = UNKNOWN) -> Failur
 
 
 def _too_slow(factor: float) -> str:
-    if factor >= REAL_TIME_FACTOR_MIN:
+    if not exceeds(REAL_TIME_FACTOR_MIN, factor):
         return ""
-    return f"real-time factor {factor:.3f} is below {REAL_TIME_FACTOR_MIN}: {ADVICE}"
+    found = format_beside(factor, REAL_TIME_FACTOR_MIN)
+    return f"real-time factor {found} is below {REAL_TIME_FACTOR_MIN}: {ADVICE}"
 
 
 def flight_evidence(
@@ -299,8 +300,9 @@ def _not_real_time(numbers: Mapping[str, Number]) -> str:
         return "the recording does not prove that the run kept real time"
     if slow := _too_slow(factor.value):
         return slow
-    if slip.value > SLIP_MAX:
-        return f"world's clock lost {slip.value:.3f} s, more than {SLIP_MAX} s: {ADVICE}"
+    if exceeds(slip.value, SLIP_MAX):
+        lost = format_beside(slip.value, SLIP_MAX)
+        return f"world's clock lost {lost} s, more than {SLIP_MAX} s: {ADVICE}"
     return ""
 
 

@@ -39,6 +39,7 @@ from cloudrc.messages import (
     Vector,
 )
 from cloudrc.records import MissionEvent
+from cloudrc.rounding import exceeds
 from cloudrc.teleop.carrot import ACCELERATION, HEARTBEAT_NS, arrival_ns, steer
 from cloudrc.teleop.requests import REPEAT_NS, RequestSender
 from cloudrc.teleop.wire import (
@@ -109,7 +110,7 @@ class LegWatch:
                 self._flown_ns += min(now_ns - before_ns, GAP_MAX_NS)
             if now_ns - before_ns > UNSEEN_MAX_NS:
                 self._near_since_ns = NEVER_NS  # the robot's path in the gap is unknown
-        if dist(seen.position, leg.position) > leg.tolerance:
+        if exceeds(dist(seen.position, leg.position), leg.tolerance):
             self._near_since_ns = NEVER_NS
             return False
         if self._near_since_ns < 0:
@@ -446,7 +447,7 @@ class Teleop:
         if not leg.speed:
             return rested
         leaves_ns = self._leaves_ns(self.leg)
-        near = dist(seen.position, leg.position) <= leg.tolerance
+        near = not exceeds(dist(seen.position, leg.position), leg.tolerance)
         return near and leaves_ns is not None and now_ns >= leaves_ns
 
     def _leaves_ns(self, leg: int) -> int | None:

@@ -83,6 +83,12 @@ def test_random_steps_must_settle_and_null_switches_it_off():
     assert "not_settled" not in judged(flight(*far, mission=mission, settle_m=None))
 
 
+def test_an_error_at_the_edge_of_the_band_is_settled():
+    """In floating point 1 - 0.95 is above 0.05."""
+    (step,) = steps(flight(lambda t: (0.0 if t < 2.0 else 0.95, 0.0, 1.0)))
+    assert step.settling_time == pytest.approx(2.0, abs=0.02)
+
+
 def test_steps_that_do_not_settle_are_counted_beside_the_mean():
     slow, quick = flight(growing), flight(second_order(0.7))
     assert SHIPPED["unsettled_steps"].measure(slow) == 1.0

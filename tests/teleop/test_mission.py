@@ -48,6 +48,13 @@ def test_dwell_starts_again_outside_of_the_tolerance():
     assert last_event(flight) == "reached"
 
 
+def test_a_robot_at_the_edge_of_the_tolerance_is_at_the_waypoint():
+    """In floating point 1.1 - 1.0 is above 0.1."""
+    flight = flying()
+    flight.step(position=(1.1, 0.0, 1.0), seconds=0.6)
+    assert last_event(flight) == "reached"
+
+
 def test_time_in_hold_or_unseen_is_no_dwell():
     flight = flying()
     flight.guard = HOLD
