@@ -49,13 +49,12 @@ def execute(options: argparse.Namespace) -> int:
     lines = [f"kept {recovery.share:.1%}: {kept}"]
     lines.append("topics: " + ", ".join(f"{name} {n}" for name, n in recovery.topics.items()))
     lines += [f"lossy: {note}" for note in recovery.notes]
+    lines += [f"the recording {remark}" for remark in recovery.remarks]
     if len(recovery.dropped) > LISTED_MAX:  # the note lists only some
         counts = {name: "?" if n is None else n for name, n in recovery.dropped.items()}
         lines.append("dropped: " + ", ".join(f"{name} {n}" for name, n in counts.items()))
     if recovery.derived:
         lines.append(f"made again from the other topics: {', '.join(recovery.derived)}")
-    if recovery.complete and recovery.index_is_new:
-        lines.append("the index was missing or damaged and is rebuilt; nothing is lost")
     text = "\n".join(map(escape, [*lines, str(target)]))
     print_result(options.output, {"file": str(target), **asdict(recovery)}, text)
     return 0 if recovery.complete else LOSSY

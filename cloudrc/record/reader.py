@@ -1,15 +1,16 @@
 """Read or repair an MCAP file: all of it, or what a kill or damage has left.
 
 A killed process leaves a file without an end; this module reads it up to its last complete chunk.
-In a damaged file, it goes on behind the damage if the file's index is intact. The package `mcap`
-parses the format. This module limits the unpacked size, and describes in words
-what is missing.
+In a damaged file, it goes on behind the damage: the file's index says where, or a search finds the
+next intact part. The package `mcap` parses the format. This module limits the unpacked size, and
+describes in words what is missing.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import zlib
 from array import array
 from collections import Counter
@@ -19,8 +20,7 @@ from dataclasses import dataclass, field
 from io import BufferedReader, BytesIO
 from itertools import pairwise
 from pathlib import Path
-from struct import Struct
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
 import lz4.frame
 import zstandard
@@ -49,10 +49,19 @@ UNKNOWN = "unknown"
 """In place of the topic of messages whose topic is lost."""
 RECORD_HEAD_SIZE = 9
 """Size of a record's opcode and length [bytes]."""
-_FOOTER = Struct("<BQQQI8s")
-"""The last record of a file (opcode, length, start of the index, start of the index of the index,
-checksum of the index), and the end of the file."""
-FOOTER_SIZE = _FOOTER.size
+_BEGINNING = re.compile(
+    b"(?s)[%c%c%c%c%c](?=.{4}\\0{4})"
+    % (
+        Opcode.CHUNK,
+        Opcode.MESSAGE_INDEX,
+        Opcode.ATTACHMENT,
+        Opcode.METADATA,
+        Opcode.DATA_END,
+    )
+)
+"""Where a record may begin behind damage: its opcode, then a length below 4 GiB."""
+_SELF_CHECKED = mcap.Chunk | mcap.Attachment | mcap.Footer
+"""Records with a checksum, or with a fixed text behind them."""
 KINDS = {
     b"": "is empty; name a recording (.mcap)",
     b"#ROSBAG V": "is a ROS 1 bag, not an MCAP file; convert it with: rosbags-convert",
@@ -89,40 +98,38 @@ class Part(NamedTuple):
 
 
 @dataclass(slots=True)
-class _Index:
-    """What the end of a file says about the whole file."""
+class _Found:
+    """What a search has found in a damaged file."""
 
-    parts: list[Part] = field(default_factory=list)  # by position
-    channels: dict[int, mcap.Channel] = field(default_factory=dict)
-    schemas: dict[int, mcap.Schema] = field(default_factory=dict)
-    statistics: mcap.Statistics | None = None
+    parts: list[Part] = field(default_factory=list)  # intact records, by position
+    holes: list[Part] = field(default_factory=list)  # damage between them, by position
+    size: int = 0  # size of the file up to its end, or up to its last intact record [bytes]
+    data_ended: bool = False  # whether nothing is missing behind the last part
+    ended: bool = False  # whether the file has an end
+    channels: dict[int, mcap.Channel] = field(default_factory=dict)  # as the index says
+    schemas: dict[int, mcap.Schema] = field(default_factory=dict)  # as the index says
+    statistics: mcap.Statistics | None = None  # as the index says
 
-    @staticmethod
-    def read(stream: IO[bytes], size: int) -> _Index | None:
-        """Read the index at the end of a file of `size` bytes; None if it is missing or damaged."""
-        stream.seek(max(size - FOOTER_SIZE, 0))
-        opcode, _, start, _, checksum, magic = _FOOTER.unpack(stream.read().rjust(FOOTER_SIZE))
-        if opcode != Opcode.FOOTER or magic != MCAP0_MAGIC or not 0 < start < size:
-            return None
-        stream.seek(start)
-        data = stream.read(size - start)
-        checked = data[: -len(MCAP0_MAGIC) - 4]  # up to the checksum itself
-        if checksum not in (0, zlib.crc32(checked)):
-            return None
-        index = _Index()
+    def read_index(self, data: bytes, start: int) -> None:
+        """Read the index from `start` up to the file's end, unless its checksum is wrong."""
+        checked = data[start : self.size - len(MCAP0_MAGIC) - 4]  # up to the checksum itself
+        checksum = int.from_bytes(data[start + len(checked) :][:4], "little")
+        if not 0 < start < self.size or checksum not in (0, zlib.crc32(checked)):
+            return
+        stream = BytesIO(data[start : self.size])
+        contents: dict[int, str] = {}  # position of a part -> its content, in words
         with suppress(Exception):  # without a checksum, the bytes may be anything
-            for record in StreamReader(BytesIO(data), skip_magic=True, emit_chunks=True).records:
-                index._store(record)
-        index.parts.sort()
-        return index if index.parts else None
+            for record in StreamReader(stream, skip_magic=True, emit_chunks=True).records:
+                self._store(record, contents)
+        # If bytes were lost or inserted, the positions hold up to the first damage only.
+        self.holes = [Part(at, size, contents.get(at, "")) for at, size, _ in self.holes]
 
-    def _store(self, record: mcap.McapRecord) -> None:
+    def _store(self, record: mcap.McapRecord, contents: dict[int, str]) -> None:
         if isinstance(record, mcap.ChunkIndex):
             times = record.message_start_time * 1e-9, record.message_end_time * 1e-9
-            content = f"{times[0]:.2f} to {times[1]:.2f} s"
-            self.parts.append(Part(record.chunk_start_offset, record.chunk_length, content))
+            contents[record.chunk_start_offset] = f"{times[0]:.2f} to {times[1]:.2f} s"
         elif isinstance(record, mcap.AttachmentIndex | mcap.MetadataIndex):
-            self.parts.append(Part(record.offset, record.length, to_one_line(record.name)))
+            contents[record.offset] = to_one_line(record.name)
         elif isinstance(record, mcap.Channel):
             self.channels[record.id] = record
         elif isinstance(record, mcap.Schema):
@@ -134,15 +141,14 @@ class _Index:
 class File:
     """Reads one MCAP file, including its chunks, and goes on behind damaged parts if it can.
 
-    The records of an intact file are read in their order. In a damaged file, only the index tells
-    where the records behind the damage begin. If the index is missing too, a damaged chunk is left
-    out as long as its length is intact.
+    The records of an intact file are read in their order. In a damaged file, a search finds the
+    next intact record: lost or inserted bytes have moved it, so that no index says where it is.
     """
 
     def __init__(self, path: Path) -> None:
         """Read a file; raise a BadInputError if it cannot be read or is not MCAP."""
         self._path = path
-        self._compression = ""  # in words: chunks are compressed in a way that cloudrc cannot read
+        self._unreadable = ""  # in words: why cloudrc cannot unpack some chunks
         try:
             self._stream = BufferedReader(open_file(path))
         except (OSError, ValueError) as error:  # ValueError: a pipe or a device
@@ -156,7 +162,7 @@ class File:
             self._read()
         if not self.recording.messages and (self.gaps or not self.data_ended):
             damage = _describe(self.gaps) if self.gaps else ""
-            reasons = [self._compression or damage, self.fault]
+            reasons = [self._unreadable or damage, self.fault]
             reason = "; ".join(filter(None, reasons))
             raise NothingReadableError(
                 f"{path}: holds no readable message: {reason}; name another recording"
@@ -186,9 +192,13 @@ class File:
         may_be_damaged = not begins or self._try(self._read_records)
         if self.gaps and self.data_ended:  # thus the checksum of all data is wrong, too
             self.fault = ""
-        if may_be_damaged and (index := _Index.read(self._stream, self.size)):
+        found = None
+        if may_be_damaged and (self.gaps or not self.data_ended):
+            with suppress(_StopError):
+                found = self._search(len(MCAP0_MAGIC) if begins else 0)
+        if found:
             self._clear()
-            self._try(lambda: self._read_parts(index))
+            self._try(lambda: self._read_parts(found))
         elif not begins:
             kind = next((k for k in KINDS if k and head.startswith(k)), head.strip(b"\0"))
             text = KINDS.get(kind, "is not an MCAP file; name a recording (.mcap)")
@@ -199,9 +209,8 @@ class File:
         try:
             read()
             return bool(self.gaps)
-        except CRCValidationError as error:
+        except CRCValidationError:
             self.fault = "damaged: a checksum is wrong"
-            self.data_ended |= isinstance(error.record, mcap.DataEnd)
         except (EndOfFile, RecordLengthLimitExceeded):  # a record longer than the rest of the file
             self.fault, self.cut = "cut short", True
         except _StopError as error:
@@ -231,33 +240,118 @@ class File:
             self.position = end
         self.position = self._stream.tell()
         self.ended = self.data_ended = True
-        if self.position < self.size:
-            self.fault = "something follows its end"
+        self._see_what_follows()
 
-    def _read_parts(self, index: _Index) -> None:
-        """Read the parts that the index names, and leave out those that are damaged."""
-        self.channels |= index.channels
-        self._schemas |= index.schemas
-        self.statistics = index.statistics
-        for part in index.parts:
-            if part.start < self.position:
-                continue  # a wrong index names a part twice
+    def _see_what_follows(self) -> None:
+        """Note what follows the end of the file: another recording, or bytes without records."""
+        self._stream.seek(self.position)
+        rest = self._stream.read()
+        if MCAP0_MAGIC in rest or self._next_intact(rest, 0) < len(rest):
+            self.fault = "something follows its end"
+        elif rest:
+            self.recording.remarks += (
+                f"had {len(rest)} bytes behind its end, which were left out",
+            )
+            self.position = self.size
+
+    def _read_parts(self, found: _Found) -> None:
+        """Read the intact parts of a damaged file."""
+        self.channels |= found.channels
+        self._schemas |= found.schemas
+        self.statistics, self.gaps = found.statistics, found.holes
+        kinds = Counter[type]()
+        for part in found.parts:
             self._stream.seek(part.start)
-            data = self._stream.read(part.size)
-            try:
-                record = _parse(data)
-            except Exception:  # the library may raise anything on damaged bytes
-                self.gaps.append(part)
+            record = _parse(self._stream.read(part.size))
+            kinds[type(record)] += 1
+            if isinstance(record, mcap.Chunk):
+                self._store_chunk(record, part)
             else:
-                if isinstance(record, mcap.Chunk):
-                    self._store_chunk(record, part)
-                else:
-                    self._store(record)
-            self.position = part.start + part.size
-        self.position = self.size
-        self.ended = self.data_ended = True
-        if not self.gaps:
+                self._store(record)
+        self.position, self.ended, self.data_ended = found.size, found.ended, found.data_ended
+        if not self.data_ended:
+            self.fault, self.cut = "cut short", True
+        elif not self.gaps:
             self.fault = "damaged outside of its messages"
+        elif self._has_all(kinds):
+            self.recording.remarks += (f"was {_describe(self.gaps)}; nothing is missing",)
+            self.gaps = []
+        if self.ended:
+            self._see_what_follows()
+
+    def _has_all(self, kinds: Counter[type]) -> bool:
+        """Return whether all that the index counts was read, and the head; `kinds`: of records."""
+        counts = self.statistics
+        return (
+            counts is not None
+            and kinds[mcap.Header] > 0
+            and self.read == Counter(counts.channel_message_counts)
+            and kinds[mcap.Attachment] >= counts.attachment_count
+            and kinds[mcap.Metadata] >= counts.metadata_count
+        )
+
+    def _search(self, position: int) -> _Found | None:
+        """Find the intact parts of a file from `position` on; None if that finds nothing new."""
+        self._stream.seek(0)
+        data, found, chunks = self._stream.read(), _Found(), set[bytes]()
+        index = 0  # where the index begins, behind the data [bytes]
+        while position < len(data) and not found.ended:
+            record, end = self._parse_at(data, position)
+            if record is None:
+                if not self._is_intact(data, end):  # the length is damaged, too
+                    end = self._next_intact(data, position + 1)
+                if end == len(data):
+                    break  # the rest is lost
+                found.holes.append(Part(position, end - position, ""))
+            elif isinstance(record, mcap.Chunk) and data[position:end] in chunks:
+                found.holes.append(Part(position, end - position, ""))  # inserted bytes repeat it
+            elif isinstance(record, mcap.Footer):
+                found.ended = found.data_ended = True
+                end += len(MCAP0_MAGIC)
+                index = index or record.summary_start
+            elif isinstance(record, mcap.DataEnd):
+                found.data_ended, index = True, end
+            elif not index:
+                found.parts.append(Part(position, end - position, ""))
+                if isinstance(record, mcap.Chunk):
+                    chunks.add(data[position:end])
+            position = end
+        found.size = position
+        if found.ended:
+            found.read_index(data, index)
+        return found if found.parts and (found.holes or found.data_ended) else None
+
+    def _next_intact(self, data: bytes, start: int) -> int:
+        """Return where the next intact record begins, from `start` on; the end if there is none."""
+        places = (match.start() for match in _BEGINNING.finditer(data, start))
+        return next((place for place in places if self._is_intact(data, place)), len(data))
+
+    def _is_intact(self, data: bytes, place: int) -> bool:
+        """Return whether records begin at `place`, up to one that proves its own content."""
+        record, end = self._parse_at(data, place)
+        while record is not None and not isinstance(record, _SELF_CHECKED):
+            record, end = self._parse_at(data, end)
+        return record is not None
+
+    def _parse_at(self, data: bytes, start: int) -> tuple[mcap.McapRecord | None, int]:
+        """Parse the record at `start`, with its checksum; return it (None if damaged), its end."""
+        self._take_room(MESSAGE_COST)
+        size = int.from_bytes(data[start + 1 : start + RECORD_HEAD_SIZE], "little")
+        end = start + RECORD_HEAD_SIZE + size
+        if start + RECORD_HEAD_SIZE > len(data) or end > len(data):
+            return None, end
+        try:
+            record = _parse(data[start:end])
+            if isinstance(record, mcap.Chunk):
+                for _ in self._unpack(record):
+                    pass
+        except _StopError:
+            raise
+        except Exception:  # the libraries may raise anything on damaged bytes
+            return None, end
+        if isinstance(record, mcap.Footer) and not data.startswith(MCAP0_MAGIC, end):
+            return None, end
+        return record, end
 
     def _store_chunk(self, chunk: mcap.Chunk, part: Part) -> None:
         """Store the records of a chunk; leave out a damaged chunk."""
@@ -333,6 +427,11 @@ class File:
             found[topic] += max(self.read[number], counts.get(number, 0))
         return found | _stored_counts(self.recording)  # of both, the larger number
 
+    @property
+    def has_counts(self) -> bool:
+        """Whether the writer's count of the messages is known."""
+        return bool(_stored_counts(self.recording))
+
     def _take_room(self, size: int) -> None:
         self._room -= size
         if self._room < 0:
@@ -340,14 +439,17 @@ class File:
 
     def _unpack(self, chunk: mcap.Chunk) -> Iterator[mcap.McapRecord]:
         size = chunk.uncompressed_size
-        self._take_room(size)
+        if size > self._room:  # a bomb, or a damaged number
+            self._unreadable = f"it unpacks to more than {UNPACKED_MAX} times its size"
+            raise ValueError(self._unreadable)
         if chunk.compression not in _UNPACK:
-            self._compression = (
+            self._unreadable = (
                 f"its chunks are compressed by {to_one_line(chunk.compression)!r}; cloudrc reads"
                 " zstd and lz4: convert it with: mcap compress"
             )
-            raise ValueError(self._compression)
+            raise ValueError(self._unreadable)
         data = _UNPACK[chunk.compression](chunk.data, size + 1)
+        self._take_room(len(data))
         if len(data) != size:
             raise ValueError("the chunk is not as long as it states")
         if chunk.uncompressed_crc not in (0, checksum := zlib.crc32(data)):

@@ -29,6 +29,7 @@ class Recovery:
     dropped: dict[str, int | None]  # number of messages that are not in the new file, by topic
     bytes_lost: int  # number of bytes that were not read
     notes: list[str]  # what is missing or doubtful, in words
+    remarks: list[str]  # what else was noticed, in words; it does no harm
     index_is_new: bool  # whether the old file had no readable index
 
 
@@ -52,7 +53,7 @@ def recover(
     if file.unread:
         missed.insert(0, f"{file.unread} bytes after the last intact part were not read")
     if dropped := _dropped(file):
-        counts = [topic if n is None else f"{n} on {topic}" for topic, n in sorted(dropped.items())]
+        counts = [f"{'?' if n is None else n} on {topic}" for topic, n in sorted(dropped.items())]
         missed.append(f"messages that are not in the copy: {list_some(counts)}")
     recording.told = "; ".join(filter(None, [recording.told, *missed]))
     recording.write(target)
@@ -70,6 +71,7 @@ def recover(
         dropped=dropped,
         bytes_lost=file.unread + file.left_out,
         notes=notes,
+        remarks=list(recording.remarks),
         index_is_new=not file.ended,
     )
 
@@ -107,9 +109,12 @@ def _written(recording: Recording) -> Counter[str]:
 
 def _dropped(file: File) -> dict[str, int | None]:
     """Count the messages that `file` has lost, by topic; None: some, but nobody knows how many."""
-    written = _written(file.recording)
-    dropped: dict[str, int | None] = dict(sorted((file.stated - written).items()))
-    is_uncounted = file.statistics is None and (file.recording.torn or file.gaps)
-    if is_uncounted and _has_views(file):
-        dropped |= {topic: None for topic in VIEWS.keys() - written.keys() - dropped.keys()}
-    return dropped
+    written, stated = _written(file.recording), file.stated
+    dropped: dict[str, int | None] = dict(sorted((stated - written).items()))
+    is_uncounted = file.statistics is None and (file.recording.torn or file.gaps or file.unread)
+    if not is_uncounted:
+        return dropped
+    topics = VIEWS.keys() - written.keys() if _has_views(file) else set[str]()
+    if not file.has_counts:
+        topics |= stated.keys()
+    return dropped | dict.fromkeys(sorted(topics - dropped.keys()))

@@ -329,8 +329,72 @@ def test_intact_parts_behind_damage_are_recovered(path, places, left_out):
     assert kept.note == "; ".join(recovery.notes)
     if left_out:
         assert recovery.share == len(kept.messages) / len(MESSAGES)
-        assert recovery.bytes_lost == sum(CHUNKS[n][1] - CHUNKS[n][0] for n in left_out)
+        size = sum(CHUNKS[n][1] - CHUNKS[n][0] for n in left_out)
+        assert size <= recovery.bytes_lost < 2 * size, "with the lists of messages beside them"
         assert recovery.notes[0].startswith(f"damaged at byte {CHUNKS[left_out[0]][0]}")
+
+
+BEHIND = CHUNKS[2][1]  # the first byte behind the third chunk
+LOST = {
+    "cut out": (WHOLE[:SECOND] + WHOLE[SECOND + 3000 :], 1),
+    "cut out twice": (WHOLE[:SECOND] + WHOLE[SECOND + 9 : THIRD] + WHOLE[THIRD + 1 :], 2),
+    "zeros put in": (WHOLE[:SECOND] + bytes(5000) + WHOLE[SECOND:], 1),
+    "as long as before": (
+        WHOLE[:SECOND] + WHOLE[SECOND + 99 : THIRD] + bytes(99) + WHOLE[THIRD:],
+        2,
+    ),
+    "a size of 2**63 bytes": (flipped(CHUNKS[1][0] + 9 + 16 + 7), 1),
+    "and padded": (WHOLE[:SECOND] + WHOLE[SECOND + 3000 :] + bytes(4096), 1),
+}
+
+
+@pytest.mark.parametrize(("data", "chunks_lost"), LOST.values(), ids=LOST)
+def test_a_recovery_goes_on_behind_bytes_that_were_lost_or_inserted(path, data, chunks_lost):
+    """All intact chunks behind them are only shifted; the index counts the others' messages."""
+    path.write_bytes(data)
+    recovery = recover(path, new := path.with_name("new.mcap"))
+    lost = sum((Counter(MESSAGES) - Counter(Recording.read(new).messages)).values())
+    assert len(MESSAGES) - recovery.kept["messages"] == lost <= chunks_lost * max(SIZES)
+    assert lost >= min(SIZES)
+    assert sum(recovery.dropped.values()) == lost
+    assert not recovery.complete
+    last = WHOLE[CHUNKS[3][0] : CHUNKS[3][0] + 50]
+    path.write_bytes(data[: data.index(last) + 50])  # without an index, too
+    kept = recover(path, new := path.with_name("torn.mcap")).kept["messages"]
+    assert kept >= SIZES[0] + (chunks_lost == 1) * SIZES[2]
+
+
+WHOLE_IN_ALL = {
+    "padded": WHOLE + bytes(4096),
+    "followed by rubbish": WHOLE + b"rubbish" * 99,
+    "repeated bytes": WHOLE[:THIRD] + WHOLE[CHUNKS[1][0] - 40 :],
+    "cut out of a list of messages": WHOLE[: BEHIND + 20] + WHOLE[BEHIND + 90 :],
+}
+
+
+@pytest.mark.parametrize("data", WHOLE_IN_ALL.values(), ids=WHOLE_IN_ALL)
+def test_a_file_with_all_that_its_index_counts_is_complete(path, call, data):
+    path.write_bytes(data)
+    new = path.with_name("x.recovered.mcap")
+    assert "left out" in call("recover", path, code=0).out
+    copy = Recording.read(new)
+    assert (copy.messages, copy.note) == (MESSAGES, "")
+    assert copy.attachments == Recording.read(path).attachments
+
+
+@pytest.mark.parametrize("rest", [WHOLE, WHOLE[:SECOND], WHOLE[1000:-1000]])
+def test_a_second_recording_behind_the_first_is_not_passed_over(path, rest):
+    path.write_bytes(WHOLE + rest)
+    assert recover(path, path.with_name("new.mcap")).notes[0] == "something follows its end"
+
+
+def test_if_nothing_counts_the_lost_messages_each_topic_has_a_question_mark(path, call):
+    path.write_bytes(WHOLE[: len(WHOLE) // 2])
+    said = call("recover", path, code=1).out
+    dropped = recover(path, path.with_name("new.mcap")).dropped
+    assert dropped.keys() >= {topic for topic, _, _ in MESSAGES[: SIZES[0]]}
+    assert {*dropped.values()} == {None}
+    assert "/odometry ?" in said
 
 
 def test_without_an_index_damaged_chunks_of_a_torn_file_are_left_out(path):

@@ -168,5 +168,5 @@ def test_views_that_cannot_be_made_again_are_named_as_dropped(flown, tmp_path):
     torn = data[: len(data) // 2]
     (tmp_path / "f.mcap").write_bytes(torn)
     recovery = recover(tmp_path / "f.mcap", tmp_path / "r.mcap")  # without a function for views
-    assert recovery.dropped.keys() == VIEWS.keys()
-    assert "/tf" in recovery.notes[-1]
+    assert recovery.dropped.keys() > VIEWS.keys()
+    assert "?" in recovery.notes[-1]
