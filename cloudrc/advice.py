@@ -198,7 +198,7 @@ def _always_up(experiment: ResolvedExperiment, *, uplink: bool) -> LinkDirection
 def _hover(experiment: ResolvedExperiment) -> Iterator[str]:
     """Yield advice if the integral of the velocity loop cannot balance wind or a changed weight."""
     from cloudrc.config.schema import GRAVITY_MPS2, MASS_KG
-    from cloudrc.robots.pelican.onboard import GRAVITY, MASS
+    from cloudrc.robots.pelican.low_level import GRAVITY, MASS
 
     plant, loop, wind = experiment.world.plant, experiment.world.low_level, experiment.world.wind
     weight = (MASS_KG * plant.mass_factor + plant.payload_kg) * GRAVITY_MPS2

@@ -142,24 +142,16 @@ def build_world(
     `clock` returns the monotonic time [ns]. It is called last, at the start of world's time, so
     that the duration of compiling the scene does not count.
     """
-    from cloudrc.robots.pelican.native.robot import make_robot
-    from cloudrc.robots.pelican.onboard import LowLevel
-    from cloudrc.robots.pelican.rotors import Rotors
+    from cloudrc.robots.build import build_robot
     from cloudrc.world.endpoint import WorldEndpoint
-    from cloudrc.world.guard.state import Guard
     from cloudrc.world.plant import Wind
-    from cloudrc.world.robot import STEP, Robot
     from cloudrc.world.sensors import Sensors
-    from cloudrc.world.simulator import Simulator
 
     world, seed = experiment.world, experiment.seed
     wind = Wind(world.wind, _generator(seed, "wind")) if world.wind.blows else None
-    actuators, onboard = Rotors(STEP), LowLevel(**world.low_level.model_dump())
-    simulator = Simulator(world.robot, world.scene, world.plant, wind, actuators=actuators)
     noise, turn_noise = _generator(seed, "odometry noise"), _generator(seed, "attitude noise")
-    make = make_robot if world.is_nominal else Robot
     return WorldEndpoint(
-        make(simulator, onboard, Guard(experiment.guard)),
+        build_robot(world, experiment.guard, wind),
         Sensors(world.sensors, noise, turn_noise),
         identity,
         newest_wins=experiment.tunnel.order == "newest",

@@ -40,12 +40,16 @@ PACKAGES = {
     "estimators": "cloudrc.cloud.estimators",
     "predictors": "cloudrc.cloud.predictors",
     "controllers": "cloudrc.cloud.controllers",
+    "onboard": "cloudrc.robots.onboard",
     "metrics": "",
 }
 """Kind of plug-in -> package that contains cloudrc's plug-ins of this kind; "" for metrics."""
 SHOWN_MAX = 60
 """Largest length of a wrong value's representation in a message [characters]."""
-METHODS = {"estimators": "horizon", "predictors": "predict", "controllers": "update"}
+METHODS = {
+    **{"estimators": "horizon", "predictors": "predict", "controllers": "update"},
+    "onboard": "update",
+}
 """Kind of plug-in -> the method that every plug-in of this kind defines."""
 
 
@@ -89,6 +93,8 @@ def find(kind: str, name: str) -> Any:
         raise BadInputError(f"{_one(kind)} {name!r}: there is no such file")
     with refuse_failure(f"{_one(kind)} {name!r} cannot be imported"):
         if is_path(name):
+            if (module := _module_of(Path(name))) is not None:
+                return importlib.import_module(module)
             return load_file(Path(name))
         if name in _shipped(kind):
             return importlib.import_module(f"{PACKAGES[kind]}.{name}")
@@ -196,6 +202,14 @@ def _shipped(kind: str) -> list[str]:
         return []
     modules = pkgutil.iter_modules(importlib.import_module(PACKAGES[kind]).__path__)
     return [module.name for module in modules if not module.name.startswith("_")]
+
+
+def _module_of(path: Path) -> str | None:
+    """Return the name of the module of cloudrc in a file; None for a file from elsewhere."""
+    package = Path(__file__).parent
+    if not path.is_relative_to(package):
+        return None
+    return ".".join(["cloudrc", *path.relative_to(package).with_suffix("").parts])
 
 
 def _installed(kind: str) -> dict[str, EntryPoint]:

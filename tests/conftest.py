@@ -209,7 +209,7 @@ def scene_at(tmp_path):
     """Return a function that writes a shipped scene with its spawn at (x, y, z) [m]."""
 
     def write(x, y, z, scene="pipes"):
-        text = file_of("scene", scene).read_text()
+        text = file_of(scene).read_text()
         assert SPAWN in text
         path = tmp_path / f"{scene}_{x}_{y}_{z}.xml"
         path.write_text(text.replace(SPAWN, f'name="spawn" pos="{x} {y} {z}"'))

@@ -31,7 +31,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     "link": {"config", "files", "exposition", "metrics.definitions", "tunnel"},
     "config": {"plugins", "geometry", "link", "files"},
     "world": {
-        "robots",
         "endpoint",
         "tunnel",
         "config",
@@ -40,7 +39,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "files",
         "metrics.definitions",
     },
-    "robots": {"world", "config", "geometry", "files"},
+    "robots": {"world", "config", "geometry", "files", "plugins"},
     "cloud": {"endpoint", "tunnel", "config", "plugins", "teleop"},
     "teleop": {"config", "files", "geometry", "metrics"},
     "exposition": {"metrics.definitions"},

@@ -10,8 +10,8 @@ from cloudrc.cli.output import output_argument, paint, print_result, table
 from cloudrc.errors import BadInputError
 
 PLUGINS = ("estimators", "predictors", "controllers", "metrics")
-YAML = ("experiments", "missions", "profiles")
-XML = ("robots", "scenes")
+YAML = ("experiments", "missions", "profiles", "robots")
+XML = ("scenes",)
 KINDS = (*YAML, *PLUGINS, *XML)
 RELEASES = "releases"
 EPILOG = """\
@@ -79,9 +79,9 @@ def describe_all(kind: str) -> dict[str, str]:
 
 
 def _comment(kind: str, name: str) -> str:
-    """Describe a robot or scene by the first sentence of the first comment in its XML file."""
+    """Describe a scene by the first sentence of the first comment in its XML file."""
     from cloudrc.config import shipped
 
-    text = shipped.file_of(kind, name).read_text("utf-8")
+    text = shipped.file_of(name).read_text("utf-8")
     comment = re.search(r"<!--(.*?)-->", text, re.DOTALL)
     return " ".join(comment[1].split()).partition(". ")[0] if comment else ""

@@ -246,9 +246,15 @@ def _local_flight(
     """Return a function that flies on this machine and shows the progress on `stream`.
 
     With `ready`, the function flies a session, in which teleop waits for missions. It calls `ready`
-    when all processes are ready.
+    when all processes are ready. Raise a BadInputError if robot and scene of the user do not fit.
     """
     from cloudrc.cli.progress import FlightView
+
+    world = experiment.world
+    if "/" in world.robot or world.scene.endswith(".xml"):
+        from cloudrc.robots.build import check_robot
+
+        check_robot(world)
 
     def flight(folder: Path) -> dict[str, Any]:
         if stream is sys.stderr and not is_live(stream):
@@ -361,15 +367,10 @@ def _record_virtual(
 
 
 def _prepare(experiment: ResolvedExperiment, folder: Path) -> None:
-    """Check the user's robot and scene, and write the link's profile into the run's `folder`."""
+    """Write the link's profile into the run's `folder`."""
     from cloudrc.cli.link_run import prepare_link
     from cloudrc.drivers.local import LINK_FOLDER
 
-    world = experiment.world
-    if world.robot.endswith(".xml") or world.scene.endswith(".xml"):
-        from cloudrc.world.scene import compile_model
-
-        compile_model(world.robot, world.scene)  # report an invalid model before the flight
     prepare_link(folder / LINK_FOLDER, experiment)
 
 

@@ -8,17 +8,15 @@ error lists all problems of an experiment, each with its file and line.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from math import sqrt
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from pydantic import (
-    BaseModel,
     Field,
-    ValidationError,
     ValidationInfo,
     ValidatorFunctionWrapHandler,
     field_validator,
@@ -31,6 +29,7 @@ from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import Problem
 from cloudrc.config.reuse import reuse
+from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import (
     Change,
     Cloud,
@@ -68,7 +67,6 @@ FILE_READERS: dict[str, Callable[[Path], object]] = {
     **{"trace": read_trace, "table": read_table, "setpoints": read_setpoints}
 }
 """Key whose value is the path of a data file -> function that reads and checks the file."""
-_Model = TypeVar("_Model", bound=BaseModel)
 
 
 def speed_cap(command_age_max_ms: float, plan_max_s: float = 0.0) -> float:
@@ -175,7 +173,7 @@ def load_experiment(
     if isinstance(names := document.get("report", "metrics"), str):  # one metric without a list
         document.tree["report"]["metrics"] = [names]
     found += overrides.resolve_plugins(document, build=build) + _resolve_paths(document)
-    experiment = validate(document, ResolvedExperiment, name, found)
+    experiment = problems.validate(document, ResolvedExperiment, name, found, described=Experiment)
     mission = experiment.mission
     scene = reuse(("scene", experiment.world.scene), lambda: load_scene(experiment.world.scene))
     contact = experiment.criteria.contact
@@ -216,7 +214,7 @@ def load_profile(name: str | Path) -> Profile:
 
 def check_profile(document: Document, name: str) -> Profile:
     """Convert a document to a link profile; raises BadInputError about all its problems."""
-    return validate(document, Profile, name, _resolve_paths(document))
+    return problems.validate(document, Profile, name, _resolve_paths(document))
 
 
 def dump(experiment: ResolvedExperiment) -> str:
@@ -256,26 +254,6 @@ def _is_inside_name(path: KeyPath) -> bool:
     return is_direction or (path[0] == "mission" and len(path) > 1)
 
 
-def validate(
-    document: Document, model: type[_Model], name: str, found: Sequence[Problem] = ()
-) -> _Model:
-    """Convert a document to `model`; `name` names the document in error messages.
-
-    If there are problems, raise one BadInputError for all: the new ones and those in `found`.
-    """
-    known = {problem.path for problem in found}
-    # The user wrote a file: describe what is valid there, for example the name of a mission.
-    file_model = Experiment if model is ResolvedExperiment else model
-    try:
-        # In JSON mode pydantic accepts lists for tuples and is still strict.
-        result = model.model_validate_json(json.dumps(document.tree))
-    except ValidationError as error:
-        more = problems.from_pydantic(error, file_model)
-        found = [*found, *(problem for problem in more if problem.path not in known)]
-    problems.raise_problems(document, found, name)
-    return result
-
-
 def _default(document: Document, path: KeyPath, value: Any) -> None:
     if document.get(*path) is None and isinstance(document.get(*path[:-1]), dict):
         document.set_value(path, value, document.source(path))
@@ -296,7 +274,7 @@ def _inline_mission(document: Document) -> None:
     name = document.tree["mission"]
     if isinstance(name, str):
         file = shipped.read("mission", name, document.source(("mission",)).folder)
-        validate(file, Mission, name)
+        problems.validate(file, Mission, name)
         document.tree["mission"] = file.tree
         document.sources |= {("mission", *key): source for key, source in file.sources.items()}
 
@@ -313,7 +291,7 @@ def _inline_profile(document: Document) -> None:
         return
     source = document.source(("link", "profile"))
     file = shipped.read("profile", name, source.folder)
-    profile = validate(file, Profile, name)
+    profile = problems.validate(file, Profile, name)
     if shipped.is_path(name):
         document.set_value(("link", "profile"), str(source.absolute(name)), source)
     for way in DIRECTIONS:
@@ -400,6 +378,8 @@ def _resolve_paths(document: Document) -> list[Problem]:
                 continue
             if key in ("robot", "scene"):
                 name = shipped.model_path(key, name, source.folder)
+                if key == "robot":
+                    reuse(("robot", name), partial(find_robot, name))
             else:
                 name = str(source.absolute(name))
                 _check_file(key, name)

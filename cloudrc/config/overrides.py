@@ -36,6 +36,8 @@ from cloudrc.messages import UPRIGHT, ZERO, Odometry
 
 KINDS = {"estimator": "estimators", "predictor": "predictors", "controller": "controllers"}
 """Key under `cloud` -> kind of plug-in."""
+GIVEN = {("onboard", "model")}
+"""Kind of plug-in and argument of its `build` that cloudrc gives, not the user."""
 _DEFAULTS = {
     **Experiment().model_dump(mode="json"),
     "mission": {"steps": Steps().model_dump(mode="json")},
@@ -251,18 +253,19 @@ def _check_model(predictor: Any, name: str) -> None:
         )
 
 
-def build_plugin(kind: str, choice: PlugIn) -> Any:
+def build_plugin(kind: str, choice: PlugIn, **given: Any) -> Any:
     """Build a plug-in of a resolved experiment; convert its parameters to the declared types.
 
-    `kind` is a key of `cloudrc.plugins.PACKAGES`, such as "controllers". Raise a BadInputError that
-    names the wrong parameters.
+    `kind` is a key of `cloudrc.plugins.PACKAGES`, such as "controllers". `given` are arguments of
+    its `build` that are no parameters of the user. Raise a BadInputError that names the wrong
+    parameters.
     """
     try:
         checked = _check(kind, choice.name, choice.model_extra or {})
     except ValidationError as error:
         found = problems.from_pydantic(error, parameter_model(kind, choice.name))
         raise BadInputError("; ".join(map(str, found))) from None
-    return plugins.load(kind, choice.name, **dict(checked))
+    return plugins.load(kind, choice.name, **given, **dict(checked))
 
 
 def parameter_model(kind: str, name: str) -> type[BaseModel]:
@@ -275,6 +278,7 @@ def parameter_model(kind: str, name: str) -> type[BaseModel]:
         )
         for name, parameter in plugins.signature(kind, name).parameters.items()
         if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+        and (kind, name) not in GIVEN
     }
     config = ConfigDict(
         extra="forbid", strict=True, arbitrary_types_allowed=True, allow_inf_nan=False,

@@ -6,10 +6,11 @@ The schema provides the texts: type, range and unit of a key, or the key most si
 from __future__ import annotations
 
 import difflib
+import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import NoneType
-from typing import Any, Literal, NamedTuple, get_args, get_origin
+from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin
 
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, ValidationError
@@ -19,6 +20,7 @@ from pydantic_core import ErrorDetails
 from cloudrc.config.document import Document, KeyPath
 from cloudrc.errors import BadInputError
 
+_Model = TypeVar("_Model", bound=BaseModel)
 _TYPES = {
     float: "a number",
     int: "a whole number",
@@ -193,6 +195,31 @@ def raise_problems(document: Document, problems: Iterable[Problem], name: str) -
         lines.insert(0, f"{name} has {len(every)} problems:")
     if every:
         raise BadInputError("\n  ".join(lines))
+
+
+def validate(
+    document: Document,
+    model: type[_Model],
+    name: str,
+    found: Sequence[Problem] = (),
+    *,
+    described: type[BaseModel] | None = None,
+) -> _Model:
+    """Convert a document to `model`; `name` names the document in error messages.
+
+    Messages say what is valid in the model `described`, by default `model`: that of the user's file
+    if `model` is more than this file. If there are problems, raise one BadInputError for all: the
+    new ones and those in `found`.
+    """
+    known = {problem.path for problem in found}
+    try:
+        # In JSON mode pydantic accepts lists for tuples and is still strict.
+        result = model.model_validate_json(json.dumps(document.tree))
+    except ValidationError as error:
+        more = from_pydantic(error, described or model)
+        found = [*found, *(problem for problem in more if problem.path not in known)]
+    raise_problems(document, found, name)
+    return result
 
 
 def in_words(value: Any) -> str:

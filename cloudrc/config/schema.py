@@ -381,8 +381,8 @@ class World(Section):
     """The robot and its scene."""
 
     robot: str = "pelican"
-    """Name of a shipped robot, or path of an MJCF file (.xml). Mass, inertia and rotors must be
-    those for which the onboard controller is made"""
+    """Name of a shipped robot, or path of a folder with robot.yaml or of an MJCF file (.xml). Mass,
+    inertia and rotors must be those for which the onboard controller is made"""
     scene: str = "pipes"
     """Name of a shipped scene, or path of an MJCF file (.xml)"""
     low_level: LowLevel = LowLevel()

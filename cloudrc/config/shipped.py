@@ -19,29 +19,27 @@ FOLDERS = {
     "robot": _PACKAGE / "robots",
 }
 """Kind of file -> folder of the shipped files; each robot has a folder of its own in it."""
-ROBOT_MODEL = "robot.xml"
-"""Name of a robot's model in its folder."""
+ROBOT_FILE = "robot.yaml"
+"""Name of the file that describes a robot, in its folder."""
 
 
 def names(kind: str) -> list[str]:
     """List the names of the shipped files of a kind, such as "profile", in alphabetical order."""
     folder = FOLDERS[kind]
     if kind == "robot":
-        return sorted(path.parent.name for path in folder.glob(f"*/{ROBOT_MODEL}"))
+        return sorted(path.parent.name for path in folder.glob(f"*/{ROBOT_FILE}"))
     return sorted(path.stem for path in folder.iterdir() if path.suffix in (".yaml", ".xml"))
 
 
-def file_of(kind: str, name: str) -> Path:
-    """Return the MJCF file of a robot or scene, given by its name or by the path of the file."""
-    if name.endswith(".xml"):
-        return Path(name)
-    folder = FOLDERS[kind]
-    return folder / name / ROBOT_MODEL if kind == "robot" else folder / f"{name}.xml"
+def file_of(scene: str) -> Path:
+    """Return the MJCF file of a scene, given by its name or by the path of the file."""
+    return Path(scene) if scene.endswith(".xml") else FOLDERS["scene"] / f"{scene}.xml"
 
 
 def describe(kind: str, name: str) -> str:
     """Return the first line of a shipped YAML file's `description`."""
-    text = read(kind, name, Path()).tree.get("description", "")
+    path = FOLDERS[kind] / (f"{name}/{ROBOT_FILE}" if kind == "robot" else f"{name}.yaml")
+    text = read_document(path, path.name).tree.get("description", "")
     return str(text).strip().partition("\n")[0]
 
 
@@ -68,12 +66,17 @@ def check_name(kind: str, name: str) -> None:
 def model_path(kind: str, name: str, folder: Path) -> str:
     """Return the name of a shipped robot or scene, or the absolute path of an .xml file.
 
-    `kind` is "robot" or "scene". Raise a BadInputError if the name or the file does not exist.
+    A robot may also be a folder with the file `robot.yaml`. `kind` is "robot" or "scene". Raise a
+    BadInputError if the name or the file does not exist.
     """
     if not (is_path(name) or name.endswith(".xml")):
         check_name(kind, name)
         return name
     path = Path(os.path.realpath(folder / os.path.expanduser(name)))
+    if kind == "robot" and os.path.isdir(path):
+        if not os.path.isfile(path / ROBOT_FILE):
+            raise BadInputError(f"{path}: has no {ROBOT_FILE}, so it is no robot")
+        return str(path)
     if path.suffix != ".xml" or not os.path.isfile(path):
         raise _no_file("no such .xml file", kind, path)
     return str(path)

@@ -14,11 +14,13 @@ import viser
 from numpy.typing import NDArray
 
 from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.robot import find_robot
+from cloudrc.config.shipped import file_of
 from cloudrc.geometry.clearance import CLEARANCE_SHOWN, Array
 from cloudrc.geometry.compiled import mujoco
 from cloudrc.geometry.scene import Pipe, Scene, load_scene
 from cloudrc.messages import Vector
-from cloudrc.world.scene import ROBOT_PREFIX, ROTORS, compile_model
+from cloudrc.world.scene import compile_model
 
 Colour = tuple[int, int, int]
 GHOST, SETPOINT, REACHED = (0, 114, 178), (213, 94, 0), (0, 158, 115)
@@ -60,7 +62,8 @@ class FlightScene:
             BadInputError: If robot or scene are missing or unsuitable.
         """
         self._scene, world = server.scene, experiment.world
-        model, geometry = compile_model(world.robot, world.scene), load_scene(world.scene)
+        model = compile_model(find_robot(world.robot).model, file_of(world.scene))
+        geometry = load_scene(world.scene)
         # Without a graphics card, shadows cost more than ten times the rest of a picture.
         self._scene.configure_default_lights(cast_shadow=False)
         self._add_surroundings(model, geometry)
@@ -174,7 +177,8 @@ class FlightScene:
         geoms = list(map(int, np.flatnonzero(model.body_rootid[model.geom_bodyid] == base)))
         self._add_geoms("/robot", model, geoms)
         self._add_geoms("/ghost", model, geoms, GHOST)
-        hubs = np.array([model.site(f"{ROBOT_PREFIX}{rotor}").pos for rotor in ROTORS])
+        sites = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE, 0]
+        hubs = model.site_pos[sites]
         struts = np.stack([hubs * (0.0, 0.0, 1.0), hubs], axis=1)
         self._scene.add_line_segments("/robot/struts", struts, STRUT, thickness=0.012)
 

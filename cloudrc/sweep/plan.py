@@ -24,10 +24,11 @@ from pydantic import Field
 from cloudrc import files, metrics, plugin_file, plugins, source
 from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, Source, read_document
-from cloudrc.config.load import ResolvedExperiment, load_experiment, local_files, validate
+from cloudrc.config.load import ResolvedExperiment, load_experiment, local_files
 from cloudrc.config.overrides import KINDS, collect_settings
-from cloudrc.config.problems import Problem
+from cloudrc.config.problems import Problem, validate
 from cloudrc.config.reuse import reuse, reuse_results
+from cloudrc.config.robot import files_of
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.model_files import model_files
@@ -174,7 +175,8 @@ def _read_grid(path: Path) -> _Grid:
 def _everything(point: ResolvedExperiment) -> bytes:
     """Return all that decides a flight, except its seed, as JSON."""
     values = point.model_dump(mode="json")
-    named = local_files(values).values() if '"/' in json.dumps(values) else ()
+    named = [*local_files(values).values()] if '"/' in json.dumps(values) else []
+    named += map(str, files_of(point.world.robot))
     code = [_code(kind, getattr(point.cloud, key).name) for key, kind in KINDS.items()]
     hashes = {file: each for path in named for file, each in _hashes(path)}
     everything = {**values, "cloudrc": source.code_hash(), "code": code, "files": hashes}

@@ -66,3 +66,24 @@ class Actuators(Protocol):
 
         The velocity of `readings` is relative to the air.
         """
+
+
+class Direct:
+    """Actuators that MuJoCo alone simulates: they get the commands unchanged."""
+
+    def __init__(self, count: int) -> None:
+        """Begin at rest, with `count` actuators."""
+        self._rest: Commands = (0.0,) * count
+        self.speeds = self._rest
+
+    def reset(self) -> None:
+        """Stand still."""
+        self.speeds = self._rest
+
+    def step(self, commands: Commands, readings: Readings) -> Inputs:
+        """Return the commands as MuJoCo's input, without further forces."""
+        self.speeds = commands
+        return (*commands, *_NO_FORCES)
+
+
+_NO_FORCES = (0.0,) * 6

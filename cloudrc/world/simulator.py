@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cloudrc.config.schema import Plant
 from cloudrc.geometry.compiled import mujoco
-from cloudrc.messages import Odometry, Vector
+from cloudrc.messages import ZERO, Odometry, Vector
 from cloudrc.records import Contact
 from cloudrc.world.onboard import Actuators, Commands, Inputs
 from cloudrc.world.plant import Wind
 from cloudrc.world.readings import Readings
-from cloudrc.world.scene import ROBOT_PREFIX, bodies_of_geoms, compile_model
+from cloudrc.world.scene import ROBOT_PREFIX, bodies_of_geoms
 
 TOUCH_GAP = 0.1
 """Shortest time without contact before a contact counts as a new contact [s]."""
@@ -52,22 +51,9 @@ class Simulator:
             a list.
     """
 
-    def __init__(
-        self,
-        robot: str = "pelican",
-        scene: str = "pipes",
-        plant: Plant | None = None,
-        wind: Wind | None = None,
-        *,
-        actuators: Actuators,
-    ) -> None:
-        """Compile `robot` in `scene` (names or paths) and put the robot at its spawn.
-
-        `plant` tells how the true robot differs from its model; None: not at all. Without `wind`
-        the air is at rest. `actuators` are those of the robot. Raise a BadInputError if a file is
-        missing or does not fit the onboard controller.
-        """
-        self.model = model = compile_model(robot, scene, plant)
+    def __init__(self, model: Any, actuators: Actuators, wind: Wind | None = None) -> None:
+        """Put the robot of a compiled `MjModel` at its spawn; without `wind` the air is at rest."""
+        self.model = model
         self._wind = wind
         self.dt: float = model.opt.timestep
         self.tape: list[Inputs] | None = None
@@ -79,10 +65,14 @@ class Simulator:
         self._qpos, self._qvel = memoryview(data.qpos), memoryview(data.qvel)
         self._ctrl, self._applied = memoryview(data.ctrl), memoryview(data.qfrc_applied)
         self._sensors: memoryview[float] = memoryview(data.sensordata)
-        self._tip_sensor: int = model.sensor(f"{ROBOT_PREFIX}tip").adr[0]
-        self._tip = model.site(f"{ROBOT_PREFIX}tip").id
-        self._tip_offset: Vector = tuple(model.site_pos[self._tip].tolist())
-        self._tip_radius = float(model.site_size[self._tip, 0])
+        # A robot without a site and a sensor named tip touches with its body alone.
+        self._tip_sensor = _address(model, mujoco.mjtObj.mjOBJ_SENSOR)
+        self._tip = _address(model, mujoco.mjtObj.mjOBJ_SITE)
+        self._tip_offset: Vector = ZERO
+        self._tip_radius = -1.0
+        if self._tip >= 0:
+            self._tip_offset = tuple(model.site_pos[self._tip].tolist())
+            self._tip_radius = float(model.site_size[self._tip, 0])
         self._bodies = bodies_of_geoms(model)
         self._gap_steps = round(TOUCH_GAP / self.dt)
         self.reset()
@@ -165,7 +155,7 @@ class Simulator:
 
     def tip_force(self) -> float:
         """Return the normal force on the arm's tip at the beginning of the last step [N]."""
-        return self._sensors[self._tip_sensor]
+        return self._sensors[self._tip_sensor] if self._tip_sensor >= 0 else 0.0
 
     def take_tip_force(self) -> tuple[float, float]:
         """Return the tip's peak force [N] and impulse [N s] since the last call; reset both."""
@@ -197,7 +187,7 @@ class Simulator:
 
         `contacts` is the number of contacts in the step; `before` has the readings before the step.
         """
-        force = self._sensors[self._tip_sensor]
+        force = self.tip_force()
         self.tip_impulse += force * self.dt
         if force > self.tip_force_peak:
             self.tip_force_peak = force
@@ -209,7 +199,7 @@ class Simulator:
     def _note_contacts(self, before: Readings) -> None:
         """Store the new contacts, with the robot's motion `before` the step of the simulation."""
         contact = self.data.contact
-        tip = self.data.site_xpos[self._tip].tolist()
+        tip = self.data.site_xpos[self._tip].tolist() if self._tip >= 0 else ZERO
         pairs, places = contact.geom.tolist(), contact.pos.tolist()
         for (first, second), place, is_near in zip(
             pairs, places, contact.exclude.tolist(), strict=True
@@ -223,6 +213,14 @@ class Simulator:
                 motion = before.position, before.velocity, _velocity_at(before, self._tip_offset)
                 self.touches.append(Contact(0, body, *motion, by_tip))
             self._last_touch[body, by_tip] = self.steps
+
+
+def _address(model: Any, kind: Any) -> int:
+    """Return the number of the site `tip`, or where its sensor writes; -1 if there is none."""
+    number: int = mujoco.mj_name2id(model, kind, f"{ROBOT_PREFIX}tip")
+    if number >= 0 and kind == mujoco.mjtObj.mjOBJ_SENSOR:
+        number = int(model.sensor_adr[number])
+    return number
 
 
 def _velocity_at(readings: Readings, offset: Vector) -> Vector:

@@ -19,7 +19,7 @@ def flown_into(tmp_path):
     """Return a function that flies into a body 0.8 m ahead, and returns the assessment."""
 
     def fly(body, *settings):
-        text = file_of("scene", "empty").read_text()
+        text = file_of("empty").read_text()
         scene, track = tmp_path / "mine.xml", tmp_path / "track.csv"
         scene.write_text(text.replace("</worldbody>", f"{body}</worldbody>"))
         track.write_text(TRACK)

@@ -2,8 +2,12 @@
 
 import numpy as np
 
+from cloudrc.config.robot import find_robot
+from cloudrc.config.schema import Plant
+from cloudrc.config.shipped import file_of
 from cloudrc.robots.pelican.rotors import Rotors
 from cloudrc.world.robot import STEP
+from cloudrc.world.scene import compile_model, compile_true
 from cloudrc.world.simulator import Simulator
 
 
@@ -14,6 +18,13 @@ def normalised(quaternion):
     return (w, *q), np.eye(3) + 2 * w * cross + 2 * cross @ cross
 
 
+def model_of(robot="pelican", scene="empty", plant=None):
+    """Compile a robot in a scene, given by names or paths; `plant` changes the true robot."""
+    files = find_robot(robot).model, file_of(scene)
+    nominal = compile_model(*files)
+    return compile_true(*files, nominal, plant or Plant())
+
+
 def simulate(robot="pelican", scene="empty", plant=None):
     """Return a simulator of the Pelican, or of a changed copy of it, with its rotors."""
-    return Simulator(robot, scene, plant, actuators=Rotors(STEP))
+    return Simulator(model_of(robot, scene, plant), Rotors(STEP))

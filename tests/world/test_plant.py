@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 
 from cloudrc.config import schema
+from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import Plant
-from cloudrc.config.shipped import file_of
 from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import UPRIGHT, ZERO
 from cloudrc.world.plant import Wind, point_inertia
 from cloudrc.world.readings import Readings
-from cloudrc.world.scene import compile_model, rotation
-from tests.world.conftest import simulate
+from cloudrc.world.scene import rotation
+from tests.world.conftest import model_of, simulate
 
 
 def model(**keys):
-    return compile_model("pelican", "empty", Plant(**keys))
+    return model_of(plant=Plant(**keys))
 
 
 def inertia(one):
@@ -33,7 +33,7 @@ def test_factors_scale_mass_and_inertia_apart():
 
 def test_a_payload_is_what_mujoco_makes_of_a_second_body():
     mass, place = 0.5, (0.1, -0.2, -0.3)
-    spec = mujoco.MjSpec.from_file(str(file_of("robot", "pelican")))
+    spec = mujoco.MjSpec.from_file(str(find_robot("pelican").model))
     point = {"mass": mass, "inertia": [1e-9] * 3, "ipos": [0.0] * 3, "explicitinertial": True}
     spec.body("base").add_body(name="payload", pos=place, **point)
     data = mujoco.MjData(whole := spec.compile())

@@ -7,27 +7,32 @@ from math import pi, tan
 
 import pytest
 
+from cloudrc.config.robot import find_robot
+from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of, names
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.geometry.compiled import import_mujoco, mujoco
 from cloudrc.geometry.scene import load_scene
+from cloudrc.robots.build import check_robot
 from cloudrc.robots.pelican.rotors import STOPPED
-from cloudrc.world.scene import PELICAN, bodies_of_geoms, compile_model
-from tests.world.conftest import simulate
+from cloudrc.world.scene import bodies_of_geoms
+from tests.world.conftest import model_of, simulate
 
+SHIPPED = {"robot": "pelican", "scene": "empty"}
+FILES = {"robot": find_robot("pelican").model, "scene": file_of("empty")}
 ROBOTS, SCENES = names("robot"), names("scene")
 
 
 @pytest.fixture(scope="module")
 def pipes():
-    return compile_model("pelican", "pipes")
+    return model_of("pelican", "pipes")
 
 
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_every_robot_compiles_in_every_scene(robot, scene, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert compile_model(robot, scene).opt.timestep == 0.002
+    assert model_of(robot, scene).opt.timestep == 0.002
     assert not list(tmp_path.iterdir()), "MuJoCo wrote a log"
 
 
@@ -78,19 +83,16 @@ BODIES = """
 def test_each_geom_has_the_name_of_its_body_and_the_robot_none(tmp_path):
     """MuJoCo fuses static bodies, but not those that `exclude` or mocap names."""
     scene, robot = tmp_path / "scene.xml", tmp_path / "robot.xml"
-    text = file_of("scene", "empty").read_text()
+    text = file_of("empty").read_text()
     scene.write_text(text.replace("</worldbody>", BODIES))
-    text = PELICAN.read_text()
+    text = FILES["robot"].read_text()
     robot.write_text(text.replace("<worldbody>", '<worldbody><geom size=".1" pos="0 0 2"/>'))
-    names = bodies_of_geoms(compile_model(str(robot), str(scene)))
+    names = bodies_of_geoms(model_of(str(robot), str(scene)))
     assert sorted(filter(None, names)) == [
         *("a/b", "floor", "in", "in", "mocap", "robot", "seen"),
         *("unnamed body 1", "unnamed body 2", "world", "world"),
     ]
     assert names.count("") == 7
-
-
-SHIPPED = {"robot": "pelican", "scene": "empty"}
 
 
 @pytest.mark.parametrize(
@@ -116,16 +118,21 @@ SHIPPED = {"robot": "pelican", "scene": "empty"}
 )  # fmt: skip
 def test_what_cannot_be_flown_is_refused_by_name(tmp_path, monkeypatch, kind, old, new, message):
     monkeypatch.chdir(tmp_path)
-    path, good = tmp_path / "mine.xml", file_of(kind, SHIPPED[kind]).read_text()
+    path, good = tmp_path / "mine.xml", FILES[kind].read_text()
     assert old in good
     path.write_text(good.replace(old, new))
     with pytest.raises(BadInputError, match=f"mine.xml[^\n]*{message}") as error:
-        compile_model(*(SHIPPED | {kind: str(path)}).values())
+        check_robot(World(**(SHIPPED | {kind: str(path)})))
     assert "\n" not in str(error.value)
     assert list(tmp_path.iterdir()) == [path], "MuJoCo wrote a log"
 
 
-FLIES = "from cloudrc.world.scene import compile_model; compile_model('pelican', 'pipes')"
+FLIES = """
+from cloudrc.config.schema import World
+from cloudrc.robots.build import check_robot
+
+check_robot(World())
+"""
 
 
 @pytest.mark.parametrize("wanted", [None, "egl"])

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.messages import UPRIGHT, ZERO
-from cloudrc.robots.pelican.onboard import LowLevel
+from cloudrc.robots.pelican.low_level import LowLevel
 from cloudrc.robots.pelican.rotors import STOPPED, Rotors
 from cloudrc.world.readings import Readings
 from cloudrc.world.simulator import replay

@@ -17,7 +17,7 @@ import z3
 from cloudrc.config.load import ResolvedGuard
 from cloudrc.geometry import fence
 from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState
-from cloudrc.robots.pelican.onboard import LowLevel
+from cloudrc.robots.pelican.low_level import LowLevel
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.readings import Readings
 from cloudrc.world.robot import Robot

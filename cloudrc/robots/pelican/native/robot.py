@@ -18,18 +18,20 @@ from typing import Any
 import numpy as np
 
 from cloudrc.config.load import ResolvedGuard
+from cloudrc.config.robot import find_robot
+from cloudrc.config.shipped import file_of
 from cloudrc.geometry import fence
 from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import Command, Vector
-from cloudrc.robots.pelican import onboard, rotors
+from cloudrc.robots.pelican import low_level, rotors
+from cloudrc.robots.pelican.low_level import LowLevel
 from cloudrc.robots.pelican.native.library import Library, library
-from cloudrc.robots.pelican.onboard import LowLevel
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard import state
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.readings import Readings
 from cloudrc.world.robot import STEP, STEP_NS, Robot
-from cloudrc.world.scene import ROBOT_PREFIX, is_of_robot
+from cloudrc.world.scene import ROBOT_PREFIX, compile_model, is_of_robot
 from cloudrc.world.simulator import CONTACT_CHECK_STEPS, Simulator
 
 _POINTERS = (
@@ -54,7 +56,7 @@ UNUSED_WITHOUT_CONTACTS = sum(
 """Parts of MuJoCo that do nothing while the robot touches nothing."""
 _CONSTANTS = {
     rotors: "thrust_coefficient torque_ratio drag_coefficient arm height",
-    onboard: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
+    low_level: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
     "thrust_max tiny nose_cosine_min yaw_sine_max",
     state: "overturned_cosine",
     rules: "sink_lead_max fence_reaction reaction stop_coefficient",
@@ -278,10 +280,8 @@ class NativeRobot(Robot):
 def _self_test() -> str:
     """Fly in C and in Python; return how the results differ, in words; "" if they are equal."""
     limits = ResolvedGuard()
-    parts = [
-        (Simulator("pelican", "empty", actuators=rotors.Rotors(STEP)), LowLevel(), Guard(limits))
-        for _ in range(2)
-    ]
+    model = compile_model(find_robot("pelican").model, file_of("empty"))
+    parts = [(Simulator(model, rotors.Rotors(STEP)), LowLevel(), Guard(limits)) for _ in range(2)]
     wrong = ""
     try:
         if _fly(Robot(*parts[0])) != _fly(NativeRobot(*parts[1])):

@@ -6,7 +6,7 @@
      read          readings.Readings.of
      guard_step    guard.state.Guard.step, for a robot in TRACK with a fresh command
      is_far        guard.limits.limit_to_fence, where it changes nothing
-     update        onboard.LowLevel.update
+     update        low_level.LowLevel.update
      turn_rotors   rotors.Rotors.step, simulator.Simulator.step
      feel          simulator.Simulator._feel
 
@@ -37,7 +37,7 @@ typedef struct {
   const int *contacts;
   double (**timer)(void); /* mjcb_time, which mj_step calls to measure its parts */
   const Obstacle *obstacles;
-  /* Constants of the Python modules rotors, onboard and guard, with the same names. */
+  /* Constants of the Python modules rotors, low_level and guard, with the same names. */
   double thrust_coefficient, torque_ratio, drag_coefficient, arm, height;
   double mass, gravity, tilt_gain, yaw_gain, tilt_rate_gain, yaw_rate_gain;
   double thrust_max, tiny, nose_cosine_min, yaw_sine_max;

@@ -11,14 +11,15 @@ import pytest
 
 from cloudrc import assembly
 from cloudrc.config.load import ResolvedGuard, load_experiment
+from cloudrc.config.robot import find_robot
 from cloudrc.config.shipped import file_of
 from cloudrc.geometry import fence
 from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import Command, GuardState
+from cloudrc.robots.pelican.low_level import LowLevel
 from cloudrc.robots.pelican.native import robot as native
 from cloudrc.robots.pelican.native.library import SWITCH, Library, library
 from cloudrc.robots.pelican.native.robot import NativeRobot, make_robot, usable
-from cloudrc.robots.pelican.onboard import LowLevel
 from cloudrc.sweep.flight import fly_in_memory
 from cloudrc.tunnel.end import Identity
 from cloudrc.world.guard import limits as rules
@@ -151,7 +152,7 @@ def test_a_micrometre_of_room_means_that_no_fence_limits():
 
 def test_c_finds_the_contacts_with_a_body_that_mujoco_does_not_fuse(tmp_path):
     """`exclude` names the pillar, so that the pillar stays a body of its own."""
-    text = file_of("scene", "empty").read_text()
+    text = file_of("empty").read_text()
     pillar = '<body name="pillar" pos="1.2 0 1"><geom type="capsule" size=".1 1"/></body>'
     exclude = '</worldbody><contact><exclude body1="pillar" body2="floor"/></contact>'
     path = tmp_path / "scene.xml"
@@ -193,7 +194,7 @@ def test_where_c_looks_for_no_contact_there_is_none(kind):
 
 def test_a_tether_holds_the_robot_in_c_too(tmp_path):
     """It is a constraint, but no contact."""
-    text = file_of("robot", "pelican").read_text()
+    text = find_robot("pelican").model.read_text()
     rope = '<tendon><spatial limited="true" range="0 1"><site site="post"/><site site="tip"/>'
     text = text.replace("<worldbody>", '<worldbody><site name="post" pos="0 0 0"/>')
     path = tmp_path / "tethered.xml"

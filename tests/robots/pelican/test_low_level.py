@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from cloudrc.messages import UPRIGHT, ZERO
-from cloudrc.robots.pelican.onboard import (
+from cloudrc.robots.pelican.low_level import (
     NOSE_COSINE_MIN,
     YAW_SINE_MAX,
     LowLevel,

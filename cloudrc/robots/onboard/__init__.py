@@ -1,0 +1,1 @@
+"""Onboard controllers that fly or drive any robot of their kind."""

@@ -1,0 +1,82 @@
+"""A robot is a folder: description, model and onboard controller; it needs no edit elsewhere."""
+
+import pytest
+
+import cloudrc
+from cloudrc.config.load import load_experiment
+from cloudrc.errors import BadInputError
+from cloudrc.sweep.plan import read_plan
+from tests.robots.conftest import CONTROLLER
+
+HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
+CLIMBS = """
+from cloudrc.robots.pelican.onboard import actuators, build as published
+
+def build(model, climb_mps: float = 0.0):
+    law = published(model)
+    follow = law.update
+    law.update = lambda r, v, w=0.0: follow(r, (v[0], v[1], v[2] + climb_mps), w)
+    return law
+"""
+
+
+def test_a_folder_with_the_same_files_flies_the_same_flight(own_robot):
+    mine = own_robot(f"onboard: {CONTROLLER}")
+    flights = [cloudrc.fly("hover", HOVER | {"world.robot": r}) for r in ("pelican", str(mine))]
+    assert flights[0].verdict == "success"
+    assert flights[0].records_sha256 == flights[1].records_sha256
+
+
+def test_the_controller_may_lie_in_the_folder_and_takes_parameters(own_robot):
+    mine = own_robot("onboard: ./own.py")
+    (mine / "own.py").write_text(CLIMBS)
+    heights = []
+    for climb in (0.0, 0.2):
+        (mine / "robot.yaml").write_text(f"onboard: {{name: ./own.py, climb_mps: {climb}}}")
+        flight = cloudrc.fly("hover", HOVER | {"world.robot": str(mine)})
+        heights.append(flight["/ground_truth"]["position"][:, 2].max())
+    assert heights[1] > heights[0] + 0.05
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("onbord: x", "robot.yaml:1: onbord: unknown key; did you mean onboard?"),
+        ("description: no controller", "onboard: is missing"),
+        ("onboard: [", "robot.yaml"),
+        (f"onboard: {{name: {CONTROLLER}, gain_q: 1}}", "gain_q: unknown key; did you mean gain_p"),
+        ("onboard: ./missing.py", "missing.py': there is no such file"),
+        ("onboard: no_such", "no onboard named 'no_such'"),
+        (f"{{model: other.xml, onboard: {CONTROLLER}}}", "other.xml"),
+    ],
+)
+def test_what_is_wrong_with_a_robot_is_one_problem_by_name(own_robot, text, message):
+    mine = own_robot(text)
+    with pytest.raises(BadInputError) as error:
+        cloudrc.fly("hover", HOVER | {"world.robot": str(mine)})
+    assert message in str(error.value)
+
+
+def test_a_folder_without_its_file_is_no_robot(tmp_path):
+    with pytest.raises(BadInputError, match=r"has no robot\.yaml, so it is no robot"):
+        load_experiment("hover", [f"world.robot={tmp_path}"])
+
+
+def test_a_model_that_the_controller_cannot_fly_is_refused_by_it(own_robot):
+    heavy = own_robot(f"onboard: {CONTROLLER}")
+    model = heavy / "robot.xml"
+    model.write_text(model.read_text().replace('mass="1.0"', 'mass="1.5"'))
+    with pytest.raises(BadInputError, match=r"robot\.xml in .*empty\.xml: .*mass .kg. is 1.56"):
+        cloudrc.fly("hover", HOVER | {"world.robot": str(heavy)})
+
+
+def test_the_key_of_a_flight_has_the_files_of_its_robot(own_robot, tmp_path):
+    mine = own_robot("onboard: ./own.py")
+    (mine / "own.py").write_text(CLIMBS)
+    sweep = tmp_path / "sweep.yaml"
+    sweep.write_text(f"experiment: hover\nset: {{world.robot: {mine}}}\nseeds: 1\n")
+    keys = []
+    for _ in range(2):
+        keys.append(list(read_plan(sweep).flights))
+        (mine / "own.py").write_text(CLIMBS + "\n# changed\n")
+    assert keys[0] != keys[1]
