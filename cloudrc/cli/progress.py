@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from cloudrc.sweep.flight import Row
 
 ENDINGS = ("done", "cancelled", "timed_out")
-FIRST_WAIT = 4.0
-"""Time until the first line of progress on a stream that is no terminal [s]."""
+FIRST_WAIT = 3.0
+"""Time from the first result to the first line of progress on a stream that is no terminal [s]."""
 FLIGHTS_PERIOD, CHECK_PERIOD = 30.0, 10.0
 """Time between two further lines [s]: while flights are flown, and while points are checked."""
 REPORT_AFTER = 1.0
@@ -138,25 +138,31 @@ class CountView:
     def __init__(self, stream: TextIO, total: int, unit: str, period: float) -> None:
         """Set the amount of work `total` and its `unit`, such as "flights".
 
-        If the stream is no terminal, print a line after `FIRST_WAIT`, and then every `period` [s].
+        If the stream is no terminal, print a line `FIRST_WAIT` after the first result, and then
+        every `period` [s]. The rate counts from the first result: workers take seconds to start.
         """
         self._stream, self._total, self._unit, self._period = stream, total, unit, period
-        self._began = monotonic()
-        self._next = self._began + FIRST_WAIT
+        self._began, self._at_first, self._next = math.nan, 0, math.inf
         self._status = Console(file=stream).status(f"0/{total}") if is_live(stream) else None
         if self._status:
             self._status.start()
 
     def count(self, done: int, more: str = "") -> None:
         """Show that `done` pieces of work are done; `more` ends the line."""
-        rate = done / max(monotonic() - self._began, 1e-3)
-        left = (self._total - done) / max(rate, 1e-9)
-        time = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
-        line = f"{done}/{self._total}  {rate:.1f} {self._unit}/s, {time} left{more}"
+        now = monotonic()
+        if math.isnan(self._began):
+            self._began, self._at_first, self._next = now, done, now + FIRST_WAIT
+        rate = (done - self._at_first) / max(now - self._began, 1e-3)
+        line = f"{done}/{self._total}"
+        if rate > 0.0:
+            left = (self._total - done) / rate
+            time = f"{left:.0f} s" if left < 120 else f"{left / 60:.0f} min"
+            line += f"  {rate:.1f} {self._unit}/s, {time} left"
+        line += more
         if self._status:
             self._status.update(line)
-        elif monotonic() >= self._next:
-            self._next = monotonic() + self._period
+        elif now >= self._next:
+            self._next = now + self._period
             print_or_drop(line, self._stream)
 
     def close(self) -> None:

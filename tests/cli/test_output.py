@@ -57,14 +57,16 @@ def test_yaml_has_the_content_of_json(line, call):
 
 
 def test_a_file_gets_the_first_rate_soon_and_then_one_per_period(monkeypatch):
-    now, file = [0.0], io.StringIO()
+    """The rate counts from the first result, not from the start of the workers."""
+    now, file = [-50.0], io.StringIO()
     monkeypatch.setattr(progress, "monotonic", lambda: now[0])
     view = CountView(file, 200, "flights", 30.0)
     for done in range(1, 101):
         now[0] = float(done)
         view.count(done)
-    lines = [line.split("  ")[0] for line in file.getvalue().splitlines()]
-    assert lines == ["4/200", "34/200", "64/200", "94/200"]
+    lines = [line.split("  ") for line in file.getvalue().splitlines()]
+    assert [line[0] for line in lines] == ["4/200", "34/200", "64/200", "94/200"]
+    assert lines[0][1] == "1.0 flights/s, 3 min left"
 
 
 def test_events_are_plain_lines_or_wrapped_on_a_terminal():
