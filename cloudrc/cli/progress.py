@@ -39,12 +39,16 @@ PLAN_WAIT = 1.0
 
 
 class FlightView:
-    """Prints the events of a flight to a stream and, on a terminal, updates a status line."""
+    """Prints the events of a flight to a stream and, on a terminal, updates a status line.
+
+    All times are those of the report: since the mission's start, on world's clock.
+    """
 
     def __init__(self, stream: TextIO, waypoints: int) -> None:
         """Set the stream and the number of waypoints (0: unknown); show a status line at once."""
         self._stream, self._waypoints = stream, waypoints
-        self._first_ns = self._now_ns = NEVER_NS
+        self._first_ns = self._now_ns = self._start_ns = NEVER_NS
+        self._mission = 0  # number of the mission in the newest telemetry
         self._began = self._seen = monotonic()
         self._position: Vector = (math.nan, math.nan, math.nan)
         self._delay, self._waypoint = math.nan, -1
@@ -69,13 +73,15 @@ class FlightView:
                     self._see_guard(record)
                 case MissionEvent():
                     self._ended = record.event in ENDINGS
-                    self._event(record.text)
+                    self._event(record.text, record.stamp_ns)
                 case Fault() | LinkChanged():
-                    self._event(in_words(record))
+                    self._event(in_words(record), record.stamp_ns)
 
     def _see_telemetry(self, record: TelemetrySent) -> None:
         if self._first_ns == NEVER_NS:
             self._first_ns, self._began = record.stamp_ns, monotonic()
+        if record.telemetry.mission_id != self._mission:
+            self._mission, self._start_ns = record.telemetry.mission_id, record.stamp_ns
         self._now_ns, self._seen = record.stamp_ns, monotonic()
         self._position = record.telemetry.odometry.position
 
@@ -84,7 +90,7 @@ class FlightView:
         # The robot holds its position after every mission: do not print this.
         is_usual = self._ended and record.state is GuardState.HOLD
         if record.state > GuardState.TRACK and not is_usual:
-            self._event(f"{record.state.name}: {record.cause}")
+            self._event(f"{record.state.name}: {record.cause}", record.stamp_ns)
         if record.state > GuardState.HOLD and not self._waypoints:
             self.say("  to fly again, find the cause, then: cloudrc mission acknowledge")
 
@@ -94,8 +100,9 @@ class FlightView:
             return Text("the mission is over: writes the report")
         elapsed, flown = self._seen - self._began, (self._now_ns - self._first_ns) * 1e-9
         number = self._waypoint + 1
+        since = self._now_ns - self._start_ns if self._start_ns != NEVER_NS else 0
         cells = (
-            f"{flown:6.1f} s",
+            f"{since * 1e-9:6.1f} s",
             f"{self._guard.name:<6}",
             f"waypoint {number}{f'/{self._waypoints}' * bool(self._waypoints)}" if number else "",
             self._place(),
@@ -112,8 +119,10 @@ class FlightView:
         x, y, z = (round(coordinate, 2) + 0.0 for coordinate in self._position)
         return "" if math.isnan(x) else f"({x:5.2f}, {y:5.2f}, {z:4.2f}) m"
 
-    def _event(self, text: str) -> None:
-        self.say(_joined((f"  {escape(text):<44}", self._place())))
+    def _event(self, text: str, stamp_ns: int) -> None:
+        since = (stamp_ns - self._start_ns) * 1e-9
+        time = " " * 9 if self._start_ns == NEVER_NS else f"{since:7.2f} s"
+        self.say(_joined((time, f"{escape(text):<44}", self._place())))
 
     def say(self, line: str) -> None:
         """Print a line above the status line."""

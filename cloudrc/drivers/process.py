@@ -132,6 +132,7 @@ class Feed:
         """
         self._descriptor, self._watched = descriptor, watched
         self._told_ns: dict[type, int] = {}
+        self._mission = 0  # number of the mission in the newest telemetry
         self._links: dict[bool, str] = {}
         self._rest = b""  # end of a line for which the pipe had no space
         os.set_blocking(descriptor, False)
@@ -183,7 +184,11 @@ class Feed:
 
     def _is_due(self, record: Record) -> bool:
         kind, stamp_ns = type(record), record.stamp_ns
-        if stamp_ns - self._told_ns.get(kind, stamp_ns - PERIOD_NS) < PERIOD_NS:
+        mission = record.telemetry.mission_id if isinstance(record, TelemetrySent) else -1
+        starts = mission not in (-1, self._mission)
+        if starts:
+            self._mission = mission
+        elif stamp_ns - self._told_ns.get(kind, stamp_ns - PERIOD_NS) < PERIOD_NS:
             return False
         self._told_ns[kind] = stamp_ns
         return True

@@ -397,8 +397,7 @@ class Teleop:
             self._report("resumed", self.leg, text, now_ns)
 
     def _advance(self, how: str, now_ns: int) -> None:
-        text = f"{self._leg_name} {how} at {self.elapsed(now_ns):.2f} s"
-        self._report("reached", self.leg, text, now_ns)
+        self._report("reached", self.leg, f"{self._leg_name} {how}", now_ns)
         leaves_ns = self._leaves_ns(self.leg)
         start = None if leaves_ns is None else self._plan.legs[self.leg].position
         self.leg += 1
@@ -410,7 +409,7 @@ class Teleop:
                     leaves_ns = now_ns
                 self._select_leg(self.leg, leaves_ns, start)
         else:
-            self._end("done", f"mission done at {self.elapsed(now_ns):.2f} s", now_ns)
+            self._end("done", "mission done", now_ns)
 
     def _lead(self, seen: RobotStatus, now_ns: int) -> None:
         """Keep the carrot, a moving setpoint, at the robot while the guard ignores commands.

@@ -72,22 +72,27 @@ def test_a_file_gets_the_first_rate_soon_and_then_one_per_period(monkeypatch):
 def test_events_are_plain_lines_or_wrapped_on_a_terminal():
     file, terminal = io.StringIO(), Terminal()
     odometry = Odometry(0, (-1.0, 2.5, -0.0004), UPRIGHT, ZERO, ZERO)
-    seen = TelemetrySent(0, 1, 1, Telemetry(0, odometry, 0.0, -1, 0, 0, 0, GuardState.TRACK))
-    reached = MissionEvent(0, "reached", 1, "waypoint 2 of 7 reached at 4.85 s")
-    hold = GuardChange(0, GuardState.HOLD, "command age 0.252 s above 0.250 s")
+    before = Telemetry(0, odometry, 0.0, -1, 0, 0, 0, GuardState.TRACK)
+    seen = TelemetrySent(1_000_000_000, 1, 1, before._replace(mission_id=7))
+    reached = MissionEvent(5_850_000_000, "reached", 1, "waypoint 2 of 7 reached")
+    hold = GuardChange(6_000_000_000, GuardState.HOLD, "command age 0.252 s above 0.250 s")
     track = GuardChange(0, GuardState.TRACK, "fresh commands")
-    late = Fault(0, "late", "plug-in " * 20)
-    done = MissionEvent(0, "done", 6, "mission done")
+    late = Fault(6_100_000_000, "late", "plug-in " * 20)
+    done = MissionEvent(7_000_000_000, "done", 6, "mission done")
+    early = MissionEvent(0, "held", 0, "held")
     for stream in (file, terminal):
         view = FlightView(stream, 7)
-        view.see([seen, reached, hold, track, late, done, hold])
+        view.see([early, TelemetrySent(0, 1, 0, before), seen, reached, hold, track, late, done])
+        view.see([hold, TelemetrySent(7_100_000_000, 1, 2, before._replace(mission_id=7))])
+        assert str(view.line()).lstrip().startswith("6.1 s")
         view.close()
     place = " (-1.00, 2.50, 0.00) m"
     assert [" ".join(line.split()) for line in file.getvalue().splitlines()] == [
-        f"waypoint 2 of 7 reached at 4.85 s{place}",
-        f"HOLD: command age 0.252 s above 0.250 s{place}",
-        f"{late.text.strip()}{place}",
-        f"mission done{place}",  # then the robot always holds
+        "held",  # before the mission's start there is no time
+        f"4.85 s waypoint 2 of 7 reached{place}",
+        f"5.00 s HOLD: command age 0.252 s above 0.250 s{place}",
+        f"5.10 s {late.text.strip()}{place}",
+        f"6.00 s mission done{place}",  # then the robot always holds
     ]
     assert max(map(len, terminal.getvalue().splitlines())) <= 90
     assert terminal.getvalue().endswith("\x1b[2K"), "the status line is erased"

@@ -188,7 +188,7 @@ def test_a_refusal_says_why(script, action, said):
         ("LAND 0.05", "guard went to LAND (fresh command) on the way to waypoint 2 of 3"),
         ("60", "mission not done within 60 s (time_limit_s): on the way to waypoint 2 of 3"),
         ("foreign 0.05", "somebody else has started another mission on the way to waypoint 2 of 3"),
-        ("full B 0.1 restart free 0.1", "waypoint 2 of 3 reached, as the robot reports, at"),
+        ("full B 0.1 restart free 0.1", "waypoint 2 of 3 reached, as the robot reports"),
         ("queue cancelm2", "mission cancelled before it began"),
         (
             "deaf 15.4 link 0.05",
