@@ -62,18 +62,22 @@ class Log:
     counts: Counter[str] = field(default_factory=Counter)  # what was done -> number of rows
     unusable: list[str] = field(default_factory=list)  # one reason for each unusable row
     halved: bool = False  # whether the delays are halves of round trips
+    unmeasured: set[float] = field(default_factory=set)
+    """Times of sending [s] of packets that arrived with an unknown delay, NaN in `entries`."""
+    elsewhere: list[float] = field(default_factory=list)
+    """Times [s] at which a packet is missing because the other direction has lost it."""
 
     def packets(self) -> Packets:
         """Check the packets, sort them by time of sending, and add a note on each correction.
 
-        Raise a BadInputError if no packet arrived; if a delay is negative; if the times jump far
-        back, as after a step of the clock; if more than 1 % of the rows are unusable; or if more
-        than 1 % of the packets have the time of an earlier packet.
+        Raise a BadInputError if no packet has a delay; if a delay is negative; if the times jump
+        far back, as after a step of the clock; if more than 1 % of the rows are unusable; or if
+        more than 1 % of the packets have the time of an earlier packet.
         """
         self._refuse_beyond_limit(len(self.unusable), *self.unusable[:1])
         times, delays = np.array(self.entries or [(nan, nan)]).T
         if np.isnan(delays).all():
-            raise self.error("no packet arrived; give a log with at least one reply")
+            raise self.error("no packet has a delay; give a log with at least one reply")
         self.refuse_early(float(np.nanmin(delays)))
         period = float(np.median(np.abs(np.diff(times)))) if len(times) > 1 else 0.0
         far = max(GAP_MIN, GAP * period)
@@ -88,13 +92,13 @@ class Log:
         self.counts["left out, unreadable"] += len(self.unusable)
         notes = [f"{count} {what}" for what, count in self.counts.items() if count] + jumps
         sent, delays = np.array(sorted(unique.items())).T
-        gaps = np.diff(sent)
+        gaps = np.diff(np.sort([*sent, *self.elsewhere]))
         if gaps.max(initial=0.0) > far:
             notes.append(
                 f"nothing sent for {gaps.max():.4g} s after packet {gaps.argmax() + 1}: a pause, "
                 "two sessions in one log, or a step of the clock"
             )
-        copies = np.isfinite(delays).astype(int)
+        copies = (np.isfinite(delays) | np.isin(sent, [*self.unmeasured])).astype(int)
         return Packets(sent, delays, copies, tuple(notes), self.halved)
 
     def _jumps(self, times: Array, delays: Array, far: float) -> list[str]:
@@ -150,12 +154,12 @@ def trace_of(packets: Packets) -> Trace:
 
     Each row applies from half a period before its packet was sent until half a period after. So in
     a flight a packet that is a little early or late gets the right row. Time 0 is the first packet.
-    A lost packet has the delay of the packet before it.
+    A packet without a known delay has the delay of the packet before it.
     """
-    sent, lost = packets.sent, np.isnan(packets.delays)
+    sent, unknown, lost = packets.sent, np.isnan(packets.delays), packets.copies == 0
     halfway = (sent[1:] + sent[:-1]) / 2 - sent[0]
-    newest = np.maximum.accumulate(np.where(lost, 0, np.arange(len(lost))))
-    delays = packets.delays[np.maximum(newest, np.argmin(lost))]
+    newest = np.maximum.accumulate(np.where(unknown, 0, np.arange(len(unknown))))
+    delays = packets.delays[np.maximum(newest, np.argmin(unknown))]
     losses = tuple(lost.astype(float).tolist()) if lost.any() else None
     return Trace((0.0, *halfway.tolist()), tuple(delays.tolist()), losses)
 
@@ -186,7 +190,8 @@ _MISSHAPEN = ArithmeticError, AttributeError, LookupError, RecursionError, TypeE
 def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool) -> Packets:
     """Read the output of `irtt client -o FILE.json`.
 
-    The packets that irtt's client sends count as the uplink. If irtt does not know in which
+    The packets that irtt's client sends count as the uplink. A packet that was lost on the way back
+    has arrived on the uplink, with an unknown delay. If irtt does not know in which
     direction a packet was lost, the packet counts as lost in both directions. The times of sending
     are on the client's monotonic clock, so steps of the client's wall clock have no effect.
 
@@ -210,7 +215,7 @@ def read_irtt(text: str, name: str, direction: Direction | None, *, halve: bool)
         _compare_counts(document.get("stats") or {}, len(trips), len(arrived), log)
         if not halve:
             _check_clocks(arrived, log)
-        log.entries = _irtt_entries(trips, "halves" if halve or not direction else direction)
+        _read_trips(trips, "halves" if halve or not direction else direction, log)
     except _MISSHAPEN as error:
         raise log.error(
             f"not a log of irtt ({type(error).__name__}: {error}); give the file that 'irtt client "
@@ -259,31 +264,31 @@ def _check_clocks(arrived: list[dict[str, Any]], log: Log) -> None:
             )
 
 
-_IRTT_NAMES = {
-    "halves": ("", "rtt"),
-    "uplink": ("true_down", "send"),
-    "downlink": ("true_up", "receive"),
-}
-"""Delays to read -> irtt's value of `lost` for packets to leave out, irtt's key of the delay."""
+_IRTT_KEYS = {"halves": "rtt", "uplink": "send", "downlink": "receive"}
+"""Delays to read -> irtt's key of the delay."""
 
 
-def _irtt_entries(trips: list[dict[str, Any]], what: str) -> list[Entry]:
-    """Read the time of sending and the delay of each packet [s]; the first time is 0.
+def _read_trips(trips: list[dict[str, Any]], what: str, log: Log) -> None:
+    """Read the time of sending and the delay of each packet [s] into `log`; the first time is 0.
 
-    `what` is "uplink", "downlink", or "halves" for half of each round trip. Packets lost in the
-    other direction are left out. The time is always that of the client, even for the downlink: a
-    lost packet has no time of the server.
+    `what` is "uplink", "downlink", or "halves" for half of each round trip. On the downlink,
+    packets lost on the uplink are left out. The time is always that of the client, even for the
+    downlink: a lost packet has no time of the server.
     """
-    other, key = _IRTT_NAMES[what]
     part = 0.5e-9 if what == "halves" else 1e-9
-    entries: list[tuple[int, float]] = []
-    for trip in trips:
-        if str(trip["lost"]).lower() != other:
-            stamp = trip["timestamps"]["client"]["send"]
-            sent = int(stamp.get("monotonic", stamp.get("wall")))
-            entries.append((sent, int(trip["delay"][key]) * part if _arrived(trip) else nan))
-    start = min((sent for sent, _ in entries), default=0)
-    return [((sent - start) * 1e-9, delay) for sent, delay in entries]
+    stamps = [trip["timestamps"]["client"]["send"] for trip in trips]
+    sent_ns = [int(stamp.get("monotonic", stamp.get("wall"))) for stamp in stamps]
+    start = min(sent_ns, default=0)
+    for trip, stamp_ns in zip(trips, sent_ns, strict=True):
+        sent, lost = (stamp_ns - start) * 1e-9, str(trip["lost"]).lower()
+        if (what, lost) == ("downlink", "true_up"):
+            log.elsewhere.append(sent)
+            continue
+        delay = int(trip["delay"][_IRTT_KEYS[what]]) * part if _arrived(trip) else nan
+        log.entries.append((sent, delay))
+        if (what, lost) == ("uplink", "true_down"):
+            log.unmeasured.add(sent)
+            log.counts["lost on the way back, delay unknown"] += 1
 
 
 SCALES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}

@@ -161,7 +161,7 @@ class Stream:
     """n packets of one direction in the order of sending; each array has the shape (n,)."""
 
     sent: Array  # times of sending, since the link came up [s]
-    delays: Array  # one-way delay of the copy that arrives first [s]; NaN for lost packets
+    delays: Array  # one-way delay of the copy that arrives first [s]; NaN if lost or not known
     copies: Array  # number of copies of each packet that arrived [1]
 
 
@@ -216,7 +216,7 @@ def sample(
 
 def numbers(stream: Stream) -> Numbers:
     """Compute the statistics of a stream of packets, such as mean delay and loss."""
-    arrived = np.isfinite(stream.delays)
+    arrived = np.isfinite(stream.delays)  # with a known delay
     delays = stream.delays[arrived]
     if not len(delays):
         delays = np.array([np.nan])
@@ -236,7 +236,7 @@ def numbers(stream: Stream) -> Numbers:
         p99=p99,
         most=most,
         correlation=float(np.corrcoef(*pairs)[0, 1]) if varies else float("nan"),
-        loss=float(np.mean(~arrived)),
+        loss=float(np.mean(stream.copies == 0)),
         runs=loss_runs(stream),
         overtaken=float(np.mean(overtaken)) if len(overtaken) else float("nan"),
         duplicated=float(np.mean(stream.copies > 1)),
@@ -250,6 +250,6 @@ def _varies(delays: Array) -> bool:
 
 def loss_runs(stream: Stream) -> tuple[int, ...]:
     """Return the length of each run of successive losses, in the order of sending."""
-    lost = np.concatenate(([0], np.isnan(stream.delays).astype(np.int8), [0]))
+    lost = np.concatenate(([0], (stream.copies == 0).astype(np.int8), [0]))
     edges = np.flatnonzero(np.diff(lost))
     return tuple((edges[1::2] - edges[::2]).tolist())

@@ -17,6 +17,7 @@ from cloudrc.link.logs import (
     refuse_others,
     trace_of,
 )
+from cloudrc.link.model import numbers
 
 
 def read(text, *, halve=False, trust_units=False):
@@ -30,7 +31,7 @@ def delays_of(packets):
 
 def test_a_row_of_a_trace_begins_halfway_between_two_packets():
     def trace_of_log(sent, delays):
-        return trace_of(Packets(np.array(sent), np.array(delays), np.ones(len(sent))))
+        return trace_of(Packets(np.array(sent), np.array(delays), np.isfinite(delays).astype(int)))
 
     trace = trace_of_log((5.0, 5.01, 5.02, 5.03), (0.040, nan, 0.060, 0.045))
     assert trace.times == pytest.approx((0.0, 0.005, 0.015, 0.025))
@@ -122,7 +123,7 @@ def test_round_trips_are_halved_only_on_request():
         ),
         ("time_s,delay_ms,loss_percent\n0,45,2", "column loss_percent is not read; call it loss"),
         ("time_s,delay_ms,Packet loss\n0,45,2", "column packet_loss is not read; call it loss"),
-        ("time_s,delay_ms", "no packet arrived"),
+        ("time_s,delay_ms", "no packet has a delay"),
         ("sent_ms,delay_ms\n" + "1.7212E+12,20\n" * 50, "49 of 50 packets have the same time"),
         ("time_s,delay_ms\n98,4\n99,4\n100,4\n0,4\n1,4", "after row 3 the times go back by 100 s"),
     ],
@@ -255,17 +256,37 @@ TRIPS = [trip(0), trip(1, "true_up"), trip(2, "true_down"), trip(3, True), trip(
 @pytest.mark.parametrize(
     ("direction", "sent", "delays"),
     [
-        ("uplink", (0.0, 0.010, 0.030, 0.040), (0.030, None, None, 0.035)),
+        ("uplink", (0.0, 0.010, 0.020, 0.030, 0.040), (0.030, None, None, None, 0.035)),
         ("downlink", (0.0, 0.020, 0.030, 0.040), (0.020, None, None, 0.020)),
         (None, (0.0, 0.010, 0.020, 0.030, 0.040), (0.025, None, None, None, 0.0275)),
     ],
 )
 def test_irtt_gives_the_delays_of_each_direction(direction, sent, delays):
-    """A packet that is lost in one direction does not count in the other direction."""
+    """A packet lost on the way back has arrived; one that never arrived is not sent back."""
     packets = irtt(TRIPS, direction, packets_sent=5, packets_received=3, duplicates=1)
     assert packets.sent == pytest.approx(sent)
     assert delays_of(packets) == pytest.approx(delays)
-    assert packets.notes == ("1 duplicates left out",)
+    unknown = ("1 lost on the way back, delay unknown",) * (direction == "uplink")
+    assert packets.notes == ("1 duplicates left out", *unknown)
+    lost = [n for n, copies in enumerate(packets.copies) if not copies]
+    assert lost == {"uplink": [1, 3], "downlink": [1, 2], None: [1, 2, 3]}[direction]
+
+
+def test_losses_on_the_way_back_are_no_losses_and_no_pause_of_the_uplink():
+    fates = ["false"] * 100 + ["true_down"] * 40 + ["true_up"] * 10 + ["false"] * 50
+    trips = [trip(n, fate if fate != "false" else False) for n, fate in enumerate(fates)]
+    up, down = irtt(trips, "uplink"), irtt(trips, "downlink")
+    assert up.notes == ("40 lost on the way back, delay unknown",)
+    assert down.notes == ()
+    assert numbers(up).loss == pytest.approx(10 / 200)
+    assert numbers(up).runs == (10,)
+    assert numbers(down).loss == pytest.approx(40 / 190)
+    assert sum(trace_of(up).losses) == 10
+
+
+def test_a_burst_of_losses_on_the_uplink_is_no_pause_of_the_downlink():
+    trips = [trip(n, "true_up" if 20 <= n < 60 else False) for n in range(80)]
+    assert irtt(trips, "downlink").notes == ()
 
 
 def test_irtt_without_a_monotonic_clock_is_read():
@@ -293,7 +314,7 @@ del NO_STAMPS[0]["delay"]["send"]
         (CLIENT_STEPPED, {}, "the clock of irtt's client made a step of 9 ms"),
         (NO_STAMPS, {}, r"server sent no stamps.*--halve-rtt"),
         (TRIPS, {"packets_sent": 6}, "counts are 6 sent and 2 received, but it has 5 packets and "),
-        ([], {}, "no packet arrived"),
+        ([], {}, "no packet has a delay"),
     ],
 )
 def test_irtt_that_contradicts_itself_is_refused(trips, stats, says, direction):
