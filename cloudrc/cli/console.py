@@ -94,7 +94,7 @@ def execute(options: argparse.Namespace) -> int:
     return 0
 
 
-class Flight(NamedTuple):
+class ConsoleTarget(NamedTuple):
     """The flight that the console shows and steers."""
 
     config: Path  # experiment file
@@ -104,7 +104,7 @@ class Flight(NamedTuple):
     token: Callable[[], str] | None = None  # of the page; None: a new one, which is printed
 
 
-def _serve(options: argparse.Namespace, flight: Flight) -> None:
+def _serve(options: argparse.Namespace, flight: ConsoleTarget) -> None:
     with ExitStack() as opened:
         from cloudrc.console.page import Page
 
@@ -149,7 +149,7 @@ def _serve(options: argparse.Namespace, flight: Flight) -> None:
             time.sleep(RETRY_PERIOD)
 
 
-def _local(options: argparse.Namespace) -> Flight:
+def _local(options: argparse.Namespace) -> ConsoleTarget:
     from cloudrc.cli.link_set import read_states, set_here
     from cloudrc.console.steering import Link
     from cloudrc.drivers.local import LINK_FOLDER, under_way
@@ -164,10 +164,10 @@ def _local(options: argparse.Namespace) -> Flight:
         return states[0].profile if states else {}
 
     link = Link(read, lambda settings: set_here(run / LINK_FOLDER, None, settings, token_hex(4)))
-    return Flight(run / "config.yaml", Api(url), link, lambda: under_way().get(run) != url)
+    return ConsoleTarget(run / "config.yaml", Api(url), link, lambda: under_way().get(run) != url)
 
 
-def _in_pod(options: argparse.Namespace) -> Flight:
+def _in_pod(options: argparse.Namespace) -> ConsoleTarget:
     """Return the flight of the pod in which this process runs.
 
     The pod has no right to change the link. Therefore this process prints the changes that the
@@ -195,7 +195,7 @@ def _in_pod(options: argparse.Namespace) -> Flight:
     file = token_file(options)
     operator = token_reader(file)
     note = " requested; only 'cloudrc console --cluster' carries it out"
-    return Flight(
+    return ConsoleTarget(
         options.config,
         Api(options.api, operator),
         Link(read, change, note),

@@ -97,7 +97,7 @@ class Formula(NamedTuple):
         raise InvalidResultError(f"gives {seen.round(3).tolist()}, not {wanted.round(3).tolist()}")
 
 
-class Flight(NamedTuple):
+class Exam(NamedTuple):
     """A test flight; the value of one metric decides how many of the points the student gets.
 
     The value `full` or better gives all points, `none` or worse gives 0; linear in between.
@@ -134,28 +134,28 @@ class Flight(NamedTuple):
         return share, seen
 
 
-CHECKS: dict[str, tuple[Formula | Flight, ...]] = {
+CHECKS: dict[str, tuple[Formula | Exam, ...]] = {
     "estimator": (
         Formula("mean", 10, lambda build: _horizons(build, 0.08, 0.14, 0.05, 0.11, 0.2)),
         Formula("hold time", 5, lambda build: _horizons(build, 0.1, hold=0.04)),
-        Flight("steps", 10, "steps", "paper-p3", "delay_estimate_error_rms", 0.025, 0.06),
+        Exam("steps", 10, "steps", "paper-p3", "delay_estimate_error_rms", 0.025, 0.06),
     ),
     "predictor": (
         Formula("position", 6, partial(_predict, select=lambda o: o.position)),
         Formula("orientation", 5, partial(_predict, select=lambda o: o.orientation_wxyz)),
         Formula("velocity, stamp", 4, partial(_predict, select=lambda o: (*o[3], o[0] / 1e9))),
-        Flight("steps", 10, "steps", "paper-p3", "prediction_error_rms", 0.015, 0.04),
+        Exam("steps", 10, "steps", "paper-p3", "prediction_error_rms", 0.015, 0.04),
     ),
     "controller": (
         Formula("P", 5, partial(_command, sign=True, gain_p=(0.5, 1.0, 2.0))),
         Formula("I", 4, partial(_command, n=1000, gain_i=(0.25, 0.25, 0.25))),
         Formula("D", 3, partial(_command, n=9, speed=0.5, gain_d=(0.4, 0.4, 0.4))),
         Formula("limit", 3, partial(_command, velocity_max=(0.3, 0.4, 0.5))),
-        Flight("steps", 10, "steps", "paper-p3", "iae_mean", 1.8, 4.0),
+        Exam("steps", 10, "steps", "paper-p3", "iae_mean", 1.8, 4.0),
     ),
     "together": (
-        Flight("pipes, paper-p2", 10, "paper", "paper-p2", "waypoints_reached", 7, 0),
-        Flight("pipes, satellite", 15, "paper", "satellite", "waypoints_reached", 7, 0),
+        Exam("pipes, paper-p2", 10, "paper", "paper-p2", "waypoints_reached", 7, 0),
+        Exam("pipes, satellite", 15, "paper", "satellite", "waypoints_reached", 7, 0),
     ),
 }
 """Part, or all parts together -> its checks; 100 points in total."""

@@ -36,7 +36,7 @@ from cloudrc.world.robot import Robot
 SHARED, OTHER = b"one clock for all".ljust(16)[:16], b"another clock..."
 
 
-class Flight:
+class FaultRun:
     """One flight of world, cloud, teleop and link.
 
     `secrets` maps "world" and "cloud" to the keys in their key files; `rings` maps them to the keys
@@ -119,12 +119,12 @@ class Flight:
         order = self.make_order()
         self.teleop.ask(lambda service, now_ns: service.create(order, now_ns))
 
-    def fly(self, until: float, is_over: Callable[[], bool] = lambda: False) -> Flight:
+    def fly(self, until: float, is_over: Callable[[], bool] = lambda: False) -> FaultRun:
         """Fly on until the virtual time `until` [s], or until `is_over()` is True; return self."""
         self.run.fly(is_over, round(until * 1e9), self._sink)
         return self
 
-    def fly_mission(self, limit: float = 120.0) -> Flight:
+    def fly_mission(self, limit: float = 120.0) -> FaultRun:
         """Fly until the mission's end or the virtual time `limit` [s], then fly 1 s more."""
         self.fly(limit, lambda: self.teleop.service is not None and self.mission.ended)
         return self.fly(self.now + 1.0)

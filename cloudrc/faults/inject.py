@@ -6,7 +6,7 @@ from collections import deque
 from functools import partial
 from itertools import islice
 from math import inf, nan
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from cloudrc.config.schema import Blackout, Change, GilbertElliott
 from cloudrc.drivers.virtual import Clock
 from cloudrc.errors import BadInputError
 from cloudrc.faults.adversary import Lie
-from cloudrc.faults.models import Action, Call, RestartableEndpoint, Tamper
+from cloudrc.faults.models import Action, Call, RestartableEndpoint, Tamper, TeleopModel
 from cloudrc.faults.schedule import Event, Schedule, generator
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.messages import Command
@@ -22,15 +22,34 @@ from cloudrc.records import Control
 from cloudrc.teleop.service import MissionService
 from cloudrc.tunnel.keys import Key, KeySet
 
-if TYPE_CHECKING:
-    from cloudrc.faults.flight import Flight
-
 SECRET = KeySet(Key(b"a key of the fault suite, 32 b.."))
 CAPTURED = 2_000  # number of datagrams that an intruder keeps
 NEXT_KEY = KeySet(Key(b"the next key of the fault suite!"), SECRET.current)
 WRONG_KEY = KeySet(Key(b"a key that world has never read!"))
 BUGS = ("values_invalid", "values_huge")  # faults of an honest cloud whose controller has a bug
 IMPOSSIBLE = (nan, inf, -inf)
+
+
+class Target(Protocol):
+    """What faults act on: the processes and keys of a flight."""
+
+    schedule: Schedule
+    world: RestartableEndpoint
+    cloud: RestartableEndpoint
+    teleop: TeleopModel
+    secrets: dict[str, KeySet]  # "world" and "cloud" -> the keys in their key files
+
+    def restart_pod(self, now_ns: int, down: float) -> None:
+        """Kill cloud and teleop at `now_ns` [ns]; start new processes after `down` [s]."""
+
+    def replace_key(self, end: str, keys: KeySet) -> None:
+        """Replace the keys of `end`, "world" or "cloud"."""
+
+    def end_rival(self) -> None:
+        """Stop the second cloud."""
+
+    def order_if_possible(self, now_ns: int) -> None:
+        """Order a further mission at `now_ns` [ns]; teleop may refuse the order."""
 
 
 def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> DirectionProfile:
@@ -74,7 +93,7 @@ def _change(profile: DirectionProfile, active: list[Event], at: float) -> Change
     return Change(at_s=at, delay_ms=delay_ms, jitter_ms=jitter_ms, loss=loss)
 
 
-def inject(flight: Flight) -> None:
+def inject(flight: Target) -> None:
     """Schedule the faults of processes, keys, datagrams, teleop and the operator in a flight."""
     schedule = flight.schedule
     for event in schedule.events:
@@ -90,7 +109,7 @@ def inject(flight: Flight) -> None:
 
 
 def _actions(
-    flight: Flight, process: RestartableEndpoint, event: Event
+    flight: Target, process: RestartableEndpoint, event: Event
 ) -> dict[str, tuple[tuple[float, Action], ...]]:
     """Return how to inject `event`: kind of fault -> pairs of time [s] and action.
 

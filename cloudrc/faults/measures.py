@@ -12,7 +12,7 @@ from math import dist, hypot, isfinite, nan
 from typing import Any, Literal, TypeAlias
 
 from cloudrc.errors import describe_error
-from cloudrc.faults.flight import Flight
+from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.schedule import generator
 from cloudrc.messages import Cause, GuardState
 from cloudrc.record.columns import Recording
@@ -153,7 +153,7 @@ def instant(seed: int, first: float = 4.0, last: float = 24.0) -> float:
     return float(generator(seed, 77).uniform(first, last))
 
 
-def refused(outcome: Outcome, flight: Flight, *reasons: str) -> None:
+def refused(outcome: Outcome, flight: FaultRun, *reasons: str) -> None:
     """Check that world has refused at least one datagram or command for each reason."""
     for reason in reasons:
         outcome.least(f"refused as {reason}", flight.count(reason), 1)
@@ -162,22 +162,22 @@ def refused(outcome: Outcome, flight: Flight, *reasons: str) -> None:
 # The guard.
 
 
-def changes_into(flight: Flight, state: GuardState) -> list[GuardChange]:
+def changes_into(flight: FaultRun, state: GuardState) -> list[GuardChange]:
     """Return the guard's changes that lead to `state`, except the HOLD at a mission's end."""
     return [c for c in flight.changes if c.state is state and c.cause != ENDED]
 
 
-def first_into(flight: Flight, state: GuardState) -> float:
+def first_into(flight: FaultRun, state: GuardState) -> float:
     """Return when the guard first changed to `state` [s]; NaN if it never did."""
     return next((c.stamp_ns * 1e-9 for c in changes_into(flight, state)), nan)
 
 
-def held(flight: Flight) -> list[GuardChange]:
+def held(flight: FaultRun) -> list[GuardChange]:
     """Return the guard's changes to HOLD, without the HOLD at the end of a mission."""
     return changes_into(flight, GuardState.HOLD)
 
 
-def held_in_time(outcome: Outcome, flight: Flight, text: str = "HOLD after") -> None:
+def held_in_time(outcome: Outcome, flight: FaultRun, text: str = "HOLD after") -> None:
     """Check that every HOLD began within one step after the last command became too old.
 
     `text` names the check in the outcome.
@@ -185,7 +185,7 @@ def held_in_time(outcome: Outcome, flight: Flight, text: str = "HOLD after") -> 
     outcome.most(text, basis_age_at_hold(flight), AGE_MAX, "s")
 
 
-def basis_age_at_hold(flight: Flight) -> float:
+def basis_age_at_hold(flight: FaultRun) -> float:
     """Return the largest age that the commands' newest odometry had when a HOLD began [s]."""
     applied = [(r.stamp_ns, r.basis_stamp_ns) for r in flight.of_world if type(r) is CommandApplied]
     ages = []
@@ -195,7 +195,7 @@ def basis_age_at_hold(flight: Flight) -> float:
     return max(ages, default=nan)
 
 
-def resumed_after(flight: Flight, back: float) -> float:
+def resumed_after(flight: FaultRun, back: float) -> float:
     """Return the time from `back` [s] until the guard next changed to TRACK [s]; NaN if never."""
     delays = [c.stamp_ns * 1e-9 - back for c in changes_into(flight, GuardState.TRACK)]
     return next((delay for delay in delays if delay >= -1e-9), nan)
@@ -216,7 +216,7 @@ def told(records: Iterable[Record], code: str) -> list[Fault]:
     return [each for each in records if isinstance(each, Fault) and each.code == code]
 
 
-def events_of_missions(flight: Flight, name: str) -> list[dict[str, Any]]:
+def events_of_missions(flight: FaultRun, name: str) -> list[dict[str, Any]]:
     """Return the events called `name` in teleop's log; none if teleop does not run now."""
     service = flight.teleop.service
     events = service.book.events_after(0) if service is not None else []
@@ -226,7 +226,7 @@ def events_of_missions(flight: Flight, name: str) -> list[dict[str, Any]]:
 # The path.
 
 
-def calm_after(flight: Flight, start: float, end: float) -> float:
+def calm_after(flight: FaultRun, start: float, end: float) -> float:
     """Return the time [s] from `start` [s] to the end of the robot's last motion before `end` [s].
 
     Return 0 if the robot did not move.
@@ -236,13 +236,13 @@ def calm_after(flight: Flight, start: float, end: float) -> float:
     return fast[-1] + SAMPLE - start if fast else 0.0
 
 
-def drift(flight: Flight, start: float, end: float) -> float:
+def drift(flight: FaultRun, start: float, end: float) -> float:
     """Return the robot's largest distance [m] from its position at `start` [s], until `end` [s]."""
     path = [r.odometry for r in flight.trajectory() if start <= r.stamp_ns * 1e-9 <= end]
     return max((dist(path[0].position, each.position) for each in path), default=nan)
 
 
-def number(flight: Flight, name: str) -> float:
+def number(flight: FaultRun, name: str) -> float:
     """Return a metric of the flight's report, in the metric's unit; NaN if there is none."""
     recording = Recording.from_records(flight.of_world, flight.of_cloud)
     numbers = assess(recording, flight.experiment, Run("virtual", "virtual")).numbers
@@ -252,20 +252,20 @@ def number(flight: Flight, name: str) -> float:
 # Commands, sessions, missions.
 
 
-def epochs(flight: Flight) -> list[int]:
+def epochs(flight: FaultRun) -> list[int]:
     """Return the epochs of the sessions that world began, in order."""
     opened = [r for r in flight.of_world if isinstance(r, SessionOpened)]
     return [record.epoch for record in opened if record.end == "world"]
 
 
-def done(outcome: Outcome, flight: Flight) -> None:
+def done(outcome: Outcome, flight: FaultRun) -> None:
     """Check that the mission was completed, with each waypoint reached once and in order."""
     outcome.true("mission done", flight.mission.state == "done")
     reached = [event.waypoint for event in flight.events("reached")]
     outcome.true("each waypoint reached once, in order", reached == list(range(len(reached))))
 
 
-def fly_safely(outcome: Outcome, flight: Flight, limit: float = 120.0) -> Flight:
+def fly_safely(outcome: Outcome, flight: FaultRun, limit: float = 120.0) -> FaultRun:
     """Fly the mission, at most until `limit` [s]; check that it was safe and was completed."""
     flight.fly_mission(limit)
     safe(outcome, flight)
@@ -273,7 +273,7 @@ def fly_safely(outcome: Outcome, flight: Flight, limit: float = 120.0) -> Flight
     return flight
 
 
-def safe(outcome: Outcome, flight: Flight) -> None:
+def safe(outcome: Outcome, flight: FaultRun) -> None:
     """Add to `outcome`: whether the flight broke an invariant, and the hash of its records."""
     outcome.same("breaches of an invariant", flight.watch.counts.total(), 0)
     for breach in flight.watch.breaches:

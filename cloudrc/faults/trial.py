@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from cloudrc.errors import describe_error
-from cloudrc.faults.flight import Flight
+from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.invariants import LATCHED, Breach
 from cloudrc.faults.measures import events_of_missions, held
 from cloudrc.faults.schedule import Schedule
@@ -69,7 +69,7 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
         BadInputError: If the schedule names an unknown link profile or an unknown policy of a
             dishonest cloud, or if its faults do not fit the profile.
     """
-    flight = Flight(schedule, keep=keep)
+    flight = FaultRun(schedule, keep=keep)
     watch, operator = flight.watch, Operator(flight)
     try:
         flight.fly(schedule.duration)
@@ -105,7 +105,7 @@ def checked_in(schedule: Schedule) -> frozenset[str]:
 class Operator:
     """Orders one mission after another, and acknowledges each landing and emergency stop."""
 
-    def __init__(self, flight: Flight) -> None:
+    def __init__(self, flight: FaultRun) -> None:
         self._flight = flight
         self._next_ns, self._tracked_ns = 0, -1
         self._unmet_ns = [round(event.at * 1e9) for event in flight.schedule.of("stopped")]
@@ -149,7 +149,7 @@ class Operator:
             flight.order_if_possible(now_ns)
 
 
-def _check_waypoints(flight: Flight) -> None:
+def _check_waypoints(flight: FaultRun) -> None:
     reached: dict[str, list[int]] = {}
     for event in events_of_missions(flight, "reached"):
         reached.setdefault(event["mission"], []).append(event["waypoint"])
@@ -159,7 +159,7 @@ def _check_waypoints(flight: Flight) -> None:
             flight.watch.note(flight.run.now_ns, "waypoint", text)
 
 
-def _check_alarms(flight: Flight) -> None:
+def _check_alarms(flight: FaultRun) -> None:
     latched = [change for change in flight.changes if change.state in LATCHED]
     for change in (*held(flight), *latched):
         text = f"{change.state.name} in a flight without faults: {change.cause}"

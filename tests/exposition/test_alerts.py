@@ -11,7 +11,7 @@ import yaml
 from cloudrc.exposition.live import LiveMetrics
 from cloudrc.exposition.parts import Histogram
 from cloudrc.exposition.table import METRICS
-from cloudrc.faults.flight import Flight
+from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.scenarios import SCENARIOS
 from cloudrc.faults.schedule import Schedule
 from cloudrc.records import Counted
@@ -121,14 +121,14 @@ def flights(monkeypatch):
     """All flights of a test."""
     if shutil.which("promtool") is None:
         pytest.skip("needs promtool (Debian package prometheus)")
-    made: list[Flight] = []
-    init = Flight.__init__
+    made: list[FaultRun] = []
+    init = FaultRun.__init__
 
     def remember(self, *settings, **options):
         made.append(self)
         init(self, *settings, **options)
 
-    monkeypatch.setattr(Flight, "__init__", remember)
+    monkeypatch.setattr(FaultRun, "__init__", remember)
     return made
 
 
@@ -141,7 +141,7 @@ def test_a_fault_fires_its_alerts_and_no_others(scenario, flights, tmp_path):
 
 @pytest.mark.parametrize("profile", ["paper-p1", "paper-p3", "wifi"])
 def test_a_clean_flight_fires_none(profile, flights, tmp_path):
-    flight = Flight(Schedule(1, profile)).fly_mission()
+    flight = FaultRun(Schedule(1, profile)).fly_mission()
     assert flight.mission.state == "done"
     assert flights == [flight]
     assert fired(flight, tmp_path) == set()

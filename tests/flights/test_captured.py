@@ -2,7 +2,7 @@
 
 import pytest
 
-from cloudrc.faults.flight import Flight
+from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.schedule import Schedule
 from cloudrc.tunnel.codec import Kind, peek
 
@@ -12,7 +12,7 @@ HOVER = (
 )
 
 
-class Tapped(Flight):
+class Tapped(FaultRun):
     """Capture the datagrams to world and to cloud."""
 
     def __init__(self, life=1):

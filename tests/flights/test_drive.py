@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from cloudrc.faults.flight import Flight
+from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.schedule import Schedule, generator
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.record.columns import Recording
@@ -22,7 +22,7 @@ class Drive:
     """A flight whose operator drives; it takes off at 0.5 s."""
 
     def __init__(self, profile="paper-p3", seed=1, link=()):
-        self.flight = Flight(Schedule(seed, profile), "world.scene=empty", *link, start=False)
+        self.flight = FaultRun(Schedule(seed, profile), "world.scene=empty", *link, start=False)
         ways = self.flight.experiment.uplink, self.flight.experiment.downlink
         self.rtt = sum(way.delay_ms for way in ways) * 1e-3
         self.random = generator(seed, 46).uniform

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cloudrc.faults import measures
-from cloudrc.faults.flight import Flight
+from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.schedule import Event, Schedule
 from cloudrc.geometry.clearance import pipe_index
 from cloudrc.geometry.scene import load_scene
@@ -22,7 +22,7 @@ KILLED, SILENT = 3.0, 60.5
 
 @cache
 def undisturbed(*settings):
-    return Flight(Schedule(1, hold_max=100.0), *PATIENCE, *settings).fly_mission()
+    return FaultRun(Schedule(1, hold_max=100.0), *PATIENCE, *settings).fly_mission()
 
 
 @cache
@@ -41,7 +41,7 @@ def interrupt(figure, kill, at, *settings, calm=1.0):
     """Kill cloud's process, of which the new one knows nothing; or silence the link."""
     back = at + (KILLED if kill else SILENT)
     event = Event("cloud_killed", at, KILLED) if kill else Event("blackout", at, SILENT)
-    flight = Flight(Schedule(1, events=(event,), hold_max=100.0), *PATIENCE, *settings)
+    flight = FaultRun(Schedule(1, events=(event,), hold_max=100.0), *PATIENCE, *settings)
     flight.fly_mission(200.0)
     waypoints = range(len(flight.mission.order.plan.legs))
     assert [event.waypoint for event in flight.events("reached")] == list(waypoints)

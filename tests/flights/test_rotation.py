@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from cloudrc.faults.flight import Flight
+from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.inject import SECRET
 from cloudrc.faults.measures import epochs
 from cloudrc.faults.schedule import Schedule
@@ -40,7 +40,7 @@ def held(flight):
 
 def rotated(*steps):
     """Fly 5 s; then an end reads keys and the flight goes on for some seconds, again and again."""
-    flight = Flight(Schedule(1, "ideal"), *HOVER).fly(5.0)
+    flight = FaultRun(Schedule(1, "ideal"), *HOVER).fly(5.0)
     for end, keys, seconds in steps:
         flight.replace_key(end, keys)
         flight.fly(flight.now + seconds)

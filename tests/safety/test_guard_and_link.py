@@ -3,7 +3,7 @@
 import pytest
 
 from cloudrc.faults import adversary
-from cloudrc.faults.flight import Flight
+from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.schedule import Schedule
 from cloudrc.messages import GuardState
 from cloudrc.world.guard.state import Guard
@@ -28,7 +28,7 @@ def test_nothing_in_the_tunnel_changes_the_limits(monkeypatch):
     monkeypatch.setattr(adversary, "SPEAKING", (*HOSTILE,))  # all of them also forge requests
     states = set()
     for policy, seed in HOSTILE.items():
-        flight = Flight(Schedule(seed, policy=policy))
+        flight = FaultRun(Schedule(seed, policy=policy))
         before = bounds(flight.robot.guard)
         flight.fly(8.0)
         assert bounds(flight.robot.guard) == before == bounds(Guard(flight.experiment.guard))

@@ -12,7 +12,7 @@ from cloudrc.config.mission_check import check_mission
 from cloudrc.config.schema import Mission
 from cloudrc.faults import measures
 from cloudrc.faults.adversary import Lie
-from cloudrc.faults.flight import Flight
+from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.measures import Outcome, fly_safely, refused, scenario
 from cloudrc.faults.schedule import Event, Schedule, Way, generator
 from cloudrc.geometry import fence
@@ -41,7 +41,7 @@ EXCESSIVE: dict[str, dict[str, Any]] = {
 )
 def _cloud_killed(outcome: Outcome, seed: int) -> None:
     at, down = measures.instant(seed), 0.8
-    flight = Flight(Schedule(seed, events=(Event("cloud_killed", at, down),)))
+    flight = FaultRun(Schedule(seed, events=(Event("cloud_killed", at, down),)))
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
     commands = [r.stamp_ns * 1e-9 - at for r in flight.of_world if isinstance(r, CommandApplied)]
@@ -59,7 +59,7 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
 )
 def _cloud_paused(outcome: Outcome, seed: int) -> None:
     paused = Event("cloud_paused", measures.instant(seed), 5.0)
-    flight = fly_safely(outcome, Flight(Schedule(seed, events=(paused,))))
+    flight = fly_safely(outcome, FaultRun(Schedule(seed, events=(paused,))))
     measures.held_in_time(outcome, flight)
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
     old = [r for r in applied if r.stamp_ns - r.basis_stamp_ns > measures.AGE_MAX * 1e9]
@@ -75,7 +75,7 @@ def _cloud_paused(outcome: Outcome, seed: int) -> None:
 )
 def _world_restarted(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
-    flight = Flight(Schedule(seed, events=(Event("world_killed", at, 2.0),)))
+    flight = FaultRun(Schedule(seed, events=(Event("world_killed", at, 2.0),)))
     flight.fly(at + 12.0)
     measures.safe(outcome, flight)
     after = [c for c in flight.changes if c.stamp_ns * 1e-9 > at]
@@ -100,7 +100,7 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
 )
 def _two_clouds(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed, 4.0, 12.0)
-    flight = Flight(Schedule(seed, events=(Event("second_cloud", at, 60.0),)))
+    flight = FaultRun(Schedule(seed, events=(Event("second_cloud", at, 60.0),)))
     flight.fly(at + 5.0)
     opened = max(measures.epochs(flight), default=-1)
     outcome.same("epochs while both clouds run", opened, 2)
@@ -141,7 +141,7 @@ def _swizzle(outcome: Outcome, seed: int) -> None:
     kinds = ("blackout", "blackout", "cloud_paused", "world_paused", "teleop_killed")
     faults = zip(kinds, spans, ways, strict=True)
     events = tuple(Event(kind, *span, way=way) for kind, span, way in faults)
-    flight = Flight(Schedule(seed, events=events), "criteria.time_limit_s=120")
+    flight = FaultRun(Schedule(seed, events=events), "criteria.time_limit_s=120")
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
     for end, records in (("cloud", flight.of_cloud), ("world", flight.of_world)):
@@ -159,7 +159,7 @@ def _swizzle(outcome: Outcome, seed: int) -> None:
 def _invalid_values(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
     for name, changes in IMPOSSIBLE.items():
-        flight = Flight(Schedule(seed), lies=[_for_a_while(at, 1.0, changes)]).fly(40.0)
+        flight = FaultRun(Schedule(seed), lies=[_for_a_while(at, 1.0, changes)]).fly(40.0)
         measures.safe(outcome, flight)
         landed = measures.first_into(flight, GuardState.LAND)
         outcome.most(f"{name}: LAND after", landed - at, 1.0, "s")
@@ -171,12 +171,12 @@ def _invalid_values(outcome: Outcome, seed: int) -> None:
         refused(outcome, flight, "range")
     for limit, changes in EXCESSIVE.items():
         lie, harmless = _for_a_while(at, 1.0, changes), limit != "speed"  # it may hit a pipe
-        flight = Flight(Schedule(seed), honest=harmless, lies=[lie]).fly(40.0)
+        flight = FaultRun(Schedule(seed), honest=harmless, lies=[lie]).fly(40.0)
         measures.safe(outcome, flight)
         rejected = sum("impossible" in change.cause for change in flight.changes)
         outcome.same(f"100 times {limit}: rejected as impossible", rejected, 0)
         outcome.least(f"100 times {limit}: limited", flight.count(f"limited_{limit}"), 20)
-    one = Flight(Schedule(seed), lies=[_for_a_while(at, 0.005, IMPOSSIBLE["NaN"])]).fly(40.0)
+    one = FaultRun(Schedule(seed), lies=[_for_a_while(at, 0.005, IMPOSSIBLE["NaN"])]).fly(40.0)
     measures.safe(outcome, one)
     measures.done(outcome, one)
     outcome.same("a single NaN: LAND", len(measures.changes_into(one, GuardState.LAND)), 0)
@@ -250,7 +250,7 @@ def _unreachable(outcome: Outcome, seed: int) -> None:
         x, y, z = (a - b for a, b in zip(stays[0], control.measured, strict=True))
         return command._replace(velocity=(x, y, z))
 
-    flight = Flight(Schedule(seed), "criteria.time_limit_s=300", lies=[stalled])
+    flight = FaultRun(Schedule(seed), "criteria.time_limit_s=300", lies=[stalled])
     flight.fly_mission(200.0)
     measures.safe(outcome, flight)
     outcome.true("the mission ends", flight.mission.state == "failed")

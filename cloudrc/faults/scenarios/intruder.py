@@ -8,7 +8,7 @@ from itertools import islice
 from typing import TypeAlias
 
 from cloudrc.faults import measures
-from cloudrc.faults.flight import Flight
+from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.inject import flipped
 from cloudrc.faults.measures import Outcome, fly_safely, refused, scenario
 from cloudrc.faults.schedule import Schedule, generator
@@ -30,7 +30,8 @@ def _check_no_effect(
     for world, an optional second function makes datagrams for cloud. `refusals` are names of
     world's counters that must rise.
     """
-    clean, flight, sent = Flight(Schedule(seed)).fly_mission(), Flight(Schedule(seed)), list[int]()
+    clean = FaultRun(Schedule(seed)).fly_mission()
+    flight, sent = FaultRun(Schedule(seed)), list[int]()
 
     def tamper(make: Make, data: bytes, now_ns: int) -> list[bytes]:
         hostile = list(make(data)) if now_ns * 1e-9 >= since else []
@@ -64,7 +65,7 @@ def _corruption(outcome: Outcome, seed: int) -> None:
             sent.append(data := flipped(data, rng, flips))
         return [data]
 
-    flight = Flight(Schedule(seed))
+    flight = FaultRun(Schedule(seed))
     flight.world.tamper = flight.cloud.tamper = tamper
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
@@ -103,7 +104,7 @@ def _flood(outcome: Outcome, seed: int) -> None:
 )
 def _old_session(outcome: Outcome, seed: int) -> None:
     captured: list[bytes] = []
-    first = Flight(Schedule(seed), life=7)
+    first = FaultRun(Schedule(seed), life=7)
 
     def record(data: bytes, now_ns: int) -> list[bytes]:
         captured.append(data)
@@ -150,7 +151,7 @@ def _malformed(outcome: Outcome, seed: int) -> None:
         return [b"", data[:cut], data + b"\0", oversized, data[:1] * 2048, newer + data[1:]]
 
     _check_no_effect(outcome, seed, [strange], "malformed", "version")
-    flight = Flight(Schedule(seed))
+    flight = FaultRun(Schedule(seed))
     flight.world.tamper = lambda data, now_ns: [newer + data[1:]]
     flight.fly(2.0)
     flight.world.tamper = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import isnan, nan
 
 from cloudrc.faults import measures
-from cloudrc.faults.flight import Flight
+from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.measures import Outcome, fly_safely, scenario
 from cloudrc.faults.schedule import WAYS, Event, Schedule
 from cloudrc.messages import Cause, GuardState
@@ -31,7 +31,7 @@ def _short_silence(outcome: Outcome, seed: int) -> None:
     for silent in WAYS:
         what, settings = ("both ways", []) if silent == "both" else (silent, [STEADY])
         cut = Schedule(seed, events=(Event("blackout", at, 0.1, way=silent),))
-        flight = fly_safely(outcome, Flight(cut, *settings))
+        flight = fly_safely(outcome, FaultRun(cut, *settings))
         outcome.same(f"silent {what}: HOLDs", len(measures.held(flight)), 0)
         for way, link in (("up", flight.uplink), ("down", flight.downlink)):
             most = 11 if silent in ("both", way) else 0
@@ -50,7 +50,7 @@ def _silence(outcome: Outcome, seed: int) -> None:
         back, what = at + duration, f"{duration:g} s of silence"
         slow = ("guard.speed_max_mps=1.5", "criteria.time_limit_s=150")
         cut = Schedule(seed, events=(Event("blackout", at, duration),))
-        flight = fly_safely(outcome, Flight(cut, *slow), 150.0)
+        flight = fly_safely(outcome, FaultRun(cut, *slow), 150.0)
         measures.held_in_time(outcome, flight, f"{what}: HOLD after")
         if duration >= 3.0:
             began = measures.first_into(flight, GuardState.HOLD)
@@ -76,13 +76,13 @@ def _long_silence(outcome: Outcome, seed: int) -> None:
     _landed(outcome, seed, measures.instant(seed, 8.0), "amid the pipes")
 
 
-def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
+def _landed(outcome: Outcome, seed: int, at: float, where: str) -> FaultRun:
     """Interrupt the link at `at` [s] for 75 s; check that the robot lands and stops its rotors.
 
     `where` is the place of the robot, for the texts of the checks.
     """
     cut = Schedule(seed, events=(Event("blackout", at, 75.0),))
-    flight = Flight(cut, "criteria.time_limit_s=200")
+    flight = FaultRun(cut, "criteria.time_limit_s=200")
     flight.fly(at + 80.0)
     measures.safe(outcome, flight)
     held = measures.first_into(flight, GuardState.HOLD)
@@ -110,8 +110,8 @@ def _landed(outcome: Outcome, seed: int, at: float, where: str) -> Flight:
     expects="TRACK, tracking error <= 1.5 times that without loss",
 )
 def _loss(outcome: Outcome, seed: int) -> None:
-    clean = Flight(Schedule(seed)).fly_mission()
-    flight = fly_safely(outcome, Flight(Schedule(seed), "link.both.loss=0.3"))
+    clean = FaultRun(Schedule(seed)).fly_mission()
+    flight = fly_safely(outcome, FaultRun(Schedule(seed), "link.both.loss=0.3"))
     outcome.same("HOLDs", len(measures.held(flight)), 0)
     error, usual = (measures.number(each, "tracking_rms_measured") for each in (flight, clean))
     outcome.most("tracking error, relative to that without loss", error / usual, 1.5)
@@ -127,7 +127,7 @@ def _loss(outcome: Outcome, seed: int) -> None:
 def _bursts(outcome: Outcome, seed: int) -> None:
     for packets in (5, 20, 50):
         loss = f"link.both.loss={{bad_start: 0.005, bad_end: {1 / packets}}}"
-        flight = Flight(Schedule(seed), "criteria.time_limit_s=150", loss).fly_mission(150.0)
+        flight = FaultRun(Schedule(seed), "criteria.time_limit_s=150", loss).fly_mission(150.0)
         measures.safe(outcome, flight)
         if packets < 50:  # else it hardly ever rests on the board for 4 s, and a leg may time out
             measures.done(outcome, flight)
@@ -146,7 +146,7 @@ def _bursts(outcome: Outcome, seed: int) -> None:
 )
 def _disorder(outcome: Outcome, seed: int) -> None:
     link = STEADY, "link.both.delay_ms=50"
-    flight = fly_safely(outcome, Flight(Schedule(seed, reorder=0.25), *link))
+    flight = fly_safely(outcome, FaultRun(Schedule(seed, reorder=0.25), *link))
     outcome.least("late commands dropped", flight.count("late"), 100)
 
 
@@ -157,8 +157,8 @@ def _disorder(outcome: Outcome, seed: int) -> None:
     expects="the same path, bit by bit",
 )
 def _copies(outcome: Outcome, seed: int) -> None:
-    clean = Flight(Schedule(seed), STEADY).fly_mission()
-    flight = fly_safely(outcome, Flight(Schedule(seed, duplicate=1.0), STEADY))
+    clean = FaultRun(Schedule(seed), STEADY).fly_mission()
+    flight = fly_safely(outcome, FaultRun(Schedule(seed, duplicate=1.0), STEADY))
     same = clean.trajectory() == flight.trajectory()
     outcome.true("the same path, bit by bit", same)
     outcome.least("copies dropped", flight.count("repeated"), 1000)
@@ -171,14 +171,14 @@ def _copies(outcome: Outcome, seed: int) -> None:
     expects="the same path, bit by bit; no HOLD with the drift",
 )
 def _clocks(outcome: Outcome, seed: int) -> None:
-    clean = Flight(Schedule(seed)).fly_mission()
+    clean = FaultRun(Schedule(seed)).fly_mission()
     for hours in (47, 49):
-        apart = Flight(Schedule(seed, cloud_offset=hours * HOUR)).fly_mission()
+        apart = FaultRun(Schedule(seed, cloud_offset=hours * HOUR)).fly_mission()
         text = f"cloud's clock {hours} h ahead: the same path, bit by bit"
         outcome.true(text, clean.trajectory() == apart.trajectory())
     for ppm in (-500, 500):
         drift = Schedule(seed, cloud_offset=HOUR, cloud_drift=ppm)
-        drifting = fly_safely(outcome, Flight(drift))
+        drifting = fly_safely(outcome, FaultRun(drift))
         outcome.same(f"drift of {ppm} ppm: HOLDs", len(measures.held(drifting)), 0)
 
 
@@ -192,7 +192,7 @@ def _delay_step(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
     link = "cloud.estimator=split", "link.both.delay_ms=10", "link.both.jitter_ms=1"
     step = Schedule(seed, events=(Event("delay", at, HOUR, 0.09),))
-    flight = fly_safely(outcome, Flight(step, *link))
+    flight = fly_safely(outcome, FaultRun(step, *link))
     off = [
         abs(r.horizon - r.loop_delay) / r.loop_delay
         for r in flight.of_cloud
@@ -211,7 +211,7 @@ def _delay_step(outcome: Outcome, seed: int) -> None:
 def _asymmetry(outcome: Outcome, seed: int) -> None:
     apart = Schedule(seed, "ideal", cloud_offset=HOUR)
     delays = "link.uplink.delay_ms=10", "link.downlink.delay_ms=190"
-    flight = fly_safely(outcome, Flight(apart, *delays))
+    flight = fly_safely(outcome, FaultRun(apart, *delays))
     outcome.same("HOLDs", len(measures.held(flight)), 0)
     rtt = measures.number(flight, "rtt_mean")
     outcome.most("deviation of the mean round trip from 0.2 s", abs(rtt - 0.2), 0.01, "s")
@@ -226,10 +226,10 @@ def _asymmetry(outcome: Outcome, seed: int) -> None:
     expects="first no HOLD; then at most 2 changes between TRACK and HOLD in any second",
 )
 def _jitter(outcome: Outcome, seed: int) -> None:
-    flight = fly_safely(outcome, Flight(Schedule(seed, "paper-p3")))
+    flight = fly_safely(outcome, FaultRun(Schedule(seed, "paper-p3")))
     outcome.same("jitter 40 ms: HOLDs", len(measures.held(flight)), 0)
     link = "link.both.delay_ms=150", "link.both.jitter_ms=150"
-    flight = Flight(Schedule(seed), *link).fly(60.0)
+    flight = FaultRun(Schedule(seed), *link).fly(60.0)
     measures.safe(outcome, flight)
     busiest = measures.busiest_second(flight.changes)
     outcome.most("jitter 150 ms: changes of the guard in any second", busiest, 2)

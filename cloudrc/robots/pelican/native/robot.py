@@ -1,7 +1,7 @@
 """A robot that runs its usual steps in C, and all others in Python, with the same results.
 
 In a usual step the robot follows a fresh command that the guard need not limit. Python and `step.c`
-share the structure `Flight`: constants, MuJoCo's addresses, present state.
+share the structure `StepState`: constants, MuJoCo's addresses, present state.
 """
 
 from __future__ import annotations
@@ -83,16 +83,16 @@ _FIELDS: dict[str, Any] = {
 }
 
 
-class Flight(ctypes.Structure):
-    """The C structure `Flight`; `step.c` explains its fields."""
+class StepState(ctypes.Structure):
+    """The C structure `StepState`; `step.c` explains its fields."""
 
     _fields_ = tuple(_FIELDS.items())
 
 
-def make_flight(simulator: Simulator, controller: LowLevel, guard: Guard) -> Flight:
-    """Make the C structure `Flight`; fill all fields except the present state of the robot.
+def make_state(simulator: Simulator, controller: LowLevel, guard: Guard) -> StepState:
+    """Make the C structure `StepState`; fill all fields except the present state of the robot.
 
-    Call `make_flight` after a reset of the simulator. Raise an OSError, AttributeError or
+    Call `make_state` after a reset of the simulator. Raise an OSError, AttributeError or
     ValueError if this version of MuJoCo lacks a part that `step.c` needs.
     """
     model, data = simulator.model, simulator.data
@@ -105,7 +105,7 @@ def make_flight(simulator: Simulator, controller: LowLevel, guard: Guard) -> Fli
     obstacles, radius = _obstacles(model, data)
     library = _mujoco_library()
     timer = ctypes.addressof(ctypes.c_void_p.in_dll(library, "mjcb_time"))
-    flight = Flight(
+    flight = StepState(
         ctypes.cast(library.mj_step, ctypes.c_void_p),
         # MuJoCo has no public name for the addresses.
         *(model._address, free_model._address, data._address),
@@ -182,7 +182,9 @@ def _contacts_offset(data: Any) -> int:
     return offset
 
 
-_TRACK, _MEMORY, _BEFORE = Flight.reference.offset, Flight.free_steps.offset, Flight.before.offset
+_TRACK = StepState.reference.offset
+_MEMORY = StepState.free_steps.offset
+_BEFORE = StepState.before.offset
 _pack_track, _unpack_track = Struct("6dq2d2q").pack_into, Struct("3d32x2d3q8x4d").unpack_from
 _pack_memory, _unpack_memory = Struct("q10dq").pack_into, Struct("40x6d").unpack_from
 _unpack_before = Struct("13d").unpack_from
@@ -214,7 +216,7 @@ class NativeRobot(Robot):
     def __init__(self, simulator: Simulator, low_level: LowLevel, guard: Guard) -> None:
         super().__init__(simulator, low_level, guard)
         self._low_level = low_level
-        self._flight = make_flight(simulator, low_level, guard)
+        self._flight = make_state(simulator, low_level, guard)
         self._address = ctypes.addressof(self._flight)
         run = library().run
         assert run is not None

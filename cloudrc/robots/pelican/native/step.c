@@ -57,13 +57,13 @@ typedef struct {
   double speeds[4], integral[3], error[3];
   i64 has_error;
   double before[13]; /* position, orientation and velocities at the beginning of the last step */
-} Flight;
+} StepState;
 
 typedef struct {
   double pose[7], twist[6], axes[9];
 } Readings;
 
-static void read(const Flight *f, Readings *r) {
+static void read(const StepState *f, Readings *r) {
   for (int i = 0; i < 7; i++) r->pose[i] = f->qpos[i];
   for (int i = 0; i < 6; i++) r->twist[i] = f->qvel[i];
   double w = r->pose[3], x = r->pose[4], y = r->pose[5], z = r->pose[6];
@@ -78,7 +78,7 @@ static void read(const Flight *f, Readings *r) {
 }
 
 /* Tell whether the fence does not limit the velocity at the position. */
-static int is_far(const Flight *f, const double *velocity, const double *position) {
+static int is_far(const StepState *f, const double *velocity, const double *position) {
   for (int i = 0; i < 3; i++) {
     double low = f->low[i], high = f->high[i], v = velocity[i];
     double reaction = i == 2 ? f->reaction : f->fence_reaction; /* towards the lower face */
@@ -92,7 +92,7 @@ static int is_far(const Flight *f, const double *velocity, const double *positio
 }
 
 /* Move the reference by one step; return 0, with nothing changed, if Python has to do this step. */
-static int guard_step(Flight *f, const Readings *r, i64 now_ns) {
+static int guard_step(StepState *f, const Readings *r, i64 now_ns) {
   if (r->axes[8] < f->overturned_cosine || now_ns > f->track_until_ns) return 0;
   const double *from = f->reference, *to = f->wanted;
   double x = to[0] - from[0], y = to[1] - from[1], z = to[2] - from[2];
@@ -107,12 +107,12 @@ static int guard_step(Flight *f, const Readings *r, i64 now_ns) {
   return 1;
 }
 
-static double speed_of(const Flight *f, double thrust) {
+static double speed_of(const StepState *f, double thrust) {
   double t = thrust < 0.0 ? 0.0 : thrust;
   return sqrt((t > f->thrust_max ? f->thrust_max : t) / f->thrust_coefficient);
 }
 
-static void update(Flight *f, const Readings *r, double *commands) {
+static void update(StepState *f, const Readings *r, double *commands) {
   const double *g = f->gains, *a = r->axes, *rate = r->twist + 3;
   double force[3];
   for (int i = 0; i < 3; i++) {
@@ -153,7 +153,7 @@ static void update(Flight *f, const Readings *r, double *commands) {
     commands[i] = plain ? sqrt(thrusts[i] / f->thrust_coefficient) : speed_of(f, thrusts[i]);
 }
 
-static void turn_rotors(Flight *f, const Readings *r, const double *commands) {
+static void turn_rotors(StepState *f, const Readings *r, const double *commands) {
   const double *a = r->axes, *v = r->twist, *rate = r->twist + 3;
   double *s = f->speeds;
   for (int i = 0; i < 4; i++) s[i] += (commands[i] - s[i]) * (commands[i] > s[i] ? f->up : f->down);
@@ -173,7 +173,7 @@ static void turn_rotors(Flight *f, const Readings *r, const double *commands) {
 }
 
 /* Measure the tip's force, and note in is_news whether Python has to look at the contacts. */
-static void feel(Flight *f) {
+static void feel(StepState *f) {
   i64 contacts = *f->contacts, before = f->touching;
   f->is_news = 0;
   if (!contacts && !before) return;
@@ -186,7 +186,7 @@ static void feel(Flight *f) {
 
 /* Return for how many steps nothing can touch a ball around the robot. The speed grows by at most
    acceleration_max. */
-static i64 free_steps(const Flight *f, const double *position, const double *velocity) {
+static i64 free_steps(const StepState *f, const double *position, const double *velocity) {
   double nearest = 1e6, speed = 0.0, most = f->acceleration_max;
   for (const Obstacle *o = f->obstacles; o < f->obstacles + f->obstacle_count; o++) {
     double square = 0.0;
@@ -210,7 +210,7 @@ static i64 free_steps(const Flight *f, const double *position, const double *vel
 
 /* Do a step of MuJoCo. While nothing can touch the robot, MuJoCo need not look for contacts. This
    changes no bit of the result, and takes half the time. */
-static void step_physics(Flight *f, const Readings *r) {
+static void step_physics(StepState *f, const Readings *r) {
   if (f->free_steps == 0 && !f->touching) {
     f->free_steps = free_steps(f, r->pose, r->twist);
     if (f->free_steps <= 0) f->free_steps = -5;
@@ -221,7 +221,7 @@ static void step_physics(Flight *f, const Readings *r) {
 
 /* Run steps from now_ns up to until_ns [ns]; return their number. The run ends early before a step
    that Python has to do, and after a step with new contacts. */
-i64 cloudrc_run(Flight *f, i64 now_ns, i64 until_ns) {
+i64 cloudrc_run(StepState *f, i64 now_ns, i64 until_ns) {
   i64 steps = 0;
   double (*timer)(void) = *f->timer;
   *f->timer = 0;
