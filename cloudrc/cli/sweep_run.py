@@ -179,16 +179,18 @@ def fly_again(options: argparse.Namespace) -> int:
         raise BadInputError(f"{options.folder}: {options.key}: {text}")
     (row,), key = rows, rows[0]["key"]
     flight = read_flight(options.folder / store.FILE, row["point"], row["seed"])
-    changed = f"{key}: a plug-in, the processor or a package has changed since; fly the sweep again"
     if flight is None or flight.key != key:
         code = row.get("code") or "without a hash"
-        other = f"{key}: was flown by code {code}, this is code {code_hash()}; fly the sweep again"
-        raise InvalidRunError(changed if code == code_hash() else other)
+        why = f"was flown by code {code}, this is code {code_hash()}"
+        if code == code_hash():
+            why = "the experiment or a file of a plug-in, trace, robot or scene has changed since"
+        raise InvalidRunError(f"{key}: {why}; fly the sweep again")
     report = _fly_into(options.folder / key, flight, page=True)
     print_traceback(options, report)
     print_or_drop(summary(report, options.folder / key))
     if row["records_sha256"] != report["records_sha256"]:
-        raise InvalidRunError(changed)
+        why = "other records, though no file of its key has changed: the processor or a package has"
+        raise InvalidRunError(f"{key}: {why}, or a plug-in uses what is in no key")
     print_or_drop("\nthe records are those of the sweep", sys.stderr)
     return 0
 

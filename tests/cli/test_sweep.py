@@ -142,8 +142,9 @@ def test_a_row_flies_again_to_the_same_hash(write_sweep, call):
     Path("grid/rows.jsonl").write_text(json.dumps(row | {"records_sha256": "f"}) + "\n")
     environment = Path(f"grid/{row['key']}/environment.json")
     environment.write_text("{}")
-    for folder, key, code in (("grid", row["key"], 6), ("grid", "x", 2), (".", row["key"], 2)):
+    for folder, key, code in (("grid", "x", 2), (".", row["key"], 2)):
         call("sweep fly", folder, key, code=code)
+    assert "no file of its key has changed" in call("sweep fly grid", row["key"], code=6).err
     assert json.loads(environment.read_text()), "it describes the newest flight"
 
 
@@ -155,6 +156,15 @@ def test_a_row_of_other_code_is_not_flown_again(write_sweep, call, monkeypatch):
     error = call("sweep fly grid", row["key"], code=6).err
     assert f"flown by code {row['code']}, this is code 0123456789abcdef" in error
     call("sweep status grid")
+
+
+def test_a_row_of_a_changed_file_is_not_flown_again(write_sweep, call):
+    Path("mine.py").write_text("from cloudrc.cloud.predictors.last_sample import build\n")
+    call("sweep run --out grid", write_sweep({"cloud.predictor": [str(Path("mine.py").resolve())]}))
+    (row,) = rows("grid")
+    Path("mine.py").write_text("from cloudrc.cloud.predictors.last_sample import build  # new\n")
+    error = call("sweep fly grid", row["key"], code=6).err
+    assert "the experiment or a file of a plug-in, trace, robot or scene has changed" in error
 
 
 def test_code_that_changes_during_a_sweep_ends_it(write_sweep, call, monkeypatch):
