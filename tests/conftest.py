@@ -10,6 +10,7 @@ import signal
 import socket
 import time
 from math import isfinite, nan
+from pathlib import Path
 
 import pytest
 
@@ -59,9 +60,15 @@ needs_ipv6 = pytest.mark.skipif(not _has_ipv6(), reason="needs the IPv6 address 
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Fail if tests were skipped and REQUIRE_ALL is set, as in CI."""
+    """Fail if tests were skipped and REQUIRE_ALL is set, as in CI; write the reasons to SKIPPED."""
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")
-    if os.environ.get("REQUIRE_ALL") and reporter and reporter.stats.get("skipped"):
+    skipped = reporter.stats.get("skipped", []) if reporter else []
+    path = os.environ.get("SKIPPED")
+    if path and not hasattr(session.config, "workerinput"):  # a worker of xdist counts them, too
+        reasons = [report.longrepr[2].removeprefix("Skipped: ") for report in skipped]
+        with Path(path).open("a", encoding="utf-8") as file:
+            file.writelines(f"{reason}\n" for reason in reasons)
+    if skipped and os.environ.get("REQUIRE_ALL"):
         reporter.write_line("REQUIRE_ALL: tests were skipped; see -rs", red=True)
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
