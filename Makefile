@@ -112,7 +112,7 @@ $(EVIDENCE)/tests.xml:
 	$(bin)/pytest -n auto -m 'not process and not e2e and not netem' --junitxml=$@
 
 $(EVIDENCE)/process.xml:
-	$(bin)/pytest -m process --junitxml=$@
+	REQUIRE_ALL=1 $(bin)/pytest -m process --junitxml=$@
 
 $(EVIDENCE)/faults.json:
 	$(bin)/cloudrc faults run --all --jobs $(JOBS) -o json > $@
