@@ -52,7 +52,7 @@ METHOD = "95 % interval of the median, by order statistics"
 def run(options: argparse.Namespace) -> int:
     """Fly the flights of a sweep whose results or recordings are missing; return the exit code."""
     plan, folder, (shard, count) = _plan(options), options.out, options.shard or (None, 1)
-    if options.shard:
+    if options.shard and not folder.exists():
         folder.mkdir(parents=True, exist_ok=True)  # another shard may be faster
     elif folder is None or not store.is_begun(folder):
         folder = new_folder(folder, f"sweep-{options.file.stem}", "latest-sweep")

@@ -20,7 +20,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, FiniteFloat, ValidationError
 
 from cloudrc import __version__, files
-from cloudrc.config.document import write_yaml
+from cloudrc.config.document import read_document, write_yaml
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file, write_atomically
 from cloudrc.renamed import NEW_NAMES
@@ -125,14 +125,16 @@ def append_rows(folder: Path, shard: int | None) -> Iterator[Callable[[Row], Non
 
 
 def is_begun(folder: Path) -> bool:
-    """Return whether a folder is that of a sweep.
+    """Return whether a folder is that of a sweep: it has a summary, which only cloudrc writes.
 
-    Before a command writes the file of the sweep, it has locked the folder. So a folder with a lock
-    alone also counts.
+    Before a command writes the summary, it has locked the folder and written the file of the sweep.
+    So a folder with a lock and at most this file also counts.
     """
+    with suppress(BadInputError):
+        return bool(read_summary(folder))
     names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
-    is_locked = all(name.startswith((LOCK, f".{FILE}.")) for name in names)
-    return FILE in names or bool(names and is_locked)
+    begun = all(name.startswith((LOCK, FILE, f".{FILE}.", f".{SUMMARY}.")) for name in names)
+    return begun and any(name.startswith(LOCK) for name in names)
 
 
 def begin(folder: Path, plan: Plan, *, is_shared: bool = False) -> dict[str, Row]:
@@ -148,7 +150,7 @@ def begin(folder: Path, plan: Plan, *, is_shared: bool = False) -> dict[str, Row
     if any(points.get(key) != row["point"] for key, row in rows.items()):
         text = "rows of another grid, of other seeds or of changed plug-ins"
         raise BadInputError(f"--out {folder}: has {text}; name a new folder")
-    write_atomically(folder / FILE, write_yaml(plan.file).encode())
+    _write_file(folder / FILE, plan)
     _write_summary(folder, plan, rows)
     if len(rows) < len(plan.flights):  # tables of a smaller grid would look complete
         for name in (TABLE, PARQUET):
@@ -223,6 +225,25 @@ def read_summary(folder: Path) -> dict[str, Any]:
     with suppress(OSError, ValueError):
         return dict(_SummaryDocument.model_validate_json(files.read(folder / SUMMARY, SUMMARY_MAX)))
     raise BadInputError(f"{folder}: is not a folder of 'cloudrc sweep run'; name one")
+
+
+def _write_file(path: Path, plan: Plan) -> None:
+    """Write the file of a sweep, unless it says the same; keep what a user has written.
+
+    Raise a BadInputError if a user has written it and it says something else.
+    """
+    old, new = path.read_bytes() if path.exists() else b"", write_yaml(plan.file).encode()
+    if old and read_document(path, str(path)).tree in (plan.file, _without_folder(plan.file)):
+        return
+    if old and write_yaml(read_document(path, str(path)).tree).encode() != old:
+        raise BadInputError(
+            f"{path}: was written or edited by hand; name a new folder with --out, or move the file"
+        )
+    write_atomically(path, new)
+
+
+def _without_folder(file: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in file.items() if key != "folder"}
 
 
 def check_points(folder: Path, rows: Iterable[Row], axes: Mapping[str, Sequence[Any]]) -> None:
