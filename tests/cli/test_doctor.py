@@ -48,9 +48,22 @@ def test_every_problem_says_how_to_fix_it(monkeypatch):
 
 def test_the_doctor_says_where_the_usual_steps_run(monkeypatch):
     monkeypatch.setenv("CLOUDRC_NATIVE", "0")
-    check = doctor.native_steps(doctor.start(doctor.NATIVE_PROGRAM))
+    _, steps = doctor.said(doctor.start(f"print('one'); {doctor.NATIVE_PROGRAM}"))
+    check = doctor.native_steps(steps)
     assert (check.state, check.found) == ("warn", "Python (CLOUDRC_NATIVE=0)")
     assert "CLOUDRC_NATIVE" in check.fix
+
+
+@pytest.mark.parametrize(
+    ("program", "told"),
+    [
+        ("print('one'); print('two')", ("one", "two")),
+        ("print('one', flush=True); import os; os._exit(7)", ("one", "exit code 7")),
+        ("raise OSError('no library')", ("OSError: no library",) * 2),
+    ],
+)
+def test_a_check_without_a_result_has_the_reason_why_its_process_ended(program, told):
+    assert doctor.said(doctor.start(program)) == told
 
 
 def test_the_extras_are_those_of_pyproject():
