@@ -33,7 +33,7 @@ class MissingPrerequisiteError(CloudrcError):
 
 
 class OutOfMemoryError(MissingPrerequisiteError):
-    """The machine has too little memory for a user's code."""
+    """The machine has too little memory for a user's code or model."""
 
 
 class DiskFullError(MissingPrerequisiteError):

@@ -12,7 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.errors import (
+    BadInputError,
+    CloudrcError,
+    MissingPrerequisiteError,
+    OutOfMemoryError,
+)
 from cloudrc.geometry.model_files import model_files
 from cloudrc.geometry.scene import FLOOR, WORLD
 from cloudrc.geometry.solids import Array, Shape, Solid
@@ -54,6 +59,8 @@ _SHAPES: dict[Any, Shape] = {
     _GEOM.mjGEOM_MESH: "hull",
 }
 """Type of a geom -> shape of its solid; all other types become the box around the geom."""
+NO_MEMORY = "could not allocate"
+"""Words of all of MuJoCo's messages about a lack of memory, in lower case."""
 ROBOT_BITS = 1
 """Value of contype and conaffinity of the robot's geoms."""
 
@@ -63,6 +70,18 @@ class Bodies(NamedTuple):
 
     names: tuple[str, ...]  # of all bodies with geoms; geoms in the worldbody belong to `world`
     solids: tuple[Solid, ...]  # everything that the robot can touch, except the floor
+
+
+def compile_error(what: str, error: Exception) -> CloudrcError:
+    """Return the error to raise if MuJoCo cannot compile `what` because of `error`.
+
+    MuJoCo reports a lack of memory as an error of the file. It says nothing about the file.
+    """
+    reason = " ".join(str(error).split())
+    if NO_MEMORY in reason.lower():
+        text = f"memory ran out: {what} could not be compiled"
+        return OutOfMemoryError(f"{text}; use fewer processes, or free some memory")
+    return BadInputError(f"{what} does not compile: {reason}")
 
 
 def read_scene(path: Path) -> Any:
@@ -121,8 +140,7 @@ def _read_bodies(path: Path, *version: tuple[str, int, int]) -> Bodies:
         spec.compiler.fusestatic = False
         model = spec.compile()
     except (ValueError, KeyError) as error:
-        reason = " ".join(str(error).split())
-        raise BadInputError(f"{path} does not compile: {reason}") from None
+        raise compile_error(str(path), error) from None
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     names = [model.geom(geom).name.rpartition("/")[0] for geom in range(model.ngeom)]

@@ -13,7 +13,7 @@ import numpy as np
 
 from cloudrc.config.schema import Plant
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.compiled import mujoco, read_scene
+from cloudrc.geometry.compiled import compile_error, mujoco, read_scene
 from cloudrc.geometry.scene import WORLD
 from cloudrc.world.plant import Array, Inertia, point_inertia, true_inertia
 
@@ -73,8 +73,7 @@ def _compile(
             _set_inertia(spec.joints[0].parent, *inertia)
         return spec.compile()
     except (ValueError, KeyError) as error:
-        reason = " ".join(str(error).split())
-        raise BadInputError(f"{robot_path} in {scene_path} does not compile: {reason}") from None
+        raise compile_error(f"{robot_path} in {scene_path}", error) from None
 
 
 def is_of_robot(model: Any) -> Any:

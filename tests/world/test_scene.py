@@ -4,14 +4,15 @@ import os
 import subprocess
 import sys
 from math import pi, tan
+from unittest.mock import Mock
 
 import pytest
 
 from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of, names
-from cloudrc.errors import BadInputError, MissingPrerequisiteError
-from cloudrc.geometry.compiled import import_mujoco, mujoco
+from cloudrc.errors import BadInputError, MissingPrerequisiteError, OutOfMemoryError
+from cloudrc.geometry.compiled import import_mujoco, mujoco, read_bodies
 from cloudrc.geometry.scene import load_scene
 from cloudrc.robots.build import check_robot
 from cloudrc.robots.pelican.rotors import STOPPED
@@ -125,6 +126,20 @@ def test_what_cannot_be_flown_is_refused_by_name(tmp_path, monkeypatch, kind, ol
         check_robot(World(**(SHIPPED | {kind: str(path)})))
     assert "\n" not in str(error.value)
     assert list(tmp_path.iterdir()) == [path], "MuJoCo wrote a log"
+
+
+@pytest.mark.parametrize(
+    "text", ["engine error: Could not allocate memory", "could not allocate mjModel"]
+)
+def test_a_lack_of_memory_is_no_error_of_the_files(tmp_path, monkeypatch, text):
+    """Otherwise each flight of a sweep would be a failed one, and count as flown."""
+    path = tmp_path / "mine.xml"
+    path.write_text(FILES["scene"].read_text())
+    monkeypatch.setattr("cloudrc.world.scene.read_scene", Mock(side_effect=ValueError(text)))
+    monkeypatch.setattr("cloudrc.geometry.compiled.read_scene", Mock(side_effect=ValueError(text)))
+    for fails in (lambda: check_robot(World(scene=str(path))), lambda: read_bodies(path)):
+        with pytest.raises(OutOfMemoryError, match=r"^memory ran out: [^\n]*mine.xml"):
+            fails()
 
 
 FLIES = """
