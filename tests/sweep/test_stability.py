@@ -87,8 +87,15 @@ def flown(*settings, rtt=0.0, gains=PUBLISHED, of="steps"):
     return load_experiment(of, [f"{key}={value}" for key, value in keys.items()])
 
 
-@pytest.mark.parametrize("gains", [FAST, *nightly(PUBLISHED)], ids=["fast", "published"])
-@pytest.mark.parametrize("predictor", ["last_sample", "constant_velocity"])
+@pytest.mark.parametrize(
+    ("predictor", "gains"),
+    [
+        ("last_sample", FAST),
+        ("constant_velocity", FAST),
+        ("last_sample", PUBLISHED),
+        pytest.param("constant_velocity", PUBLISHED, marks=pytest.mark.full),
+    ],
+)
 def test_the_limit_of_stability_is_that_of_the_linear_model(predictor, gains):
     margin = delay_margin(gains, predictor == "constant_velocity")
     stable = [
@@ -96,6 +103,14 @@ def test_the_limit_of_stability_is_that_of_the_linear_model(predictor, gains):
         for share in (0.9, 1.1)
     ]
     assert stable == [True, False], f"the model says {margin:.3f} s"
+
+
+@pytest.mark.parametrize(
+    ("predictor", "stable"), [("command_history", True), ("last_sample", False)]
+)
+def test_a_predictor_that_replays_the_commands_is_stable_at_3_s(predictor, stable):
+    found = fly_step(flown(f"cloud.predictor={predictor}", rtt=3.0))
+    assert found["stable"] == stable, found
 
 
 @pytest.mark.parametrize(
