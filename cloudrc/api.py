@@ -25,7 +25,7 @@ from cloudrc.metrics.flight import Columns
 from cloudrc.metrics.response import Step, steps
 from cloudrc.metrics.verdict import Failure
 from cloudrc.record.columns import Recording, Table
-from cloudrc.sweep.flight import fly_in_memory
+from cloudrc.runs.flight import fly_in_memory
 
 
 @dataclass(frozen=True, eq=False)

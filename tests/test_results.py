@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from cloudrc import plugins
-from cloudrc.sweep.statistics import median_interval
+from cloudrc.statistics import median_interval
 from tests.conftest import nightly
 from tests.flights.conftest import both_ways, fly, numbers
 from tools.results import fly as fly_sweep

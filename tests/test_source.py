@@ -85,7 +85,7 @@ def test_the_hash_takes_milliseconds(hash_of, figure):
 def test_a_flight_runs_nothing_from_the_folders_that_do_not_count():
     program = (
         "import sys\nfrom cloudrc.config.load import load_experiment\n"
-        "from cloudrc.sweep.flight import fly_point\n"
+        "from cloudrc.runs.flight import fly_point\n"
         "row = fly_point(load_experiment('steps', ['mission.steps.count=1']))\n"
         "assert row['verdict'] == 'success', row\n"
         "print(*(name.split('.')[1] for name in sys.modules if name.startswith('cloudrc.')))"

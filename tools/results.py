@@ -15,7 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cloudrc.sweep.statistics import median_interval
+from cloudrc.statistics import median_interval
 from tools.docs import insert, table
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -46,7 +46,7 @@ def execute(options: argparse.Namespace) -> int:
     require("the bench", ("world",))
     from cloudrc.config.load import load_experiment
     from cloudrc.robots.pelican.native.robot import usable
-    from cloudrc.sweep.flight import fly_point
+    from cloudrc.runs.flight import fly_point
 
     experiment = load_experiment("paper")
     replay = _replay(experiment)

@@ -26,8 +26,8 @@ from cloudrc.errors import BadInputError
 from cloudrc.renamed import new_name
 
 if TYPE_CHECKING:
-    from cloudrc.sweep.compare import Found
-    from cloudrc.sweep.flight import Row
+    from cloudrc.runs.compare import Pairs
+    from cloudrc.runs.flight import Row
 
 EPILOG = """\
 A and B are one of:
@@ -74,7 +74,7 @@ def flight_arguments(parser: argparse.ArgumentParser, seeds: int) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Compare A and B, print the result, and return the exit code: 0 if all flights were flown."""
     interrupt_on_signals()
-    from cloudrc.sweep.compare import compare, of_sweep
+    from cloudrc.runs.compare import compare, of_sweep
 
     stopped, code = "", 0
     if options.set and options.sweep:
@@ -96,15 +96,15 @@ def execute(options: argparse.Namespace) -> int:
     return code
 
 
-def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
+def _fly_both(options: argparse.Namespace) -> tuple[Pairs, str, int]:
     """Fly the experiment with the settings A and with the settings B, each with all seeds.
 
     Return the pairs of flights; why the work ended early, or ""; and the exit code.
     """
     from cloudrc.cli.progress import SweepView
     from cloudrc.cli.run import load, refuse_seed, warn
-    from cloudrc.sweep.compare import Found, Pair, check_names
-    from cloudrc.sweep.flight import fly_point, units
+    from cloudrc.runs.compare import Pair, Pairs, check_names
+    from cloudrc.runs.flight import fly_point, units
 
     for text in (options.a, options.b):
         if "=" not in text:
@@ -134,12 +134,12 @@ def _fly_both(options: argparse.Namespace) -> tuple[Found, str, int]:
     view.close()
     both = zip(flights[::2], flights[1::2], strict=False)
     pairs = [Pair({"seed": n}, a, b) for n, (a, b) in enumerate(both, start=1)]
-    return Found(pairs, unit_of, f"experiment {options.experiment}"), stopped, code
+    return Pairs(pairs, unit_of, f"experiment {options.experiment}"), stopped, code
 
 
 def as_text(document: Mapping[str, Any]) -> str:
     """Format the result of a comparison: a table and, in the last lines, the conclusion."""
-    from cloudrc.sweep.compare import LEFT_OUT
+    from cloudrc.runs.compare import LEFT_OUT
 
     body = [_row(name, entry) for name, entry in document["numbers"].items()]
     success, left_out = document["success"], document["left_out"]
@@ -227,7 +227,7 @@ def _answer(document: Mapping[str, Any]) -> str:
 
 def _cautions(entry: Mapping[str, Any]) -> str:
     """Say what weakens the answer about a metric, each in a sentence after a space."""
-    from cloudrc.sweep.statistics import LEVEL
+    from cloudrc.statistics import LEVEL
 
     text = ""
     if entry["decided"] and entry["p_sign"] >= LEVEL:

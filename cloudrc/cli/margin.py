@@ -18,7 +18,7 @@ from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
-    from cloudrc.sweep.margin import Found
+    from cloudrc.runs.margin import ValueRange
 
 EPILOG = """\
 examples:
@@ -96,7 +96,7 @@ class Trials:
     def __init__(self, options: argparse.Namespace) -> None:
         """Read the present value and the range of the search; refuse a key that has no range."""
         from cloudrc.cli.run import load, refuse_seed
-        from cloudrc.sweep.margin import STEPS_MAX, check_largest, present_value
+        from cloudrc.runs.margin import STEPS_MAX, check_largest, present_value
 
         self._options, self._load = options, load
         key = options.key
@@ -129,7 +129,7 @@ class Trials:
 
     def _find_range(self, top: int) -> None:
         """Limit the search to values that the experiment allows, around the present one."""
-        from cloudrc.sweep.margin import bisect
+        from cloudrc.runs.margin import bisect
 
         def allowed(number: int) -> bool:
             return self.experiment(number)[0] is not None
@@ -156,7 +156,7 @@ class Trials:
         return self._ready[number]
 
     def _prepare(self, number: int) -> tuple[ResolvedExperiment | None, str]:
-        from cloudrc.sweep.margin import LIMIT_MAX, limits
+        from cloudrc.runs.margin import LIMIT_MAX, limits
 
         options = self._options
         settings = [*options.set, f"{options.key}={self.value(number):.12g}"]
@@ -174,10 +174,10 @@ class Trials:
             return None, f"{age}, and guard.command_age_max_ms ends at {LIMIT_MAX:g} s"
         return (self._load(options.experiment, [*settings, *more]) if more else experiment), ""
 
-    def search(self, question: str) -> Found:
+    def search(self, question: str) -> ValueRange:
         """Find the range of values in which the answer to a question is yes."""
-        from cloudrc.sweep.margin import search
-        from cloudrc.sweep.stability import SCENE, SMALL
+        from cloudrc.runs.margin import search
+        from cloudrc.runs.stability import SCENE, SMALL
 
         options = self._options
         stream = sys.stdout if options.output == "table" else sys.stderr
@@ -231,7 +231,7 @@ class Trials:
 
     def large_step(self, value: float | None) -> Trial:
         """Fly a step of 1 m per axis at the stable `value` [any unit]; {} if it is None."""
-        from cloudrc.sweep.stability import LARGE, fly_step
+        from cloudrc.runs.stability import LARGE, fly_step
 
         experiment = None if value is None else self.experiment(self._number(value))[0]
         if experiment is None:
@@ -249,7 +249,7 @@ class Trials:
 
 
 def _ask_stable(jobs: list[ResolvedExperiment]) -> Iterable[Trial]:
-    from cloudrc.sweep.stability import fly_step
+    from cloudrc.runs.stability import fly_step
 
     # A worker takes as long to start as some flights.
     with closing(map_in_order(fly_step, jobs, len(jobs) // 4)) as answers:
@@ -257,7 +257,7 @@ def _ask_stable(jobs: list[ResolvedExperiment]) -> Iterable[Trial]:
 
 
 def _ask_settles(jobs: list[ResolvedExperiment]) -> Iterable[Trial]:
-    from cloudrc.sweep.flight import fly_point
+    from cloudrc.runs.flight import fly_point
 
     with closing(map_in_order(fly_point, jobs, len(jobs) // 4)) as flights:
         for flight in flights:
@@ -268,7 +268,7 @@ def _ask_settles(jobs: list[ResolvedExperiment]) -> Iterable[Trial]:
                 yield {"settles": False, "code": code, "text": flight["text"]}
 
 
-def _entries(name: str, found: Found | None, trials: Trials) -> dict[str, Any]:
+def _entries(name: str, found: ValueRange | None, trials: Trials) -> dict[str, Any]:
     """Return the part of the document about one question; `found` is None if it is not asked."""
     if found is None:
         return {f"{name}_up_to": None, f"{name}_trials": []}
@@ -283,7 +283,7 @@ def _entries(name: str, found: Found | None, trials: Trials) -> dict[str, Any]:
     }
 
 
-def _answer(name: str, found: Found | None, trials: Trials) -> str:
+def _answer(name: str, found: ValueRange | None, trials: Trials) -> str:
     """Return the answer to one question in one line."""
     if found is None:
         return f"{name}: not asked, because the step does not depend on this key"

@@ -25,7 +25,7 @@ from cloudrc.records import (
 )
 
 if TYPE_CHECKING:
-    from cloudrc.sweep.flight import Row
+    from cloudrc.runs.flight import Row
 
 ENDINGS = ("done", "cancelled", "timed_out")
 FIRST_WAIT = 3.0

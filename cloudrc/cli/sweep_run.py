@@ -39,19 +39,19 @@ from cloudrc.config.overrides import parse_settings
 from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, describe_error
 from cloudrc.files import write_atomically
 from cloudrc.metrics.verdict import EXIT_CODES
+from cloudrc.runs import store
+from cloudrc.runs.flight import Row, counts, fly_point, measure
+from cloudrc.runs.grid import Grid, SweepPoint, pack, read_flight, read_grid, unpack
+from cloudrc.runs.lock import lock_folder
 from cloudrc.source import code_hash
-from cloudrc.sweep import store
-from cloudrc.sweep.flight import Row, counts, fly_point, measure
-from cloudrc.sweep.lock import lock_folder
-from cloudrc.sweep.plan import Flight, Plan, pack, read_flight, read_plan, unpack
-from cloudrc.sweep.statistics import median_interval
+from cloudrc.statistics import median_interval
 
 METHOD = "95 % interval of the median, by order statistics"
 
 
 def run(options: argparse.Namespace) -> int:
     """Fly the flights of a sweep whose results or recordings are missing; return the exit code."""
-    plan, folder, (shard, count) = _plan(options), options.out, options.shard or (None, 1)
+    grid, folder, (shard, count) = _read(options), options.out, options.shard or (None, 1)
     if options.shard and not folder.exists():
         folder.mkdir(parents=True, exist_ok=True)  # another shard may be faster
     elif folder is None or not store.is_begun(folder):
@@ -59,44 +59,44 @@ def run(options: argparse.Namespace) -> int:
     with lock_folder(folder, shard, count) as warning:
         if warning:
             print_line(f"cloudrc: warning: {warning}", sys.stderr)
-        return _run_locked(options, plan, folder, shard, count)
+        return _run_locked(options, grid, folder, shard, count)
 
 
 def _run_locked(
-    options: argparse.Namespace, plan: Plan, folder: Path, shard: int | None, count: int
+    options: argparse.Namespace, grid: Grid, folder: Path, shard: int | None, count: int
 ) -> int:
     """Fly what is missing in `folder`, which no other command may fly now; return the exit code."""
-    before = store.begin(folder, plan, is_shared=bool(shard))
-    mine = [*plan.flights.values()][(shard or 1) - 1 :: count]
+    before = store.begin(folder, grid, is_shared=bool(shard))
+    mine = [*grid.flights.values()][(shard or 1) - 1 :: count]
     missing = [
         each
         for each in mine
         if each.key not in before or _to_record(before[each.key], options.record, folder)
     ]
     part = f", shard {shard} of {count}" if shard else ""
-    head = f"{len(plan.points)} points x {len(plan.seeds)} seeds{part}: {len(mine)} flights"
+    head = f"{len(grid.points)} points x {len(grid.seeds)} seeds{part}: {len(mine)} flights"
     stream = sys.stdout if options.output == "table" else sys.stderr
     head += f", {len(mine) - len(missing)} done before" if len(missing) < len(mine) else ""
-    view = SweepView(stream, f"{plan.points[0].name}: {head}", len(missing))
+    view = SweepView(stream, f"{grid.points[0].name}: {head}", len(missing))
     with closing(view):
         if options.on:
-            flown = rows_from_pods(options, plan, missing)
+            flown = rows_from_pods(options, grid, missing)
         else:
             job = partial(fly_row, record=options.record, folder=folder)
             flown = map_in_order(job, missing, options.jobs, in_order=False)
-        rows, stopped, code = _keep(flown, folder, plan, shard, before, view.see)
+        rows, stopped, code = _keep(flown, folder, grid, shard, before, view.see)
     if stopped:
         flags = " --on kubernetes, and its other flags" if options.on else ""
         again = f"cloudrc sweep run {options.file} --out {folder}{flags}"
         print_line(f"cloudrc: {stopped}; to continue: {again}", sys.stderr)
-    name = store.TABLE if len(rows) == len(plan.flights) else store.SUMMARY
+    name = store.TABLE if len(rows) == len(grid.flights) else store.SUMMARY
     text = f"\n{_verdicts(rows.values())}\n\n{escape(str(folder / name))}"
     print_result(options.output, store.read_summary(folder), text)
     return code or int(any(rows[each.key]["verdict"] != "success" for each in mine))
 
 
-def _plan(options: argparse.Namespace) -> Plan:
-    """Check the flags, read the plan, and print warnings; nothing is written yet."""
+def _read(options: argparse.Namespace) -> Grid:
+    """Check the flags, read the grid, and print warnings; nothing is written yet."""
     if not options.on:
         require("a sweep", MODES["virtual"] if options.record else ("world",))
     elif options.record or options.shard:
@@ -105,18 +105,18 @@ def _plan(options: argparse.Namespace) -> Plan:
         raise BadInputError("--shard needs --out, the folder that all shards share")
     stream = sys.stdout if options.output == "table" else sys.stderr
     with closing(PlanView(stream)) as view:
-        plan = read_plan(options.file, flights_max=options.max_flights, see=view.see)
+        grid = read_grid(options.file, flights_max=options.max_flights, see=view.see)
     if options.on:
-        for point in plan.points:
+        for point in grid.points:
             refuse_local_files(point.model_dump(mode="json"), "or fly without --on")
-    warn(*plan.points)
-    return plan
+    warn(*grid.points)
+    return grid
 
 
 def _keep(
     flown: Generator[Row],
     folder: Path,
-    plan: Plan,
+    grid: Grid,
     shard: int | None,
     before: Collection[str],
     see: Callable[[Row], None],
@@ -137,14 +137,14 @@ def _keep(
 
         stopped, code = take_each(flown, take)
     try:
-        return store.finish(folder, plan), stopped, code
+        return store.finish(folder, grid), stopped, code
     except OSError:
         if not stopped:
             raise
         return store.read_rows(folder), stopped, code  # the reason to tell is the first one
 
 
-def fly_row(flight: Flight, record: str | None = None, folder: Path = Path()) -> Row:
+def fly_row(flight: SweepPoint, record: str | None = None, folder: Path = Path()) -> Row:
     """Fly a flight and return its row; if a recording is wanted, fly again to make it."""
     row = flight.row(fly_point(flight.experiment))
     if _to_record(row, record, folder):
@@ -162,7 +162,7 @@ def _to_record(row: Row, record: str | None, folder: Path) -> bool:
     return wanted and row["verdict"] != "error" and not has
 
 
-def _fly_into(folder: Path, flight: Flight, *, page: bool) -> dict[str, Any]:
+def _fly_into(folder: Path, flight: SweepPoint, *, page: bool) -> dict[str, Any]:
     folder.mkdir(exist_ok=True)
     (folder / "environment.json").unlink(missing_ok=True)  # it describes an earlier flight
     return fly(flight.experiment, "virtual", folder, page=page)
@@ -219,7 +219,7 @@ def draw_figure(options: argparse.Namespace) -> int:
     """Draw a sweep and write the figure as PDF, PNG and SVG; print the caption and the paths."""
     require("a figure", ("report",))
     from cloudrc.report.figures.style import Look
-    from cloudrc.sweep.figure import draw_sweep
+    from cloudrc.runs.figure import draw_sweep
 
     rows, units, missing = store.read_flights(options.folder)
     look = Look(options.width, options.font_size)
@@ -243,9 +243,9 @@ def _verdicts(rows: Iterable[Row]) -> str:
 
 
 def rows_from_pods(
-    options: argparse.Namespace, plan: Plan, flights: Sequence[Flight]
+    options: argparse.Namespace, grid: Grid, flights: Sequence[SweepPoint]
 ) -> Generator[Row]:
-    """Fly flights of a plan on a cluster, and yield each row once.
+    """Fly flights of a grid on a cluster, and yield each row once.
 
     Each pod of a Job flies a share (shard) of the flights and logs their rows. If a pod is deleted
     just after its last flight, its log is lost, but Kubernetes counts its shard as complete.
@@ -259,7 +259,7 @@ def rows_from_pods(
         print_line(f"  {text}", sys.stderr)
 
     release = release_from_flags(options)
-    every = "".join(plan.flights).encode() + str(options.shards).encode()
+    every = "".join(grid.flights).encode() + str(options.shards).encode()
     name = f"sweep-{hashlib.sha256(every).hexdigest()[:12]}"
     words = {"image": options.image, "cpu": options.cpu, "queue": options.queue}
     missing = {flight.key: flight for flight in flights}
@@ -361,8 +361,8 @@ def fly_seeds(options: argparse.Namespace) -> int:
     settings = {".".join(path): each.value for path, each in parse_settings(options.set).items()}
     file = {"experiment": options.experiment, "set": settings, "seeds": options.seeds}
     (folder / store.FILE).write_text(write_yaml(file | {"folder": str(Path.cwd())}), "utf-8")
-    plan, seen = read_plan(folder / store.FILE), list[Row]()
-    work = [*plan.flights.values()]
+    grid, seen = read_grid(folder / store.FILE), list[Row]()
+    work = [*grid.flights.values()]
     head = f"{name}: mode virtual, seeds 1 to {options.seeds}, link {experiment.link.profile}"
     for_people = options.output == "table"
     make, stream = (SeedsView, sys.stdout) if for_people else (SweepView, sys.stderr)
@@ -375,7 +375,7 @@ def fly_seeds(options: argparse.Namespace) -> int:
 
     with closing(make(stream, head, len(work))) as view:
         flown = map_in_order(fly_seed, work, len(work))
-        _, stopped, code = _keep(flown, folder, plan, None, store.begin(folder, plan), see)
+        _, stopped, code = _keep(flown, folder, grid, None, store.begin(folder, grid), see)
     if stopped:
         text = f"\ncloudrc: {stopped}: {len(seen)} of {len(work)} seeds are finished"
         print_or_drop(text, sys.stderr)
@@ -390,6 +390,6 @@ def fly_seeds(options: argparse.Namespace) -> int:
     return code or max(EXIT_CODES[row["verdict"]] for row in seen)
 
 
-def fly_seed(flight: Flight) -> Row:
+def fly_seed(flight: SweepPoint) -> Row:
     """Fly once; return the row of results, such as the verdict. An exception ends the command."""
     return flight.row(measure(flight.experiment))

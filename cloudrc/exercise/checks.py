@@ -24,7 +24,7 @@ from cloudrc.exercise.hand_in import FILES, find_method
 from cloudrc.exercise.remote import HandInError, Remote
 from cloudrc.messages import UPRIGHT, ZERO, Odometry, Setpoint
 from cloudrc.plugins import InvalidResultError
-from cloudrc.sweep.flight import fly_in_memory
+from cloudrc.runs.flight import fly_in_memory
 
 REFERENCES = {"estimator": "running_mean", "predictor": "constant_velocity", "controller": "pid"}
 """Part -> cloudrc's plug-in."""

@@ -28,4 +28,4 @@ def folder(tmp_path, monkeypatch):
 def replace_flights(monkeypatch):
     """Return a function that replaces flights by `fly(experiment)`, in this process."""
     monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 1)
-    return lambda fly: monkeypatch.setattr("cloudrc.sweep.flight.fly_point", fly)
+    return lambda fly: monkeypatch.setattr("cloudrc.runs.flight.fly_point", fly)

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from tests.cli.conftest import SHORT
-from tests.sweep.conftest import flown
+from tests.runs.conftest import flown
 
 A, B = "cloud.predictor=last_sample", "cloud.predictor=constant_velocity"
 COMPARE = f"compare {A} {B} "

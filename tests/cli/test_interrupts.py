@@ -22,9 +22,9 @@ from cloudrc.cli.interrupts import interrupt_on_signals, is_interrupted
 from cloudrc.cli.pool import isolated_start, map_in_order, take_each
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
-from cloudrc.sweep.plan import pack, read_plan
-from cloudrc.sweep.store import read_rows
-from tests.sweep.conftest import write_sweep
+from cloudrc.runs.grid import pack, read_grid
+from cloudrc.runs.store import read_rows
+from tests.runs.conftest import write_sweep
 
 __all__ = ["write_sweep"]
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
@@ -139,7 +139,7 @@ def test_a_sweep_stores_no_row_after_a_signal_that_a_library_caught(
 def test_a_pod_prints_no_row_after_a_signal_that_a_library_caught(
     fly, write_sweep, monkeypatch, call, tmp_path
 ):
-    (tmp_path / "flights").write_bytes(pack(read_plan(write_sweep()).flights.values()))
+    (tmp_path / "flights").write_bytes(pack(read_grid(write_sweep()).flights.values()))
     monkeypatch.setattr(sweep_run, "fly_row", fly)
     assert call("sweep rows", tmp_path / "flights", code=130).out == ""
 

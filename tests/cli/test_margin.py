@@ -24,7 +24,7 @@ def fly_with(replace_flights, monkeypatch):
             return {"stable": True, "left": 0.0, "speed_limited": 0.25 if size == 1.0 else 0.0}
 
         replace_flights(lambda found: {"verdict": "success"} if works(found) else FAILED)
-        monkeypatch.setattr("cloudrc.sweep.stability.fly_step", fly_step)
+        monkeypatch.setattr("cloudrc.runs.stability.fly_step", fly_step)
 
     return use
 

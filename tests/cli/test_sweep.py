@@ -22,13 +22,13 @@ from cloudrc.cli.sweep import _shard
 from cloudrc.cli.sweep_run import as_table, fly_row, summarise
 from cloudrc.cluster import batch
 from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.runs.grid import pack, read_grid
+from cloudrc.runs.lock import lock_folder
+from cloudrc.runs.store import read_rows
 from cloudrc.source import code_hash
-from cloudrc.sweep.lock import lock_folder
-from cloudrc.sweep.plan import pack, read_plan
-from cloudrc.sweep.store import read_rows
 from tests.cli.conftest import KEYS, SHORT
 from tests.conftest import wait_until
-from tests.sweep.conftest import flown, write_sweep
+from tests.runs.conftest import flown, write_sweep
 
 __all__ = ["write_sweep"]
 ONE = {"cloud.predictor": ["constant_velocity"]}
@@ -262,7 +262,7 @@ def test_an_error_of_the_machine_ends_a_pod_with_one_sentence(
     log = tmp_path / "termination-log"
     log.touch()
     monkeypatch.setattr("cloudrc.cli.sweep_run.TERMINATION_LOG", log)
-    plan = read_plan(write_sweep(ONE, seeds=[1, 2, 3]))
+    plan = read_grid(write_sweep(ONE, seeds=[1, 2, 3]))
     (tmp_path / "flights").write_bytes(pack(plan.flights.values()))
     out, error = call("sweep rows", tmp_path / "flights", code=3)
     assert [json.loads(line)["seed"] for line in out.splitlines()] == [1]
@@ -418,7 +418,7 @@ def fly_in_pods(write_sweep, monkeypatch, call):
     path = write_sweep()
 
     def run(make, code):
-        made = [flight.row(flown()) for flight in read_plan(path).flights.values()]
+        made = [flight.row(flown()) for flight in read_grid(path).flights.values()]
         jobs = make([json.dumps(row) for row in made])
         monkeypatch.setattr(batch, "read_lines", lambda *given: jobs.pop(0) if jobs else [])
         error = call("sweep run --out grid --on kubernetes", path, code=code).err

@@ -19,7 +19,7 @@ from cloudrc.messages import (
     Start,
 )
 from cloudrc.records import Counted
-from cloudrc.sweep.flight import fly_in_memory
+from cloudrc.runs.flight import fly_in_memory
 from cloudrc.tunnel import codec
 from cloudrc.tunnel.codec import DecodeError, Direction, Kind
 from cloudrc.tunnel.end import Identity

@@ -14,7 +14,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.drivers.virtual import VirtualRun
 from cloudrc.messages import Passed
 from cloudrc.record.columns import Recording, RecordStore
-from cloudrc.sweep.flight import fly_in_memory
+from cloudrc.runs.flight import fly_in_memory
 from cloudrc.tunnel.codec import DecodeError
 from cloudrc.tunnel.end import Identity
 from tests.flights.conftest import both_ways, ring

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cloudrc.config.load import load_experiment
-from cloudrc.sweep.flight import fly_in_memory
+from cloudrc.runs.flight import fly_in_memory
 from tests.flights.conftest import numbers
 
 POINT = (0.5, 0.0, 0.9)

@@ -24,7 +24,7 @@ from cloudrc.records import (
     SessionOpened,
     TelemetrySent,
 )
-from cloudrc.sweep.flight import fly_in_memory
+from cloudrc.runs.flight import fly_in_memory
 from tests.console.conftest import control
 
 SECOND = 1_000_000_000

@@ -11,7 +11,7 @@ from cloudrc.cli.list import describe_all
 from cloudrc.cli.main import main
 from cloudrc.config.load import load_experiment
 from cloudrc.metrics import SHIPPED, measure_all
-from cloudrc.sweep.flight import fly_point
+from cloudrc.runs.flight import fly_point
 from tests.cli.conftest import KEYS
 from tests.metrics.conftest import straight_flight
 

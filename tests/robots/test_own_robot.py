@@ -5,7 +5,7 @@ import pytest
 import cloudrc
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
-from cloudrc.sweep.plan import read_plan
+from cloudrc.runs.grid import read_grid
 from tests.robots.conftest import CONTROLLER
 
 HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
@@ -77,6 +77,6 @@ def test_the_key_of_a_flight_has_the_files_of_its_robot(own_robot, tmp_path):
     sweep.write_text(f"experiment: hover\nset: {{world.robot: {mine}}}\nseeds: 1\n")
     keys = []
     for _ in range(2):
-        keys.append(list(read_plan(sweep).flights))
+        keys.append(list(read_grid(sweep).flights))
         (mine / "own.py").write_text(CLIMBS + "\n# changed\n")
     assert keys[0] != keys[1]

@@ -24,7 +24,7 @@ from cloudrc.report.document import clock_offset_document, write_json
 from cloudrc.report.figures import FIGURES
 from cloudrc.report.folder import read_run
 from cloudrc.report.write import write_report
-from cloudrc.sweep.plan import read_plan
+from cloudrc.runs.grid import read_grid
 from tests.metrics.conftest import flown
 from tests.record.conftest import cloud_records, rewrite, world_records, write, write_mission
 
@@ -39,7 +39,7 @@ def no_waiting():
     signal.signal(signal.SIGALRM, before)
 
 
-READERS = (read_experiment, load_profile, read_trace, read_plan, Recording.read)
+READERS = (read_experiment, load_profile, read_trace, read_grid, Recording.read)
 
 
 @pytest.mark.parametrize("read", READERS)

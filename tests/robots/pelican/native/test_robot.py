@@ -20,7 +20,7 @@ from cloudrc.robots.pelican.low_level import LowLevel
 from cloudrc.robots.pelican.native import robot as native
 from cloudrc.robots.pelican.native.library import SWITCH, Library, library
 from cloudrc.robots.pelican.native.robot import NativeRobot, make_robot, usable
-from cloudrc.sweep.flight import fly_in_memory
+from cloudrc.runs.flight import fly_in_memory
 from cloudrc.tunnel.end import Identity
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.state import Guard

@@ -6,7 +6,7 @@ import fcntl
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.sweep.lock import lock_folder
+from cloudrc.runs.lock import lock_folder
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.sweep import statistics
-from cloudrc.sweep.statistics import (
+from cloudrc import statistics
+from cloudrc.statistics import (
     exact_interval,
     median_interval,
     paired,

@@ -5,10 +5,10 @@ import json
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.sweep.compare import of_sweep
-from cloudrc.sweep.figure import draw_sweep
-from cloudrc.sweep.store import read_flights
-from tests.sweep.conftest import flown
+from cloudrc.runs.compare import of_sweep
+from cloudrc.runs.figure import draw_sweep
+from cloudrc.runs.store import read_flights
+from tests.runs.conftest import flown
 
 UNITS = {"iae_mean": "m s"}
 AXES = {"delay_ms": [20, 5, 10], "predictor": ["none", "kalman"], "gain": [[1, 2], [3, 4]]}
@@ -34,7 +34,7 @@ def sweep(folder, rows=None):
 def drawn(monkeypatch):
     """Replace drawing; return the arguments of `draw`."""
     kept = []
-    monkeypatch.setattr("cloudrc.sweep.figure.draw", lambda *what, look: kept.extend(what) or {})
+    monkeypatch.setattr("cloudrc.runs.figure.draw", lambda *what, look: kept.extend(what) or {})
     return kept
 
 

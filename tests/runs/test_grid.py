@@ -15,43 +15,43 @@ from cloudrc.assembly import build_links
 from cloudrc.config import document, load, overrides
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import SCENES
+from cloudrc.runs import grid as grids
+from cloudrc.runs.grid import pack, read_flight, read_grid, unpack
 from cloudrc.source import code_hash
-from cloudrc.sweep import plan
-from cloudrc.sweep.plan import pack, read_flight, read_plan, unpack
-from tests.sweep.conftest import SHORT
+from tests.runs.conftest import SHORT
 
 
 def test_every_point_is_flown_with_every_seed(write_sweep):
-    plan = read_plan(write_sweep(seeds=[7, 3]))
-    assert (len(plan.points), len(plan.flights), plan.seeds) == (4, 8, (7, 3))
-    flights = list(plan.flights.values())
+    sweep = read_grid(write_sweep(seeds=[7, 3]))
+    assert (len(sweep.points), len(sweep.flights), sweep.seeds) == (4, 8, (7, 3))
+    flights = list(sweep.flights.values())
     assert [(*each.point.values(), each.seed) for each in flights[:3]] == [
         ("last_sample", 40, 7), ("last_sample", 40, 3), ("last_sample", 0, 7)
     ]  # fmt: skip
     last = flights[-1].experiment
     assert (last.seed, last.cloud.predictor.name) == (3, "constant_velocity")
     assert last.uplink.delay_ms == last.downlink.delay_ms == 0 < last.uplink.jitter_ms
-    assert read_plan(write_sweep(seeds=2)).seeds == (1, 2)
+    assert read_grid(write_sweep(seeds=2)).seeds == (1, 2)
 
 
 def test_an_axis_may_have_named_settings(write_sweep):
     grid = {"gains": {"low": {"cloud.controller.gain_p": [1, 1, 1]}, "default": {}}}
-    plan = read_plan(write_sweep(grid))
-    assert [each.point for each in plan.flights.values()] == [
+    sweep = read_grid(write_sweep(grid))
+    assert [each.point for each in sweep.flights.values()] == [
         {"gains": "low"},
         {"gains": "default"},
     ]
-    assert plan.points[0].cloud.controller.model_extra["gain_p"] == [1, 1, 1]
-    assert plan.points[1].cloud.controller.model_extra["gain_p"] != [1, 1, 1]
-    assert plan.axes == {"gains": ["low", "default"]}
+    assert sweep.points[0].cloud.controller.model_extra["gain_p"] == [1, 1, 1]
+    assert sweep.points[1].cloud.controller.model_extra["gain_p"] != [1, 1, 1]
+    assert sweep.axes == {"gains": ["low", "default"]}
 
 
 def test_equal_flights_have_equal_keys_however_they_are_written(write_sweep):
-    keys = list(read_plan(write_sweep({"link.both.delay_ms": [40, 0]}, seeds=2)).flights)
+    keys = list(read_grid(write_sweep({"link.both.delay_ms": [40, 0]}, seeds=2)).flights)
     assert len({*keys}) == 4
     assert all(len(key) == 16 for key in keys)
     delays = {"far": {"link.uplink.delay_ms": 40, "link.downlink.delay_ms": 40.0}}
-    assert list(read_plan(write_sweep({"delay": delays}, seeds=2)).flights) == keys[:2]
+    assert list(read_grid(write_sweep({"delay": delays}, seeds=2)).flights) == keys[:2]
 
 
 def test_a_key_depends_on_the_code_of_a_named_plugin(write_sweep, monkeypatch, tmp_path):
@@ -60,12 +60,12 @@ def test_a_key_depends_on_the_code_of_a_named_plugin(write_sweep, monkeypatch, t
     (tmp_path / "edited.py").write_text("# edited")
     real = inspect.getfile
     for name in ("", "last_sample"):
-        plan._code.cache_clear()
+        grids._code.cache_clear()
         monkeypatch.setattr(inspect, "getfile", lambda module, edited=name: str(
             tmp_path / "edited.py" if module.__name__.endswith(f".{edited}") else real(module)
         ))  # fmt: skip
-        found.append([*read_plan(path).flights])
-    plan._code.cache_clear()
+        found.append([*read_grid(path).flights])
+    grids._code.cache_clear()
     assert found[0][0] != found[1][0]
     assert found[0][1] == found[1][1]
 
@@ -84,7 +84,7 @@ def test_a_key_depends_on_what_a_model_includes(write_sweep, tmp_path, key):
     for radius in (".1", ".1", ".2"):
         part = f'<mujoco><site name="one" pos="0 9 5" size="{radius}"/></mujoco>'
         (tmp_path / "b.xml").write_text(part)
-        found.append([*read_plan(path).flights])
+        found.append([*read_grid(path).flights])
     assert found[0] == found[1] != found[2]
 
 
@@ -99,7 +99,7 @@ def test_a_key_depends_on_the_data_of_a_plug_in(write_sweep, tmp_path, named):
     found = []
     for gains in ("1", "1", "2"):
         (tmp_path / "gains.json").write_text(gains)
-        found.append([*read_plan(path).flights])
+        found.append([*read_grid(path).flights])
     assert found[0] == found[1] != found[2]
 
 
@@ -108,7 +108,7 @@ def test_points_with_one_seed_meet_the_same_draws(write_sweep):
         return [link.send(1, 2, n, 100, 0) for link in build_links(experiment) for n in range(300)]
 
     grid = {"cloud.predictor": ["last_sample", "constant_velocity"]}
-    flights = read_plan(write_sweep(grid, seeds=2)).flights.values()
+    flights = read_grid(write_sweep(grid, seeds=2)).flights.values()
     first, other, again, _ = (delays(each.experiment) for each in flights)
     assert first == again != other
 
@@ -119,9 +119,9 @@ def test_relative_paths_start_at_the_file(write_sweep, tmp_path, monkeypatch):
     (tmp_path / "own.yaml").write_text("{world: {scene: empty}, mission: steps}\n")
     monkeypatch.chdir("/")
     path = write_sweep({"cloud.predictor": ["./mine.py"]}, experiment="./own.yaml", set={})
-    (point,) = read_plan(path).points
+    (point,) = read_grid(path).points
     assert point.cloud.predictor.name == str(tmp_path / "mine.py")
-    assert read_plan(path).file["folder"] == str(tmp_path)
+    assert read_grid(path).file["folder"] == str(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_relative_paths_start_at_the_file(write_sweep, tmp_path, monkeypatch):
 def test_a_problem_is_refused_at_its_place(write_sweep, keys, reason):
     path = write_sweep(**{"set": SHORT, **keys})
     with pytest.raises(BadInputError) as caught:
-        read_plan(path)
+        read_grid(path)
     assert reason in str(caught.value)
     number = re.search(rf"{re.escape(str(path))}:(\d+)", str(caught.value))[1]
     key = list(keys.get("grid", keys))[-1]
@@ -154,13 +154,13 @@ def test_a_problem_is_refused_at_its_place(write_sweep, keys, reason):
 def test_the_file_of_the_page_is_a_sweep(tmp_path):
     page = (Path(__file__).parents[2] / "docs/sweeps.md").read_text()
     (tmp_path / "grid.yaml").write_text(re.search(r"```yaml\n(.*?)```", page, re.DOTALL)[1])
-    plan = read_plan(tmp_path / "grid.yaml")
-    assert (len(plan.points), len(plan.flights)) == (12, 240)
+    sweep = read_grid(tmp_path / "grid.yaml")
+    assert (len(sweep.points), len(sweep.flights)) == (12, 240)
 
 
 def test_equal_points_are_refused(write_sweep):
     with pytest.raises(BadInputError, match=r"5\.0} is the same as"):
-        read_plan(write_sweep({"guard.hold_max_s": [5, 5.0]}))
+        read_grid(write_sweep({"guard.hold_max_s": [5, 5.0]}))
 
 
 @pytest.fixture
@@ -168,7 +168,7 @@ def flights(tmp_path):
     (tmp_path / "mine.yaml").write_text("mission: steps\nworld: {scene: empty}\n")
     text = "experiment: ./mine.yaml\ngrid: {cloud.predictor: [last_sample, constant_velocity]}\n"
     (tmp_path / "sweep.yaml").write_text(text + "seeds: [3, 1]\n")
-    return [*read_plan(tmp_path / "sweep.yaml").flights.values()]
+    return [*read_grid(tmp_path / "sweep.yaml").flights.values()]
 
 
 @pytest.mark.parametrize("some", [slice(None), slice(1, 3)])
@@ -209,15 +209,15 @@ def test_what_points_share_is_read_and_checked_once(write_sweep, tmp_path, monke
                         (overrides, "parameter_model")):  # fmt: skip
         count(place, name)
     axes = {"link.both.delay_ms": [*range(20)], "guard.hold_max_s": [1, 2]}
-    plan = read_plan(write_sweep(axes))
-    assert len(plan.points) == 40
+    sweep = read_grid(write_sweep(axes))
+    assert len(sweep.points) == 40
     # The sweep, the experiment, the mission and the profile; three plug-ins.
     assert counts == {"parse_yaml": 4, "check_mission": 1, "load_scene": 1, "parameter_model": 3}
 
 
 def test_points_that_share_results_are_independent(write_sweep):
     gains = {"cloud.controller.gain_p": [[1, 1, 1], [2, 2, 2]], "cloud.predictor": ["kalman"]}
-    first, second = read_plan(write_sweep(gains)).points
+    first, second = read_grid(write_sweep(gains)).points
     assert first.cloud.controller.gain_p == [1.0, 1.0, 1.0]
     assert second.cloud.controller.gain_p == [2.0, 2.0, 2.0]
 
@@ -227,14 +227,14 @@ def test_nothing_is_kept_after_the_plan(write_sweep, tmp_path):
     (tmp_path / "mine.yaml").write_text("waypoints: [{position_m: [0, 0, 1]}]\n")
     keys = {"set": {"mission": "./mine.yaml", "criteria.contact": False, "world.scene": "empty"}}
     path = write_sweep({}, **keys)
-    before = read_plan(path).points[0].mission.waypoints[0].position_m
+    before = read_grid(path).points[0].mission.waypoints[0].position_m
     (tmp_path / "mine.yaml").write_text("waypoints: [{position_m: [0, 0, 2]}]\n")
-    assert (before[2], read_plan(path).points[0].mission.waypoints[0].position_m[2]) == (1.0, 2.0)
+    assert (before[2], read_grid(path).points[0].mission.waypoints[0].position_m[2]) == (1.0, 2.0)
 
 
 def test_one_flight_is_read_without_the_others(write_sweep):
     path = write_sweep(seeds=2)
-    flights = read_plan(path).flights
+    flights = read_grid(path).flights
     for flight in flights.values():
         assert read_flight(path, flight.point, flight.seed) == flight
     point = next(iter(flights.values())).point
@@ -244,14 +244,14 @@ def test_one_flight_is_read_without_the_others(write_sweep):
 
 def test_the_progress_is_told_for_each_point(write_sweep):
     seen = []
-    read_plan(write_sweep(seeds=3), see=lambda *counts: seen.append(counts))
+    read_grid(write_sweep(seeds=3), see=lambda *counts: seen.append(counts))
     assert seen == [(done, 4, 3) for done in range(5)]
 
 
 def test_the_key_takes_in_the_code(write_sweep, monkeypatch):
-    before = {*read_plan(write_sweep()).flights}
+    before = {*read_grid(write_sweep()).flights}
     monkeypatch.setattr("cloudrc.source.code_hash", lambda: "0123456789abcdef")
-    assert before.isdisjoint(read_plan(write_sweep()).flights)
+    assert before.isdisjoint(read_grid(write_sweep()).flights)
 
 
 @pytest.mark.parametrize("content", [b"", b"no gzip", OTHER], ids=["empty", "text", "other"])

@@ -27,7 +27,7 @@ STEPS_MAX = 32
 Works: TypeAlias = Callable[[int], bool]
 
 
-class Found(NamedTuple):
+class ValueRange(NamedTuple):
     """The range of numbers around the present one for which the answer is yes.
 
     A number that does not exist is None: `first` and `last` if the answer is never yes, `below` and
@@ -54,7 +54,7 @@ def grid(present: int, bottom: int, top: int) -> list[int]:
     return sorted(numbers)
 
 
-def search(works: Works, present: int, bottom: int, top: int) -> Found:
+def search(works: Works, present: int, bottom: int, top: int) -> ValueRange:
     """Find the range of whole numbers in which `works` is true, from `bottom` to `top`.
 
     The range is the one with `present`, or that nearest to it. Inside the range, only
@@ -64,7 +64,7 @@ def search(works: Works, present: int, bottom: int, top: int) -> Found:
     answers = [works(number) for number in numbers]
     runs = _runs(answers)
     if not runs:
-        return Found(None, None, None, numbers[0], [])
+        return ValueRange(None, None, None, numbers[0], [])
     at = numbers.index(present)
     run = min(runs, key=lambda each: max(each[0] - at, at - each[1], 0))
     first, last, below, above = numbers[run[0]], numbers[run[1]], None, None
@@ -73,7 +73,7 @@ def search(works: Works, present: int, bottom: int, top: int) -> Found:
     if run[1] < len(numbers) - 1:
         last, above = bisect(works, last, numbers[run[1] + 1])
     elsewhere = [(numbers[a], numbers[b]) for a, b in runs if (a, b) != run]
-    return Found(first, last, below, above, elsewhere)
+    return ValueRange(first, last, below, above, elsewhere)
 
 
 def _runs(answers: list[bool]) -> list[tuple[int, int]]:

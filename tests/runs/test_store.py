@@ -8,22 +8,22 @@ from math import nan
 import pytest
 
 from cloudrc.errors import BadInputError
+from cloudrc.runs import store
+from cloudrc.runs.grid import read_grid
 from cloudrc.source import code_hash
-from cloudrc.sweep import store
-from cloudrc.sweep.plan import read_plan
-from tests.sweep.conftest import flown
+from tests.runs.conftest import flown
 
 
 @pytest.fixture
-def plan(write_sweep):
-    return read_plan(write_sweep())
+def grid(write_sweep):
+    return read_grid(write_sweep())
 
 
 @pytest.fixture
-def rows(plan):
+def rows(grid):
     """Four rows in the order of the grid; the last one lacks a number."""
     numbers = [{"duration": n + 0.1} for n in range(3)]
-    pairs = zip(plan.flights.values(), [*numbers, {}], strict=True)
+    pairs = zip(grid.flights.values(), [*numbers, {}], strict=True)
     return [flight.row(flown(**found)) for flight, found in pairs]
 
 
@@ -33,28 +33,28 @@ def write(folder, rows, shard=None):
             append(row)
 
 
-def test_the_table_has_the_order_of_the_grid(plan, rows, tmp_path):
+def test_the_table_has_the_order_of_the_grid(grid, rows, tmp_path):
     tables = []
     for order, shards in (([0, 1, 2, 3], (None, None)), ([3, 1, 0, 2], (1, 2))):
         folder = tmp_path / str(shards[0])
         folder.mkdir()
-        assert store.begin(folder, plan) == {}
+        assert store.begin(folder, grid) == {}
         write(folder, [rows[n] for n in order[:2]], shards[0])
-        assert len(store.finish(folder, plan)) == 2
+        assert len(store.finish(folder, grid)) == 2
         assert not (folder / "table.csv").exists()
         write(folder, [rows[n] for n in order[2:]], shards[1])
-        assert len(store.finish(folder, plan)) == 4
+        assert len(store.finish(folder, grid)) == 4
         tables.append((folder / "table.csv").read_bytes())
     assert tables[0] == tables[1]
     head, first, *_, last = csv.reader(tables[0].decode().splitlines())
     names = ["seed", "verdict", "failures", "code", "physics_steps", "duration [s]"]
-    assert head[1:] == [*plan.axes, *names]
+    assert head[1:] == [*grid.axes, *names]
     own = [code_hash(), "Python"]
     assert first == [rows[0]["key"], "last_sample", "40", "1", "success", "", *own, "0.1"]
     assert last[1:] == ["constant_velocity", "0", "1", "success", "", *own, ""]
     summary = store.read_summary(folder)
     assert (summary["counts"], summary["flights"]) == ({"success": 4}, 4)
-    assert (summary["axes"], summary["seeds"]) == (plan.axes, [1])
+    assert (summary["axes"], summary["seeds"]) == (grid.axes, [1])
     assert "link.profile=paper-p3" in summary["overrides"]
 
 
@@ -113,8 +113,8 @@ def test_a_row_with_a_field_of_another_type_is_no_row(wrong, rows):
 
 
 @pytest.mark.parametrize("point", [{}, {"other": 1}, {"link.both.delay_ms": 7}])
-def test_rows_of_another_grid_are_refused(point, plan, rows, tmp_path):
-    store.begin(tmp_path, plan)
+def test_rows_of_another_grid_are_refused(point, grid, rows, tmp_path):
+    store.begin(tmp_path, grid)
     write(tmp_path, [rows[0] | {"point": point if "other" in point or not point
                                 else rows[0]["point"] | point}])  # fmt: skip
     with pytest.raises(BadInputError, match="has another point than those in"):
@@ -130,16 +130,16 @@ def test_what_is_no_description_of_a_sweep_is_refused(text, tmp_path):
         store.read_summary(tmp_path)
 
 
-def test_a_folder_holds_one_sweep(plan, rows, write_sweep, tmp_path):
-    store.begin(tmp_path, plan)
+def test_a_folder_holds_one_sweep(grid, rows, write_sweep, tmp_path):
+    store.begin(tmp_path, grid)
     write(tmp_path, rows)
-    store.finish(tmp_path, plan)
-    store.begin(tmp_path, plan)
+    store.finish(tmp_path, grid)
+    store.begin(tmp_path, grid)
     assert (tmp_path / "table.csv").is_file()
-    more = read_plan(write_sweep(seeds=2))  # more flights are no other sweep
+    more = read_grid(write_sweep(seeds=2))  # more flights are no other sweep
     assert list(store.begin(tmp_path, more).values()) == rows
     assert not (tmp_path / "table.csv").exists()  # it has fewer flights than sweep.json says
-    other = read_plan(write_sweep({"link.both.delay_ms": [7]}))
+    other = read_grid(write_sweep({"link.both.delay_ms": [7]}))
     with pytest.raises(BadInputError, match=r"has rows of another grid.*name a new folder"):
         store.begin(tmp_path, other)
 
@@ -149,43 +149,43 @@ def test_a_changed_plugin_is_not_mixed_with_rows_of_the_old_one(write_sweep, tmp
     (tmp_path / "mine.py").write_text("from helper import build\n")
     (tmp_path / "helper.py").write_text("from cloudrc.cloud.predictors import Predictor as build\n")
     path = write_sweep({"cloud.predictor": ["./mine.py"]})
-    (flight,) = read_plan(path).flights.values()
+    (flight,) = read_grid(path).flights.values()
     write(tmp_path, [flight.row(flown())])
-    assert list(store.begin(tmp_path, read_plan(path))) == [flight.key]
+    assert list(store.begin(tmp_path, read_grid(path))) == [flight.key]
     with (tmp_path / changed).open("a") as file:
         file.write("# changed\n")
     with pytest.raises(BadInputError, match=r"has rows of .* changed plug-ins"):
-        store.begin(tmp_path, read_plan(path))
+        store.begin(tmp_path, read_grid(path))
 
 
-def test_other_code_flies_nothing_into_the_folder(plan, rows, tmp_path, monkeypatch):
+def test_other_code_flies_nothing_into_the_folder(grid, rows, tmp_path, monkeypatch):
     """Both hashes are named, so that the user finds the code of the flights."""
-    store.begin(tmp_path, plan)
+    store.begin(tmp_path, grid)
     write(tmp_path, rows[:1])
     monkeypatch.setattr(store, "code_hash", lambda: "0123456789abcdef")
     said = f"its flights are of code {code_hash()}, this is code 0123456789abcdef"
     for is_shared in (False, True):
         with pytest.raises(BadInputError, match=said):
-            store.begin(tmp_path, plan, is_shared=is_shared)
+            store.begin(tmp_path, grid, is_shared=is_shared)
 
 
-def test_shards_of_other_code_are_refused_before_the_first_row(plan, tmp_path, monkeypatch):
-    store.begin(tmp_path, plan, is_shared=True)
+def test_shards_of_other_code_are_refused_before_the_first_row(grid, tmp_path, monkeypatch):
+    store.begin(tmp_path, grid, is_shared=True)
     monkeypatch.setattr(store, "code_hash", lambda: "0123456789abcdef")
     with pytest.raises(BadInputError, match=f"{code_hash()}, this is code 0123456789abcdef"):
-        store.begin(tmp_path, plan, is_shared=True)
-    store.begin(tmp_path, plan)  # no other process flies into this folder, and it has no row
+        store.begin(tmp_path, grid, is_shared=True)
+    store.begin(tmp_path, grid)  # no other process flies into this folder, and it has no row
 
 
-def test_a_folder_from_before_the_hash_is_read_but_not_continued(plan, rows, tmp_path):
-    store.begin(tmp_path, plan)
+def test_a_folder_from_before_the_hash_is_read_but_not_continued(grid, rows, tmp_path):
+    store.begin(tmp_path, grid)
     for row in rows:
         del row["code"], row["physics_steps"]
     write(tmp_path, rows)
     found, units, missing = store.read_flights(tmp_path)
     assert (len(found), units["duration"], missing) == (4, "s", "")
     with pytest.raises(BadInputError, match=r"of code without a hash, of an earlier version"):
-        store.begin(tmp_path, plan)
+        store.begin(tmp_path, grid)
 
 
 def test_another_folder_is_refused(tmp_path):

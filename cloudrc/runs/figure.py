@@ -12,10 +12,10 @@ from cloudrc.metrics import scale
 from cloudrc.plugins import unknown_name_text
 from cloudrc.report.figures.bands import Panel, Point, draw
 from cloudrc.report.figures.style import Look
-from cloudrc.sweep.compare import NUMBERS, check_names
-from cloudrc.sweep.flight import Row, counts
-from cloudrc.sweep.statistics import exact_interval, median_interval
-from cloudrc.sweep.store import values_of
+from cloudrc.runs.compare import NUMBERS, check_names
+from cloudrc.runs.flight import Row, counts
+from cloudrc.runs.store import values_of
+from cloudrc.statistics import exact_interval, median_interval
 
 COLUMN = Look(width=3.5)
 """Look of a figure in one column of a page. Source: IEEE conference template."""

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 from cloudrc.errors import BadInputError
 from cloudrc.plugins import unknown_name_text
 from cloudrc.rounding import differences
-from cloudrc.sweep import store
-from cloudrc.sweep.flight import Row, counts
-from cloudrc.sweep.statistics import LEVEL, exact_interval, paired, sign_test
+from cloudrc.runs import store
+from cloudrc.runs.flight import Row, counts
+from cloudrc.statistics import LEVEL, exact_interval, paired, sign_test
 
 NUMBERS = (
     *("prediction_error_rms", "tracking_error_p95", "iae_mean", "settling_time_mean"),
@@ -37,7 +37,7 @@ class Pair(NamedTuple):
     b: Row
 
 
-class Found(NamedTuple):
+class Pairs(NamedTuple):
     """Pairs of flights, with the units of their metrics and a description of the comparison."""
 
     pairs: list[Pair]
@@ -116,7 +116,7 @@ def _flight(row: Row, names: Sequence[str]) -> dict[str, Any]:
     return {"verdict": row["verdict"], "numbers": numbers}
 
 
-def of_sweep(folder: Path, a: str, b: str) -> Found:
+def of_sweep(folder: Path, a: str, b: str) -> Pairs:
     """Pair the rows of a sweep that differ only in one axis: one has the value `a`, the other `b`.
 
     `a` and `b` are texts: VALUE or AXIS=VALUE.
@@ -152,4 +152,4 @@ def of_sweep(folder: Path, a: str, b: str) -> Found:
     if pooled := ", ".join(name for name, each in axes.items() if name != axis and len(each) > 1):
         what += f", over all values of {pooled}; flights with equal seeds depend on each other, "
         what += "so p is too small"
-    return Found(pairs, units, what)
+    return Pairs(pairs, units, what)

@@ -32,7 +32,7 @@ from cloudrc.config.robot import files_of
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.model_files import model_files
-from cloudrc.sweep.flight import Row
+from cloudrc.runs.flight import Row
 
 SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
 """Largest seed, and largest number of seeds."""
@@ -59,7 +59,7 @@ class SweepFile(Section):
     """Folder in which relative paths start (default: that of the file)"""
 
 
-class Flight(NamedTuple):
+class SweepPoint(NamedTuple):
     """One flight of a sweep: a point (one value per axis), flown with one seed."""
 
     key: str  # 16 hexadecimal digits; equal keys mean equal flights
@@ -79,17 +79,17 @@ class Flight(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class Grid:
     """A checked sweep: the content of its file, its points, and the flights of each point."""
 
     file: dict[str, Any]  # content of the file, with `folder`
     axes: dict[str, list[Any]]  # axis -> its values or names
     seeds: tuple[int, ...]
     points: list[ResolvedExperiment]
-    flights: dict[str, Flight]  # key -> flight; all seeds of a point follow each other
+    flights: dict[str, SweepPoint]  # key -> flight; all seeds of a point follow each other
 
 
-class _Grid(NamedTuple):
+class _UncheckedGrid(NamedTuple):
     """The content of a sweep's file, whose points are not checked yet."""
 
     name: str
@@ -104,9 +104,9 @@ class _Grid(NamedTuple):
         return _resolve(self.experiment, chain(self.common, *(entries for _, entries in choices)))
 
 
-def read_plan(
+def read_grid(
     path: Path, *, flights_max: int | None = None, see: See = lambda done, points, seeds: None
-) -> Plan:
+) -> Grid:
     """Read the file of a sweep, and check all of its points.
 
     Call `see` with the number of points that are checked, that of all points, and that of seeds:
@@ -116,14 +116,14 @@ def read_plan(
         BadInputError: If the file or one of its points has problems, with file and line of each; or
             if the sweep has more than `flights_max` flights.
     """
-    grid = _read_grid(path)
+    grid = _read_unchecked(path)
     count, seeds = prod(len(choices) for choices in grid.axes.values()), len(grid.seeds)
     if flights_max is not None and count * seeds > flights_max:
         text = f"{count:,} points x {seeds:,} seeds: {count * seeds:,} flights are more than "
         text += f"{flights_max:,}; take fewer values or seeds, or give --max-flights"
         raise BadInputError(f"{grid.name}: {text} {count * seeds}")
     see(0, count, seeds)
-    points, flights = list[ResolvedExperiment](), dict[str, Flight]()
+    points, flights = list[ResolvedExperiment](), dict[str, SweepPoint]()
     with reuse_results():
         for choices in product(*grid.axes.values()):
             point = {axis: label for axis, (label, _) in zip(grid.axes, choices, strict=True)}
@@ -134,15 +134,15 @@ def read_plan(
                 if key in flights:
                     same = f"{point} is the same as {flights[key].point}; remove one of them"
                     raise BadInputError(f"{grid.name}: {same}")
-                flights[key] = Flight(key, point, seed, points[-1])
+                flights[key] = SweepPoint(key, point, seed, points[-1])
             see(len(points), count, seeds)
     labels = {axis: [label for label, _ in choices] for axis, choices in grid.axes.items()}
-    return Plan(grid.file, labels, grid.seeds, points, flights)
+    return Grid(grid.file, labels, grid.seeds, points, flights)
 
 
-def read_flight(path: Path, point: Mapping[str, Any], seed: int) -> Flight | None:
+def read_flight(path: Path, point: Mapping[str, Any], seed: int) -> SweepPoint | None:
     """Read one flight of a sweep, without the others; None if the sweep does not have it."""
-    grid = _read_grid(path)
+    grid = _read_unchecked(path)
     if point.keys() != grid.axes.keys() or seed not in grid.seeds:
         return None
     choices = []
@@ -152,10 +152,10 @@ def read_flight(path: Path, point: Mapping[str, Any], seed: int) -> Flight | Non
             return None
         choices.append(found[0])
     resolved = grid.resolve(choices)
-    return Flight(_key(_everything(resolved), seed), dict(point), seed, resolved)
+    return SweepPoint(_key(_everything(resolved), seed), dict(point), seed, resolved)
 
 
-def _read_grid(path: Path) -> _Grid:
+def _read_unchecked(path: Path) -> _UncheckedGrid:
     """Read the file of a sweep, and check all but its points; raise a BadInputError."""
     name, document = str(path), read_document(path, str(path))
     file = validate(document, SweepFile, name)
@@ -169,7 +169,7 @@ def _read_grid(path: Path) -> _Grid:
     is_path = shipped.is_path(file.experiment)
     experiment = str(folder / file.experiment) if is_path else file.experiment
     content = document.tree | {"folder": str(folder)}
-    return _Grid(name, content, experiment, common, axes, seeds)
+    return _UncheckedGrid(name, content, experiment, common, axes, seeds)
 
 
 def _everything(point: ResolvedExperiment) -> bytes:
@@ -262,7 +262,7 @@ def _resolve(experiment: str, entries: Iterable[_Entry]) -> ResolvedExperiment:
     return resolved
 
 
-def pack(flights: Iterable[Flight]) -> bytes:
+def pack(flights: Iterable[SweepPoint]) -> bytes:
     """Pack flights into a file for pods, which have none of the user's files.
 
     The file contains each point once, with its resolved experiment. For each flight, it contains
@@ -279,7 +279,7 @@ def pack(flights: Iterable[Flight]) -> bytes:
     return gzip.compress(text.encode(), mtime=0)
 
 
-def unpack(path: Path) -> list[Flight]:
+def unpack(path: Path) -> list[SweepPoint]:
     """Read the flights from a file made by `pack`; raise a BadInputError if it is unusable.
 
     It is also unusable if other code has packed it: the rows would not be those of the sweep.
@@ -293,7 +293,7 @@ def unpack(path: Path) -> list[Flight]:
             points.append((point, resolved, _everything(resolved)))
         chosen = ((*points[index], seed) for index, seed in content["flights"])
         return [
-            Flight(_key(everything, seed), point, seed, resolved)
+            SweepPoint(_key(everything, seed), point, seed, resolved)
             for point, resolved, everything, seed in chosen
         ]
     except (OSError, EOFError, ValueError, LookupError, TypeError) as error:

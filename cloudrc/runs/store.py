@@ -24,10 +24,10 @@ from cloudrc.config.document import read_document, write_yaml
 from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file, write_atomically
 from cloudrc.renamed import NEW_NAMES
+from cloudrc.runs.flight import Row, units
+from cloudrc.runs.grid import Grid
+from cloudrc.runs.lock import LOCK
 from cloudrc.source import code_hash
-from cloudrc.sweep.flight import Row, units
-from cloudrc.sweep.lock import LOCK
-from cloudrc.sweep.plan import Plan
 
 FILE, SUMMARY = "sweep.yaml", "sweep.json"
 TABLE, PARQUET = "table.csv", "table.parquet"
@@ -137,7 +137,7 @@ def is_begun(folder: Path) -> bool:
     return begun and any(name.startswith(LOCK) for name in names)
 
 
-def begin(folder: Path, plan: Plan, *, is_shared: bool = False) -> dict[str, Row]:
+def begin(folder: Path, grid: Grid, *, is_shared: bool = False) -> dict[str, Row]:
     """Write the file of a sweep into `folder`; return flight key -> row of earlier flights.
 
     `is_shared` tells whether shards on other machines may fly into the same folder.
@@ -145,14 +145,14 @@ def begin(folder: Path, plan: Plan, *, is_shared: bool = False) -> dict[str, Row
     Raises:
         BadInputError: If the folder belongs to another sweep or to other code.
     """
-    rows, points = read_rows(folder), {key: each.point for key, each in plan.flights.items()}
+    rows, points = read_rows(folder), {key: each.point for key, each in grid.flights.items()}
     _refuse_other_code(folder, rows.values(), is_shared)
     if any(points.get(key) != row["point"] for key, row in rows.items()):
         text = "rows of another grid, of other seeds or of changed plug-ins"
         raise BadInputError(f"--out {folder}: has {text}; name a new folder")
-    _write_file(folder / FILE, plan)
-    _write_summary(folder, plan, rows)
-    if len(rows) < len(plan.flights):  # tables of a smaller grid would look complete
+    _write_file(folder / FILE, grid)
+    _write_summary(folder, grid, rows)
+    if len(rows) < len(grid.flights):  # tables of a smaller grid would look complete
         for name in (TABLE, PARQUET):
             (folder / name).unlink(missing_ok=True)
     return rows
@@ -171,12 +171,12 @@ def _refuse_other_code(folder: Path, rows: Iterable[Row], is_shared: bool) -> No
         )
 
 
-def finish(folder: Path, plan: Plan) -> dict[str, Row]:
+def finish(folder: Path, grid: Grid) -> dict[str, Row]:
     """Write the summary and, if no flight is missing, the tables; return flight key -> row."""
     rows = read_rows(folder)
-    unit_of = _write_summary(folder, plan, rows)
-    if rows.keys() == plan.flights.keys():
-        columns = _columns([rows[key] for key in plan.flights], plan)
+    unit_of = _write_summary(folder, grid, rows)
+    if rows.keys() == grid.flights.keys():
+        columns = _columns([rows[key] for key in grid.flights], grid)
         write_atomically(folder / TABLE, as_csv(columns, unit_of).encode())
         if find_spec("pyarrow"):
             parquet, tables = import_module("pyarrow.parquet"), import_module("pyarrow")
@@ -193,10 +193,10 @@ def as_csv(columns: Mapping[str, Sequence[Any]], unit_of: Mapping[str, str]) -> 
     return text.getvalue()
 
 
-def _columns(rows: list[Row], plan: Plan) -> dict[str, list[Any]]:
+def _columns(rows: list[Row], grid: Grid) -> dict[str, list[Any]]:
     """Return the columns of a sweep's tables; an axis with values of several types becomes text."""
     columns = {"key": [row["key"] for row in rows]}
-    for axis in plan.axes:
+    for axis in grid.axes:
         values = [row["point"][axis] for row in rows]
         plain = len({*map(type, values)}) == 1 and isinstance(values[0], str | int | float)
         columns[axis] = values if plain else [*map(as_text, values)]
@@ -227,13 +227,13 @@ def read_summary(folder: Path) -> dict[str, Any]:
     raise BadInputError(f"{folder}: is not a folder of 'cloudrc sweep run'; name one")
 
 
-def _write_file(path: Path, plan: Plan) -> None:
+def _write_file(path: Path, grid: Grid) -> None:
     """Write the file of a sweep, unless it says the same; keep what a user has written.
 
     Raise a BadInputError if a user has written it and it says something else.
     """
-    old, new = path.read_bytes() if path.exists() else b"", write_yaml(plan.file).encode()
-    if old and read_document(path, str(path)).tree in (plan.file, _without_folder(plan.file)):
+    old, new = path.read_bytes() if path.exists() else b"", write_yaml(grid.file).encode()
+    if old and read_document(path, str(path)).tree in (grid.file, _without_folder(grid.file)):
         return
     if old and write_yaml(read_document(path, str(path)).tree).encode() != old:
         raise BadInputError(
@@ -291,19 +291,19 @@ def values_of(rows: Sequence[Row]) -> dict[str, list[Any]]:
             for axis in rows[0]["point"]}  # fmt: skip
 
 
-def _write_summary(folder: Path, plan: Plan, rows: Mapping[str, Row]) -> dict[str, str]:
+def _write_summary(folder: Path, grid: Grid, rows: Mapping[str, Row]) -> dict[str, str]:
     """Write the file SUMMARY of a sweep; return metric -> unit."""
-    own = {choice for point in plan.points for choice in point.report.metrics}
+    own = {choice for point in grid.points for choice in point.report.metrics}
     unit_of = units(own)
     summary = {
         "schemaVersion": 1,
-        "experiment": plan.points[0].name,
+        "experiment": grid.points[0].name,
         "cloudrc": __version__,
         "code": code_hash(),
-        "overrides": [f"{key}={as_text(value)}" for key, value in plan.file.get("set", {}).items()],
-        "axes": plan.axes,
-        "seeds": plan.seeds,
-        "flights": len(plan.flights),
+        "overrides": [f"{key}={as_text(value)}" for key, value in grid.file.get("set", {}).items()],
+        "axes": grid.axes,
+        "seeds": grid.seeds,
+        "flights": len(grid.flights),
         "counts": dict(sorted(Counter(row["verdict"] for row in rows.values()).items())),
         "units": unit_of,
     }

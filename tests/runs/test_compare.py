@@ -3,8 +3,8 @@
 import pytest
 
 from cloudrc.errors import BadInputError
-from cloudrc.sweep.compare import Pair, compare
-from tests.sweep.conftest import flown
+from cloudrc.runs.compare import Pair, compare
+from tests.runs.conftest import flown
 
 UNITS = {"iae_mean": "m", "rtt_mean": "s"}
 

@@ -1,0 +1,1 @@
+"""Runs: fly experiments, sweep settings, compare and measure them, from commands and programs."""
