@@ -48,6 +48,7 @@ class Table:
 
     Integers are stored as int64, floats and vectors as float64, truth values as bool, strings as
     object. The shape is (n, 3) for vectors, (n, 4) for quaternions, and (n,) for other columns.
+    The columns are read-only, because all metrics and the report share them.
     """
 
     def __init__(self, topic: Topic, columns: Iterable[Any]) -> None:
@@ -81,7 +82,9 @@ def _column(kind: Kind, values: Any) -> Column:
     dtype, shape = _TYPES[kind]
     if shape and not isinstance(values, np.ndarray):  # asarray takes three times as long
         values = np.fromiter(chain.from_iterable(values), dtype)
-    return np.asarray(values, dtype=dtype).reshape(-1, *shape)
+    column: Column = np.asarray(values, dtype=dtype).reshape(-1, *shape)
+    column.flags.writeable = False
+    return column
 
 
 @dataclass(eq=False)

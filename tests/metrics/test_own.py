@@ -33,6 +33,12 @@ BODIES = {
     "infinite": f"{FAILING}return float('inf')",
     "exits": f"{FAILING}raise SystemExit(0)",
 }
+CHANGING = f"""{FAILING}flight.truth["position"] *= 1000.0
+    flight.control["measured"] = flight.control["measured"][:0]
+    flight.clearance[:] = 0.0
+    flight.applied.clear()
+    return flight.truth["position"].max()
+"""
 SHORT = ["steps", "--mode", "virtual", "--set", "mission.steps.count=1"]
 
 
@@ -110,6 +116,20 @@ def test_an_installed_metric_is_in_every_report(folder, monkeypatch):
     assert list(listed) == sorted({*SHIPPED, "past"})
     assert listed["past"].startswith("Largest distance by which")
     sys.modules.pop("overshoot", None)
+
+
+def test_a_metric_that_changes_its_arrays_changes_no_other_number(folder):
+    (folder / "a_changing.py").write_text(CHANGING)  # its name comes before those of cloudrc
+    (folder / "a_writing.py").write_text(
+        f"{FAILING}flight.recording['/ground_truth']['position'][:] = 0.0"
+    )
+    wanted, _ = measure_all(straight_flight())
+    flight = straight_flight()
+    numbers, notes = measure_all(flight, ["./a_changing.py", "./a_writing.py"])
+    assert numbers.pop("a_changing").value > 1000.0
+    assert numbers == wanted
+    assert notes == ["metric a_writing failed: ValueError: assignment destination is read-only"]
+    assert flight.truth["position"].max() < 100.0  # also for verdict and figures
 
 
 @pytest.mark.parametrize(
