@@ -149,15 +149,27 @@ def to_number(value: Any, name: str) -> float:
     """Convert a number that a plug-in returned to a float; `name` names it in the error's text.
 
     A scalar or an array without dimensions of numpy, PyTorch or JAX is a number. A boolean, a text,
-    a Decimal, and an integer that no float can hold are none: they raise an InvalidResultError.
+    a Decimal, a masked value, a time of numpy, and an integer that no float can hold are none: they
+    raise an InvalidResultError.
     """
     if type(value) is float:
         return value
     plain = value.item() if getattr(value, "shape", None) == () else value
-    if not isinstance(plain, bool) and isinstance(plain, Real):
+    is_none = isinstance(plain, bool) or _is_disguised(value, plain)
+    if not is_none and isinstance(plain, Real):
         with suppress(OverflowError):
             return float(plain)
     raise InvalidResultError(f"its {name} is {shorten(value)}, which is no number")
+
+
+def _is_disguised(value: Any, plain: Any) -> bool:
+    """Return whether `plain`, the item of `value`, looks like a number but is none.
+
+    The item of a masked value of numpy is 0, and that of a time is a count of its unit, such as ns.
+    """
+    kinds = (getattr(getattr(each, "dtype", None), "kind", "") for each in (value, plain))
+    is_masked = value is not plain and bool(getattr(value, "mask", False))
+    return is_masked or not {"m", "M"}.isdisjoint(kinds)
 
 
 def shorten(value: Any) -> str:

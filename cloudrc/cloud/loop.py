@@ -20,14 +20,15 @@ import traceback
 from collections import Counter, deque
 from collections.abc import Callable
 from copy import deepcopy
-from math import isfinite, nan
+from itertools import chain
+from math import nan
 from typing import Any
 
 from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.plan_log import PlanLog
 from cloudrc.cloud.predictors import Predictor
-from cloudrc.cloud.results import check_estimate, check_output, refuse, to_vector
+from cloudrc.cloud.results import check_estimate, check_output, is_fit, refuse, to_vector
 from cloudrc.errors import describe_error
 from cloudrc.messages import (
     NEVER_NS,
@@ -329,7 +330,7 @@ class ControlLoop:
                 output = controller.update(state, goal, PLAN_STEP)
                 velocity = x, y, z = to_vector(output.velocity, "planned velocity")
                 if not (abs(x) <= most and abs(y) <= most and abs(z) <= most):
-                    if not isfinite(sum(velocity)):
+                    if not is_fit(*velocity):
                         plug_in = "predictor"
                         check_estimate(state)  # a wrong state is the model's failure
                         plug_in = "controller"
@@ -338,7 +339,7 @@ class ControlLoop:
                 plan.append(as_planned(velocity))
                 positions.append(position)
             plug_in = "predictor"
-            if not isfinite(sum(map(sum, positions))):
+            if not is_fit(*chain.from_iterable(positions)):
                 for position in positions:
                     refuse("planned position", *position)
         except BaseException as error:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Set
 from itertools import islice
-from math import isfinite, sqrt
+from math import hypot, isfinite, sqrt
 from typing import Any, NoReturn
 
 from cloudrc.cloud.controllers import ControlOutput
@@ -20,10 +20,10 @@ SQUARE_TOLERANCE = 0.01
 first-order integration, is scaled away. ROS's tf2 accepts the same deviation."""
 SQUARE_ROUNDING = 1e-9
 """Deviation from 1 of an orientation's squared length that comes from rounding [1]."""
+LARGEST = 1e30
+"""Largest length of the numbers of a result [any unit]. Metrics square numbers, and the page of the
+report stores some with single precision: a much larger number overflows there."""
 _new = tuple.__new__  # makes a named tuple twice as fast as its class does
-
-# A sum is finite only if all terms are finite. Finite terms whose sum overflows are refused, too,
-# because no robot can fly them.
 
 
 def check_estimate(estimate: Any) -> Odometry:
@@ -35,7 +35,7 @@ def check_estimate(estimate: Any) -> Odometry:
     if not float is type(w) is type(x) is type(y) is type(z):
         w, x, y, z = (to_number(each, "orientation") for each in (w, x, y, z))
     square = w * w + x * x + y * y + z * z
-    if not isfinite(sum(position + velocity + rate)) or not abs(square - 1.0) <= SQUARE_TOLERANCE:
+    if not is_fit(*position, *velocity, *rate) or not abs(square - 1.0) <= SQUARE_TOLERANCE:
         _refuse_estimate(position, velocity, rate, (w, x, y, z))
     if abs(square - 1.0) > SQUARE_ROUNDING:
         length = sqrt(square)
@@ -51,10 +51,11 @@ def check_output(output: Any) -> ControlOutput:
     velocity, yaw_rate, *given = _unpack(output, 5, "result")
     velocity, yaw_rate = to_vector(velocity, "velocity"), to_number(yaw_rate, "yaw rate")
     proportional, integral, derivative = (to_vector(each, "PID term") for each in given)
-    if not isfinite(sum(velocity + proportional + integral + derivative, yaw_rate)):
+    if not is_fit(*velocity, yaw_rate, *proportional, *integral, *derivative):
         refuse("velocity", *velocity)
         refuse("yaw rate", yaw_rate)
         refuse("PID terms", *proportional, *integral, *derivative)
+        refuse("result", *velocity, yaw_rate, *proportional, *integral, *derivative)
     return _new(ControlOutput, (velocity, yaw_rate, proportional, integral, derivative))
 
 
@@ -68,10 +69,17 @@ def to_vector(numbers: Any, name: str) -> Vector:
     return to_number(x, name), to_number(y, name), to_number(z, name)
 
 
+def is_fit(*numbers: float) -> bool:
+    """Return whether all numbers are finite, and none is beyond `LARGEST`."""
+    return hypot(*numbers) <= LARGEST  # False for NaN
+
+
 def refuse(name: str, *numbers: float) -> None:
-    """Raise an InvalidResultError if one of the numbers is not finite, or if their sum is not."""
-    if not isfinite(sum(numbers)):
-        raise InvalidResultError(f"its {name} is ({', '.join(f'{each:.4g}' for each in numbers)})")
+    """Raise an InvalidResultError if the numbers are not finite or too large."""
+    if not is_fit(*numbers):
+        beyond = f", beyond {LARGEST:g}" if all(map(isfinite, numbers)) else ""
+        shown = ", ".join(f"{each:.4g}" for each in numbers)
+        raise InvalidResultError(f"its {name} is ({shown}){beyond}")
 
 
 def _refuse_estimate(
