@@ -31,9 +31,10 @@ def fly_point(experiment: ResolvedExperiment) -> Row:
     """
     try:
         return measure(experiment)
-    except (Exception, SystemExit) as error:  # one point that cannot fly must not stop the others
+    except BaseException as error:  # one point that cannot fly must not stop the others
         if failure := machine_error(error) or _lost_file(experiment):
             raise failure from error
+        plugins.check_failure(error, "the flight")
         text, none = describe_error(error), {"numbers": {}, "records_sha256": ""}
         return {"verdict": ERROR, "failures": [ERROR], "text": text, **none, "physics_steps": ""}
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc import assembly
+from cloudrc import assembly, plugins
 from cloudrc.advice import simulate_ages
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.schema import Criteria, Mission, Waypoint
@@ -79,9 +79,10 @@ def fly_step(experiment: ResolvedExperiment, size: float = SMALL) -> Answer:
     """
     try:
         return _fly_step(experiment, size)
-    except (Exception, SystemExit) as error:  # a value that cannot fly must not stop the search
+    except BaseException as error:  # a value that cannot fly must not stop the search
         if failure := machine_error(error):
             raise failure from error
+        plugins.check_failure(error, "the flight")
         return {"stable": False, "code": "error", "text": describe_error(error)}
 
 
