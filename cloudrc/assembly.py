@@ -23,6 +23,7 @@ from cloudrc.geometry import fence
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile
 from cloudrc.messages import Start
+from cloudrc.plugins import apart
 from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.wire import Leg, Plan
 from cloudrc.tunnel.end import Identity
@@ -98,6 +99,7 @@ def start_mission(experiment: ResolvedExperiment, now_ns: int = 0) -> Teleop:
     return teleop
 
 
+@apart()
 def fly(
     experiment: ResolvedExperiment,
     see: Sink,

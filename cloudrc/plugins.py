@@ -9,7 +9,8 @@ places:
 3. a file, if the name is a path or ends in `.py`; `plugin_file` loads it.
 
 Plug-ins are code of the user, which may raise anything and may call `sys.exit()`. `check_failure`
-decides what is a failure of a plug-in; all parts of cloudrc that call plug-ins use it.
+decides what is a failure of a plug-in; all parts of cloudrc that call plug-ins use it. `apart`
+keeps the working folder and the standard streams of the command.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
+import os
 import pkgutil
+import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -25,7 +28,7 @@ from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TextIO, cast
 
 from cloudrc.errors import (
     BadInputError,
@@ -117,6 +120,34 @@ def check_failure(error: BaseException, what: str) -> None:
         raise OutOfMemoryError(f"{text}; let it use less memory, or free some") from error
 
 
+class _Stderr:
+    """The standard error for a plug-in, which cannot close it."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def close(self) -> None:
+        """Leave the stream open, because the command needs it."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextmanager
+def apart() -> Iterator[None]:
+    """Call plug-ins inside the block: what they print goes to stderr, as stdout has the result.
+
+    Afterwards, working folder and standard streams are again those before the block.
+    """
+    folder, out, err = os.getcwd(), sys.stdout, sys.stderr
+    sys.stdout = sys.stderr = cast(TextIO, _Stderr(err))
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = out, err
+        os.chdir(folder)
+
+
 @contextmanager
 def refuse_failure(what: str) -> Iterator[None]:
     """Convert the failure of a plug-in to a BadInputError; `what` says which one failed to do what.
@@ -124,7 +155,8 @@ def refuse_failure(what: str) -> Iterator[None]:
     Use it before a flight and between flights; in flight, cloud goes on.
     """
     try:
-        yield
+        with apart():
+            yield
     except BaseException as error:
         check_failure(error, what)
         raise BadInputError(f"{what}: {_explain(error)}") from error

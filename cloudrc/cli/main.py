@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+from cloudrc.cli.leave import limit_exit
 from cloudrc.cli.output import discard_output, escape
 from cloudrc.cli.parser import build_parser
 from cloudrc.errors import (
@@ -19,8 +20,18 @@ INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command in `arguments` (default: those of this process); return the exit code."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    """Run the command in `arguments`, or this process's command; return the exit code."""
+    if arguments is not None:
+        return _run(list(arguments))
+    code = INTERNAL
+    try:
+        code = _run(sys.argv[1:])
+    finally:
+        limit_exit(code)
+    return code
+
+
+def _run(given: list[str]) -> int:
     try:
         return _dispatch(given)
     except KeyboardInterrupt:

@@ -11,10 +11,13 @@ from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from itertools import chain, islice
+from multiprocessing.process import BaseProcess
+from multiprocessing.util import Finalize
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 from cloudrc.cli.interrupts import is_interrupted, noted_interrupts, raise_if_interrupted
+from cloudrc.cli.leave import limit_exit
 from cloudrc.drivers.machine import usable_cores
 from cloudrc.errors import InterruptedRunError, InvalidRunError, machine_error
 
@@ -30,11 +33,15 @@ PERIOD = 0.1
 
 
 class WorkerDiedError(InvalidRunError):
-    """Report that a worker process was killed."""
+    """Report that a worker process was killed or ended itself."""
 
 
-def _end_with_parent() -> None:
-    """End this worker process when the parent process ends, even if SIGKILL ended the parent."""
+def _start_worker() -> None:
+    """Let this worker process end with its work, and with the parent process.
+
+    It ends even if SIGKILL ended the parent, and even if a plug-in has left a thread running.
+    """
+    Finalize(None, limit_exit, args=(0,), exitpriority=0)
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -96,25 +103,37 @@ def _map_in_workers(
     # Spawn, do not fork: libraries may have started threads in this process.
     context = multiprocessing.get_context("spawn")
     with isolated_start():  # starts multiprocessing's resource tracker
-        pool = ProcessPoolExecutor(workers, context, _end_with_parent)
+        pool = ProcessPoolExecutor(workers, context, _start_worker)
+    started = list[BaseProcess]()
     try:
         while chunk:
             with isolated_start():  # submit() starts the workers
                 futures = [pool.submit(function, each) for each in chunk]
+            started = multiprocessing.active_children()
             for future in _ended(futures, in_order):
                 result = future.result()
                 raise_if_interrupted()
                 yield result
             chunk = [*islice(rest, CHUNK)]
     except BrokenProcessPool as error:
-        text = "a worker was killed, perhaps by the kernel because memory ran out"
-        raise WorkerDiedError(f"{text}; use fewer processes") from error
+        pool.shutdown(cancel_futures=True)  # only then are all exit codes known
+        raise WorkerDiedError(_explain_end(started)) from error
     except BaseException:  # Ctrl-C, or the caller has closed the generator
         for worker in multiprocessing.active_children():
             worker.kill()
         raise
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _explain_end(workers: Iterable[BaseProcess]) -> str:
+    """Say why a worker process ended during its work."""
+    # The pool ends the other workers by signals, whose exit codes are negative.
+    codes = [worker.exitcode for worker in workers]
+    if own := [code for code in codes if code is not None and code >= 0]:
+        return f"a worker ended itself (exit status {own[0]}); does a plug-in call os._exit()?"
+    text = "a worker was killed, perhaps by the kernel because memory ran out"
+    return f"{text}; use fewer processes"
 
 
 def _ended(futures: list[Future[Result]], in_order: bool) -> Iterator[Future[Result]]:

@@ -200,6 +200,7 @@ def _run_cloud(options: argparse.Namespace) -> int:
     from cloudrc import assembly
     from cloudrc.drivers.teleop import RemoteTeleop, UnixPeer
     from cloudrc.messages import GuardState
+    from cloudrc.plugins import apart
 
     experiment, identity, end = open_end(options, "cloud")
     paths = options.teleop / "cloud.sock", options.teleop / "teleop.sock"
@@ -211,7 +212,8 @@ def _run_cloud(options: argparse.Namespace) -> int:
             return cloud.guard is GuardState.TRACK
 
         ends = GracefulStop(stop, lambda: not flies(), FORWARD_LIMIT_NS)
-        end.run(cloud, ends, flies)
+        with apart():
+            end.run(cloud, ends, flies)
     return 0
 
 

@@ -333,8 +333,11 @@ def summarise(rows: Sequence[Row], units: Mapping[str, str]) -> dict[str, Any]:
     return {"done": done, "count": len(rows), "method": METHOD, "numbers": numbers}
 
 
-def as_table(summary: Mapping[str, Any]) -> str:
-    """Format the result of `summarise` as a table; the last line counts the successful runs."""
+def as_table(summary: Mapping[str, Any], planned: int = 0) -> str:
+    """Format the result of `summarise` as a table; the last line counts the successful runs.
+
+    `planned` is the number of runs to fly, if it is larger than that of the runs that have flown.
+    """
     rows = [("number", "median", "95 % interval", "unit")]
     for name, entry in summary["numbers"].items():
         between = " .. ".join(map(format_number, entry["interval"] or ())) or "-"
@@ -345,7 +348,8 @@ def as_table(summary: Mapping[str, Any]) -> str:
     method = METHOD if summary["count"] >= 6 else "an interval needs 6 seeds or more"
     if any(entry["failed"] for entry in summary["numbers"].values()):
         method += f"\n{FAILED_NOTE}"
-    return f"{table(rows, right=(1, 2))}\n\n{method}\ndone {summary['done']}/{summary['count']}"
+    count = planned or summary["count"]
+    return f"{table(rows, right=(1, 2))}\n\n{method}\ndone {summary['done']}/{count}"
 
 
 def fly_seeds(options: argparse.Namespace) -> int:
@@ -385,7 +389,7 @@ def fly_seeds(options: argparse.Namespace) -> int:
         **summarise(seen, store.read_summary(folder)["units"]),
         "runs": [{key: row[key] for key in ("seed", "verdict", "key", "text")} for row in seen],
     }
-    text = f"\n{as_table(document)}\n\n{folder / store.SUMMARY}"
+    text = f"\n{as_table(document, len(work))}\n\n{folder / store.SUMMARY}"
     print_result(options.output, document, text)
     return code or max(EXIT_CODES[row["verdict"]] for row in seen)
 
