@@ -28,29 +28,41 @@ FUSES_WRONG = tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 11)
 def compile_model(robot: Path, scene: Path) -> Any:
     """Attach the robot to the scene's frame `spawn` and compile both into an `MjModel`.
 
-    `robot` and `scene` are MJCF files. In the result, names of the robot begin with `robot/`.
-    Static bodies are fused, so that a step takes half the time. Fused bodies lose their names;
-    therefore each geom of the scene gets the name BODY/NUMBER. Raise a BadInputError if a file is
+    `robot` and `scene` are MJCF files. In the result, names of the robot begin with `robot/`. The
+    robot may have joints of its own, such as those of wheels; its free joint comes first. Static
+    bodies are fused, so that a step takes half the time. Fused bodies lose their names; therefore
+    each geom of the scene gets the name BODY/NUMBER. Raise a BadInputError if a file is
     missing or does not compile, if the robot has no free base or no actuator, or if the scene has
     another time step.
     """
     model = _compile(robot, scene)
     _check_parts(model, robot, scene)
     if FUSES_WRONG:
-        inertia = _inertia(_compile(robot, scene, fuse=False))
-        model = _compile(robot, scene, inertia)
+        apart = _compile(robot, scene, fuse=False)
+        # The inertia of a wheel with parts cannot be corrected on the base.
+        model = apart if _has_joints(apart) else _compile(robot, scene, _inertia(apart))
     return model
 
 
 def compile_true(robot: Path, scene: Path, nominal: Any, plant: Plant) -> Any:
     """Return the model of the true robot, whose mass, inertia and thrust `plant` changes.
 
-    `nominal` is the result of `compile_model` for the same files.
+    `nominal` is the result of `compile_model` for the same files. Raise a BadInputError if `plant`
+    has factors for another number of actuators.
     """
     if plant == Plant():
         return nominal
-    model = _compile(robot, scene, true_inertia(plant, _inertia(nominal)))
-    model.actuator_gainprm[:, 0] *= plant.thrust_factor
+    factors = plant.thrust_factor
+    if factors == Plant().thrust_factor:
+        factors = (1.0,) * nominal.nu
+    elif len(factors) != nominal.nu:
+        raise BadInputError(
+            f"world.plant.thrust_factor: has {len(factors)} factors, but {robot} has {nominal.nu} "
+            "actuators; leave it out"
+        )
+    fuse = not (FUSES_WRONG and _has_joints(nominal))
+    model = _compile(robot, scene, true_inertia(plant, _inertia(nominal)), fuse=fuse)
+    model.actuator_gainprm[:, 0] *= factors
     return model
 
 
@@ -59,7 +71,7 @@ def _compile(
 ) -> Any:
     """Compile the robot in the scene; `fuse` tells whether MuJoCo fuses static bodies.
 
-    `inertia` replaces the robot's inertia; None keeps it.
+    `inertia` replaces that of the robot's base; None keeps it.
     """
     try:
         spec = read_scene(scene_path)
@@ -70,7 +82,7 @@ def _compile(
             geom.name = f"{WORLD}/{number}"  # also geoms in the worldbody of the robot's file
         spec.compiler.fusestatic = fuse
         if inertia is not None:
-            _set_inertia(spec.joints[0].parent, *inertia)
+            _set_inertia(_base(spec), *inertia)
         return spec.compile()
     except (ValueError, KeyError) as error:
         raise compile_error(f"{robot_path} in {scene_path}", error) from None
@@ -90,10 +102,22 @@ def bodies_of_geoms(model: Any) -> list[str]:
     ]
 
 
+def _has_joints(model: Any) -> bool:
+    """Return whether the robot has joints besides that of its base."""
+    return bool(model.njnt > 1)
+
+
+def _base(spec: Any) -> Any:
+    """Return the body with the free joint."""
+    free = mujoco.mjtJoint.mjJNT_FREE
+    return next(joint.parent for joint in spec.joints if joint.type == free)
+
+
 def _inertia(model: Any) -> Inertia:
+    """Return the inertia of the base and of what is fixed to it."""
     data, base = mujoco.MjData(model), model.jnt_bodyid[0]
     mujoco.mj_forward(model, data)
-    frame, bodies = data.xmat[base].reshape(3, 3), np.flatnonzero(model.body_rootid == base)
+    frame, bodies = data.xmat[base].reshape(3, 3), np.flatnonzero(model.body_weldid == base)
     masses, places = model.body_mass[bodies], (data.xipos[bodies] - data.xpos[base]) @ frame
     centre, inertia = masses @ places / masses.sum(), np.zeros((3, 3))
     for body, mass, place in zip(bodies, masses, places, strict=True):
@@ -104,13 +128,16 @@ def _inertia(model: Any) -> Inertia:
 
 
 def _set_inertia(base: Any, mass: float, centre: Array, inertia: Array) -> None:
-    """Set the mass and inertia of the whole robot on its base body, and zero on all other bodies.
+    """Set the mass and inertia of the base body, and zero on the bodies that are fixed to it.
 
-    `base` is the base body in an `MjSpec`.
+    `base` is the base body in an `MjSpec`. Bodies with a joint keep their inertia.
     """
-    for geom in base.find_all("geom"):
-        geom.mass = 0.0
-    for body in base.find_all("body"):
+    fixed = [base]
+    for body in fixed:
+        for geom in body.geoms:
+            geom.mass = 0.0
+        fixed += [child for child in body.bodies if not child.joints]
+    for body in fixed[1:]:
         body.mass, body.inertia, body.fullinertia = 0.0, np.zeros(3), np.full(6, nan)
     moments, axes = np.linalg.eigh(inertia)
     axes[:, 0] *= np.linalg.det(axes)  # a rotation, not a mirror image

@@ -1,0 +1,170 @@
+"""Onboard controller for robots with driven wheels on the left and on the right.
+
+The robot turns its nearer end, front or back, towards the wanted velocity, and drives with that
+part of the velocity that points along the robot. It ignores the vertical component. With v and w,
+the speed of the base and its yaw rate, a wheel of the radius r at the distance y to the left of the
+base turns at (v - w y) / r.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import atan2, hypot, inf
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cloudrc.config.schema import Positive
+from cloudrc.errors import BadInputError
+from cloudrc.geometry.compiled import mujoco
+from cloudrc.messages import Vector
+from cloudrc.world.onboard import Commands
+from cloudrc.world.readings import Readings
+from cloudrc.world.scene import ROBOT_PREFIX
+
+SLOW = 0.1
+"""Below this wanted speed the robot turns towards it more slowly, in proportion, because the
+direction of a speed near zero is noise [m/s]."""
+KEEP_END = 0.2
+"""The end that leads changes when the velocity points beyond the side of the robot by an angle with
+this sine. Without this margin, a velocity to the side would make the robot turn to and fro."""
+LEVEL = 0.05
+"""Largest sine of the angle between a wheel's axis and the base's y axis."""
+ROUND = tuple(
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{shape}")) for shape in ("CYLINDER", "SPHERE", "ELLIPSOID")
+)
+"""Shapes whose first size is the radius of a wheel."""
+
+
+class Wheel(NamedTuple):
+    """A driven wheel."""
+
+    y: float  # distance to the left of the base [m]
+    command: float  # value of the actuator per speed of the wheel over the ground [rad/m]
+    speed_max: float  # largest speed over the ground [m/s]
+
+
+class DiffDrive:
+    """Makes a robot with driven wheels follow a horizontal velocity.
+
+    Attributes:
+        stopped: Commands of wheels at rest.
+    """
+
+    def __init__(self, wheels: Sequence[Wheel], turn_gain: float, turn_rate_max: float) -> None:
+        """Begin with the front in the lead.
+
+        `turn_gain` is in [1/s], `turn_rate_max` in [rad/s]; `build` describes them.
+        """
+        self.stopped: Commands = (0.0,) * len(wheels)
+        self._wheels = tuple(wheels)
+        self._turn_gain = turn_gain
+        self._speed_max = min(wheel.speed_max for wheel in wheels)
+        self._half_track = max(abs(wheel.y) for wheel in wheels)
+        self._turn_rate_max = min(turn_rate_max, self._speed_max / self._half_track)
+        self._lead = 1.0
+
+    def reset(self) -> None:
+        """Let the front lead."""
+        self._lead = 1.0
+
+    def update(self, readings: Readings, velocity: Vector, yaw_rate: float) -> Commands:
+        """Return the wheels' speeds [rad/s] that turn the robot towards a velocity and drive.
+
+        `velocity` is in [m/s], world frame, shape (3,). `yaw_rate` is in [rad/s]. A robot that has
+        to drive needs its heading for that: it follows `yaw_rate` only near rest.
+        """
+        x, y, _ = velocity
+        ahead_x, ahead_y = readings.axes[0], readings.axes[1]
+        ahead = x * ahead_x + y * ahead_y
+        left = y * ahead_x - x * ahead_y
+        speed = hypot(ahead, left)
+        if self._lead * ahead < -KEEP_END * speed:
+            self._lead = -self._lead
+        share = min(speed / SLOW, 1.0)
+        angle = atan2(self._lead * left, self._lead * ahead)
+        turn = share * self._turn_gain * angle + (1.0 - share) * yaw_rate
+        return self._wheel_speeds(ahead, turn)
+
+    def brake(self, readings: Readings, velocity: Vector) -> Commands:
+        """Return the wheels' speeds [rad/s] while the robot brakes to a velocity [m/s]."""
+        return self.update(readings, velocity, 0.0)
+
+    def _wheel_speeds(self, ahead: float, turn: float) -> Commands:
+        """Return commands for a speed [m/s] and a yaw rate [rad/s]; turning comes first."""
+        turn = max(min(turn, self._turn_rate_max), -self._turn_rate_max)
+        rest = self._speed_max - abs(turn) * self._half_track
+        ahead = max(min(ahead, rest), -rest)
+        return tuple([(ahead - turn * wheel.y) * wheel.command for wheel in self._wheels])
+
+
+def build(
+    model: Any,
+    turn_gain: Positive = 3.0,
+    turn_rate_max: Positive = 3.0,
+    wheel_radius_m: Positive | None = None,
+) -> DiffDrive:
+    """Make the controller for a compiled `MjModel`.
+
+    Each actuator of the model is a velocity servo of a wheel; radius, place and largest speed of
+    each wheel are those of the model.
+
+    Args:
+        model: The robot in its scene.
+        turn_gain: Yaw rate per angle between the robot and the wanted velocity [1/s].
+        turn_rate_max: Largest yaw rate [rad/s].
+        wheel_radius_m: Radius of the wheels [m], for wheels whose shape is a mesh; None: the radius
+            of the largest round geom of each wheel.
+
+    Raises:
+        BadInputError: If the model has no such wheels.
+    """
+    data, base = mujoco.MjData(model), model.jnt_bodyid[0]
+    mujoco.mj_forward(model, data)
+    frame = data.xmat[base].reshape(3, 3)
+    wheels = []
+    for number in range(model.nu):
+        joint = _wheel_joint(model, number)
+        axis = data.xaxis[joint] @ frame
+        place = (data.xanchor[joint] - data.xpos[base]) @ frame
+        if hypot(axis[0], axis[2]) > LEVEL:
+            raise BadInputError(f"the axis of {_name(model, number)} must point along the base's y")
+        radius = wheel_radius_m or _radius(model, number, joint)
+        gear = float(model.actuator_gear[number, 0] * np.sign(axis[1]))
+        most = model.actuator_ctrlrange[number] if model.actuator_ctrllimited[number] else [inf]
+        speed_max = float(np.abs(most).min()) * radius / abs(gear)
+        wheels.append(Wheel(float(place[1]), gear / radius, speed_max))
+    if not min(wheel.y for wheel in wheels) < 0.0 < max(wheel.y for wheel in wheels):
+        raise BadInputError("needs driven wheels on both sides: y above 0 and below 0")
+    return DiffDrive(wheels, turn_gain, turn_rate_max)
+
+
+def _wheel_joint(model: Any, number: int) -> int:
+    """Return the hinge that an actuator turns; raise a BadInputError if it is no wheel's servo."""
+    joint = int(model.actuator_trnid[number, 0])
+    kind = model.actuator_trntype[number]
+    if kind != mujoco.mjtTrn.mjTRN_JOINT or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_HINGE:
+        raise BadInputError(f"{_name(model, number)} must turn the hinge of a wheel")
+    gain, bias = model.actuator_gainprm[number, 0], model.actuator_biasprm[number]
+    if not gain > 0.0 or bias[2] != -gain or np.any(bias[:2]):
+        raise BadInputError(
+            f"{_name(model, number)} must be a velocity servo, in MJCF: <velocity kv=...>"
+        )
+    if model.actuator_gear[number, 0] == 0.0:
+        raise BadInputError(f"{_name(model, number)} has gear 0, so that it turns no wheel")
+    return joint
+
+
+def _radius(model: Any, number: int, joint: int) -> float:
+    body = model.jnt_bodyid[joint]
+    geoms = np.flatnonzero(model.geom_bodyid == body)
+    radii = [model.geom_size[geom, 0] for geom in geoms if model.geom_type[geom] in ROUND]
+    if not radii:
+        raise BadInputError(
+            f"the wheel of {_name(model, number)} has no round geom; set onboard.wheel_radius_m"
+        )
+    return float(max(radii))
+
+
+def _name(model: Any, number: int) -> str:
+    return f"actuator '{model.actuator(number).name.removeprefix(ROBOT_PREFIX) or number}'"

@@ -1,0 +1,190 @@
+"""A robot with driven wheels goes where the wanted velocity points; unfit models are refused."""
+
+from math import atan2, cos, degrees, hypot, pi, radians, sin
+
+import pytest
+
+import cloudrc
+from cloudrc.config.robot import find_robot
+from cloudrc.config.schema import Plant, World
+from cloudrc.config.shipped import file_of
+from cloudrc.errors import BadInputError
+from cloudrc.robots.build import build_onboard, check_robot
+from cloudrc.world import scene
+from cloudrc.world.onboard import Direct
+from cloudrc.world.scene import compile_model, compile_true
+from cloudrc.world.simulator import Simulator
+
+MODEL = find_robot("rover").model
+EMPTY = file_of("empty")
+TEXT = MODEL.read_text()
+SERVO = '<velocity kv="3" ctrlrange="-20 20" forcerange="-3 3"/>'
+
+
+@pytest.fixture
+def drive(own_robot):
+    """Return a function that drives the rover with velocities (x, y, z, yaw rate), 2 s each."""
+
+    def go(*wanted, model=TEXT, onboard="diff_drive", time=2.0):
+        folder = own_robot(f"onboard: {onboard}", model)
+        compiled = compile_model(folder / "robot.xml", EMPTY)
+        controller = build_onboard(World(robot=str(folder), scene="empty"), compiled)
+        simulator = Simulator(compiled, Direct(compiled.nu))
+        for *velocity, yaw_rate in wanted:
+            for _ in range(round(time / simulator.dt)):
+                simulator.step(controller.update(simulator.readings, tuple(velocity), yaw_rate))
+        return simulator
+
+    return go
+
+
+def heading(simulator):
+    return atan2(simulator.readings.axes[1], simulator.readings.axes[0])
+
+
+@pytest.mark.parametrize("degree", [0, 30, 80, 100, 135, 180, -60, -120, -179])
+def test_it_drives_where_the_velocity_points_with_its_nearer_end(drive, degree):
+    x, y = 0.8 * cos(radians(degree)), 0.8 * sin(radians(degree))
+    simulator = drive((x, y, 0.0, 0.0), time=3.0)
+    assert simulator.readings.velocity == pytest.approx((x, y, 0.0), abs=0.03)
+    ends = degree if abs(degree) <= 100 else degree - 180 if degree > 0 else degree + 180
+    assert degrees(heading(simulator)) == pytest.approx(ends, abs=2.0)
+
+
+def test_a_reversed_velocity_makes_it_drive_back_without_a_turn(drive):
+    simulator = drive((0.8, 0.0, 0.0, 0.0), (-0.8, 0.0, 0.0, 0.0))
+    assert simulator.readings.velocity[0] == pytest.approx(-0.8, abs=0.01)
+    assert abs(heading(simulator)) < 0.01
+
+
+def test_at_rest_it_turns_with_the_yaw_rate_and_while_it_drives_the_velocity_decides(drive):
+    turned = drive((0.0, 0.0, 0.0, 0.5))
+    assert turned.readings.angular_velocity_body[2] == pytest.approx(0.5, abs=0.05)
+    assert hypot(*turned.readings.position[:2]) < 0.01
+    assert abs(heading(drive((0.8, 0.0, 0.0, 0.5)))) < 0.01
+
+
+def test_without_velocity_or_with_a_vertical_one_it_stays_at_rest(drive):
+    at = drive((0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 2.0, 0.0), (0.0, 0.0, -2.0, 0.0)).readings
+    assert at.position == pytest.approx((0.0, 0.0, 0.1), abs=1e-3)
+
+
+def test_stopped_wheels_brake(drive):
+    simulator = drive((1.0, 0.0, 0.0, 0.0))
+    for _ in range(300):
+        simulator.step((0.0, 0.0))
+    assert simulator.readings.velocity == pytest.approx((0.0, 0.0, 0.0), abs=0.01)
+
+
+def test_no_wheel_is_faster_than_its_limit_and_turning_comes_first():
+    model = compile_model(MODEL, EMPTY)
+    controller = build_onboard(World(robot="rover", scene="empty"), model)
+    readings = Simulator(model, Direct(2)).readings
+    assert controller.update(readings, (50.0, 0.0, 0.0), 0.0) == pytest.approx((20.0, 20.0))
+    left, right = controller.update(readings, (50.0, 50.0, 0.0), 0.0)
+    assert right == pytest.approx(20.0)
+    assert (right - left) * 0.08 / 0.32 == pytest.approx(min(3.0, 3.0 * pi / 4))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {'axis="0 1 0"/>': 'axis="0 -1 0"/>'},
+        {SERVO: SERVO.replace("kv", 'gear="-2" kv').replace("20", "40")},
+        {'size=".08 .01"': 'size=".06 .01"', ".16 -.02": ".16 -.04", "20 20": "30 30"},
+        {"0 .16": "0 .25", "0 -.16": "0 -.25"},
+    ],
+    ids=["axis", "gear", "radius", "track"],
+)
+def test_directions_gears_radius_and_track_of_the_wheels_come_from_the_model(drive, changes):
+    model = TEXT
+    for old, new in changes.items():
+        assert old in model
+        model = model.replace(old, new)
+    driven = drive((0.8, 0.0, 0.0, 0.0), model=model).readings
+    assert driven.velocity == pytest.approx((0.8, 0.0, 0.0), abs=0.03)
+    turned = drive((0.0, 0.0, 0.0, 0.5), model=model).readings
+    assert turned.angular_velocity_body[2] == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_robot_with_four_driven_wheels_drives(drive):
+    back = "".join(
+        f'<body name="back_{side}" pos="-.2 {y} -.02" childclass="wheel">'
+        f'<joint name="back_{side}"/><geom/></body>'
+        for side, y in (("left", ".16"), ("right", "-.16"))
+    )
+    servos = "".join(
+        f'<velocity class="wheel" name="back_{side}" joint="back_{side}"/>'
+        for side in ("left", "right")
+    )
+    model = TEXT.replace("</body>\n  </worldbody>", f"{back}</body>\n  </worldbody>")
+    model = model.replace("</actuator>", f"{servos}</actuator>")
+    simulator = drive((0.8, 0.0, 0.0, 0.0), (0.0, 0.8, 0.0, 0.0), model=model, time=3.0)
+    assert simulator.readings.velocity == pytest.approx((0.0, 0.8, 0.0), abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({SERVO: '<motor ctrlrange="-1 1"/>', "<velocity class": "<motor class"}, "velocity servo"),
+        ({'axis="0 1 0"': 'axis="1 0 0"'}, "axis of actuator 'left' must point along the base's y"),
+        ({'type="hinge"': 'type="slide"'}, "'left' must turn the hinge of a wheel"),
+        ({'type="cylinder" size=".08 .01"': 'type="box" size=".1 .1 .1"'}, "wheel_radius_m"),
+        ({"0 .16 -.02": "0 -.1 -.02"}, "wheels on both sides"),
+        ({'kv="3"': 'gear="0" kv="3"'}, "gear 0"),
+    ],
+)
+def test_a_model_without_such_wheels_is_refused_in_one_line(own_robot, changes, message):
+    model = TEXT
+    for old, new in changes.items():
+        assert old in model
+        model = model.replace(old, new)
+    folder = own_robot("onboard: diff_drive", model)
+    with pytest.raises(BadInputError) as error:
+        check_robot(World(robot=str(folder), scene="empty"))
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+    assert str(folder / "robot.xml") in str(error.value)
+
+
+def test_a_robot_that_flies_is_refused(own_robot):
+    folder = own_robot("onboard: diff_drive")
+    with pytest.raises(BadInputError, match="'rotor_front' must turn the hinge of a wheel"):
+        check_robot(World(robot=str(folder), scene="empty"))
+
+
+@pytest.mark.parametrize(
+    "onboard", ["{name: diff_drive, turn_gain: 0}", "{name: diff_drive, r: 1}"]
+)
+def test_wrong_parameters_are_refused(own_robot, onboard):
+    folder = own_robot(f"onboard: {onboard}", TEXT)
+    with pytest.raises(BadInputError, match=r"turn_gain|unknown key"):
+        check_robot(World(robot=str(folder), scene="empty"))
+
+
+def test_the_cloud_drives_the_rover_to_its_waypoints_and_twice_alike():
+    points = [{"position_m": [x, y, 0.35], "tolerance_m": 0.3} for x, y in ((1.5, 0), (1.5, -1))]
+    settings = {"world.robot": "rover", "mission": {"waypoints": points}}
+    flights = [cloudrc.fly("steps", settings) for _ in range(2)]
+    assert flights[0].verdict == "success"
+    assert flights[0].numbers["waypoints_reached"] == 2
+    assert flights[0].records_sha256 == flights[1].records_sha256
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_mass_and_payload_change_the_base_and_keep_the_wheels(wrong, monkeypatch):
+    monkeypatch.setattr(scene, "FUSES_WRONG", wrong)
+    nominal = compile_model(MODEL, EMPTY)
+    plant = Plant(mass_factor=1.1, payload_kg=0.5)
+    heavy = compile_true(MODEL, EMPTY, nominal, plant)
+    base = nominal.jnt_bodyid[0]
+    assert nominal.body_mass[base] == pytest.approx(6.2)
+    assert heavy.body_mass[base] == pytest.approx(1.1 * 6.2 + 0.5)
+    assert heavy.body_mass[base + 1 :] == pytest.approx(nominal.body_mass[base + 1 :])
+
+
+def test_factors_for_four_actuators_do_not_fit_two_wheels():
+    nominal = compile_model(MODEL, EMPTY)
+    plant = Plant(thrust_factor=(1.0, 1.0, 1.0, 0.9))
+    with pytest.raises(BadInputError, match=r"has 4 factors, but .*robot\.xml has 2 actuators"):
+        compile_true(MODEL, EMPTY, nominal, plant)
