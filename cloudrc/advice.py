@@ -196,10 +196,16 @@ def _always_up(experiment: ResolvedExperiment, *, uplink: bool) -> LinkDirection
 
 
 def _hover(experiment: ResolvedExperiment) -> Iterator[str]:
-    """Yield advice if the integral of the velocity loop cannot balance wind or a changed weight."""
+    """Yield advice if the integral of the velocity loop cannot balance wind or a changed weight.
+
+    The numbers are those of the published controller of the Pelican.
+    """
+    from cloudrc.config.robot import ALONE, find_robot
     from cloudrc.config.schema import GRAVITY_MPS2, MASS_KG
     from cloudrc.robots.pelican.low_level import GRAVITY, MASS
 
+    if find_robot(experiment.world.robot).onboard.name != find_robot(ALONE).onboard.name:
+        return
     plant, loop, wind = experiment.world.plant, experiment.world.low_level, experiment.world.wind
     weight = (MASS_KG * plant.mass_factor + plant.payload_kg) * GRAVITY_MPS2
     heavy = abs(weight * 4 / sum(plant.thrust_factor) - MASS * GRAVITY)

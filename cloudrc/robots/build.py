@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import TYPE_CHECKING, Any
 
 from cloudrc import plugins
 from cloudrc.config.overrides import build_plugin
 from cloudrc.config.robot import find_robot
-from cloudrc.config.schema import LowLevel, World
+from cloudrc.config.schema import LowLevel, PlugIn, World
 from cloudrc.config.shipped import file_of
 from cloudrc.errors import BadInputError
 from cloudrc.world.guard.state import Guard
@@ -39,7 +40,9 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     nominal = compile_model(robot.model, scene)
     onboard, plugin = build_onboard(world, nominal), plugins.find(KIND, robot.onboard.name)
     simulator = Simulator(
-        compile_true(robot.model, scene, nominal, world.plant), _actuators(plugin, nominal), wind
+        compile_true(robot.model, scene, nominal, world.plant),
+        _actuators(plugin, nominal, robot.onboard),
+        wind,
     )
     guard = Guard(limits)
     if world.is_nominal and hasattr(plugin, "accelerate"):
@@ -66,7 +69,10 @@ def build_onboard(world: World, model: Any) -> Onboard:
         raise BadInputError(f"{robot.model} in {file_of(world.scene)}: {error}") from error
 
 
-def _actuators(plugin: Any, model: Any) -> Actuators:
-    if hasattr(plugin, "actuators"):
-        return plugin.actuators(model, STEP)  # type: ignore[no-any-return]
-    return Direct(model.nu)
+def _actuators(plugin: Any, model: Any, onboard: PlugIn) -> Actuators:
+    """Make the actuators; they get those parameters of the controller that they name, too."""
+    if not hasattr(plugin, "actuators"):
+        return Direct(model.nu)
+    known, given = inspect.signature(plugin.actuators).parameters, onboard.model_extra or {}
+    own = {name: value for name, value in given.items() if name in known}
+    return plugin.actuators(model, STEP, **own)  # type: ignore[no-any-return]

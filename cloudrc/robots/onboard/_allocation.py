@@ -1,0 +1,160 @@
+"""Distribute thrust and torques over the actuators of a multirotor.
+
+The allocation works with accelerations instead of forces and torques, so that gains do not depend
+on the robot's size: the acceleration along the base's z axis [m/s^2], and the angular accelerations
+about its x, y and z axes [rad/s^2].
+"""
+
+from __future__ import annotations
+
+from math import inf
+
+import numpy as np
+
+from cloudrc.errors import BadInputError
+from cloudrc.robots.onboard._airframe import Airframe, span
+from cloudrc.world.onboard import Commands
+from cloudrc.world.plant import Array
+
+BRAKE = 3.0
+"""Deceleration that a robot must reach when it stops a descent [m/s^2]. The guard's stop rule
+assumes it."""
+TURN_MIN, YAW_MIN = 10.0, 0.2
+"""Smallest angular acceleration about x and y, and about z, that a robot must reach in hover
+[rad/s^2]. With less, it cannot tilt in time to brake, or hardly turns."""
+TINY = 1e-9
+
+
+class Allocation:
+    """Turns accelerations into controls; torques have priority where the controls do not suffice.
+
+    Attributes:
+        stopped: Controls that push least.
+        acceleration_max: Largest acceleration along z without torque [m/s^2].
+        turn_max: Largest angular acceleration about x and about y in hover, in both directions
+            [rad/s^2].
+        yaw_max: Largest angular acceleration about z in hover, in both directions [rad/s^2].
+    """
+
+    def __init__(self, frame: Airframe) -> None:
+        """Invert the wrench of `frame`.
+
+        The inverse prefers small controls, relative to their ranges. Raise a BadInputError if the
+        actuators cannot hold the robot in hover, with enough room to brake and to turn.
+        """
+        width = span(frame)
+        turn_x, turn_y, lift, turn_z = width * np.linalg.pinv(frame.wrench * width).T
+        thrust = frame.mass * lift
+        turns = np.array((turn_x, turn_y, turn_z)).T @ frame.inertia
+        hover = frame.gravity * thrust
+        share = _check_hover(frame, hover)
+        self.acceleration_max = frame.gravity / share if share else inf
+        room = np.minimum(frame.high - hover, hover - frame.low)[:, None]
+        some = TINY * abs(turns).max(axis=0)  # instead of a division by 0
+        reach = (room / np.maximum(abs(turns), some)).min(axis=0)
+        self.turn_max, self.yaw_max = float(reach[:2].min()), float(reach[2])
+        _check_turns(self.turn_max, self.yaw_max)
+
+        least = np.clip(0.0, frame.low, frame.high)
+        self.stopped: Commands = tuple(least.tolist())
+        self._columns = list(zip(thrust.tolist(), *turns.T.tolist(), strict=True))
+        self._limits = list(zip(frame.low.tolist(), frame.high.tolist(), strict=True))
+        self._lifts = abs(thrust) > TINY * abs(thrust).max()
+
+    def allocate(self, thrust: float, roll: float, pitch: float, yaw: float) -> Commands:
+        """Return the controls that make an acceleration and angular accelerations.
+
+        `thrust` is the acceleration along z [m/s^2]; `roll`, `pitch` and `yaw` are the angular
+        accelerations about x, y and z [rad/s^2]. If a control exceeds its range, the turn about x
+        and y is kept first, then the thrust, then the turn about z.
+        """
+        commands = tuple(
+            [
+                lift * thrust + turn_x * roll + turn_y * pitch + turn_z * yaw
+                for lift, turn_x, turn_y, turn_z in self._columns
+            ]
+        )
+        for command, (low, high) in zip(commands, self._limits, strict=True):
+            if not low <= command <= high:
+                return self._saturate(thrust, roll, pitch, yaw)
+        return commands
+
+    def _saturate(self, thrust: float, roll: float, pitch: float, yaw: float) -> Commands:
+        """Shorten what has the lowest priority, until every control is in its range.
+
+        A control that lifts is `lift` · (thrust + turn); so each range limits the thrust to an
+        interval, and a shorter turn makes the intervals overlap.
+        """
+        turns = [turn_x * roll + turn_y * pitch for _, turn_x, turn_y, _ in self._columns]
+        shorter, intervals = 1.0, []
+        for (lift, *_), turn, limits, lifts in zip(
+            self._columns, turns, self._limits, self._lifts, strict=True
+        ):
+            if lifts:
+                low, high = sorted(limit / lift for limit in limits)
+                intervals.append((low, high, turn / lift))
+            elif turn:
+                shorter = min(shorter, max(limit / turn for limit in limits))
+        for low, _, turn in intervals:
+            for _, high, other in intervals:
+                if other - turn > TINY:
+                    shorter = min(shorter, (high - low) / (other - turn))
+        least = max(low - shorter * turn for low, _, turn in intervals)
+        most = min(high - shorter * turn for _, high, turn in intervals)
+        thrust = min(max(thrust, least), most)
+        before = [
+            column[0] * thrust + shorter * turn
+            for column, turn in zip(self._columns, turns, strict=True)
+        ]
+        return self._add_yaw(before, yaw)
+
+    def _add_yaw(self, before: list[float], yaw: float) -> Commands:
+        """Add as much of the turn about z to the controls as their ranges allow."""
+        part = 1.0
+        for value, column, (low, high) in zip(before, self._columns, self._limits, strict=True):
+            change = column[3] * yaw
+            if change > 0.0:
+                part = min(part, max(high - value, 0.0) / change)
+            elif change < 0.0:
+                part = min(part, min(low - value, 0.0) / change)
+        # Rounding may exceed a range by a little.
+        return tuple(
+            [
+                min(max(value + part * yaw * column[3], low), high)
+                for value, column, (low, high) in zip(
+                    before, self._columns, self._limits, strict=True
+                )
+            ]
+        )
+
+
+def _check_hover(frame: Airframe, hover: Array) -> float:
+    """Return the share [1] of the largest thrust that hover needs; refuse a robot without room."""
+    share = 0.0
+    for name, value, low, high in zip(frame.names, hover, frame.low, frame.high, strict=True):
+        # A control that lifts when it is negative is the mirror image of a usual one.
+        need, least, most = (-value, -high, -low) if value < 0.0 else (value, low, high)
+        if need <= least or most <= 0.0:
+            rounded = round(float(value), 6) + 0.0
+            raise BadInputError(
+                f"hover needs a control of {rounded:.3g} from actuator {name}, which has no room "
+                f"on both sides within {low:g} to {high:g}: are its range, its place and all spin "
+                "directions right?"
+            )
+        share = max(share, float(need / most))
+    most = frame.gravity / (frame.gravity + BRAKE)
+    if share > most:
+        raise BadInputError(
+            f"hover needs {100.0 * share:.0f} % of the thrust; above {100.0 * most:.0f} % a robot "
+            f"cannot brake a descent: is the mass of {frame.mass:g} kg right (kg, not g)?"
+        )
+    return share
+
+
+def _check_turns(turn_max: float, yaw_max: float) -> None:
+    for reach, least, axes in ((turn_max, TURN_MIN, "x and y"), (yaw_max, YAW_MIN, "z")):
+        if reach < least:
+            raise BadInputError(
+                f"in hover the actuators turn the robot about {axes} by {reach:.2g} rad/s^2 at "
+                f"most, and it needs {least:g}: is the inertia too large, or a range too small?"
+            )

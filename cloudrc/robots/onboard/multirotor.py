@@ -1,0 +1,289 @@
+"""Fly any multirotor: a body with a free joint, and actuators that push at sites.
+
+Allocation and hover thrust come from the compiled model, and gains from bandwidths. So one
+controller flies a robot of 27 g and one of several kg, with any number and layout of rotors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import atan2, hypot, inf, pi, radians, remainder, sqrt, tan
+from typing import Any
+
+from cloudrc.errors import BadInputError
+from cloudrc.messages import ZERO, Vector
+from cloudrc.robots.onboard._airframe import Airframe, read_airframe
+from cloudrc.robots.onboard._allocation import Allocation
+from cloudrc.robots.onboard._drag import RotorDrag
+from cloudrc.world.onboard import Actuators, Commands, Direct
+from cloudrc.world.readings import Readings
+
+VELOCITY_RADPS, ATTITUDE_RADPS, YAW_RADPS = 5.0, 20.0, 4.0
+"""Largest default bandwidths of velocity, attitude and yaw [rad/s]."""
+ATTITUDE_MAX_RADPS = 100.0
+"""Largest bandwidth of the attitude [rad/s]: a fifth of the rate of the steps."""
+LAG_MAX = 0.05
+"""Largest lag of an actuator [s]. With a longer one, the attitude is too slow to brake in time."""
+TILT_MAX_MAX = 60.0
+"""Largest accepted limit of the tilt [deg]. Beyond 78 degrees the guard stops the robot."""
+CLIMB = 2.0
+"""Bandwidth of the vertical velocity relative to that of the horizontal velocity [1]. The thrust
+follows at once, the tilt does not."""
+WIND = 2.0
+"""Largest horizontal acceleration of the integral [m/s^2]: what wind and drag can ask for."""
+WEIGHT = 0.5
+"""Largest vertical acceleration of the integral, relative to gravity [1]: a payload."""
+SINK, RISE = 0.6, 0.9
+"""Largest planned downward acceleration relative to gravity, and largest planned upward
+acceleration relative to what the thrust allows [1]."""
+AHEAD = 0.8
+"""Largest planned horizontal acceleration relative to what the tilt limit allows [1]. The rest is
+left for corrections."""
+THRUST_MIN = 0.3
+"""Smallest commanded vertical force relative to the weight [1]: the robot can still turn."""
+THRUST_MAX = 2.5
+"""Largest commanded force relative to the weight [1]."""
+YAW_LEAD_MAX = 0.5
+"""Largest difference between the yaw reference and the yaw [rad]."""
+TINY = 1e-9
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Bandwidths and limits of the controller."""
+
+    velocity: float  # bandwidth of the horizontal velocity [rad/s]
+    attitude: float  # bandwidth of roll and pitch [rad/s]
+    yaw: float  # bandwidth of the yaw [rad/s]
+    tilt_max: float  # largest commanded tilt [rad]
+
+
+class Multirotor:
+    """Controller that makes a multirotor follow a velocity and a yaw rate.
+
+    A first-order model of the wanted response plans velocity and acceleration. A PI controller
+    keeps the velocity on this plan, so that steps do not wind up the integral. Geometric attitude
+    control turns the thrust axis towards the wanted acceleration, and the nose to the yaw
+    reference.
+
+    Attributes:
+        gains: Bandwidths and limits.
+        stopped: Controls while the guard has stopped the robot.
+    """
+
+    stopped: Commands
+
+    def __init__(self, frame: Airframe, allocation: Allocation, gains: Gains, dt: float) -> None:
+        """Set up the loops; `dt` is the time between two updates [s]."""
+        self.gains = gains
+        self.stopped = allocation.stopped
+        self._allocate = allocation.allocate
+        self._dt = dt
+        self._gravity = gravity = frame.gravity
+        self._thrust_max = min(allocation.acceleration_max, THRUST_MAX * gravity)
+        self._slope_max = tan(gains.tilt_max)
+        self._ahead_max = gravity * self._slope_max
+        self._lead_max = self._ahead_max / gains.velocity
+        self._climb_lead_max = gravity / (CLIMB * gains.velocity)
+        self._rise_max = min(RISE * (self._thrust_max - gravity), gravity)
+        x, y, z = frame.centre.tolist()
+        self._centre = (x, y, z)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget plan, integral and yaw reference; the next update takes the present ones."""
+        self._plan: Vector | None = None  # planned velocity [m/s]
+        self._lagging = (0.0, 0.0)  # planned horizontal velocity, after the lag of the tilt [m/s]
+        self._integral = ZERO  # [m/s^2]
+        self._yaw: float | None = None  # yaw reference [rad]
+
+    def update(self, readings: Readings, velocity: Vector, yaw_rate: float) -> Commands:
+        """Return the controls that make the robot follow a velocity; call once per time step.
+
+        `velocity` is the wanted velocity [m/s], world frame, shape (3,); `yaw_rate` is the wanted
+        yaw rate [rad/s].
+        """
+        acceleration = self._acceleration(self._velocity(readings), velocity)
+        yaw = self._yaw_acceleration(readings, yaw_rate)
+        thrust, roll, pitch = self._tilt(acceleration, readings)
+        return self._allocate(thrust, roll, pitch, yaw)
+
+    def brake(self, readings: Readings, velocity: Vector) -> Commands:
+        """Follow `velocity` [m/s] and keep the yaw, but keep the integral constant."""
+        integral = self._integral
+        commands = self.update(readings, velocity, 0.0)
+        self._integral = integral
+        return commands
+
+    def _velocity(self, readings: Readings) -> Vector:
+        """Return the velocity of the base's origin without the part of roll and pitch rates.
+
+        This part is the velocity of the origin about the centre of mass, which no force changes.
+        """
+        _, _, (vx, vy, vz), (p, q, _), (xx, xy, xz, yx, yy, yz, zx, zy, zz) = readings
+        cx, cy, cz = self._centre
+        u, v, w = q * cz, -p * cz, p * cy - q * cx
+        return (
+            vx + xx * u + yx * v + zx * w,
+            vy + xy * u + yy * v + zy * w,
+            vz + xz * u + yz * v + zz * w,
+        )
+
+    def _acceleration(self, velocity: Vector, reference: Vector) -> Vector:
+        """Return the acceleration that the actuators must make, and advance plan and integral.
+
+        With the plan u, its bandwidth b, the reference r and the gravity g, in the world frame:
+            du/dt = b · (r - u), limited;
+            a = du/dt + b · (u - v) + integral of b^2/4 · (u - v) + g.
+        Both poles of the PI loop are at b/2. The vertical loop has the bandwidth CLIMB · b. The
+        tilt follows with a lag of 2/b of the attitude; so the horizontal velocity is compared with
+        the plan after this lag, else it would overshoot.
+        """
+        dt, b, gravity = self._dt, self.gains.velocity, self._gravity
+        climb = CLIMB * b
+        vx, vy, vz = velocity
+        rx, ry, rz = reference
+        if self._plan is None:
+            self._plan, self._lagging = velocity, (vx, vy)
+        ux, uy, uz = self._plan
+        lx, ly = self._lagging
+        ix, iy, iz = self._integral
+
+        planned_x, planned_y = b * (rx - ux), b * (ry - uy)
+        planned_x, planned_y = _shorten(planned_x, planned_y, AHEAD * self._ahead_max)
+        planned_z = min(max(climb * (rz - uz), -SINK * gravity), self._rise_max)
+        ex, ey, ez = lx - vx, ly - vy, uz - vz
+        # A robot that cannot follow, as in contact, does not get the whole plan later.
+        ahead, aside = _shorten(ux + planned_x * dt - vx, uy + planned_y * dt - vy, self._lead_max)
+        above = min(max(uz + planned_z * dt - vz, -self._climb_lead_max), self._climb_lead_max)
+        self._plan = (vx + ahead, vy + aside, vz + above)
+        part = 0.5 * self.gains.attitude * dt
+        self._lagging = (lx + part * (ux - lx), ly + part * (uy - ly))
+
+        # The vertical force has priority; the tilt limit and the largest thrust bound the rest.
+        wanted_z = planned_z + climb * ez + iz + gravity
+        up = min(max(wanted_z, THRUST_MIN * gravity), self._thrust_max)
+        wanted_x, wanted_y = planned_x + b * ex + ix, planned_y + b * ey + iy
+        left = sqrt(self._thrust_max * self._thrust_max - up * up)
+        ahead, aside = _shorten(wanted_x, wanted_y, min(up * self._slope_max, left))
+
+        # A limited force would wind up the integral.
+        if up == wanted_z:
+            iz += 0.25 * climb * climb * ez * dt
+            iz = min(max(iz, -WEIGHT * gravity), WEIGHT * gravity)
+        if ahead == wanted_x and aside == wanted_y:
+            ix, iy = _shorten(ix + 0.25 * b * b * ex * dt, iy + 0.25 * b * b * ey * dt, WIND)
+        self._integral = (ix, iy, iz)
+        return ahead, aside, up
+
+    def _tilt(self, acceleration: Vector, readings: Readings) -> Vector:
+        """Return the thrust and the angular accelerations about x and y that make `acceleration`.
+
+        `acceleration` is in [m/s^2], world frame, shape (3,). The thrust [m/s^2] is its part along
+        the body's z axis. The angular accelerations [rad/s^2] turn this axis by the smallest angle
+        towards the acceleration, critically damped.
+        """
+        ax, ay, az = acceleration
+        _, _, _, (p, q, _), (xx, xy, xz, yx, yy, yz, zx, zy, zz) = readings
+        ahead = ax * xx + ay * xy + az * xz
+        aside = ax * yx + ay * yy + az * yz
+        thrust = ax * zx + ay * zy + az * zz
+        across = hypot(ahead, aside)
+        angle = atan2(across, thrust)
+        if across > TINY:
+            roll, pitch = -angle * aside / across, angle * ahead / across
+        else:
+            roll, pitch = angle, 0.0  # upright, or upside down: turn about any axis
+        b = self.gains.attitude
+        return thrust, b * (b * roll - 2.0 * p), b * (b * pitch - 2.0 * q)
+
+    def _yaw_acceleration(self, readings: Readings, yaw_rate: float) -> float:
+        """Advance the yaw reference; return the angular acceleration about z [rad/s^2].
+
+        The yaw is the direction of the nose on the ground. The reference stays within YAW_LEAD_MAX
+        of the yaw, so that it does not run away from a robot that cannot turn.
+        """
+        axes, r = readings.axes, readings.angular_velocity_body[2]
+        yaw = atan2(axes[1], axes[0])
+        reference = yaw if self._yaw is None else self._yaw
+        lead = remainder(reference + yaw_rate * self._dt - yaw, 2.0 * pi)
+        lead = min(max(lead, -YAW_LEAD_MAX), YAW_LEAD_MAX)
+        self._yaw = yaw + lead
+        b = self.gains.yaw
+        return b * (b * lead + 2.0 * (yaw_rate - r))
+
+
+def build(
+    model: Any,
+    *,
+    velocity_bandwidth_radps: float | None = None,
+    attitude_bandwidth_radps: float | None = None,
+    yaw_bandwidth_radps: float | None = None,
+    tilt_max_deg: float = 35.0,
+    drag_s_per_m: float = 0.0,
+) -> Multirotor:
+    """Make the controller for the compiled `MjModel` of a robot in its scene.
+
+    Without bandwidths, the robot is as fast as its actuators allow, up to the usual values.
+
+    Args:
+        model: The model. Joint 0 is the robot's free joint.
+        velocity_bandwidth_radps: Bandwidth of the horizontal velocity [rad/s]; a velocity step is
+            63 % done after about its inverse. The vertical velocity is twice as fast. Default: 5,
+            or a quarter of the attitude's bandwidth.
+        attitude_bandwidth_radps: Bandwidth of roll and pitch [rad/s]. Default: 20, or less for a
+            robot that turns slowly or whose actuators lag.
+        yaw_bandwidth_radps: Bandwidth of the yaw [rad/s]. Default: 4, or less for a robot that
+            turns slowly.
+        tilt_max_deg: Largest commanded tilt [deg].
+        drag_s_per_m: Drag of the rotors, which `actuators` simulates and the controller does not
+            know: force relative to the thrust of a rotor and to the velocity of its hub across its
+            axis [s/m]. Default: no drag.
+
+    Raises:
+        BadInputError: If the controller cannot fly the model, or a value does not fit.
+    """
+    frame = read_airframe(model)
+    allocation = Allocation(frame)
+    lag = frame.lag or TINY
+    if lag > LAG_MAX:
+        raise BadInputError(f"an actuator has a lag (dynprm) of {lag:g} s, above {LAG_MAX:g} s")
+    # At most so fast that turns up to 50 degrees (8/9 rad) end without overshoot although the
+    # actuators saturate; and slow enough for the lag of the actuators.
+    attitude = min(ATTITUDE_RADPS, 3.0 * sqrt(allocation.turn_max), 0.4 / lag)
+    most = min(ATTITUDE_MAX_RADPS, 1.0 / lag)
+    attitude = _checked("attitude", attitude_bandwidth_radps, attitude, most)
+    velocity = min(VELOCITY_RADPS, 0.25 * attitude)
+    velocity = _checked("velocity", velocity_bandwidth_radps, velocity, 0.5 * attitude)
+    yaw = min(YAW_RADPS, 2.0 * sqrt(allocation.yaw_max), 0.5 * attitude)
+    yaw = _checked("yaw", yaw_bandwidth_radps, yaw, attitude)
+    if not 0.0 < tilt_max_deg <= TILT_MAX_MAX:
+        raise BadInputError(f"tilt_max_deg: {tilt_max_deg:g} is not above 0 and up to 60")
+    if not 0.0 <= drag_s_per_m < inf:
+        raise BadInputError(f"drag_s_per_m: {drag_s_per_m:g} is not 0 or more")
+    gains = Gains(velocity, attitude, yaw, radians(tilt_max_deg))
+    return Multirotor(frame, allocation, gains, model.opt.timestep)
+
+
+def actuators(model: Any, dt: float, *, drag_s_per_m: float = 0.0) -> Actuators:
+    """Make the actuators of a compiled `MjModel`: MuJoCo's own, with drag of the rotors if wanted.
+
+    `dt` is the duration of a step [s]. `drag_s_per_m` is the drag [s/m] as in `build`.
+    """
+    return RotorDrag(model, drag_s_per_m) if drag_s_per_m else Direct(model.nu)
+
+
+def _checked(name: str, wanted: float | None, default: float, most: float) -> float:
+    if wanted is None:
+        return default
+    if not 0.0 < wanted <= most:
+        raise BadInputError(f"{name}_bandwidth_radps: {wanted:g} is not above 0 and up to {most:g}")
+    return wanted
+
+
+def _shorten(x: float, y: float, length: float) -> tuple[float, float]:
+    """Return a vector of at most a given length, in any unit."""
+    size = hypot(x, y)
+    if size <= length:
+        return x, y
+    return x * length / size, y * length / size

@@ -1,0 +1,41 @@
+"""A folder with a model and `onboard: multirotor` is a robot that flies in the testbed."""
+
+import pytest
+
+import cloudrc
+from cloudrc.config.load import load_experiment
+from cloudrc.errors import BadInputError
+from cloudrc.robots.build import build_robot
+from cloudrc.robots.onboard._drag import RotorDrag
+from tests.robots.onboard.conftest import nano
+
+HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
+MODEL = nano().replace('pos="0 0 2"', "")
+
+
+def test_a_nano_flies_also_if_it_is_heavier_than_its_model(own_robot):
+    mine = own_robot("onboard: multirotor", MODEL)
+    for factor in (1.0, 1.3):
+        changes = {"world.robot": str(mine), "world.plant.mass_factor": factor}
+        assert cloudrc.fly("hover", HOVER | changes).verdict == "success"
+
+
+def test_the_drag_of_robot_yaml_reaches_the_rotors(own_robot):
+    mine = own_robot("onboard: {name: multirotor, drag_s_per_m: 0.02}", MODEL)
+    experiment = load_experiment("hover", ["world.scene=empty", f"world.robot={mine}"])
+    robot = build_robot(experiment.world, experiment.guard)
+    assert isinstance(robot.simulator.actuators, RotorDrag)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ("drag: 0.1", "drag: unknown key; did you mean drag_s_per_m?"),
+        ("tilt_max_deg: steep", "tilt_max_deg"),
+        ("tilt_max_deg: 90", "robot.xml in .*: .*tilt_max_deg: 90 is not above 0 and up to 60"),
+    ],
+)
+def test_a_wrong_parameter_is_refused_by_its_name(own_robot, keys, message):
+    mine = own_robot(f"onboard: {{name: multirotor, {keys}}}", MODEL)
+    with pytest.raises(BadInputError, match=message):
+        cloudrc.fly("hover", HOVER | {"world.robot": str(mine)})
