@@ -1,4 +1,4 @@
-"""List the obstacles of a scene: declared pipes and board, and other bodies of a user's scene."""
+"""List the obstacles of a scene: declared pipes and board, and all other bodies."""
 
 from __future__ import annotations
 
@@ -46,7 +46,10 @@ def surface(obstacle: Obstacle) -> str:
 
 
 def body_names(scene: Scene) -> tuple[str, ...] | None:
-    """Return the names of all bodies of a user's scene; None if they are not `known`."""
+    """Return the names of all bodies of a scene that may have bodies without numbers.
+
+    Return None if the scene has no such bodies, or if they are not `known`.
+    """
     return _compiled(scene)[0] or None
 
 

@@ -58,7 +58,7 @@ class Scene:
     board: Board | None = None
     floor: float = 0.0  # z of the floor [m], world frame
     spawn: Vector = SPAWN  # position of the base at the start of a mission [m], world frame
-    path: Path | None = None  # of a user's file, which may have more bodies; None: a shipped scene
+    path: Path | None = None  # of the file if it may have more bodies; None: this is all it has
 
 
 def is_obstacle(body: str, *, contact: bool) -> bool:
@@ -97,7 +97,9 @@ def load_scene(name: str) -> Scene:
         raise BadInputError(f"scene {path.name}: not readable as XML: {error}") from error
     except ValueError as error:
         raise BadInputError(f"scene {path.name}: {error}") from None
-    return Scene(path.stem, pipes, board, floor, (x, y, z), own)
+    bodies = {body.get("name") for body in root.iterfind("worldbody/body")}
+    is_complete = own is None and bodies <= {FLOOR, *(name for name, _ in numerics)}
+    return Scene(path.stem, pipes, board, floor, (x, y, z), None if is_complete else path)
 
 
 def _pipe(name: str, data: str) -> Pipe:
