@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections import Counter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -64,6 +65,19 @@ MAY_IMPORT: dict[str, set[str]] = {
     "__main__": {"cli"},
     "__init__": {"api"},
 }
+SHARED_NAMES = {
+    "Command",
+    "Direction",
+    "Failure",
+    "Guard",
+    "LowLevel",
+    "Mission",
+    "Problem",
+    "Sensors",
+    "Verdict",
+    "Wind",
+}
+"""Names that two public classes share today."""
 ALWAYS = {"errors", "messages", "records", "renamed", "source", "__version__", "rounding"}
 
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it. Ruff checks
@@ -179,3 +193,14 @@ def test_no_file_and_no_function_is_too_long():
             if function and node.end_lineno - node.lineno >= 50:
                 long.add(f"{place_of(path)}: {node.name}")
     assert long == set()
+
+
+def test_no_two_public_classes_share_a_name():
+    """A name that is left here must go: the next class that shares one fails this test."""
+    found = Counter(
+        node.name
+        for tree in TREES.values()
+        for node in tree.body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    )
+    assert {name for name, count in found.items() if count > 1} == SHARED_NAMES

@@ -31,7 +31,7 @@ from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.link.profile import Timeline
 from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE
 from cloudrc.link.traces import link_profile
-from cloudrc.link.verify.judge import Flow, Plan
+from cloudrc.link.verify.judge import Flow, Measurement
 from cloudrc.link.verify.probe import FIRST_PROBE, PROBE
 from cloudrc.tunnel.codec import SIZES
 
@@ -144,7 +144,7 @@ def compare(experiment: ResolvedExperiment, duration: float, rate: float) -> dic
     # Half a period away from the instants at which time lines change: a probe takes time.
     sent = FIRST_PROBE + (np.arange(round(duration * rate)) + 0.5) / rate
     plans = {
-        way: Plan(
+        way: Measurement(
             link_profile(getattr(experiment, way)),
             Flow(experiment.seed, way == "uplink", PROBE, SIZES[kind]),
             sent,

@@ -21,7 +21,7 @@ from cloudrc.cli.parser import whole_number
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 
 if TYPE_CHECKING:
-    from cloudrc.console.steering import Link
+    from cloudrc.console.steering import LinkControl
 
 EPILOG = """\
 examples:
@@ -99,7 +99,7 @@ class ConsoleTarget(NamedTuple):
 
     config: Path  # experiment file
     api: Api  # of teleop
-    link: Link  # reads and changes the link
+    link: LinkControl  # reads and changes the link
     has_ended: Callable[[], bool]
     token: Callable[[], str] | None = None  # of the page; None: a new one, which is printed
 
@@ -151,7 +151,7 @@ def _serve(options: argparse.Namespace, flight: ConsoleTarget) -> None:
 
 def _local(options: argparse.Namespace) -> ConsoleTarget:
     from cloudrc.cli.link_set import read_states, set_here
-    from cloudrc.console.steering import Link
+    from cloudrc.console.steering import LinkControl
     from cloudrc.drivers.local import LINK_FOLDER, under_way
 
     found = find_local_run(options, flag="")
@@ -163,7 +163,9 @@ def _local(options: argparse.Namespace) -> ConsoleTarget:
         states = read_states(run / LINK_FOLDER)
         return states[0].profile if states else {}
 
-    link = Link(read, lambda settings: set_here(run / LINK_FOLDER, None, settings, token_hex(4)))
+    link = LinkControl(
+        read, lambda settings: set_here(run / LINK_FOLDER, None, settings, token_hex(4))
+    )
     return ConsoleTarget(run / "config.yaml", Api(url), link, lambda: under_way().get(run) != url)
 
 
@@ -175,7 +177,7 @@ def _in_pod(options: argparse.Namespace) -> ConsoleTarget:
     """
     from cloudrc.config.document import read_document
     from cloudrc.console.access import page_token
-    from cloudrc.console.steering import Link
+    from cloudrc.console.steering import LinkControl
 
     own: dict[str, tuple[float, float]] = {}  # key -> last requested value, and when [s]
 
@@ -198,7 +200,7 @@ def _in_pod(options: argparse.Namespace) -> ConsoleTarget:
     return ConsoleTarget(
         options.config,
         Api(options.api, operator),
-        Link(read, change, note),
+        LinkControl(read, change, note),
         has_ended=lambda: False,
         token=(lambda: page_token(operator())) if file else None,
     )

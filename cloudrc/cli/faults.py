@@ -22,7 +22,7 @@ from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
     from cloudrc.faults.measures import Outcome, Scenario
-    from cloudrc.faults.trial import Finding
+    from cloudrc.faults.trial import TrialResult
 
 EPILOG = """\
 examples:
@@ -186,7 +186,7 @@ def search(options: argparse.Namespace) -> int:
         print(f"{kind} schedules from seed {options.first} on, for {options.minutes:g} min")
     began = time.monotonic()
 
-    def take(finding: Finding) -> None:
+    def take(finding: TrialResult) -> None:
         found["seconds"] = time.monotonic() - began
         _count(found, finding)
         if finding.breaches:
@@ -206,7 +206,7 @@ def search(options: argparse.Namespace) -> int:
     return code or (FAILED if found["failures"] else 0)
 
 
-def _fly_seeds(options: argparse.Namespace, began: float) -> Generator[Finding]:
+def _fly_seeds(options: argparse.Namespace, began: float) -> Generator[TrialResult]:
     """Fly one flight per seed, until `options.minutes` [min] have passed since `began` [s]."""
     fly = partial(fly_seed, adversarial=options.adversarial)
     for finding in map_in_order(fly, count(options.first), options.jobs):
@@ -215,7 +215,7 @@ def _fly_seeds(options: argparse.Namespace, began: float) -> Generator[Finding]:
             return
 
 
-def fly_seed(seed: int, adversarial: bool) -> Finding:
+def fly_seed(seed: int, adversarial: bool) -> TrialResult:
     """Fly the schedule for a seed: random faults, or a dishonest cloud with or without faults."""
     from cloudrc.faults import trial
     from cloudrc.faults.adversary import choose
@@ -224,7 +224,7 @@ def fly_seed(seed: int, adversarial: bool) -> Finding:
     return trial.fly((choose if adversarial else compose)(seed))
 
 
-def _count(found: dict[str, Any], finding: Finding) -> None:
+def _count(found: dict[str, Any], finding: TrialResult) -> None:
     """Add the finding of the next seed to `found`, the document of a search."""
     from cloudrc.faults.trial import checked_in
 
@@ -239,7 +239,7 @@ def _count(found: dict[str, Any], finding: Finding) -> None:
     found["missions_done"] += finding.missions
 
 
-def _store(finding: Finding, folder: Path) -> dict[str, Any]:
+def _store(finding: TrialResult, folder: Path) -> dict[str, Any]:
     """Write a schedule that broke an invariant into `folder`; return the failure for JSON."""
     from cloudrc.faults.schedule import dump
 

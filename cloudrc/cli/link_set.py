@@ -112,7 +112,7 @@ def set_here(
     from cloudrc.config.load import edit_profile
     from cloudrc.files import write_atomically
     from cloudrc.link.follow import HANDED_FILE, PROFILE
-    from cloudrc.link.state import CHANGE_FILE, Change, write_change
+    from cloudrc.link.state import CHANGE_FILE, ChangeFacts, write_change
 
     states = read_states(folder)
     if not states:
@@ -120,7 +120,7 @@ def set_here(
             f"{folder.parent}: no link is up there: the flight has not begun or has ended"
         )
     edit = edit_profile(Document(states[0].profile), profile, settings)
-    note = write_change(Change(number, edit.cause, edit.restart))
+    note = write_change(ChangeFacts(number, edit.cause, edit.restart))
     document = json.dumps({CHANGE_FILE: note, PROFILE: write_yaml(edit.values)})
     for state in states:
         write_atomically(folder / state.direction / HANDED_FILE, document.encode())

@@ -55,7 +55,7 @@ from cloudrc.link.verify.causes import (
     read_evidence,
     read_metrics,
 )
-from cloudrc.link.verify.judge import Flow, Plan, Row, look_twice, verdict_of
+from cloudrc.link.verify.judge import Flow, Judgement, Measurement, look_twice, verdict_of
 from cloudrc.link.verify.probe import PROBE, ProbeEnd, plan_probes, send_probes
 from cloudrc.tunnel.codec import SIZES, Kind
 
@@ -152,7 +152,7 @@ def verify(
 
 def make_plans(
     experiment: ResolvedExperiment, seconds: float | None, shaper: str
-) -> dict[str, Plan]:
+) -> dict[str, Measurement]:
     """Plan probes in both directions for `seconds` [s] (None: as long as needed).
 
     Raises:
@@ -171,7 +171,7 @@ def make_plans(
     return plans
 
 
-def measure(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Stream]:
+def measure(ways: Mapping[str, Way], plans: Mapping[str, Measurement]) -> dict[str, Stream]:
     """Send all probes over a running link; return what the probes measured in each direction."""
     since_wall_ns, ends = time.time_ns() - time.monotonic_ns(), []
     for name, way in ways.items():
@@ -181,7 +181,7 @@ def measure(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Str
     return dict(zip(ways, send_probes(ends), strict=True))
 
 
-def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Plan]) -> dict[str, Findings]:
+def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Measurement]) -> dict[str, Findings]:
     """Send all probes over a running link, and judge it; return direction -> findings."""
     streams, found = measure(ways, plans), {}
     time.sleep(COUNTS_WAIT)
@@ -353,13 +353,13 @@ def _findings(found: Mapping[str, Any], link: str) -> Findings:
     page, rows = json.loads(fetch(f"{link}/link.json") or "{}"), []
     for one in found["rows"]:
         asked, measured, low, high = (float(one.get(key, nan)) for key in KEYS)
-        rows.append(Row(one["quantity"], asked, measured, low, high, one["verdict"]))
+        rows.append(Judgement(one["quantity"], asked, measured, low, high, one["verdict"]))
     count = max((one["datagrams"] for one in found["rows"]), default=0)
     known = read_evidence(page, read_metrics(fetch(f"{link}/metrics")))
     return Findings(rows, known, f"{count} of the tunnel's own datagrams")
 
 
-def _notes(way: str, rows: Sequence[Row]) -> Iterator[str]:
+def _notes(way: str, rows: Sequence[Judgement]) -> Iterator[str]:
     judged = {row.name for row in rows if row.verdict != "told"}
     if not rows:
         yield f"{way}: no datagrams to measure; fly a mission first"
@@ -395,7 +395,7 @@ def make_report(title: str, findings: Mapping[str, Findings]) -> Report:
     }
 
 
-def _as_json(row: Row) -> dict[str, Any]:
+def _as_json(row: Judgement) -> dict[str, Any]:
     return {"name": row.name, "unit": row.unit} | _known(row._asdict())
 
 

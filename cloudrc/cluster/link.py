@@ -29,7 +29,7 @@ from cloudrc.link.follow import HANDED_FILE, PROFILE
 from cloudrc.link.state import (
     CHANGE_FILE,
     STATE_FILE,
-    Change,
+    ChangeFacts,
     LinkState,
     from_text,
     write_change,
@@ -138,7 +138,7 @@ def send(
     change.
     """
     edit, files = with_files(link.files, profile, settings)
-    files[CHANGE_FILE] = write_change(Change(number, edit.cause, edit.restart))
+    files[CHANGE_FILE] = write_change(ChangeFacts(number, edit.cause, edit.restart))
     document = json.dumps(_needed_files(edit.values, {**link.files, **files}))
 
     def ask(component: str) -> LinkState | CloudrcError:

@@ -26,7 +26,7 @@ _LINE = re.compile(r"[\t -~\x80-\xff]*")
 
 
 @dataclass(frozen=True)
-class Request:
+class PageRequest:
     """The head of an HTTP request."""
 
     method: str
@@ -44,7 +44,7 @@ class Request:
         return [value.lower() for value in self.values("upgrade")] == ["websocket"]
 
 
-def parse_head(head: bytes) -> Request:
+def parse_head(head: bytes) -> PageRequest:
     """Parse the head of an HTTP request, without the empty line at its end.
 
     Raises:
@@ -61,7 +61,7 @@ def parse_head(head: bytes) -> Request:
         if not (colon and _NAME.fullmatch(name) and _LINE.fullmatch(value)):
             raise ValueError("no request: a line is not a header")
         headers.append((name.lower(), value.strip("\t ")))
-    return Request(method, path, query, tuple(headers))
+    return PageRequest(method, path, query, tuple(headers))
 
 
 class Access:
@@ -76,7 +76,7 @@ class Access:
         self.token, self.origins = token, frozenset(origins)
         self._hosts = {origin.partition("://")[2] for origin in origins}
 
-    def is_own_page(self, request: Request) -> bool:
+    def is_own_page(self, request: PageRequest) -> bool:
         """Return whether the request comes from the console's page or from no page at all."""
         hosts, origins = request.values("host"), request.values("origin")
         if len(hosts) != 1 or len(origins) > 1:
@@ -88,12 +88,12 @@ class Access:
         own = {f"http://{host}"} if is_local else set()
         return not origins or origins[0] in own | self.origins
 
-    def has_token(self, request: Request) -> bool:
+    def has_token(self, request: PageRequest) -> bool:
         """Return whether the address has the token, or has none and the cookie has it."""
         given = self.given_tokens(request) or self._cookies(request)
         return bool(given) and all(self._is_token(each) for each in given)
 
-    def given_tokens(self, request: Request) -> list[str]:
+    def given_tokens(self, request: PageRequest) -> list[str]:
         """Return the tokens in the request's address, as they are written there."""
         pairs = (part.partition("=") for part in request.query.split("&"))
         return [value for name, _, value in pairs if name == PARAMETER]
@@ -103,7 +103,7 @@ class Access:
         """The name of the cookie. It differs between consoles: cookies ignore the port."""
         return f"cloudrc-{sha256(self.token().encode()).hexdigest()[:12]}"
 
-    def _cookies(self, request: Request) -> list[str]:
+    def _cookies(self, request: PageRequest) -> list[str]:
         pairs = (
             part.strip(" ").partition("=")
             for line in request.values("cookie")

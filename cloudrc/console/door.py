@@ -18,7 +18,7 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cloudrc.console.access import PARAMETER, Access, Request, parse_head
+from cloudrc.console.access import PARAMETER, Access, PageRequest, parse_head
 from cloudrc.console.handed import HandedSockets
 from cloudrc.errors import BadInputError, CloudrcError
 
@@ -44,7 +44,7 @@ WEB = Path(__file__).parent / "web"
 """Folder of the pages' parts."""
 
 
-class Answer(NamedTuple):
+class PageAnswer(NamedTuple):
     """An HTTP answer."""
 
     status: HTTPStatus
@@ -193,35 +193,35 @@ class Door:
         finally:
             self._loop.remove_reader(connection)
 
-    async def _answer(self, head: bytes) -> Answer | None:
+    async def _answer(self, head: bytes) -> PageAnswer | None:
         """Answer a request; return None if viser shall."""
         try:
             request = parse_head(head)
         except ValueError:
-            return Answer(HTTPStatus.BAD_REQUEST)
+            return PageAnswer(HTTPStatus.BAD_REQUEST)
         if not self._access.is_own_page(request):
-            return Answer(HTTPStatus.FORBIDDEN, FOREIGN.encode())
+            return PageAnswer(HTTPStatus.FORBIDDEN, FOREIGN.encode())
         try:
             if not self._access.has_token(request):
-                return Answer(HTTPStatus.FORBIDDEN, NO_TOKEN.encode())
+                return PageAnswer(HTTPStatus.FORBIDDEN, NO_TOKEN.encode())
         except CloudrcError as error:  # the file with the token cannot be read now
-            return Answer(HTTPStatus.SERVICE_UNAVAILABLE, str(error).encode())
+            return PageAnswer(HTTPStatus.SERVICE_UNAVAILABLE, str(error).encode())
         return await self._admit(request)
 
-    async def _admit(self, request: Request) -> Answer | None:
+    async def _admit(self, request: PageRequest) -> PageAnswer | None:
         """Answer a checked request; return None if viser shall."""
         if request.method == "POST":
             return await self._act(request.path.removeprefix("/"))
         if request.method != "GET":
-            return Answer(HTTPStatus.METHOD_NOT_ALLOWED)
+            return PageAnswer(HTTPStatus.METHOD_NOT_ALLOWED)
         if request.is_websocket:
             is_free = self._count_in()
-            return None if is_free else Answer(HTTPStatus.SERVICE_UNAVAILABLE)
+            return None if is_free else PageAnswer(HTTPStatus.SERVICE_UNAVAILABLE)
         if self._access.given_tokens(request):
             return self._keep_token(request)
         return self._page(request.path)
 
-    def _keep_token(self, request: Request) -> Answer:
+    def _keep_token(self, request: PageRequest) -> PageAnswer:
         """Move the token from the address to a cookie.
 
         The cookie has no path: the browser takes that of the page, also behind a proxy.
@@ -231,18 +231,18 @@ class Door:
         target = f"./{name}" + (f"?{'&'.join(parts)}" if parts else "")
         cookie = f"{self._access.cookie}={self._access.token()}; HttpOnly; SameSite=Lax"
         headers = (("Location", target), ("Set-Cookie", cookie))
-        return Answer(HTTPStatus.SEE_OTHER, headers=headers)
+        return PageAnswer(HTTPStatus.SEE_OTHER, headers=headers)
 
-    def _page(self, path: str) -> Answer:
+    def _page(self, path: str) -> PageAnswer:
         if path == "/state":
-            return Answer(HTTPStatus.OK, json.dumps(self._state()).encode(), "application/json")
+            return PageAnswer(HTTPStatus.OK, json.dumps(self._state()).encode(), "application/json")
         if path == "/plain" or (path == "/" and self._open >= PAGES_MAX):
             text = plain_page(self._state()["lines"])
         elif path == "/":
             text = self._scene
         else:
-            return Answer(HTTPStatus.NOT_FOUND)
-        return Answer(HTTPStatus.OK, text.encode(), "text/html; charset=utf-8")
+            return PageAnswer(HTTPStatus.NOT_FOUND)
+        return PageAnswer(HTTPStatus.OK, text.encode(), "text/html; charset=utf-8")
 
     def _state(self) -> dict[str, Any]:
         """Return the state, the buttons of the plain page, and whether all scenes are taken."""
@@ -252,17 +252,17 @@ class Door:
         lines += self._desk.describe()
         return {"lines": lines, "acts": acts, "is_full": self._open >= PAGES_MAX}
 
-    async def _act(self, name: str) -> Answer:
+    async def _act(self, name: str) -> PageAnswer:
         """Carry out what a page asks for."""
         if name == "stop":
             if self._desk.stop():
-                return Answer(HTTPStatus.ACCEPTED, b"stopping the rotors")
-            return Answer(HTTPStatus.SERVICE_UNAVAILABLE, b"the console starts; ask again")
+                return PageAnswer(HTTPStatus.ACCEPTED, b"stopping the rotors")
+            return PageAnswer(HTTPStatus.SERVICE_UNAVAILABLE, b"the console starts; ask again")
         if (act := self._desk.acts.get(name)) is None:
-            return Answer(HTTPStatus.NOT_FOUND)
+            return PageAnswer(HTTPStatus.NOT_FOUND)
         if self._desk.has_pilot():
-            return Answer(HTTPStatus.CONFLICT, b"another browser steers")
-        return Answer(HTTPStatus.OK, (await asyncio.to_thread(act)).encode())
+            return PageAnswer(HTTPStatus.CONFLICT, b"another browser steers")
+        return PageAnswer(HTTPStatus.OK, (await asyncio.to_thread(act)).encode())
 
 
 def scene_page(viser: str, keys: Mapping[str, str]) -> str:

@@ -31,7 +31,7 @@ SLIDERS: dict[str, tuple[str, float, float, float]] = {
 setting's unit to that of the slider."""
 
 
-class Api(Protocol):
+class TeleopApi(Protocol):
     """The API of teleop; both methods raise a CloudrcError with the reason of a refusal."""
 
     def get(self, path: str) -> Any:
@@ -42,7 +42,7 @@ class Api(Protocol):
 
 
 @dataclass(frozen=True)
-class Link:
+class LinkControl:
     """Functions for the emulated link, on this machine or in a cluster.
 
     Attributes:
@@ -69,8 +69,8 @@ class Steering:
         conditions: Key of the link, such as "uplink.delay_ms" -> present value, in the key's unit.
     """
 
-    api: Api
-    link: Link = Link()
+    api: TeleopApi
+    link: LinkControl = LinkControl()
     answer: tuple[str, bool, float] = ("", False, -inf)
     state: dict[str, Any] = field(default_factory=dict)
     route: list[Vector] = field(default_factory=list)

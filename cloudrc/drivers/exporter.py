@@ -20,9 +20,9 @@ from prometheus_client.metrics_core import Metric as Family
 
 from cloudrc import __version__
 from cloudrc.errors import MissingPrerequisiteError
-from cloudrc.exposition.live import Link, LiveMetrics
+from cloudrc.exposition.live import LinkMetrics, LiveMetrics
 from cloudrc.exposition.parts import Histogram, Readings, samples
-from cloudrc.exposition.table import Kind, Labels, Metric, of_role
+from cloudrc.exposition.table import Labels, LiveMetric, MetricKind, of_role
 from cloudrc.records import Counted, Record
 
 TEXT_FORMAT = "text/plain; version=0.0.4; charset=utf-8"
@@ -165,7 +165,7 @@ class Exporter:
         self._said_ready = ready
 
     @property
-    def link(self) -> Link:
+    def link(self) -> LinkMetrics:
         """The metrics of the emulated link; only an exporter with the role "link" has them."""
         assert self._live.link is not None, "only a link is shaped"
         return self._live.link
@@ -245,12 +245,12 @@ class Exporter:
         return Answer(503, f"the loop has stood still for {still:.0f} s\n")
 
 
-def _family(metric: Metric, reading: dict[Labels, float] | Histogram) -> Family:
+def _family(metric: LiveMetric, reading: dict[Labels, float] | Histogram) -> Family:
     if isinstance(reading, Histogram):
         bounds = [*map(str, reading.bounds), "+Inf"]
         buckets = list(zip(bounds, reading.cumulative(), strict=True))
         return HistogramMetricFamily(metric.name, metric.meaning, buckets, reading.total)
-    kind = CounterMetricFamily if metric.kind is Kind.COUNTER else GaugeMetricFamily
+    kind = CounterMetricFamily if metric.kind is MetricKind.COUNTER else GaugeMetricFamily
     family = kind(metric.name, metric.meaning, labels=list(metric.labels))
     for labels, value in reading.items():
         family.add_metric(labels, value)

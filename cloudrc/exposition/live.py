@@ -14,7 +14,7 @@ from typing import Any, TypeAlias, get_args
 
 from cloudrc.exposition import table
 from cloudrc.exposition.parts import Histogram, Readings, samples
-from cloudrc.exposition.table import Kind, Metric, of_role
+from cloudrc.exposition.table import LiveMetric, MetricKind, of_role
 from cloudrc.messages import NEVER_NS, Cause, GuardState
 from cloudrc.metrics.definitions import (
     DatagramTally,
@@ -273,7 +273,7 @@ class CloudEnd(End):
         terms["derivative"] = record.derivative
 
 
-class Link:
+class LinkMetrics:
     """Metrics of a process that shapes one direction of the link."""
 
     def __init__(self, values: Values) -> None:
@@ -295,7 +295,7 @@ NO_WAYPOINT = -1
 HELD = table.MISSION_STATES.index("held")
 
 
-class Mission:
+class MissionMetrics:
     """Metrics of missions, computed from mission events."""
 
     def __init__(self, values: Values) -> None:
@@ -324,15 +324,15 @@ class Mission:
             self._set("starting", NO_WAYPOINT)
 
 
-def _beginning(metric: Metric) -> Any:
+def _beginning(metric: LiveMetric) -> Any:
     """Return the value of a metric before the first record: 0 for a counter, else unknown."""
     if metric.buckets:
         return Histogram(metric.buckets)
-    value = 0 if metric.kind is Kind.COUNTER and metric.name not in ONE_SHAPER else nan
+    value = 0 if metric.kind is MetricKind.COUNTER and metric.name not in ONE_SHAPER else nan
     return dict.fromkeys(next(iter(metric.labels.values())), value) if metric.labels else value
 
 
-def _places(metrics: Iterable[Metric], values: Values) -> dict[str, list[tuple[Values, str]]]:
+def _places(metrics: Iterable[LiveMetric], values: Values) -> dict[str, list[tuple[Values, str]]]:
     """Map the name of each `Counted` record to the dicts and keys that store its total."""
     counted = [("*", outcomes) for outcomes in values.get("cloudrc_datagrams_total", {}).values()]
     places = defaultdict(list)
@@ -368,8 +368,8 @@ class LiveMetrics:
         self._values = values = {metric.name: _beginning(metric) for metric in metrics}
         ends: dict[str, type[WorldEnd | CloudEnd]] = {table.WORLD: WorldEnd, table.CLOUD: CloudEnd}
         self.end: End | None = ends[role](values) if role in ends else None
-        self.link = Link(values) if role == table.LINK else None
-        mission = Mission(values) if role == table.TELEOP else None
+        self.link = LinkMetrics(values) if role == table.LINK else None
+        mission = MissionMetrics(values) if role == table.TELEOP else None
         self._places = _places(metrics, values)
         self._handlers = _handlers(self, self.end, self.end and self.end.check, mission)
 

@@ -49,7 +49,7 @@ RELEASE_PERCENTILES = ("50", "99", "99.9")
 Labels = tuple[str, ...]
 
 
-class Kind(Enum):
+class MetricKind(Enum):
     """Type of a metric, as Prometheus names it."""
 
     COUNTER = "counter"
@@ -57,11 +57,11 @@ class Kind(Enum):
     HISTOGRAM = "histogram"
 
 
-class Metric(NamedTuple):
+class LiveMetric(NamedTuple):
     """One Prometheus metric."""
 
     name: str  # a histogram adds `_bucket`, `_sum` and `_count`
-    kind: Kind
+    kind: MetricKind
     meaning: str  # the HELP text, one or two sentences
     roles: tuple[str, ...]  # processes that expose the metric
     labels: Mapping[str, Labels]  # label -> all possible values; () if they are not known
@@ -235,7 +235,7 @@ _BUCKETS: Mapping[str, tuple[float, ...]] = {
 _ENTRY = re.compile(r"^(cloudrc_\w+)(?:\[(.*)\])?(?: = (\S+))?: (.*(?:\n .*)*)", re.MULTILINE)
 
 
-def _metrics() -> Iterator[Metric]:
+def _metrics() -> Iterator[LiveMetric]:
     for section in _TABLE.strip().split("\n\n"):
         roles, _, text = section.partition("\n")
         for name, names, count, meaning in _ENTRY.findall(text):
@@ -243,19 +243,19 @@ def _metrics() -> Iterator[Metric]:
                 each: _LABELS.get(f"{name} {each}") or _LABELS[each]
                 for each in re.findall(r"\w+", names)
             }
-            kind, buckets = Kind.GAUGE, _BUCKETS.get(name, ())
+            kind, buckets = MetricKind.GAUGE, _BUCKETS.get(name, ())
             if buckets:
-                kind = Kind.HISTOGRAM
+                kind = MetricKind.HISTOGRAM
             elif name.endswith("_total"):
-                kind = Kind.COUNTER
+                kind = MetricKind.COUNTER
             one_line = " ".join(meaning.split())
-            yield Metric(name, kind, one_line, tuple(roles.split()), labels, buckets, count)
+            yield LiveMetric(name, kind, one_line, tuple(roles.split()), labels, buckets, count)
 
 
-METRICS: Mapping[str, Metric] = MappingProxyType({metric.name: metric for metric in _metrics()})
+METRICS: Mapping[str, LiveMetric] = MappingProxyType({metric.name: metric for metric in _metrics()})
 """All metrics by name."""
 
 
-def of_role(role: str) -> list[Metric]:
+def of_role(role: str) -> list[LiveMetric]:
     """List the metrics that processes with this role, one of `ROLES`, expose."""
     return [metric for metric in METRICS.values() if role in metric.roles]

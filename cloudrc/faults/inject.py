@@ -15,7 +15,7 @@ from cloudrc.drivers.virtual import Clock
 from cloudrc.errors import BadInputError
 from cloudrc.faults.adversary import Lie
 from cloudrc.faults.models import Action, Call, RestartableEndpoint, Tamper, TeleopModel
-from cloudrc.faults.schedule import Event, Schedule, generator
+from cloudrc.faults.schedule import FaultEvent, Schedule, generator
 from cloudrc.link.profile import DirectionProfile
 from cloudrc.messages import Command
 from cloudrc.records import Control
@@ -78,7 +78,7 @@ def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> Direction
     return profile.model_copy(update=with_faults)
 
 
-def _change(profile: DirectionProfile, active: list[Event], at: float) -> Change:
+def _change(profile: DirectionProfile, active: list[FaultEvent], at: float) -> Change:
     """Return the link's conditions from `at` [s] on: the profile with the `active` faults."""
     delay_ms, jitter_ms, loss = profile.delay_ms, profile.jitter_ms, profile.loss
     for event in active:
@@ -109,7 +109,7 @@ def inject(flight: Target) -> None:
 
 
 def _actions(
-    flight: Target, process: RestartableEndpoint, event: Event
+    flight: Target, process: RestartableEndpoint, event: FaultEvent
 ) -> dict[str, tuple[tuple[float, Action], ...]]:
     """Return how to inject `event`: kind of fault -> pairs of time [s] and action.
 
@@ -144,7 +144,7 @@ def _actions(
     }
 
 
-def _tamper(events: list[Event], rng: np.random.Generator) -> Tamper:
+def _tamper(events: list[FaultEvent], rng: np.random.Generator) -> Tamper:
     captured: deque[bytes] = deque(maxlen=CAPTURED)
 
     def tamper(data: bytes, now_ns: int) -> list[bytes]:
@@ -177,7 +177,7 @@ def flipped(data: bytes, rng: np.random.Generator, flips: int) -> bytes:
 def bugs(schedule: Schedule, clock: Clock) -> Lie:
     """Return a function that replaces some commands by commands with impossible values.
 
-    While an event lasts, the function replaces `Event.value` commands per second.
+    While an event lasts, the function replaces `FaultEvent.value` commands per second.
     """
     rng, events = generator(schedule.seed, 43), schedule.of(*BUGS)
     due = [event.at for event in events]
@@ -193,7 +193,7 @@ def bugs(schedule: Schedule, clock: Clock) -> Lie:
     return lie
 
 
-def _ruined(command: Command, event: Event, rng: np.random.Generator) -> Command:
+def _ruined(command: Command, event: FaultEvent, rng: np.random.Generator) -> Command:
     """Return the command with one number replaced by NaN or infinity, or with a huge velocity."""
     if event.kind == "values_huge":
         x, y, z = rng.choice([1e308, -1e308], 3).tolist()

@@ -33,7 +33,7 @@ ENDED = Cause.ENDED.words  # cause of a HOLD that the operator has requested
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class Requirement:
     """One check of a reaction: compares `measured` with `limit`, both in `unit`."""
 
     text: str
@@ -61,7 +61,7 @@ class Check:
 class Outcome:
     """Result of a scenario: its checks in order."""
 
-    checks: list[Check] = field(default_factory=list)
+    checks: list[Requirement] = field(default_factory=list)
     sha256: str = ""  # hash of the records of all its flights
     seconds: float = 0.0  # how long it ran [s]
     error: str = ""  # the exception that ended it, if any
@@ -73,19 +73,19 @@ class Outcome:
 
     def most(self, text: str, measured: float, limit: float, unit: str = "") -> None:
         """Check `measured` <= `limit`, both in `unit` [any unit]; `text` says what is measured."""
-        self.checks.append(Check(text, measured, "<=", limit, unit))
+        self.checks.append(Requirement(text, measured, "<=", limit, unit))
 
     def least(self, text: str, measured: float, limit: float) -> None:
         """Check `measured` >= `limit`, both without a unit [1]; `text` says what is measured."""
-        self.checks.append(Check(text, measured, ">=", limit))
+        self.checks.append(Requirement(text, measured, ">=", limit))
 
     def same(self, text: str, measured: float, limit: float) -> None:
         """Check that `measured` equals `limit`, both counts [1]; `text` says what is counted."""
-        self.checks.append(Check(text, measured, "==", limit))
+        self.checks.append(Requirement(text, measured, "==", limit))
 
     def true(self, text: str, holds: bool) -> None:
         """Check that the statement `text` is true; `holds` tells whether it is."""
-        self.checks.append(Check(text, float(holds), "==", 1.0, YES))
+        self.checks.append(Requirement(text, float(holds), "==", 1.0, YES))
 
     @property
     def passed(self) -> bool:

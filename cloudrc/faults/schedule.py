@@ -18,7 +18,7 @@ def generator(seed: int, use: int) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64([seed, use]))
 
 
-class Kind(NamedTuple):
+class FaultKind(NamedTuple):
     """A kind of fault: what happens, and the limits of its random duration and value."""
 
     text: str
@@ -28,33 +28,41 @@ class Kind(NamedTuple):
 
 
 KINDS = {
-    "blackout": Kind("no datagram passes", 8.0),
-    "delay": Kind("one-way delay rises by value [s]", 10.0, 0.01, 0.3),
-    "jitter": Kind("jitter rises to value [s]", 10.0, 0.01, 0.15),
-    "loss": Kind("a share of value is lost", 10.0, 0.05, 0.9),
-    "bursts": Kind("loss in bursts of value packets", 15.0, 3.0, 60.0),
-    "corruption": Kind("a share of value has 1 to 8 flipped bits", 10.0, 0.01, 1.0),
-    "garbage": Kind("value random datagrams arrive before every honest one", 5.0, 1.0, 20.0),
-    "replay": Kind("value captured datagrams arrive before every honest one", 5.0, 1.0, 20.0),
-    "cloud_killed": Kind("the cloud process is down", 5.0),
-    "pod_killed": Kind("the cloud pod with teleop is down", 8.0),
-    "teleop_killed": Kind("teleop is down", 6.0),
-    "teleop_shut_down": Kind("teleop pauses, and is down after a share of value", 6.0, 0.0, 1.0),
-    "pod_shut_down": Kind("teleop pauses, the pod is down after a share of value", 8.0, 0.0, 1.0),
-    "cloud_paused": Kind("the cloud process is stopped", 5.0),
-    "cloud_throttled": Kind("the cloud process gets a share of value of the CPU", 8.0, 0.05, 0.9),
-    "world_paused": Kind("the world process is stopped", 1.0),
-    "world_killed": Kind("the world process is down, then restarts", 3.0),
-    "world_throttled": Kind("the world process gets a share of value of the CPU", 8.0, 0.1, 0.95),
-    "teleop_paused": Kind("the teleop process is stopped", 5.0),
-    "second_cloud": Kind("another cloud with the same key joins", 15.0),
-    "key_rotated": Kind("world reads a new key, cloud reads it after the duration", 10.0),
-    "key_wrong": Kind("cloud has a wrong key", 10.0),
-    "values_invalid": Kind("value commands a second have NaN or infinity", 10.0, 1.0, 12.0),
-    "values_huge": Kind("value commands a second are 1e308 m/s", 10.0, 1.0, 4.0),
-    "second_order": Kind("another mission is ordered"),
-    "stopped": Kind("the operator stops the rotors, and acknowledges later"),
-    "held": Kind("the operator holds the mission, resumes it after the duration", 5.0),
+    "blackout": FaultKind("no datagram passes", 8.0),
+    "delay": FaultKind("one-way delay rises by value [s]", 10.0, 0.01, 0.3),
+    "jitter": FaultKind("jitter rises to value [s]", 10.0, 0.01, 0.15),
+    "loss": FaultKind("a share of value is lost", 10.0, 0.05, 0.9),
+    "bursts": FaultKind("loss in bursts of value packets", 15.0, 3.0, 60.0),
+    "corruption": FaultKind("a share of value has 1 to 8 flipped bits", 10.0, 0.01, 1.0),
+    "garbage": FaultKind("value random datagrams arrive before every honest one", 5.0, 1.0, 20.0),
+    "replay": FaultKind("value captured datagrams arrive before every honest one", 5.0, 1.0, 20.0),
+    "cloud_killed": FaultKind("the cloud process is down", 5.0),
+    "pod_killed": FaultKind("the cloud pod with teleop is down", 8.0),
+    "teleop_killed": FaultKind("teleop is down", 6.0),
+    "teleop_shut_down": FaultKind(
+        "teleop pauses, and is down after a share of value", 6.0, 0.0, 1.0
+    ),
+    "pod_shut_down": FaultKind(
+        "teleop pauses, the pod is down after a share of value", 8.0, 0.0, 1.0
+    ),
+    "cloud_paused": FaultKind("the cloud process is stopped", 5.0),
+    "cloud_throttled": FaultKind(
+        "the cloud process gets a share of value of the CPU", 8.0, 0.05, 0.9
+    ),
+    "world_paused": FaultKind("the world process is stopped", 1.0),
+    "world_killed": FaultKind("the world process is down, then restarts", 3.0),
+    "world_throttled": FaultKind(
+        "the world process gets a share of value of the CPU", 8.0, 0.1, 0.95
+    ),
+    "teleop_paused": FaultKind("the teleop process is stopped", 5.0),
+    "second_cloud": FaultKind("another cloud with the same key joins", 15.0),
+    "key_rotated": FaultKind("world reads a new key, cloud reads it after the duration", 10.0),
+    "key_wrong": FaultKind("cloud has a wrong key", 10.0),
+    "values_invalid": FaultKind("value commands a second have NaN or infinity", 10.0, 1.0, 12.0),
+    "values_huge": FaultKind("value commands a second are 1e308 m/s", 10.0, 1.0, 4.0),
+    "second_order": FaultKind("another mission is ordered"),
+    "stopped": FaultKind("the operator stops the rotors, and acknowledges later"),
+    "held": FaultKind("the operator holds the mission, resumes it after the duration", 5.0),
 }
 """Name of a fault in a schedule's file -> kind of fault."""
 SHARES = ("loss", "corruption", "cloud_throttled", "world_throttled", "teleop_shut_down",
@@ -70,7 +78,7 @@ WAYS: tuple[Way, ...] = ("both", "up", "down")
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class FaultEvent:
     """One fault, from `at` [s] for `duration` [s]; link faults hit one direction or both.
 
     The meaning and the unit of `value` depend on the kind of fault; the texts in `KINDS` tell them.
@@ -102,7 +110,7 @@ class Schedule:
     __pydantic_config__: ClassVar[ConfigDict] = _CONFIG
     seed: Annotated[int, Field(ge=0, le=2**63)]
     profile: str = "paper-p2"
-    events: tuple[Event, ...] = ()
+    events: tuple[FaultEvent, ...] = ()
     duplicate: Share = 0.0  # share of datagrams that arrive twice
     reorder: Share = 0.0  # share of datagrams that overtake others
     cloud_offset: Annotated[float, Field(ge=-OFFSET_MAX, le=OFFSET_MAX)] = 0.0
@@ -117,7 +125,7 @@ class Schedule:
         """Time at which the last fault ends [s, virtual time]; 0 without faults."""
         return max((event.end for event in self.events), default=0.0)
 
-    def of(self, *kinds: str) -> list[Event]:
+    def of(self, *kinds: str) -> list[FaultEvent]:
         """List the faults of these kinds in the order of time."""
         return sorted((e for e in self.events if e.kind in kinds), key=lambda e: e.at)
 
@@ -161,7 +169,7 @@ def compose(seed: int) -> Schedule:
     A schedule without faults uses one of the paper's link profiles, with which the guard should
     never enter HOLD.
     """
-    rng, kinds, events = generator(seed, 40), sorted(KINDS), list[Event]()
+    rng, kinds, events = generator(seed, 40), sorted(KINDS), list[FaultEvent]()
     for _ in range(int(rng.integers(13))):
         kind = kinds[int(rng.integers(len(kinds)))]
         if kind not in ONCE or all(event.kind != kind for event in events):
@@ -182,14 +190,14 @@ def compose(seed: int) -> Schedule:
     )
 
 
-def _event(kind: str, rng: np.random.Generator) -> Event:
+def _event(kind: str, rng: np.random.Generator) -> FaultEvent:
     _, longest, low, high = KINDS[kind]
     at, way = float(rng.uniform(0.5, CALM - 1.0)), WAYS[int(rng.integers(3))]
     duration = 0.0
     if longest:  # short ones are as likely as long ones: 20 ms find as much as 5 s
         duration = min(max(longest * float(rng.uniform()) ** 3, 0.02), CALM - at)
     value = float(rng.uniform(low, high))
-    return Event(kind, round(at, 3), round(duration, 3), round(value, 4), way)
+    return FaultEvent(kind, round(at, 3), round(duration, 3), round(value, 4), way)
 
 
 def _sometimes(rng: np.random.Generator, most: float) -> float:

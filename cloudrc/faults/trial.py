@@ -44,7 +44,7 @@ PATIENCE_NS = 1_000_000_000  # shortest time between two actions of the operator
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class TrialResult:
     """Result of a flight with a schedule of faults."""
 
     schedule: Schedule
@@ -60,7 +60,7 @@ class Finding:
         return {breach.kind for breach in self.breaches}
 
 
-def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
+def fly(schedule: Schedule, *, keep: bool = False) -> TrialResult:
     """Fly with a schedule of faults.
 
     With `keep` the records are kept and hashed, which doubles the time.
@@ -70,7 +70,7 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
             dishonest cloud, or if its faults do not fit the profile.
     """
     flight = FaultRun(schedule, keep=keep)
-    watch, operator = flight.watch, Operator(flight)
+    watch, operator = flight.watch, TrialOperator(flight)
     try:
         flight.fly(schedule.duration)
     except Exception as error:  # world and cloud must survive every fault
@@ -84,7 +84,7 @@ def fly(schedule: Schedule, *, keep: bool = False) -> Finding:
     for kind in [kind for kind in checks if kind in checked_in(schedule)]:
         checks[kind]()
     sha256, done = flight.sha256() if keep else "", len(flight.events("done"))
-    return Finding(schedule, tuple(watch.breaches), sha256, watch.margin, watch.speed, done)
+    return TrialResult(schedule, tuple(watch.breaches), sha256, watch.margin, watch.speed, done)
 
 
 def checked_in(schedule: Schedule) -> frozenset[str]:
@@ -102,7 +102,7 @@ def checked_in(schedule: Schedule) -> frozenset[str]:
     return frozenset(name for name in INVARIANTS if sometimes.get(name, True))
 
 
-class Operator:
+class TrialOperator:
     """Orders one mission after another, and acknowledges each landing and emergency stop."""
 
     def __init__(self, flight: FaultRun) -> None:

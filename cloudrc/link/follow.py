@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc.errors import BadInputError
 from cloudrc.files import read, version
-from cloudrc.link.state import CHANGE_FILE, Change, parse, read_change
+from cloudrc.link.state import CHANGE_FILE, ChangeFacts, parse, read_change
 
 if TYPE_CHECKING:
     from cloudrc.link.profile import DirectionProfile
@@ -42,7 +42,7 @@ class Loaded(NamedTuple):
 
     direction: DirectionProfile  # profile of the direction that this process shapes, in SI units
     values: dict[str, Any]  # content of the file, without defaults, to show to users
-    change: Change = Change()  # the last change of the profile: its number and cause
+    change: ChangeFacts = ChangeFacts()  # the last change of the profile: its number and cause
 
 
 Load = Callable[[Path], Loaded]
@@ -121,7 +121,7 @@ class Profiles:
                 return loaded
             if _with_names(known) != _with_names(loaded.values):
                 # `helm upgrade` keeps the number of the previous change.
-                return loaded._replace(change=Change())
+                return loaded._replace(change=ChangeFacts())
             if known != loaded.values:  # the same files in another folder, which stays
                 return loaded._replace(change=replace(loaded.change, restart=False))
         return None

@@ -25,11 +25,11 @@ RELEASED = frozenset(
     | {f"release_error_{quantile}_ns" for quantile in ("p50", "p99", "p999")}
 )
 """Names in the file with the suffix `RELEASED_SUFFIX`."""
-CHANGE_FILE = "change.json"  # last `Change` of a profile, in the profile's folder
+CHANGE_FILE = "change.json"  # last `ChangeFacts` of a profile, in the profile's folder
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class ChangeFacts:
     """Facts about a change of a link profile; `cloudrc link set` writes them to `CHANGE_FILE`.
 
     If `restart` is True, the profile's time line starts again when the new profile takes effect.
@@ -91,15 +91,15 @@ def from_text(text: bytes | str) -> LinkState:
     return parse(LinkState, text)
 
 
-def write_change(change: Change) -> str:
+def write_change(change: ChangeFacts) -> str:
     """Format a change as the content of change.json."""
     return json.dumps(asdict(change)) + "\n"
 
 
-def read_change(text: str) -> Change:
-    """Parse the content of change.json; return an empty `Change` if the text is invalid."""
+def read_change(text: str) -> ChangeFacts:
+    """Parse the content of change.json; return an empty `ChangeFacts` if the text is invalid."""
     try:
         found = json.loads(text)
-        return Change(str(found["number"]), str(found["cause"]), bool(found["restart"]))
+        return ChangeFacts(str(found["number"]), str(found["cause"]), bool(found["restart"]))
     except (ValueError, KeyError, TypeError):
-        return Change()
+        return ChangeFacts()

@@ -89,7 +89,7 @@ _UNPACK: dict[str, Callable[[bytes, int], bytes]] = {
 used, because they allocate whatever size the file claims."""
 
 
-class Part(NamedTuple):
+class FilePart(NamedTuple):
     """A chunk, an attachment or a metadata record of a file."""
 
     start: int  # position in the file [bytes]
@@ -101,8 +101,8 @@ class Part(NamedTuple):
 class _Found:
     """What a search has found in a damaged file."""
 
-    parts: list[Part] = field(default_factory=list)  # intact records, by position
-    holes: list[Part] = field(default_factory=list)  # damage between them, by position
+    parts: list[FilePart] = field(default_factory=list)  # intact records, by position
+    holes: list[FilePart] = field(default_factory=list)  # damage between them, by position
     size: int = 0  # size of the file up to its end, or up to its last intact record [bytes]
     data_ended: bool = False  # whether nothing is missing behind the last part
     ended: bool = False  # whether the file has an end
@@ -122,7 +122,7 @@ class _Found:
             for record in StreamReader(stream, skip_magic=True, emit_chunks=True).records:
                 self._store(record, contents)
         # If bytes were lost or inserted, the positions hold up to the first damage only.
-        self.holes = [Part(at, size, contents.get(at, "")) for at, size, _ in self.holes]
+        self.holes = [FilePart(at, size, contents.get(at, "")) for at, size, _ in self.holes]
 
     def _store(self, record: mcap.McapRecord, contents: dict[int, str]) -> None:
         if isinstance(record, mcap.ChunkIndex):
@@ -177,7 +177,7 @@ class File:
         self.ended = False  # whether the whole file was read
         self.fault = ""  # why reading stopped or what is wrong, in words; "" if nothing is wrong
         self.cut = False  # whether the file breaks off at the fault, as after a kill
-        self.gaps = list[Part]()  # what was left out
+        self.gaps = list[FilePart]()  # what was left out
         self.read = Counter[int]()  # channel -> number of messages, also of other programs
         self.statistics: mcap.Statistics | None = None
         self.channels: dict[int, mcap.Channel] = {}
@@ -231,7 +231,7 @@ class File:
         for record in reader.records:
             end = self._stream.tell()
             if isinstance(record, mcap.Chunk):
-                self._store_chunk(record, Part(self.position, end - self.position, ""))
+                self._store_chunk(record, FilePart(self.position, end - self.position, ""))
             elif not self.data_ended:  # records after the data repeat the definitions
                 self._store(record)
             if isinstance(record, mcap.Statistics):
@@ -302,9 +302,11 @@ class File:
                     end = self._next_intact(data, position + 1)
                 if end == len(data):
                     break  # the rest is lost
-                found.holes.append(Part(position, end - position, ""))
+                found.holes.append(FilePart(position, end - position, ""))
             elif isinstance(record, mcap.Chunk) and data[position:end] in chunks:
-                found.holes.append(Part(position, end - position, ""))  # inserted bytes repeat it
+                found.holes.append(
+                    FilePart(position, end - position, "")
+                )  # inserted bytes repeat it
             elif isinstance(record, mcap.Footer):
                 found.ended = found.data_ended = True
                 end += len(MCAP0_MAGIC)
@@ -312,7 +314,7 @@ class File:
             elif isinstance(record, mcap.DataEnd):
                 found.data_ended, index = True, end
             elif not index:
-                found.parts.append(Part(position, end - position, ""))
+                found.parts.append(FilePart(position, end - position, ""))
                 if isinstance(record, mcap.Chunk):
                     chunks.add(data[position:end])
             position = end
@@ -353,7 +355,7 @@ class File:
             return None, end
         return record, end
 
-    def _store_chunk(self, chunk: mcap.Chunk, part: Part) -> None:
+    def _store_chunk(self, chunk: mcap.Chunk, part: FilePart) -> None:
         """Store the records of a chunk; leave out a damaged chunk."""
         try:
             for record in self._unpack(chunk):
@@ -507,7 +509,7 @@ def _note(file: File) -> None:
     recording.told = to_one_line(metadata.get(MISSING, ""))
 
 
-def _describe(gaps: list[Part]) -> str:
+def _describe(gaps: list[FilePart]) -> str:
     """Describe the damaged parts of a file in words."""
     shown = [
         f"byte {gap.start}" + f" ({gap.content})" * bool(gap.content) for gap in gaps[:LISTED_MAX]

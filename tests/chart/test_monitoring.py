@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from cloudrc.exposition import table
-from cloudrc.exposition.table import METRICS, Kind
+from cloudrc.exposition.table import METRICS, MetricKind
 from tests.chart.conftest import CHART, OPERATOR, metrics_ports, of_kind, pod_specs, render
 from tools.dashboards import draw, expressions, fetch
 
@@ -52,7 +52,7 @@ def test_scrape_annotations_are_optional(wanted):
 
 def series():
     """Return the names of all series; a histogram has the series bucket, sum and count."""
-    parts = {Kind.HISTOGRAM: ("_bucket", "_sum", "_count")}
+    parts = {MetricKind.HISTOGRAM: ("_bucket", "_sum", "_count")}
     return {name + part for name, one in METRICS.items() for part in parts.get(one.kind, ("",))}
 
 

@@ -16,8 +16,8 @@ from cloudrc.cli.pool import WorkerDiedError
 from cloudrc.faults.invariants import Breach
 from cloudrc.faults.measures import Outcome
 from cloudrc.faults.scenarios import SCENARIOS
-from cloudrc.faults.schedule import Event, Schedule, dump, load
-from cloudrc.faults.trial import Finding
+from cloudrc.faults.schedule import FaultEvent, Schedule, dump, load
+from cloudrc.faults.trial import TrialResult
 
 NUMBERS = (*range(1, 14), 15, 17, *range(20, 26), 27, 28, 40)
 KILLED = WorkerDiedError("a worker was killed")
@@ -76,7 +76,7 @@ def test_bad_input_is_told_in_one_line(words, said, refused):
 )
 def test_what_was_flown_before_an_interrupt_is_kept(line, error, code, said, monkeypatch, call):
     def flown(function, work, jobs):
-        yield Finding(Schedule(1), ()) if "search" in line else Outcome()
+        yield TrialResult(Schedule(1), ()) if "search" in line else Outcome()
         raise error
 
     monkeypatch.setattr("cloudrc.cli.faults.map_in_order", flown)
@@ -101,7 +101,7 @@ def find(monkeypatch, call):
             if schedule.seed == INTERRUPTED:
                 os.kill(os.getpid(), signal.SIGTERM)
             breaches = (Breach(1.0, "stuck", "not flown"),) if schedule.seed == BAD else ()
-            return Finding(schedule, breaches, "", 1.0 / (1 + schedule.seed), 2.0, 2)
+            return TrialResult(schedule, breaches, "", 1.0 / (1 + schedule.seed), 2.0, 2)
 
         clock = [0.0]
         monkeypatch.setattr("cloudrc.faults.trial.fly", fly)
@@ -134,7 +134,7 @@ def test_a_search_counts_stores_and_can_continue(find):
 
 def test_a_search_and_its_schedule_are_flown_for_real(call):
     assert "1 random schedules" in call("faults search --minutes 1e-9 --store new").out
-    schedule = Schedule(1, events=(Event("blackout", 2.0, 0.5),), duration=3.0)
+    schedule = Schedule(1, events=(FaultEvent("blackout", 2.0, 0.5),), duration=3.0)
     Path("schedule.yaml").write_text(dump(schedule))
     told = json.loads(call("faults run schedule.yaml -o json").out)
     assert (told["breaches"], len(told["records_sha256"])) == ([], 64)

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from cloudrc.console.steering import Link, Steering
+from cloudrc.console.steering import LinkControl, Steering
 from cloudrc.errors import BadInputError
 from cloudrc.messages import ZERO
 from tests.conftest import wait_until
@@ -38,7 +38,7 @@ def test_a_drive_ends_with_a_request_to_rest(api, steering):
 @pytest.mark.parametrize("loss", [0.02, {"good_to_bad": 0.1}])
 def test_sliders_show_the_numbers_of_the_profile(api, loss):
     api.answers["/v1/state"] = {"mission": None}
-    steering = Steering(api, Link(lambda: {"uplink": {"delay_ms": 40, "loss": loss}}))
+    steering = Steering(api, LinkControl(lambda: {"uplink": {"delay_ms": 40, "loss": loss}}))
     steering.watch()
     assert steering.conditions["uplink.delay_ms"] == 40.0
     assert steering.conditions["downlink.jitter_ms"] == 0.0
@@ -97,7 +97,7 @@ def test_an_unreadable_link_leaves_the_missions_in_sight(api):
         raise BadInputError("profile.yaml: cannot be read")
 
     api.answers["/v1/state"] = {"mission": None, "queue": []}
-    steering = Steering(api, Link(unreadable))
+    steering = Steering(api, LinkControl(unreadable))
     steering.watch()
     assert steering.state == {"mission": None, "queue": []}
     assert steering.answer[:2] == ("profile.yaml: cannot be read", True)
@@ -124,7 +124,7 @@ def test_a_slow_link_gets_the_newest_value_of_each_slider(steering):
             raise BadInputError("loss: must be at most 1")
         go.wait()
 
-    steering.link = Link(change=change, note=" requested")
+    steering.link = LinkControl(change=change, note=" requested")
     steering.start()
     steering.set_link("uplink.delay_ms", 10)
     wait_until(lambda: applied)

@@ -13,7 +13,15 @@ from prometheus_client.parser import text_string_to_metric_families
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers import exporter as exporters
 from cloudrc.drivers.exporter import Exporter, read_throttling
-from cloudrc.exposition.table import BODIES, ENDS, LINK_OUTCOMES, METRICS, ROLES, Kind, of_role
+from cloudrc.exposition.table import (
+    BODIES,
+    ENDS,
+    LINK_OUTCOMES,
+    METRICS,
+    ROLES,
+    MetricKind,
+    of_role,
+)
 from cloudrc.link.relay import ReleaseErrors
 from cloudrc.messages import ZERO
 from cloudrc.records import (
@@ -71,7 +79,7 @@ def test_a_flight_shows_the_metrics_of_its_role(role, flight):
         found.add(family.name + "_total" * (family.type == "counter"))
         for sample in family.samples:
             metric = METRICS.get(sample.name)
-            if metric is not None and metric.kind is not Kind.HISTOGRAM:
+            if metric is not None and metric.kind is not MetricKind.HISTOGRAM:
                 assert set(sample.labels) == set(metric.labels)
     expected = {metric.name for metric in of_role(role)}
     own = {name for name in found if not name.startswith("process_")}

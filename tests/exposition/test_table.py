@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.exposition import table
-from cloudrc.exposition.table import METRICS, Kind
+from cloudrc.exposition.table import METRICS, MetricKind
 from cloudrc.geometry.scene import BOARD, FLOOR
 from cloudrc.teleop.wire import QUEUED, STATES
 from tools.docs import OPEN
@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.mark.parametrize("metric", METRICS.values(), ids=lambda metric: metric.name)
 def test_a_metric_keeps_the_rules(metric):
     assert re.fullmatch(r"cloudrc(_[a-z]+)+", metric.name)
-    assert metric.name.endswith("_total") == (metric.kind is Kind.COUNTER)
+    assert metric.name.endswith("_total") == (metric.kind is MetricKind.COUNTER)
     assert metric.meaning.endswith(".")
     assert set(metric.roles) <= set(table.ROLES)
     assert list(metric.buckets) == sorted(metric.buckets)

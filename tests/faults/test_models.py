@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from cloudrc.drivers.virtual import Clock
 from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.schedule import Event, Schedule
+from cloudrc.faults.schedule import FaultEvent, Schedule
 from cloudrc.messages import GuardState
 
 
@@ -18,7 +18,7 @@ def test_a_clock_reaches_a_time_exactly_when_it_says(offset_ns, drift_ppm, now_n
 
 
 def test_teleop_pauses_and_its_successor_resumes():
-    schedule = Schedule(3, "ideal", (Event("pod_shut_down", 8.0, 4.0, 0.25),))
+    schedule = Schedule(3, "ideal", (FaultEvent("pod_shut_down", 8.0, 4.0, 0.25),))
     flight = FaultRun(schedule).fly(8.5)
     assert flight.events("paused")
     assert flight.guard_now()[0] is GuardState.HOLD

@@ -10,7 +10,7 @@ from cloudrc.cloud.operator import EmergencyStopRepeater
 from cloudrc.errors import BadInputError
 from cloudrc.faults.adversary import POLICIES, choose
 from cloudrc.faults.invariants import Watch
-from cloudrc.faults.schedule import Event, Schedule, compose, load
+from cloudrc.faults.schedule import FaultEvent, Schedule, compose, load
 from cloudrc.faults.trial import FORGETFUL, _check_waypoints, checked_in, fly
 from cloudrc.messages import ZERO
 from cloudrc.records import CommandApplied, SessionOpened
@@ -44,7 +44,7 @@ def test_a_hostile_cloud_causes_no_breach(policy):
     assert fly(replace(choose(seed), duration=8.0)).breaches == ()
 
 
-BLACKOUT, STOPPED = Event("blackout", 44.0, 8.0), Event("stopped", 5.0)
+BLACKOUT, STOPPED = FaultEvent("blackout", 44.0, 8.0), FaultEvent("stopped", 5.0)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ BLACKOUT, STOPPED = Event("blackout", 44.0, 8.0), Event("stopped", 5.0)
         ((BLACKOUT,), "", 61.0, "collision waypoint"),
         ((STOPPED,), "", 60.0, "collision waypoint stuck obeyed"),
         ((STOPPED,), "greedy", 60.0, ""),
-        *(((STOPPED, Event(n, 9.0)), "", 60.0, "collision waypoint stuck") for n in FORGETFUL),
+        *(((STOPPED, FaultEvent(n, 9.0)), "", 60.0, "collision waypoint stuck") for n in FORGETFUL),
     ],
 )
 def test_a_schedule_is_checked_for_what_it_allows(events, policy, duration, kinds):
@@ -67,8 +67,8 @@ def test_a_schedule_is_checked_for_what_it_allows(events, policy, duration, kind
 HELD = Schedule(
     3,
     events=(
-        *(Event("blackout", at, lasts) for at, lasts in ((6.0, 0.4), (6.8, 0.3), (9.5, 1.5))),
-        *(Event("stopped", 12.0), Event("blackout", 15.0, 3.0)),
+        *(FaultEvent("blackout", at, lasts) for at, lasts in ((6.0, 0.4), (6.8, 0.3), (9.5, 1.5))),
+        *(FaultEvent("stopped", 12.0), FaultEvent("blackout", 15.0, 3.0)),
     ),
     duration=30.0,
     hold_max=2.0,
@@ -104,7 +104,7 @@ def fails_to_shut_down(patch):
         (
             fails_to_shut_down,
             "error",
-            Schedule(3, events=(Event("pod_shut_down", 4.0, 2.0, 0.5),), duration=5.0),
+            Schedule(3, events=(FaultEvent("pod_shut_down", 4.0, 2.0, 0.5),), duration=5.0),
         ),
     ],
 )
@@ -149,6 +149,6 @@ def test_a_waypoint_is_reached_once_and_in_order(waypoints, kinds):
 
 
 def test_a_fault_of_the_link_needs_a_profile_without_changes():
-    schedule = Schedule(1, "handover", (Event("delay", 1.0, 1.0, 0.1),))
+    schedule = Schedule(1, "handover", (FaultEvent("delay", 1.0, 1.0, 0.1),))
     with pytest.raises(BadInputError, match=r"handover changes over time, .* delay cannot be"):
         fly(schedule)

@@ -7,7 +7,7 @@ import pytest
 
 from cloudrc.faults import measures
 from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.schedule import Event, Schedule
+from cloudrc.faults.schedule import FaultEvent, Schedule
 from cloudrc.geometry.clearance import pipe_index
 from cloudrc.geometry.scene import load_scene
 from tests.conftest import nightly
@@ -40,7 +40,7 @@ def mid_pipe(*settings):
 def interrupt(figure, kill, at, *settings, calm=1.0):
     """Kill cloud's process, of which the new one knows nothing; or silence the link."""
     back = at + (KILLED if kill else SILENT)
-    event = Event("cloud_killed", at, KILLED) if kill else Event("blackout", at, SILENT)
+    event = FaultEvent("cloud_killed", at, KILLED) if kill else FaultEvent("blackout", at, SILENT)
     flight = FaultRun(Schedule(1, events=(event,), hold_max=100.0), *PATIENCE, *settings)
     flight.fly_mission(200.0)
     waypoints = range(len(flight.mission.order.plan.legs))

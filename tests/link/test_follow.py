@@ -14,7 +14,7 @@ from cloudrc.link.follow import (
     PeerName,
     Profiles,
 )
-from cloudrc.link.state import Change
+from cloudrc.link.state import ChangeFacts
 
 LOAD = make_profile_loader("uplink")
 
@@ -88,7 +88,10 @@ def test_a_change_that_comes_both_ways_takes_effect_once(pod, faster):
     ways = [pod.hand, pod.put] if faster == "hand" else [pod.put, pod.hand]
     ways[0](120.0, "a1")
     loaded = pod.profiles.poll()
-    assert (loaded.direction.delay_ms, loaded.change) == (120.0, Change("a1", "cause a1", False))
+    assert (loaded.direction.delay_ms, loaded.change) == (
+        120.0,
+        ChangeFacts("a1", "cause a1", False),
+    )
     assert pod.poll() is None
     ways[1](120.0, "a1")
     assert pod.poll() is None

@@ -20,7 +20,7 @@ from cloudrc.exposition.table import LINK_OUTCOMES, RELEASE_PERCENTILES
 from cloudrc.link import relay as module
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.relay import AGE_MAX_NS, QUANTILES, Relay, ReleaseErrors, Stamps, ask_for_stamps
-from cloudrc.link.verify.judge import Flow, Plan
+from cloudrc.link.verify.judge import Flow, Measurement
 from cloudrc.link.verify.probe import PROBE, ProbeEnd
 from cloudrc.tunnel.codec import Kind, encode_header
 from tests.conftest import wait_until
@@ -213,7 +213,7 @@ def test_a_change_in_flight_acts_within_1_s_and_loses_nothing(tmp_path):
         with bind_loopback() as stranger:
             stranger.sendto(encode_header(Kind.TELEMETRY, 0, 1, 999) + bytes(150), listen)
         Timer(0.2, draft.replace, [profile]).start()
-        plan = Plan(PLAIN, Flow(1, True, PROBE, 204), np.zeros(300))
+        plan = Measurement(PLAIN, Flow(1, True, PROBE, 204), np.zeros(300))
         with bind_loopback(end[1]) as own, bind_loopback(peer[1]) as far:
             sender = ProbeEnd(own, listen, plan, time.time_ns())
             ask_for_stamps(far)

@@ -10,7 +10,7 @@ import pytest
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.link.follow import Loaded
 from cloudrc.link.sidecar import Machine, Sidecar
-from cloudrc.link.state import Change
+from cloudrc.link.state import ChangeFacts
 from tests.link.profiles import profile_of
 
 PEER, NEXT = ("10.244.0.7", 7400), ("10.244.0.9", 7400)
@@ -103,7 +103,7 @@ class Bench:
         self.did.append(f"metric {state.shaper}")
         self.delays.append(state.asked["delay"])
 
-    def replace(self, delay, change=Change()):  # noqa: B008
+    def replace(self, delay, change=ChangeFacts()):  # noqa: B008
         values = {"description": f"{delay:g} s"}
         self.sidecar.profile = Loaded(profile_of(delay), values, change)
 
@@ -158,7 +158,7 @@ def test_the_peer_is_waited_for_and_its_new_address_followed(tmp_path):
     bench.at(1.0, lambda: bench.did.append(str(bench.route.exists())))
     bench.at(2.0, lambda: setattr(bench.sidecar, "peer", PEER))
     bench.at(2.5, lambda: setattr(bench.sidecar, "peer", NEXT))
-    bench.at(5.0, lambda: bench.replace(9.0, Change("c3", "for the relay", restart=False)))
+    bench.at(5.0, lambda: bench.replace(9.0, ChangeFacts("c3", "for the relay", restart=False)))
     bench.at(4.0, lambda: bench.routes.append(bench.route.read_text()))
     bench.run(7.0)
     assert bench.routes == ["10.244.0.9:7400\n", "127.0.0.1:7401\n"]
@@ -171,7 +171,7 @@ def test_the_peer_is_waited_for_and_its_new_address_followed(tmp_path):
 def test_a_new_profile_is_followed_within_a_step(tmp_path):
     bench = Bench(tmp_path, "relay")
     states = []
-    by_hand = Change("a1", "downlink.delay_ms=500", restart=False)
+    by_hand = ChangeFacts("a1", "downlink.delay_ms=500", restart=False)
     bench.at(1.0, lambda: bench.replace(0.5, by_hand))
     bench.at(1.15, lambda: bench.did.append("later"))
     bench.at(1.5, lambda: states.append(bench.told()))
@@ -192,11 +192,11 @@ def test_a_new_profile_is_followed_within_a_step(tmp_path):
 
 def test_a_profile_netem_cannot_do_is_refused_or_relayed(tmp_path):
     netem, auto = Bench(tmp_path, "netem"), Bench(tmp_path, "auto")
-    netem.at(1.0, lambda: netem.replace(9.0, Change("b2", "far")))
+    netem.at(1.0, lambda: netem.replace(9.0, ChangeFacts("b2", "far")))
     told = netem.run().told()
     assert (told["shaper"], told["changes"], told["refused"]) == ("netem", 0, "b2")
     assert "netem cannot do delay_ms" in told["refusal"]
-    auto.at(1.0, lambda: auto.replace(9.0, Change("b2", "far")))
+    auto.at(1.0, lambda: auto.replace(9.0, ChangeFacts("b2", "far")))
     told = auto.run().told()
     assert any("netem cannot do delay_ms" in line for line in auto.log)
     assert (told["shaper"], told["changes"], told["refused"]) == ("relay", 1, "")

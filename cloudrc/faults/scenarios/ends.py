@@ -14,7 +14,7 @@ from cloudrc.faults import measures
 from cloudrc.faults.adversary import Lie
 from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.measures import Outcome, fly_safely, refused, scenario
-from cloudrc.faults.schedule import Event, Schedule, Way, generator
+from cloudrc.faults.schedule import FaultEvent, Schedule, Way, generator
 from cloudrc.geometry import fence
 from cloudrc.geometry.scene import Pipe, load_scene
 from cloudrc.messages import Command, GuardState, Vector
@@ -41,7 +41,7 @@ EXCESSIVE: dict[str, dict[str, Any]] = {
 )
 def _cloud_killed(outcome: Outcome, seed: int) -> None:
     at, down = measures.instant(seed), 0.8
-    flight = FaultRun(Schedule(seed, events=(Event("cloud_killed", at, down),)))
+    flight = FaultRun(Schedule(seed, events=(FaultEvent("cloud_killed", at, down),)))
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)
     commands = [r.stamp_ns * 1e-9 - at for r in flight.of_world if isinstance(r, CommandApplied)]
@@ -58,7 +58,7 @@ def _cloud_killed(outcome: Outcome, seed: int) -> None:
     expects="HOLD; world applies no command that is too old",
 )
 def _cloud_paused(outcome: Outcome, seed: int) -> None:
-    paused = Event("cloud_paused", measures.instant(seed), 5.0)
+    paused = FaultEvent("cloud_paused", measures.instant(seed), 5.0)
     flight = fly_safely(outcome, FaultRun(Schedule(seed, events=(paused,))))
     measures.held_in_time(outcome, flight)
     applied = [r for r in flight.of_world if isinstance(r, CommandApplied)]
@@ -75,7 +75,7 @@ def _cloud_paused(outcome: Outcome, seed: int) -> None:
 )
 def _world_restarted(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
-    flight = FaultRun(Schedule(seed, events=(Event("world_killed", at, 2.0),)))
+    flight = FaultRun(Schedule(seed, events=(FaultEvent("world_killed", at, 2.0),)))
     flight.fly(at + 12.0)
     measures.safe(outcome, flight)
     after = [c for c in flight.changes if c.stamp_ns * 1e-9 > at]
@@ -100,7 +100,7 @@ def _world_restarted(outcome: Outcome, seed: int) -> None:
 )
 def _two_clouds(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed, 4.0, 12.0)
-    flight = FaultRun(Schedule(seed, events=(Event("second_cloud", at, 60.0),)))
+    flight = FaultRun(Schedule(seed, events=(FaultEvent("second_cloud", at, 60.0),)))
     flight.fly(at + 5.0)
     opened = max(measures.epochs(flight), default=-1)
     outcome.same("epochs while both clouds run", opened, 2)
@@ -140,7 +140,7 @@ def _swizzle(outcome: Outcome, seed: int) -> None:
     ways: tuple[Way, ...] = ("up", "down", "both", "both", "both")
     kinds = ("blackout", "blackout", "cloud_paused", "world_paused", "teleop_killed")
     faults = zip(kinds, spans, ways, strict=True)
-    events = tuple(Event(kind, *span, way=way) for kind, span, way in faults)
+    events = tuple(FaultEvent(kind, *span, way=way) for kind, span, way in faults)
     flight = FaultRun(Schedule(seed, events=events), "criteria.time_limit_s=120")
     fly_safely(outcome, flight)
     measures.held_in_time(outcome, flight)

@@ -7,7 +7,7 @@ from math import isnan, nan
 from cloudrc.faults import measures
 from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.measures import Outcome, fly_safely, scenario
-from cloudrc.faults.schedule import WAYS, Event, Schedule
+from cloudrc.faults.schedule import WAYS, FaultEvent, Schedule
 from cloudrc.messages import Cause, GuardState
 from cloudrc.records import Arrival, Control
 
@@ -30,7 +30,7 @@ def _short_silence(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
     for silent in WAYS:
         what, settings = ("both ways", []) if silent == "both" else (silent, [STEADY])
-        cut = Schedule(seed, events=(Event("blackout", at, 0.1, way=silent),))
+        cut = Schedule(seed, events=(FaultEvent("blackout", at, 0.1, way=silent),))
         flight = fly_safely(outcome, FaultRun(cut, *settings))
         outcome.same(f"silent {what}: HOLDs", len(measures.held(flight)), 0)
         for way, link in (("up", flight.uplink), ("down", flight.downlink)):
@@ -49,7 +49,7 @@ def _silence(outcome: Outcome, seed: int) -> None:
     for duration in (0.5, 3.0, 20.0):
         back, what = at + duration, f"{duration:g} s of silence"
         slow = ("guard.speed_max_mps=1.5", "criteria.time_limit_s=150")
-        cut = Schedule(seed, events=(Event("blackout", at, duration),))
+        cut = Schedule(seed, events=(FaultEvent("blackout", at, duration),))
         flight = fly_safely(outcome, FaultRun(cut, *slow), 150.0)
         measures.held_in_time(outcome, flight, f"{what}: HOLD after")
         if duration >= 3.0:
@@ -81,7 +81,7 @@ def _landed(outcome: Outcome, seed: int, at: float, where: str) -> FaultRun:
 
     `where` is the place of the robot, for the texts of the checks.
     """
-    cut = Schedule(seed, events=(Event("blackout", at, 75.0),))
+    cut = Schedule(seed, events=(FaultEvent("blackout", at, 75.0),))
     flight = FaultRun(cut, "criteria.time_limit_s=200")
     flight.fly(at + 80.0)
     measures.safe(outcome, flight)
@@ -191,7 +191,7 @@ def _clocks(outcome: Outcome, seed: int) -> None:
 def _delay_step(outcome: Outcome, seed: int) -> None:
     at = measures.instant(seed)
     link = "cloud.estimator=split", "link.both.delay_ms=10", "link.both.jitter_ms=1"
-    step = Schedule(seed, events=(Event("delay", at, HOUR, 0.09),))
+    step = Schedule(seed, events=(FaultEvent("delay", at, HOUR, 0.09),))
     flight = fly_safely(outcome, FaultRun(step, *link))
     off = [
         abs(r.horizon - r.loop_delay) / r.loop_delay

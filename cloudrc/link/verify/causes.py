@@ -12,7 +12,7 @@ from itertools import islice
 from math import inf, isnan
 from typing import Any, NamedTuple
 
-from cloudrc.link.verify.judge import Row
+from cloudrc.link.verify.judge import Judgement
 
 LATE, UNREAD, STOPPED = 1.5e-3, 0.003, 0.01
 """Limits of a shaper with enough CPU time: 99 % quantile of its release error [s]; share of
@@ -21,7 +21,7 @@ RAISED = ("mean", "round_trip", "deviation", "loss")  # rise if the shaper lacks
 PASSED = 0.9  # if the shaper counts less than this share of the arrived datagrams, some bypass it
 
 
-class Evidence(NamedTuple):
+class ShaperFacts(NamedTuple):
     """Facts about one direction's shaper, which its machine reports; None or "" means unknown."""
 
     shaper: str = ""  # "relay", "netem"; "none" if the interface has no netem qdisc
@@ -44,7 +44,7 @@ def read_metrics(text: str) -> dict[str, float]:
 
 def read_evidence(
     page: Mapping[str, Any], metrics: Mapping[str, float], sent: int | None = None
-) -> Evidence:
+) -> ShaperFacts:
     """Combine the page /link.json of a `link` container with its metrics.
 
     `sent` is the number of datagrams sent to the shaper since it started; None if unknown.
@@ -67,7 +67,7 @@ def read_evidence(
     passed = received + unread if metrics and not netem else None
     if netem and here:
         passed = max(int(one.get("packets", 0)) + int(one.get("drops", 0)) for one in here)
-    return Evidence(
+    return ShaperFacts(
         shaper="none" if netem and "netems" in page and not here else shaper,
         why=page.get("reason", ""),
         interface=interface,
@@ -80,7 +80,7 @@ def read_evidence(
     )
 
 
-class Cause(NamedTuple):
+class LinkCause(NamedTuple):
     """One reason why a link differs from its profile."""
 
     code: str  # one word, for programs
@@ -91,12 +91,12 @@ class Cause(NamedTuple):
 class Findings(NamedTuple):
     """Judged measurements of one direction of the link, and facts about its shaper."""
 
-    rows: Sequence[Row]
-    evidence: Evidence
+    rows: Sequence[Judgement]
+    evidence: ShaperFacts
     probes: str = ""  # which datagrams were measured, in words
 
 
-def find_causes(findings: Mapping[str, Findings]) -> list[Cause]:
+def find_causes(findings: Mapping[str, Findings]) -> list[LinkCause]:
     """List why measurements of a link have the verdict "off"; return [] if none has it."""
     found = {way: list(_causes_of(one)) for way, one in findings.items()}
     silent = [way for way, causes in found.items() if causes and causes[0][0] in _UNSHAPED]
@@ -106,7 +106,7 @@ def find_causes(findings: Mapping[str, Findings]) -> list[Cause]:
         found[silent[0]] = [("one_direction", text)]
     if len({*map(tuple, found.values())}) == 1 < len(found):
         found = {"both": next(iter(found.values()))}
-    return [Cause(code, way, text) for way, causes in found.items() for code, text in causes]
+    return [LinkCause(code, way, text) for way, causes in found.items() for code, text in causes]
 
 
 _UNSHAPED = ("no_qdisc", "wrong_interface", "no_sch_netem", "not_shaped")
@@ -147,14 +147,16 @@ def _causes_of(one: Findings) -> Iterator[tuple[str, str]]:
     yield from islice(_by_numbers(off), 1)
 
 
-def _by_numbers(off: Mapping[str, Row]) -> Iterator[tuple[str, str]]:
+def _by_numbers(off: Mapping[str, Judgement]) -> Iterator[tuple[str, str]]:
     """Yield code and text of each cause that the measured values show, the most certain first."""
     for code, name, low, high, text in _BY_NUMBERS:
         if name in off and low <= _ratio(off[name]) <= high:
             yield (code, describe(off[name]) + text)
 
 
-def _of_machine(known: Evidence, off: Mapping[str, Row], lost: float) -> Iterator[tuple[str, str]]:
+def _of_machine(
+    known: ShaperFacts, off: Mapping[str, Judgement], lost: float
+) -> Iterator[tuple[str, str]]:
     """Yield code and text of each cause that this machine's counters show, the most certain first.
 
     `known` has the counters. `off` has the measurements outside their limits, by name. `lost` is
@@ -183,11 +185,11 @@ def _of_machine(known: Evidence, off: Mapping[str, Row], lost: float) -> Iterato
     yield from ((code, text) for code, holds, text in table if holds)
 
 
-def _ratio(row: Row) -> float:
+def _ratio(row: Judgement) -> float:
     return row.measured / row.asked if row.asked else inf
 
 
-def describe(row: Row) -> str:
+def describe(row: Judgement) -> str:
     """Return a text such as "mean 52.00 ms instead of 40.00 ms", the measured value first."""
     return f"{row.name} {in_unit(row.measured, row.unit)} instead of {in_unit(row.asked, row.unit)}"
 

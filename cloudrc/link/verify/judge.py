@@ -60,14 +60,14 @@ class Flow(NamedTuple):
     size: int  # UDP payload [bytes]
 
 
-class Row(NamedTuple):
+class Judgement(NamedTuple):
     """Verdict on one quantity of one direction of a link; an unknown value is NaN.
 
     A `measured` value from `low` to `high` is accepted. `asked`, `measured`, `low` and `high` have
     the unit of the quantity (any unit).
     """
 
-    name: str  # as in `Plan.quantities`, or "round_trip"
+    name: str  # as in `Measurement.quantities`, or "round_trip"
     asked: float  # mean value of links with the requested profile
     measured: float
     low: float  # lowest accepted value
@@ -96,7 +96,7 @@ class Expected(NamedTuple):
         mean, low, high = self.bands[name]
         return 0.5 * (high - low) / tolerance(name, mean)
 
-    def judge(self, name: str, value: float) -> Row:
+    def judge(self, name: str, value: float) -> Judgement:
         """Judge whether a correct link can give the `value` [any unit] of the quantity `name`."""
         mean, low, high = self.bands[name]
         slack, hidden = tolerance(name, mean), self.hidden(name)
@@ -106,11 +106,11 @@ class Expected(NamedTuple):
         verdict = "ok" if low <= value <= high else "off"
         if isnan(value) or (verdict == "ok" and hidden > CHANCE_MAX):
             verdict = "open"
-        return Row(name, mean, value, low, high, verdict)
+        return Judgement(name, mean, value, low, high, verdict)
 
 
 @dataclass(frozen=True)
-class Plan:
+class Measurement:
     """A measurement of one direction: the requested profile, and the datagrams to send.
 
     A train is a group of datagrams that are sent back to back to measure the rate. Before each
@@ -171,7 +171,7 @@ class Plan:
         }
         return self.chance._replace(bands=bands)
 
-    def judge(self, measured: Stream, epoch: int = 1, first: int = 0) -> list[Row]:
+    def judge(self, measured: Stream, epoch: int = 1, first: int = 0) -> list[Judgement]:
         """Judge a measured stream; return one row per quantity.
 
         If the stream cannot show a requested property, such as the rate without trains, its row has
@@ -292,9 +292,9 @@ def netem_makes(profile: DirectionProfile) -> DirectionProfile:
     return profile.model_copy(update={"correlation": 0.0, "loss": loss, "duplicate": twice})
 
 
-def told(name: str, asked: float) -> Row:
+def told(name: str, asked: float) -> Judgement:
     """Make a row that shows the requested value `asked` [unit of `name`] without a judgement."""
-    return Row(name, asked, nan, nan, nan, "told")
+    return Judgement(name, asked, nan, nan, nan, "told")
 
 
 def tolerance(name: str, asked: float) -> float:
@@ -303,13 +303,13 @@ def tolerance(name: str, asked: float) -> float:
     return max(floor, share * asked)
 
 
-def look_twice(first: Sequence[Row], second: Sequence[Row]) -> list[Row]:
+def look_twice(first: Sequence[Judgement], second: Sequence[Judgement]) -> list[Judgement]:
     """Combine two measurements of a link: a quantity is "off" only if "off" in both."""
     again = {row.name: row for row in second}
     return [again.get(row.name, row) if row.verdict == "off" else row for row in first]
 
 
-def verdict_of(rows: Iterable[Row]) -> str:
+def verdict_of(rows: Iterable[Judgement]) -> str:
     """Return "off" if any row is "off", "ok" if all judged rows are "ok", otherwise "open"."""
     verdicts = {row.verdict for row in rows} - {"told"}
     return "off" if "off" in verdicts else "ok" if verdicts == {"ok"} else "open"

@@ -30,8 +30,8 @@ from cloudrc.link.verify.judge import (
     TAIL,
     Expected,
     Flow,
-    Plan,
-    Row,
+    Judgement,
+    Measurement,
     told,
     verdict_of,
 )
@@ -68,7 +68,7 @@ class LinkMonitor:
         self._trips, self._lates = (deque[float](maxlen=KEPT) for _ in range(2))
         self._echoes = Echoes()
         self._asked: Asked | None = None
-        self._plans: list[Plan] = []  # for the received flow, and for the other direction
+        self._plans: list[Measurement] = []  # for the received flow, and for the other direction
         self._news = deque[dict[str, Any] | None](maxlen=1)  # the newest profile, if not used yet
         self._epoch, self._fresh = -1, True
         self._since_ns, self._due_ns = 0.0, 0
@@ -98,7 +98,8 @@ class LinkMonitor:
             sent = np.arange(float(RUN_LENGTH)) * self._period
             ways = () if asked is None else asked if self._uplink else asked[::-1]
             self._plans = [
-                Plan(settled(profile), self._flow, sent, pause=self._pause) for profile in ways
+                Measurement(settled(profile), self._flow, sent, pause=self._pause)
+                for profile in ways
             ]
 
     def _load(self, values: dict[str, Any] | None) -> Asked | None:
@@ -170,7 +171,7 @@ class LinkMonitor:
         for kept in (self._arrivals, self._trips, self._lates):
             kept.clear()
 
-    def _report(self, rows: list[Row], now_ns: int) -> list[Record]:
+    def _report(self, rows: list[Judgement], now_ns: int) -> list[Record]:
         """Make records of the verdicts; a first "off" becomes "open", a second stays "off"."""
         count, off = len(self._arrivals), {row.name for row in rows if row.verdict == "off"}
         if off - self._suspects:
@@ -180,7 +181,7 @@ class LinkMonitor:
         checked = [LinkChecked(now_ns, self._uplink, *row, count) for row in rows]
         return [*checked, *self._complain(rows, now_ns)]
 
-    def _complain(self, rows: list[Row], now_ns: int) -> list[Record]:
+    def _complain(self, rows: list[Judgement], now_ns: int) -> list[Record]:
         """Report a link that differs from its profile, when the verdict becomes "off"."""
         before, self._complained = self._complained, verdict_of(rows) == "off"
         if before or not self._complained:
@@ -190,7 +191,7 @@ class LinkMonitor:
         text = f"the {way} differs from its profile: {wrong}; see 'cloudrc link verify'"
         return [Fault(now_ns, "link", text)]
 
-    def _rows(self) -> list[Row]:
+    def _rows(self) -> list[Judgement]:
         """Judge all quantities; the row "time_line" tells that a profile changes over time."""
         stream, first, timed = _in_order(self._arrivals, self._period)
         rows = self._rows_of_flow(stream, first, timed)
@@ -201,9 +202,9 @@ class LinkMonitor:
             rows.append(told("time_line", 1))
         return rows
 
-    def _rows_of_flow(self, stream: Stream, first: int, timed: bool) -> list[Row]:
+    def _rows_of_flow(self, stream: Stream, first: int, timed: bool) -> list[Judgement]:
         """Judge the received flow; its delays only if they are `timed` and without compute time."""
-        rows, skipped = list[Row](), UNJUDGED
+        rows, skipped = list[Judgement](), UNJUDGED
         if not timed or (self._computes and not self._uplink):
             skipped = UNJUDGED | DELAYS
         if len(stream.sent) >= FEWEST:
@@ -212,7 +213,7 @@ class LinkMonitor:
             rows = [told("loss", nan)._replace(verdict="open")]
         return [row for row in rows if row.name not in skipped]
 
-    def _round_trip(self) -> Row:
+    def _round_trip(self) -> Judgement:
         """Judge the mean round trip; datagrams that a later datagram overtook are left out."""
         means = np.sum([[_first_come(link) for link in plan.links] for plan in self._plans], axis=0)
         low, high = np.quantile(means, (TAIL, 1.0 - TAIL)).tolist()
@@ -220,7 +221,7 @@ class LinkMonitor:
         expected = Expected(bands, np.zeros(0), known=False)
         return expected.judge("round_trip", float(np.mean(self._trips)))
 
-    def _excuse(self, row: Row) -> Row:
+    def _excuse(self, row: Judgement) -> Judgement:
         """Change a verdict "off" to "open" if late wakes of this machine may explain a long delay.
 
         If a loop wakes late by t, about t / period datagrams arrive meanwhile. The mean square of

@@ -20,7 +20,7 @@ import numpy as np
 from cloudrc.link.model import HEADER_BYTES, Stream
 from cloudrc.link.profile import DirectionProfile, Timeline
 from cloudrc.link.relay import ANCILLARY_SIZE, DATAGRAM_MAX, Stamps, ask_for_stamps
-from cloudrc.link.verify.judge import Flow, Plan
+from cloudrc.link.verify.judge import Flow, Measurement
 from cloudrc.tunnel.codec import Direction, encode_header, peek
 
 PROBE = 254  # kind of datagram in the header of probes; world and cloud reject this kind
@@ -40,7 +40,7 @@ _BUFFER = 4_000_000
 
 def plan_probes(
     profile: DirectionProfile, flow: Flow, seconds: float | None = None, *, drawn: bool = False
-) -> Plan:
+) -> Measurement:
     """Plan when to send probes, for `seconds` [s].
 
     Without `seconds`, the duration is long enough for a verdict, and covers the profile's time line
@@ -57,9 +57,9 @@ def plan_probes(
     block = np.minimum(np.arange(float(2 * train or 1)), train) * step
     length = step * len(block)
 
-    def plan(time: float) -> Plan:
+    def plan(time: float) -> Measurement:
         starts = FIRST_PROBE + np.arange(ceil(max(time, 2 * step) / length)) * length
-        return Plan(profile, flow, (starts[:, None] + block).ravel(), train)
+        return Measurement(profile, flow, (starts[:, None] + block).ravel(), train)
 
     last = timeline.last_ns * 1e-9
     if seconds or last or not drawn:
@@ -71,7 +71,7 @@ class ProbeEnd:
     """Sends the probes of one direction through its socket, and records their arrivals."""
 
     def __init__(
-        self, own: socket.socket, route: tuple[str, int], plan: Plan, origin_ns: int
+        self, own: socket.socket, route: tuple[str, int], plan: Measurement, origin_ns: int
     ) -> None:
         """Prepare to send the probes of `plan` from the socket `own`, which the caller closes.
 

@@ -46,10 +46,10 @@ def band(delays: Timeline, time: Array) -> tuple[Array, Array]:
     return np.maximum(delay - jitter, 0.0), delay + jitter
 
 
-class Part(NamedTuple):
+class LinkSpan(NamedTuple):
     """Part of a flight in which one direction of the link has one profile.
 
-    It lasts until the next `Part` begins. Times are in seconds since the start of the flight.
+    It lasts until the next `LinkSpan` begins. Times are in seconds since the start of the flight.
     """
 
     begin: float  # [s]; -inf for the profile at the start of the flight
@@ -58,12 +58,12 @@ class Part(NamedTuple):
     cause: str  # cause of the change; "" if the link started with this profile
 
 
-def parts(subject: Subject, *, uplink: bool) -> list[Part]:
+def parts(subject: Subject, *, uplink: bool) -> list[LinkSpan]:
     """List the profiles that were in force in one direction of the link, the earliest first."""
     recording, seconds = subject.flight.recording, subject.flight.seconds
     sent, table = recording["/telemetry"]["stamp_ns"], recording["/link"]
     start = float(seconds(sent[0])) if len(sent) else 0.0
-    found = [Part(-inf, start, subject.uplink if uplink else subject.downlink, "")]
+    found = [LinkSpan(-inf, start, subject.uplink if uplink else subject.downlink, "")]
     begins = seconds(table["stamp_ns"]) - table["age"]
     for row in np.argsort(begins, kind="stable"):
         if table["uplink"][row] != uplink:
@@ -73,7 +73,7 @@ def parts(subject: Subject, *, uplink: bool) -> list[Part]:
         except ValueError:  # another version of cloudrc has recorded this flight
             continue
         origin = float(seconds(table["stamp_ns"][row]) - table["time_line"][row])
-        found.append(Part(float(begins[row]), origin, direction, str(table["cause"][row])))
+        found.append(LinkSpan(float(begins[row]), origin, direction, str(table["cause"][row])))
     return found
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from cloudrc.config.shipped import names
 from cloudrc.link.profile import mean_loss
-from cloudrc.link.verify.causes import Evidence, Findings, find_causes
+from cloudrc.link.verify.causes import Findings, ShaperFacts, find_causes
 from cloudrc.link.verify.judge import look_twice, netem_makes, verdict_of
 from tests.link.profiles import changed, in_bursts, profile_of
 from tests.link.verify.conftest import asked, random_profile, rows_of, verify
@@ -32,13 +32,13 @@ def test_200_honest_links_of_200_are_believed(figure):
 
 
 def netem(**facts):
-    return Evidence(**{"shaper": "netem", "layers": 1, **facts})
+    return ShaperFacts(**{"shaper": "netem", "layers": 1, **facts})
 
 
 # Requested, found on the uplink, found on the downlink, reported by the machine.
 FAULTS = {
-    "no_qdisc": (PAPER, NOTHING, NOTHING, Evidence("none", interface="eth0")),
-    "wrong_interface": (PAPER, NOTHING, NOTHING, Evidence("none", elsewhere=("eth1",))),
+    "no_qdisc": (PAPER, NOTHING, NOTHING, ShaperFacts("none", interface="eth0")),
+    "wrong_interface": (PAPER, NOTHING, NOTHING, ShaperFacts("none", elsewhere=("eth1",))),
     "doubled_delay": (PAPER, *[changed(PAPER, delay=0.090)] * 2, netem()),
     "halved_delay": (PAPER, *[changed(PAPER, delay=0.0225, jitter=0.0125)] * 2, netem()),
     "one_direction": (PAPER, PAPER, NOTHING, netem()),
@@ -48,7 +48,7 @@ FAULTS = {
     "bypassed": (PAPER, NOTHING, NOTHING, netem(sent=3000, passed=3)),
     "order_kept": (PAPER, *[changed(PAPER, keep_order=True)] * 2, netem()),
     "rate_ignored": (NARROW, *[changed(NARROW, rate=None)] * 2, netem()),
-    "no_sch_netem": (PAPER, NOTHING, NOTHING, Evidence("none", "this kernel has no sch_netem")),
+    "no_sch_netem": (PAPER, NOTHING, NOTHING, ShaperFacts("none", "this kernel has no sch_netem")),
     "shaped_twice": (PAPER, *[changed(PAPER, delay=0.090)] * 2, netem(layers=2)),
     "order_broken": (NARROW, *[changed(NARROW, keep_order=False, jitter=0.015)] * 2, netem()),
     "wrong_duplicates": (PAPER, *[changed(PAPER, duplicate=0.1)] * 2, netem()),
@@ -106,7 +106,7 @@ def test_netem_loses_either_a_packet_or_its_copy(loss):
     ],
 )
 def test_a_lack_of_cpu_is_named_beside_other_faults(real, causes):
-    known = Evidence("relay", starved="500 datagrams not read in time")
+    known = ShaperFacts("relay", starved="500 datagrams not read in time")
     stall = 0.0 if "keep_order" in real else 0.04
     rows = rows_of(PAPER, changed(PAPER, **real), stall=stall)
     assert [one.code for one in find_causes({"uplink": Findings(rows, known)})] == causes
@@ -121,7 +121,7 @@ SLOW = changed(PAPER, delay=0.090)
         (PAPER, changed(PAPER, loss=0.2), netem(), [("more_loss", "downlink")]),
         (SLOW, SLOW, netem(), [("doubled_delay", "both")]),
         (NOTHING, PAPER, netem(restored=1), [("no_qdisc", "uplink")]),
-        (*[changed(PAPER, loss=1.0)] * 2, Evidence(), [("nothing_arrives", "both")]),
+        (*[changed(PAPER, loss=1.0)] * 2, ShaperFacts(), [("nothing_arrives", "both")]),
     ],
 )
 def test_directions_are_told_apart(up, down, known, causes):

@@ -2,8 +2,14 @@
 
 import pytest
 
-from cloudrc.link.verify.causes import Evidence, Findings, find_causes, read_evidence, read_metrics
-from cloudrc.link.verify.judge import Row
+from cloudrc.link.verify.causes import (
+    Findings,
+    ShaperFacts,
+    find_causes,
+    read_evidence,
+    read_metrics,
+)
+from cloudrc.link.verify.judge import Judgement
 
 NETEM = {"kind": "netem", "handle": "7401:", "packets": 85, "drops": 15}
 METRICS = """
@@ -25,7 +31,7 @@ def test_metrics_report_lateness_counts_and_stops():
         " periods"
     )
     assert read_evidence(page, found).passed is None, "since its start"
-    nothing = Evidence("relay", "link.mode=relay", sent=5)
+    nothing = ShaperFacts("relay", "link.mode=relay", sent=5)
     assert read_evidence(page, {}, 5) == nothing, "without tools nothing is claimed"
     netem = {"shaper": "netem", "interface": "eth0", "netems": {"eth0": [NETEM]}}
     assert read_evidence(netem, {}, 100).passed == 100, "counted by the kernel"
@@ -43,5 +49,5 @@ def test_metrics_report_lateness_counts_and_stops():
 )
 def test_qdiscs_on_the_way_of_the_flow_are_the_cause(shaper, netems, code):
     known = read_evidence({"shaper": shaper, "interface": "eth0", "netems": netems}, {})
-    row = Row("mean", 0.045, 0.09, 0.043, 0.047, "off")
+    row = Judgement("mean", 0.045, 0.09, 0.043, 0.047, "off")
     assert [one.code for one in find_causes({"uplink": Findings([row], known)})] == [code]
