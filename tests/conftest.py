@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.interrupts import forget_interrupt
 from cloudrc.cli.main import main
 from cloudrc.config.shipped import file_of
+from cloudrc.runs.interrupts import forget_interrupt
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)

@@ -53,8 +53,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cluster": {"config", "link", "record", "report"},
     "statistics": set(),
     "runs": {
-        *("advice", "assembly", "cloud", "config", "files", "geometry", "metrics", "plugin_file"),
-        *("plugins", "record", "report", "statistics"),
+        *("advice", "assembly", "cloud", "config", "drivers", "files", "geometry", "metrics"),
+        *("plugin_file", "plugins", "record", "report", "statistics"),
     },
     "assembly": EVERYTHING,
     "advice": {"assembly", "config", "link", "robots", "tunnel"},
@@ -105,8 +105,8 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "pkgutil": ("plugins",),
     # A compiler makes the machine code of the usual step.
     "subprocess": ("drivers/", "cli/", "cluster/", "robots/pelican/native/library"),
-    "multiprocessing": ("drivers/", "cli/"),
-    "concurrent": ("cli/", "cluster/", "teleop/"),
+    "multiprocessing": ("drivers/", "runs/workers"),
+    "concurrent": ("cli/", "runs/workers", "cluster/", "teleop/"),
     **dict.fromkeys(("secrets", "uuid"), ("console/", "drivers/", "cluster/", "cli/")),
     "websockets": ("console/handed",),
     **dict.fromkeys(("pickle", "marshal", "shelve", "dill"), ()),

@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import format_document, print_or_drop, print_result, table
 from cloudrc.cli.parser import add_verbs
 from cloudrc.errors import BadInputError
+from cloudrc.runs.interrupts import interrupt_on_signals
 
 TIME_LIMIT = 60.0
 """Time limit of each part [s]; the solution needs 2 s."""

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import MODES, require
-from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import (
     FAILED_MARK,
     FAILED_NOTE,
@@ -21,9 +20,10 @@ from cloudrc.cli.output import (
     table,
 )
 from cloudrc.cli.parser import read_count
-from cloudrc.cli.pool import map_in_order, take_each
-from cloudrc.errors import BadInputError
+from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.renamed import new_name
+from cloudrc.runs.interrupts import interrupt_on_signals
+from cloudrc.runs.workers import map_in_order, take_each
 
 if TYPE_CHECKING:
     from cloudrc.runs.compare import Pairs
@@ -76,30 +76,30 @@ def execute(options: argparse.Namespace) -> int:
     interrupt_on_signals()
     from cloudrc.runs.compare import compare, of_sweep
 
-    stopped, code = "", 0
+    stopped = None
     if options.set and options.sweep:
         raise BadInputError(f"--set {options.set[0]}: these flights are finished; leave it out")
     if options.sweep:
         found = of_sweep(options.sweep, options.a, options.b)
     else:
-        found, stopped, code = _fly_both(options)
+        found, stopped = _fly_both(options)
     if stopped:
         print_or_drop(f"cloudrc: {stopped}: {len(found.pairs)} pairs are finished", sys.stderr)
         if not found.pairs:
-            return code
+            return stopped.exit_code
     document = {
         **{"a": options.a, "b": options.b, "of": found.what},
         **{"overrides": options.set, "interrupted": bool(stopped)},
         **compare(found.pairs, found.units, options.number),
     }
     print_result(options.output, document, as_text(document))
-    return code
+    return stopped.exit_code if stopped else 0
 
 
-def _fly_both(options: argparse.Namespace) -> tuple[Pairs, str, int]:
+def _fly_both(options: argparse.Namespace) -> tuple[Pairs, CloudrcError | None]:
     """Fly the experiment with the settings A and with the settings B, each with all seeds.
 
-    Return the pairs of flights; why the work ended early, or ""; and the exit code.
+    Return the pairs of flights; and why the work ended early, or None.
     """
     from cloudrc.cli.progress import SweepView
     from cloudrc.cli.run import load, refuse_seed, warn
@@ -130,11 +130,11 @@ def _fly_both(options: argparse.Namespace) -> tuple[Pairs, str, int]:
         flights.append(flight)
         view.see({"key": "BA"[len(flights) % 2], **flight})
 
-    stopped, code = take_each(map_in_order(fly_point, jobs, len(jobs)), take)
+    stopped = take_each(map_in_order(fly_point, jobs, len(jobs)), take)
     view.close()
     both = zip(flights[::2], flights[1::2], strict=False)
     pairs = [Pair({"seed": n}, a, b) for n, (a, b) in enumerate(both, start=1)]
-    return Pairs(pairs, unit_of, f"experiment {options.experiment}"), stopped, code
+    return Pairs(pairs, unit_of, f"experiment {options.experiment}"), stopped
 
 
 def as_text(document: Mapping[str, Any]) -> str:

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import escape, output_argument, paint, print_line, print_result, table
 from cloudrc.cli.parser import add_verbs, number, read_count, whole_number
-from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.errors import BadInputError
+from cloudrc.runs.interrupts import interrupt_on_signals
+from cloudrc.runs.workers import map_in_order, take_each
 
 if TYPE_CHECKING:
     from cloudrc.faults.measures import Outcome, Scenario
@@ -121,15 +121,16 @@ def run(options: argparse.Namespace) -> int:
 
     run_seed = partial(_run, seed=options.seed)
     flown = map_in_order(run_seed, [each.name for each in chosen], options.jobs)
-    cause, code = take_each(flown, take)
+    stopped = take_each(flown, take)
     done, failed = len(faults), sum(each["result"] == "failed" for each in faults)
     document = {"seed": options.seed, "passed": not failed, "faults": faults}
     text = f"\nseed {options.seed}: {done - failed} of {done} passed, {failed} failed"
     print_result(options.output, document, text)
-    if cause:
-        text = f"cloudrc: {cause}; {done} of {len(chosen)} faults were run before"
+    if stopped:
+        text = f"cloudrc: {stopped}; {done} of {len(chosen)} faults were run before"
         print(text, file=sys.stderr, flush=True)
-    return code or (FAILED if failed else 0)
+        return stopped.exit_code
+    return FAILED if failed else 0
 
 
 def _run(name: str, seed: int) -> Outcome:
@@ -196,14 +197,15 @@ def search(options: argparse.Namespace) -> int:
                 print_line(f"FAILED seed {failure['seed']}: {failure['breaches'][0]['text']}")
                 print_line(f"  again: cloudrc faults run {failure['file']}")
 
-    cause, code = take_each(_fly_seeds(options, began), take)
+    stopped = take_each(_fly_seeds(options, began), take)
     again = f"cloudrc faults search{' --adversarial' if options.adversarial else ''}"
     again += f" --first {found['next']}"
     lines = table(search_rows(found), right=(1, 2)), "", search_summary(found)
     print_result(options.output, found, "\n".join(["", *lines, f"to continue: {again}"]))
-    if cause:
-        print(f"cloudrc: {cause}; continue with '{again}'", file=sys.stderr, flush=True)
-    return code or (FAILED if found["failures"] else 0)
+    if stopped:
+        print(f"cloudrc: {stopped}; continue with '{again}'", file=sys.stderr, flush=True)
+        return stopped.exit_code
+    return FAILED if found["failures"] else 0
 
 
 def _fly_seeds(options: argparse.Namespace, began: float) -> Generator[TrialResult]:

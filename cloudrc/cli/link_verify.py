@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from cloudrc.cli.cluster_flags import flown_release
-from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.link import VERIFY_DEFAULT
 from cloudrc.cli.link_run import prepare_link, run_tool
 from cloudrc.cli.output import escape, paint, print_result, table
@@ -57,6 +56,7 @@ from cloudrc.link.verify.causes import (
 )
 from cloudrc.link.verify.judge import Flow, Judgement, Measurement, look_twice, verdict_of
 from cloudrc.link.verify.probe import PROBE, ProbeEnd, plan_probes, send_probes
+from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.tunnel.codec import SIZES, Kind
 
 RELEASE_TIMEOUT = 270.0  # default time limit for the verdict on a release [s]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from cloudrc.cli.leave import limit_exit
 from cloudrc.cli.output import discard_output, escape
 from cloudrc.cli.parser import build_parser
 from cloudrc.errors import (
@@ -15,6 +14,7 @@ from cloudrc.errors import (
     DiskFullError,
     InterruptedRunError,
 )
+from cloudrc.runs.leave import limit_exit
 
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
 

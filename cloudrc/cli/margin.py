@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from cloudrc.cli.compare import flight_arguments
 from cloudrc.cli.extras import MODES, require
-from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import escape, output_argument, print_or_drop, print_result
-from cloudrc.cli.pool import map_in_order
 from cloudrc.errors import BadInputError
+from cloudrc.runs.interrupts import interrupt_on_signals
+from cloudrc.runs.workers import map_in_order
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment

@@ -31,7 +31,6 @@ from cloudrc.cli.client import (
 )
 from cloudrc.cli.cluster_flags import flown_release, release_arguments, timeout_argument
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
-from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import escape, output_argument, print_line, print_result, table
 from cloudrc.cli.parser import add_verbs, number
 from cloudrc.drivers.machine import Deadline
@@ -41,6 +40,7 @@ from cloudrc.errors import (
     MissingPrerequisiteError,
     TimedOutError,
 )
+from cloudrc.runs.interrupts import interrupt_on_signals
 
 if TYPE_CHECKING:
     from cloudrc.cluster.client import Release

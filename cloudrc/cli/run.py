@@ -23,7 +23,6 @@ from cloudrc.cli.cluster_flags import (
 )
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.find_run import RUNS
-from cloudrc.cli.interrupts import interrupt_on_signals, is_interrupted, raise_if_interrupted
 from cloudrc.cli.output import (
     escape,
     is_live,
@@ -35,6 +34,7 @@ from cloudrc.cli.output import (
 from cloudrc.cli.parser import read_count, whole_number
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError, machine_error
+from cloudrc.runs.interrupts import interrupt_on_signals, is_interrupted, raise_if_interrupted
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment

@@ -18,11 +18,11 @@ from typing import IO, TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.find_run import ask_if_unclear, run_argument, short
-from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import escape, print_line
 from cloudrc.cli.processes import Command
 from cloudrc.cli.run import experiment_arguments, fly_once
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, NothingFlownError
+from cloudrc.runs.interrupts import interrupt_on_signals
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cloudrc.cli.cluster_flags import release_arguments
-from cloudrc.cli.interrupts import interrupt_on_signals
 from cloudrc.cli.output import output_argument
 from cloudrc.cli.parser import COUNT_MAX, add_verbs, figure_arguments, read_count, whole_number
 from cloudrc.renamed import new_name
+from cloudrc.runs.interrupts import interrupt_on_signals
 
 VERBS = {
     "run": "fly all points of a grid, or those that are missing in --out",

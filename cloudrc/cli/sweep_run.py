@@ -27,7 +27,6 @@ from cloudrc.cli.output import (
     print_result,
     table,
 )
-from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.cli.progress import PlanView, SeedsView, SweepView
 from cloudrc.cli.report import print_traceback, summary
 from cloudrc.cli.run import fly, load, new_folder, refuse_seed, warn
@@ -43,6 +42,7 @@ from cloudrc.runs import store
 from cloudrc.runs.flight import Row, counts, fly_point, measure
 from cloudrc.runs.grid import Grid, SweepPoint, pack, read_flight, read_grid, unpack
 from cloudrc.runs.lock import lock_folder
+from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.source import code_hash
 from cloudrc.statistics import median_interval
 
@@ -84,7 +84,7 @@ def _run_locked(
         else:
             job = partial(fly_row, record=options.record, folder=folder)
             flown = map_in_order(job, missing, options.jobs, in_order=False)
-        rows, stopped, code = _keep(flown, folder, grid, shard, before, view.see)
+        rows, stopped = _keep(flown, folder, grid, shard, before, view.see)
     if stopped:
         flags = " --on kubernetes, and its other flags" if options.on else ""
         again = f"cloudrc sweep run {options.file} --out {folder}{flags}"
@@ -92,7 +92,9 @@ def _run_locked(
     name = store.TABLE if len(rows) == len(grid.flights) else store.SUMMARY
     text = f"\n{_verdicts(rows.values())}\n\n{escape(str(folder / name))}"
     print_result(options.output, store.read_summary(folder), text)
-    return code or int(any(rows[each.key]["verdict"] != "success" for each in mine))
+    if stopped:
+        return stopped.exit_code
+    return int(any(rows[each.key]["verdict"] != "success" for each in mine))
 
 
 def _read(options: argparse.Namespace) -> Grid:
@@ -120,11 +122,11 @@ def _keep(
     shard: int | None,
     before: Collection[str],
     see: Callable[[Row], None],
-) -> tuple[dict[str, Row], str, int]:
+) -> tuple[dict[str, Row], CloudrcError | None]:
     """Append each new row to the sweep in `folder`, call `see` with it, and write the tables.
 
-    `before` has the keys of the rows that the folder already has. Return all rows, key -> row; why
-    the work ended early, or ""; and the exit code.
+    `before` has the keys of the rows that the folder already has. Return all rows, key -> row; and
+    why the work ended early, or None.
     """
     with store.append_rows(folder, shard) as append:
 
@@ -135,13 +137,13 @@ def _keep(
                 append(row)
             see(row)
 
-        stopped, code = take_each(flown, take)
+        stopped = take_each(flown, take)
     try:
-        return store.finish(folder, grid), stopped, code
+        return store.finish(folder, grid), stopped
     except OSError:
         if not stopped:
             raise
-        return store.read_rows(folder), stopped, code  # the reason to tell is the first one
+        return store.read_rows(folder), stopped  # the reason to tell is the first one
 
 
 def fly_row(flight: SweepPoint, record: str | None = None, folder: Path = Path()) -> Row:
@@ -286,17 +288,18 @@ def print_rows(options: argparse.Namespace) -> int:
     If the shard cannot be finished, leave the reason for Kubernetes, which flies the shard again.
     """
     try:
-        stopped, code = _print_rows(options)
+        stopped = _print_rows(options)
     except Exception as error:
         _leave_message(str(error) if isinstance(error, CloudrcError) else describe_error(error))
         raise
     if stopped:
         print_line(f"cloudrc: error: {stopped}", sys.stderr)
-        _leave_message(stopped)
-    return code
+        _leave_message(str(stopped))
+        return stopped.exit_code
+    return 0
 
 
-def _print_rows(options: argparse.Namespace) -> tuple[str, int]:
+def _print_rows(options: argparse.Namespace) -> CloudrcError | None:
     shard, count = options.shard
     flights = unpack(options.file)[shard - 1 :: count]
 
@@ -379,7 +382,7 @@ def fly_seeds(options: argparse.Namespace) -> int:
 
     with closing(make(stream, head, len(work))) as view:
         flown = map_in_order(fly_seed, work, len(work))
-        _, stopped, code = _keep(flown, folder, grid, None, store.begin(folder, grid), see)
+        _, stopped = _keep(flown, folder, grid, None, store.begin(folder, grid), see)
     if stopped:
         text = f"\ncloudrc: {stopped}: {len(seen)} of {len(work)} seeds are finished"
         print_or_drop(text, sys.stderr)
@@ -391,7 +394,9 @@ def fly_seeds(options: argparse.Namespace) -> int:
     }
     text = f"\n{as_table(document, len(work))}\n\n{folder / store.SUMMARY}"
     print_result(options.output, document, text)
-    return code or max(EXIT_CODES[row["verdict"]] for row in seen)
+    if stopped:
+        return stopped.exit_code
+    return max(EXIT_CODES[row["verdict"]] for row in seen)
 
 
 def fly_seed(flight: SweepPoint) -> Row:

@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli import faults as command
-from cloudrc.cli.pool import WorkerDiedError
 from cloudrc.faults.invariants import Breach
 from cloudrc.faults.measures import Outcome
 from cloudrc.faults.scenarios import SCENARIOS
 from cloudrc.faults.schedule import FaultEvent, Schedule, dump, load
 from cloudrc.faults.trial import TrialResult
+from cloudrc.runs.workers import WorkerDiedError
 
 NUMBERS = (*range(1, 14), 15, 17, *range(20, 26), 27, 28, 40)
 KILLED = WorkerDiedError("a worker was killed")

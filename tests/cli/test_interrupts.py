@@ -17,13 +17,14 @@ from typing import Annotated
 import pytest
 from pydantic import Discriminator, Tag, create_model
 
-from cloudrc.cli import interrupts, run, sweep_run
-from cloudrc.cli.interrupts import interrupt_on_signals, is_interrupted
-from cloudrc.cli.pool import isolated_start, map_in_order, take_each
+from cloudrc.cli import run, sweep_run
 from cloudrc.config.load import load_experiment
-from cloudrc.errors import BadInputError
+from cloudrc.errors import BadInputError, InterruptedRunError
+from cloudrc.runs import interrupts
 from cloudrc.runs.grid import pack, read_grid
+from cloudrc.runs.interrupts import interrupt_on_signals, is_interrupted
 from cloudrc.runs.store import read_rows
+from cloudrc.runs.workers import isolated_start, map_in_order, take_each
 from tests.runs.conftest import write_sweep
 
 __all__ = ["write_sweep"]
@@ -32,7 +33,7 @@ SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 @pytest.fixture(autouse=True)
 def one_core_and_a_terminal(monkeypatch):
-    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 1)
+    monkeypatch.setattr("cloudrc.runs.workers.usable_cores", lambda: 1)
     for number in SIGNALS:  # tests/conftest.py restores them
         signal.signal(number, signal.SIG_DFL)
     yield
@@ -157,7 +158,8 @@ def test_results_before_the_signal_are_kept():
             pass
         return json.dumps(number)
 
-    assert take_each(map_in_order(work, range(3), 1), results.append) == ("interrupted", 130)
+    end = take_each(map_in_order(work, range(3), 1), results.append)
+    assert isinstance(end, InterruptedRunError)
     assert results == ["0"]
 
 

@@ -10,9 +10,9 @@ import time
 import pytest
 
 from cloudrc import plugins
-from cloudrc.cli.leave import limit_exit
-from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.drivers.machine import interpreter
+from cloudrc.runs.leave import limit_exit
+from cloudrc.runs.workers import map_in_order, take_each
 from tests.cli.conftest import FLY
 
 METRIC = """
@@ -81,7 +81,7 @@ def _exit_at_once(number):
 
 
 def test_a_thread_in_a_worker_does_not_hold_up_the_command(monkeypatch):
-    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 2)
+    monkeypatch.setattr("cloudrc.runs.workers.usable_cores", lambda: 2)
     began = time.monotonic()
     assert [*map_in_order(_leave_thread, range(2), 2)] == [0, 1]
     assert time.monotonic() - began < 60.0
@@ -89,10 +89,10 @@ def test_a_thread_in_a_worker_does_not_hold_up_the_command(monkeypatch):
 
 @pytest.mark.parametrize("status", [0, 3])
 def test_a_worker_that_ends_itself_is_not_called_killed(status, monkeypatch):
-    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 2)
-    text, code = take_each(map_in_order(_exit_at_once, [status] * 2, 2), print)
-    assert code == 6
-    assert text.startswith(f"a worker ended itself (exit status {status}); does a plug-in")
+    monkeypatch.setattr("cloudrc.runs.workers.usable_cores", lambda: 2)
+    end = take_each(map_in_order(_exit_at_once, [status] * 2, 2), print)
+    assert end.exit_code == 6
+    assert str(end).startswith(f"a worker ended itself (exit status {status}); does a plug-in")
 
 
 def test_a_process_without_foreign_threads_ends_as_usual(monkeypatch):

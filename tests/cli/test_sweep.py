@@ -36,7 +36,7 @@ ONE = {"cloud.predictor": ["constant_velocity"]}
 
 @pytest.fixture(autouse=True)
 def one_core(monkeypatch):
-    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 1)
+    monkeypatch.setattr("cloudrc.runs.workers.usable_cores", lambda: 1)
 
 
 def rows(folder):
@@ -327,7 +327,7 @@ def _end(flight, **words):
 
 
 def test_a_killed_worker_ends_a_sweep_and_is_no_row(write_sweep, call, monkeypatch):
-    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 2)
+    monkeypatch.setattr("cloudrc.runs.workers.usable_cores", lambda: 2)
     monkeypatch.setattr("cloudrc.cli.sweep_run.fly_row", _end)
     error = call("sweep run --out grid", write_sweep(ONE, seeds=[1, 2, 3, 4]), code=6).err
     assert "a worker was killed, perhaps by the kernel because memory ran out" in error

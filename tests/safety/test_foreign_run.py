@@ -11,10 +11,10 @@ import pytest
 from cloudrc.cli import processes
 from cloudrc.cli.link_verify import find_experiment
 from cloudrc.cli.main import main
-from cloudrc.cli.pool import map_in_order
 from cloudrc.config.load import dump, read_experiment
 from cloudrc.config.schema import PlugIn
 from cloudrc.drivers.machine import interpreter
+from cloudrc.runs.workers import map_in_order
 from tests.metrics.conftest import flown
 from tests.record.conftest import write_mission
 
@@ -124,7 +124,7 @@ def test_a_worker_imports_nothing_from_the_working_folder(run, trace, spy, monke
     (run / "pickle.py").write_text(spy)
     monkeypatch.chdir(run)
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
-    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 2)
+    monkeypatch.setattr("cloudrc.runs.workers.usable_cores", lambda: 2)
     assert list(map_in_order(abs, [-1, -2], 2)) == [1, 2]
     assert not trace.exists()
     assert not os.environ.get("PYTHONSAFEPATH")

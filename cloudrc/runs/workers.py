@@ -1,4 +1,4 @@
-"""Run work in worker processes, which end with the command."""
+"""Run work in worker processes, which end with this process."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from multiprocessing.util import Finalize
 from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
-from cloudrc.cli.interrupts import is_interrupted, noted_interrupts, raise_if_interrupted
-from cloudrc.cli.leave import limit_exit
 from cloudrc.drivers.machine import usable_cores
-from cloudrc.errors import InterruptedRunError, InvalidRunError, machine_error
+from cloudrc.errors import CloudrcError, InterruptedRunError, InvalidRunError, machine_error
+from cloudrc.runs.interrupts import is_interrupted, noted_interrupts, raise_if_interrupted
+from cloudrc.runs.leave import limit_exit
 
 Work = TypeVar("Work")
 Result = TypeVar("Result")
@@ -160,25 +160,23 @@ def _ended(futures: list[Future[Result]], in_order: bool) -> Iterator[Future[Res
 
 def take_each(
     results: Generator[Result, Any, None], take: Callable[[Result], None]
-) -> tuple[str, int]:
+) -> CloudrcError | None:
     """Call `take` with each result until the work ends or is interrupted.
 
-    Return "" and 0. If the work ended early, return the reason and the exit code instead: after a
-    signal, or if the machine failed, for example because the disk is full.
+    Return None. If the work ended early, return the reason instead: an `InterruptedRunError` after
+    a signal, or the machine's failure, for example that the disk is full.
     """
     try:
         with closing(results):
             for result in results:
                 take(result)
     except KeyboardInterrupt:
-        return "interrupted", InterruptedRunError.exit_code
+        return InterruptedRunError("interrupted")
     except Exception as error:
-        if (
-            is_interrupted()
-        ):  # the signal also killed a worker, or a library converted its exception
-            return "interrupted", InterruptedRunError.exit_code
+        if is_interrupted():  # the signal also killed a worker, or a library converted the error
+            return InterruptedRunError("interrupted")
         failure = error if isinstance(error, WorkerDiedError) else machine_error(error)
         if failure is None or isinstance(error, BrokenPipeError):
             raise
-        return str(failure), failure.exit_code
-    return "", 0
+        return failure
+    return None

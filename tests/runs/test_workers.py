@@ -8,8 +8,8 @@ from copy import copy
 
 import pytest
 
-from cloudrc.cli.pool import map_in_order, take_each
 from cloudrc.errors import BadInputError, DiskFullError
+from cloudrc.runs.workers import map_in_order, take_each
 
 KILLED = 5
 """The piece of work at which a worker kills its own process."""
@@ -17,7 +17,7 @@ KILLED = 5
 
 @pytest.fixture(autouse=True)
 def two_cores_and_a_terminal(monkeypatch):
-    monkeypatch.setattr("cloudrc.cli.pool.usable_cores", lambda: 2)
+    monkeypatch.setattr("cloudrc.runs.workers.usable_cores", lambda: 2)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # as in a terminal; tests/conftest.py restores it
     yield
     assert multiprocessing.active_children() == []
@@ -37,7 +37,7 @@ def _kill_at_five(number):
 
 @pytest.mark.parametrize(("pieces", "jobs", "workers"), [(6, 100_000, 2), (1, 9, 0), (6, 1, 0)])
 def test_results_keep_the_order_of_the_work(pieces, jobs, workers, monkeypatch):
-    monkeypatch.setattr("cloudrc.cli.pool.CHUNK", 4)
+    monkeypatch.setattr("cloudrc.runs.workers.CHUNK", 4)
     done = map_in_order(_slow_first, range(pieces), jobs)
     first = next(done)
     assert len(multiprocessing.active_children()) == workers
@@ -50,7 +50,7 @@ def test_results_before_a_worker_was_killed_are_kept():
     results = []
     end = take_each(map_in_order(_kill_at_five, range(9), 2), results.append)
     text = "a worker was killed, perhaps by the kernel because memory ran out; use fewer processes"
-    assert end == (text, 6)
+    assert (str(end), end.exit_code) == (text, 6)
     assert results == list(range(KILLED))
 
 
