@@ -182,15 +182,22 @@ def test_no_child_of_a_file_outlives_the_check(child, tmp_path):
 
 @needs_proc
 @pytest.mark.process
-def test_no_child_outlives_ctrl_c(tmp_path):
-    marker = leave("subprocess.Popen(SLEEP)\nwhile True: pass", tmp_path)
+@pytest.mark.parametrize(
+    ("number", "code", "loop"),
+    [
+        (signal.SIGINT, 130, "while True: pass"),
+        (signal.SIGKILL, -9, "any(iter(int, 1))"),  # lets no other thread run
+    ],
+)
+def test_neither_a_loop_nor_its_child_outlives_the_check(number, code, loop, tmp_path):
+    marker = leave(f"subprocess.Popen(SLEEP)\n{loop}", tmp_path)
     (tmp_path / "predictor.py").rename(tmp_path / "delay_estimator.py")
     line = [sys.executable, "-m", "cloudrc", "class", "check", str(tmp_path)]
     command = subprocess.Popen(line, stdout=subprocess.DEVNULL)
     wait_until(lambda: is_running(marker), 60.0)
-    command.send_signal(signal.SIGINT)
-    assert command.wait(20.0) == 130
-    wait_until(lambda: not is_running(marker), 5.0)
+    command.send_signal(number)
+    assert command.wait(20.0) == code
+    wait_until(lambda: not is_running(marker) and not is_running(str(tmp_path)), 5.0)
 
 
 @pytest.mark.process
