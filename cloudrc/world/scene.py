@@ -5,6 +5,7 @@ Both may be a user's own. Whether a controller can fly the robot is the controll
 
 from __future__ import annotations
 
+import warnings
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -83,7 +84,10 @@ def _compile(
         spec.compiler.fusestatic = fuse
         if inertia is not None:
             _set_inertia(_base(spec), *inertia)
-        return spec.compile()
+        with warnings.catch_warnings():
+            # Options in the robot's file, which the scene's replace.
+            warnings.filterwarnings("ignore", "Attach conflict")
+            return spec.compile()
     except (ValueError, KeyError) as error:
         raise compile_error(f"{robot_path} in {scene_path}", error) from None
 

@@ -23,7 +23,8 @@ HINTS = {
     "torque about x (roll)": "place the actuators on both sides of the centre of mass",
     "torque about y (pitch)": "place the actuators before and behind the centre of mass",
     "force along z (thrust)": "let the actuators push along the base's z axis",
-    "torque about z (yaw)": "the last number of gear needs both signs, one per spin direction",
+    "torque about z (yaw)": "neighbouring rotors need opposite spin directions, the signs of "
+    "the last number of gear; or leave the yaw alone with yaw_bandwidth_radps: 0",
 }
 """Forces and torques that a controller commands, in the order of the rows of `Airframe.wrench` ->
 what to do if the actuators cannot make it independently of those before it."""
@@ -43,11 +44,15 @@ class Airframe:
     wrench: Array  # [N] and [N m] per unit, shape (4, n)
     low: Array  # smallest value of each control, in its own unit [any unit], shape (n,)
     high: Array  # largest value of each control, in its own unit [any unit], shape (n,)
+    steers_yaw: bool  # False: the controller leaves the yaw alone
     lag: float  # largest time constant of an actuator [s]; 0: none
 
 
-def read_airframe(model: Any) -> Airframe:
-    """Read a compiled `MjModel`; raise a BadInputError if it is no rigid body with thrusters."""
+def read_airframe(model: Any, *, steers_yaw: bool = True) -> Airframe:
+    """Read a compiled `MjModel`; raise a BadInputError if it is no rigid body with thrusters.
+
+    Without `steers_yaw`, it need not turn about z.
+    """
     _check_joints(model)
     names = [_name(model.actuator(number), number) for number in range(model.nu)]
     if len(names) < len(HINTS):
@@ -81,6 +86,7 @@ def read_airframe(model: Any) -> Airframe:
         wrench=_wrench(model, data, centre),
         low=low,
         high=high,
+        steers_yaw=steers_yaw,
         lag=float(max(lags, default=0.0)),
     )
     _check_directions(frame)
@@ -203,7 +209,8 @@ def _limits(model: Any, number: int) -> tuple[float, float]:
 def _check_directions(frame: Airframe) -> None:
     """Refuse a robot whose actuators cannot make each force and torque by itself."""
     known = np.empty((0, len(frame.names)))
-    for (direction, hint), row in zip(HINTS.items(), frame.wrench * span(frame), strict=True):
+    rows = (frame.wrench if frame.steers_yaw else frame.wrench[:3]) * span(frame)
+    for (direction, hint), row in zip(HINTS.items(), rows, strict=False):
         size = np.linalg.norm(row)
         rest = row - row @ np.linalg.pinv(known) @ known
         if not size or np.linalg.norm(rest) <= INDEPENDENT * size:

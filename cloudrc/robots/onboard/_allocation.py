@@ -43,14 +43,16 @@ class Allocation:
         actuators cannot hold the robot in hover, with enough room to brake and to turn.
         """
         width = span(frame)
-        turn_x, turn_y, lift, turn_z = width * np.linalg.pinv(frame.wrench * width).T
+        wrench = frame.wrench if frame.steers_yaw else frame.wrench[:3]
+        turn_x, turn_y, lift, *turn_z = width * np.linalg.pinv(wrench * width).T
         thrust = frame.mass * lift
-        turns = np.array((turn_x, turn_y, turn_z)).T @ frame.inertia
+        still = np.zeros_like(lift)
+        turns = np.array((turn_x, turn_y, *(turn_z or [still]))).T @ frame.inertia
         hover = frame.gravity * thrust
         share = _check_hover(frame, hover)
         self.acceleration_max = frame.gravity / share if share else inf
         room = np.minimum(frame.high - hover, hover - frame.low)[:, None]
-        some = TINY * abs(turns).max(axis=0)  # instead of a division by 0
+        some = TINY * abs(turns).max(axis=0) + TINY**2  # instead of a division by 0
         reach = (room / np.maximum(abs(turns), some)).min(axis=0)
         self.turn_max, self.yaw_max = float(reach[:2].min()), float(reach[2])
         _check_turns(self.turn_max, self.yaw_max)
@@ -147,6 +149,12 @@ def _check_hover(frame: Airframe, hover: Array) -> float:
         raise BadInputError(
             f"hover needs {100.0 * share:.0f} % of the thrust; above {100.0 * most:.0f} % a robot "
             f"cannot brake a descent: is the mass of {frame.mass:g} kg right (kg, not g)?"
+        )
+    spin = float(frame.wrench[3] @ hover / frame.inertia[2, 2])
+    if abs(spin) > TINY * frame.gravity:
+        raise BadInputError(
+            f"hover turns the robot about z by {spin:.2g} rad/s^2: balance the spin directions of "
+            "the rotors, which are the signs of the last number of gear"
         )
     return share
 

@@ -234,7 +234,7 @@ def build(
         attitude_bandwidth_radps: Bandwidth of roll and pitch [rad/s]. Default: 20, or less for a
             robot that turns slowly or whose actuators lag.
         yaw_bandwidth_radps: Bandwidth of the yaw [rad/s]. Default: 4, or less for a robot that
-            turns slowly.
+            turns slowly. 0: leave the yaw alone.
         tilt_max_deg: Largest commanded tilt [deg].
         drag_s_per_m: Drag of the rotors, which `actuators` simulates and the controller does not
             know: force relative to the thrust of a rotor and to the velocity of its hub across its
@@ -243,7 +243,7 @@ def build(
     Raises:
         BadInputError: If the controller cannot fly the model, or a value does not fit.
     """
-    frame = read_airframe(model)
+    frame = read_airframe(model, steers_yaw=yaw_bandwidth_radps != 0.0)
     allocation = Allocation(frame)
     lag = frame.lag or TINY
     if lag > LAG_MAX:
@@ -256,7 +256,7 @@ def build(
     velocity = min(VELOCITY_RADPS, 0.25 * attitude)
     velocity = _checked("velocity", velocity_bandwidth_radps, velocity, 0.5 * attitude)
     yaw = min(YAW_RADPS, 2.0 * sqrt(allocation.yaw_max), 0.5 * attitude)
-    yaw = _checked("yaw", yaw_bandwidth_radps, yaw, attitude)
+    yaw = _checked("yaw", yaw_bandwidth_radps, yaw, attitude) if frame.steers_yaw else 0.0
     if not 0.0 < tilt_max_deg <= TILT_MAX_MAX:
         raise BadInputError(f"tilt_max_deg: {tilt_max_deg:g} is not above 0 and up to 60")
     if not 0.0 <= drag_s_per_m < inf:

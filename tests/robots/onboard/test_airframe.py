@@ -70,6 +70,7 @@ REFUSED = {
     ),
     "yaw": (changed("0.02", "0.0002"), "about z by .* at most"),
     "one direction": (with_spins(1, 1, 1, 1), r"torque about z \(yaw\).*spin direction"),
+    "both directions, on two sides": (with_spins(1, -1, -1, 1), r"\(yaw\).*neighbouring rotors"),
     "no torque": (with_spins(0, 0, 0, 0), r"torque about z \(yaw\).*spin direction"),
     "one of four": (
         with_spins(1, -1, 1, 1),
@@ -137,3 +138,9 @@ def test_a_bandwidth_that_is_too_fast_for_the_lag_is_refused():
     lagging = changed("<general", '<general dyntype="filter" dynprm=".04"')
     with pytest.raises(BadInputError, match=r"attitude_bandwidth_radps: 30 is not .* up to 25"):
         multirotor.build(compiled(lagging), attitude_bandwidth_radps=30.0)
+
+
+def test_the_yaw_can_be_left_alone_if_hover_does_not_turn_the_robot():
+    assert multirotor.build(compiled(with_spins(1, -1, -1, 1)), yaw_bandwidth_radps=0.0)
+    with pytest.raises(BadInputError, match=r"hover turns the robot about z by .* balance"):
+        multirotor.build(compiled(with_spins(1, 1, 1, 1)), yaw_bandwidth_radps=0.0)

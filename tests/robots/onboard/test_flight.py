@@ -20,6 +20,13 @@ def test_a_nano_flies_also_if_it_is_heavier_than_its_model(own_robot):
         assert cloudrc.fly("hover", HOVER | changes).verdict == "success"
 
 
+def test_options_in_the_file_of_the_robot_give_way_to_those_of_the_scene(own_robot):
+    # A warning would fail the test.
+    model = MODEL.replace('timestep="0.002"', 'timestep="0.01" density="1.2" viscosity="1.8e-5"')
+    mine = own_robot("onboard: multirotor", model)
+    assert cloudrc.fly("hover", HOVER | {"world.robot": str(mine)}).verdict == "success"
+
+
 def test_the_drag_of_robot_yaml_reaches_the_rotors(own_robot):
     mine = own_robot("onboard: {name: multirotor, drag_s_per_m: 0.02}", MODEL)
     experiment = load_experiment("hover", ["world.scene=empty", f"world.robot={mine}"])

@@ -181,6 +181,17 @@ def test_the_tilt_limit_and_the_bandwidths_are_parameters():
     assert 7.0 < gentle.tilt < 10.1
 
 
+def test_a_robot_that_turns_only_with_its_roll_flies_with_its_yaw_left_alone():
+    corners = [(x, y, np.sign(-y)) for x, y, _ in X]  # as published models have it
+    text = robot(x_layout(0.14, 0.17, 0.02, 8.0, corners), **BARE)
+    flight = Flight(text, yaw_bandwidth_radps=0.0)
+    for velocity in ((1.0, -1.0, 0.5), (9.0, 9.0, 9.0), (-1.0, 1.0, -0.5)):
+        velocities = flight.fly(4.0, velocity, 0.5)
+    assert velocities[-1] == pytest.approx((-1.0, 1.0, -0.5), abs=0.02)
+    assert abs(flight.yaw) < 0.3
+    assert flight.tilt < 36.0
+
+
 def test_a_slow_robot_has_slower_defaults():
     def gains(inertia, more=""):
         rotors = x_layout(0.14, 0.17, 0.02, 8.0, more=more)
