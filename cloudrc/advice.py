@@ -200,11 +200,12 @@ def _hover(experiment: ResolvedExperiment) -> Iterator[str]:
 
     The numbers are those of the published controller of the Pelican.
     """
-    from cloudrc.config.robot import ALONE, find_robot
+    from cloudrc.config.robot import find_robot
     from cloudrc.config.schema import GRAVITY_MPS2, MASS_KG
     from cloudrc.robots.pelican.low_level import GRAVITY, MASS
 
-    if find_robot(experiment.world.robot).onboard.name != find_robot(ALONE).onboard.name:
+    mine, published = (find_robot(each).onboard for each in (experiment.world.robot, "pelican"))
+    if mine is None or published is None or mine.name != published.name:
         return
     plant, loop, wind = experiment.world.plant, experiment.world.low_level, experiment.world.wind
     weight = (MASS_KG * plant.mass_factor + plant.payload_kg) * GRAVITY_MPS2

@@ -54,7 +54,7 @@ ADVISED_MAX = 50
 """Number of points of a sweep for which warnings are looked for."""
 WARNINGS_MAX = 3
 """Largest number of warnings that are printed about more than two experiments."""
-NO_C = "Python (wind, or a robot that differs from its model)"
+NO_C = "Python (wind, a robot that differs from its model, or one without steps in C)"
 """Where the physics steps run if the C code does not cover the experiment."""
 EPILOG = """\
 modes:
@@ -355,7 +355,7 @@ def _record_virtual(
         except KeyboardInterrupt:
             interrupted = True
         try:
-            steps = usable().text if experiment.world.is_nominal else NO_C
+            steps = _where_steps_run(experiment, usable().text)
             run = Run("virtual", "virtual", interrupted, assembly.virtual_notes(experiment), steps)
             writer.note(run.metadata)
             recording = Recording(records=store, metadata={CODE: code_hash()})
@@ -364,6 +364,13 @@ def _record_virtual(
         finally:
             for name, data in attachments(folder).items() - at_start.items():
                 writer.attach(name, data)
+
+
+def _where_steps_run(experiment: ResolvedExperiment, machine: str) -> str:
+    """Say where the usual physics steps run; `machine` says where they run if they can be in C."""
+    from cloudrc.robots.build import runs_in_c
+
+    return machine if runs_in_c(experiment.world) else NO_C
 
 
 def _prepare(experiment: ResolvedExperiment, folder: Path) -> None:
@@ -424,7 +431,7 @@ def _record_local(
             raise broken or InterruptedRunError("interrupted, nothing was recorded") from None
         raise
     notes = (*local.notes, *([str(broken)] if broken else ()))
-    steps = library().text if experiment.world.is_nominal else NO_C
+    steps = _where_steps_run(experiment, library().text)
     run = Run("local", "relay", interrupted, notes, steps)
     mission.metadata |= run.metadata
     try:

@@ -1,7 +1,7 @@
 """Read what a robot is: its model, and the onboard controller that flies or drives it.
 
 A robot is a folder with the file `robot.yaml`, or the file of a model alone. Shipped robots are the
-folders in `cloudrc/robots/`. A model alone is flown by the Pelican's controller.
+folders in `cloudrc/robots/`.
 """
 
 from __future__ import annotations
@@ -14,9 +14,6 @@ from cloudrc.config.document import read_document
 from cloudrc.config.problems import validate
 from cloudrc.config.schema import NameOr, PlugIn, Section
 from cloudrc.plugins import is_path
-
-ALONE = "pelican"
-"""Robot whose controller flies a model without `robot.yaml`."""
 
 
 class RobotFile(Section):
@@ -36,7 +33,9 @@ class RobotFiles:
     """A robot whose files are found."""
 
     model: Path  # MJCF file
-    onboard: PlugIn  # with the absolute path of a Python file, or the name of a plug-in
+    # With the absolute path of a Python file, or the name of a plug-in. None for a model alone:
+    # which controller flies it depends on the model.
+    onboard: PlugIn | None
 
 
 def find_robot(name: str) -> RobotFiles:
@@ -45,7 +44,7 @@ def find_robot(name: str) -> RobotFiles:
     Raise a BadInputError if its `robot.yaml` is invalid.
     """
     if name.endswith(".xml"):
-        return RobotFiles(Path(name), find_robot(ALONE).onboard)
+        return RobotFiles(Path(name), None)
     folder = Path(name) if shipped.is_path(name) else shipped.FOLDERS["robot"] / name
     file = folder / shipped.ROBOT_FILE
     label = str(file) if shipped.is_path(name) else f"{name}/{shipped.ROBOT_FILE}"
@@ -66,5 +65,5 @@ def files_of(name: str) -> list[Path]:
     if name.endswith(".xml"):
         return [Path(name)]
     robot = find_robot(name)
-    own = [Path(robot.onboard.name)] if is_path(robot.onboard.name) else []
+    own = [Path(robot.onboard.name)] if robot.onboard and is_path(robot.onboard.name) else []
     return [Path(name) / shipped.ROBOT_FILE, robot.model, *own]

@@ -23,11 +23,14 @@ if TYPE_CHECKING:
 
 KIND = "onboard"
 """Kind of plug-in."""
+GENERAL = PlugIn(name="multirotor")
+"""Onboard controller of a model without `robot.yaml` that is not like the Pelican."""
 
 
 def check_robot(world: World) -> None:
     """Raise a BadInputError if the robot does not compile or its controller refuses the model."""
-    build_onboard(world, compile_model(find_robot(world.robot).model, file_of(world.scene)))
+    model = compile_model(find_robot(world.robot).model, file_of(world.scene))
+    _build_onboard(world, model, controller(world, model))
 
 
 def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -> Robot:
@@ -38,35 +41,60 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     """
     robot, scene = find_robot(world.robot), file_of(world.scene)
     nominal = compile_model(robot.model, scene)
-    onboard, plugin = build_onboard(world, nominal), plugins.find(KIND, robot.onboard.name)
-    simulator = Simulator(
-        compile_true(robot.model, scene, nominal, world.plant),
-        _actuators(plugin, nominal, robot.onboard),
-        wind,
-    )
+    choice = controller(world, nominal)
+    onboard, plugin = _build_onboard(world, nominal, choice), plugins.find(KIND, choice.name)
+    true = compile_true(robot.model, scene, nominal, world.plant)
+    simulator = Simulator(true, _actuators(plugin, nominal, choice), wind)
     guard = Guard(limits)
     if world.is_nominal and hasattr(plugin, "accelerate"):
         return plugin.accelerate(simulator, onboard, guard)  # type: ignore[no-any-return]
     return Robot(simulator, onboard, guard)
 
 
-def build_onboard(world: World, model: Any) -> Onboard:
-    """Build the onboard controller for the compiled `MjModel` of the robot in its scene."""
+def controller(world: World, model: Any = None) -> PlugIn:
+    """Return the onboard controller of a robot.
+
+    A model without `robot.yaml` is flown by the Pelican's controller if the model is enough like
+    the Pelican, and else by `GENERAL`. `model` is the compiled `MjModel`, which is compiled if it
+    is needed and None.
+    """
     robot = find_robot(world.robot)
-    parameters = dict(robot.onboard.model_extra or {})
+    if robot.onboard is not None:
+        return robot.onboard
+    from cloudrc.robots.pelican.fit import check_fit
+
+    try:
+        check_fit(compile_model(robot.model, file_of(world.scene)) if model is None else model)
+    except BadInputError:
+        return GENERAL
+    pelican = find_robot("pelican").onboard
+    assert pelican is not None
+    return pelican
+
+
+def runs_in_c(world: World) -> bool:
+    """Return whether the usual physics steps of a robot can run in C."""
+    return world.is_nominal and hasattr(plugins.find(KIND, controller(world).name), "accelerate")
+
+
+def _build_onboard(world: World, model: Any, choice: PlugIn) -> Onboard:
+    """Build an onboard controller for the compiled `MjModel` of the robot in its scene."""
+    where = f"{find_robot(world.robot).model} in {file_of(world.scene)}"
+    parameters = dict(choice.model_extra or {})
     if world.low_level != LowLevel():
-        known = plugins.signature(KIND, robot.onboard.name).parameters
+        known = plugins.signature(KIND, choice.name).parameters
         if unknown := LowLevel.model_fields.keys() - known:
             raise BadInputError(
-                f"world.low_level: the onboard controller of {world.robot} has no "
+                f"world.low_level: the onboard controller {choice.name} of {where} has no "
                 f"{', '.join(sorted(unknown))}; leave this section out"
             )
         parameters |= world.low_level.model_dump()
-    choice = robot.onboard.model_copy(update=parameters)
     try:
-        return build_plugin(KIND, choice, model=model)  # type: ignore[no-any-return]
+        return build_plugin(  # type: ignore[no-any-return]
+            KIND, choice.model_copy(update=parameters), model=model
+        )
     except BadInputError as error:
-        raise BadInputError(f"{robot.model} in {file_of(world.scene)}: {error}") from error
+        raise BadInputError(f"{where}: {error}") from error
 
 
 def _actuators(plugin: Any, model: Any, onboard: PlugIn) -> Actuators:

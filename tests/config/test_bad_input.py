@@ -41,7 +41,7 @@ def test_all_problems_are_listed_with_their_lines(mine):
         "command_history, commanded_velocity, constant_acceleration, constant_velocity, kalman, "
         "last_sample, model_based; did you mean last_sample?",
         "mine.yaml:6: cloud.controller.sped_max: unknown key; did you mean speed_max?",
-        "mine.yaml:7: world.scene: no scene named 'pipe'; available: empty, pipes; "
+        "mine.yaml:7: world.scene: no scene named 'pipe'; available: empty, pillars, pipes; "
         "did you mean pipes?",
     ])  # fmt: skip
 
@@ -141,7 +141,7 @@ def test_an_unreadable_file_is_reported(tmp_path, monkeypatch, name, reason):
         ("cloud.plan_s=0.4", "cloud.predictor: 'constant_velocity' has no model of the robot"),
         ("mission.waypoints.2.speed_mps=1", "waypoints.2.speed_mps: 1: is the speed of a carrot;"),
         ("mission=steps mission.carrot.speed_mps=1", "mission.carrot: impossible with steps"),
-        ("world.robot=./no.xml", "no.xml; names of shipped robots: pelican"),
+        ("world.robot=./no.xml", "no.xml; names of shipped robots: nano, pelican"),
         ("world.robot=/x/q", "world.robot: no such .xml file: /x/q"),
         # A limit of the guard cannot be switched off.
         ("guard.command_age_max_ms=true", "--set: guard.command_age_max_ms: "),

@@ -1,0 +1,58 @@
+"""The published controller flies what is like the Pelican, and says why it refuses others."""
+
+import pytest
+
+from cloudrc.config.robot import find_robot
+from cloudrc.config.schema import World
+from cloudrc.config.shipped import file_of
+from cloudrc.errors import BadInputError
+from cloudrc.robots.build import controller
+from cloudrc.robots.pelican.fit import check_fit
+from cloudrc.world.scene import compile_model
+
+PELICAN, EMPTY = find_robot("pelican").model, file_of("empty")
+
+
+def changed(folder, file, old, new):
+    """Write a copy of a file in which `old` is `new`; return its path."""
+    text = file.read_text()
+    assert old in text
+    path = folder / file.name
+    path.write_text(text.replace(old, new))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('name="rotor_left" site', 'name="rotor_5" site', "needs the actuators"),
+        ('mass="1.0"', 'mass="1.265"', r"mass .kg. is 1.325, not 1.06 \+- 0.1"),
+        (".01 .01 .02", ".02 .01 .02", "inertia .kg m.2. is 0.0215"),
+        ('"0 .21 .05" childclass', '"0 .21 .05" euler="9 0 0" childclass', "left gear"),
+        ('ctrllimited="false"', 'ctrlrange="0 13"', "range .N. is 0 13, not 0 33.74"),
+        ('ctrllimited="false"', 'ctrlrange="1 40"', "range .N. is 1 33.74, not 0 33"),
+        ('ctrllimited="false"', 'dyntype="filter" dynprm="1"', "dyntype is 2, not 0"),
+        ('size=".03" pos=".2 0 0"', 'size=".03" pos=".1 0 0"', "tip .m. is 0.3 0 0.17"),
+    ],
+)
+def test_a_robot_that_is_not_like_the_pelican_is_refused_by_its_difference(
+    tmp_path, old, new, message
+):
+    robot = changed(tmp_path, PELICAN, old, new)
+    with pytest.raises(BadInputError, match=message) as error:
+        check_fit(compile_model(robot, EMPTY))
+    assert "\n" not in str(error.value)
+
+
+def test_other_gravity_is_refused(tmp_path):
+    scene = changed(tmp_path, EMPTY, "-9.8066", "-1.62")
+    with pytest.raises(BadInputError, match=r"gravity .m/s.2. is 0 0 -1.62, not 0 0 -9.8"):
+        check_fit(compile_model(PELICAN, scene))
+
+
+@pytest.mark.parametrize(("mass", "name"), [("1.05", "onboard.py"), ("1.265", "multirotor")])
+def test_a_model_alone_has_the_published_controller_only_if_it_is_like_the_pelican(
+    tmp_path, mass, name
+):
+    robot = changed(tmp_path, PELICAN, 'mass="1.0"', f'mass="{mass}"')
+    assert controller(World(robot=str(robot), scene="empty")).name.endswith(name)
