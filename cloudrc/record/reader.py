@@ -109,9 +109,27 @@ class _Found:
     channels: dict[int, mcap.Channel] = field(default_factory=dict)  # as the index says
     schemas: dict[int, mcap.Schema] = field(default_factory=dict)  # as the index says
     statistics: mcap.Statistics | None = None  # as the index says
+    index: int = 0  # where the index begins, behind the data [bytes]; 0: not found
+    chunks: set[bytes] = field(default_factory=set)  # contents of the intact chunks
 
-    def read_index(self, data: bytes, start: int) -> None:
-        """Read the index from `start` up to the file's end, unless its checksum is wrong."""
+    def take(self, record: mcap.McapRecord, content: bytes, position: int) -> None:
+        """Note the intact record at `position`, whose bytes are `content`."""
+        part = FilePart(position, len(content), "")
+        if isinstance(record, mcap.Footer):
+            self.ended = self.data_ended = True
+            self.index = self.index or record.summary_start
+        elif isinstance(record, mcap.DataEnd):
+            self.data_ended, self.index = True, position + len(content)
+        elif content in self.chunks:  # inserted bytes repeat it
+            self.holes.append(part)
+        elif not self.index:
+            self.parts.append(part)
+            if isinstance(record, mcap.Chunk):
+                self.chunks.add(content)
+
+    def read_index(self, data: bytes) -> None:
+        """Read the index up to the file's end, unless its checksum is wrong."""
+        start = self.index
         checked = data[start : self.size - len(MCAP0_MAGIC) - 4]  # up to the checksum itself
         checksum = int.from_bytes(data[start + len(checked) :][:4], "little")
         if not 0 < start < self.size or checksum not in (0, zlib.crc32(checked)):
@@ -293,34 +311,22 @@ class File:
     def _search(self, position: int) -> _Found | None:
         """Find the intact parts of a file from `position` on; None if that finds nothing new."""
         self._stream.seek(0)
-        data, found, chunks = self._stream.read(), _Found(), set[bytes]()
-        index = 0  # where the index begins, behind the data [bytes]
+        data, found = self._stream.read(), _Found()
         while position < len(data) and not found.ended:
             record, end = self._parse_at(data, position)
-            if record is None:
+            if record is not None:
+                found.take(record, data[position:end], position)
+            else:
                 if not self._is_intact(data, end):  # the length is damaged, too
                     end = self._next_intact(data, position + 1)
                 if end == len(data):
                     break  # the rest is lost
                 found.holes.append(FilePart(position, end - position, ""))
-            elif isinstance(record, mcap.Chunk) and data[position:end] in chunks:
-                found.holes.append(
-                    FilePart(position, end - position, "")
-                )  # inserted bytes repeat it
-            elif isinstance(record, mcap.Footer):
-                found.ended = found.data_ended = True
-                end += len(MCAP0_MAGIC)
-                index = index or record.summary_start
-            elif isinstance(record, mcap.DataEnd):
-                found.data_ended, index = True, end
-            elif not index:
-                found.parts.append(FilePart(position, end - position, ""))
-                if isinstance(record, mcap.Chunk):
-                    chunks.add(data[position:end])
             position = end
         found.size = position
         if found.ended:
-            found.read_index(data, index)
+            found.size += len(MCAP0_MAGIC)
+            found.read_index(data)
         return found if found.parts and (found.holes or found.data_ended) else None
 
     def _next_intact(self, data: bytes, start: int) -> int:
