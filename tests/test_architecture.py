@@ -53,8 +53,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cluster": {"config", "link", "record", "report"},
     "statistics": set(),
     "runs": {
-        *("advice", "assembly", "cloud", "config", "drivers", "files", "geometry", "metrics"),
-        *("plugin_file", "plugins", "record", "report", "statistics"),
+        *("advice", "assembly", "cloud", "config", "drivers", "files", "geometry", "link"),
+        *("metrics", "plugin_file", "plugins", "record", "report", "robots", "statistics"),
+        "teleop",
     },
     "assembly": EVERYTHING,
     "advice": {"assembly", "config", "link", "robots", "tunnel"},

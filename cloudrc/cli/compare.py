@@ -18,6 +18,7 @@ from cloudrc.cli.output import (
     print_or_drop,
     print_result,
     table,
+    warn,
 )
 from cloudrc.cli.parser import read_count
 from cloudrc.errors import BadInputError, CloudrcError
@@ -102,8 +103,8 @@ def _fly_both(options: argparse.Namespace) -> tuple[Pairs, CloudrcError | None]:
     Return the pairs of flights; and why the work ended early, or None.
     """
     from cloudrc.cli.progress import SweepView
-    from cloudrc.cli.run import load, refuse_seed, warn
     from cloudrc.runs.compare import Pair, Pairs, check_names
+    from cloudrc.runs.experiment import load, refuse_seed
     from cloudrc.runs.flight import fly_point, units
 
     for text in (options.a, options.b):

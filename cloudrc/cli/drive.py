@@ -15,8 +15,7 @@ from contextlib import suppress
 from textwrap import wrap
 
 from cloudrc.cli.client import Api, describe_mission
-from cloudrc.cli.mission import describe_point
-from cloudrc.cli.output import escape, print_line
+from cloudrc.cli.output import describe_point, escape, print_line
 from cloudrc.console.steering import Steering
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Vector

@@ -11,8 +11,7 @@ from pathlib import Path
 from cloudrc.cli.output import print_line
 from cloudrc.cli.parser import KUBECTL_PLUGIN
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
-
-RUNS = Path("runs")
+from cloudrc.runs.folder import RUNS
 
 
 def run_argument(parser: argparse.ArgumentParser) -> None:

@@ -22,6 +22,7 @@ from cloudrc.cli.extras import require
 from cloudrc.cli.output import escape, output_argument, print_line, table
 from cloudrc.cli.parser import add_verbs
 from cloudrc.errors import BadInputError
+from cloudrc.link.verify import DEFAULT
 
 if TYPE_CHECKING:
     from cloudrc.config.schema import Direction, Profile
@@ -77,7 +78,6 @@ tunnel's own datagrams, within a minute. It reports what it cannot judge.
 
 exit codes: 0 believed, 1 not believed or undecided, 2 bad input,
 3 missing prerequisite, 4 no answer in time, 5 cluster, 6 a process died"""
-VERIFY_DEFAULT = "paper"
 PACKETS_MAX = 10_000_000
 RANGES: dict[str, tuple[float, float]] = {
     "seconds": (0.001, 86_400),
@@ -117,8 +117,8 @@ def execute(options: argparse.Namespace) -> int:
 def verify_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `verify`."""
     add = parser.add_argument
-    target = f"name of a shipped one, or a file (default: {VERIFY_DEFAULT})"
-    add("target", nargs="?", default=VERIFY_DEFAULT, metavar="PROFILE|EXPERIMENT", help=target)
+    target = f"name of a shipped one, or a file (default: {DEFAULT})"
+    add("target", nargs="?", default=DEFAULT, metavar="PROFILE|EXPERIMENT", help=target)
     setting = "override one value of the experiment, for example link.uplink.loss=0.1"
     add("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help=setting)
     seconds = (

@@ -33,7 +33,6 @@ from cloudrc.drivers.process import Feed, StopSignal
 from cloudrc.records import Counted
 
 if TYPE_CHECKING:
-    from cloudrc.config.load import ResolvedExperiment
     from cloudrc.drivers.exporter import Exporter
     from cloudrc.link.follow import Load
     from cloudrc.link.netem import Netem
@@ -138,20 +137,6 @@ def make_profile_loader(direction: str) -> Load:
         return Loaded(link_profile(getattr(profile, direction)), values)
 
     return load
-
-
-def prepare_link(folder: Path, link: ResolvedExperiment) -> None:
-    """Make the folder of a link on this machine, with its profile and a folder per direction."""
-    from cloudrc.config.document import write_yaml
-    from cloudrc.config.load import DIRECTIONS
-    from cloudrc.config.schema import Profile
-    from cloudrc.link.follow import PROFILE
-
-    for way in DIRECTIONS:
-        (folder / way).mkdir(parents=True)
-    profile = Profile(uplink=link.uplink, downlink=link.downlink)
-    text = write_yaml(profile.model_dump(mode="json", exclude_defaults=True))
-    (folder / PROFILE).write_text(text, encoding="utf-8")
 
 
 def _machine(options: argparse.Namespace, seed: int, programs: Programs, tables: Path) -> Machine:

@@ -25,8 +25,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from cloudrc.cli.cluster_flags import flown_release
-from cloudrc.cli.link import VERIFY_DEFAULT
-from cloudrc.cli.link_run import prepare_link, run_tool
+from cloudrc.cli.link_run import run_tool
 from cloudrc.cli.output import escape, paint, print_result, table
 from cloudrc.cli.processes import show_address
 from cloudrc.cluster.client import end_process
@@ -43,10 +42,12 @@ from cloudrc.errors import (
     MissingPrerequisiteError,
     TimedOutError,
 )
+from cloudrc.link.follow import prepare_link
 from cloudrc.link.model import Stream
 from cloudrc.link.netem import check, find_netems
 from cloudrc.link.state import STATE_FILE, from_text
 from cloudrc.link.traces import link_profile
+from cloudrc.link.verify import DEFAULT
 from cloudrc.link.verify.causes import (
     Findings,
     find_causes,
@@ -115,7 +116,7 @@ def find_experiment(target: str, settings: list[str]) -> ResolvedExperiment:
         raise BadInputError(f"no profile or experiment named '{target}'; available: {names}")
     if not is_profile:
         return read_experiment(target, settings)
-    return read_experiment(VERIFY_DEFAULT, [f"link.profile={target}", *settings])
+    return read_experiment(DEFAULT, [f"link.profile={target}", *settings])
 
 
 @dataclass(slots=True)

@@ -95,7 +95,7 @@ class Trials:
 
     def __init__(self, options: argparse.Namespace) -> None:
         """Read the present value and the range of the search; refuse a key that has no range."""
-        from cloudrc.cli.run import load, refuse_seed
+        from cloudrc.runs.experiment import load, refuse_seed
         from cloudrc.runs.margin import STEPS_MAX, check_largest, present_value
 
         self._options, self._load = options, load

@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -31,7 +31,14 @@ from cloudrc.cli.client import (
 )
 from cloudrc.cli.cluster_flags import flown_release, release_arguments, timeout_argument
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
-from cloudrc.cli.output import escape, output_argument, print_line, print_result, table
+from cloudrc.cli.output import (
+    describe_point,
+    escape,
+    output_argument,
+    print_line,
+    print_result,
+    table,
+)
 from cloudrc.cli.parser import add_verbs, number
 from cloudrc.drivers.machine import Deadline
 from cloudrc.errors import (
@@ -406,11 +413,6 @@ VERBS: dict[str, tuple[str, Callable[[argparse.Namespace, Api], int]]] = {
     "fly": ("fly a mission inside a Job: post it, follow it, exit with the verdict", _fly),
 }
 """Verb -> help line, and function that carries it out."""
-
-
-def describe_point(position: Sequence[float | None]) -> str:
-    """Format a position [m]; an unknown coordinate, None, becomes a question mark."""
-    return f"({', '.join('?' if value is None else f'{value:.2f}' for value in position)})"
 
 
 def _print_robot(seen: Json | None, cloud_age: float | None) -> None:

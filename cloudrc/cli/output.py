@@ -10,9 +10,12 @@ import os
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from cloudrc.errors import DISK_FULL
+
+if TYPE_CHECKING:
+    from cloudrc.config.load import ResolvedExperiment
 
 _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1"}
 
@@ -134,3 +137,16 @@ def format_number(value: float) -> str:
         digits = f"{value:#.4g}"
         return digits.rstrip(".") if abs(value) >= 1000 else digits
     return f"{value:.3e}"
+
+
+def describe_point(position: Sequence[float | None]) -> str:
+    """Format a position [m]; an unknown coordinate, None, becomes a question mark."""
+    return f"({', '.join('?' if value is None else f'{value:.2f}' for value in position)})"
+
+
+def warn(*experiments: ResolvedExperiment) -> None:
+    """Print warnings about experiments on stderr."""
+    from cloudrc.runs.experiment import advice_on
+
+    for text in advice_on(*experiments):
+        print_line(f"cloudrc: warning: {text}", sys.stderr)

@@ -44,11 +44,11 @@ def execute(options: argparse.Namespace) -> int:
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
     from cloudrc import metrics
-    from cloudrc.cli.session import restore_mission
     from cloudrc.metrics.verdict import exit_code
     from cloudrc.report.figures.style import Look
     from cloudrc.report.folder import read_run
     from cloudrc.report.write import write_report
+    from cloudrc.runs.session import restore_mission
 
     metrics.check(options.metric)
     restore_mission(options.run)

@@ -10,11 +10,11 @@ from __future__ import annotations
 import argparse
 import subprocess
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from shlex import quote
 from threading import Thread
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.find_run import ask_if_unclear, run_argument, short
@@ -23,11 +23,6 @@ from cloudrc.cli.processes import Command
 from cloudrc.cli.run import experiment_arguments, fly_once
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, NothingFlownError
 from cloudrc.runs.interrupts import interrupt_on_signals
-
-if TYPE_CHECKING:
-    from cloudrc.config.load import ResolvedExperiment
-    from cloudrc.record.columns import Recording
-    from cloudrc.teleop.store import Mission
 
 Say = Callable[[str], None]
 """Function that prints a line above the status line of a flight."""
@@ -123,64 +118,10 @@ def _console(folder: Path, say: Say) -> Iterator[None]:
             reader.join()
 
 
-def _last_mission(folder: Path) -> Mission | None:
-    """Return the last mission that flew in a session that has ended; None if none flew."""
-    from cloudrc.drivers.local import JOURNAL_FILE
-    from cloudrc.teleop.store import open_store
-
-    if not (folder / JOURNAL_FILE).exists():  # the session has ended before it was ready
-        return None
-    with closing(open_store(folder / JOURNAL_FILE, b"")) as store:
-        flown = [each for each in store.missions.values() if "started" in each.happened]
-    return flown[-1] if flown else None
-
-
-def read_last_mission(folder: Path) -> tuple[Recording, ResolvedExperiment, bool]:
-    """Read the last mission of a session that has ended; write its experiment to config.yaml.
-
-    Returns:
-        The recording of this mission, its experiment, and whether the session ended before the
-        mission.
-
-    Raises:
-        NothingFlownError: If no mission flew.
-    """
-    from cloudrc.assembly import with_order
-    from cloudrc.config.load import dump, read_experiment
-    from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
-    from cloudrc.record.merge import cut_to_last_mission, merge
-
-    if (last := _last_mission(folder)) is None:
-        raise NothingFlownError(f"{folder}: no mission flew, so there is no report")
-    if last.order.plan.by_hand:  # rest at the start, until the report has the setpoints
-        rest = [(time, last.order.plan.legs[0].position) for time in (0.0, 1.0)]
-        (folder / DRIVE_FILE).write_text(write_setpoints(rest), encoding="utf-8")
-    config = folder / "config.yaml"
-    about = f"Mission {last.id} ({last.order.name}), the last one of a session"
-    experiment = with_order(read_experiment(config, flown=True), last.order, about)
-    config.write_text(dump(experiment), encoding="utf-8")
-    recording = merge(folder / "world.mcap", folder / "cloud.mcap")
-    cut_to_last_mission(recording)
-    return recording, experiment, not last.ended
-
-
-def restore_mission(folder: Path) -> None:
-    """Write the mission.mcap of a session that was killed before it wrote this file."""
-    from cloudrc.drivers.local import JOURNAL_FILE, under_way
-    from cloudrc.report.document import Run
-    from cloudrc.report.write import attachments
-
-    if (folder / JOURNAL_FILE).is_file() and not (folder / "mission.mcap").exists():
-        if folder.resolve() in under_way():
-            raise BadInputError(f"{folder}: the session has not ended; end it: cloudrc down")
-        recording, _, interrupted = read_last_mission(folder)
-        recording.metadata |= Run("local", "relay", interrupted).metadata
-        recording.write(folder / "mission.mcap", attachments(folder))
-
-
 def _down(options: argparse.Namespace) -> int:
     """End a session, and print the path of its report."""
     from cloudrc.drivers.local import SESSION, end_session, flight_files
+    from cloudrc.runs.session import last_mission
 
     sessions = [run for run, flight in flight_files().items() if flight.kind == SESSION]
     if options.run is not None:
@@ -197,7 +138,7 @@ def _down(options: argparse.Namespace) -> int:
     name = short(run)
     if (run / "report.json").exists():
         print_line(short(run / "report.html"))
-    elif last := _last_mission(run):
+    elif last := last_mission(run):
         text = f"ended; mission {last.id} flew, but has no report"
         raise CloudrcError(f"{name}: {text}; to write it: cloudrc report {name}")
     else:

@@ -26,10 +26,10 @@ from cloudrc.cli.output import (
     print_or_drop,
     print_result,
     table,
+    warn,
 )
 from cloudrc.cli.progress import PlanView, SeedsView, SweepView
 from cloudrc.cli.report import print_traceback, summary
-from cloudrc.cli.run import fly, load, new_folder, refuse_seed, warn
 from cloudrc.cluster import batch
 from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.pods import refuse_local_files
@@ -39,7 +39,10 @@ from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, describ
 from cloudrc.files import write_atomically
 from cloudrc.metrics.verdict import EXIT_CODES
 from cloudrc.runs import store
+from cloudrc.runs.experiment import load, refuse_seed
 from cloudrc.runs.flight import Row, counts, fly_point, measure
+from cloudrc.runs.fly import fly
+from cloudrc.runs.folder import new_folder
 from cloudrc.runs.grid import Grid, SweepPoint, pack, read_flight, read_grid, unpack
 from cloudrc.runs.lock import lock_folder
 from cloudrc.runs.workers import map_in_order, take_each

@@ -21,6 +21,7 @@ from cloudrc.files import read, version
 from cloudrc.link.state import CHANGE_FILE, ChangeFacts, parse, read_change
 
 if TYPE_CHECKING:
+    from cloudrc.config.load import ResolvedExperiment
     from cloudrc.link.profile import DirectionProfile
     from cloudrc.link.relay import Address
 
@@ -47,6 +48,19 @@ class Loaded(NamedTuple):
 
 Load = Callable[[Path], Loaded]
 """Function that reads and checks a profile's file; raises a BadInputError if it is invalid."""
+
+
+def prepare_link(folder: Path, link: ResolvedExperiment) -> None:
+    """Make the folder of a link on this machine, with its profile and a folder per direction."""
+    from cloudrc.config.document import write_yaml
+    from cloudrc.config.load import DIRECTIONS
+    from cloudrc.config.schema import Profile
+
+    for way in DIRECTIONS:
+        (folder / way).mkdir(parents=True)
+    profile = Profile(uplink=link.uplink, downlink=link.downlink)
+    text = write_yaml(profile.model_dump(mode="json", exclude_defaults=True))
+    (folder / PROFILE).write_text(text, encoding="utf-8")
 
 
 def read_handed(text: bytes | str) -> dict[str, str]:

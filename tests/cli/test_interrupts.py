@@ -20,6 +20,7 @@ from pydantic import Discriminator, Tag, create_model
 from cloudrc.cli import run, sweep_run
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError, InterruptedRunError
+from cloudrc.runs import fly as flights
 from cloudrc.runs import interrupts
 from cloudrc.runs.grid import pack, read_grid
 from cloudrc.runs.interrupts import interrupt_on_signals, is_interrupted
@@ -173,7 +174,7 @@ def test_a_flight_ends_after_a_signal_that_a_plugin_caught(tmp_path, monkeypatch
     interrupt_on_signals()
     monkeypatch.setattr("cloudrc.assembly.fly", fly)
     experiment = load_experiment("hover")
-    with run._record_virtual(experiment, tmp_path, lambda records: None) as (_, _, facts):
+    with flights._record_virtual(experiment, tmp_path, lambda records: None) as (_, _, facts):
         assert facts.interrupted
 
 

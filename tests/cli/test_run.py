@@ -10,8 +10,8 @@ import pytest
 from cloudrc.cli import extras
 from cloudrc.cli.main import main
 from cloudrc.cli.report import summary
-from cloudrc.cli.run import new_folder
 from cloudrc.errors import BadInputError
+from cloudrc.runs.folder import new_folder
 from tests.cli.conftest import FLY, SHORT
 
 
@@ -51,7 +51,7 @@ def test_the_last_line_is_the_report_and_the_folder_is_complete(folder, call):
 def test_a_run_that_c_cannot_fly_says_so(key, folder):
     main([*FLY, f"--set=world.{key}", "--out", "a"])
     steps = json.loads((folder / "a/environment.json").read_text())["physics_steps"]
-    assert steps == "Python (wind, or a robot that differs from its model)"
+    assert steps.startswith("Python (wind, a robot that differs from its model")
 
 
 @pytest.mark.usefixtures("no_page")
@@ -76,14 +76,15 @@ def test_a_run_and_its_report_can_be_repeated(folder, call):
 @pytest.mark.parametrize(
     ("fails", "error", "code", "said"),
     [
-        ("write_report", KeyboardInterrupt, 130, "'cloudrc report here' writes its report"),
-        ("write_json", OSError(28, "No space left on device", "here/report.json"), 3,
+        ("runs.fly.write_report", KeyboardInterrupt, 130,
+         "'cloudrc report here' writes its report"),
+        ("report.write.write_json", OSError(28, "No space left on device", "here/report.json"), 3,
          "disk_full: here/report.json: free some space"),
     ],
 )  # fmt: skip
 def test_a_report_that_cannot_be_written_can_be_later(fails, error, code, said, monkeypatch, call):
     with monkeypatch.context() as changed:
-        changed.setattr(f"cloudrc.report.write.{fails}", Mock(side_effect=error))
+        changed.setattr(f"cloudrc.{fails}", Mock(side_effect=error))
         assert said in call(*FLY, "--out", "here", code=code).err
     call("report here")
 

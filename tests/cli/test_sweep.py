@@ -122,7 +122,9 @@ def test_a_check_of_more_than_a_second_says_how_far_it_is(write_sweep, call, mon
 
 
 def test_alike_warnings_of_many_points_are_counted(write_sweep, monkeypatch, call):
-    monkeypatch.setattr("cloudrc.cli.run.advise", lambda point: [f"{point.uplink.delay_ms} ms"])
+    monkeypatch.setattr(
+        "cloudrc.runs.experiment.advise", lambda point: [f"{point.uplink.delay_ms} ms"]
+    )
     grid = {"link.both.delay_ms": [0, 1, 2, 3, 4]}
     told = call("sweep run --out grid --shard 6/6", write_sweep(grid)).err.splitlines()
     assert told[0] == "cloudrc: warning: 0.0 ms"

@@ -11,12 +11,12 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from cloudrc.cli.run import fly
 from cloudrc.config.load import load_experiment
 from cloudrc.geometry.scene import load_scene
 from cloudrc.record.columns import Recording
 from cloudrc.record.recovery import recover
 from cloudrc.record.topics import TOPICS, VIEWS
+from cloudrc.runs.fly import fly
 
 LAYOUT = Path(__file__).resolve().parents[2] / "docs" / "cloudrc.foxglove.json"
 SHORT = ("mission.waypoints=[{position_m: [0.5, 0, 0.7], dwell_s: 1.0}]", "criteria.contact=false")

@@ -1,0 +1,65 @@
+"""Load the experiment of a command or of a call, and advise on settings that do not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from cloudrc import metrics
+from cloudrc.advice import advise
+from cloudrc.config.load import ResolvedExperiment, load_experiment
+from cloudrc.config.overrides import parse_settings
+from cloudrc.errors import BadInputError
+
+ADVISED_MAX = 50
+"""Number of points of a sweep for which warnings are looked for."""
+WARNINGS_MAX = 3
+"""Largest number of warnings about more than two experiments."""
+
+
+def load(name: str, overrides: Iterable[str], seed: int | None = None) -> ResolvedExperiment:
+    """Load an experiment by name or path with `overrides` (KEY=VALUE); check `report.metrics`."""
+    seeds = [] if seed is None else [f"seed={seed}"]
+    experiment = load_experiment(name, [*overrides, *seeds])
+    metrics.check(experiment.report.metrics)
+    return experiment
+
+
+def refuse_seed(texts: Iterable[str]) -> None:
+    """Raise a BadInputError if one of the settings `texts` (KEY=VALUE) sets the seed.
+
+    Work with several seeds replaces the seed in every flight.
+    """
+    if ("seed",) in parse_settings(texts):
+        raise BadInputError("seed: each flight has its own seed; give their number with --seeds")
+
+
+def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
+    """Raise a BadInputError if an experiment cannot fly in a mode, before a folder is made.
+
+    `mode` is "virtual", "local" or "cluster".
+    """
+    if mode != "virtual" and (experiment.cloud.clock_offset_s or experiment.cloud.clock_drift_ppm):
+        raise BadInputError(
+            "cloud.clock_offset_s and cloud.clock_drift_ppm act in virtual time only, elsewhere "
+            "the machine's clock counts; use --mode virtual, or leave them out"
+        )
+    world = experiment.world
+    if mode != "cluster" and ("/" in world.robot or world.scene.endswith(".xml")):
+        from cloudrc.robots.build import check_robot
+
+        check_robot(world)
+
+
+def advice_on(*experiments: ResolvedExperiment) -> list[str]:
+    """Return the warnings of `advise`, each once.
+
+    For three or more experiments, such as the points of a sweep, return at most `WARNINGS_MAX`, and
+    their number. Of many experiments, only the first, the last and some between them are looked at,
+    because each takes some milliseconds: together about `ADVISED_MAX`.
+    """
+    some = dict.fromkeys(range(0, len(experiments), len(experiments) // ADVISED_MAX + 1))
+    some[len(experiments) - 1] = None
+    advice = list(dict.fromkeys(text for index in some for text in advise(experiments[index])))
+    if len(experiments) > 2 and len(advice) > WARNINGS_MAX:
+        advice[WARNINGS_MAX:] = [f"{len(advice)} warnings; the others are alike"]
+    return advice

@@ -1,0 +1,169 @@
+"""Fly an experiment, record the flight, and write the report.
+
+A run is a folder: the experiment as config.yaml, the recording as mission.mcap, and the report.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+from collections.abc import Callable, Iterator
+from functools import partial
+from math import inf
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from cloudrc import assembly
+from cloudrc.config.load import ResolvedExperiment, dump
+from cloudrc.drivers.local import LINK_FOLDER, LocalRun
+from cloudrc.errors import CloudrcError, InterruptedRunError, machine_error
+from cloudrc.link.follow import prepare_link
+from cloudrc.record.columns import Recording, RecordStore
+from cloudrc.record.merge import merge
+from cloudrc.record.writer import CODE, McapWriter
+from cloudrc.records import Record
+from cloudrc.report.document import Run
+from cloudrc.report.views import views
+from cloudrc.report.write import attachments, write_report
+from cloudrc.robots.pelican.native.library import library
+from cloudrc.runs.interrupts import raise_if_interrupted
+from cloudrc.runs.session import read_last_mission
+from cloudrc.source import code_hash
+
+See: TypeAlias = Callable[[list[Record]], None]
+"""Function that gets records during the flight."""
+Session: TypeAlias = Callable[[str, dict[str, str]], None]
+"""Function that a session calls when it is ready, with the API's address, and process -> HOST:PORT
+of its metrics."""
+NO_C = "Python (wind, a robot that differs from its model, or one without steps in C)"
+"""Where the physics steps run if the C code does not cover the experiment."""
+
+
+def fly(
+    experiment: ResolvedExperiment,
+    mode: str,
+    folder: Path,
+    see: See = lambda records: None,
+    *,
+    page: bool = True,
+    session: Session | None = None,
+) -> dict[str, Any]:
+    """Fly in mode "virtual" or "local"; write all files into `folder`, and return the report.
+
+    During the flight `see` is called with new records; in local mode some are left out. An
+    interrupted flight also gets a report. Without `page`, write no report.html.
+
+    With `session`, teleop waits for missions, and the report is that of the last one. When all
+    processes are ready, `session` gets the API's address and process -> HOST:PORT of its metrics.
+    """
+    record = _record_virtual if mode == "virtual" else partial(_record_local, session=session)
+    own = experiment.report.metrics
+    try:
+        (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
+        with record(experiment, folder, see) as flown:
+            return write_report(folder, *flown, own=own, page=page)
+    except OSError as error:
+        error.filename = str(error.filename or folder)
+        raise machine_error(error) or error from error
+
+
+def _where_steps_run(experiment: ResolvedExperiment, machine: str) -> str:
+    """Say where the usual physics steps run; `machine` says where they run if they can be in C."""
+    from cloudrc.robots.build import runs_in_c
+
+    return machine if runs_in_c(experiment.world) else NO_C
+
+
+def _interruptible(see: See) -> See:
+    """Return a function that first looks for a signal: a library may have caught the exception."""
+
+    def look(records: list[Record]) -> None:
+        raise_if_interrupted()
+        see(records)
+
+    return look
+
+
+@contextlib.contextmanager
+def _record_virtual(
+    experiment: ResolvedExperiment, folder: Path, see: See
+) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
+    """Fly in virtual time, and yield the recording, the experiment and facts about the run.
+
+    The caller writes the report in the `with` block. After the block, this function attaches a copy
+    of the report to mission.mcap.
+    """
+    from cloudrc.robots.pelican.native.robot import usable
+
+    store, interrupted, see = RecordStore(), False, _interruptible(see)
+    # Record during the flight, so that the recording is kept if the run or its report fails.
+    with McapWriter(folder / "mission.mcap", clock="world", code=code_hash()) as writer:
+        at_start = attachments(folder)  # the experiment, also for a copy that is cut short
+        for name, data in at_start.items():
+            writer.attach(name, data)
+
+        def sink(from_world: list[Record], from_cloud: list[Record]) -> None:
+            writer.write(heapq.merge(from_world, from_cloud, key=attrgetter("stamp_ns")))
+            store.add(from_world, from_cloud)
+            see(from_cloud)
+            see(from_world)
+
+        try:
+            assembly.fly(experiment, sink)
+        except KeyboardInterrupt:
+            interrupted = True
+        try:
+            steps = _where_steps_run(experiment, usable().text)
+            run = Run("virtual", "virtual", interrupted, assembly.virtual_notes(experiment), steps)
+            writer.note(run.metadata)
+            recording = Recording(records=store, metadata={CODE: code_hash()})
+            writer.write_views(views(recording, experiment))
+            yield recording, experiment, run
+        finally:
+            for name, data in attachments(folder).items() - at_start.items():
+                writer.attach(name, data)
+
+
+@contextlib.contextmanager
+def _record_local(
+    experiment: ResolvedExperiment,
+    folder: Path,
+    see: See,
+    session: Session | None = None,
+) -> Iterator[tuple[Recording, ResolvedExperiment, Run]]:
+    """Fly in real time; yield the merged recording, the experiment and facts about the run.
+
+    With `session`, as in `fly`, yield those of the session's last mission.
+    """
+    prepare_link(folder / LINK_FOLDER, experiment)
+    local = LocalRun(folder, _interruptible(see), session=session)
+    broken, interrupted = None, True
+    try:
+        local.fly(inf if session else assembly.flight_limit(experiment))
+        interrupted = False
+    except KeyboardInterrupt:
+        pass
+    except CloudrcError as error:
+        broken = error
+    try:
+        if session:
+            mission, experiment, interrupted = read_last_mission(folder)
+        else:
+            mission = merge(folder / "world.mcap", folder / "cloud.mcap")
+    except CloudrcError:
+        if broken or (interrupted and not session):
+            raise broken or InterruptedRunError("interrupted, nothing was recorded") from None
+        raise
+    notes = (*local.notes, *([str(broken)] if broken else ()))
+    steps = _where_steps_run(experiment, library().text)
+    run = Run("local", "relay", interrupted, notes, steps)
+    mission.metadata |= run.metadata
+    try:
+        mission.views = views(mission, experiment)
+        yield mission, experiment, run
+    finally:
+        mission.write(folder / "mission.mcap", attachments(folder))
+        local.announcement.close()
+    if broken:
+        raise broken

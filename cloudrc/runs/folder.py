@@ -1,0 +1,50 @@
+"""Make the folder of a run or of a sweep."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+from pathlib import Path
+
+from cloudrc.errors import BadInputError
+
+RUNS = Path("runs")
+"""Folder for runs, in the working folder."""
+
+
+def new_folder(out: Path | None, name: str, link: str = "latest") -> Path:
+    """Make the folder of a run: `out`, or the next free `runs/<name>-<n>`.
+
+    Without `out`, point the symbolic link `runs/<link>` to the new folder; "" for no link. Raise a
+    BadInputError if `out` exists and is not an empty folder, or if no folder can be made.
+    """
+    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise BadInputError(
+            f"--out {out}: already exists; name a new folder, runs are never overwritten"
+        )
+    try:
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            return out
+        RUNS.mkdir(exist_ok=True)
+        for n in itertools.count(1):
+            folder = RUNS / f"{name}-{n}"
+            with contextlib.suppress(FileExistsError):  # another process may make it first
+                folder.mkdir()
+                break
+    except OSError as error:
+        where = f"--out {out}" if out else f"{RUNS}/ in the working folder"
+        text = f"{where}: cannot be made: {error.strerror}; name a writable folder with --out"
+        raise BadInputError(text) from error
+    if link:
+        point_to(folder, link)
+    return folder
+
+
+def point_to(folder: Path, link: str) -> None:
+    """Let the symbolic link `link`, beside `folder`, point to `folder`; ignore a failure."""
+    latest = folder.parent / link
+    with contextlib.suppress(OSError):
+        if latest.is_symlink():
+            latest.unlink()
+        latest.symlink_to(folder.name, target_is_directory=True)

@@ -1,0 +1,64 @@
+"""Read the last mission of a session (`cloudrc up`) that has ended.
+
+The recordings of world and cloud contain all flights of the session; `mission.mcap` and the report
+contain the last mission.
+"""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+
+from cloudrc.assembly import with_order
+from cloudrc.config.load import ResolvedExperiment, dump, read_experiment
+from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
+from cloudrc.drivers.local import JOURNAL_FILE, under_way
+from cloudrc.errors import BadInputError, NothingFlownError
+from cloudrc.record.columns import Recording
+from cloudrc.record.merge import cut_to_last_mission, merge
+from cloudrc.report.document import Run
+from cloudrc.report.write import attachments
+from cloudrc.teleop.store import Mission, open_store
+
+
+def last_mission(folder: Path) -> Mission | None:
+    """Return the last mission that flew in a session that has ended; None if none flew."""
+    if not (folder / JOURNAL_FILE).exists():  # the session has ended before it was ready
+        return None
+    with closing(open_store(folder / JOURNAL_FILE, b"")) as store:
+        flown = [each for each in store.missions.values() if "started" in each.happened]
+    return flown[-1] if flown else None
+
+
+def read_last_mission(folder: Path) -> tuple[Recording, ResolvedExperiment, bool]:
+    """Read the last mission of a session that has ended; write its experiment to config.yaml.
+
+    Returns:
+        The recording of this mission, its experiment, and whether the session ended before the
+        mission.
+
+    Raises:
+        NothingFlownError: If no mission flew.
+    """
+    if (last := last_mission(folder)) is None:
+        raise NothingFlownError(f"{folder}: no mission flew, so there is no report")
+    if last.order.plan.by_hand:  # rest at the start, until the report has the setpoints
+        rest = [(time, last.order.plan.legs[0].position) for time in (0.0, 1.0)]
+        (folder / DRIVE_FILE).write_text(write_setpoints(rest), encoding="utf-8")
+    config = folder / "config.yaml"
+    about = f"Mission {last.id} ({last.order.name}), the last one of a session"
+    experiment = with_order(read_experiment(config, flown=True), last.order, about)
+    config.write_text(dump(experiment), encoding="utf-8")
+    recording = merge(folder / "world.mcap", folder / "cloud.mcap")
+    cut_to_last_mission(recording)
+    return recording, experiment, not last.ended
+
+
+def restore_mission(folder: Path) -> None:
+    """Write the mission.mcap of a session that was killed before it wrote this file."""
+    if (folder / JOURNAL_FILE).is_file() and not (folder / "mission.mcap").exists():
+        if folder.resolve() in under_way():
+            raise BadInputError(f"{folder}: the session has not ended; end it: cloudrc down")
+        recording, _, interrupted = read_last_mission(folder)
+        recording.metadata |= Run("local", "relay", interrupted).metadata
+        recording.write(folder / "mission.mcap", attachments(folder))
