@@ -15,9 +15,11 @@ import numpy as np
 from cloudrc.cloud.endpoint import CloudEndpoint, ComputeTime
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
+from cloudrc.cloud.planar import Planar
 from cloudrc.config import schema
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.overrides import build_plugin
+from cloudrc.config.robot import is_planar
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
 from cloudrc.geometry import fence
 from cloudrc.link.model import LinkDirection
@@ -180,10 +182,13 @@ def build_cloud(
     make a loop that lies.
     """
     cloud = experiment.cloud
+    controller = build_plugin("controllers", cloud.controller)
+    if is_planar(experiment.world.robot):
+        controller = Planar(controller)
     loop = make_loop(
         lambda: build_plugin("estimators", cloud.estimator),
         build_plugin("predictors", cloud.predictor),
-        build_plugin("controllers", cloud.controller),
+        controller,
         horizon_max=cloud.horizon_max_s,
         freeze_after=cloud.freeze_after_s,
         period_ns=round(SECOND_NS / cloud.command_rate_hz),

@@ -125,20 +125,23 @@ def serve_api(
 ) -> ApiServer:
     """Start the API; until the mission service runs, the API answers that teleop is starting."""
     from cloudrc import assembly
+    from cloudrc.config.robot import is_planar
     from cloudrc.files import write_atomically
     from cloudrc.teleop.api import ApiServer, Bridge, create_app
     from cloudrc.teleop.auth import Audit, Gate, Tokens
-    from cloudrc.teleop.models import read_goto, read_order
+    from cloudrc.teleop.models import read_drive, read_goto, read_order
 
     if not isinstance(options.api, Path):
         warn_if_exposed(options.api)
     bridge, contact = Bridge(), bool(experiment.criteria.contact)
+    planar = is_planar(experiment.world.robot)
     order = partial(
-        read_order, scene=scene, contact=contact,
+        read_order, scene=scene, contact=contact, planar=planar,
         plan=partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps),
     )  # fmt: skip
     tokens = Tokens(options.tokens, log_line) if options.tokens else None
-    app = create_app(bridge, order, partial(read_goto, scene=scene), log_line)
+    goto = partial(read_goto, scene=scene, planar=planar)
+    app = create_app(bridge, order, goto, partial(read_drive, planar=planar), log_line)
     server = ApiServer(Gate(app, tokens, Audit(options.audit, log_line)), bridge, options.api)
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     files = FILES_MAX if hard == resource.RLIM_INFINITY else min(FILES_MAX, hard)

@@ -25,11 +25,12 @@ from pydantic import (
 from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
 from cloudrc.config.document import Document, KeyPath, write_yaml
+from cloudrc.config.ground import put_on_ground
 from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import Problem
 from cloudrc.config.reuse import reuse
-from cloudrc.config.robot import find_robot
+from cloudrc.config.robot import find_robot, is_planar
 from cloudrc.config.schema import (
     Change,
     Cloud,
@@ -174,26 +175,38 @@ def load_experiment(
         document.tree["report"]["metrics"] = [names]
     found += overrides.resolve_plugins(document, build=build) + _resolve_paths(document)
     experiment = problems.validate(document, ResolvedExperiment, name, found, described=Experiment)
+    return _judge(document, experiment, name, flown=flown)
+
+
+def _judge(
+    document: Document, experiment: ResolvedExperiment, name: str, *, flown: bool
+) -> ResolvedExperiment:
+    """Complete an experiment with what depends on its scene and robot.
+
+    Unless the experiment is `flown` already, raise a BadInputError if the mission does not fit.
+    """
     mission = experiment.mission
     scene = reuse(("scene", experiment.world.scene), lambda: load_scene(experiment.world.scene))
     contact = experiment.criteria.contact
     if contact is None:
         contact = scene.board is not None and not (mission.steps or mission.setpoints)
     if not flown:
-        problems.raise_problems(document, _check_flown(mission, scene, contact), name)
+        planar = is_planar(experiment.world.robot)
+        mission = put_on_ground(mission, scene) if planar else mission
+        problems.raise_problems(document, _check_flown(mission, scene, contact, planar), name)
     criteria = experiment.criteria.model_copy(update={"contact": contact})
-    return experiment.model_copy(update={"criteria": criteria})
+    return experiment.model_copy(update={"criteria": criteria, "mission": mission})
 
 
-def _check_flown(mission: Mission, scene: Scene, contact: bool) -> list[Problem]:
+def _check_flown(mission: Mission, scene: Scene, contact: bool, planar: bool) -> list[Problem]:
     """List the problems of a mission in a scene, with their paths in the experiment."""
 
     def check() -> list[Problem]:
-        wrong = check_mission(mission, scene, contact=contact)
+        wrong = check_mission(mission, scene, contact=contact, planar=planar)
         below = [problem._replace(path=("mission", *problem.path)) for problem in wrong]
         return [*check_scene(scene, contact=contact), *below]
 
-    return reuse(("mission", mission.model_dump_json(), repr(scene), contact), check)
+    return reuse(("mission", mission.model_dump_json(), repr(scene), contact, planar), check)
 
 
 def read_experiment(

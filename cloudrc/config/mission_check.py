@@ -13,6 +13,7 @@ from difflib import get_close_matches
 
 import numpy as np
 
+from cloudrc.config.ground import check_heights
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Mission, Steps
 from cloudrc.geometry import fence
@@ -34,8 +35,13 @@ _REPORTED = 20
 _SPANS = zip("xyz", fence.INNER_LOW, fence.INNER_HIGH, strict=True)
 _INNER = ", ".join(f"{name} {low:g} to {high:g}" for name, low, high in _SPANS) + " [m]"
 """Text that describes the region in which the guard lets the robot fly, in the world frame."""
+_INNER_WALLS = _INNER.partition(", z")[0] + " [m]"
+"""The same text for a robot on the ground."""
 
 
+LIFT = 1.0
+"""Height that is added to the positions of a robot on the ground [m], because only the walls of the
+fence concern it."""
 TOUCHING = 1e-3
 """Distance from an obstacle below which the robot touches it [m]; it covers rounding errors."""
 
@@ -65,11 +71,17 @@ def _named(names: Sequence[str]) -> str:
     return f"the nearest name is {near[0]}" if near else f"it has {', '.join(names)}"
 
 
-def check_mission(mission: Mission, scene: Scene, *, contact: bool) -> list[Problem]:
+def check_mission(
+    mission: Mission, scene: Scene, *, contact: bool, planar: bool = False
+) -> list[Problem]:
     """List the problems of a mission in a scene, each with its path inside the mission.
 
-    With `contact`, the mission has to touch the board, which is then no obstacle.
+    With `contact`, the mission has to touch the board, which is then no obstacle. A `planar` robot
+    stays on the ground, at the height of the spawn.
     """
+    if planar and (problems := check_heights(mission, scene)):
+        return problems
+    lift = LIFT if planar else 0.0
     if mission.setpoints is not None:
         if mission.waypoints or mission.steps or mission.carrot:
             reason = "a mission has setpoints, or waypoints, steps and a carrot; delete one"
@@ -87,23 +99,24 @@ def check_mission(mission: Mission, scene: Scene, *, contact: bool) -> list[Prob
         if mission.waypoints:
             reason = "a mission has waypoints or steps, not both; delete one"
             return [Problem(("steps",), "", reason)]
-        reason = _check_steps(mission.steps, obstacles(scene, contact=contact))
+        reason = _check_steps(mission.steps, obstacles(scene, contact=contact), lift)
         return [Problem(("steps",), "", reason)] if reason else []
     if not mission.waypoints:
         return [Problem(("waypoints",), "", "none given; give at least one, or steps or setpoints")]
     start = scene.spawn if mission.start == "spawn" else None
-    return list(_check_waypoints(mission, obstacles(scene, contact=contact), start))
+    return list(_check_waypoints(mission, obstacles(scene, contact=contact), start, lift))
 
 
 def _check_waypoints(
-    mission: Mission, known: Sequence[Obstacle], start: Vector | None
+    mission: Mission, known: Sequence[Obstacle], start: Vector | None, lift: float
 ) -> Iterator[Problem]:
     positions = np.array([waypoint.position_m for waypoint in mission.waypoints])
     yaws = np.radians([waypoint.yaw_deg for waypoint in mission.waypoints])
     # A waypoint may be outside by half its tolerance; the other half is for control errors.
     slack = np.array([0.5 * waypoint.tolerance_m for waypoint in mission.waypoints])
-    in_fence = np.all((positions >= fence.LOW) & (positions <= fence.HIGH), axis=1)
-    outside = outside_fence(positions, slack) | ~in_fence
+    lifted = positions + np.array((0.0, 0.0, lift))
+    in_fence = np.all((lifted >= fence.LOW) & (lifted <= fence.HIGH), axis=1)
+    outside = outside_fence(lifted, slack) | ~in_fence
     hit = find_overlapped(known, positions, yaws)
     wrong = np.flatnonzero(outside | (hit >= 0))
     for index in np.flatnonzero(yaws)[:_REPORTED]:
@@ -111,8 +124,8 @@ def _check_waypoints(
         yield Problem(path, f"{mission.waypoints[index].yaw_deg:g}", _YAW)
     for index in wrong[:_REPORTED]:
         if outside[index]:
-            reason = (
-                f"beyond the fence, or too near to it; the guard lets the robot fly at {_INNER}"
+            reason = "beyond the fence, or too near to it; the guard lets the robot " + (
+                f"drive at {_INNER_WALLS}" if lift else f"fly at {_INNER}"
             )
         else:
             reason = (
@@ -121,7 +134,9 @@ def _check_waypoints(
         position = mission.waypoints[index].position_m
         before = mission.waypoints[index - 1].position_m if index else start
         legal = None if index - 1 in wrong else before
-        near = find_nearest_legal(known, position, float(yaws[index]), legal)
+        near = None
+        if not lift:
+            near = find_nearest_legal(known, position, float(yaws[index]), legal)
         if near is not None:
             reason += f"; nearest legal point found: {_point(np.array(near))}"
         yield _at_point(index, positions[index], reason)
@@ -143,13 +158,13 @@ def _check_ways(positions: Array, known: Sequence[Obstacle]) -> Iterator[Problem
         yield _at_point(index, positions[index + 1], reason)
 
 
-def _check_steps(steps: Steps, known: Sequence[Obstacle]) -> str:
+def _check_steps(steps: Steps, known: Sequence[Obstacle], lift: float) -> str:
     """Check the box that contains all random setpoints; return the problem, "" if none."""
     axis = np.linspace(-1, 1, 9)
     box = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     with np.errstate(over="ignore"):  # an infinite position is outside the fence, too
         positions = np.array(steps.centre_m) + box * np.array(steps.range_m)
-    if outside_fence(positions).any():
+    if outside_fence(positions + np.array((0.0, 0.0, lift))).any():
         return (
             "steps reach beyond the fence, or too near to it; the guard lets the robot fly at "
             f"{_INNER}; choose a smaller range_m"

@@ -12,6 +12,7 @@ from pathlib import Path
 from cloudrc.config import shipped
 from cloudrc.config.document import read_document
 from cloudrc.config.problems import validate
+from cloudrc.config.reuse import reuse
 from cloudrc.config.schema import NameOr, PlugIn, Section
 from cloudrc.plugins import is_path
 
@@ -26,6 +27,10 @@ class RobotFile(Section):
     onboard: NameOr[PlugIn]
     """Controller on board, which follows the velocity that the guard allows: the name of a plug-in,
     the path of a Python file, or a mapping with parameters"""
+    planar: bool = False
+    """Whether the robot stays on the ground. Then the guard limits x and y alone, HOLD and LAND
+    brake the robot to rest, waypoints have the height of the spawn, and cloud commands no vertical
+    velocity"""
 
 
 @dataclass(frozen=True)
@@ -36,6 +41,7 @@ class RobotFiles:
     # With the absolute path of a Python file, or the name of a plug-in. None for a model alone:
     # which controller flies it depends on the model.
     onboard: PlugIn | None
+    planar: bool = False  # whether it stays on the ground
 
 
 def find_robot(name: str) -> RobotFiles:
@@ -52,7 +58,12 @@ def find_robot(name: str) -> RobotFiles:
     onboard = robot.onboard if isinstance(robot.onboard, PlugIn) else PlugIn(name=robot.onboard)
     if is_path(onboard.name):
         onboard = onboard.model_copy(update={"name": str((folder / onboard.name).resolve())})
-    return RobotFiles(folder / robot.model, onboard)
+    return RobotFiles(folder / robot.model, onboard, robot.planar)
+
+
+def is_planar(name: str) -> bool:
+    """Return whether a robot stays on the ground; raise a BadInputError as `find_robot` does."""
+    return reuse(("robot", name), lambda: find_robot(name)).planar
 
 
 def files_of(name: str) -> list[Path]:

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Discriminator,
     Field,
@@ -23,6 +24,20 @@ from pydantic import (
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Point = tuple[Finite, Finite, Finite]
+
+
+def _with_height(value: Any) -> Any:
+    return [*value, GROUND] if isinstance(value, list | tuple) and len(value) == 2 else value
+
+
+GROUND = 0.0
+"""Height of a place that is given by two numbers [m]; `config.ground` replaces it."""
+Place = Annotated[
+    Point,
+    Field(strict=False, json_schema_extra={"minItems": 2}),
+    BeforeValidator(_with_height),
+]
+"""A point; a robot that stays on the ground needs no third number."""
 NotNegative = Annotated[float, Field(ge=0)]
 NotNegatives = tuple[NotNegative, NotNegative, NotNegative]
 Positive = Annotated[float, Field(gt=0)]
@@ -217,9 +232,9 @@ NameOr = Annotated[
 class Waypoint(Section):
     """A point to fly to."""
 
-    position_m: Point
-    """Position of the base [m], world frame. The guard must allow the point and the straight line
-    to it, and both must be clear of obstacles"""
+    position_m: Place
+    """Position of the base [m], world frame; two numbers for a robot that stays on the ground. The
+    guard must allow the point and the straight line to it, and both must be clear of obstacles"""
     yaw_deg: Finite = 0.0
     """Heading [deg]; only 0 is accepted, because the onboard controller holds the yaw at 0"""
     tolerance_m: Positive = 0.10

@@ -45,7 +45,7 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     onboard, plugin = _build_onboard(world, nominal, choice), plugins.find(KIND, choice.name)
     true = compile_true(robot.model, scene, nominal, world.plant)
     simulator = Simulator(true, _actuators(plugin, nominal, choice), wind)
-    guard = Guard(limits)
+    guard = Guard(limits, planar=robot.planar)
     if world.is_nominal and hasattr(plugin, "accelerate"):
         return plugin.accelerate(simulator, onboard, guard)  # type: ignore[no-any-return]
     return Robot(simulator, onboard, guard)

@@ -26,6 +26,7 @@ from starlette.requests import ClientDisconnect
 from cloudrc import __version__
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.messages import Vector
 from cloudrc.teleop import models
 from cloudrc.teleop.auth import BEARER, REFUSED, Gate
 from cloudrc.teleop.service import MissionService
@@ -176,12 +177,14 @@ def create_app(
     bridge: Bridge,
     read_order: Callable[[bytes], Order],
     read_goto: Callable[[bytes], Leg],
+    read_drive: Callable[[bytes], Vector],
     complain: Callable[[str], None],
 ) -> FastAPI:
     """Make the ASGI application of the API; run it behind a `Gate`, which checks the tokens.
 
     `read_order` reads and checks the body of an order to fly a mission, `read_goto` the body of an
-    order to fly to a point. `complain` receives one line about each internal error.
+    order to fly to a point, `read_drive` that of a velocity. `complain` receives one line about
+    each internal error.
     """
     app = FastAPI(
         title="cloudrc teleop",
@@ -192,6 +195,7 @@ def create_app(
         redirect_slashes=False,
     )
     app.state.bridge, app.state.read_order, app.state.read_goto = bridge, read_order, read_goto
+    app.state.read_drive = read_drive
 
     @app.exception_handler(CloudrcError)
     async def refuse(request: Request, error: CloudrcError) -> JSONResponse:
@@ -327,7 +331,7 @@ async def go_to(body: Body, bridge: Bridged, request: Request) -> Any:
 @router.post(
     "/drive", response_model=models.MissionSummary, openapi_extra=_takes(models.DriveRequest)
 )
-async def drive(body: Body, bridge: Bridged) -> Any:
+async def drive(body: Body, bridge: Bridged, request: Request) -> Any:
     """Drive the setpoint by hand, during a held mission or as a new mission.
 
     The setpoint accelerates to the velocity with at most 2 m/s^2 and stays inside the fence. Repeat
@@ -335,7 +339,7 @@ async def drive(body: Body, bridge: Bridged) -> Any:
     rest, and the robot holds there. After a hold, a stop or the end of a mission, let go first:
     send the velocity zero, or nothing for 0.5 s. The answer is 409 while a mission flies.
     """
-    velocity = models.read_drive(body)
+    velocity = request.app.state.read_drive(body)
     return await bridge.move(lambda service, now_ns: service.drive(velocity, now_ns).summary())
 
 

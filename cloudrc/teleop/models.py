@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from cloudrc.config.ground import ABOVE, on_ground, put_on_ground
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem as ConfigProblem
 from cloudrc.config.problems import from_pydantic
@@ -20,6 +21,7 @@ from cloudrc.config.schema import (
     Carrot,
     Finite,
     Mission,
+    Place,
     Section,
     TimeLimit,
     Waypoint,
@@ -69,7 +71,7 @@ class MissionRequest(Section):
 class GoToRequest(Section):
     """Order to fly to a point."""
 
-    position_m: tuple[Finite, Finite, Finite] = Field(description="Base position [m], world frame")
+    position_m: Place = Field(description="Base position [m], world frame")
     yaw_deg: Finite = Field(0.0, description="Heading [deg]")
 
 
@@ -245,42 +247,55 @@ def read_order(
     scene: Scene,
     *,
     contact: bool,
+    planar: bool = False,
     plan: Callable[[Mission, float | None], Plan],
 ) -> Order:
     """Read, check and plan the mission in the body of a request.
 
     `contact` is a default: whether the arm has to touch the board in missions with a waypoint at
-    the board. `plan` makes a plan from a mission and a time limit [s], which may be None. Raise a
-    RefusedError that lists all problems.
+    the board. A `planar` robot stays on the ground. `plan` makes a plan from a mission and a time
+    limit [s], which may be None. Raise a RefusedError that lists all problems.
     """
     request = _parse(body, MissionRequest)
     if not request.waypoints:  # only an experiment may have steps instead
         raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
     mission = Mission(start=request.start, waypoints=request.waypoints, carrot=request.carrot)
+    mission = put_on_ground(mission, scene) if planar else mission
     contact = contact and leads_to_board(mission, scene)
     contact = contact if request.contact is None else request.contact
-    if problems := check_mission(mission, scene, contact=contact):
+    if problems := check_mission(mission, scene, contact=contact, planar=planar):
         raise RefusedError(problems)
     planned = plan(mission, request.time_limit_s)
     lease = request.lease_s or 0.0
     return Order(planned, request.name, request.key, contact, request.queue, lease)
 
 
-def read_goto(body: bytes, scene: Scene) -> Leg:
-    """Read and check a point in a request's body; raise a RefusedError that lists all problems."""
+def read_goto(body: bytes, scene: Scene, *, planar: bool = False) -> Leg:
+    """Read and check a point in a request's body; raise a RefusedError that lists all problems.
+
+    A `planar` robot stays on the ground.
+    """
     request = _parse(body, GoToRequest)
-    waypoint = Waypoint(position_m=request.position_m, yaw_deg=request.yaw_deg)
+    position = on_ground(request.position_m, scene) if planar else request.position_m
+    waypoint = Waypoint(position_m=position, yaw_deg=request.yaw_deg)
     # Whether the board is an obstacle depends on the mission; the service checks the way.
     mission = Mission(start="here", waypoints=(waypoint,))
-    problems = check_mission(mission, scene, contact=True)
+    problems = check_mission(mission, scene, contact=True, planar=planar)
     if problems:
         raise RefusedError([ConfigProblem(p.path[2:], p.value, p.reason) for p in problems])
-    return Leg(request.position_m, radians(request.yaw_deg))
+    return Leg(position, radians(request.yaw_deg))
 
 
-def read_drive(body: bytes) -> Vector:
-    """Read the velocity [m/s] in a request's body; raise a RefusedError that lists all problems."""
-    return _parse(body, DriveRequest).velocity_mps
+def read_drive(body: bytes, *, planar: bool = False) -> Vector:
+    """Read the velocity [m/s] in a request's body; raise a RefusedError that lists all problems.
+
+    A `planar` robot stays on the ground: it has no vertical velocity.
+    """
+    velocity = _parse(body, DriveRequest).velocity_mps
+    if planar and velocity[2] != 0.0:
+        reason = f"leads up or down, {ABOVE}; set it to 0"
+        raise RefusedError([ConfigProblem(("velocity_mps", "2"), f"{velocity[2]:g}", reason)])
+    return velocity
 
 
 def leads_to_board(mission: Mission, scene: Scene) -> bool:

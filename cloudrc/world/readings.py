@@ -33,6 +33,12 @@ class Readings(NamedTuple):
     angular_velocity_body: Vector
     axes: Axes
 
+    def on_ground(self) -> Readings:
+        """Return the readings without height and vertical velocity, for a planar robot."""
+        x, y, _ = self.position
+        vx, vy, _ = self.velocity
+        return self._replace(position=(x, y, 0.0), velocity=(vx, vy, 0.0))
+
     @classmethod
     def of(cls, pose: Iterable[float], twist: Iterable[float]) -> Readings:
         """Make readings from the state of a free joint in MuJoCo.

@@ -5,15 +5,14 @@ from math import atan2, cos, degrees, hypot, pi, radians, sin
 import pytest
 
 import cloudrc
+from cloudrc.config.load import ResolvedGuard
 from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import Plant, World
 from cloudrc.config.shipped import file_of
 from cloudrc.errors import BadInputError
-from cloudrc.robots.build import build_onboard, check_robot
+from cloudrc.robots.build import build_robot, check_robot
 from cloudrc.world import scene
-from cloudrc.world.onboard import Direct
 from cloudrc.world.scene import compile_model, compile_true
-from cloudrc.world.simulator import Simulator
 
 MODEL = find_robot("rover").model
 EMPTY = file_of("empty")
@@ -27,9 +26,8 @@ def drive(own_robot):
 
     def go(*wanted, model=TEXT, onboard="diff_drive", time=2.0):
         folder = own_robot(f"onboard: {onboard}", model)
-        compiled = compile_model(folder / "robot.xml", EMPTY)
-        controller = build_onboard(World(robot=str(folder), scene="empty"), compiled)
-        simulator = Simulator(compiled, Direct(compiled.nu))
+        robot = build_robot(World(robot=str(folder), scene="empty"), ResolvedGuard())
+        simulator, controller = robot.simulator, robot.onboard
         for *velocity, yaw_rate in wanted:
             for _ in range(round(time / simulator.dt)):
                 simulator.step(controller.update(simulator.readings, tuple(velocity), yaw_rate))
@@ -77,9 +75,8 @@ def test_stopped_wheels_brake(drive):
 
 
 def test_no_wheel_is_faster_than_its_limit_and_turning_comes_first():
-    model = compile_model(MODEL, EMPTY)
-    controller = build_onboard(World(robot="rover", scene="empty"), model)
-    readings = Simulator(model, Direct(2)).readings
+    robot = build_robot(World(robot="rover", scene="empty"), ResolvedGuard())
+    controller, readings = robot.onboard, robot.simulator.readings
     assert controller.update(readings, (50.0, 0.0, 0.0), 0.0) == pytest.approx((20.0, 20.0))
     left, right = controller.update(readings, (50.0, 50.0, 0.0), 0.0)
     assert right == pytest.approx(20.0)
@@ -163,7 +160,7 @@ def test_wrong_parameters_are_refused(own_robot, onboard):
 
 
 def test_the_cloud_drives_the_rover_to_its_waypoints_and_twice_alike():
-    points = [{"position_m": [x, y, 0.35], "tolerance_m": 0.3} for x, y in ((1.5, 0), (1.5, -1))]
+    points = [{"position_m": [x, y], "tolerance_m": 0.3} for x, y in ((1.5, 0), (1.5, -1))]
     settings = {"world.robot": "rover", "mission": {"waypoints": points}}
     flights = [cloudrc.fly("steps", settings) for _ in range(2)]
     assert flights[0].verdict == "success"

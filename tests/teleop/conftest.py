@@ -24,7 +24,7 @@ from cloudrc.teleop.api import STARTING, ApiServer, Bridge, create_app
 from cloudrc.teleop.auth import Audit, Gate, Tokens
 from cloudrc.teleop.carrot import setpoint_at
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.models import read_goto, read_order
+from cloudrc.teleop.models import read_drive, read_goto, read_order
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import ConflictError, MissionStore, Order, UnavailableError
 from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus
@@ -324,7 +324,8 @@ class Running:
         self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
         how = {"contact": True, "plan": assembly.mission_plan}
         order, goto = (partial(read, scene=self.scene) for read in (read_order, read_goto))
-        app = create_app(self.bridge, partial(order, **how), goto, self.complaints.append)
+        order = partial(order, **how)
+        app = create_app(self.bridge, order, goto, read_drive, self.complaints.append)
         tokens = None if unix else Tokens(folder, self.complaints.append)
         self.gate = Gate(app, tokens, Audit(self.audit_file, self.complaints.append))
         self.address = folder / "api.sock" if unix else (host, 0)

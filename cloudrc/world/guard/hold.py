@@ -8,7 +8,7 @@ always stops within this distance.
 
 from __future__ import annotations
 
-from math import hypot, nan
+from math import hypot, inf, nan
 from operator import le
 
 from cloudrc.messages import ZERO, Cause, Vector
@@ -173,20 +173,40 @@ class Descent:
         return now_ns - self._moved_ns >= TOUCH_DOWN_NS
 
 
+class Halt(Descent):
+    """Ends the landing of a planar robot: it brakes, and stops once it is at rest."""
+
+    def __init__(self) -> None:
+        """Plan no descent."""
+        super().__init__(-inf, 0.0)
+
+    def is_over(self, now_ns: int, reference: Vector, readings: Readings) -> bool:
+        """Return whether the robot is at rest at `now_ns` [ns], world's clock.
+
+        `reference` is that of `Descent.is_over` [m/s].
+        """
+        if not hypot(*readings.velocity) < STILL_SPEED:
+            self._moved_ns = now_ns
+        return now_ns - self._moved_ns >= TOUCH_DOWN_NS
+
+
 class TakeOff:
     """Detects the end of the take-off, and decides whether the robot may take off.
 
     `over` becomes True when the robot has left the ground. If the rotors stopped in the air, the
     robot may still fall, or be outside the fence, when the operator acknowledges the stop. Before
     the robot may take off again, it has to come to rest on the ground, at least TAKE_OFF_MARGIN
-    inside the fence.
+    inside the fence. A planar robot takes off, as it were, when it is allowed to move; it needs no
+    margin.
     """
 
-    def __init__(self, low: Vector, high: Vector) -> None:
+    def __init__(self, low: Vector, high: Vector, *, planar: bool = False) -> None:
         """Set the fence from corner `low` to `high` [m], world frame; begin before the take-off."""
         (ax, ay, az), (bx, by, bz) = low, high
-        self._low = (ax + TAKE_OFF_MARGIN, ay + TAKE_OFF_MARGIN, az)
-        self._high = (bx - TAKE_OFF_MARGIN, by - TAKE_OFF_MARGIN, bz)
+        margin = 0.0 if planar else TAKE_OFF_MARGIN
+        self._lift_off = 0.0 if planar else LIFT_OFF_HEIGHT
+        self._low = (ax + margin, ay + margin, az)
+        self._high = (bx - margin, by - margin, bz)
         self.over = self._stopped = False
         self._still_ticks, self._height = 0, nan
 
@@ -221,7 +241,7 @@ class TakeOff:
         """
         height = readings.position[2]
         if flies:
-            self.over, self._stopped = not abs(height - self._height) < LIFT_OFF_HEIGHT, False
+            self.over, self._stopped = not abs(height - self._height) < self._lift_off, False
         else:
             self._height = height
             if self._stopped:

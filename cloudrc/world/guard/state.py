@@ -33,6 +33,9 @@ the stamp of a basis in the future.
 - HOLD within a mission has a time limit, because the operator may be gone. HOLD after a mission has
   no time limit: the robot waits for the next mission.
 
+A planar robot stays on the ground: the guard ignores heights and vertical velocities. Its LAND is
+to brake and, at rest, to stop; its HOLD ends as that of a robot in the air.
+
 A robot that touches nothing never turns over: no command tilts it as far as OVERTURNED_COSINE.
 """
 
@@ -54,7 +57,7 @@ from cloudrc.messages import (
 )
 from cloudrc.records import GuardChange
 from cloudrc.world.guard import limits as rules
-from cloudrc.world.guard.hold import Descent, PositionHold, TakeOff
+from cloudrc.world.guard.hold import Descent, Halt, PositionHold, TakeOff
 from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX
 from cloudrc.world.readings import Readings
 
@@ -96,10 +99,12 @@ class Guard:
         changes: Changes of the state since the last `take_changes`.
         counts: Counters of world. The guard counts "limited_speed": shortened velocities of
             commands and plans; "limited_yaw_rate": commands with a limited yaw rate;
+            "limited_vertical": vertical velocities that a planar robot got and ignored;
             "limited_fence": steps in which the fence limited the reference.
     """
 
-    def __init__(self, limits: ResolvedGuard) -> None:
+    def __init__(self, limits: ResolvedGuard, *, planar: bool = False) -> None:
+        """Begin in GROUND; a `planar` robot stays on the ground."""
         self.command_age_max_ns = round(limits.command_age_max_ms * 1_000_000)
         self._hold_max_ns = round(limits.hold_max_s * 1e9)
         self._plan_max_ns = round(limits.plan_max_s * 1e9)
@@ -107,11 +112,14 @@ class Guard:
         self.acceleration_max = limits.acceleration_max_mps2
         self._yaw_rate_max = limits.yaw_rate_max_radps
         self._speed_max = limits.speed_max_mps * rules.ROUNDING_FACTOR
+        self._planar = planar
         self._low, self._high = fence.INNER_LOW, fence.INNER_HIGH
+        if planar:
+            self._low, self._high = (*self._low[:2], -inf), (*self._high[:2], inf)
         self._floor, half = self._low[2], 0.5 * limits.speed_max_mps
         self._position_hold = PositionHold(self._low, self._high, half)
-        self._descent = Descent(self._floor, half)
-        self._take_off = TakeOff(fence.LOW, fence.HIGH)
+        self._descent = Halt() if planar else Descent(self._floor, half)
+        self._take_off = TakeOff(fence.LOW, fence.HIGH, planar=planar)
         self.changes: list[GuardChange] = []
         self.counts: Counter[str] = Counter()
         self.state, self.cause = GROUND, Cause.SPAWN
@@ -257,6 +265,9 @@ class Guard:
             step = max(now_ns - command.planned_ns, 0) // PLAN_STEP_NS
             if step < len(command.plan):
                 self._next_ns = command.planned_ns + (step + 1) * PLAN_STEP_NS
+        if self._planar and velocity[2] != 0.0:
+            velocity = (velocity[0], velocity[1], 0.0)
+            self.counts["limited_vertical"] += 1
         self._wanted = rules.limit_length(velocity, self._speed_max)
         if self._wanted is not velocity:
             self.counts["limited_speed"] += 1
@@ -293,6 +304,8 @@ class Guard:
         Return the velocity reference for the low-level controller [m/s], world frame, shape (3,).
         Return None while the rotors are stopped.
         """
+        if self._planar:
+            readings = readings.on_ground()
         if now_ns >= self._next_ns:
             self._play(self._played, now_ns)
         if self._flies and readings.axes[8] < OVERTURNED_COSINE:

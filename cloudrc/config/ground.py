@@ -1,0 +1,53 @@
+"""Missions of a robot that stays on the ground: its waypoints have the height of the spawn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from cloudrc.config.problems import Problem
+from cloudrc.config.schema import GROUND, Mission
+from cloudrc.geometry.scene import Scene
+from cloudrc.messages import Vector
+
+ABOVE = "but the robot stays on the ground"
+"""Part of the messages about missions that lead off the ground."""
+SAME = 1e-6
+"""Largest difference from the height of the spawn [m]."""
+
+
+def on_ground(position: Vector, scene: Scene) -> Vector:
+    """Return a position [m], with the height of the spawn if it has none."""
+    x, y, z = position
+    return (x, y, scene.spawn[2] if z == GROUND else z)
+
+
+def put_on_ground(mission: Mission, scene: Scene) -> Mission:
+    """Return a mission in which waypoints of two numbers have the height of the spawn."""
+    placed = tuple(
+        waypoint.model_copy(update={"position_m": on_ground(waypoint.position_m, scene)})
+        for waypoint in mission.waypoints
+    )
+    return mission.model_copy(update={"waypoints": placed})
+
+
+def check_heights(mission: Mission, scene: Scene) -> list[Problem]:
+    """List what leads a robot off the ground, each with its path inside the mission."""
+    return list(_heights(mission, scene.spawn[2]))
+
+
+def _heights(mission: Mission, height: float) -> Iterator[Problem]:
+    if mission.setpoints is not None:
+        yield Problem(("setpoints",), "", f"have heights, {ABOVE}; give waypoints")
+    steps = mission.steps
+    if steps is not None and (steps.range_m[2] or abs(steps.centre_m[2] - height) > SAME):
+        reason = (
+            f"have heights, {ABOVE}; set range_m to [x, y, 0] and the third number of centre_m to "
+            f"{height:g}, or give waypoints"
+        )
+        yield Problem(("steps",), "", reason)
+    for index, waypoint in enumerate(mission.waypoints):
+        if abs(waypoint.position_m[2] - height) > SAME:
+            path = ("waypoints", str(index), "position_m")
+            shown = f"[{', '.join(f'{value:g}' for value in waypoint.position_m)}]"
+            yield Problem(path, shown, f"has a height, {ABOVE}; give two numbers, x and y")
+            return

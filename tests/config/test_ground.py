@@ -1,0 +1,113 @@
+"""Missions of a robot on the ground: two numbers are enough, heights are refused with a word."""
+
+import json
+
+import pytest
+
+import cloudrc
+from cloudrc.assembly import mission_plan
+from cloudrc.config.load import dump, load_experiment
+from cloudrc.errors import BadInputError
+from cloudrc.geometry.scene import load_scene
+from cloudrc.teleop.models import RefusedError, read_drive, read_goto, read_order
+
+SCENE = load_scene("pillars")
+ROVER = ["world.robot=rover", "world.scene=empty"]
+
+
+def with_points(*points):
+    waypoints = ", ".join(f"{{position_m: {list(point)}}}" for point in points)
+    return [*ROVER, f"mission={{waypoints: [{waypoints}]}}"]
+
+
+@pytest.mark.parametrize("point", [(1, 0), (1, 0, 0.1)])
+def test_a_waypoint_has_two_numbers_or_the_height_of_the_spawn(point):
+    experiment = load_experiment("steps", with_points(point))
+    assert experiment.mission.waypoints[0].position_m == (1.0, 0.0, 0.1)
+
+
+def test_the_resolved_experiment_loads_again_as_it_is(tmp_path):
+    experiment = load_experiment("pillars")
+    (tmp_path / "again.yaml").write_text(dump(experiment))
+    assert load_experiment(tmp_path / "again.yaml") == experiment
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (with_points((1, 0), (1, 1, 1)), r"waypoints\.1\.position_m: \[1, 1, 1\]: has a height"),
+        (with_points((1, 0, -0.5)), "has a height, but the robot stays on the ground"),
+        (ROVER, "mission.steps: have heights, but the robot stays on the ground"),
+        ([*ROVER, "mission.steps.range_m=[1, 1, 0]"], "third number of centre_m to 0.1"),
+        (with_points((9.1, 0)), r"drive at x -2.8 to 9, y -8.3 to 5.3 \[m\]$"),
+        ([*with_points((3.5, 0)), "world.scene=pillars"], "within 0.04 m of pillar_2$"),
+    ],
+)
+def test_a_mission_that_leads_off_the_ground_or_away_is_refused_in_one_line(settings, message):
+    if "world.scene=pillars" in settings:
+        settings = [each for each in settings if each != "world.scene=empty"]
+    with pytest.raises(BadInputError, match=message) as error:
+        load_experiment("steps", settings)
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_of_setpoints_has_heights(tmp_path):
+    file = tmp_path / "drive.csv"
+    file.write_text("time_s,x_m,y_m,z_m\n0,0,0,1\n1,1,0,1\n")
+    with pytest.raises(BadInputError, match="setpoints: have heights, but the robot stays on"):
+        load_experiment("steps", [*ROVER, f"mission={{setpoints: {file}}}"])
+
+
+def test_steps_in_the_plane_are_driven():
+    flat = {"mission.steps.range_m": [1, 1, 0], "mission.steps.centre_m": [0, 0, 0.1]}
+    settings = {"world.robot": "rover", "mission.steps.count": 2, **flat}
+    assert cloudrc.fly("steps", settings).verdict == "success"
+
+
+def test_a_robot_that_flies_needs_three_numbers():
+    with pytest.raises(BadInputError, match=r"\[1, 0, 0\]: beyond the fence"):
+        load_experiment("steps", with_points((1, 0))[1:])
+
+
+def test_the_rover_drives_through_the_pillars_without_a_vertical_command():
+    flight = cloudrc.fly("pillars")
+    assert flight.verdict == "success"
+    assert flight.numbers["obstacle_contacts"] == 0
+    assert (flight["/cmd_vel"]["command"][:, 2] == 0.0).all()
+    assert "limited_vertical" not in set(flight["/count"]["name"])
+
+
+def test_a_silent_link_makes_the_rover_hold_and_then_stop_for_good():
+    silent = [{"start_s": 3.0, "duration_s": 30.0}]
+    flight = cloudrc.fly("pillars", {"link.both.blackouts": silent, "guard.hold_max_s": 3.0})
+    assert "guard_stopped" in {failure.code for failure in flight.failures}
+    assert [int(state) for state in flight["/guard"]["state"]] == [0, 1, 2, 3, 3]
+    speed = abs(flight["/ground_truth"]["velocity"][-1])
+    assert speed.max() < 1e-3
+
+
+def order(point):
+    return json.dumps({"waypoints": [{"position_m": point}]}).encode()
+
+
+def test_teleop_takes_two_numbers_and_refuses_heights():
+    options = {"contact": False, "planar": True, "plan": mission_plan}
+    taken = read_order(order([1.5, 1.2]), SCENE, **options)
+    assert taken.plan.legs[0].position == (1.5, 1.2, 0.1)
+    with pytest.raises(RefusedError, match="has a height"):
+        read_order(order([1.5, 1.2, 1.0]), SCENE, **options)
+    assert read_goto(b'{"position_m": [1, 1.2]}', SCENE, planar=True).position == (1.0, 1.2, 0.1)
+    with pytest.raises(RefusedError, match=r"position_m: .* has a height"):
+        read_goto(b'{"position_m": [1, 1.2, 1]}', SCENE, planar=True)
+
+
+@pytest.mark.parametrize(
+    ("z", "planar", "fits"), [(0, True, True), (0.5, True, False), (0.5, False, True)]
+)
+def test_a_drive_up_or_down_is_refused(z, planar, fits):
+    body = json.dumps({"velocity_mps": [1, 0, z]}).encode()
+    if fits:
+        assert read_drive(body, planar=planar) == (1.0, 0.0, z)
+    else:
+        with pytest.raises(RefusedError, match=r"velocity_mps.2: 0.5: leads up or down"):
+            read_drive(body, planar=planar)

@@ -1,0 +1,108 @@
+"""The guard of a robot that stays on the ground: no heights, HOLD and LAND brake to rest."""
+
+import pytest
+
+from cloudrc.config.load import ResolvedGuard
+from cloudrc.geometry import fence
+from cloudrc.messages import ZERO, GuardState
+from cloudrc.world.guard.state import Guard
+from tests.world.guard.conftest import LIMITS, MS, SECOND, command, run
+
+GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
+AT = (1.0, 2.0, 0.1)
+MOVES = (1.0, 0.0, 0.0)
+
+
+def tracking(velocity=MOVES, limits=LIMITS):
+    guard = Guard(limits, planar=True)
+    guard.start_mission(0)
+    assert guard.accept_command(command(velocity), 0) is None
+    assert guard.state is TRACK
+    return guard
+
+
+def commanded(guard, velocity, end_ns, position=AT, moves=ZERO, start_ns=0):
+    """Give a fresh command every 10 ms up to `end_ns`; return the last reference."""
+    for now_ns in range(start_ns, end_ns, 10 * MS):
+        guard.accept_command(command(velocity, now_ns), now_ns)
+        found = run(guard, now_ns, now_ns + 10 * MS, position, moves)
+    return found[-1]
+
+
+def test_near_the_floor_neither_height_nor_speed_is_limited():
+    guard = tracking()
+    assert commanded(guard, (3.0, 0.0, 0.0), SECOND) == (3.0, 0.0, 0.0)
+    assert not guard.counts
+
+
+@pytest.mark.parametrize("z", [2.0, -2.0])
+def test_a_vertical_velocity_is_taken_out_and_counted(z):
+    guard = tracking()
+    assert commanded(guard, (1.0, 0.5, z), SECOND) == (1.0, 0.5, 0.0)
+    assert guard.counts["limited_vertical"] == 100
+
+
+@pytest.mark.parametrize("climb", [-1.0, 1.0])
+def test_the_reference_stays_horizontal_while_the_robot_bounces(climb):
+    guard = tracking()
+    assert commanded(guard, MOVES, SECOND, (1.0, 2.0, 0.3), (1.0, 0.0, climb)) == MOVES
+
+
+def test_the_walls_of_the_fence_hold_the_robot():
+    guard = tracking()
+    wall = (fence.INNER_HIGH[0], 0.0, 0.1)
+    assert commanded(guard, MOVES, SECOND, wall) == ZERO
+    assert guard.counts["limited_fence"]
+
+
+def test_a_hold_brakes_holds_the_position_and_goes_on_with_fresh_commands():
+    guard = tracking()
+    commanded(guard, MOVES, SECOND, moves=MOVES)
+    assert run(guard, SECOND, 2 * SECOND, AT, MOVES)[-1] == pytest.approx(ZERO)
+    run(guard, 2 * SECOND, 3 * SECOND, AT)
+    assert guard.state is HOLD, "a robot at rest is not put to GROUND"
+    x, y, z = run(guard, 3 * SECOND, 4 * SECOND, (1.2, 2.0, 0.1))[-1]
+    assert (x, y, z) == (pytest.approx(-0.16, abs=0.06), 0.0, 0.0)
+    commanded(guard, MOVES, 5 * SECOND, start_ns=4 * SECOND)
+    assert guard.state is TRACK
+
+
+def landing():
+    guard = tracking(limits=ResolvedGuard(hold_max_s=1.0))
+    commanded(guard, MOVES, SECOND, moves=MOVES)
+    run(guard, SECOND, 2300 * MS, AT, MOVES)  # never at rest
+    assert guard.state is LAND
+    return guard
+
+
+def test_a_landing_is_to_brake_and_to_stop_at_rest():
+    guard = landing()
+    moving = run(guard, 2300 * MS, 4 * SECOND, AT, (0.2, 0.0, 0.0))
+    assert None not in moving
+    assert moving[-1] == pytest.approx(ZERO)
+    assert run(guard, 4 * SECOND, 4500 * MS, AT)[-1] is None
+    assert (guard.state, guard.armed) == (LAND, False)
+    guard.acknowledge(5 * SECOND)
+    assert guard.state is GROUND
+
+
+def test_an_acknowledged_landing_ends_in_ground_at_rest_not_in_hold():
+    guard = landing()
+    guard.acknowledge(2400 * MS)
+    run(guard, 2400 * MS, 3 * SECOND, AT, (0.2, 0.0, -0.4))
+    assert guard.state is LAND
+    run(guard, 3 * SECOND, 3500 * MS, AT)
+    assert guard.state is GROUND
+
+
+@pytest.mark.parametrize(("x", "moves"), [(1.0, True), (fence.HIGH[0] - 0.1, True), (99.0, False)])
+def test_after_a_stop_it_moves_again_once_it_is_at_rest_inside_the_fence(x, moves):
+    guard = tracking()
+    place = (x, 2.0, 0.1)
+    commanded(guard, MOVES, SECOND, moves=MOVES)
+    guard.stop(SECOND)
+    guard.acknowledge(SECOND)
+    run(guard, SECOND, 2 * SECOND, place)
+    guard.start_mission(2 * SECOND)
+    guard.accept_command(command(MOVES, 2 * SECOND), 2 * SECOND)
+    assert (guard.state is TRACK) == moves
