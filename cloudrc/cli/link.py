@@ -19,7 +19,14 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import release_arguments
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import escape, output_argument, print_line, table
+from cloudrc.cli.output import (
+    PICTURES,
+    escape,
+    output_argument,
+    print_line,
+    refuse_other_file,
+    table,
+)
 from cloudrc.cli.parser import add_verbs
 from cloudrc.errors import BadInputError
 from cloudrc.link.verify import DEFAULT
@@ -88,7 +95,6 @@ RANGES: dict[str, tuple[float, float]] = {
 """Option of `show` -> its least and largest value."""
 ROWS = 1000  # least number of packets for a trace that has shares of losses
 SECONDS = 30.0  # time that a figure shows by default [s]; a longer time line is shown in full
-KINDS = ("png", "svg", "pdf")
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -162,12 +168,13 @@ def show(options: argparse.Namespace) -> int:
     """Write a picture of a profile; print statistics and, in the last line, the file's path."""
     require("a picture of a link", ("report",))
     output = options.output or Path(f"{Path(options.profile).stem}.png")
-    if output.suffix[1:] not in KINDS:
+    if output.suffix[1:] not in PICTURES:
         raise BadInputError(f"-o {output}: not a picture; end its name in .png, .svg or .pdf")
     for name, (least, most) in RANGES.items():
         value = getattr(options, name)
         if value is not None and not least <= value <= most:
             raise BadInputError(f"--{name} {value:g}: give a number from {least} to {most}")
+    refuse_other_file(output, PICTURES[output.suffix[1:]])
     from cloudrc.report.figures.link import render_link
 
     profile, is_trace = _profile(options.profile)

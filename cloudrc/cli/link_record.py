@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.extras import require
+from cloudrc.cli.output import refuse_other_file
 from cloudrc.errors import BadInputError
 
 if TYPE_CHECKING:
@@ -53,6 +54,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Read the delays from SOURCE, write a trace per direction, and print a summary of each."""
+    from cloudrc.link.traces import HEAD
+
     source, output, only = options.source, options.output, options.direction
     if not (source.is_dir() or source.is_file()):
         raise BadInputError(f"{source}: no such file or folder; name a run, a log or a CSV file")
@@ -65,9 +68,13 @@ def execute(options: argparse.Namespace) -> int:
         recording = _recording(source)
         ways = (only,) if only else DIRECTIONS
         found = {way: one_way(recording, source, way) for way in ways}
+    paths = {
+        way: output.with_stem(f"{output.stem}-{way}") if len(found) > 1 else output for way in found
+    }
+    for path in paths.values():
+        refuse_other_file(path, HEAD, source)
     for way, packets in found.items():
-        own = output.with_stem(f"{output.stem}-{way}") if len(found) > 1 else output
-        _write(packets, own, way)
+        _write(packets, paths[way], way)
     return 0
 
 

@@ -20,11 +20,13 @@ from cloudrc.cli.mission import TERMINATION_LOG
 from cloudrc.cli.output import (
     FAILED_MARK,
     FAILED_NOTE,
+    PICTURES,
     escape,
     format_number,
     print_line,
     print_or_drop,
     print_result,
+    refuse_other_file,
     table,
     warn,
 )
@@ -231,10 +233,12 @@ def draw_figure(options: argparse.Namespace) -> int:
     files, caption = draw_sweep(rows, units, options.number, options.x, options.by, look)
     out = options.out or options.folder / "figure"
     stem = out.stem if out.suffix.removeprefix(".") in files else out.name
+    paths = {kind: out.with_name(f"{stem}.{kind}") for kind in files}
+    for kind, path in paths.items():
+        refuse_other_file(path, PICTURES[kind], flag="--out")
     print_or_drop(caption + (f" {missing}." if missing else "") + "\n")
-    for kind, data in files.items():
-        path = out.with_name(f"{stem}.{kind}")
-        write_atomically(path, data)
+    for kind, path in paths.items():
+        write_atomically(path, files[kind])
         print_or_drop(escape(str(path)))
     return 0
 

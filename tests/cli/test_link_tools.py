@@ -40,6 +40,39 @@ def test_a_recording_of_the_world_alone_gives_no_trace(folder, refused):
     assert f"world.mcap: {said}" in refused("link record world.mcap -o t.csv")
 
 
+def test_a_trace_replaces_an_earlier_trace_but_neither_its_source_nor_another_file(
+    folder, call, refused
+):
+    log = "time_s,delay_ms\n0,45\n1,46\n"
+    (folder / "log.csv").write_text(log)
+    (folder / "same.csv").symlink_to("log.csv")
+    (folder / "others.csv").write_text("robot,delay\n1,2\n")
+    for name in ("log.csv", "same.csv", "others.csv"):
+        said = refused(f"link record log.csv -o {name}")
+        assert f"{name}: already there; name another file with -o" in said
+    assert (folder / "log.csv").read_text() == log
+    (folder / "t.csv").touch()  # as mktemp does
+    for _ in range(2):
+        call("link record log.csv -o t.csv")
+    assert read_trace(folder / "t.csv").delays == (0.045, 0.046)
+
+
+def test_both_traces_of_a_run_are_refused_before_one_is_written(run, folder, refused):
+    (folder / "t-downlink.csv").write_text("mine")
+    assert "t-downlink.csv: already there" in refused("link record -o t.csv", run)
+    assert [path.name for path in folder.iterdir()] == ["t-downlink.csv"]
+
+
+@pytest.mark.parametrize("kind", ["png", "svg", "pdf"])
+def test_a_picture_replaces_a_picture_of_its_kind_alone(kind, folder, call, refused):
+    for _ in range(2):
+        call(f"link show ideal -o fig.{kind} --packets 10 --seconds 1")
+    (folder / f"fig.{kind}").write_text("mine")
+    said = refused(f"link show ideal -o fig.{kind}")
+    assert f"fig.{kind}: already there; name another file with -o" in said
+    assert (folder / f"fig.{kind}").read_text() == "mine"
+
+
 @pytest.mark.parametrize(
     ("name", "data", "says"),
     [
