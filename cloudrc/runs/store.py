@@ -25,7 +25,7 @@ from cloudrc.errors import BadInputError, to_one_line
 from cloudrc.files import open_file, write_atomically
 from cloudrc.renamed import NEW_NAMES
 from cloudrc.runs.flight import Row, units
-from cloudrc.runs.grid import Grid
+from cloudrc.runs.grid import Grid, read_grid
 from cloudrc.runs.lock import LOCK
 from cloudrc.source import code_hash
 
@@ -147,10 +147,12 @@ def begin(folder: Path, grid: Grid, *, is_shared: bool = False) -> dict[str, Row
     """
     rows, points = read_rows(folder), {key: each.point for key, each in grid.flights.items()}
     _refuse_other_code(folder, rows.values(), is_shared)
+    is_same = _has_same_file(folder, grid)
     if any(points.get(key) != row["point"] for key, row in rows.items()):
-        text = "rows of another grid, of other seeds or of changed plug-ins"
+        text = f"flights that are not in {FILE}, or a file that it names has changed since"
         raise BadInputError(f"--out {folder}: has {text}; name a new folder")
-    _write_file(folder / FILE, grid)
+    if not is_same:
+        write_atomically(folder / FILE, write_yaml(grid.file).encode())
     _write_summary(folder, grid, rows)
     if len(rows) < len(grid.flights):  # tables of a smaller grid would look complete
         for name in (TABLE, PARQUET):
@@ -227,19 +229,26 @@ def read_summary(folder: Path) -> dict[str, Any]:
     raise BadInputError(f"{folder}: is not a folder of 'cloudrc sweep run'; name one")
 
 
-def _write_file(path: Path, grid: Grid) -> None:
-    """Write the file of a sweep, unless it says the same; keep what a user has written.
+def _has_same_file(folder: Path, grid: Grid) -> bool:
+    """Return whether the file of a sweep in `folder` says the same; if so, it stays as it is.
 
-    Raise a BadInputError if a user has written it and it says something else.
+    Raise a BadInputError if something would be lost with the file: what a user has written, or a
+    flight that `grid` does not have.
     """
-    old, new = path.read_bytes() if path.exists() else b"", write_yaml(grid.file).encode()
-    if old and read_document(path, str(path)).tree in (grid.file, _without_folder(grid.file)):
-        return
-    if old and write_yaml(read_document(path, str(path)).tree).encode() != old:
+    path = folder / FILE
+    old = path.read_bytes() if path.exists() else b""
+    if not old:
+        return False
+    tree = read_document(path, str(path)).tree
+    if tree in (grid.file, _without_folder(grid.file)):
+        return True
+    if write_yaml(tree).encode() != old:
         raise BadInputError(
             f"{path}: was written or edited by hand; name a new folder with --out, or move the file"
         )
-    write_atomically(path, new)
+    if not read_grid(path).flights.keys() <= grid.flights.keys():
+        raise BadInputError(f"--out {folder}: has another sweep, see {FILE}; name a new folder")
+    return False
 
 
 def _without_folder(file: Mapping[str, Any]) -> dict[str, Any]:

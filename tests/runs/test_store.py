@@ -11,7 +11,7 @@ from cloudrc.errors import BadInputError
 from cloudrc.runs import store
 from cloudrc.runs.grid import read_grid
 from cloudrc.source import code_hash
-from tests.runs.conftest import flown
+from tests.runs.conftest import GRID, flown
 
 
 @pytest.fixture
@@ -140,8 +140,30 @@ def test_a_folder_holds_one_sweep(grid, rows, write_sweep, tmp_path):
     assert list(store.begin(tmp_path, more).values()) == rows
     assert not (tmp_path / "table.csv").exists()  # it has fewer flights than sweep.json says
     other = read_grid(write_sweep({"link.both.delay_ms": [7]}))
-    with pytest.raises(BadInputError, match=r"has rows of another grid.*name a new folder"):
+    with pytest.raises(
+        BadInputError, match=r"has another sweep, see sweep\.yaml; name a new folder"
+    ):
         store.begin(tmp_path, other)
+
+
+def test_another_sweep_is_refused_before_the_first_row(write_sweep, tmp_path):
+    store.begin(tmp_path, read_grid(write_sweep(seeds=2)))
+    before = (tmp_path / "sweep.yaml").read_bytes()
+    for axes, seeds in ((GRID, 1), ({"link.both.delay_ms": [7]}, 2)):
+        with pytest.raises(BadInputError, match="has another sweep"):
+            store.begin(tmp_path, read_grid(write_sweep(axes, seeds)))
+    assert (tmp_path / "sweep.yaml").read_bytes() == before
+
+
+def test_the_comments_of_a_user_stay_in_the_file_of_the_sweep(write_sweep, tmp_path):
+    path, file = write_sweep(), tmp_path / "sweep.yaml"
+    store.begin(tmp_path, read_grid(path))
+    commented = f"# mine\n{file.read_text()}"
+    file.write_text(commented)
+    store.begin(tmp_path, read_grid(path))
+    with pytest.raises(BadInputError, match="edited by hand"):
+        store.begin(tmp_path, read_grid(write_sweep(seeds=9)))
+    assert file.read_text() == commented
 
 
 @pytest.mark.parametrize("changed", ["mine.py", "helper.py"])
@@ -154,7 +176,7 @@ def test_a_changed_plugin_is_not_mixed_with_rows_of_the_old_one(write_sweep, tmp
     assert list(store.begin(tmp_path, read_grid(path))) == [flight.key]
     with (tmp_path / changed).open("a") as file:
         file.write("# changed\n")
-    with pytest.raises(BadInputError, match=r"has rows of .* changed plug-ins"):
+    with pytest.raises(BadInputError, match=r"a file that it names has changed since"):
         store.begin(tmp_path, read_grid(path))
 
 
