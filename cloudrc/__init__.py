@@ -3,10 +3,19 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cloudrc.api import Result, fly
+    from cloudrc.api import Comparison, Result, SweepTable, compare, fly, identify, sweep
 
 __version__ = "0.1.0"
-__all__ = ["Result", "__version__", "fly"]
+__all__ = [
+    "Comparison",
+    "Result",
+    "SweepTable",
+    "__version__",
+    "compare",
+    "fly",
+    "identify",
+    "sweep",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""The Python API: fly an experiment in virtual time from a program or a notebook.
+"""The Python API: fly, sweep, compare and identify from a program or a notebook.
 
     import cloudrc
 
@@ -13,19 +13,30 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Literal
 
-from cloudrc import metrics
-from cloudrc.advice import advise
-from cloudrc.config.load import dump, load_experiment
+import numpy as np
+from numpy.typing import NDArray
+
+from cloudrc.config.document import write_yaml
+from cloudrc.config.load import ResolvedExperiment, dump
+from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Columns
 from cloudrc.metrics.response import Step, steps
 from cloudrc.metrics.verdict import Failure
 from cloudrc.record.columns import Recording, Table
+from cloudrc.runs.experiment import advice_on, check_mode, load
 from cloudrc.runs.flight import fly_in_memory
+from cloudrc.runs.folder import new_folder
+
+if TYPE_CHECKING:
+    from cloudrc.report.document import Assessment
+    from cloudrc.runs.grid import Grid
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,16 +83,58 @@ class Result:
         return f"<Result: {self.verdict}{why}; {len(self.numbers)} numbers>"
 
 
+@dataclass(frozen=True, eq=False)
+class SweepTable:
+    """The flights of a sweep, one per row, in the order of the grid.
+
+    `table[column]` is a numpy array: an axis, `seed`, `verdict`, `failures` or a metric. A metric
+    that a flight does not have is nan.
+    """
+
+    columns: dict[str, NDArray[Any]]  # name -> values, shape (n,)
+    units: dict[str, str]  # metric -> SI unit; "1" for counts and shares
+    folder: Path | None  # folder of the sweep; None if it was not kept
+
+    def __getitem__(self, column: str) -> NDArray[Any]:
+        """Return a column; raise a KeyError that names all columns."""
+        if column not in self.columns:
+            raise KeyError(f"no column {column!r}; columns: {', '.join(self.columns)}")
+        return self.columns[column]
+
+    def __len__(self) -> int:
+        """Return the number of flights."""
+        return len(self.columns["key"])
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The result of a comparison of A and B in pairs of flights."""
+
+    name: str  # the first compared metric
+    p: float  # p-value of its signed-rank test [1]; a value below 0.05 decides
+    difference: float  # B - A [any unit: that of the metric]
+    document: dict[str, Any]  # as `cloudrc compare -o json`: all metrics, success, the flights
+
+
 def fly(
-    experiment: str = "paper", settings: Mapping[str, Any] | None = None, *, seed: int | None = None
+    experiment: str = "paper",
+    settings: Mapping[str, Any] | None = None,
+    *,
+    seed: int | None = None,
+    mode: Literal["virtual", "local"] = "virtual",
+    out: str | Path | None = None,
 ) -> Result:
-    """Fly in virtual time in this process; no file is written.
+    """Fly an experiment on this machine.
 
     Args:
         experiment: Name of a shipped experiment, or path of a YAML file.
         settings: Changes, as with `--set`: key -> value, such as `{"link.profile": "paper-p3"}`.
             A value may be a list or a mapping.
         seed: Random seed; with None, the seed in the experiment.
+        mode: "virtual" flies in virtual time in this process, "local" in real time in five
+            processes.
+        out: Folder for the recording and the report. With None, "virtual" writes no file, and
+            "local" makes a new folder in runs/.
 
     Settings that do not fit together, such as a delay that the guard does not allow, cause a Python
     warning before the flight.
@@ -90,28 +143,169 @@ def fly(
         The result, also if the mission failed.
 
     Raises:
-        cloudrc.errors.BadInputError: If a name, key or value is invalid; the text says where.
+        cloudrc.errors.BadInputError: If a name, key or value is invalid, or if `out` is not empty;
+            the text says where.
     """
+    if mode not in ("virtual", "local"):
+        raise BadInputError(f"mode {mode!r}: give 'virtual' or 'local'")
     changes = dict(settings or {}) | ({} if seed is None else {"seed": seed})
-    texts = [
-        f"{key}={json.dumps(value, default=_plain, ensure_ascii=False)}"
-        for key, value in changes.items()
-    ]
-    resolved = load_experiment(experiment, texts)
-    metrics.check(resolved.report.metrics)
-    for text in advise(resolved):
+    resolved = load(str(experiment), _texts(changes))
+    check_mode(resolved, mode)
+    for text in advice_on(resolved):
         warnings.warn(text, stacklevel=2)
-    found = fly_in_memory(resolved)
+    if mode == "virtual" and out is None:
+        return _result(fly_in_memory(resolved))
+    where = None if out is None else Path(out)
+    return _fly_into(
+        resolved, mode, new_folder(where, f"{resolved.name}-{mode}-seed{resolved.seed}")
+    )
+
+
+def _fly_into(experiment: ResolvedExperiment, mode: str, folder: Path) -> Result:
+    """Fly with a recording and a report in a folder."""
+    from cloudrc.report.folder import read_run
+    from cloudrc.report.write import assess
+    from cloudrc.runs.fly import fly
+
+    report = fly(experiment, mode, folder)
+    found = _result(assess(*read_run(folder), experiment.report.metrics))
+    # A recording holds velocities in another frame: the last bit of a number may differ.
+    numbers = {name: entry["value"] for name, entry in report["numbers"].items()}
+    return replace(found, numbers=numbers, records_sha256=report.get("records_sha256", ""))
+
+
+def _result(found: Assessment) -> Result:
     return Result(
         verdict=found.verdict.outcome,
         failures=found.verdict.failures,
         numbers={name: number.value for name, number in found.numbers.items()},
         units={name: number.unit for name, number in found.numbers.items()},
         notes=found.notes,
-        config=dump(resolved),
+        config=dump(found.experiment),
         records_sha256=found.records_sha256 or "",
         flight=found.flight,
     )
+
+
+def sweep(
+    grid: str | Path | Mapping[str, Any], *, jobs: int = 1, out: str | Path | None = None
+) -> SweepTable:
+    """Fly a grid of settings with several seeds in virtual time; return a row per flight.
+
+    Args:
+        grid: Path of a sweep's file, or its content as a mapping, such as `{"experiment": "steps",
+            "grid": {"link.profile": ["paper-p1", "paper-p3"]}, "seeds": 20}`.
+        jobs: Number of processes.
+        out: Folder of the sweep. If it holds flights of this sweep, only the missing ones are
+            flown. With None, nothing is kept.
+
+    Raises:
+        cloudrc.errors.BadInputError: If the grid or a point of it is invalid, or if the folder
+            belongs to another sweep.
+    """
+    from cloudrc.runs.grid import read_grid
+
+    with TemporaryDirectory(prefix="cloudrc-sweep-") as temporary:
+        path = Path(temporary, "sweep.yaml")
+        if isinstance(grid, Mapping):
+            content = json.loads(json.dumps(dict(grid), default=_plain))
+            path.write_text(write_yaml({"folder": str(Path.cwd()), **content}), encoding="utf-8")
+        else:
+            path = Path(grid)
+        read = read_grid(path)
+        for text in advice_on(*read.points):
+            warnings.warn(text, stacklevel=2)
+        return _fly_sweep(read, None if out is None else Path(out), Path(temporary, "rows"), jobs)
+
+
+def _fly_sweep(grid: Grid, out: Path | None, temporary: Path, jobs: int) -> SweepTable:
+    from cloudrc.runs import store
+    from cloudrc.runs import sweep as work
+    from cloudrc.runs.lock import lock_folder
+
+    folder = out or temporary
+    if not store.is_begun(folder):
+        folder = new_folder(folder, "sweep")
+    with lock_folder(folder) as warning:
+        if warning:
+            warnings.warn(warning, stacklevel=3)
+        begun = work.begin(grid, folder)
+        flown = work.fly_missing(begun, folder, jobs)
+        rows, stopped = work.keep(flown, folder, grid, None, begun.before)
+    if stopped:
+        raise _as_exception(stopped)
+    columns = store.columns_of([rows[key] for key in grid.flights], grid)
+    units = store.read_summary(folder)["units"]
+    arrays = {
+        name: np.array(values, dtype=float if None in values else None)
+        for name, values in columns.items()
+    }
+    return SweepTable(arrays, {name: units[name] for name in arrays if name in units}, out)
+
+
+def compare(
+    a: str | Mapping[str, Any],
+    b: str | Mapping[str, Any],
+    *,
+    of: str = "steps",
+    settings: Mapping[str, Any] | None = None,
+    seeds: int = 10,
+    numbers: Sequence[str] = (),
+    jobs: int = 1,
+) -> Comparison:
+    """Fly an experiment with the settings A and with the settings B, with equal seeds, and compare.
+
+    Args:
+        a: KEY=VALUE[,KEY=VALUE...] as for `cloudrc compare`, or key -> value.
+        b: The same for B.
+        of: Name of a shipped experiment, or path of a YAML file.
+        settings: Settings of both sides: key -> value.
+        seeds: Fly the seeds 1 to `seeds`.
+        numbers: Metrics to compare; by default those that matter first.
+        jobs: Number of processes.
+
+    Raises:
+        cloudrc.errors.BadInputError: If a setting is invalid, or if no pair has a metric.
+    """
+    from cloudrc.runs import compare as pairs
+
+    first, second = (pairs.split_settings(x) if isinstance(x, str) else _texts(x) for x in (a, b))
+    sides, units = pairs.load_sides(of, _texts(settings or {}), first, second, numbers)
+    for text in advice_on(*sides):
+        warnings.warn(text, stacklevel=2)
+    flown, stopped = pairs.fly_pairs(sides, seeds, jobs)
+    if stopped:
+        raise _as_exception(stopped)
+    document = pairs.compare(flown, units, numbers)
+    if not document["numbers"]:
+        raise BadInputError("no pair has one of the default numbers; name one with numbers=[...]")
+    name, entry = next(iter(document["numbers"].items()))
+    return Comparison(name, entry["p_wilcoxon"], entry["difference"], document)
+
+
+def identify(run: str | Path) -> dict[str, Any]:
+    """Fit the model of the velocity loop to a run, the folder or its MCAP file.
+
+    The result is the content of a file that the predictor `command_history` reads: a value per axis
+    of `time_constant` [s], `dead_time` [s] and `gain`, and their 95 % intervals.
+    """
+    from cloudrc.runs.identify import describe
+    from cloudrc.runs.identify import identify as fit
+
+    return describe(*fit(Path(run)))
+
+
+def _as_exception(stopped: CloudrcError) -> BaseException:
+    """Return the exception for work that ended early."""
+    return KeyboardInterrupt() if isinstance(stopped, InterruptedRunError) else stopped
+
+
+def _texts(settings: Mapping[str, Any]) -> list[str]:
+    """Return settings as texts KEY=VALUE."""
+    return [
+        f"{key}={json.dumps(value, default=_plain, ensure_ascii=False)}"
+        for key, value in settings.items()
+    ]
 
 
 def _plain(value: Any) -> Any:

@@ -1,7 +1,9 @@
 """The Python API: one call flies and returns verdict, numbers and columns."""
 
+import importlib
 import json
 import os
+import pkgutil
 import re
 import runpy
 import subprocess
@@ -62,6 +64,98 @@ def test_a_failed_mission_is_a_result():
 def test_a_wrong_setting_is_refused_before_the_flight(settings):
     with pytest.raises(BadInputError, match=next(iter(settings)).rpartition(".")[2][:6]):
         cloudrc.fly("steps", settings)
+
+
+def test_every_function_can_be_called_after_every_module_is_imported():
+    """A subpackage with the name of a function would take its place."""
+    for module in pkgutil.walk_packages(cloudrc.__path__, "cloudrc."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+    names = [name for name in cloudrc.__all__ if not name.startswith("_")]
+    assert all(callable(getattr(cloudrc, name)) for name in names)
+    assert callable(cloudrc.sweep)
+
+
+def test_a_flight_with_a_folder_equals_one_without(result, tmp_path, monkeypatch):
+    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *given: None)
+    kept = cloudrc.fly("steps", SHORT, seed=3, out=tmp_path / "run")
+    assert (kept.numbers, kept.records_sha256) == (result.numbers, result.records_sha256)
+    assert (tmp_path / "run/report.json").is_file()
+    assert len(kept["/odometry"]) == len(result["/odometry"])
+    with pytest.raises(BadInputError, match="already exists"):
+        cloudrc.fly("steps", SHORT, out=tmp_path / "run")
+
+
+@pytest.mark.parametrize("mode", ["cluster", "real"])
+def test_an_unknown_mode_is_refused(mode):
+    with pytest.raises(BadInputError, match="give 'virtual' or 'local'"):
+        cloudrc.fly("steps", mode=mode)
+
+
+GRID = {"experiment": "steps", "set": SHORT, "grid": {"link.both.delay_ms": np.array([5, 40])}}
+
+
+def test_a_sweep_is_a_table_of_arrays_that_goes_on(result, tmp_path, capfd):
+    folder = tmp_path / "sweep"
+    table = cloudrc.sweep({**GRID, "seeds": [3]}, out=folder)
+    assert table["link.both.delay_ms"].tolist() == [5, 40]
+    assert table.units["prediction_error_rms"] == "m"
+    again = cloudrc.sweep({**GRID, "seeds": [3, 4]}, out=folder)
+    assert again["seed"].tolist() == [3, 4, 3, 4]
+    assert again["prediction_error_rms"][0] == table["prediction_error_rms"][0]
+    assert len((folder / "rows.jsonl").read_text().splitlines()) == 4
+    assert capfd.readouterr() == ("", "")
+    with pytest.raises(KeyError, match="columns: key, link"):
+        table["prediction_error"]
+
+
+@pytest.mark.parametrize(
+    ("grid", "text"),
+    [
+        ({"experiment": "papper"}, "paper"),
+        ({**GRID, "seeds": 0}, "seeds"),
+        ({"grid": {"cloud.predictr": ["none"]}}, "predictor"),
+        ("no.yaml", "no.yaml"),
+    ],
+)
+def test_a_wrong_sweep_is_refused_and_writes_nothing(grid, text, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(BadInputError, match=text):
+        cloudrc.sweep(grid, out="out")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_comparison_has_a_p_value_and_all_of_the_commands_document():
+    found = cloudrc.compare(
+        "cloud.predictor=last_sample", {"cloud.predictor": "kalman"}, settings=SHORT, seeds=6
+    )
+    assert (found.name, found.p < 0.05) == ("prediction_error_rms", True)
+    assert found.document["pairs"] == 6
+    assert found.difference < 0
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "text"),
+    [
+        ("seed=1", "seed=2", "each flight has its own seed"),
+        ({"cloud.predictor": "kalman"}, "cloud.predictor=kalman", "the same experiment"),
+        ("cloud.predictor=kalmann", "cloud.predictor=kalman", "kalman"),
+    ],
+)
+def test_a_wrong_comparison_is_refused(a, b, text):
+    with pytest.raises(BadInputError, match=text):
+        cloudrc.compare(a, b)
+
+
+def test_a_script_flies_in_several_processes(tmp_path):
+    """It needs no `if __name__ == "__main__"`: a worker does not run the script again."""
+    grid = {"experiment": "steps", "set": SHORT, "seeds": 2}
+    (tmp_path / "own.py").write_text(f"import cloudrc\nprint(len(cloudrc.sweep({grid}, jobs=2)))")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "own.py"], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.stdout == "2\n", done.stderr
 
 
 def test_importing_cloudrc_imports_nothing_else():

@@ -59,7 +59,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     },
     "assembly": EVERYTHING,
     "advice": {"assembly", "config", "link", "robots", "tunnel"},
-    "api": {"advice", "runs", "config", "metrics", "record"},
+    "api": {"runs", "config", "metrics", "record", "report"},
     "exercise": {"cloud", "config", "plugins", "runs"},
     "faults": EVERYTHING,
     "cli": EVERYTHING,

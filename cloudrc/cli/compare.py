@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 from collections.abc import Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,11 +24,9 @@ from cloudrc.cli.parser import read_count
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.renamed import new_name
 from cloudrc.runs.interrupts import interrupt_on_signals
-from cloudrc.runs.workers import map_in_order, take_each
 
 if TYPE_CHECKING:
     from cloudrc.runs.compare import Pairs
-    from cloudrc.runs.flight import Row
 
 EPILOG = """\
 A and B are one of:
@@ -103,38 +101,20 @@ def _fly_both(options: argparse.Namespace) -> tuple[Pairs, CloudrcError | None]:
     Return the pairs of flights; and why the work ended early, or None.
     """
     from cloudrc.cli.progress import SweepView
-    from cloudrc.runs.compare import Pair, Pairs, check_names
-    from cloudrc.runs.experiment import load, refuse_seed
-    from cloudrc.runs.flight import fly_point, units
+    from cloudrc.runs.compare import Pairs, fly_pairs, load_sides, split_settings
 
     for text in (options.a, options.b):
         if "=" not in text:
             raise BadInputError(f"{text}: is not KEY=VALUE; for a value of a sweep, add --in DIR")
     require("compare", MODES["virtual"])
-    # A comma separates settings only before KEY=: a list may contain commas.
-    texts = [re.split(r",(?=[\w.]+=)", text) for text in (options.a, options.b)]
-    for each in texts:
-        refuse_seed([*options.set, *each])
-    sides = [load(options.experiment, [*options.set, *each]) for each in texts]
-    if sides[0] == sides[1]:
-        raise BadInputError("A and B are the same experiment; change one of them")
-    unit_of = units({name for each in sides for name in each.report.metrics})
-    check_names(options.number, unit_of)
+    a, b = split_settings(options.a), split_settings(options.b)
+    sides, unit_of = load_sides(options.experiment, options.set, a, b, options.number)
     warn(*sides)
-    jobs = [side.model_copy(update={"seed": n + 1}) for n in range(options.seeds) for side in sides]
-    flights: list[Row] = []
     head = f"{sides[0].name}: A and B, each with seeds 1 to {options.seeds}"
     stream = sys.stdout if options.output == "table" else sys.stderr
-    view = SweepView(stream, f"{head}, {len(jobs)} flights", len(jobs))
-
-    def take(flight: Row) -> None:
-        flights.append(flight)
-        view.see({"key": "BA"[len(flights) % 2], **flight})
-
-    stopped = take_each(map_in_order(fly_point, jobs, len(jobs)), take)
-    view.close()
-    both = zip(flights[::2], flights[1::2], strict=False)
-    pairs = [Pair({"seed": n}, a, b) for n, (a, b) in enumerate(both, start=1)]
+    flights = 2 * options.seeds
+    with closing(SweepView(stream, f"{head}, {flights} flights", flights)) as view:
+        pairs, stopped = fly_pairs(sides, options.seeds, flights, view.see)
     return Pairs(pairs, unit_of, f"experiment {options.experiment}"), stopped
 
 

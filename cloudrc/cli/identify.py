@@ -6,16 +6,11 @@ import argparse
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import escape, format_document, output_argument, print_result, table
 from cloudrc.errors import BadInputError
 
-if TYPE_CHECKING:
-    from cloudrc.metrics.velocity_loop import Fit
-
-NAMES = ("time_constant", "dead_time", "gain")
 EPILOG = """\
 examples:
   cloudrc run steps --mode virtual
@@ -35,19 +30,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Fit the model, write it to a file, and print it."""
     require("identify", ("record",))
-    from cloudrc.metrics.velocity_loop import DT, INPUT, OUTPUT, identify, series
-    from cloudrc.record.columns import Recording
+    from cloudrc.runs.identify import INPUT, OUTPUT, describe, identify
 
-    path, out = options.run, options.out
+    out = options.out
     if os.path.lexists(out):
         raise BadInputError(f"{out}: already there; name another file with --out")
-    path = path / "mission.mcap" if path.is_dir() else path
-    given, measured = series(Recording.read(path), str(path))
-    fits = [
-        identify(given[:, axis], measured[:, axis], f"{path}: {name}")
-        for axis, name in enumerate("xyz")
-    ]
-    document = _document(fits, len(given) * DT, (INPUT, OUTPUT))
+    fits, seconds = identify(options.run)
+    document = describe(fits, seconds)
     out.write_text(format_document(document, "yaml") + "\n", encoding="utf-8")
     head = f"velocity loop from {document['seconds']} s, input {INPUT}, output {OUTPUT}"
     rows: list[Sequence[str]] = [
@@ -60,13 +49,3 @@ def execute(options: argparse.Namespace) -> int:
     text = f"{head}\n\n{shown}\n\n± : 95 % interval\n{escape(str(out))}"
     print_result(options.output, document, text)
     return 0
-
-
-def _document(fits: Sequence[Fit], seconds: float, topics: tuple[str, str]) -> dict[str, Any]:
-    values, halves = (
-        {name: [round(float(fit[:2][part][n]), 4) for fit in fits] for n, name in enumerate(NAMES)}
-        for part in (0, 1)
-    )
-    shares = [round(fit.share, 4) for fit in fits]
-    more = {"seconds": round(seconds, 2), "input": topics[0], "output": topics[1]}
-    return {**values, "half_width_95": halves, "explained": shares, **more}

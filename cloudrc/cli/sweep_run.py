@@ -5,12 +5,10 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import statistics
 import sys
 from collections import Counter
-from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import closing, suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,18 +38,14 @@ from cloudrc.config.overrides import parse_settings
 from cloudrc.errors import BadInputError, CloudrcError, InvalidRunError, describe_error
 from cloudrc.files import write_atomically
 from cloudrc.metrics.verdict import EXIT_CODES
-from cloudrc.runs import store
+from cloudrc.runs import store, sweep
 from cloudrc.runs.experiment import load, refuse_seed
-from cloudrc.runs.flight import Row, counts, fly_point, measure
-from cloudrc.runs.fly import fly
+from cloudrc.runs.flight import Row
 from cloudrc.runs.folder import new_folder
 from cloudrc.runs.grid import Grid, SweepPoint, pack, read_flight, read_grid, unpack
 from cloudrc.runs.lock import lock_folder
 from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.source import code_hash
-from cloudrc.statistics import median_interval
-
-METHOD = "95 % interval of the median, by order statistics"
 
 
 def run(options: argparse.Namespace) -> int:
@@ -71,13 +65,8 @@ def _run_locked(
     options: argparse.Namespace, grid: Grid, folder: Path, shard: int | None, count: int
 ) -> int:
     """Fly what is missing in `folder`, which no other command may fly now; return the exit code."""
-    before = store.begin(folder, grid, is_shared=bool(shard))
-    mine = [*grid.flights.values()][(shard or 1) - 1 :: count]
-    missing = [
-        each
-        for each in mine
-        if each.key not in before or _to_record(before[each.key], options.record, folder)
-    ]
+    work = sweep.begin(grid, folder, shard, count, options.record)
+    mine, missing = work.mine, work.missing
     part = f", shard {shard} of {count}" if shard else ""
     head = f"{len(grid.points)} points x {len(grid.seeds)} seeds{part}: {len(mine)} flights"
     stream = sys.stdout if options.output == "table" else sys.stderr
@@ -87,9 +76,8 @@ def _run_locked(
         if options.on:
             flown = rows_from_pods(options, grid, missing)
         else:
-            job = partial(fly_row, record=options.record, folder=folder)
-            flown = map_in_order(job, missing, options.jobs, in_order=False)
-        rows, stopped = _keep(flown, folder, grid, shard, before, view.see)
+            flown = sweep.fly_missing(work, folder, options.jobs, options.record)
+        rows, stopped = sweep.keep(flown, folder, grid, shard, work.before, view.see)
     if stopped:
         flags = " --on kubernetes, and its other flags" if options.on else ""
         again = f"cloudrc sweep run {options.file} --out {folder}{flags}"
@@ -120,61 +108,6 @@ def _read(options: argparse.Namespace) -> Grid:
     return grid
 
 
-def _keep(
-    flown: Generator[Row],
-    folder: Path,
-    grid: Grid,
-    shard: int | None,
-    before: Collection[str],
-    see: Callable[[Row], None],
-) -> tuple[dict[str, Row], CloudrcError | None]:
-    """Append each new row to the sweep in `folder`, call `see` with it, and write the tables.
-
-    `before` has the keys of the rows that the folder already has. Return all rows, key -> row; and
-    why the work ended early, or None.
-    """
-    with store.append_rows(folder, shard) as append:
-
-        def take(row: Row) -> None:
-            if row["code"] != code_hash():
-                raise BadInputError("the code of cloudrc has changed during the sweep; begin again")
-            if row["key"] not in before:
-                append(row)
-            see(row)
-
-        stopped = take_each(flown, take)
-    try:
-        return store.finish(folder, grid), stopped
-    except OSError:
-        if not stopped:
-            raise
-        return store.read_rows(folder), stopped  # the reason to tell is the first one
-
-
-def fly_row(flight: SweepPoint, record: str | None = None, folder: Path = Path()) -> Row:
-    """Fly a flight and return its row; if a recording is wanted, fly again to make it."""
-    row = flight.row(fly_point(flight.experiment))
-    if _to_record(row, record, folder):
-        _fly_into(folder / flight.key, flight, page=False)
-    return row
-
-
-def _to_record(row: Row, record: str | None, folder: Path) -> bool:
-    """Return whether a flight still needs a recording.
-
-    `record` names the flights to record: "failed", "all" or None for no flights.
-    """
-    wanted = record == "all" or (record == "failed" and row["verdict"] != "success")
-    has = (folder / row["key"] / "report.json").is_file()
-    return wanted and row["verdict"] != "error" and not has
-
-
-def _fly_into(folder: Path, flight: SweepPoint, *, page: bool) -> dict[str, Any]:
-    folder.mkdir(exist_ok=True)
-    (folder / "environment.json").unlink(missing_ok=True)  # it describes an earlier flight
-    return fly(flight.experiment, "virtual", folder, page=page)
-
-
 def fly_again(options: argparse.Namespace) -> int:
     """Repeat a flight of a sweep with recording and report; exit with 6 if its records changed."""
     require("a report", MODES["virtual"])
@@ -192,7 +125,7 @@ def fly_again(options: argparse.Namespace) -> int:
         if code == code_hash():
             why = "the experiment or a file of a plug-in, trace, robot or scene has changed since"
         raise InvalidRunError(f"{key}: {why}; fly the sweep again")
-    report = _fly_into(options.folder / key, flight, page=True)
+    report = sweep.fly_into(options.folder / key, flight, page=True)
     print_traceback(options, report)
     print_or_drop(summary(report, options.folder / key))
     if row["records_sha256"] != report["records_sha256"]:
@@ -313,7 +246,7 @@ def _print_rows(options: argparse.Namespace) -> CloudrcError | None:
     def print_row(row: Row) -> None:
         print(json.dumps(row, allow_nan=False), flush=True)
 
-    return take_each(map_in_order(fly_row, flights, jobs=1), print_row)
+    return take_each(map_in_order(sweep.fly_row, flights, jobs=1), print_row)
 
 
 def _leave_message(text: str) -> None:
@@ -324,23 +257,6 @@ def _leave_message(text: str) -> None:
 
 
 # `cloudrc run --seeds N`.
-
-
-def summarise(rows: Sequence[Row], units: Mapping[str, str]) -> dict[str, Any]:
-    """Count all runs and successful runs; compute the median of each measurement.
-
-    Each median has a confidence interval. A run whose plug-in failed is counted, but its
-    measurements are left out. `units`: metric -> unit.
-    """
-    numbers, measured = {}, [row["numbers"] for row in rows if counts(row)]
-    failed = [row["numbers"] for row in rows if counts(row) and row["verdict"] != "success"]
-    for name in dict.fromkeys(name for each in measured for name in each):
-        found = [each[name] for each in measured if name in each]
-        middle = {"median": statistics.median(found), "interval": median_interval(found)}
-        marks = {"unit": units[name], "count": len(found), "failed": sum(name in n for n in failed)}
-        numbers[name] = middle | marks
-    done = sum(row["verdict"] == "success" for row in rows)
-    return {"done": done, "count": len(rows), "method": METHOD, "numbers": numbers}
 
 
 def as_table(summary: Mapping[str, Any], planned: int = 0) -> str:
@@ -355,7 +271,7 @@ def as_table(summary: Mapping[str, Any], planned: int = 0) -> str:
         note = "" if entry["count"] == summary["count"] else f"  ({entry['count']} runs)"
         mark = FAILED_MARK if entry["failed"] else ""
         rows.append((name, format_number(entry["median"]) + mark, between, unit + note))
-    method = METHOD if summary["count"] >= 6 else "an interval needs 6 seeds or more"
+    method = sweep.METHOD if summary["count"] >= 6 else "an interval needs 6 seeds or more"
     if any(entry["failed"] for entry in summary["numbers"].values()):
         method += f"\n{FAILED_NOTE}"
     count = planned or summary["count"]
@@ -388,15 +304,15 @@ def fly_seeds(options: argparse.Namespace) -> int:
             print_traceback(options, row)
 
     with closing(make(stream, head, len(work))) as view:
-        flown = map_in_order(fly_seed, work, len(work))
-        _, stopped = _keep(flown, folder, grid, None, store.begin(folder, grid), see)
+        flown = map_in_order(sweep.fly_seed, work, len(work))
+        _, stopped = sweep.keep(flown, folder, grid, None, store.begin(folder, grid), see)
     if stopped:
         text = f"\ncloudrc: {stopped}: {len(seen)} of {len(work)} seeds are finished"
         print_or_drop(text, sys.stderr)
     document = {
         **{"experiment": name, "mode": "virtual", "interrupted": bool(stopped)},
         "overrides": list(options.set),
-        **summarise(seen, store.read_summary(folder)["units"]),
+        **sweep.summarise(seen, store.read_summary(folder)["units"]),
         "runs": [{key: row[key] for key in ("seed", "verdict", "key", "text")} for row in seen],
     }
     text = f"\n{as_table(document, len(work))}\n\n{folder / store.SUMMARY}"
@@ -404,8 +320,3 @@ def fly_seeds(options: argparse.Namespace) -> int:
     if stopped:
         return stopped.exit_code
     return max(EXIT_CODES[row["verdict"]] for row in seen)
-
-
-def fly_seed(flight: SweepPoint) -> Row:
-    """Fly once; return the row of results, such as the verdict. An exception ends the command."""
-    return flight.row(measure(flight.experiment))

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
-from cloudrc.errors import BadInputError
+from cloudrc.config.load import ResolvedExperiment
+from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.plugins import unknown_name_text
 from cloudrc.rounding import differences
-from cloudrc.runs import store
+from cloudrc.runs import flight, store
+from cloudrc.runs.experiment import load, refuse_seed
 from cloudrc.runs.flight import Row, counts
+from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.statistics import LEVEL, exact_interval, paired, sign_test
 
 NUMBERS = (
@@ -43,6 +47,62 @@ class Pairs(NamedTuple):
     pairs: list[Pair]
     units: dict[str, str]  # metric -> unit
     what: str  # in words: the compared axis, the folder, and limits of the comparison
+
+
+def split_settings(text: str) -> list[str]:
+    """Split KEY=VALUE[,KEY=VALUE...] into settings KEY=VALUE.
+
+    A comma separates settings only before KEY=, because a list may contain commas.
+    """
+    return re.split(r",(?=[\w.]+=)", text)
+
+
+def load_sides(
+    experiment: str,
+    common: Sequence[str],
+    a: Sequence[str],
+    b: Sequence[str],
+    names: Sequence[str] = (),
+) -> tuple[tuple[ResolvedExperiment, ResolvedExperiment], dict[str, str]]:
+    """Load an experiment with the settings `a` and with the settings `b`, both after `common`.
+
+    Also return metric -> unit. `names` are metrics that will be compared.
+
+    Raises:
+        BadInputError: If a setting, the seed among them, or a metric is refused, or if the
+            settings give the same experiment.
+    """
+    for each in (a, b):
+        refuse_seed([*common, *each])
+    first, second = (load(experiment, [*common, *each]) for each in (a, b))
+    if first == second:
+        raise BadInputError("A and B are the same experiment; change one of them")
+    unit_of = flight.units({*first.report.metrics, *second.report.metrics})
+    check_names(names, unit_of)
+    return (first, second), unit_of
+
+
+def fly_pairs(
+    sides: Sequence[ResolvedExperiment],
+    seeds: int,
+    jobs: int,
+    see: Callable[[Row], None] = lambda row: None,
+) -> tuple[list[Pair], CloudrcError | None]:
+    """Fly both sides with the seeds 1 to `seeds` in `jobs` processes.
+
+    Call `see` with each row; its key is "A" or "B". Return the pairs of flights, and why the work
+    ended early, or None.
+    """
+    work = [side.model_copy(update={"seed": n + 1}) for n in range(seeds) for side in sides]
+    flights: list[Row] = []
+
+    def take(row: Row) -> None:
+        flights.append(row)
+        see({"key": "BA"[len(flights) % 2], **row})
+
+    stopped = take_each(map_in_order(flight.fly_point, work, jobs), take)
+    both = zip(flights[::2], flights[1::2], strict=False)
+    return [Pair({"seed": n}, a, b) for n, (a, b) in enumerate(both, start=1)], stopped
 
 
 def compare(

@@ -178,7 +178,7 @@ def finish(folder: Path, grid: Grid) -> dict[str, Row]:
     rows = read_rows(folder)
     unit_of = _write_summary(folder, grid, rows)
     if rows.keys() == grid.flights.keys():
-        columns = _columns([rows[key] for key in grid.flights], grid)
+        columns = columns_of([rows[key] for key in grid.flights], grid)
         write_atomically(folder / TABLE, as_csv(columns, unit_of).encode())
         if find_spec("pyarrow"):
             parquet, tables = import_module("pyarrow.parquet"), import_module("pyarrow")
@@ -195,7 +195,7 @@ def as_csv(columns: Mapping[str, Sequence[Any]], unit_of: Mapping[str, str]) -> 
     return text.getvalue()
 
 
-def _columns(rows: list[Row], grid: Grid) -> dict[str, list[Any]]:
+def columns_of(rows: list[Row], grid: Grid) -> dict[str, list[Any]]:
     """Return the columns of a sweep's tables; an axis with values of several types becomes text."""
     columns = {"key": [row["key"] for row in rows]}
     for axis in grid.axes:

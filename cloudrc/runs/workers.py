@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, wait
@@ -14,6 +15,7 @@ from itertools import chain, islice
 from multiprocessing.process import BaseProcess
 from multiprocessing.util import Finalize
 from queue import Empty, SimpleQueue
+from types import ModuleType
 from typing import Any, TypeVar
 
 from cloudrc.drivers.machine import usable_cores
@@ -58,14 +60,18 @@ def isolated_start() -> Iterator[None]:
 
     The workers block SIGINT and SIGHUP, because the parent process ends them. They import no
     module from the working folder: a file there may be somebody else's, and importing runs it.
+    They do not run the program of this process again, so that a script needs no
+    `if __name__ == "__main__"`.
     """
     # The workers inherit the mask. A signal to this process reaches its handler after the block.
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
     safe_path = os.environ.get("PYTHONSAFEPATH", "")
     os.environ["PYTHONSAFEPATH"] = "1"
+    main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
     try:
         yield
     finally:
+        sys.modules["__main__"] = main
         os.environ["PYTHONSAFEPATH"] = safe_path  # empty: not set
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 

@@ -17,11 +17,11 @@ from typing import Annotated
 import pytest
 from pydantic import Discriminator, Tag, create_model
 
-from cloudrc.cli import run, sweep_run
+from cloudrc.cli import run
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError, InterruptedRunError
 from cloudrc.runs import fly as flights
-from cloudrc.runs import interrupts
+from cloudrc.runs import interrupts, sweep
 from cloudrc.runs.grid import pack, read_grid
 from cloudrc.runs.interrupts import interrupt_on_signals, is_interrupted
 from cloudrc.runs.store import read_rows
@@ -131,7 +131,7 @@ def convert(flight):
 def test_a_sweep_stores_no_row_after_a_signal_that_a_library_caught(
     fly, write_sweep, monkeypatch, call
 ):
-    monkeypatch.setattr(sweep_run, "fly_row", lambda flight, **words: fly(flight))
+    monkeypatch.setattr(sweep, "fly_row", lambda flight, **words: fly(flight))
     error = call("sweep run --out grid", write_sweep(), code=130).err
     assert "cloudrc: interrupted; to continue: " in error
     assert read_rows(Path("grid")) == {}
@@ -142,7 +142,7 @@ def test_a_pod_prints_no_row_after_a_signal_that_a_library_caught(
     fly, write_sweep, monkeypatch, call, tmp_path
 ):
     (tmp_path / "flights").write_bytes(pack(read_grid(write_sweep()).flights.values()))
-    monkeypatch.setattr(sweep_run, "fly_row", fly)
+    monkeypatch.setattr(sweep, "fly_row", fly)
     assert call("sweep rows", tmp_path / "flights", code=130).out == ""
 
 

@@ -17,14 +17,15 @@ import pytest
 
 from cloudrc import assembly
 from cloudrc.assembly import assemble
-from cloudrc.cli import sweep_run
 from cloudrc.cli.sweep import _shard
-from cloudrc.cli.sweep_run import as_table, fly_row, summarise
+from cloudrc.cli.sweep_run import as_table
 from cloudrc.cluster import batch
 from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.runs import sweep as sweeps
 from cloudrc.runs.grid import pack, read_grid
 from cloudrc.runs.lock import lock_folder
 from cloudrc.runs.store import read_rows
+from cloudrc.runs.sweep import fly_row, summarise
 from cloudrc.source import code_hash
 from tests.cli.conftest import KEYS, SHORT
 from tests.conftest import wait_until
@@ -69,7 +70,7 @@ def test_a_sweep_goes_on_where_it_ended(write_sweep, monkeypatch, call):
             raise KeyboardInterrupt
         return fly_row(flight, **words)
 
-    monkeypatch.setattr("cloudrc.cli.sweep_run.fly_row", fly)
+    monkeypatch.setattr("cloudrc.runs.sweep.fly_row", fly)
     said = call("sweep run", write_sweep(ONE, seeds=3), code=130)
     assert said.out.endswith("runs/sweep-grid-1/sweep.json\n")
     again = said.err.partition("to continue: cloudrc ")[2]
@@ -172,8 +173,8 @@ def test_a_row_of_a_changed_file_is_not_flown_again(write_sweep, call):
 def test_code_that_changes_during_a_sweep_ends_it(write_sweep, call, monkeypatch):
     """A worker that starts later runs the changed sources."""
     hashes = iter(["0123456789abcdef"])
-    real = sweep_run.fly_row
-    monkeypatch.setattr(sweep_run, "fly_row", lambda flight, **words: (
+    real = sweeps.fly_row
+    monkeypatch.setattr(sweeps, "fly_row", lambda flight, **words: (
         real(flight) | ({"code": next(hashes)} if flight.seed == 2 else {})
     ))  # fmt: skip
     error = call("sweep run --out grid", write_sweep(ONE, seeds=3), code=2).err
@@ -330,7 +331,7 @@ def _end(flight, **words):
 
 def test_a_killed_worker_ends_a_sweep_and_is_no_row(write_sweep, call, monkeypatch):
     monkeypatch.setattr("cloudrc.runs.workers.usable_cores", lambda: 2)
-    monkeypatch.setattr("cloudrc.cli.sweep_run.fly_row", _end)
+    monkeypatch.setattr("cloudrc.runs.sweep.fly_row", _end)
     error = call("sweep run --out grid", write_sweep(ONE, seeds=[1, 2, 3, 4]), code=6).err
     assert "a worker was killed, perhaps by the kernel because memory ran out" in error
     assert "error" not in {row["verdict"] for row in rows("grid")}

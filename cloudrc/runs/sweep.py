@@ -1,0 +1,131 @@
+"""Fly the flights of a sweep, keep their rows, and summarise them."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.runs import store
+from cloudrc.runs.flight import Row, counts, fly_point, measure
+from cloudrc.runs.fly import fly
+from cloudrc.runs.grid import Grid, SweepPoint
+from cloudrc.runs.workers import map_in_order, take_each
+from cloudrc.source import code_hash
+from cloudrc.statistics import median_interval
+
+METHOD = "95 % interval of the median, by order statistics"
+
+
+class Work(NamedTuple):
+    """The flights that a command or a call has to do, of a sweep in a folder."""
+
+    mine: list[SweepPoint]  # flights of this shard, or of the whole sweep
+    missing: list[SweepPoint]  # those of them without a row, or without a wanted recording
+    before: dict[str, Row]  # key -> row of the flights that are in the folder
+
+
+def begin(
+    grid: Grid, folder: Path, shard: int | None = None, count: int = 1, record: str | None = None
+) -> Work:
+    """Begin or continue a sweep in `folder`, which is locked; return what has to be flown.
+
+    `shard` is a number from 1 to `count`, or None for all flights. `record` names the flights to
+    record: "failed", "all" or None for no flights. Raise a BadInputError if the folder has rows of
+    another sweep or of other code.
+    """
+    before = store.begin(folder, grid, is_shared=bool(shard))
+    mine = [*grid.flights.values()][(shard or 1) - 1 :: count]
+    missing = [
+        each
+        for each in mine
+        if each.key not in before or _to_record(before[each.key], record, folder)
+    ]
+    return Work(mine, missing, before)
+
+
+def fly_missing(work: Work, folder: Path, jobs: int, record: str | None = None) -> Generator[Row]:
+    """Fly what is missing in `jobs` processes; yield each row once it is flown."""
+    job = partial(fly_row, record=record, folder=folder)
+    return map_in_order(job, work.missing, jobs, in_order=False)
+
+
+def keep(
+    flown: Generator[Row],
+    folder: Path,
+    grid: Grid,
+    shard: int | None,
+    before: Collection[str],
+    see: Callable[[Row], None] = lambda row: None,
+) -> tuple[dict[str, Row], CloudrcError | None]:
+    """Append each new row to the sweep in `folder`, call `see` with it, and write the tables.
+
+    `before` has the keys of the rows that the folder already has. Return all rows, key -> row; and
+    why the work ended early, or None.
+    """
+    with store.append_rows(folder, shard) as append:
+
+        def take(row: Row) -> None:
+            if row["code"] != code_hash():
+                raise BadInputError("the code of cloudrc has changed during the sweep; begin again")
+            if row["key"] not in before:
+                append(row)
+            see(row)
+
+        stopped = take_each(flown, take)
+    try:
+        return store.finish(folder, grid), stopped
+    except OSError:
+        if not stopped:
+            raise
+        return store.read_rows(folder), stopped  # the reason to tell is the first one
+
+
+def fly_row(flight: SweepPoint, record: str | None = None, folder: Path = Path()) -> Row:
+    """Fly a flight and return its row; if a recording is wanted, fly again to make it."""
+    row = flight.row(fly_point(flight.experiment))
+    if _to_record(row, record, folder):
+        fly_into(folder / flight.key, flight, page=False)
+    return row
+
+
+def _to_record(row: Row, record: str | None, folder: Path) -> bool:
+    """Return whether a flight still needs a recording.
+
+    `record` names the flights to record: "failed", "all" or None for no flights.
+    """
+    wanted = record == "all" or (record == "failed" and row["verdict"] != "success")
+    has = (folder / row["key"] / "report.json").is_file()
+    return wanted and row["verdict"] != "error" and not has
+
+
+def fly_into(folder: Path, flight: SweepPoint, *, page: bool) -> dict[str, Any]:
+    """Fly a flight with a recording into its folder in a sweep; return the report."""
+    folder.mkdir(exist_ok=True)
+    (folder / "environment.json").unlink(missing_ok=True)  # it describes an earlier flight
+    return fly(flight.experiment, "virtual", folder, page=page)
+
+
+def fly_seed(flight: SweepPoint) -> Row:
+    """Fly once; return the row of results, such as the verdict. An exception ends the command."""
+    return flight.row(measure(flight.experiment))
+
+
+def summarise(rows: Sequence[Row], units: Mapping[str, str]) -> dict[str, Any]:
+    """Count all runs and successful runs; compute the median of each measurement.
+
+    Each median has a confidence interval. A run whose plug-in failed is counted, but its
+    measurements are left out. `units`: metric -> unit.
+    """
+    numbers, measured = {}, [row["numbers"] for row in rows if counts(row)]
+    failed = [row["numbers"] for row in rows if counts(row) and row["verdict"] != "success"]
+    for name in dict.fromkeys(name for each in measured for name in each):
+        found = [each[name] for each in measured if name in each]
+        middle = {"median": statistics.median(found), "interval": median_interval(found)}
+        marks = {"unit": units[name], "count": len(found), "failed": sum(name in n for n in failed)}
+        numbers[name] = middle | marks
+    done = sum(row["verdict"] == "success" for row in rows)
+    return {"done": done, "count": len(rows), "method": METHOD, "numbers": numbers}
