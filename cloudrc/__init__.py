@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cloudrc.api import Comparison, Result, SweepTable, compare, fly, identify, sweep
+    from cloudrc.api import Comparison, Result, SweepTable, compare, fly, identify, margin, sweep
 
 __version__ = "0.1.0"
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "compare",
     "fly",
     "identify",
+    "margin",
     "sweep",
 ]
 

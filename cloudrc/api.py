@@ -283,6 +283,39 @@ def compare(
     return Comparison(name, entry["p_wilcoxon"], entry["difference"], document)
 
 
+def margin(
+    key: str,
+    *,
+    of: str = "steps",
+    settings: Mapping[str, Any] | None = None,
+    seeds: int = 3,
+    largest: float | None = None,
+    resolution: float | None = None,
+) -> dict[str, Any]:
+    """Find up to which value of a key the loop is stable, and flights succeed.
+
+    Args:
+        key: Key of the experiment whose value is a number, such as `link.both.delay_ms`.
+        of: Name of a shipped experiment, or path of a YAML file.
+        settings: Changes of the experiment: key -> value.
+        seeds: Fly the seeds 1 to `seeds`.
+        largest: Largest value to try [any unit]; with None, 32 times the present one.
+        resolution: Try multiples of this value [any unit].
+
+    Returns:
+        The result of `cloudrc margin -o json`: `stable_up_to`, `settles_up_to` and more.
+
+    Raises:
+        cloudrc.errors.BadInputError: If the key has no range of numbers.
+    """
+    from cloudrc.runs.trials import QUESTIONS, Asked, Trials, describe, questions
+
+    trials = Trials(Asked(key, of, _texts(settings or {}), seeds, largest, resolution))
+    asked = questions(trials)
+    found = {name: trials.search(name) if name in asked else None for name in QUESTIONS}
+    return describe(trials, found)
+
+
 def identify(run: str | Path) -> dict[str, Any]:
     """Fit the model of the velocity loop to a run, the folder or its MCAP file.
 

@@ -147,6 +147,14 @@ def test_a_wrong_comparison_is_refused(a, b, text):
         cloudrc.compare(a, b)
 
 
+def test_a_margin_is_that_of_the_command(capfd):
+    found = cloudrc.margin("link.uplink.delay_ms", settings=SHORT, seeds=1, largest=20)
+    assert (found["settles_up_to"], found["stable_up_to"]) == (20.0, 20.0)
+    assert capfd.readouterr() == ("", "")
+    with pytest.raises(BadInputError, match="is no number"):
+        cloudrc.margin("link.profile")
+
+
 def test_a_script_flies_in_several_processes(tmp_path):
     """It needs no `if __name__ == "__main__"`: a worker does not run the script again."""
     grid = {"experiment": "steps", "set": SHORT, "seeds": 2}

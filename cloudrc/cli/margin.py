@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
-from collections.abc import Callable, Iterable
-from contextlib import closing
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING
 
 from cloudrc.cli.compare import flight_arguments
 from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.output import escape, output_argument, print_or_drop, print_result
-from cloudrc.errors import BadInputError
 from cloudrc.runs.interrupts import interrupt_on_signals
-from cloudrc.runs.workers import map_in_order
 
 if TYPE_CHECKING:
-    from cloudrc.config.load import ResolvedExperiment
     from cloudrc.runs.margin import ValueRange
+    from cloudrc.runs.trials import Trial, Trials
 
 EPILOG = """\
 examples:
@@ -32,17 +27,6 @@ out, in the scene 'empty'. It settles in time if the flights of the experiment
 succeed with all seeds. The search begins at the present value and goes up and
 down. It raises cloud.horizon_max_s, cloud.freeze_after_s and
 guard.command_age_max_ms as the delays need it, unless --set gives them."""
-QUESTIONS = {
-    "stable": "is the loop stable? a step of {small:g} m per axis in the scene {scene}",
-    "settles": "does it settle in time? flights of {experiment}",
-}
-"""Name of a question -> the question in words."""
-NOT_IN_STEP = "mission.", "criteria.", "report."
-"""Keys that begin so do not change the step, so that stability does not depend on them."""
-
-Trial: TypeAlias = dict[str, Any]
-"""Result of the flights with one value: `value`, the guard's `speed_max_mps`, and the answer as
-`stable` or `settles`; for a delay `rtt_ms`; after a failure `code`, `text` and `seed`."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,226 +45,45 @@ def execute(options: argparse.Namespace) -> int:
     """Print both answers; return 0, or 1 if no value is stable (or, without that, none settles)."""
     interrupt_on_signals()
     require("margin", MODES["virtual"])
-    trials = Trials(options)
-    asked = [name for name in QUESTIONS if name == "settles" or trials.step_depends]
-    document: dict[str, Any] = {
-        **{"key": options.key, "experiment": options.experiment},
-        **{"overrides": options.set, "seeds": options.seeds, "resolution": trials.size},
-        **{"smallest": trials.value(trials.bottom), "largest": trials.value(trials.top)},
-        "largest_why": trials.top_why,
-    }
-    lines = []
+    from cloudrc.runs.trials import QUESTIONS, Asked, Trials, describe, questions
+
+    trials = Trials(
+        Asked(
+            options.key,
+            options.experiment,
+            options.set,
+            options.seeds,
+            options.max,
+            options.resolution,
+        )
+    )
+    asked = questions(trials)
+    found: dict[str, ValueRange | None] = {}
     for name in QUESTIONS:
-        found = trials.search(name) if name in asked else None
-        document |= _entries(name, found, trials)
-        lines.append(_answer(name, found, trials))
-    if large := trials.large_step(document["stable_up_to"]):
-        document["large_step"] = large
-        lines.insert(1, _large(large))
+        found[name] = _search(options, trials, name) if name in asked else None
+    document = describe(trials, found)
+    lines = [_answer(name, each, trials) for name, each in found.items()]
+    if "large_step" in document:
+        lines.insert(1, _large(document["large_step"]))
     print_result(options.output, document, "\n" + "\n".join(map(escape, lines)))
     return 0 if document[f"{asked[0]}_up_to"] is not None else 1
 
 
-class Trials:
-    """The values of the key that are tried, each at most once per question.
+def _search(options: argparse.Namespace, trials: Trials, question: str) -> ValueRange:
+    """Search the answer to a question, and print each value that is tried."""
+    from cloudrc.runs.stability import SCENE, SMALL
+    from cloudrc.runs.trials import QUESTIONS
 
-    Attributes:
-        size: All values are multiples of this one.
-        present: The number of the first value: the value divided by `size`.
-        bottom: Number of the smallest value that is tried.
-        top: Number of the largest value that is tried.
-        top_why: Why no larger value is tried, in words.
-        step_depends: Whether the response to a step depends on the key.
-    """
+    stream = sys.stdout if options.output == "table" else sys.stderr
+    facts = {"small": SMALL, "scene": SCENE, "experiment": options.experiment}
+    text = QUESTIONS[question].format(**facts)
+    print_or_drop(escape(f"{text}, seeds 1 to {options.seeds}"), stream)
 
-    def __init__(self, options: argparse.Namespace) -> None:
-        """Read the present value and the range of the search; refuse a key that has no range."""
-        from cloudrc.runs.experiment import load, refuse_seed
-        from cloudrc.runs.margin import STEPS_MAX, check_largest, present_value
+    def see(number: int, trial: Trial) -> None:
+        line = f"  {trials.name(number):<26}{_result(question, trial)}"
+        print_or_drop(escape(line), stream)
 
-        self._options, self._load = options, load
-        key = options.key
-        refuse_seed([*options.set, f"{key}=0"])
-        self.step_depends = not key.startswith(NOT_IN_STEP)
-        now = present_value(load(options.experiment, options.set), key)
-        if options.max is not None:
-            check_largest(key, options.max)
-        elif now is None:
-            load(options.experiment, [*options.set, f"{key}=1"])  # names an unknown key
-            raise BadInputError(f"{key}: has no value now; name the largest one to try with --max")
-        self.size = 1.0 if isinstance(now, int) else 0.01
-        if key.endswith("_ms"):
-            self.size = 10.0
-        if options.resolution is not None:
-            self.size = options.resolution
-        # Without a value the key has no effect, as a large value has: begin there.
-        self.present = self._number(options.max if now is None else now)
-        given = STEPS_MAX * self.present * self.size if options.max is None else options.max
-        if not 0 < self.size <= given < math.inf:
-            raise BadInputError(
-                f"--resolution {self.size:g} must be above 0, --max {given:g} not below it"
-            )
-        self._done: dict[tuple[str, int], Trial] = {}
-        self._ready: dict[int, tuple[ResolvedExperiment | None, str]] = {}
-        self._find_range(math.floor(given / self.size + 1e-9))
-
-    def _number(self, value: float) -> int:
-        return max(1, round(value / self.size)) if 0 < self.size < math.inf else 1
-
-    def _find_range(self, top: int) -> None:
-        """Limit the search to values that the experiment allows, around the present one."""
-        from cloudrc.runs.margin import bisect
-
-        def allowed(number: int) -> bool:
-            return self.experiment(number)[0] is not None
-
-        self.present = min(self.present, top)
-        if not allowed(self.present):
-            raise BadInputError(self.experiment(self.present)[1])
-        self.top, self.bottom = top, 1
-        self.top_why = "the largest value tried; raise --max"
-        if not allowed(top):
-            self.top, beyond = bisect(allowed, self.present, top)
-            self.top_why = f"the largest value possible: {self.experiment(beyond)[1]}"
-        if not allowed(1):
-            self.bottom, _ = bisect(allowed, self.present, 1)
-
-    def value(self, number: int | None) -> float | None:
-        """Return the value of a number; None for None."""
-        return None if number is None else round(number * self.size, 9)
-
-    def experiment(self, number: int) -> tuple[ResolvedExperiment | None, str]:
-        """Return the experiment with a value, and limits that fit; or why there is none."""
-        if number not in self._ready:
-            self._ready[number] = self._prepare(number)
-        return self._ready[number]
-
-    def _prepare(self, number: int) -> tuple[ResolvedExperiment | None, str]:
-        from cloudrc.runs.margin import LIMIT_MAX, limits
-
-        options = self._options
-        settings = [*options.set, f"{options.key}={self.value(number):.12g}"]
-        try:
-            experiment = self._load(options.experiment, settings)
-        except BadInputError as error:
-            return None, str(error)
-        given = [text.partition("=")[0].strip() for text in settings]
-        if options.key == "guard.speed_max_mps":  # a longer limit would lower the largest speed
-            given.append("guard.command_age_max_ms")
-        more, needed = limits(experiment, given)
-        if needed > LIMIT_MAX and "guard.command_age_max_ms" not in given:
-            age = f"a command would be {needed:g} s old"
-            age = age if needed < math.inf else "no command arrives within 20 s"
-            return None, f"{age}, and guard.command_age_max_ms ends at {LIMIT_MAX:g} s"
-        return (self._load(options.experiment, [*settings, *more]) if more else experiment), ""
-
-    def search(self, question: str) -> ValueRange:
-        """Find the range of values in which the answer to a question is yes."""
-        from cloudrc.runs.margin import search
-        from cloudrc.runs.stability import SCENE, SMALL
-
-        options = self._options
-        stream = sys.stdout if options.output == "table" else sys.stderr
-        facts = {"small": SMALL, "scene": SCENE, "experiment": options.experiment}
-        text = QUESTIONS[question].format(**facts)
-        print_or_drop(escape(f"{text}, seeds 1 to {options.seeds}"), stream)
-
-        def works(number: int) -> bool:
-            trial = self._try(question, number)
-            line = f"  {self.name(number):<26}{_result(question, trial)}"
-            print_or_drop(escape(line), stream)
-            return bool(trial[question])
-
-        return search(works, self.present, self.bottom, self.top)
-
-    def trial(self, question: str, number: int) -> Trial:
-        """Return a trial that has been flown."""
-        return self._done[question, number]
-
-    def trials(self, question: str) -> list[Trial]:
-        """Return all trials of a question, the smallest value first."""
-        return [self._done[key] for key in sorted(self._done) if key[0] == question]
-
-    def _try(self, question: str, number: int) -> Trial:
-        if (question, number) not in self._done:
-            experiment, why = self.experiment(number)
-            trial: Trial = {"value": self.value(number), question: experiment is not None}
-            if experiment is None:
-                trial |= {"code": "refused", "text": why}
-            else:
-                if self._options.key.endswith("delay_ms"):
-                    trial["rtt_ms"] = experiment.uplink.delay_ms + experiment.downlink.delay_ms
-                trial["speed_max_mps"] = experiment.guard.speed_max_mps
-                ask = _ask_stable if question == "stable" else _ask_settles
-                trial |= self._fly(experiment, ask, question)
-            self._done[question, number] = trial
-        return self._done[question, number]
-
-    def _fly(
-        self, experiment: ResolvedExperiment, ask: Callable[..., Iterable[Trial]], question: str
-    ) -> Trial:
-        """Fly one seed after the other, until an answer is no; return what is new in the trial."""
-        seeds = range(1, self._options.seeds + 1)
-        jobs = [experiment.model_copy(update={"seed": seed}) for seed in seeds]
-        result: Trial = {}
-        for seed, answer in zip(seeds, ask(jobs), strict=False):
-            result = answer
-            if not answer[question]:
-                return result | {"seed": seed}
-        return result
-
-    def large_step(self, value: float | None) -> Trial:
-        """Fly a step of 1 m per axis at the stable `value` [any unit]; {} if it is None."""
-        from cloudrc.runs.stability import LARGE, fly_step
-
-        experiment = None if value is None else self.experiment(self._number(value))[0]
-        if experiment is None:
-            return {}
-        found = fly_step(experiment.model_copy(update={"seed": 1}), LARGE)
-        return {"size_m": LARGE, "speed_max_mps": experiment.guard.speed_max_mps, **found}
-
-    def name(self, number: int) -> str:
-        """Return the value of a number with its unit and, for a delay, the round trip."""
-        experiment, _ = self.experiment(number)
-        key, rtt = self._options.key, ""
-        if key.endswith("delay_ms") and experiment is not None:
-            rtt = f" (RTT {experiment.uplink.delay_ms + experiment.downlink.delay_ms:g} ms)"
-        return f"{self.value(number):.12g}{' ms' if key.endswith('_ms') else ''}{rtt}"
-
-
-def _ask_stable(jobs: list[ResolvedExperiment]) -> Iterable[Trial]:
-    from cloudrc.runs.stability import fly_step
-
-    # A worker takes as long to start as some flights.
-    with closing(map_in_order(fly_step, jobs, len(jobs) // 4)) as answers:
-        yield from answers
-
-
-def _ask_settles(jobs: list[ResolvedExperiment]) -> Iterable[Trial]:
-    from cloudrc.runs.flight import fly_point
-
-    with closing(map_in_order(fly_point, jobs, len(jobs) // 4)) as flights:
-        for flight in flights:
-            if flight["verdict"] == "success":
-                yield {"settles": True}
-            else:
-                code = (*flight["failures"], flight["verdict"])[0]
-                yield {"settles": False, "code": code, "text": flight["text"]}
-
-
-def _entries(name: str, found: ValueRange | None, trials: Trials) -> dict[str, Any]:
-    """Return the part of the document about one question; `found` is None if it is not asked."""
-    if found is None:
-        return {f"{name}_up_to": None, f"{name}_trials": []}
-    elsewhere = [[trials.value(a), trials.value(b)] for a, b in found.elsewhere]
-    return {
-        f"{name}_from": trials.value(found.first),
-        f"{name}_up_to": trials.value(found.last),
-        f"{name}_fails_below": trials.value(found.below),
-        f"{name}_fails_at": trials.value(found.above),
-        f"{name}_elsewhere": elsewhere,
-        f"{name}_trials": trials.trials(name),
-    }
+    return trials.search(question, see)
 
 
 def _answer(name: str, found: ValueRange | None, trials: Trials) -> str:
