@@ -76,10 +76,16 @@ def signature(kind: str, name: str) -> inspect.Signature:
     with refuse_failure(
         f"{_one(kind)} {name!r} has a build() with annotations that cannot be read"
     ):
-        return inspect.signature(build, eval_str=True)
+        found = inspect.signature(build, eval_str=True)
+    if "name" in found.parameters:
+        raise BadInputError(
+            f"{_one(kind)} {name!r}: no parameter of build() may be called name, because the key "
+            "name is the plug-in itself; call it something else"
+        )
+    return found
 
 
-def load(kind: str, name: str, **parameters: Any) -> Any:
+def load(kind: str, name: str, /, **parameters: Any) -> Any:
     """Find a plug-in and build it; raise a BadInputError if it is missing or its `build` fails."""
     build, method = _build(kind, name), METHODS[kind]
     with refuse_failure(f"{_one(kind)} {name!r} cannot be built"):

@@ -189,3 +189,16 @@ def test_a_notebook_runs(path, tmp_path):
     code = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
     environment = {**os.environ, "MPLBACKEND": "Agg", "PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)
+
+
+def test_a_horizon_in_the_wrong_unit_is_told(tmp_path):
+    """An estimator that returns milliseconds flies with the longest horizon, and may succeed."""
+    path = tmp_path / "in_ms.py"
+    path.write_text(
+        "from cloudrc.cloud.estimators import Estimator\n"
+        "class E(Estimator):\n"
+        "    def horizon(self, age): return 45.0\n"
+        "def build(): return E()\n"
+    )
+    (note,) = cloudrc.fly("hover", {"cloud.estimator": str(path)}).notes
+    assert "horizon was not in the range 0 to 1 s (cloud.horizon_max_s)" in note

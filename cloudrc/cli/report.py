@@ -65,7 +65,7 @@ def execute(options: argparse.Namespace) -> int:
 
 def summary(report: Mapping[str, Any], folder: Path) -> str:
     """Summarize a report as text: verdict, failures, main numbers and path of report.html."""
-    from cloudrc.metrics import Number
+    from cloudrc.metrics import METRIC_NOTE, Number
     from cloudrc.report.page import main_numbers
 
     outcome, failures = report["verdict"], report["failures"]
@@ -79,6 +79,8 @@ def summary(report: Mapping[str, Any], folder: Path) -> str:
     }
     rows = [(f"  {label}", digits, unit) for label, digits, unit in main_numbers(numbers)]
     lines += ["", table(rows, right=[1]) if rows else "  no numbers: nothing was flown"]
+    own = [note for note in report.get("notes", ()) if note.startswith(METRIC_NOTE)]
+    lines += [paint(f"  {escape(note)}", "yellow") for note in own]
     if "fault_count" in numbers and numbers["fault_count"].value:
         count = numbers["fault_count"].value
         lines.append(paint(f"  faults noted in flight: {count:.0f}, see the report", "yellow"))

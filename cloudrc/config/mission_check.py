@@ -79,32 +79,41 @@ def check_mission(
     With `contact`, the mission has to touch the board, which is then no obstacle. A `planar` robot
     stays on the ground, at the height of the spawn.
     """
+    if problem := _check_parts(mission):
+        return [problem]
     if planar and (problems := check_heights(mission, scene)):
         return problems
-    lift = LIFT if planar else 0.0
+    if mission.setpoints is not None:
+        return []
+    lift, known = LIFT if planar else 0.0, obstacles(scene, contact=contact)
+    if mission.steps is not None:
+        reason = _check_steps(mission.steps, known, lift)
+        return [Problem(("steps",), "", reason)] if reason else []
+    start = scene.spawn if mission.start == "spawn" else None
+    return list(_check_waypoints(mission, known, start, lift))
+
+
+def _check_parts(mission: Mission) -> Problem | None:
+    """Return the first problem of parts that exclude or need each other."""
     if mission.setpoints is not None:
         if mission.waypoints or mission.steps or mission.carrot:
             reason = "a mission has setpoints, or waypoints, steps and a carrot; delete one"
-            return [Problem(("setpoints",), "", reason)]
-        return []
+            return Problem(("setpoints",), "", reason)
+        return None
     if mission.carrot is None:
         for index, waypoint in enumerate(mission.waypoints):
             if waypoint.speed_mps is not None:
                 reason = "is the speed of a carrot; give the mission a carrot, or delete it"
                 path = ("waypoints", str(index), "speed_mps")
-                return [Problem(path, f"{waypoint.speed_mps:g}", reason)]
+                return Problem(path, f"{waypoint.speed_mps:g}", reason)
     elif mission.steps is not None:
-        return [Problem(("carrot",), "", "impossible with steps; delete it, or give waypoints")]
-    if mission.steps is not None:
-        if mission.waypoints:
-            reason = "a mission has waypoints or steps, not both; delete one"
-            return [Problem(("steps",), "", reason)]
-        reason = _check_steps(mission.steps, obstacles(scene, contact=contact), lift)
-        return [Problem(("steps",), "", reason)] if reason else []
-    if not mission.waypoints:
-        return [Problem(("waypoints",), "", "none given; give at least one, or steps or setpoints")]
-    start = scene.spawn if mission.start == "spawn" else None
-    return list(_check_waypoints(mission, obstacles(scene, contact=contact), start, lift))
+        return Problem(("carrot",), "", "impossible with steps; delete it, or give waypoints")
+    if mission.steps is not None and mission.waypoints:
+        return Problem(("steps",), "", "a mission has waypoints or steps, not both; delete one")
+    if mission.steps is None and not mission.waypoints:
+        reason = "none given; give at least one, or steps or setpoints"
+        return Problem(("waypoints",), "", reason)
+    return None
 
 
 def _check_waypoints(

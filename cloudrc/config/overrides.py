@@ -253,7 +253,7 @@ def _check_model(predictor: Any, name: str) -> None:
         )
 
 
-def build_plugin(kind: str, choice: PlugIn, **given: Any) -> Any:
+def build_plugin(kind: str, choice: PlugIn, /, **given: Any) -> Any:
     """Build a plug-in of a resolved experiment; convert its parameters to the declared types.
 
     `kind` is a key of `cloudrc.plugins.PACKAGES`, such as "controllers". `given` are arguments of

@@ -51,6 +51,7 @@ def assess(
         notes.append(f"The recording is incomplete: {recording.note}.")
     notes += [f"The recording {remark}." for remark in recording.remarks]
     notes += [f"{text[0].upper()}{text[1:]}." for text in recording["/fault"]["text"] if text]
+    notes += _clamped_horizon(flight, experiment)
     notes += _unknown_clearance(flight)
     if flight.ending is not None:
         seen = operator_verdict(flight, evidence, numbers)
@@ -63,6 +64,21 @@ def assess(
     kept = tuple(dict.fromkeys([*notes, *metric_notes]))
     digest = None if recording.note else recording.sha256
     return Assessment(run, experiment, flight, numbers, verdict, operator, kept, digest)
+
+
+def _clamped_horizon(flight: Flight, experiment: ResolvedExperiment) -> list[str]:
+    """Return a note if cloud had to limit the estimator's horizon."""
+    count = flight.recording["/count"]
+    rows = zip(count["name"], count["total"], strict=True)
+    clamped = max((int(total) for name, total in rows if name == "horizon_clamped"), default=0)
+    if not clamped:
+        return []
+    periods = len(flight.recording["/delay_estimate"])
+    return [
+        f"In {clamped} of {periods} periods, the estimator's horizon was not in the range 0 to "
+        f"{experiment.cloud.horizon_max_s:g} s (cloud.horizon_max_s), and cloud limited it; a "
+        "horizon is in seconds."
+    ]
 
 
 def _unknown_clearance(flight: Flight) -> list[str]:

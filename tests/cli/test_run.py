@@ -155,3 +155,13 @@ def test_each_later_failure_has_its_time():
 def test_a_run_in_real_time_needs_the_extra_of_the_api(monkeypatch, refused):
     monkeypatch.setitem(extras.EXTRAS, "api", ("fastapi_is_not_here",))
     assert "pip install 'cloudrc[api]'" in refused("run hover --mode local", code=3)
+
+
+def test_a_metric_without_a_value_is_told_on_the_terminal(tmp_path):
+    report = {
+        **{"verdict": "success", "failures": [], "numbers": {}},
+        "notes": ["metric own failed: GeneratorExit: ", "The recording is incomplete: a test."],
+    }
+    text = summary(report, tmp_path)
+    assert "metric own failed: GeneratorExit" in text
+    assert "incomplete" not in text
