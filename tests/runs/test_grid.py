@@ -211,8 +211,8 @@ def test_what_points_share_is_read_and_checked_once(write_sweep, tmp_path, monke
     axes = {"link.both.delay_ms": [*range(20)], "guard.hold_max_s": [1, 2]}
     sweep = read_grid(write_sweep(axes))
     assert len(sweep.points) == 40
-    # The sweep, the experiment, the mission and the profile; three plug-ins.
-    assert counts == {"parse_yaml": 4, "check_mission": 1, "load_scene": 1, "parameter_model": 3}
+    # The sweep, the experiment, the mission, the profile and the robot; three plug-ins.
+    assert counts == {"parse_yaml": 5, "check_mission": 1, "load_scene": 1, "parameter_model": 3}
 
 
 def test_points_that_share_results_are_independent(write_sweep):
