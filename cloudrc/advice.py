@@ -20,6 +20,8 @@ DURATION_NS = 20_000_000_000
 """Simulated time of the link [ns]."""
 FAR = 1.0
 """Tolerance of a waypoint that may be meant in cm or mm [m]."""
+JITTER_MAX = 1.0
+"""Jitter of a link that may be meant in another unit [s]."""
 LONG = 3600.0
 """Duration of a mission that may be meant in milliseconds [s]."""
 SAG_MAX = 0.05
@@ -32,6 +34,7 @@ rotors, one third comes from the tilt that this drag causes."""
 def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     """Yield a warning for each group of settings that do not fit together."""
     yield from _units(experiment)
+    yield from _jitter(experiment)
     yield from _time(experiment)
     for number, waypoint in enumerate(experiment.mission.waypoints, start=1):
         if waypoint.tolerance_m >= FAR:
@@ -91,6 +94,19 @@ def _low_rates(experiment: ResolvedExperiment) -> Iterator[str]:
         needed = (size + HEADER_BYTES) * 8.0 * rate
         if doubt := describe_low_rate(getattr(experiment, name), name, needed, what):
             yield doubt
+
+
+def _jitter(experiment: ResolvedExperiment) -> Iterator[str]:
+    """Yield a warning for each direction whose jitter may be meant in microseconds."""
+    from cloudrc.link.profile import Timeline
+
+    for name, profile in _directions(experiment).items():
+        jitter = max(piece.jitter for piece in Timeline(profile).pieces)
+        if jitter >= JITTER_MAX:
+            yield (
+                f"link.{name}.jitter_ms is {jitter * 1e3:g} ({jitter:g} s), and a delay that would "
+                "be below 0 becomes 0; give the jitter in milliseconds"
+            )
 
 
 def _late(experiment: ResolvedExperiment) -> Iterator[str]:

@@ -78,6 +78,7 @@ def test_a_share_that_may_be_meant_in_percent_is_named(settings, words):
     [
         (both(45_000, 0), "uplink.delay_ms is 45000 (45 s) and link.downlink.delay_ms is 45000"),
         (["link.uplink.delay_ms=45000"], "link.uplink.delay_ms is 45000 (45 s): no command"),
+        (["link.uplink.jitter_ms=45000"], "link.uplink.jitter_ms is 45000 (45 s), and a delay"),
         (["link.uplink.rate_kbit=0.05"], "rate_kbit 0.05 is below the 185.6 kbit/s that telemetry"),
         (["link.downlink.rate_kbit=0.05"], "below the 92.8 kbit/s that the stream of commands"),
         (
