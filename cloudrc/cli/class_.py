@@ -13,14 +13,15 @@ import os
 import select
 import signal
 import subprocess
+import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.extras import require
-from cloudrc.cli.output import format_document, print_or_drop, print_result, table
+from cloudrc.cli.output import escape, format_document, print_or_drop, print_result, table
 from cloudrc.cli.parser import add_verbs
 from cloudrc.errors import BadInputError
 from cloudrc.runs.interrupts import interrupt_on_signals
@@ -58,7 +59,12 @@ def execute(options: argparse.Namespace) -> int:
     _refuse_other_folder(options)
     require("a check", ("world",))
     interrupt_on_signals()
-    rows = check(options.folder.resolve())
+    print_or_drop(escape(f"scores {options.folder}"), sys.stderr)
+    rows = []
+    for row in check(options.folder.resolve()):
+        rows.append(row)
+        text = f"  {row['part']}, {row['test']}: {row['points']:g}/{row['max_points']}"
+        print_or_drop(text, sys.stderr)
     score, of = (round(sum(row[key] for row in rows), 1) for key in ("points", "max_points"))
     if options.output == "gradescope":
         names = {"points": "score", "max_points": "max_score", "seen": "output"}
@@ -183,17 +189,15 @@ class Process:
                     pipe.close()
 
 
-def check(folder: Path, limit: float = TIME_LIMIT) -> list[dict[str, Any]]:
+def check(folder: Path, limit: float = TIME_LIMIT) -> Iterator[dict[str, Any]]:
     """Score the student's files in a folder, each part within `limit` [s].
 
-    Return one dictionary per test, with the test's name, its points and the result in words.
+    Yield one dictionary per test, as it ends: the test's name, its points and the result in words.
     """
     from cloudrc.exercise import checks
     from cloudrc.exercise.hand_in import FILES
     from cloudrc.exercise.remote import Remote
 
-    found = list[dict[str, Any]]()
     for part in checks.CHECKS:
         with closing(Process(folder, FILES.get(part, "a file"), limit)) as process:
-            found += checks.run(part, Remote(process.ask), folder)
-    return found
+            yield from checks.run(part, Remote(process.ask), folder)

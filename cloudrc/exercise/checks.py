@@ -8,7 +8,7 @@ process of the check; the student's functions run in another process (`hand_in`)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -161,13 +161,12 @@ CHECKS: dict[str, tuple[Formula | Exam, ...]] = {
 """Part, or all parts together -> its checks; 100 points in total."""
 
 
-def run(part: str, hand_in: Remote, folder: Path) -> list[dict[str, Any]]:
-    """Score the tests of a part, or of all "together"; return a row per test.
+def run(part: str, hand_in: Remote, folder: Path) -> Iterator[dict[str, Any]]:
+    """Score the tests of a part, or of all "together"; yield a row per test, as it ends.
 
     `hand_in` calls the functions of the files in `folder`. A test that cannot be scored gives 0.
     """
     parts = tuple(FILES) if part == "together" else (part,)
-    scored = []
     for check in CHECKS[part]:
         try:
             share, seen = check.score(parts, hand_in)
@@ -178,7 +177,10 @@ def run(part: str, hand_in: Remote, folder: Path) -> list[dict[str, Any]]:
                 raise failure from error
             text = str(error) if isinstance(error, InvalidResultError) else describe_error(error)
             share, seen = 0.0, f"{find_method(folder, parts[0])}: {text}"
-        points = round(check.points * min(max(share, 0.0), 1.0), 1)
-        scored.append((part, check.test, points, check.points, to_one_line(seen)))
-    keys = ("part", "test", "points", "max_points", "seen")
-    return [dict(zip(keys, row, strict=True)) for row in scored]
+        yield {
+            "part": part,
+            "test": check.test,
+            "points": round(check.points * min(max(share, 0.0), 1.0), 1),
+            "max_points": check.points,
+            "seen": to_one_line(seen),
+        }

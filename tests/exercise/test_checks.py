@@ -14,6 +14,7 @@ import pytest
 
 from cloudrc import exercise
 from cloudrc.cli import class_
+from cloudrc.cli.main import main
 from cloudrc.exercise import checks
 from cloudrc.exercise.hand_in import FILES, HandIn
 from cloudrc.exercise.remote import HandInError, Remote
@@ -31,7 +32,7 @@ def score(part, folder):
     def ask(calls):
         return json.loads(json.dumps(hand_in.answer(json.loads(json.dumps(calls)))))
 
-    return checks.run(part, Remote(ask), folder)
+    return list(checks.run(part, Remote(ask), folder))
 
 
 @pytest.mark.parametrize(("folder", "points"), [(STUBS, 0), (SOLUTION, 100)])
@@ -79,7 +80,7 @@ def test_whatever_a_file_does_the_other_parts_are_scored(tmp_path):
     (tmp_path / "delay_estimator.py").write_text("while True:\n    print('on and on')\n")
     (tmp_path / "predictor.py").write_text("import sys\nsys.exit('no')\n")
     (tmp_path / "controller.py").write_text("import os\nos._exit(0)\n")
-    rows = class_.check(tmp_path, limit=10.0)
+    rows = list(class_.check(tmp_path, limit=10.0))
     seen = {row["part"]: row["seen"] for row in rows}
     assert [row["test"] for row in rows] == [
         each[0] for part in checks.CHECKS.values() for each in part
@@ -128,7 +129,7 @@ def test_a_forged_answer_costs_the_part(data, tmp_path):
     ],
 )
 def test_whatever_is_answered_the_rows_are_valid(answer, points):
-    rows = checks.run("predictor", Remote(lambda calls: answer), STUBS)
+    rows = list(checks.run("predictor", Remote(lambda calls: answer), STUBS))
     assert [row["points"] for row in rows] == [points] * 4
     json.dumps(rows, allow_nan=False).encode()
     assert all("\n" not in row["seen"] and len(row["seen"]) < 2500 for row in rows)
@@ -218,3 +219,23 @@ def test_files_are_not_overwritten_and_a_folder_must_exist(tmp_path, refused):
     refused("class check", tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     assert "has none of delay_estimator.py" in refused("class check", tmp_path / "empty")
+
+
+def test_each_test_is_told_as_it_ends(tmp_path, monkeypatch, capsys):
+    """A check takes up to minutes; stdout carries the result alone."""
+    row = {"part": "estimator", "points": 1.0, "max_points": 2, "seen": "right"}
+
+    def check(folder):
+        for test in ("mean", "steps"):
+            told.append(capsys.readouterr())
+            yield row | {"test": test}
+
+    told = []
+    (tmp_path / "predictor.py").touch()
+    monkeypatch.setattr(class_, "check", check)
+    assert main(["class", "check", str(tmp_path), "-o", "json"]) == 0
+    told.append(capsys.readouterr())
+    lines = [f"scores {tmp_path}\n", "  estimator, mean: 1/2\n", "  estimator, steps: 1/2\n"]
+    assert [each.err for each in told] == lines
+    assert [bool(each.out) for each in told] == [False, False, True]
+    assert json.loads(told[-1].out)["score"] == 2.0
