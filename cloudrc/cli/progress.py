@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from threading import Timer
 from time import monotonic
 from typing import TYPE_CHECKING, TextIO
 
@@ -35,7 +36,7 @@ FLIGHTS_PERIOD, CHECK_PERIOD = 30.0, 10.0
 REPORT_AFTER = 1.0
 """Time without a record after the end of a mission, from which on the report is written [s]."""
 PLAN_WAIT = 1.0
-"""Time after which the check of a sweep shows its progress [s]."""
+"""Time after which the check of a sweep, or a report, shows its progress [s]."""
 
 
 class FlightView:
@@ -202,6 +203,40 @@ class PlanView:
         """Erase the status line on a terminal."""
         for view in self._view:
             view.close()
+
+
+class StepView:
+    """Shows the present step of a command: on a terminal in a status line, else in one line.
+
+    Nothing is shown before `PLAN_WAIT` on a terminal, or `FIRST_WAIT` on another stream.
+    """
+
+    def __init__(self, stream: TextIO, step: str) -> None:
+        """Set the stream and the first step, such as "reads the recording"."""
+        self._stream, self._step = stream, step
+        self._status = Console(file=stream).status(Text(escape(step))) if is_live(stream) else None
+        self._timer = Timer(PLAN_WAIT if self._status else FIRST_WAIT, self._begin)
+        self._timer.daemon = True
+        self._timer.start()
+
+    def _begin(self) -> None:
+        if self._status:
+            self._status.start()
+        else:
+            print_or_drop(escape(self._step), self._stream)
+
+    def tell(self, step: str) -> None:
+        """Set the next step."""
+        self._step = step
+        if self._status:
+            self._status.update(Text(escape(step)))
+
+    def close(self) -> None:
+        """Erase the status line on a terminal."""
+        self._timer.cancel()
+        self._timer.join()
+        if self._status:
+            self._status.stop()
 
 
 class SweepView(CountView):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,20 +45,27 @@ def execute(options: argparse.Namespace) -> int:
     if not options.run.is_dir():
         raise BadInputError(f"{options.run}: no such folder; name the folder of a run")
     from cloudrc import metrics
+    from cloudrc.cli.progress import StepView
     from cloudrc.metrics.verdict import exit_code
+    from cloudrc.record.topics import TOPICS
     from cloudrc.report.figures.style import Look
     from cloudrc.report.folder import read_run
     from cloudrc.report.write import write_report
     from cloudrc.runs.session import restore_mission
 
     metrics.check(options.metric)
-    restore_mission(options.run)
-    recording, experiment, run = read_run(options.run)
-    # The run may come from somebody else: never execute files that it names.
-    unmeasured = metrics.not_measured(experiment.report.metrics, options.metric)
-    run = replace(run, notes=(*run.notes, *unmeasured))
     look = Look(options.width, options.font_size)
-    document = write_report(options.run, recording, experiment, run, own=options.metric, look=look)
+    with closing(StepView(sys.stderr, f"reads the recording of {options.run}")) as view:
+        restore_mission(options.run)
+        recording, experiment, run = read_run(options.run)
+        # The run may come from somebody else: never execute files that it names.
+        unmeasured = metrics.not_measured(experiment.report.metrics, options.metric)
+        run = replace(run, notes=(*run.notes, *unmeasured))
+        count = sum(len(recording[topic]) for topic in TOPICS)
+        view.tell(f"measures {count:,} messages and draws the figures")
+        document = write_report(
+            options.run, recording, experiment, run, own=options.metric, look=look
+        )
     print_traceback(options, document)
     print_result(options.output, document, summary(document, options.run))
     return exit_code(document)

@@ -4,15 +4,17 @@ import io
 import json
 import subprocess
 import sys
+from contextlib import closing
 
 import pytest
 import yaml
 
 from cloudrc.cli import progress
 from cloudrc.cli.output import format_number, is_live, paint, table
-from cloudrc.cli.progress import CountView, FlightView
+from cloudrc.cli.progress import CountView, FlightView, StepView
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.records import Fault, GuardChange, MissionEvent, TelemetrySent
+from tests.conftest import wait_until
 
 
 class Terminal(io.StringIO):
@@ -111,6 +113,20 @@ def test_a_terminal_shows_what_happens_before_and_after_the_flight(monkeypatch):
             assert str(view.line()) == "the mission is over: writes the report"
         view.close()
     assert file.getvalue().split() == ["mission", "done"]
+
+
+@pytest.mark.parametrize("kind", [io.StringIO, Terminal])
+def test_a_long_report_shows_its_step_and_a_short_one_nothing(kind, monkeypatch):
+    stream = kind()
+    with closing(StepView(stream, "reads [it]")) as view:
+        view.tell("draws")
+    assert stream.getvalue() == ""
+    monkeypatch.setattr("cloudrc.cli.progress.PLAN_WAIT", 0.0)
+    monkeypatch.setattr("cloudrc.cli.progress.FIRST_WAIT", 0.0)
+    with closing(StepView(stream, "reads [it]")) as view:
+        wait_until(lambda: "reads [it]" in stream.getvalue(), 5.0)
+        view.tell("draws")
+    assert stream.isatty() or stream.getvalue() == "reads [it]\n"
 
 
 def test_a_full_disk_is_told(folder):
