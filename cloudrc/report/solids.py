@@ -28,8 +28,23 @@ class Face(NamedTuple):
     opacity: float = 1.0
 
 
-def robot_faces() -> list[Face]:
-    """Return the faces that draw the robot, in its body frame."""
+DRAWN = "pelican"
+"""Robot whose shape is known here; all others are drawn as a marker."""
+MARKER_HALF, MARKER_NOSE = (0.10, 0.06, 0.03), 0.06
+"""Half the size of the marker, and the length of its nose, which points along +x [m]."""
+
+
+def robot_faces(robot: str = DRAWN) -> list[Face]:
+    """Return the faces that draw a robot, given as in `world.robot`, in its body frame.
+
+    A robot other than `DRAWN` is drawn as a small box with a nose, not to scale.
+    """
+    if robot != DRAWN:
+        nose = (MARKER_HALF[0] + MARKER_NOSE / 2, 0.0, 0.0)
+        return [
+            *_box((0.0, 0.0, 0.0), MARKER_HALF, BASE),
+            *_box(nose, (MARKER_NOSE / 2, 0.02, 0.02), ARM),
+        ]
     rod, arm = (body.ROD_TOP - body.ROD_BOTTOM) / 2, body.ARM_LENGTH / 2
     wide, thin = body.ROD_RADIUS, body.ARM_RADIUS
     faces = _box((0.0, 0.0, 0.0), body.BASE_HALF, BASE)

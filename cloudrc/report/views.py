@@ -49,8 +49,9 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[Message]
     flight = Flight(recording, experiment.criteria, experiment.mission, scene)
     poses, control = _thin({name: truth[name] for name in truth.names}), _thin(flight.control)
     first_ns = int(truth["stamp_ns"][0])
-    ghost = [face._replace(colour=GHOST, opacity=0.45) for face in robot_faces()]
-    shapes = [_solid("robot", "base_link", robot_faces()), _solid("estimate", "estimate", ghost)]
+    faces = robot_faces(experiment.world.robot)
+    ghost = [face._replace(colour=GHOST, opacity=0.45) for face in faces]
+    shapes = [_solid("robot", "base_link", faces), _solid("estimate", "estimate", ghost)]
     shapes += [("setpoint", SPHERE, "setpoint", 0.12, (*GOAL, 0.9))]
     shapes += [_solid(pipe.name, "world", _pipe(pipe)) for pipe in scene.pipes]
     shapes += [_solid("board", "world", board_faces(scene.board))] if scene.board else []

@@ -155,9 +155,12 @@ def _write_page(
     from cloudrc.report.figures.style import Look, Subject
     from cloudrc.report.page import render
 
-    link = assessment.experiment.uplink, assessment.experiment.downlink
+    flown = assessment.experiment
+    subject = Subject(
+        assessment.flight, flown.uplink, flown.downlink, look or Look(), flown.world.robot
+    )
     try:
-        pictures = draw_all(Subject(assessment.flight, *link, look or Look()))
+        pictures = draw_all(subject)
     except ValueError as error:  # matplotlib cannot draw impossible values
         raise BadInputError(
             f"{folder}: the recorded values cannot be drawn ({describe_error(error)}); "

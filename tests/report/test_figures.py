@@ -10,9 +10,10 @@ from matplotlib.collections import LineCollection
 
 from cloudrc.config.schema import Direction
 from cloudrc.records import Control
-from cloudrc.report.figures import FIGURES, draw_all, own_settings
+from cloudrc.report.figures import FIGURES, draw_all, overview, own_settings
 from cloudrc.report.figures.labels import FREE, place_labels
 from cloudrc.report.figures.style import RC, Look, Subject
+from cloudrc.report.solids import robot_faces
 from tests.metrics.conftest import ONE_PIPE, START, flown
 
 CALM = Direction(delay_ms=50.0)
@@ -123,3 +124,10 @@ def test_text_stays_text_and_a_flight_in_real_time_has_a_date(monkeypatch):
     assert b"1970-01-02" in picture.files["svg"]
     assert b"1970-01-02" in picture.files["png"]
     assert b"D:19700102" in picture.files["pdf"]
+
+
+def test_a_robot_whose_shape_is_not_known_is_a_marker_and_the_caption_says_so():
+    pelican = subject_of(flown())
+    assert overview.MARKED in overview.caption(replace(pelican, robot="rover"))
+    assert overview.MARKED not in overview.caption(pelican)
+    assert len(robot_faces("rover")) < len(robot_faces())

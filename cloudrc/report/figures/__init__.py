@@ -25,7 +25,7 @@ FIGURES: dict[str, tuple[Draw, Write, str]] = {
     "delay": (curves.draw_delay, lambda s: curves.DELAY + marks.legend(s), curves.DELAY_ALT),
     "odom": (curves.draw_odom, lambda s: curves.ODOM + marks.legend(s), curves.ODOM_ALT),
     "error": (curves.draw_error, lambda s: curves.ERROR + marks.legend(s), curves.ERROR_ALT),
-    "overview": (overview.draw, lambda s: overview.CAPTION, overview.ALT),
+    "overview": (overview.draw, overview.caption, overview.ALT),
 }
 """Name of a figure -> function that draws the figure, function that returns the caption, text for
 readers who cannot see the figure. The figures of the paper are delay, odom and error."""

@@ -19,7 +19,7 @@ from cloudrc.metrics.flight import Array
 from cloudrc.metrics.mission import first_touch
 from cloudrc.report.figures.labels import free_label
 from cloudrc.report.figures.style import LIGHT, Subject, new_figure
-from cloudrc.report.solids import PATH, PIPE, Face, board_faces, bore, robot_faces, strip
+from cloudrc.report.solids import DRAWN, PATH, PIPE, Face, board_faces, bore, robot_faces, strip
 
 ALT = (
     "A drawing of the scene in perspective from above: pipes cut open, board, path, and the robot."
@@ -29,6 +29,8 @@ CAPTION = (
     "flown until the contact or the end. Pose and scale are true, pipes are cut open "
     "towards the reader, floor tiles are 1 m wide."
 )
+MARKED = "A marker stands for the robot; obstacles other than pipes and board are not drawn."
+"""Further sentence of the caption for a robot other than the Pelican."""
 ROBOTS, APART = 6, 0.6
 """Largest number of robots in the drawing, and the smallest distance between two of them [m]."""
 ELEVATION = np.radians(38.0)
@@ -40,8 +42,13 @@ FLATTEST, TALLEST = 0.3, 0.6
 WALL_COLOUR = (0.45, 0.48, 0.52)
 
 
-def _robot(position: Array, orientation_wxyz: Array) -> list[Face]:
-    faces = robot_faces()
+def caption(subject: Subject) -> str:
+    """Return the caption of the figure."""
+    return CAPTION + (f" {MARKED}" if subject.robot != DRAWN else "")
+
+
+def _robot(robot: str, position: Array, orientation_wxyz: Array) -> list[Face]:
+    faces = robot_faces(robot)
     points = body.Spheres(np.concatenate([face.corners for face in faces]), np.zeros(0))
     placed = body.place_points(points, position[None], orientation_wxyz[None])[0]
     corners = np.split(placed, np.cumsum([len(face.corners) for face in faces])[:-1])
@@ -108,7 +115,7 @@ def draw(subject: Subject) -> Figure:
     ends = [centre + side * along for centre, along in axes_ends for side in (-0.5, 0.5)]
     points = np.concatenate([[scene.spawn], path, np.reshape(ends, (-1, 3))])
     view = _View(points, scene.spawn - (axes_ends[0][0] if ends else np.array(scene.spawn)))
-    robots = [_robot(path[row], truth["orientation_wxyz"][row]) for row in rows]
+    robots = [_robot(subject.robot, path[row], truth["orientation_wxyz"][row]) for row in rows]
     faces = [face for pipe in scene.pipes for face in _pipe(pipe, view)]
     faces += [*chain(*robots), *(board_faces(scene.board) if scene.board else [])]
     shown = view.project(np.concatenate([points, *[face.corners for face in faces]]))

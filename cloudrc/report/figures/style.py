@@ -109,3 +109,4 @@ class Subject:
     uplink: Direction
     downlink: Direction
     look: Look = Look()
+    robot: str = "pelican"  # as in `world.robot`
