@@ -31,7 +31,7 @@ ONLY_WORLD = {"stale", "range", "future", "hello", "unanswered"}
 """Outcomes that only world counts."""
 ONLY_CLOUD = {"accept_ignored"}
 """Outcomes that only cloud counts."""
-LIMITS = ("speed", "yaw_rate", "fence")
+LIMITS = ("speed", "yaw_rate", "vertical", "fence")
 """Limits to which the guard restricts commands."""
 GUARD_STATES = tuple(state.name.lower() for state in GuardState)
 GUARD_CAUSES = {cause: cause.words.partition(",")[0] for cause in Cause}
