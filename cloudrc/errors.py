@@ -44,7 +44,7 @@ class DiskFullError(MissingPrerequisiteError):
         super().__init__(where)  # pickle passes these arguments to the parent process
 
     def __str__(self) -> str:
-        return f"disk_full: {self.args[0]}: free some space, or choose another folder with --out"
+        return f"disk_full: {self.args[0]}: free some space, or choose another place"
 
 
 class InvalidRunError(CloudrcError):
@@ -75,7 +75,7 @@ def machine_error(error: BaseException) -> MissingPrerequisiteError | None:
         return error
     if isinstance(error, OSError):
         if error.errno in DISK_FULL:
-            return DiskFullError(str(error.filename or "this folder"))
+            return DiskFullError(str(error.filename or "a file"))
         where = f"{error.filename}: " if error.filename else ""
         text = to_one_line(f"{where}{error.strerror or error}")
         return MissingPrerequisiteError(f"{text}; check disk, path and permissions")

@@ -140,6 +140,16 @@ def read_token(path: Path) -> str:
 
 
 @contextmanager
+def naming(place: Path | str) -> Iterator[None]:
+    """Let an OSError that names no file, such as a full disk, name the `place` of the writing."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(place)
+        raise
+
+
+@contextmanager
 def atomic_file(path: Path, mode: int = 0o666) -> Iterator[IO[bytes]]:
     """Write a file under a temporary name, then rename it to `path`; readers see no partial file.
 

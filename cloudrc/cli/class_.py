@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from cloudrc.cli.extras import require
 from cloudrc.cli.output import escape, format_document, print_or_drop, print_result, table
 from cloudrc.cli.parser import add_verbs
 from cloudrc.errors import BadInputError
+from cloudrc.files import write_atomically
 from cloudrc.runs.interrupts import interrupt_on_signals
 
 TIME_LIMIT = 60.0
@@ -103,8 +104,11 @@ def _new(folder: Path) -> int:
     if there := [name for name in names if (folder / name).exists()]:
         raise BadInputError(f"{folder / there[0]}: exists and stays as it is; name another folder")
     folder.mkdir(parents=True, exist_ok=True)
-    for name in names:
-        (folder / name).write_bytes(Path(hand_in.__file__).with_name(name).read_bytes())
+    with ExitStack() as undo:  # without all files, leave none: the next try would be refused
+        for name in names:
+            write_atomically(folder / name, Path(hand_in.__file__).with_name(name).read_bytes())
+            undo.callback((folder / name).unlink)
+        undo.pop_all()
     print_or_drop(f"fill in {', '.join(names)} in {folder}, then: cloudrc class check {folder}")
     return 0
 

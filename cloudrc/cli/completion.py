@@ -11,7 +11,9 @@ import importlib.util
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from cloudrc.cli.output import STDOUT
 from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.files import naming
 
 EPILOG = """\
 installation:
@@ -70,7 +72,8 @@ def execute(options: argparse.Namespace) -> int:
         name = " of ".join([str(action.metavar), *action.option_strings])
         if found := candidates.get(name) or candidates.get(str(action.metavar)):
             action.complete = found  # type: ignore[attr-defined]
-    print(shtab.complete(parser, options.shell))
+    with naming(STDOUT):
+        print(shtab.complete(parser, options.shell))
     if options.shell == "bash":
         print(JOINED)
     return 0

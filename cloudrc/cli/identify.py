@@ -10,6 +10,7 @@ from pathlib import Path
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import escape, format_document, output_argument, print_result, table
 from cloudrc.errors import BadInputError
+from cloudrc.files import write_atomically
 
 EPILOG = """\
 examples:
@@ -37,7 +38,7 @@ def execute(options: argparse.Namespace) -> int:
         raise BadInputError(f"{out}: already there; name another file with --out")
     fits, seconds = identify(options.run)
     document = describe(fits, seconds)
-    out.write_text(format_document(document, "yaml") + "\n", encoding="utf-8")
+    write_atomically(out, f"{format_document(document, 'yaml')}\n".encode())
     head = f"velocity loop from {document['seconds']} s, input {INPUT}, output {OUTPUT}"
     rows: list[Sequence[str]] = [
         ("axis", "time constant [s]", "dead time [s]", "gain", "explained")

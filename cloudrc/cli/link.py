@@ -29,6 +29,7 @@ from cloudrc.cli.output import (
 )
 from cloudrc.cli.parser import add_verbs
 from cloudrc.errors import BadInputError
+from cloudrc.files import naming
 from cloudrc.link.verify import DEFAULT
 
 if TYPE_CHECKING:
@@ -183,7 +184,8 @@ def show(options: argparse.Namespace) -> int:
     title = escape(": ".join(filter(None, (Path(options.profile).stem, profile.description))))
     samples = [sample for sample, _ in ways.values()]
     picture = render_link(title, samples[0], samples[1] if samples[1:] else None, output.suffix[1:])
-    output.write_bytes(picture)
+    with naming(output):
+        output.write_bytes(picture)
     print(title)
     print(_table({name: numbers for name, (_, numbers) in ways.items()}))
     print_line(str(output))

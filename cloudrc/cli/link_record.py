@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from cloudrc.cli.extras import require
 from cloudrc.cli.output import refuse_other_file
 from cloudrc.errors import BadInputError
+from cloudrc.files import naming
 
 if TYPE_CHECKING:
     from cloudrc.link.logs import Direction, Packets
@@ -83,7 +84,8 @@ def _write(packets: Packets, path: Path, direction: str) -> None:
     from cloudrc.link.model import numbers
     from cloudrc.link.traces import write_trace
 
-    path.write_text(write_trace(trace_of(packets)), encoding="utf-8")
+    with naming(path):
+        path.write_text(write_trace(trace_of(packets)), encoding="utf-8")
     found, count = numbers(packets), len(packets.delays)
     mean, deviation = found.mean * 1e3, found.deviation * 1e3
     seconds = packets.sent[-1] - packets.sent[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from cloudrc.cli.output import discard_output, escape
+from cloudrc.cli.output import STDOUT, discard_output, escape
 from cloudrc.cli.parser import build_parser
 from cloudrc.errors import (
     DISK_FULL,
@@ -14,6 +14,7 @@ from cloudrc.errors import (
     DiskFullError,
     InterruptedRunError,
 )
+from cloudrc.files import naming
 from cloudrc.runs.leave import limit_exit
 
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
@@ -59,7 +60,8 @@ def _dispatch(given: Sequence[str]) -> int:
     if name is None:
         raise BadInputError("a command is missing; see 'cloudrc --help'")
     code: int = options.execute(options)
-    sys.stdout.flush()
+    with naming(STDOUT):
+        sys.stdout.flush()
     return code
 
 
@@ -69,7 +71,7 @@ def _explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
         if error.errno in DISK_FULL:
-            full = DiskFullError(str(error.filename or "this folder"))
+            full = DiskFullError(str(error.filename or "a file"))
             return str(full), full.exit_code
         remedy = "check the path, and whether you have access to it ('--debug' shows where)"
         return f"{where}{error.strerror or error}; {remedy}", BadInputError.exit_code

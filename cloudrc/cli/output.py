@@ -14,12 +14,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from cloudrc.errors import DISK_FULL, BadInputError
+from cloudrc.files import naming
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
 
 _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1"}
 
+STDOUT = "the output (stdout)"
+"""Place of the output in errors."""
 FAILED_MARK = "*"
 """Mark of a number in a table if some of its flights failed."""
 FAILED_NOTE = (
@@ -76,7 +79,8 @@ def print_result(form: str, document: Mapping[str, Any], text: str) -> None:
     """
     shown = text if form == "table" else format_document({"schemaVersion": 1, **document}, form)
     try:
-        print(shown, flush=True)
+        with naming(STDOUT):
+            print(shown, flush=True)
     except OSError as error:
         discard_output(sys.stdout)
         if error.errno in DISK_FULL:
@@ -151,7 +155,8 @@ def escape(text: str) -> str:
 
 def print_line(line: str, stream: TextIO | None = None) -> None:
     """Print a line with unprintable characters escaped (default: on stdout), and flush at once."""
-    print(escape(line), file=stream, flush=True)
+    with naming(STDOUT):  # if stderr fails, nobody reads the error
+        print(escape(line), file=stream, flush=True)
 
 
 def format_number(value: float) -> str:

@@ -129,9 +129,10 @@ def test_a_long_report_shows_its_step_and_a_short_one_nothing(kind, monkeypatch)
     assert stream.isatty() or stream.getvalue() == "reads [it]\n"
 
 
-def test_a_full_disk_is_told(folder):
+@pytest.mark.parametrize("line", ["list -o json", "completion bash"])
+def test_a_full_disk_is_told(line, folder):
     with open("/dev/full", "w") as full:
-        command = [sys.executable, "-m", "cloudrc", "list", "-o", "json"]
+        command = [sys.executable, "-m", "cloudrc", *line.split()]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert (done.returncode, done.stderr.count("\n")) == (3, 1)
-    assert "disk_full: this folder" in done.stderr
+    assert "disk_full: the output (stdout): free some space" in done.stderr

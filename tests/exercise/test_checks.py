@@ -1,5 +1,6 @@
 """The checks of the exercise: full points for the solution, none for the files to fill in."""
 
+import errno
 import json
 import os
 import signal
@@ -219,6 +220,18 @@ def test_files_are_not_overwritten_and_a_folder_must_exist(tmp_path, refused):
     refused("class check", tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     assert "has none of delay_estimator.py" in refused("class check", tmp_path / "empty")
+
+
+def test_new_files_on_a_full_disk_are_named_and_none_is_left(tmp_path, monkeypatch, refused):
+    def write(path, data):
+        if path.name != "delay_estimator.py":
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        path.write_bytes(data)
+
+    monkeypatch.setattr(class_, "write_atomically", write)
+    said = f"disk_full: {tmp_path / 'a/predictor.py'}: free some space, or choose another place\n"
+    assert refused("class new", tmp_path / "a", code=3).endswith(said)
+    assert [*(tmp_path / "a").iterdir()] == []
 
 
 def test_each_test_is_told_as_it_ends(tmp_path, monkeypatch, capsys):
