@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import select
 import signal
 import sys
@@ -150,8 +151,14 @@ def end_with_check() -> None:
     os.killpg(0, signal.SIGKILL)
 
 
-if __name__ == "__main__":  # the folder
+def limit_time(limit: int) -> None:
+    """End this process after `limit` [s] of processor time: SIGXCPU or, if blocked, SIGKILL."""
+    resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 1))
+
+
+if __name__ == "__main__":  # the folder, the limit of processor time [s]
     end_with_check()
+    limit_time(int(sys.argv.pop(2)))
     requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_RDWR)
     for standard in (0, 1, 2):  # what the student's files print is no answer

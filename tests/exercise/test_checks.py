@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 from math import inf, nan
 from pathlib import Path
 
@@ -81,15 +81,36 @@ def test_whatever_a_file_does_the_other_parts_are_scored(tmp_path):
     (tmp_path / "delay_estimator.py").write_text("while True:\n    print('on and on')\n")
     (tmp_path / "predictor.py").write_text("import sys\nsys.exit('no')\n")
     (tmp_path / "controller.py").write_text("import os\nos._exit(0)\n")
-    rows = list(class_.check(tmp_path, limit=10.0))
+    rows = list(class_.check(tmp_path, limit=4))
     seen = {row["part"]: row["seen"] for row in rows}
     assert [row["test"] for row in rows] == [
         each[0] for part in checks.CHECKS.values() for each in part
     ]
-    assert seen["estimator"] == "delay_estimator.py: no end after 10 s"
+    assert seen["estimator"] == "delay_estimator.py: no end after 4 s of processor time"
     assert seen["predictor"] == "predictor.py:2: SystemExit: no (sys.exit() was called)"
     assert seen["controller"] == "controller.py: ended the process of the check"
     assert {row["points"] for row in rows} == {0.0}
+    assert {row["valid"] for row in rows} == {True}
+
+
+@pytest.mark.process
+def test_a_wait_costs_no_processor_time_and_ends_with_a_score_that_is_not_valid(tmp_path):
+    """A loaded computer gives a right hand-in too little processor time, which costs no points."""
+    text = (SOLUTION / "predictor.py").read_text()
+    (tmp_path / "predictor.py").write_text(f"import time\ntime.sleep(4.0)\n{text}")
+    with closing(class_.Process(tmp_path, limit=3)) as process:
+        Remote(process.ask).build("predictor").predict(checks.STATE, 0.1)
+        assert not process.too_slow
+    with closing(class_.Process(tmp_path, limit=10, patience=0.1)) as process:
+        with pytest.raises(HandInError, match=r"^predictor\.py: too slow here"):
+            Remote(process.ask).build("predictor")
+        assert process.too_slow
+
+
+def test_a_failure_of_all_parts_together_names_the_files_that_were_called():
+    calls = [("predictor 3", "observe", []), ("estimator 2", "horizon", [1.0])]
+    assert class_._files_of(calls[1:]) == "delay_estimator.py"
+    assert class_._files_of(calls) == "delay_estimator.py or predictor.py"
 
 
 # What a file writes in place of an answer.
@@ -111,7 +132,7 @@ def test_a_forged_answer_costs_the_part(data, tmp_path):
     """The file writes to every pipe of its process, and ends it."""
     write = f"for n in range(3, 9):\n    try: os.write(n, {data!r})\n    except OSError: pass\n"
     (tmp_path / "predictor.py").write_text(f"import os\n{write}os._exit(0)\n")
-    process = class_.Process(tmp_path, "predictor.py", 20.0)
+    process = class_.Process(tmp_path, 20)
     remote = Remote(process.ask)
     for _ in range(2):
         with pytest.raises(HandInError, match=r"^predictor.py: (ended|sent) "):
@@ -174,7 +195,7 @@ needs_proc = pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /
 @pytest.mark.parametrize("child", CHILDREN.values(), ids=CHILDREN)
 def test_no_child_of_a_file_outlives_the_check(child, tmp_path):
     marker = leave(child, tmp_path)
-    process = class_.Process(tmp_path, "predictor.py", 20.0)
+    process = class_.Process(tmp_path, 20)
     with suppress(HandInError):  # some files end their process
         process.ask([("predictor 1", "build", {})])
         wait_until(lambda: is_running(marker), 5.0)
@@ -236,7 +257,7 @@ def test_new_files_on_a_full_disk_are_named_and_none_is_left(tmp_path, monkeypat
 
 def test_each_test_is_told_as_it_ends(tmp_path, monkeypatch, capsys):
     """A check takes up to minutes; stdout carries the result alone."""
-    row = {"part": "estimator", "points": 1.0, "max_points": 2, "seen": "right"}
+    row = {"part": "estimator", "points": 1.0, "max_points": 2, "seen": "right", "valid": False}
 
     def check(folder):
         for test in ("mean", "steps"):
@@ -251,4 +272,5 @@ def test_each_test_is_told_as_it_ends(tmp_path, monkeypatch, capsys):
     lines = [f"scores {tmp_path}\n", "  estimator, mean: 1/2\n", "  estimator, steps: 1/2\n"]
     assert [each.err for each in told] == lines
     assert [bool(each.out) for each in told] == [False, False, True]
-    assert json.loads(told[-1].out)["score"] == 2.0
+    found = json.loads(told[-1].out)
+    assert (found["score"], found["valid"]) == (2.0, False)
