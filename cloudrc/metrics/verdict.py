@@ -265,10 +265,9 @@ def plugin_failures(recording: Recording) -> Iterator[Failure]:
         if share > PLUGIN_FAILURES_MAX:
             first = faults["text"][faults["code"] == f"{kind}_failed"]
             why = f": {first[0]}" if len(first) else ""
+            shown = format_beside(min(share, 1.0) * 100, PLUGIN_FAILURES_MAX * 100)
             limit = f"{PLUGIN_FAILURES_MAX:.0%}"
-            text = (
-                f"cloud.{kind} failed in {min(share, 1.0):.0%} of its periods, above {limit}{why}"
-            )
+            text = f"cloud.{kind} failed in {shown}% of its periods, above {limit}{why}"
             yield Failure("plugin_failed", text)
 
 
