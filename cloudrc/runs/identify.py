@@ -9,6 +9,7 @@ from typing import Any
 from cloudrc.metrics import velocity_loop
 from cloudrc.metrics.velocity_loop import DT, INPUT, OUTPUT, Fit
 from cloudrc.record.columns import Recording
+from cloudrc.runs.session import refuse_under_way
 
 __all__ = ["INPUT", "OUTPUT", "describe", "identify"]
 NAMES = ("time_constant", "dead_time", "gain")
@@ -17,9 +18,12 @@ NAMES = ("time_constant", "dead_time", "gain")
 def identify(run: Path) -> tuple[list[Fit], float]:
     """Fit a model per axis to a run, the folder or its MCAP file; also return its duration [s].
 
-    Raise a BadInputError if there is no recording, or if it does not excite an axis.
+    Raise a BadInputError if there is no recording, if the flight has not ended, or if the recording
+    does not excite an axis.
     """
     path = run / "mission.mcap" if run.is_dir() else run
+    if not path.exists():
+        refuse_under_way(path.parent)
     given, measured = velocity_loop.series(Recording.read(path), str(path))
     fits = [
         velocity_loop.identify(given[:, axis], measured[:, axis], f"{path}: {name}")

@@ -54,11 +54,19 @@ def read_last_mission(folder: Path) -> tuple[Recording, ResolvedExperiment, bool
     return recording, experiment, not last.ended
 
 
+def refuse_under_way(folder: Path) -> None:
+    """Raise a BadInputError if the flight whose files are in a folder has not ended."""
+    if folder.resolve() not in under_way():
+        return
+    if (folder / JOURNAL_FILE).is_file():
+        raise BadInputError(f"{folder}: the session has not ended; end it: cloudrc down")
+    raise BadInputError(f"{folder}: the flight has not ended; wait for its end")
+
+
 def restore_mission(folder: Path) -> None:
     """Write the mission.mcap of a session that was killed before it wrote this file."""
     if (folder / JOURNAL_FILE).is_file() and not (folder / "mission.mcap").exists():
-        if folder.resolve() in under_way():
-            raise BadInputError(f"{folder}: the session has not ended; end it: cloudrc down")
+        refuse_under_way(folder)
         recording, _, interrupted = read_last_mission(folder)
         recording.metadata |= Run("local", "relay", interrupted).metadata
         recording.write(folder / "mission.mcap", attachments(folder))

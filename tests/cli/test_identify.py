@@ -9,6 +9,7 @@ import pytest
 
 from cloudrc.config.document import parse_yaml
 from cloudrc.config.load import load_experiment
+from cloudrc.drivers import local
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry
 from cloudrc.metrics.velocity_loop import DT, identify, series
@@ -97,6 +98,22 @@ def test_only_the_flight_under_commands_counts():
 def test_a_recording_that_is_not_enough_is_refused(recording, text):
     with pytest.raises(BadInputError, match=text):
         series(Recording.from_records(recording), "m")
+
+
+@pytest.mark.parametrize(
+    ("journal", "said"),
+    [
+        (True, "the session has not ended; end it: cloudrc down"),
+        (False, "the flight has not ended; wait for its end"),
+    ],
+)
+def test_a_flight_under_way_is_not_read(journal, said, tmp_path, monkeypatch, refused):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    if journal:
+        (tmp_path / local.JOURNAL_FILE).touch()
+    with local.announced(tmp_path, ""):
+        assert f"{tmp_path}: {said}" in refused("identify --out model.yaml", tmp_path)
+    assert "has not ended" not in refused("identify --out model.yaml", tmp_path)
 
 
 def test_the_command_writes_a_model_that_a_predictor_takes(tmp_path, call):

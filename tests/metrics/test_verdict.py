@@ -208,7 +208,9 @@ def test_a_plug_in_may_fail_in_one_percent_of_the_periods(failures, found):
     log.cloud.append(Counted(at(2), "cloud", "predictor_failed", failures))
     verdict = judged(log.flight(ONE_PIPE, contact=True))
     assert codes(verdict) == found
-    assert all("failed in 1.25% of its periods, above 1%:" in each.text for each in verdict.failures)
+    assert all(
+        "failed in 1.25% of its periods, above 1%:" in each.text for each in verdict.failures
+    )
     assert all("my.py:12 in predict" in each.text for each in verdict.failures)
 
 
