@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote, urlsplit
 
 from cloudrc.cli.output import escape, print_line
@@ -221,7 +221,7 @@ def _refusal(answer: http.client.HTTPResponse, place: str, *, with_token: bool) 
 
 
 @contextmanager
-def release_api(release: Release, token: Path | None = None) -> Iterator[Api]:
+def release_api(release: Release, token: TokenFile | None = None) -> Iterator[Api]:
     """Yield the API of a release, over a forwarded port, while the `with` block runs.
 
     `token` is the file with the token; by default the token comes from the release's Secret.
@@ -282,25 +282,35 @@ def token_argument(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--token-file", type=Path, metavar="FILE", help=text)
 
 
-def token_file(options: argparse.Namespace) -> Path | None:
-    """Return the path of the token file from the flag, else from the environment, else None."""
-    given = options.token_file or os.environ.get(VARIABLE)
-    return Path(given) if given else None
+class TokenFile(NamedTuple):
+    """A file with a token; `given` is how the user named it, for errors."""
+
+    path: Path
+    given: str
 
 
-def token_reader(path: Path | None) -> Callable[[], str]:
-    """Return a function that reads the token from `path`, or returns "" if `path` is None.
+def token_file(options: argparse.Namespace) -> TokenFile | None:
+    """Return the token file from the flag, else from the environment, else None."""
+    if path := options.token_file:
+        return TokenFile(path, f"--token-file {path}")
+    if name := os.environ.get(VARIABLE):
+        return TokenFile(Path(name), f"{VARIABLE}={name}")
+    return None
+
+
+def token_reader(file: TokenFile | None) -> Callable[[], str]:
+    """Return a function that reads the token from `file`, or returns "" if `file` is None.
 
     Print a warning if other users can read the file.
     """
-    if path is None:
+    if file is None:
         return lambda: ""
-    warn_if_readable(path, lambda text: print_line(f"cloudrc: {text}", sys.stderr))
-    return lambda: _read(path)
+    warn_if_readable(file.path, lambda text: print_line(f"cloudrc: {text}", sys.stderr))
+    return lambda: _read(file)
 
 
-def _read(path: Path) -> str:
+def _read(file: TokenFile) -> str:
     try:
-        return read_token(path)
+        return read_token(file.path)
     except ValueError as error:
-        raise BadInputError(f"--token-file {path}: {error}; name another file") from None
+        raise BadInputError(f"{file.given}: {error}; name another file") from None

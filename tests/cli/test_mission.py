@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.cli import mission as command
-from cloudrc.cli.client import Api, token_reader
+from cloudrc.cli.client import Api, TokenFile, token_reader
 from tests.conftest import wait_until
 from tests.teleop.conftest import A, B, running
 
@@ -172,7 +172,7 @@ def test_list_status_and_logs(api, mission):
     assert json.loads(mission("status m1 -o json").out)["events"][1]["event"] == "started"
     assert mission("logs").out == mission("logs m1").out != ""
     assert "no mission 'm9'" in mission("status m9", 5).err
-    events = Api(api.url, token_reader(api.token_file)).events()
+    events = Api(api.url, token_reader(TokenFile(api.token_file, ""))).events()
     assert [next(events)["event"] for _ in range(2)] == ["starting", "started"]
     events.close()
 
@@ -207,6 +207,7 @@ def test_the_token_file_comes_from_flag_or_environment(api, folder, monkeypatch,
     assert "no mission is under way" in hold(5, f"--token-file {api.token_file}")
     wrong.write_text("two words")
     error = hold(2)
+    assert f"error: CLOUDRC_TOKEN_FILE={wrong}: " in error
     assert "a token is 16 to 512 visible" in error
     assert "two words" not in error
     assert "--token-file none: No such file or directory" in hold(2, "--token-file none")
