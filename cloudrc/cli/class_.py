@@ -33,7 +33,9 @@ PATIENCE = 10
 """Last resort: each part ends after the limit times this number, in real time [1]."""
 ANSWER_MAX = 64 << 10
 """Largest size of an answer from the process of a hand-in [bytes]."""
-NOT_VALID = "not valid: this computer was too slow for a part; check again with less load"
+NOT_VALID = (
+    "not valid: a part took too long; check again with less load, or look for a file that waits"
+)
 """Mark of a score."""
 VERBS = {"new": "write the files that students fill in", "check": "score a student's files"}
 FORMS = ("table", "json", "yaml", "gradescope")
