@@ -196,6 +196,17 @@ def test_from_one_hold_or_track_to_the_next_it_takes_a_second():
     assert until_track(guard, start_ns + 20 * MS) == start_ns + 1000 * MS
 
 
+def test_the_end_of_a_mission_in_hold_is_recorded_once():
+    """From then on the HOLD interrupts no mission, so that it no longer counts."""
+    guard = holding()
+    guard.take_changes()
+    guard.end_mission(5 * SECOND)
+    assert (guard.state, guard.armed) == (HOLD, False)
+    assert told(guard) == (5 * SECOND, HOLD, Cause.ENDED.words)
+    guard.end_mission(6 * SECOND)
+    assert guard.take_changes() == []
+
+
 @pytest.mark.parametrize(("speed_max", "ramp_s"), [(6.0, 2.0), (4.5, 1.5), (1.5, 1.0)])
 def test_after_a_hold_the_ramp_lasts_until_the_cap(speed_max, ramp_s):
     """A first command of zero, or one that the reference reaches, does not end the ramp."""
