@@ -28,7 +28,7 @@ from cloudrc.cli.output import (
 )
 from cloudrc.cli.parser import read_count, whole_number
 from cloudrc.cli.report import print_traceback, summary
-from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.errors import BadInputError, CloudrcError, NothingFlownError
 from cloudrc.runs.folder import new_folder, point_to
 from cloudrc.runs.interrupts import interrupt_on_signals, is_interrupted
 
@@ -127,7 +127,8 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
     try:
         report = flight(folder)
     except (CloudrcError, KeyboardInterrupt) as error:
-        if isinstance(error, BadInputError) and is_interrupted():
+        nothing = isinstance(error, NothingFlownError)  # the regular end of a session by a signal
+        if isinstance(error, BadInputError) and is_interrupted() and not nothing:
             error = KeyboardInterrupt()  # a library has converted the exception
         if in_cluster:  # the folder stays empty until the mission has flown
             with contextlib.suppress(OSError):
