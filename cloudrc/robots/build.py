@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc import plugins
 from cloudrc.config.overrides import build_plugin
-from cloudrc.config.robot import find_robot
+from cloudrc.config.robot import RobotFiles, find_robot
 from cloudrc.config.schema import LowLevel, PlugIn, World
 from cloudrc.config.shipped import file_of
 from cloudrc.errors import BadInputError
@@ -29,8 +29,9 @@ GENERAL = PlugIn(name="multirotor")
 
 def check_robot(world: World) -> None:
     """Raise a BadInputError if the robot does not compile or its controller refuses the model."""
-    model = compile_model(find_robot(world.robot).model, file_of(world.scene))
-    _build_onboard(world, model, controller(world, model))
+    robot, scene = find_robot(world.robot), file_of(world.scene)
+    model = compile_model(robot.model, scene)
+    _build_onboard(world, f"{robot.model} in {scene}", model, controller(robot, model))
 
 
 def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -> Robot:
@@ -41,8 +42,9 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     """
     robot, scene = find_robot(world.robot), file_of(world.scene)
     nominal = compile_model(robot.model, scene)
-    choice = controller(world, nominal)
-    onboard, plugin = _build_onboard(world, nominal, choice), plugins.find(KIND, choice.name)
+    choice = controller(robot, nominal)
+    onboard = _build_onboard(world, f"{robot.model} in {scene}", nominal, choice)
+    plugin = plugins.find(KIND, choice.name)
     true = compile_true(robot.model, scene, nominal, world.plant)
     simulator = Simulator(true, _actuators(plugin, nominal, choice), wind)
     guard = Guard(limits, planar=robot.planar)
@@ -51,20 +53,18 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     return Robot(simulator, onboard, guard)
 
 
-def controller(world: World, model: Any = None) -> PlugIn:
+def controller(robot: RobotFiles, model: Any) -> PlugIn:
     """Return the onboard controller of a robot.
 
-    A model without `robot.yaml` is flown by the Pelican's controller if the model is enough like
-    the Pelican, and else by `GENERAL`. `model` is the compiled `MjModel`, which is compiled if it
-    is needed and None.
+    A model without `robot.yaml` is flown by the Pelican's controller if the model, a compiled
+    `MjModel`, is enough like the Pelican, and else by `GENERAL`.
     """
-    robot = find_robot(world.robot)
     if robot.onboard is not None:
         return robot.onboard
     from cloudrc.robots.pelican.fit import check_fit
 
     try:
-        check_fit(compile_model(robot.model, file_of(world.scene)) if model is None else model)
+        check_fit(model)
     except BadInputError:
         return GENERAL
     pelican = find_robot("pelican").onboard
@@ -74,12 +74,15 @@ def controller(world: World, model: Any = None) -> PlugIn:
 
 def runs_in_c(world: World) -> bool:
     """Return whether the usual physics steps of a robot can run in C."""
-    return world.is_nominal and hasattr(plugins.find(KIND, controller(world).name), "accelerate")
+    if not world.is_nominal:
+        return False
+    robot = find_robot(world.robot)
+    model = compile_model(robot.model, file_of(world.scene)) if robot.onboard is None else None
+    return hasattr(plugins.find(KIND, controller(robot, model).name), "accelerate")
 
 
-def _build_onboard(world: World, model: Any, choice: PlugIn) -> Onboard:
-    """Build an onboard controller for the compiled `MjModel` of the robot in its scene."""
-    where = f"{find_robot(world.robot).model} in {file_of(world.scene)}"
+def _build_onboard(world: World, where: str, model: Any, choice: PlugIn) -> Onboard:
+    """Build an onboard controller for a compiled `MjModel`; errors name the files in `where`."""
     parameters = dict(choice.model_extra or {})
     if world.low_level != LowLevel():
         known = plugins.signature(KIND, choice.name).parameters

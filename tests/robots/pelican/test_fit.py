@@ -3,7 +3,6 @@
 import pytest
 
 from cloudrc.config.robot import find_robot
-from cloudrc.config.schema import World
 from cloudrc.config.shipped import file_of
 from cloudrc.errors import BadInputError
 from cloudrc.robots.build import controller
@@ -55,4 +54,4 @@ def test_a_model_alone_has_the_published_controller_only_if_it_is_like_the_pelic
     tmp_path, mass, name
 ):
     robot = changed(tmp_path, PELICAN, 'mass="1.0"', f'mass="{mass}"')
-    assert controller(World(robot=str(robot), scene="empty")).name.endswith(name)
+    assert controller(find_robot(str(robot)), compile_model(robot, EMPTY)).name.endswith(name)
