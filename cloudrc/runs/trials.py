@@ -119,7 +119,6 @@ class Trials:
         return self._ready[number]
 
     def _prepare(self, number: int) -> tuple[ResolvedExperiment | None, str]:
-
         asked = self.asked
         settings = [*asked.settings, f"{asked.key}={self.value(number):.12g}"]
         try:
@@ -226,14 +225,12 @@ def describe(trials: Trials, found: Mapping[str, ValueRange | None]) -> dict[str
 
 
 def _ask_stable(jobs: list[ResolvedExperiment]) -> Iterable[Trial]:
-
     # A worker takes as long to start as some flights.
     with closing(map_in_order(stability.fly_step, jobs, len(jobs) // 4)) as answers:
         yield from answers
 
 
 def _ask_settles(jobs: list[ResolvedExperiment]) -> Iterable[Trial]:
-
     with closing(map_in_order(flight.fly_point, jobs, len(jobs) // 4)) as flights:
         for row in flights:
             if row["verdict"] == "success":
