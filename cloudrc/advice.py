@@ -6,7 +6,7 @@ A warning never prevents the flight.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from math import ceil, floor
 from typing import TYPE_CHECKING, Any
@@ -33,8 +33,9 @@ rotors, one third comes from the tilt that this drag causes."""
 
 def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     """Yield a warning for each group of settings that do not fit together."""
-    yield from _units(experiment)
-    yield from _jitter(experiment)
+    ways = _directions(experiment)
+    yield from _units(ways)
+    yield from _jitter(ways)
     yield from _time(experiment)
     for number, waypoint in enumerate(experiment.mission.waypoints, start=1):
         if waypoint.tolerance_m >= FAR:
@@ -55,17 +56,17 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     low_rates = list(_low_rates(experiment))
     yield from low_rates
     if not ages:
-        yield from _late(experiment)
+        yield from _late(ways)
     elif not low_rates:  # else the queue fills, so the delays depend on the simulated time
         yield from _long_link(experiment, ages, echoes)
         yield from _control(experiment, sum(ages) / len(ages))
 
 
-def _units(experiment: ResolvedExperiment) -> Iterator[str]:
+def _units(ways: Mapping[str, DirectionProfile]) -> Iterator[str]:
     """Yield a warning for each share and each trace of the link that may be in another unit."""
     from cloudrc.link.doubts import describe_heavy_shares, describe_trace
 
-    for name, profile in _directions(experiment).items():
+    for name, profile in ways.items():
         yield from describe_heavy_shares(profile, name)
         if doubt := describe_trace(profile.rows):
             yield f"link.{name}.trace {profile.trace}: {doubt}"
@@ -96,11 +97,11 @@ def _low_rates(experiment: ResolvedExperiment) -> Iterator[str]:
             yield doubt
 
 
-def _jitter(experiment: ResolvedExperiment) -> Iterator[str]:
+def _jitter(ways: Mapping[str, DirectionProfile]) -> Iterator[str]:
     """Yield a warning for each direction whose jitter may be meant in microseconds."""
     from cloudrc.link.profile import Timeline
 
-    for name, profile in _directions(experiment).items():
+    for name, profile in ways.items():
         jitter = max(piece.jitter for piece in Timeline(profile).pieces)
         if jitter >= JITTER_MAX:
             yield (
@@ -109,13 +110,13 @@ def _jitter(experiment: ResolvedExperiment) -> Iterator[str]:
             )
 
 
-def _late(experiment: ResolvedExperiment) -> Iterator[str]:
+def _late(ways: Mapping[str, DirectionProfile]) -> Iterator[str]:
     """Yield a warning if delays are the reason why no command arrives in the simulated time."""
     from cloudrc.config.schema import COMMAND_AGE_MS
     from cloudrc.link.profile import Timeline
 
     parts, total = list[str](), 0.0
-    for name, profile in _directions(experiment).items():
+    for name, profile in ways.items():
         delay = min(piece.delay_ns for piece in Timeline(profile).pieces) * 1e-9
         total += delay
         if delay >= 1.0:
