@@ -6,9 +6,9 @@ import argparse
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.extras import require
 from cloudrc.cli.parser import number
 from cloudrc.cluster.client import DEFAULT_RELEASE as DEFAULT_RELEASE
+from cloudrc.runs.requirements import require
 
 if TYPE_CHECKING:
     from cloudrc.cluster.client import Release

@@ -9,7 +9,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.output import (
     FAILED_MARK,
     FAILED_NOTE,
@@ -24,6 +23,7 @@ from cloudrc.cli.parser import read_count
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.renamed import new_name
 from cloudrc.runs.interrupts import interrupt_on_signals
+from cloudrc.runs.requirements import MODES, require
 
 if TYPE_CHECKING:
     from cloudrc.runs.compare import Pairs

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc.cli.client import Api, token_argument, token_file, token_reader
 from cloudrc.cli.cluster_flags import flown_release, release_arguments
-from cloudrc.cli.extras import require
 from cloudrc.cli.find_run import find_local_run
 from cloudrc.cli.output import open_page, print_line
 from cloudrc.cli.parser import whole_number
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
+from cloudrc.runs.requirements import require
 
 if TYPE_CHECKING:
     from cloudrc.console.steering import LinkControl

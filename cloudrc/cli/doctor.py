@@ -11,10 +11,10 @@ import subprocess
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
-from cloudrc.cli.extras import EXTRAS, MODES, missing
 from cloudrc.cli.output import output_argument, paint, print_result, table
 from cloudrc.drivers.machine import interpreter, usable_cores
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
+from cloudrc.runs.requirements import EXTRAS, MODES, missing
 
 FLYING, CLUSTER = ("local", "virtual"), ("cluster",)
 PROGRAMS = {

@@ -13,11 +13,11 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.extras import require
 from cloudrc.cli.output import escape, output_argument, paint, print_line, print_result, table
 from cloudrc.cli.parser import add_verbs, number, read_count, whole_number
 from cloudrc.errors import BadInputError
 from cloudrc.runs.interrupts import interrupt_on_signals
+from cloudrc.runs.requirements import require
 from cloudrc.runs.workers import map_in_order, take_each
 
 if TYPE_CHECKING:

@@ -7,10 +7,10 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from cloudrc.cli.extras import require
 from cloudrc.cli.output import escape, format_document, output_argument, print_result, table
 from cloudrc.errors import BadInputError
 from cloudrc.files import write_atomically
+from cloudrc.runs.requirements import require
 
 EPILOG = """\
 examples:

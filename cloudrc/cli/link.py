@@ -18,7 +18,6 @@ from statistics import fmean
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import release_arguments
-from cloudrc.cli.extras import require
 from cloudrc.cli.output import (
     PICTURES,
     escape,
@@ -31,6 +30,7 @@ from cloudrc.cli.parser import add_verbs
 from cloudrc.errors import BadInputError
 from cloudrc.files import naming
 from cloudrc.link.verify import DEFAULT
+from cloudrc.runs.requirements import require
 
 if TYPE_CHECKING:
     from cloudrc.config.schema import Direction, Profile

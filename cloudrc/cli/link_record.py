@@ -12,10 +12,10 @@ from math import isnan, nan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.extras import require
 from cloudrc.cli.output import refuse_other_file
 from cloudrc.errors import BadInputError
 from cloudrc.files import naming
+from cloudrc.runs.requirements import require
 
 if TYPE_CHECKING:
     from cloudrc.link.logs import Direction, Packets

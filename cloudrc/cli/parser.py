@@ -46,11 +46,12 @@ GROUPS: dict[str, dict[str, str]] = {
     },
 }
 """Group of commands -> command -> help line. `cloudrc/cli/<command>.py` contains the command."""
-SHARED = {
+MODULES = {
     **dict.fromkeys(("world", "cloud"), "processes"),
     **dict.fromkeys(("up", "down"), "session"),
+    "class": "exercise",
 }
-"""Commands without a module of their own -> the module in `cloudrc/cli` that contains them."""
+"""Command -> the module in `cloudrc/cli` that contains it, if the module has another name."""
 COMMANDS = {name: line for group in GROUPS.values() for name, line in group.items()}
 KUBECTL_PLUGIN = "kubectl-cloudrc"
 """Name of this program when kubectl starts it as a plug-in."""
@@ -204,10 +205,8 @@ def _sentence(line: str) -> str:
 
 def _find_command(name: str) -> Any:
     """Return the module or `Command` with the functions `arguments` and `execute` of a command."""
-    if name in SHARED:
-        return getattr(importlib.import_module(f"cloudrc.cli.{SHARED[name]}"), name)
-    module = "class_" if name == "class" else name  # a keyword of Python
-    return importlib.import_module(f"cloudrc.cli.{module}")
+    module = importlib.import_module(f"cloudrc.cli.{MODULES.get(name, name)}")
+    return getattr(module, name, module) if name in MODULES else module
 
 
 def _lines(title: str) -> str:

@@ -13,13 +13,13 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from cloudrc.cli.extras import require
 from cloudrc.cli.output import print_line
 from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
 from cloudrc.drivers.realtime import Address, Peer, bind, split_address
 from cloudrc.errors import BadInputError
 from cloudrc.files import warn_if_readable
 from cloudrc.link.state import STATE_FILE
+from cloudrc.runs.requirements import require
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment

@@ -9,9 +9,9 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.extras import require
 from cloudrc.cli.output import open_page, print_line
 from cloudrc.errors import BadInputError
+from cloudrc.runs.requirements import require
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment

@@ -10,10 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cloudrc.cli.extras import missing, require
 from cloudrc.cli.output import escape, output_argument, paint, print_line, print_result, table
 from cloudrc.cli.parser import figure_arguments
 from cloudrc.errors import BadInputError
+from cloudrc.runs.requirements import missing, require
 
 COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
 EPILOG = """\

@@ -16,7 +16,6 @@ from cloudrc.cli.cluster_flags import (
     release_from_flags,
     timeout_argument,
 )
-from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.output import (
     escape,
     is_live,
@@ -31,6 +30,7 @@ from cloudrc.cli.report import print_traceback, summary
 from cloudrc.errors import BadInputError, CloudrcError, NothingFlownError
 from cloudrc.runs.folder import new_folder, point_to
 from cloudrc.runs.interrupts import interrupt_on_signals, is_interrupted
+from cloudrc.runs.requirements import MODES, require
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment

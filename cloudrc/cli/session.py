@@ -16,13 +16,13 @@ from shlex import quote
 from threading import Thread
 from typing import IO, Any
 
-from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.find_run import ask_if_unclear, run_argument, short
 from cloudrc.cli.output import escape, print_line
 from cloudrc.cli.processes import Command
 from cloudrc.cli.run import experiment_arguments, fly_once
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, NothingFlownError
 from cloudrc.runs.interrupts import interrupt_on_signals
+from cloudrc.runs.requirements import MODES, require
 
 Say = Callable[[str], None]
 """Function that prints a line above the status line of a flight."""

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from cloudrc.cli.cluster_flags import release_from_flags
-from cloudrc.cli.extras import MODES, require
 from cloudrc.cli.mission import TERMINATION_LOG
 from cloudrc.cli.output import (
     FAILED_MARK,
@@ -44,6 +43,7 @@ from cloudrc.runs.flight import Row
 from cloudrc.runs.folder import new_folder
 from cloudrc.runs.grid import Grid, SweepPoint, pack, read_flight, read_grid, unpack
 from cloudrc.runs.lock import lock_folder
+from cloudrc.runs.requirements import MODES, require
 from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.source import code_hash
 

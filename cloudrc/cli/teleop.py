@@ -14,10 +14,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.extras import require
 from cloudrc.cli.output import print_line
 from cloudrc.cli.processes import open_exporter, process_arguments, read_address, warn_if_exposed
 from cloudrc.drivers.realtime import Address
+from cloudrc.runs.requirements import require
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from cloudrc import metrics
-from cloudrc.advice import advise
 from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.config.overrides import parse_settings
 from cloudrc.errors import BadInputError
+from cloudrc.warnings import advise
 
 ADVISED_MAX = 50
 """Number of points of a sweep for which warnings are looked for."""

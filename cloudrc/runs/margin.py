@@ -11,12 +11,12 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args, get_origin
 
-from cloudrc.advice import simulate_ages
 from cloudrc.config.document import child
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.problems import exceeds, expectation
 from cloudrc.config.schema import COMMAND_AGE_MS, Experiment
 from cloudrc.errors import BadInputError
+from cloudrc.warnings import simulate_ages
 
 SLACK = 0.1
 """Reserve between the largest age of `simulate_ages` and the limits of cloud and guard [s]."""

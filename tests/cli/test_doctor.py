@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import doctor, extras
+from cloudrc.cli import doctor
 from cloudrc.cli.doctor import Check
 from cloudrc.cli.parser import build_parser
 from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.runs import requirements
 
 GOOD = Check("python", "ok", "3.12.1", "", ("local", "virtual"))
 NO_HELM = Check("helm", "missing", "not in PATH", "https://helm.sh", ("cluster",))
@@ -34,7 +35,7 @@ def test_only_a_needed_check_gives_exit_code_3(mode, found, code, monkeypatch, c
 
 
 def test_every_problem_says_how_to_fix_it(monkeypatch):
-    monkeypatch.setitem(extras.EXTRAS, "world", ("no_such_module",))
+    monkeypatch.setitem(requirements.EXTRAS, "world", ("no_such_module",))
     options = build_parser(["doctor"]).parse_args(["doctor"])
     checks = {check.name: check for check in doctor.all_checks(options)}
     for check in checks.values():
@@ -43,7 +44,7 @@ def test_every_problem_says_how_to_fix_it(monkeypatch):
     assert checks["extra world"].fix == "pip install 'cloudrc[world]'"
     assert checks["extra world"].modes == ("local", "virtual")
     with pytest.raises(MissingPrerequisiteError, match=r"mode virtual needs no_such_module.*world"):
-        extras.require("mode virtual", ["world", "record"])
+        requirements.require("mode virtual", ["world", "record"])
 
 
 def test_the_doctor_says_where_the_usual_steps_run(monkeypatch):
@@ -69,15 +70,15 @@ def test_a_check_without_a_result_has_the_reason_why_its_process_ended(program, 
 def test_the_extras_are_those_of_pyproject():
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     declared = project["optional-dependencies"]
-    for extra, modules in extras.EXTRAS.items():
+    for extra, modules in requirements.EXTRAS.items():
         assert all(module in " ".join(declared[extra]) for module in modules), extra
-    assert set(extras.EXTRAS) | {"sim", "all", "dev"} == set(declared)
-    assert declared["sim"] == [f"cloudrc[{','.join(extras.MODES['virtual'])}]"]
+    assert set(requirements.EXTRAS) | {"sim", "all", "dev"} == set(declared)
+    assert declared["sim"] == [f"cloudrc[{','.join(requirements.MODES['virtual'])}]"]
 
 
 def test_who_lacks_all_of_the_simulation_is_told_its_one_extra(monkeypatch):
-    monkeypatch.setattr(extras, "missing", lambda extra: [f"module_of_{extra}"])
+    monkeypatch.setattr(requirements, "missing", lambda extra: [f"module_of_{extra}"])
     with pytest.raises(MissingPrerequisiteError, match=r"cloudrc\[sim,api\]"):
-        extras.require("mode local", extras.MODES["local"])
+        requirements.require("mode local", requirements.MODES["local"])
     with pytest.raises(MissingPrerequisiteError, match=r"cloudrc\[record\]"):
-        extras.require("recover", ["record"])
+        requirements.require("recover", ["record"])

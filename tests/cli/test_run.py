@@ -7,10 +7,10 @@ from unittest.mock import Mock
 
 import pytest
 
-from cloudrc.cli import extras
 from cloudrc.cli.main import main
 from cloudrc.cli.report import summary
 from cloudrc.errors import BadInputError
+from cloudrc.runs import requirements
 from cloudrc.runs.folder import new_folder
 from tests.cli.conftest import FLY, SHORT
 
@@ -153,7 +153,7 @@ def test_each_later_failure_has_its_time():
 
 
 def test_a_run_in_real_time_needs_the_extra_of_the_api(monkeypatch, refused):
-    monkeypatch.setitem(extras.EXTRAS, "api", ("fastapi_is_not_here",))
+    monkeypatch.setitem(requirements.EXTRAS, "api", ("fastapi_is_not_here",))
     assert "pip install 'cloudrc[api]'" in refused("run hover --mode local", code=3)
 
 

@@ -4,9 +4,9 @@ import re
 
 import pytest
 
-from cloudrc.advice import advise
 from cloudrc.config import shipped
 from cloudrc.config.load import load_experiment
+from cloudrc.warnings import advise
 from tests.conftest import nightly
 from tests.flights.conftest import both_ways, fly, numbers
 
