@@ -8,13 +8,40 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
 
 from cloudrc.config import shipped
 from cloudrc.config.document import read_document
 from cloudrc.config.problems import validate
 from cloudrc.config.reuse import reuse
-from cloudrc.config.schema import NameOr, PlugIn, Section
+from cloudrc.config.schema import Acceleration, NameOr, PlugIn, Section, Speed
 from cloudrc.plugins import is_path
+
+Braking = Annotated[float, Field(ge=0.1, le=10)]
+Hull = Annotated[float, Field(gt=0, le=10)]
+
+
+class RobotLimits(Section):
+    """What the guard may expect of a robot; an experiment's section `guard` sets lower limits."""
+
+    speed_max_mps: Speed | None = None
+    """Largest speed that the robot can follow [m/s]. null: the guard limits the speed only so that
+    the robot stops in time"""
+    acceleration_max_mps2: Acceleration = 12.0
+    """Largest acceleration of the velocity that the robot can follow [m/s^2]; default of
+    guard.acceleration_max_mps2"""
+    braking_mps2: Braking = 3.0
+    """Deceleration that the braking robot always reaches or exceeds [m/s^2]. The guard computes
+    the braking distance from it; a wheel has no more than the friction of its tyre, about 10"""
+    stop: Literal["land", "brake"] | None = None
+    """How a landing ends; land: the robot descends and switches off at touch-down; brake: it brakes
+    and switches off at rest. null: brake for a planar robot, else land"""
+
+
+DEFAULT_LIMITS = RobotLimits()
+"""Limits of a robot that flies."""
 
 
 class RobotFile(Section):
@@ -31,6 +58,19 @@ class RobotFile(Section):
     """Whether the robot stays on the ground. Then the guard limits x and y alone, HOLD and LAND
     brake the robot to rest, waypoints have the height of the spawn, and cloud commands no vertical
     velocity"""
+    guard: RobotLimits = DEFAULT_LIMITS
+    """What the guard may expect of the robot"""
+    hull_m: Hull | None = None
+    """Radius of the ball about the base that contains the robot [m], for the distance from
+    obstacles. null: the smallest ball that contains the geoms of the model"""
+
+    @model_validator(mode="after")
+    def _check_stop(self) -> RobotFile:
+        if self.planar and self.guard.stop == "land":
+            raise ValueError(
+                "guard.stop is land, but a planar robot does not leave the ground; leave it out"
+            )
+        return self
 
 
 @dataclass(frozen=True)
@@ -42,6 +82,8 @@ class RobotFiles:
     # which controller flies it depends on the model.
     onboard: PlugIn | None
     planar: bool = False  # whether it stays on the ground
+    guard: RobotLimits = DEFAULT_LIMITS
+    hull: float | None = None  # radius about the base [m]; None: that of the model
 
 
 def find_robot(name: str) -> RobotFiles:
@@ -58,7 +100,9 @@ def find_robot(name: str) -> RobotFiles:
     onboard = robot.onboard if isinstance(robot.onboard, PlugIn) else PlugIn(name=robot.onboard)
     if is_path(onboard.name):
         onboard = onboard.model_copy(update={"name": str((folder / onboard.name).resolve())})
-    return RobotFiles(folder / robot.model, onboard, robot.planar)
+    stop = robot.guard.stop or ("brake" if robot.planar else "land")
+    limits = robot.guard.model_copy(update={"stop": stop})
+    return RobotFiles(folder / robot.model, onboard, robot.planar, limits, robot.hull_m)
 
 
 def is_planar(name: str) -> bool:
