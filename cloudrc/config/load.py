@@ -30,8 +30,9 @@ from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import Problem
 from cloudrc.config.reuse import reuse
-from cloudrc.config.robot import find_robot, is_planar
+from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits, find_robot, is_planar
 from cloudrc.config.schema import (
+    Acceleration,
     Change,
     Cloud,
     CloudTime,
@@ -44,6 +45,7 @@ from cloudrc.config.schema import (
     PlugIn,
     Profile,
     Speed,
+    World,
 )
 from cloudrc.config.setpoints import read_setpoints
 from cloudrc.errors import BadInputError
@@ -70,24 +72,32 @@ FILE_READERS: dict[str, Callable[[Path], object]] = {
 """Key whose value is the path of a data file -> function that reads and checks the file."""
 
 
-def speed_cap(command_age_max_ms: float, plan_max_s: float = 0.0) -> float:
+def speed_cap(
+    command_age_max_ms: float, plan_max_s: float = 0.0, robot: RobotLimits = DEFAULT_LIMITS
+) -> float:
     """Compute the speed cap: the largest speed v [m/s] from which the robot stops within 8.7 m.
 
     If commands stop arriving, the robot follows the last one for the time T, reacts within 0.2 s
-    and brakes at 3 m/s^2: v · (T + 0.2 s) + v^2 / (6 m/s^2) = 8.7 m. T is the largest age of a
-    command, `command_age_max_ms` [ms], plus the longest plan, `plan_max_s` [s].
+    and brakes at a, its `braking_mps2`: v · (T + 0.2 s) + v^2 / (2a) = 8.7 m. T is the largest age
+    of a command, `command_age_max_ms` [ms], plus the longest plan, `plan_max_s` [s]. The cap is
+    lower for a robot that cannot follow this speed.
     Source: docs/reference/plant.md, "Speed cap".
     """
-    delay = command_age_max_ms * 1e-3 + plan_max_s + 0.2
-    return round(3.0 * (sqrt(delay * delay + 8.7 / 1.5) - delay), 6)
+    delay, braking = command_age_max_ms * 1e-3 + plan_max_s + 0.2, robot.braking_mps2
+    stops = round(braking * (sqrt(delay * delay + 17.4 / braking) - delay), 6)
+    return min(stops, robot.speed_max_mps or stops)
 
 
 class ResolvedGuard(Guard):
-    """The section `guard`, in which every limit has a value."""
+    """The section `guard`, in which every limit has a value.
+
+    The context of its validation is the `RobotLimits` of the robot; without one, `DEFAULT_LIMITS`.
+    """
 
     command_age_max_ms: CommandAge = COMMAND_AGE_MAX_MS
     plan_max_s: PlanMax = 0.0
     speed_max_mps: Speed = Field(None, validate_default=True)
+    acceleration_max_mps2: Acceleration = Field(None, validate_default=True)
 
     @field_validator("speed_max_mps", mode="wrap")
     @classmethod
@@ -95,16 +105,24 @@ class ResolvedGuard(Guard):
         cls, given: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo
     ) -> float:
         age_max = info.data.get("command_age_max_ms", COMMAND_AGE_MAX_MS)
-        plan_max = info.data.get("plan_max_s", 0.0)
-        cap = speed_cap(age_max, plan_max)
+        plan_max, robot = info.data.get("plan_max_s", 0.0), info.context or DEFAULT_LIMITS
+        cap = speed_cap(age_max, plan_max, robot)
         speed_max: float = cap if given is None else check(given)
         if speed_max > cap + 1e-6:
+            if cap == robot.speed_max_mps:
+                raise ValueError(f"must be at most {cap:g} m/s, the largest speed of the robot")
             plan = f" and plans of {plan_max:g} s" if plan_max else ""
             raise ValueError(
                 f"must be at most {cap:g} m/s: above it the robot does not stop in time with "
                 f"commands {age_max:g} ms old{plan}; lower it or guard.command_age_max_ms"
             )
         return speed_max
+
+    @field_validator("acceleration_max_mps2", mode="before")
+    @classmethod
+    def _limit_acceleration(cls, given: Any, info: ValidationInfo) -> Any:
+        robot = info.context or DEFAULT_LIMITS
+        return robot.acceleration_max_mps2 if given is None else given
 
 
 class ResolvedCloud(Cloud):
@@ -174,7 +192,14 @@ def load_experiment(
     if isinstance(names := document.get("report", "metrics"), str):  # one metric without a list
         document.tree["report"]["metrics"] = [names]
     found += overrides.resolve_plugins(document, build=build) + _resolve_paths(document)
-    experiment = problems.validate(document, ResolvedExperiment, name, found, described=Experiment)
+    experiment = problems.validate(
+        document,
+        ResolvedExperiment,
+        name,
+        found,
+        described=Experiment,
+        context=_robot_limits(document),
+    )
     return _judge(document, experiment, name, flown=flown)
 
 
@@ -355,6 +380,14 @@ def _plan_max(document: Document) -> float:
     return PLAN_MAX_S if isinstance(plan, float | int) and plan > 0 else 0.0
 
 
+def _robot_limits(document: Document) -> RobotLimits:
+    """Return the limits of the robot in an experiment; the default if there is no such robot."""
+    name: Any = document.get("world", "robot") or World().robot
+    with suppress(BadInputError, AttributeError):  # the latter if the name is no text
+        return reuse(("robot", name), partial(find_robot, name)).guard
+    return DEFAULT_LIMITS
+
+
 def _remove_derived(document: Document, *, new_profile: bool) -> None:
     """Remove computed values from a resolved file.
 
@@ -363,9 +396,12 @@ def _remove_derived(document: Document, *, new_profile: bool) -> None:
     computed value, because the user has set it.
     """
     derived: dict[KeyPath, float] = {("guard", "plan_max_s"): _plan_max(document)}
-    limits: Any = (document.get("guard", key) for key in ("command_age_max_ms", "plan_max_s"))
+    age_max: Any = document.get("guard", "command_age_max_ms")
+    plan_max: Any = document.get("guard", "plan_max_s")
+    robot = _robot_limits(document)
+    derived["guard", "acceleration_max_mps2"] = robot.acceleration_max_mps2
     with suppress(TypeError):  # a value is missing, or no number
-        derived["guard", "speed_max_mps"] = speed_cap(*limits)
+        derived["guard", "speed_max_mps"] = speed_cap(age_max, plan_max, robot)
     if new_profile:
         derived |= _implied(_present_profile(document))
         for way in DIRECTIONS:

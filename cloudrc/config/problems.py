@@ -204,17 +204,18 @@ def validate(
     found: Sequence[Problem] = (),
     *,
     described: type[BaseModel] | None = None,
+    context: object = None,
 ) -> _Model:
     """Convert a document to `model`; `name` names the document in error messages.
 
     Messages say what is valid in the model `described`, by default `model`: that of the user's file
-    if `model` is more than this file. If there are problems, raise one BadInputError for all: the
-    new ones and those in `found`.
+    if `model` is more than this file. The model's validators see `context`. If there are problems,
+    raise one BadInputError for all: the new ones and those in `found`.
     """
     known = {problem.path for problem in found}
     try:
         # In JSON mode pydantic accepts lists for tuples and is still strict.
-        result = model.model_validate_json(json.dumps(document.tree))
+        result = model.model_validate_json(json.dumps(document.tree), context=context)
     except ValidationError as error:
         more = from_pydantic(error, described or model)
         found = [*found, *(problem for problem in more if problem.path not in known)]

@@ -430,11 +430,12 @@ class Guard(Section):
     arrival of the command [s]. 0: only while the command is younger than command_age_max_ms.
     null: 0.8 if cloud.plan_s is above 0, else 0"""
     speed_max_mps: Speed | None = None
-    """Cap on the commanded speed [m/s]; a faster command is shortened. null: the largest speed
-    from which the robot stops within 8.7 m. This is 6 m/s if command_age_max_ms is 250 and
-    plan_max_s is 0"""
-    acceleration_max_mps2: Acceleration = 12.0
-    """Largest acceleration of the velocity that the onboard controller follows [m/s^2]"""
+    """Cap on the commanded speed [m/s]; a faster command is shortened. null: the largest speed that
+    the robot can follow and from which it stops within 8.7 m. For the Pelican this is 6 m/s if
+    command_age_max_ms is 250 and plan_max_s is 0"""
+    acceleration_max_mps2: Acceleration | None = None
+    """Largest acceleration of the velocity that the onboard controller follows [m/s^2]. null: that
+    of the robot, for the Pelican 12"""
     yaw_rate_max_radps: Speed = 1.0
     """Cap on the commanded yaw rate [rad/s]; a faster command is shortened"""
     hold_max_s: HoldTime = 60.0

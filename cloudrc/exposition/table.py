@@ -23,15 +23,15 @@ AXES = ("x", "y", "z")
 TERMS = ("proportional", "integral", "derivative")
 DIRECTIONS = ("uplink", "downlink")
 OUTCOMES = (
-    *("sent", "used", "late", "stale", "repeated", "old_epoch", "range", "future", "malformed"),
-    *("version", "direction", "accept_ignored", "tag", "hello", "busy", "unanswered"),
+    *("sent", "used", "late", "stale", "repeated", "old_epoch", "range", "vertical", "future"),
+    *("malformed", "version", "direction", "accept_ignored", "tag", "hello", "busy", "unanswered"),
 )
 """Outcomes of a datagram. The sender counts "sent", the receiver counts all other outcomes."""
-ONLY_WORLD = {"stale", "range", "future", "hello", "unanswered"}
+ONLY_WORLD = {"stale", "range", "vertical", "future", "hello", "unanswered"}
 """Outcomes that only world counts."""
 ONLY_CLOUD = {"accept_ignored"}
 """Outcomes that only cloud counts."""
-LIMITS = ("speed", "yaw_rate", "vertical", "fence")
+LIMITS = ("speed", "yaw_rate", "fence")
 """Limits to which the guard restricts commands."""
 GUARD_STATES = tuple(state.name.lower() for state in GuardState)
 GUARD_CAUSES = {cause: cause.words.partition(",")[0] for cause in Cause}

@@ -47,7 +47,7 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     plugin = plugins.find(KIND, choice.name)
     true = compile_true(robot.model, scene, nominal, world.plant)
     simulator = Simulator(true, _actuators(plugin, nominal, choice), wind)
-    guard = Guard(limits, planar=robot.planar)
+    guard = Guard(limits, robot.guard, planar=robot.planar)
     if world.is_nominal and hasattr(plugin, "accelerate"):
         return plugin.accelerate(simulator, onboard, guard)  # type: ignore[no-any-return]
     return Robot(simulator, onboard, guard)

@@ -2,8 +2,8 @@
 
 The deceleration falls towards the end of braking. The robot follows the velocity reference with a
 delay, so a constant deceleration would make the robot overshoot. The guard's stop rule computes a
-stopping distance from the deceleration BRAKE, which begins after the time REACTION. The robot
-always stops within this distance.
+stopping distance from the robot's braking (robot.yaml), which begins after the time REACTION. The
+robot always stops within this distance.
 """
 
 from __future__ import annotations
@@ -12,11 +12,12 @@ from math import hypot, inf, nan
 from operator import le
 
 from cloudrc.messages import ZERO, Cause, Vector
-from cloudrc.world.guard.limits import BRAKE, clamp, limit_length, step_towards
+from cloudrc.world.guard.limits import clamp, limit_length, step_towards
 from cloudrc.world.readings import Readings
 
-BRAKE_MAX, BRAKE_MIN = 5.5, 1.0
-"""Largest and smallest deceleration of the velocity reference while the robot brakes [m/s^2]."""
+BRAKE_MAX, BRAKE_MIN, BRAKE = 5.5, 1.0, 3.0
+"""Largest and smallest deceleration of the velocity reference while a robot with the braking BRAKE
+brakes [m/s^2]; both are in proportion for other robots."""
 BRAKE_TIME_CONSTANT = 0.25
 """Time constant with which the velocity reference decays to zero at the end of braking [s]."""
 BRAKE_LEAD, BRAKE_SHARE_MIN = 1.0, 0.2
@@ -59,12 +60,13 @@ class PositionHold:
     `brakes` tells whether the robot still brakes.
     """
 
-    def __init__(self, low: Vector, high: Vector, speed_max: float) -> None:
+    def __init__(self, low: Vector, high: Vector, speed_max: float, braking: float) -> None:
         """Set the box for hold points, and the limit `speed_max` of the reference [m/s].
 
-        `low` and `high` are the corners of the box [m], world frame.
+        `low` and `high` are the corners of the box [m], world frame. `braking` is the deceleration
+        of the robot [m/s^2].
         """
-        self._low, self._high = low, high
+        self._low, self._high, self._braking = low, high, braking
         self._speed_max = min(HOLD_SPEED_MAX, speed_max)
         self._hold_point: Vector | None = None
         self._integral = ZERO
@@ -94,7 +96,7 @@ class PositionHold:
         back_y = POSITION_GAIN * dy - DAMPING_GAIN * vy + iy
         back_z = 0.0 if sink else POSITION_GAIN * dz - DAMPING_GAIN * vz + iz
         x, y, z = limit_length((back_x, back_y, back_z), self._speed_max)
-        return step_towards(reference, (x, y, z - sink), BRAKE * dt)
+        return step_towards(reference, (x, y, z - sink), self._braking * dt)
 
     def _brake(self, reference: Vector, readings: Readings, sink: float, dt: float) -> Vector:
         """Brake for one step of `dt` [s]; at the velocity of the descent, set the hold point."""
@@ -102,7 +104,8 @@ class PositionHold:
             reference, self.brakes = brake_start(reference, readings.velocity), True
         x, y, z = reference
         rest = (0.0, 0.0, -sink)
-        reference = step_towards(reference, rest, brake_rate(hypot(x, y, z + sink)) * dt)
+        rate = brake_rate(hypot(x, y, z + sink), self._braking)
+        reference = step_towards(reference, rest, rate * dt)
         vx, vy, vz = readings.velocity
         if reference is rest and hypot(vx, vy, vz + sink) < STILL_SPEED:
             x, y, z = map(clamp, readings.position, self._low, self._high)
@@ -126,9 +129,13 @@ def brake_start(reference: Vector, velocity: Vector) -> Vector:
     return (share * x, share * y, share * z)
 
 
-def brake_rate(speed: float) -> float:
-    """Return the deceleration [m/s^2] for braking from `speed` [m/s]: large at high speed."""
-    return min(BRAKE_MAX, max(BRAKE_MIN, speed / BRAKE_TIME_CONSTANT))
+def brake_rate(speed: float, braking: float) -> float:
+    """Return the deceleration [m/s^2] for braking from `speed` [m/s]: large at high speed.
+
+    `braking` is the deceleration that the robot reaches at least [m/s^2].
+    """
+    share = braking / BRAKE
+    return min(share * BRAKE_MAX, max(share * BRAKE_MIN, speed / BRAKE_TIME_CONSTANT))
 
 
 class Descent:
@@ -174,11 +181,15 @@ class Descent:
 
 
 class Halt(Descent):
-    """Ends the landing of a planar robot: it brakes, and stops once it is at rest."""
+    """Ends the landing of a robot that does not descend: it brakes and stops at rest."""
 
     def __init__(self) -> None:
         """Plan no descent."""
         super().__init__(-inf, 0.0)
+
+    def may_stop(self, readings: Readings) -> bool:
+        """Return False: the robot does not descend."""
+        return False
 
     def is_over(self, now_ns: int, reference: Vector, readings: Readings) -> bool:
         """Return whether the robot is at rest at `now_ns` [ns], world's clock.

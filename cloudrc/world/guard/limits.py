@@ -15,18 +15,14 @@ from cloudrc.config.schema import COMMAND_AGE_MS
 from cloudrc.geometry.fence import FLOOR_MARGIN
 from cloudrc.messages import ZERO, Vector
 
-BRAKE = 3.0
-"""Deceleration that a braking robot always reaches or exceeds [m/s^2].
-Source: docs/reference/plant.md, "Stop rule"."""
 REACTION = 0.2
-"""Time from the start of braking until the robot decelerates at BRAKE [s].
+"""Time from the start of braking until the robot decelerates as its robot.yaml promises [s].
 Source: docs/reference/plant.md, "Stop rule"."""
-STOP_COEFFICIENT = 1.0 / (2.0 * BRAKE)
-"""Braking distance divided by the square of the speed [s^2/m]."""
 FENCE_REACTION = 0.6
-"""Reaction time in the stop rule at the walls and the ceiling of the fence [s]. The guard limits
-the speed v so that FENCE_REACTION · v + v^2/6 <= distance - WALL_MARGIN. At the floor the guard
-uses REACTION and FLOOR_MARGIN, because the robot can stop a descent quickly.
+"""Reaction time in the stop rule at the walls and the ceiling of the fence [s]. With the braking a
+of the robot, the guard limits the speed v so that
+FENCE_REACTION · v + v^2/(2a) <= distance - WALL_MARGIN. At the floor the guard uses REACTION and
+FLOOR_MARGIN, because the robot can stop a descent quickly.
 Deviation: docs/reference/plant.md, "Stop rule", has 0.2 s and 0.1 m. With 0.2 s and 0.1 m a hostile
 cloud can move the robot 0.3 m beyond the fence, because the robot reacts with a delay."""
 FAR = 1e6
@@ -51,36 +47,47 @@ def clamp(value: float, low: float, high: float) -> float:
     return value if value > low else low
 
 
-def approach_speed(distance: float, reaction: float = FENCE_REACTION) -> float:
+def stop_coefficient(braking: float) -> float:
+    """Return the braking distance divided by the square of the speed [s^2/m].
+
+    `braking` is the deceleration of the robot [m/s^2].
+    """
+    return 1.0 / (2.0 * braking)
+
+
+def approach_speed(distance: float, stop: float, reaction: float = FENCE_REACTION) -> float:
     """Return the largest velocity towards a face of the fence [m/s].
 
-    The result v solves reaction · v + v^2/6 = distance; v^2/6 is the braking distance at 3 m/s^2.
-    `distance` is the distance to the face minus the fence's margin [m], `reaction` the reaction
-    time [s]. If `distance` is negative, v is negative, so that the robot returns.
+    The result v solves reaction · v + stop · v^2 = distance. `distance` is the distance to the face
+    minus the fence's margin [m], `stop` the robot's `stop_coefficient` [s^2/m], `reaction` the
+    reaction time [s]. If `distance` is negative, v is negative, so that the robot returns.
     """
     if distance > FAR:
         return inf
     if distance > 0.0:
-        root = sqrt(reaction * reaction + 4.0 * STOP_COEFFICIENT * distance)
+        root = sqrt(reaction * reaction + 4.0 * stop * distance)
         return 2.0 * distance / (reaction + root)
     return max(RETURN_GAIN * distance, -RETURN_SPEED_MAX) if distance < 0.0 else 0.0
 
 
-def limit_to_fence(velocity: Vector, position: Vector, low: Vector, high: Vector) -> Vector:
+def limit_to_fence(
+    velocity: Vector, position: Vector, low: Vector, high: Vector, stop: float
+) -> Vector:
     """Slow a finite `velocity` [m/s], axis by axis, so that the robot can stop before the fence.
 
     Near the floor the horizontal velocity is limited, too, because a rotor that touches the floor
     at speed turns the robot over. `position` is that of the base [m]. `low` and `high` are the
     corners of the box in which the robot may fly [m]. All are in the world frame, shape (3,).
+    `stop` is the robot's `stop_coefficient` [s^2/m].
     """
     (vx, vy, vz), (x, y, z), (ax, ay, az), (bx, by, bz) = velocity, position, low, high
     if not z >= az - FLOOR_MARGIN + LOW_HEIGHT:
         vx, vy, _ = limit_length((vx, vy, 0.0), LOW_SPEED)
     return (
-        clamp(vx, -approach_speed(x - ax), approach_speed(bx - x)),
-        clamp(vy, -approach_speed(y - ay), approach_speed(by - y)),
+        clamp(vx, -approach_speed(x - ax, stop), approach_speed(bx - x, stop)),
+        clamp(vy, -approach_speed(y - ay, stop), approach_speed(by - y, stop)),
         # At most 0: a robot that stands on the floor does not have to climb.
-        clamp(vz, min(0.0, -approach_speed(z - az, REACTION)), approach_speed(bz - z)),
+        clamp(vz, min(0.0, -approach_speed(z - az, stop, REACTION)), approach_speed(bz - z, stop)),
     )
 
 
@@ -171,12 +178,12 @@ component comes from a bug, so its direction cannot be trusted either.
 Source: docs/reference/faults.md, "F23"."""
 
 
-def ramp_ns(speed_max: float) -> int:
-    """Return how long after a HOLD the acceleration of the reference is limited to BRAKE [ns].
+def ramp_ns(speed_max: float, braking: float) -> int:
+    """Return how long after a HOLD the acceleration of the reference is limited to `braking` [ns].
 
-    In this time the robot can reach its highest speed, `speed_max` [m/s]. The limit does not end
-    earlier when the reference reaches the command, because the first commands after a silence may
-    be zero.
+    In this time the robot can reach its highest speed, `speed_max` [m/s]; `braking` is in [m/s^2].
+    The limit does not end earlier when the reference reaches the command, because the first
+    commands after a silence may be zero.
     Source: docs/reference/plant.md, "Leaving HOLD".
     """
-    return round(max(RAMP_MIN, speed_max / BRAKE) * 1e9)
+    return round(max(RAMP_MIN, speed_max / braking) * 1e9)

@@ -19,8 +19,8 @@ while its basis is at most `command_age_max_ns` old. A command with a plan stays
 plan ends, at most for `guard.plan_max_s` after its arrival. The guard does not trust a plan: in
 each step it limits the plan's velocity for the present time like the velocity of a new command.
 
-A command is impossible if a number in it is NaN or too large, or if a time in it is wrong, such as
-the stamp of a basis in the future.
+A command is impossible if a number in it is NaN or too large, if a time in it is wrong, such as
+the stamp of a basis in the future, or if the robot cannot move that way.
 
 - Every state can change to ESTOP: by the operator's request, or when the robot has turned over,
   because its rotors would then push it in any direction. The operator's acknowledgement leads to
@@ -33,8 +33,9 @@ the stamp of a basis in the future.
 - HOLD within a mission has a time limit, because the operator may be gone. HOLD after a mission has
   no time limit: the robot waits for the next mission.
 
-A planar robot stays on the ground: the guard ignores heights and vertical velocities. Its LAND is
-to brake and, at rest, to stop; its HOLD ends as that of a robot in the air.
+A robot whose robot.yaml says `stop: brake` does not descend in LAND: it brakes and, at rest, stops.
+A planar robot stays on the ground: the guard ignores its height, and refuses commands with a
+vertical velocity as impossible. Its HOLD ends as that of a robot in the air.
 
 A robot that touches nothing never turns over: no command tilts it as far as OVERTURNED_COSINE.
 """
@@ -45,6 +46,7 @@ from collections import Counter, deque
 from math import inf
 
 from cloudrc.config.load import ResolvedGuard
+from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits
 from cloudrc.geometry import fence
 from cloudrc.messages import (
     NEVER_NS,
@@ -96,29 +98,40 @@ class Guard:
         command_age_max_ns: Largest accepted age of the odometry from which cloud computed a command
             [ns].
         acceleration_max: Largest rate of change of the velocity reference [m/s^2].
+        stop_coefficient: Braking distance divided by the square of the speed [s^2/m].
         changes: Changes of the state since the last `take_changes`.
         counts: Counters of world. The guard counts "limited_speed": shortened velocities of
             commands and plans; "limited_yaw_rate": commands with a limited yaw rate;
-            "limited_vertical": vertical velocities that a planar robot got and ignored;
             "limited_fence": steps in which the fence limited the reference.
     """
 
-    def __init__(self, limits: ResolvedGuard, *, planar: bool = False) -> None:
-        """Begin in GROUND; a `planar` robot stays on the ground."""
+    def __init__(
+        self,
+        limits: ResolvedGuard,
+        robot: RobotLimits = DEFAULT_LIMITS,
+        *,
+        planar: bool = False,
+    ) -> None:
+        """Begin in GROUND.
+
+        `robot` tells how fast the robot brakes and how it lands. A `planar` robot stays on the
+        ground.
+        """
         self.command_age_max_ns = round(limits.command_age_max_ms * 1_000_000)
         self._hold_max_ns = round(limits.hold_max_s * 1e9)
         self._plan_max_ns = round(limits.plan_max_s * 1e9)
-        self._ramp_ns = rules.ramp_ns(limits.speed_max_mps)
+        self._ramp_ns = rules.ramp_ns(limits.speed_max_mps, robot.braking_mps2)
         self.acceleration_max = limits.acceleration_max_mps2
         self._yaw_rate_max = limits.yaw_rate_max_radps
         self._speed_max = limits.speed_max_mps * rules.ROUNDING_FACTOR
-        self._planar = planar
+        self._braking, self._planar = robot.braking_mps2, planar
+        self.stop_coefficient = rules.stop_coefficient(self._braking)
         self._low, self._high = fence.INNER_LOW, fence.INNER_HIGH
         if planar:
             self._low, self._high = (*self._low[:2], -inf), (*self._high[:2], inf)
         self._floor, half = self._low[2], 0.5 * limits.speed_max_mps
-        self._position_hold = PositionHold(self._low, self._high, half)
-        self._descent = Halt() if planar else Descent(self._floor, half)
+        self._position_hold = PositionHold(self._low, self._high, half, self._braking)
+        self._descent = Halt() if robot.stop == "brake" else Descent(self._floor, half)
         self._take_off = TakeOff(fence.LOW, fence.HIGH, planar=planar)
         self.changes: list[GuardChange] = []
         self.counts: Counter[str] = Counter()
@@ -203,7 +216,8 @@ class Guard:
     def accept_command(self, command: Command, now_ns: int) -> str | None:
         """Accept a command at `now_ns` [ns] and return None, or return the reason to reject it.
 
-        The reason is "range" for a number that is too large or NaN and for an impossible plan.
+        The reason is "range" for a number that is too large or NaN and for an impossible plan, and
+        "vertical" for a vertical velocity of a planar robot.
         It is "stale" if the odometry from which cloud computed the command is too old, and "future"
         if this odometry is later than `now_ns`.
         """
@@ -227,6 +241,8 @@ class Guard:
             return "stale"
         if command.plan and not self._is_plan_possible(command):
             return "range"
+        if self._planar and (z or any(planned[2] for planned in command.plan)):
+            return "vertical"
         return None
 
     def _obey(self, command: Command, now_ns: int) -> None:
@@ -265,9 +281,6 @@ class Guard:
             step = max(now_ns - command.planned_ns, 0) // PLAN_STEP_NS
             if step < len(command.plan):
                 self._next_ns = command.planned_ns + (step + 1) * PLAN_STEP_NS
-        if self._planar and velocity[2] != 0.0:
-            velocity = (velocity[0], velocity[1], 0.0)
-            self.counts["limited_vertical"] += 1
         self._wanted = rules.limit_length(velocity, self._speed_max)
         if self._wanted is not velocity:
             self.counts["limited_speed"] += 1
@@ -339,17 +352,17 @@ class Guard:
 
     def _follow(self, reference: Vector, now_ns: int, readings: Readings, dt: float) -> None:
         """Store a velocity reference, limited to keep the robot upright and inside the fence."""
-        climb, position = readings.velocity[2], readings.position
+        climb, position, stop = readings.velocity[2], readings.position, self.stop_coefficient
         if reference[2] < climb - rules.SINK_LEAD_MAX:
             reference = rules.limit_sink(reference, self.reference, climb, self._speed_max)
-        inside = rules.limit_to_fence(reference, position, self._low, self._high)
+        inside = rules.limit_to_fence(reference, position, self._low, self._high, stop)
         if inside != reference:
             self.counts["limited_fence"] += 1
             step = self.acceleration_max * dt
             inside = rules.limit_growth(self.reference, inside, step)
             reference = rules.limit_length(inside, self._speed_max)
         if now_ns < self._ramp_until_ns:
-            reference = rules.limit_growth(self.reference, reference, rules.BRAKE * dt)
+            reference = rules.limit_growth(self.reference, reference, self._braking * dt)
         self.reference = reference
 
     def _look_after_itself(self, now_ns: int, readings: Readings) -> None:

@@ -4,21 +4,22 @@ from math import hypot, nan
 
 import pytest
 
+from cloudrc.config.robot import DEFAULT_LIMITS
 from cloudrc.geometry import fence
 from cloudrc.messages import ZERO
 from cloudrc.world.guard import hold as rules
 from cloudrc.world.guard.hold import PositionHold, TakeOff, brake_start
-from cloudrc.world.guard.limits import BRAKE
 from tests.world.guard.conftest import DT, HERE, sensed
 
 LOW, HIGH = (-2.8, -8.3, 0.0), (9.0, 5.3, 2.3)
+BRAKING = DEFAULT_LIMITS.braking_mps2
 ENOUGH = 1.0
 """A tick that is long enough to reach any reference [s]."""
 
 
 def holding_at(sink=0.0, speed_max=6.0, position=HERE):
     """Return a position hold with its hold point at `position`."""
-    hold = PositionHold(LOW, HIGH, speed_max)
+    hold = PositionHold(LOW, HIGH, speed_max, BRAKING)
     reference = (0.0, 0.0, -sink)
     assert hold.follow(reference, sensed(position, reference), sink, ENOUGH) == reference
     assert not hold.brakes
@@ -50,7 +51,7 @@ def test_braking_starts_1_mps_below_the_speed_but_above_0(axis, speed, begins):
     ],
 )
 def test_braking_goes_step_by_step_towards_rest(reference, sink, rate):
-    hold, fast = PositionHold(LOW, HIGH, 6.0), sensed(velocity=(5.0, 5.0, 5.0))
+    hold, fast = PositionHold(LOW, HIGH, 6.0, BRAKING), sensed(velocity=(5.0, 5.0, 5.0))
     hold.follow(reference, fast, sink, DT)  # begins
     x, y, z = hold.follow(reference, fast, sink, DT)
     assert hypot(reference[0] - x, reference[1] - y, reference[2] - z) == pytest.approx(rate * DT)
@@ -63,7 +64,7 @@ def test_braking_goes_step_by_step_towards_rest(reference, sink, rate):
 @pytest.mark.parametrize("sink", [0.0, 0.5])
 @pytest.mark.parametrize(("share", "still"), [(0.99, True), (1.01, False), (-1.01, False)])
 def test_at_rest_the_robot_is_slow_in_every_direction(axis, sink, share, still):
-    hold, velocity = PositionHold(LOW, HIGH, 6.0), [0.0, 0.0, -sink]
+    hold, velocity = PositionHold(LOW, HIGH, 6.0, BRAKING), [0.0, 0.0, -sink]
     assert hold.brakes is False
     velocity[axis] += share * rules.STILL_SPEED
     hold.follow((0.0, 0.0, -sink), sensed(velocity=tuple(velocity)), sink, ENOUGH)
@@ -87,7 +88,7 @@ def test_the_position_hold_is_no_faster_than_its_limits(speed_max, allowed):
     hold = holding_at(speed_max=speed_max)
     assert hypot(*hold.follow(ZERO, moved((3.0, -4.0, 0.5)), 0.0, ENOUGH)) == pytest.approx(allowed)
     accelerated = hold.follow(ZERO, moved((3.0, 0.0, 0.0)), 0.0, DT)
-    assert accelerated == pytest.approx((-BRAKE * DT, 0.0, 0.0))
+    assert accelerated == pytest.approx((-BRAKING * DT, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config.load import ResolvedGuard
+from cloudrc.config.load import ResolvedGuard, speed_cap
+from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits
 from cloudrc.geometry import fence
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.hold import brake_start
 from tests.world.guard.conftest import LIMITS, MS, SECOND, TICK, armed, command, run
+
+STOP = rules.stop_coefficient(DEFAULT_LIMITS.braking_mps2)
 
 
 @pytest.mark.promise("commands-within-caps")
@@ -29,7 +32,7 @@ def test_a_limit_cannot_be_switched_off_or_changed(name):
 @pytest.mark.parametrize(("age_ms", "fastest"), [(250, 6.0), (400, 5.645805), (800, 4.823043)])
 def test_a_speed_beyond_the_stop_rule_is_refused(age_ms, fastest):
     # v (T + 0.2) + v^2 / 6 = 8.7 m, solved by hand.
-    way = fastest * (age_ms / 1000 + rules.REACTION + fastest * rules.STOP_COEFFICIENT)
+    way = fastest * (age_ms / 1000 + rules.REACTION + fastest * STOP)
     assert way == pytest.approx(8.7, abs=1e-4), "the guard brakes as the cap assumes"
     for plan_ms in (0, age_ms // 2):
         times = {"command_age_max_ms": age_ms - plan_ms, "plan_max_s": plan_ms / 1000}
@@ -39,6 +42,18 @@ def test_a_speed_beyond_the_stop_rule_is_refused(age_ms, fastest):
     ResolvedGuard(command_age_max_ms=10_000.0, speed_max_mps=0.5)
     with pytest.raises(ValueError, match="command_age_max_ms"):
         ResolvedGuard(command_age_max_ms=10_001.0, speed_max_mps=0.5)
+
+
+@pytest.mark.parametrize("braking", [0.1, 2.0, 3.0, 10.0])
+def test_a_robot_that_brakes_less_has_a_lower_speed_cap(braking):
+    # v (T + 0.2) + v^2 / (2a) = 8.7 m
+    cap = speed_cap(250.0, 0.8, RobotLimits(braking_mps2=braking))
+    assert cap * 1.25 + cap * cap / (2.0 * braking) == pytest.approx(8.7, abs=1e-4)
+
+
+def test_the_cap_is_no_higher_than_the_speed_of_the_robot():
+    assert speed_cap(250.0, 0.0, RobotLimits(speed_max_mps=1.5)) == 1.5
+    assert speed_cap(250.0, 0.0, RobotLimits(speed_max_mps=9.0)) == 6.0
 
 
 @pytest.mark.parametrize(("hold_s", "waited_s"), [(0.1, 10), (11, 11)])
@@ -67,16 +82,18 @@ MANY = settings(max_examples=1000, deadline=None)
 
 
 def fenced(velocity, position, low=LOW):
-    return rules.limit_to_fence(velocity, position, low, HIGH)
+    return rules.limit_to_fence(velocity, position, low, HIGH, STOP)
 
 
 @pytest.mark.parametrize("caution", [rules.FENCE_REACTION, rules.REACTION])
-def test_approach_speed_solves_the_stop_rule(caution):
+@pytest.mark.parametrize("braking", [0.1, 2.0, 3.0, 10.0])
+def test_approach_speed_solves_the_stop_rule(braking, caution):
+    stop = rules.stop_coefficient(braking)
     for reach in (TINY, 0.01, 1.0, 7.0, 1e6):
-        v = rules.approach_speed(reach, caution)
-        assert v * (caution + v / 6) == pytest.approx(reach, rel=1e-12)
+        v = rules.approach_speed(reach, stop, caution)
+        assert v * (caution + v / (2.0 * braking)) == pytest.approx(reach, rel=1e-12)
     for reach, speed in ((-0.1, -0.1), (-3.0, -0.5), (0.0, 0.0), (nan, 0.0), (1e6 + 1, inf)):
-        assert rules.approach_speed(reach, caution) == speed
+        assert rules.approach_speed(reach, stop, caution) == speed
 
 
 @pytest.mark.parametrize("length_max", [0.5, 6.0])

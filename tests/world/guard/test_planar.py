@@ -1,20 +1,24 @@
 """The guard of a robot that stays on the ground: no heights, HOLD and LAND brake to rest."""
 
+from itertools import pairwise
+from math import nan
+
 import pytest
 
 from cloudrc.config.load import ResolvedGuard
+from cloudrc.config.robot import RobotLimits
 from cloudrc.geometry import fence
-from cloudrc.messages import ZERO, GuardState
+from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.world.guard.state import Guard
-from tests.world.guard.conftest import LIMITS, MS, SECOND, command, run
+from tests.world.guard.conftest import DT, LIMITS, MS, SECOND, command, run
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 AT = (1.0, 2.0, 0.1)
 MOVES = (1.0, 0.0, 0.0)
 
 
-def tracking(velocity=MOVES, limits=LIMITS):
-    guard = Guard(limits, planar=True)
+def tracking(velocity=MOVES, limits=LIMITS, braking=3.0):
+    guard = Guard(limits, RobotLimits(braking_mps2=braking, stop="brake"), planar=True)
     guard.start_mission(0)
     assert guard.accept_command(command(velocity), 0) is None
     assert guard.state is TRACK
@@ -35,11 +39,20 @@ def test_near_the_floor_neither_height_nor_speed_is_limited():
     assert not guard.counts
 
 
-@pytest.mark.parametrize("z", [2.0, -2.0])
-def test_a_vertical_velocity_is_taken_out_and_counted(z):
+@pytest.mark.parametrize("z", [2.0, -1e-9])
+def test_a_vertical_velocity_is_refused_and_a_few_make_it_land(z):
     guard = tracking()
-    assert commanded(guard, (1.0, 0.5, z), SECOND) == (1.0, 0.5, 0.0)
-    assert guard.counts["limited_vertical"] == 100
+    for count in range(1, 6):
+        assert guard.state is TRACK
+        assert guard.accept_command(command((1.0, 0.5, z), count * MS), count * MS) == "vertical"
+    assert (guard.state, guard.cause) == (LAND, Cause.IMPOSSIBLE)
+
+
+def test_a_plan_that_leaves_the_ground_is_refused():
+    guard, level, climbs = tracking(), (MOVES,) * 3, (MOVES, (1.0, 0.0, 0.1))
+    for plan, reason in ((level, None), (climbs, "vertical")):
+        planned = command(MOVES)._replace(plan=plan, planned_ns=0)
+        assert guard.accept_command(planned, 0) == reason
 
 
 @pytest.mark.parametrize("climb", [-1.0, 1.0])
@@ -106,3 +119,48 @@ def test_after_a_stop_it_moves_again_once_it_is_at_rest_inside_the_fence(x, move
     guard.start_mission(2 * SECOND)
     guard.accept_command(command(MOVES, 2 * SECOND), 2 * SECOND)
     assert (guard.state is TRACK) == moves
+
+
+@pytest.mark.parametrize("braking", [1.0, 3.0, 6.0])
+def test_the_braking_of_the_robot_sets_how_fast_a_hold_slows_down_and_speeds_up(braking):
+    guard = tracking(braking=braking)
+    commanded(guard, (4.0, 0.0, 0.0), SECOND, moves=(4.0, 0.0, 0.0))
+    slowed = [x for x, _, _ in run(guard, SECOND, 2 * SECOND, AT, (4.0, 0.0, 0.0))]
+    steps = [a - b for a, b in pairwise(slowed) if a > b]
+    assert max(steps[1:-1]) == pytest.approx(5.5 / 3.0 * braking * DT)
+    run(guard, 2 * SECOND, 4 * SECOND, AT)
+    assert guard.state is HOLD
+    found = []
+    for now_ns in range(4 * SECOND, 5 * SECOND, 10 * MS):
+        guard.accept_command(command((4.0, 0.0, 0.0), now_ns), now_ns)
+        found += [x for x, _, _ in run(guard, now_ns, now_ns + 10 * MS, AT)]
+    assert guard.state is TRACK
+    assert max(b - a for a, b in pairwise(found)) == pytest.approx(braking * DT)
+
+
+def test_a_robot_that_brakes_less_approaches_the_fence_more_slowly():
+    near = (fence.INNER_HIGH[0] - 1.0, 0.0, 0.1)
+    speeds = []
+    for braking in (1.0, 3.0):
+        guard = tracking(braking=braking)
+        speeds.append(commanded(guard, (5.0, 0.0, 0.0), SECOND, near)[0])
+        v = speeds[-1]
+        assert v * (0.6 + v / (2.0 * braking)) == pytest.approx(1.0)
+    assert speeds[0] < speeds[1]
+
+
+def test_a_robot_in_the_air_or_water_may_brake_instead_of_landing():
+    guard = Guard(LIMITS, RobotLimits(stop="brake"))
+    guard.start_mission(0)
+    up = (1.0, 2.0, 1.3)
+    for now_ns in range(0, SECOND, 10 * MS):
+        guard.accept_command(command((0.0, 0.0, -0.4), now_ns), now_ns)
+        run(guard, now_ns, now_ns + 10 * MS, up)
+    for _ in range(5):
+        guard.accept_command(command((nan, 0.0, 0.0), SECOND), SECOND)
+    guard.acknowledge(SECOND)
+    references = run(guard, SECOND, SECOND + 100 * MS, up, (0.0, 0.0, -0.4))
+    assert guard.state is LAND, "it does not hold, although it sinks and is acknowledged"
+    assert min(z for _, _, z in references) >= -0.4, "it does not descend faster"
+    assert run(guard, SECOND + 100 * MS, 2 * SECOND, up)[-1] is None
+    assert guard.state is GROUND

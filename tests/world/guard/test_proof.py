@@ -47,10 +47,11 @@ def test_clamp_moves_only_values_outside_into_the_interval():
 
 
 @pytest.mark.parametrize("caution", [rules.FENCE_REACTION, rules.REACTION])
-def test_approach_speed_is_a_number_and_has_its_lower_bound(caution):
+@pytest.mark.parametrize("braking", [0.1, 2.0, 3.0, 10.0])
+def test_approach_speed_is_a_number_and_has_its_lower_bound(braking, caution):
     def check(run):
         reach = run.fresh("reach")
-        answer = rules.approach_speed(reach, caution)
+        answer = rules.approach_speed(reach, rules.stop_coefficient(braking), caution)
         term = answer.term if hasattr(answer, "term") else z3.FPVal(answer, z3.Float64())
         run.prove(term >= -rules.RETURN_SPEED_MAX)
         # At the face or outside never outwards; inside never back.
@@ -90,7 +91,7 @@ def test_growth_is_at_most_the_value_itself():
 
 def test_brake_rate_of_any_speed_is_in_its_range():
     def check(run):
-        rate = lift(run, hold.brake_rate(run.fresh("speed"))).term
+        rate = lift(run, hold.brake_rate(run.fresh("speed"), 3.0)).term
         run.prove(z3.And(rate >= hold.BRAKE_MIN, rate <= hold.BRAKE_MAX))
 
     everywhere(check)

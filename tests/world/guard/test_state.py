@@ -513,6 +513,6 @@ def test_c_runs_no_step_before_take_off_or_after_a_hold():
     now_ns = feed(guard, 2 * SECOND, 20, (0.0, 0.0, 1.0), position=(0.0, 0.0, 1.1))
     assert states(guard) == [HOLD, TRACK]
     assert guard.plain_track(now_ns) is None
-    periods = 1 + ramp_ns(6.0) // (10 * MS)
+    periods = 1 + ramp_ns(6.0, 3.0) // (10 * MS)
     now_ns = feed(guard, now_ns, periods, ZERO, position=(0.0, 0.0, 1.1))
     assert guard.plain_track(now_ns) is not None

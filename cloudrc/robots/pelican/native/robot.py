@@ -59,7 +59,7 @@ _CONSTANTS = {
     low_level: "mass gravity tilt_gain yaw_gain tilt_rate_gain yaw_rate_gain "
     "thrust_max tiny nose_cosine_min yaw_sine_max",
     state: "overturned_cosine",
-    rules: "sink_lead_max fence_reaction reaction stop_coefficient",
+    rules: "sink_lead_max fence_reaction reaction",
 }
 """Modules and their constants that `step.c` needs, in the order of its fields."""
 _VALUES = {
@@ -70,7 +70,7 @@ _VALUES = {
 _double, _int64 = ctypes.c_double, ctypes.c_int64
 _FIELDS: dict[str, Any] = {
     **dict.fromkeys(_POINTERS, ctypes.c_void_p),
-    **dict.fromkeys([*_VALUES, "up", "down"], _double),
+    **dict.fromkeys([*_VALUES, "stop_coefficient", "up", "down"], _double),
     **{"gains": _double * 9, "limit_xy": _double, "limit_z": _double, "dt": _double},
     **{"change_max": _double, "low": _double * 3, "high": _double * 3},
     **dict.fromkeys(("time_step", "robot_radius", "acceleration_max"), _double),
@@ -112,7 +112,15 @@ def make_state(simulator: Simulator, controller: LowLevel, guard: Guard) -> Step
         *(array.ctypes.data for array in (*arrays, tip_force)),
         *(data._address + _contacts_offset(data), timer, obstacles.ctypes.data),
         *_VALUES.values(),
-        *(turning.up, turning.down, controller.gains, limit_xy, limit_z, dt),
+        *(
+            guard.stop_coefficient,
+            turning.up,
+            turning.down,
+            controller.gains,
+            limit_xy,
+            limit_z,
+            dt,
+        ),
         guard.acceleration_max * STEP,
         *(fence.INNER_LOW, fence.INNER_HIGH, simulator.dt, radius, ACCELERATION_MAX, STEP_NS),
         *(CONTACT_CHECK_STEPS, len(obstacles)),

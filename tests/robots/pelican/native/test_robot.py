@@ -11,7 +11,7 @@ import pytest
 
 from cloudrc import assembly
 from cloudrc.config.load import ResolvedGuard, load_experiment
-from cloudrc.config.robot import find_robot
+from cloudrc.config.robot import DEFAULT_LIMITS, find_robot
 from cloudrc.config.shipped import file_of
 from cloudrc.geometry import fence
 from cloudrc.geometry.compiled import mujoco
@@ -85,6 +85,7 @@ def silence(pilot):
 
 
 TOUCHING, IN_PIPE = (8.0, -6.42, 0.9), (-1.0, 0.5, 0.5)
+STOP = rules.stop_coefficient(DEFAULT_LIMITS.braking_mps2)
 HOLDS = ResolvedGuard(hold_max_s=2.0)
 
 
@@ -140,13 +141,13 @@ def test_a_micrometre_of_room_means_that_no_fence_limits():
         velocity, place, axis = rng.uniform(-6.0, 6.0, 3), rng.uniform(low, high), rng.integers(3)
         slow = (velocity < 0.0) & ([False, False, True])
         reaction = np.where(slow, rules.REACTION, rules.FENCE_REACTION)
-        way = abs(velocity) * (reaction + abs(velocity) * rules.STOP_COEFFICIENT) + 1e-6
+        way = abs(velocity) * (reaction + abs(velocity) * STOP) + 1e-6
         nearest, farthest = low + way * (velocity <= 0.0), high - way * (velocity > 0.0)
         place[axis] = (farthest if velocity[axis] > 0.0 else nearest)[axis]
         if ((nearest <= place) & (place <= farthest)).all():
             found += 1
             given = tuple(velocity.tolist())
-            assert rules.limit_to_fence(given, tuple(place.tolist()), low, high) == given
+            assert rules.limit_to_fence(given, tuple(place.tolist()), low, high, STOP) == given
     assert found > 1000
 
 
