@@ -3,7 +3,17 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cloudrc.api import Comparison, Result, SweepTable, compare, fly, identify, margin, sweep
+    from cloudrc.api import (
+        Comparison,
+        Result,
+        SweepTable,
+        compare,
+        fly,
+        identify,
+        margin,
+        sweep,
+        verify,
+    )
 
 __version__ = "0.1.0"
 __all__ = [
@@ -16,6 +26,7 @@ __all__ = [
     "identify",
     "margin",
     "sweep",
+    "verify",
 ]
 
 

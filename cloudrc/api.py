@@ -1,4 +1,4 @@
-"""The Python API: fly, sweep, compare and identify from a program or a notebook.
+"""The Python API: fly, sweep, compare, identify and verify from a program or a notebook.
 
     import cloudrc
 
@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,8 @@ from cloudrc.metrics.verdict import Failure
 from cloudrc.record.columns import Recording, Table
 from cloudrc.runs.experiment import advice_on, check_mode, load
 from cloudrc.runs.flight import fly_in_memory
-from cloudrc.runs.folder import new_folder
+from cloudrc.runs.folder import new_folder, point_to
+from cloudrc.runs.requirements import MODES, require
 
 if TYPE_CHECKING:
     from cloudrc.report.document import Assessment
@@ -121,53 +122,93 @@ def fly(
     settings: Mapping[str, Any] | None = None,
     *,
     seed: int | None = None,
-    mode: Literal["virtual", "local"] = "virtual",
+    mode: Literal["virtual", "local", "cluster"] = "virtual",
     out: str | Path | None = None,
+    context: str | None = None,
+    namespace: str | None = None,
+    release: str = "cloudrc",
+    timeout: float = 300.0,
 ) -> Result:
-    """Fly an experiment on this machine.
+    """Fly an experiment on this machine or in a Kubernetes cluster.
 
     Args:
         experiment: Name of a shipped experiment, or path of a YAML file.
         settings: Changes, as with `--set`: key -> value, such as `{"link.profile": "paper-p3"}`.
-            A value may be a list or a mapping.
         seed: Random seed; with None, the seed in the experiment.
-        mode: "virtual" flies in virtual time in this process, "local" in real time in five
-            processes.
-        out: Folder for the recording and the report. With None, "virtual" writes no file, and
-            "local" makes a new folder in runs/.
+        mode: "virtual": in virtual time in this process; "local": in real time in five processes;
+            "cluster": in the pods of a release.
+        out: Folder for the recording and the report. With None, "virtual" writes no file, and the
+            other modes make a new folder in runs/.
+        context: For "cluster": context of the kubeconfig, by default the current one.
+        namespace: For "cluster": namespace, by default that of the context.
+        release: For "cluster": name of the Helm release, which is installed if it is missing.
+        timeout: For "cluster": time limit for the pods to become ready [s].
 
-    Settings that do not fit together, such as a delay that the guard does not allow, cause a Python
-    warning before the flight.
+    Settings that do not fit together cause a Python warning before the flight.
 
     Returns:
         The result, also if the mission failed.
 
     Raises:
-        cloudrc.errors.BadInputError: If a name, key or value is invalid, or if `out` is not empty;
-            the text says where.
+        cloudrc.errors.BadInputError: If a name, key or value is invalid, or if `out` is not empty.
+        cloudrc.errors.CloudrcError: If nothing has flown: docs/python.md lists the reasons.
     """
-    if mode not in ("virtual", "local"):
-        raise BadInputError(f"mode {mode!r}: give 'virtual' or 'local'")
-    changes = dict(settings or {}) | ({} if seed is None else {"seed": seed})
-    resolved = load(str(experiment), _texts(changes))
+    if mode not in MODES:
+        raise BadInputError(f"mode {mode!r}: give 'virtual', 'local' or 'cluster'")
+    require(f"mode {mode}", MODES[mode])
+    resolved = load(str(experiment), _texts(settings or {}), seed)
     check_mode(resolved, mode)
     for text in advice_on(resolved):
         warnings.warn(text, stacklevel=2)
     if mode == "virtual" and out is None:
         return _result(fly_in_memory(resolved))
-    where = None if out is None else Path(out)
-    return _fly_into(
-        resolved, mode, new_folder(where, f"{resolved.name}-{mode}-seed{resolved.seed}")
-    )
+    if mode == "cluster":
+        return _fly_in_cluster(resolved, _Place(context, namespace, release, timeout), out)
+    return _fly_here(resolved, mode, out)
 
 
-def _fly_into(experiment: ResolvedExperiment, mode: str, folder: Path) -> Result:
-    """Fly with a recording and a report in a folder."""
-    from cloudrc.report.folder import read_run
-    from cloudrc.report.write import assess
+class _Place(NamedTuple):
+    """Where a flight in a cluster takes place; the fields are arguments of `fly`."""
+
+    context: str | None
+    namespace: str | None
+    release: str
+    timeout: float  # [s]
+
+
+def _fly_in_cluster(
+    experiment: ResolvedExperiment, place: _Place, out: str | Path | None
+) -> Result:
+    from cloudrc.cluster.client import connect
+    from cloudrc.cluster.flight import fly_in_cluster, refuse_flight, refuse_local_files
+
+    refuse_local_files(experiment)
+    release = connect(place.context, place.namespace, place.release)
+    refuse_flight(release)
+    folder = _folder(experiment, "cluster", out, "")  # the pods may refuse to fly
+    report = fly_in_cluster(experiment, folder, release, place.timeout)
+    if out is None:
+        point_to(folder, "latest")
+    return _read(experiment, folder, report)
+
+
+def _fly_here(experiment: ResolvedExperiment, mode: str, out: str | Path | None) -> Result:
     from cloudrc.runs.fly import fly
 
-    report = fly(experiment, mode, folder)
+    folder = _folder(experiment, mode, out, "latest")
+    return _read(experiment, folder, fly(experiment, mode, folder))
+
+
+def _folder(experiment: ResolvedExperiment, mode: str, out: str | Path | None, link: str) -> Path:
+    name = f"{experiment.name}-{mode}-seed{experiment.seed}"
+    return new_folder(None if out is None else Path(out), name, link)
+
+
+def _read(experiment: ResolvedExperiment, folder: Path, report: Mapping[str, Any]) -> Result:
+    """Return the result of a flight whose recording and report are in a folder."""
+    from cloudrc.report.folder import read_run
+    from cloudrc.report.write import assess
+
     found = _result(assess(*read_run(folder), experiment.report.metrics))
     # A recording holds velocities in another frame: the last bit of a number may differ.
     numbers = {name: entry["value"] for name, entry in report["numbers"].items()}
@@ -326,6 +367,56 @@ def identify(run: str | Path) -> dict[str, Any]:
     from cloudrc.runs.identify import identify as fit
 
     return describe(*fit(Path(run)))
+
+
+def verify(
+    target: str = "paper",
+    settings: Mapping[str, Any] | None = None,
+    *,
+    shaper: Literal["relay", "netem"] = "relay",
+    seconds: float | None = None,
+    mode: Literal["local", "cluster"] = "local",
+    context: str | None = None,
+    namespace: str | None = None,
+    release: str | None = None,
+) -> dict[str, Any]:
+    """Check by measurement that a link does what its profile says.
+
+    Args:
+        target: For "local": name or file of a link profile or an experiment.
+        settings: For "local": changes of the experiment: key -> value.
+        shaper: For "local": "relay", or "netem", which needs root.
+        seconds: Time to send probes [s], by default as long as needed; for "cluster", the time to
+            wait for a verdict [s].
+        mode: "local" starts a link on this machine and sends probes over it; "cluster" asks for the
+            verdict on the link of a release in flight.
+        context: For "cluster": context of the kubeconfig; with None, the current one.
+        namespace: For "cluster": namespace; with None, that of the context, or "default".
+        release: For "cluster": name of the release; with None, the only one of the namespace.
+
+    Returns:
+        The result of `cloudrc link verify -o json`: `verdict` ("believed", "not believed" or
+        "undecided"), `causes`, `notes` and, per direction, the measured quantities.
+
+    Raises:
+        cloudrc.errors.BadInputError: If there is no such profile, or if a value is invalid.
+        cloudrc.errors.MissingPrerequisiteError: If root rights or a kubeconfig are missing.
+        cloudrc.errors.TimedOutError: If the link or the pods do not answer in time.
+    """
+    from cloudrc.runs import verify as work
+
+    if mode == "local":
+        texts = _texts(settings or {})
+        return work.verify(target, texts, shaper=shaper, seconds=seconds)
+    if mode != "cluster":
+        raise BadInputError(f"mode {mode!r}: give 'local' or 'cluster'")
+    limit = work.check_seconds(seconds) or work.RELEASE_TIMEOUT
+    require("mode cluster", ("kube",))
+    from cloudrc.cluster.releases import choose_release
+
+    place = choose_release(context, namespace, release)
+    with work.forwarded_pods(place) as pods:
+        return work.verify_release(place.name, pods, limit)
 
 
 def _as_exception(stopped: CloudrcError) -> BaseException:

@@ -86,9 +86,9 @@ def test_a_flight_with_a_folder_equals_one_without(result, tmp_path, monkeypatch
         cloudrc.fly("steps", SHORT, out=tmp_path / "run")
 
 
-@pytest.mark.parametrize("mode", ["cluster", "real"])
+@pytest.mark.parametrize("mode", ["kubernetes", "real"])
 def test_an_unknown_mode_is_refused(mode):
-    with pytest.raises(BadInputError, match="give 'virtual' or 'local'"):
+    with pytest.raises(BadInputError, match="give 'virtual', 'local' or 'cluster'"):
         cloudrc.fly("steps", mode=mode)
 
 
@@ -176,10 +176,57 @@ def test_importing_cloudrc_imports_nothing_else():
 
 def test_the_example_of_the_page_runs(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "python.md").read_text()
-    (tmp_path / "page.py").write_text(re.search("```python\n(.*?)```", page, re.DOTALL)[1])
+    (tmp_path / "page.py").write_text(examples()[0])
     runpy.run_path("page.py")
     assert capsys.readouterr().out.startswith("success []\n")
+
+
+def examples():
+    page = (ROOT / "docs" / "python.md").read_text()
+    return re.findall("```python\n(.*?)```", page, re.DOTALL)
+
+
+@pytest.mark.process
+def test_the_examples_with_many_flights_run(tmp_path):
+    (tmp_path / "page.py").write_text("import cloudrc\n" + examples()[1])
+    command = [sys.executable, "page.py"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert (done.returncode, len(done.stdout.splitlines())) == (0, 5), done.stderr
+
+
+def test_the_velocity_loop_of_a_recording_is_identified(tmp_path, monkeypatch):
+    monkeypatch.setattr("cloudrc.report.write._write_page", lambda *given: None)
+    cloudrc.fly("steps", {"link.profile": "paper-p1"}, seed=1, out=tmp_path / "run")
+    model = cloudrc.identify(tmp_path / "run")
+    assert all(0.05 < each < 0.3 for each in model["time_constant"])
+    assert model == cloudrc.identify(tmp_path / "run" / "mission.mcap")
+    with pytest.raises(BadInputError, match="name a recording"):
+        cloudrc.identify(tmp_path / "other")
+
+
+@pytest.mark.process
+def test_a_link_is_verified(capfd):
+    settings = {"link.both.delay_ms": 100, "link.both.jitter_ms": 0}
+    found = cloudrc.verify("paper-p1", settings, seconds=2)
+    assert found["link"] == "paper-p1"
+    (mean,) = (r for r in found["directions"]["uplink"]["rows"] if r["name"] == "mean")
+    assert mean["asked"] == pytest.approx(0.1)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"target": "no-such"}, "no profile or experiment named 'no-such'"),
+        ({"settings": {"link.no": 1}}, "no such key|unknown|link"),
+        ({"seconds": 0.5}, "number from 1 to 3600"),
+        ({"mode": "virtual"}, "give 'local' or 'cluster'"),
+    ],
+)
+def test_a_wrong_verification_is_refused(given, text):
+    with pytest.raises(BadInputError, match=text):
+        cloudrc.verify(**given)
 
 
 @pytest.mark.full

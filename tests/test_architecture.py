@@ -23,6 +23,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "renamed": set(),
     "rounding": set(),
     "source": set(),
+    "text": set(),
     "endpoint": set(),
     "files": set(),
     "geometry": set(),
@@ -50,16 +51,16 @@ MAY_IMPORT: dict[str, set[str]] = {
     "metrics.definitions": set(),  # live metrics import it in every process, with no heavy library
     "report": {"assembly", "record", "metrics", "config", "geometry", "link", "files", "console"},
     "console": {"config", "exposition", "geometry", "metrics.definitions", "teleop", "world"},
-    "cluster": {"config", "link", "record", "report"},
+    "cluster": {"config", "link", "record", "report", "teleop"},
     "statistics": set(),
     "runs": {
-        *("assembly", "cloud", "config", "drivers", "files", "geometry", "link", "metrics"),
-        *("plugin_file", "plugins", "record", "report", "robots", "statistics", "teleop"),
-        "warnings",
+        *("assembly", "cloud", "cluster", "config", "drivers", "files", "geometry", "link"),
+        *("metrics", "plugin_file", "plugins", "record", "report", "robots", "statistics"),
+        *("teleop", "tunnel", "warnings"),
     },
     "assembly": EVERYTHING,
     "warnings": {"assembly", "config", "link", "robots", "tunnel"},
-    "api": {"runs", "config", "metrics", "record", "report"},
+    "api": {"runs", "cluster", "config", "metrics", "record", "report"},
     "exercise": {"cloud", "config", "plugins", "runs"},
     "faults": EVERYTHING,
     "cli": EVERYTHING,
@@ -79,7 +80,7 @@ SHARED_NAMES = {
     "Wind",
 }
 """Names that two public classes share today."""
-ALWAYS = {"errors", "messages", "records", "renamed", "source", "__version__", "rounding"}
+ALWAYS = {"errors", "messages", "records", "renamed", "rounding", "source", "text", "__version__"}
 
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it. Ruff checks
 # clocks, sockets, threads, signals, chance, and calls such as `eval` and `print` (pyproject.toml).
@@ -105,7 +106,10 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "importlib.metadata": ("plugins", "cli/", "report/"),
     "pkgutil": ("plugins",),
     # A compiler makes the machine code of the usual step.
-    "subprocess": ("drivers/", "cli/", "cluster/", "robots/pelican/native/library"),
+    "subprocess": (
+        *("drivers/", "cli/", "cluster/", "robots/pelican/native/library"),
+        "runs/link_under_test",
+    ),
     "multiprocessing": ("drivers/", "runs/workers"),
     "concurrent": ("cli/", "runs/workers", "cluster/", "teleop/"),
     **dict.fromkeys(("secrets", "uuid"), ("console/", "drivers/", "cluster/", "cli/")),

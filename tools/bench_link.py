@@ -23,8 +23,6 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.cli.link_verify import WAYS, find_experiment, measure, run_link
-from cloudrc.cli.output import table
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.shipped import names
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
@@ -33,6 +31,9 @@ from cloudrc.link.state import RELEASED_SUFFIX, STATE_FILE
 from cloudrc.link.traces import link_profile
 from cloudrc.link.verify.judge import Flow, Measurement
 from cloudrc.link.verify.probe import FIRST_PROBE, PROBE
+from cloudrc.runs.link_under_test import WAYS, measure, run_link
+from cloudrc.runs.verify import find_experiment
+from cloudrc.text import table
 from cloudrc.tunnel.codec import SIZES
 
 Array: TypeAlias = NDArray[np.float64]

@@ -16,8 +16,8 @@ from importlib.metadata import version
 import numpy as np
 
 from cloudrc.cli.bench import LOOP, STEP, flight, measure
-from cloudrc.cli.output import table
 from cloudrc.config.load import load_experiment
+from cloudrc.text import table
 
 SECONDS = 10
 """Duration of the flight of gym-pybullet-drones, in virtual time [s]."""

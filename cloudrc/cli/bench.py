@@ -14,10 +14,11 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.output import output_argument, print_result, table
+from cloudrc.cli.output import output_argument, print_result
 from cloudrc.cli.parser import read_count
 from cloudrc.errors import CloudrcError
 from cloudrc.runs.requirements import require
+from cloudrc.text import table
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment

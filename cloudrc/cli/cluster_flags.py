@@ -69,9 +69,7 @@ def flown_release(options: argparse.Namespace) -> Release:
 
     Raise a BadInputError if the namespace has several, a ClusterError if it has none.
     """
-    release = release_from_flags(options)
-    if options.release:
-        return release
-    from cloudrc.cluster.releases import only_release
+    require("a cluster", ("kube",))
+    from cloudrc.cluster.releases import choose_release
 
-    return only_release(release)
+    return choose_release(options.context, options.namespace, options.release)

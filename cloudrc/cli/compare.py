@@ -9,21 +9,13 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.output import (
-    FAILED_MARK,
-    FAILED_NOTE,
-    format_number,
-    output_argument,
-    print_or_drop,
-    print_result,
-    table,
-    warn,
-)
+from cloudrc.cli.output import output_argument, print_or_drop, print_result, warn
 from cloudrc.cli.parser import read_count
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.renamed import new_name
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import MODES, require
+from cloudrc.text import FAILED_MARK, FAILED_NOTE, format_number, table
 
 if TYPE_CHECKING:
     from cloudrc.runs.compare import Pairs

@@ -12,13 +12,14 @@ from pathlib import Path
 from secrets import token_hex
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from cloudrc.cli.client import Api, token_argument, token_file, token_reader
 from cloudrc.cli.cluster_flags import flown_release, release_arguments
 from cloudrc.cli.find_run import find_local_run
 from cloudrc.cli.output import open_page, print_line
 from cloudrc.cli.parser import whole_number
+from cloudrc.cli.token_flag import given_token, token_argument
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 from cloudrc.runs.requirements import require
+from cloudrc.teleop.client import Api
 
 if TYPE_CHECKING:
     from cloudrc.console.steering import LinkControl
@@ -157,7 +158,7 @@ def _local(options: argparse.Namespace) -> ConsoleTarget:
     found = find_local_run(options, flag="")
     if found is None:
         raise BadInputError("no run flies here; start one: cloudrc up")
-    run, url = found[0].resolve(), found[1]
+    run, url = found.folder.resolve(), found.url
 
     def read() -> dict[str, Any]:
         states = read_states(run / LINK_FOLDER)
@@ -194,15 +195,15 @@ def _in_pod(options: argparse.Namespace) -> ConsoleTarget:
         own.update({key: (float(value), time.monotonic()) for key, value in pairs})
         print_line(f"{LINK_SET}{' '.join(settings)}")
 
-    file = token_file(options)
-    operator = token_reader(file)
+    given = given_token(options)
+    operator = given or str
     note = " requested; only 'cloudrc console --cluster' carries it out"
     return ConsoleTarget(
         options.config,
         Api(options.api, operator),
         LinkControl(read, change, note),
         has_ended=lambda: False,
-        token=(lambda: page_token(operator())) if file else None,
+        token=(lambda: page_token(operator())) if given else None,
     )
 
 
@@ -218,8 +219,8 @@ def _show_release(options: argparse.Namespace) -> int:
     from cloudrc.console.access import PARAMETER, page_token
 
     def ready(address: str) -> None:
-        file = token_file(options)
-        operator = token_reader(file)() if file else operator_token(release)
+        given = given_token(options)
+        operator = given() if given else operator_token(release)
         url = f"{address}/?{PARAMETER}={page_token(operator)}"
         print_line(f"console: {url}")
         if not options.no_open:

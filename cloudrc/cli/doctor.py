@@ -11,10 +11,11 @@ import subprocess
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
-from cloudrc.cli.output import output_argument, paint, print_result, table
+from cloudrc.cli.output import output_argument, paint, print_result
 from cloudrc.drivers.machine import interpreter, usable_cores
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.runs.requirements import EXTRAS, MODES, missing
+from cloudrc.text import table
 
 FLYING, CLUSTER = ("local", "virtual"), ("cluster",)
 PROGRAMS = {

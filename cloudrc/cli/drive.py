@@ -14,11 +14,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from textwrap import wrap
 
-from cloudrc.cli.client import Api, describe_mission
-from cloudrc.cli.output import describe_point, escape, print_line
+from cloudrc.cli.output import print_line
 from cloudrc.console.steering import Steering
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Vector
+from cloudrc.teleop.client import Api, describe_mission
+from cloudrc.text import describe_point, escape
 
 SPEED = 0.5
 """Speed along each axis while its key is held [m/s]."""

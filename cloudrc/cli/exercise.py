@@ -20,12 +20,13 @@ from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
-from cloudrc.cli.output import escape, format_document, print_or_drop, print_result, table
+from cloudrc.cli.output import format_document, print_or_drop, print_result
 from cloudrc.cli.parser import add_verbs
 from cloudrc.errors import BadInputError
 from cloudrc.files import write_atomically
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import require
+from cloudrc.text import escape, table
 
 TIME_LIMIT = 60
 """Limit of each part [s] of processor time; the solution needs 2 s."""

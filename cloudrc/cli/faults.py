@@ -13,12 +13,13 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cloudrc.cli.output import escape, output_argument, paint, print_line, print_result, table
+from cloudrc.cli.output import output_argument, paint, print_line, print_result
 from cloudrc.cli.parser import add_verbs, number, read_count, whole_number
 from cloudrc.errors import BadInputError
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import require
 from cloudrc.runs.workers import map_in_order, take_each
+from cloudrc.text import escape, table
 
 if TYPE_CHECKING:
     from cloudrc.faults.measures import Outcome, Scenario

@@ -7,10 +7,11 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from cloudrc.cli.output import escape, format_document, output_argument, print_result, table
+from cloudrc.cli.output import format_document, output_argument, print_result
 from cloudrc.errors import BadInputError
 from cloudrc.files import write_atomically
 from cloudrc.runs.requirements import require
+from cloudrc.text import escape, table
 
 EPILOG = """\
 examples:

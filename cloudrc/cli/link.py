@@ -18,19 +18,13 @@ from statistics import fmean
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import release_arguments
-from cloudrc.cli.output import (
-    PICTURES,
-    escape,
-    output_argument,
-    print_line,
-    refuse_other_file,
-    table,
-)
+from cloudrc.cli.output import PICTURES, output_argument, print_line, refuse_other_file
 from cloudrc.cli.parser import add_verbs
 from cloudrc.errors import BadInputError
 from cloudrc.files import naming
 from cloudrc.link.verify import DEFAULT
 from cloudrc.runs.requirements import require
+from cloudrc.text import escape, table
 
 if TYPE_CHECKING:
     from cloudrc.config.schema import Direction, Profile

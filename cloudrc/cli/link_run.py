@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import random
-import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict
 from functools import lru_cache, partial
 from pathlib import Path
@@ -30,6 +28,7 @@ from cloudrc.cli.processes import (
     read_address,
 )
 from cloudrc.drivers.process import Feed, StopSignal
+from cloudrc.drivers.programs import Programs, run_tool
 from cloudrc.records import Counted
 
 if TYPE_CHECKING:
@@ -40,12 +39,7 @@ if TYPE_CHECKING:
     from cloudrc.link.state import LinkState
 
 EPILOG = ""
-TOOL_TIMEOUT = 5.0  # time limit of one call of tc or ip [s]
 RELEASED_PERIOD = 1.0  # time between two updates of the file with the lateness of datagrams [s]
-_BATCH = ("tc", "-s", "-j", "-force", "-batch", "-")
-_END = "qdisc show dev lo"
-"""Command that follows each command to tc. Its answer, a list of qdiscs, marks the end of the
-previous answer, because tc itself marks no end."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -205,78 +199,3 @@ def _find_netems(host: str, second: int) -> dict[str, Any]:
     from cloudrc.link.netem import find_netems
 
     return find_netems(run_tool, host)
-
-
-def run_tool(words: Sequence[str], environment: dict[str, str] | None = None) -> str:
-    """Run a program; return its output, or raise a MissingPrerequisiteError with the remedy."""
-    from cloudrc.link.netem import explain
-
-    try:
-        done = subprocess.run(
-            words, capture_output=True, text=True, env=environment, timeout=TOOL_TIMEOUT
-        )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise explain(words, str(error), missing=isinstance(error, FileNotFoundError)) from None
-    if done.returncode:
-        raise explain(words, done.stderr or done.stdout or f"exit code {done.returncode}")
-    return done.stdout
-
-
-class Programs:
-    """Runs tc and ip.
-
-    The steps of a time line have to take effect within milliseconds; starting a process takes
-    longer. Therefore one `tc -batch -` process stays open for all changes and lists of qdiscs.
-    """
-
-    def __init__(self, tables: str = "") -> None:
-        """Set `tables`, the folder in which tc looks for its tables of delays."""
-        self._environment = {**os.environ, "TC_LIB_DIR": tables, "LC_ALL": "C"}
-        self._tc: subprocess.Popen[str] | None = None
-
-    def __call__(self, words: Sequence[str]) -> str:
-        """Run a command of tc or ip; return its output, or raise a MissingPrerequisiteError."""
-        try:
-            match list(words):
-                case ["tc", "qdisc", "change", *_]:
-                    return self._ask(words[1:], lists=False)
-                case ["tc", "-s", "-j", "qdisc", "show", *_]:
-                    return self._ask(words[3:], lists=True)
-        except OSError:  # tc was killed or is too old for -batch: start it for this command alone
-            self.close()
-        return run_tool(words, self._environment)
-
-    def close(self) -> None:
-        """Kill the open tc process, if there is one."""
-        if self._tc is not None:
-            self._tc.kill()
-            self._tc.communicate()
-            self._tc = None
-
-    def _ask(self, words: Sequence[str], *, lists: bool) -> str:
-        """Send a command to the open tc process.
-
-        If the command `lists` qdiscs, return the list as JSON, else "". Raise an OSError if tc has
-        ended.
-        """
-        from cloudrc.link.netem import explain
-
-        if self._tc is None:
-            pipe, merged = subprocess.PIPE, subprocess.STDOUT
-            self._tc = subprocess.Popen(
-                _BATCH, 1, stdin=pipe, stdout=pipe, stderr=merged, text=True, env=self._environment
-            )
-        assert self._tc.stdin is not None
-        assert self._tc.stdout is not None
-        self._tc.stdin.write(f"{' '.join(words)}\n{_END}\n")
-        self._tc.stdin.flush()
-        said, listings, failed = list[str](), list[str](), False
-        while len(listings) < 1 + (lists and not failed):
-            if not (answer := self._tc.stdout.readline()):
-                raise OSError("tc has ended")
-            failed = failed or answer.startswith("Command failed")
-            (listings if answer.startswith("[") else said).append(answer.strip())
-        if failed:
-            errors = [one for one in said if not one.startswith("Command failed")]
-            raise explain(("tc", *words), " ".join(errors))
-        return listings[0] if lists else ""

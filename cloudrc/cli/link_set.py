@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.cluster_flags import flown_release, release_arguments
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
-from cloudrc.cli.output import escape, output_argument, print_line, print_result, table
+from cloudrc.cli.output import output_argument, print_line, print_result
 from cloudrc.cluster.client import ClusterError, Release
 from cloudrc.errors import BadInputError, MissingPrerequisiteError, TimedOutError
+from cloudrc.text import escape, table
 
 if TYPE_CHECKING:
     from cloudrc.cluster.link import LinkParts
@@ -60,7 +61,7 @@ def execute(options: argparse.Namespace) -> int:
     from cloudrc.drivers.local import LINK_FOLDER
 
     if (found := find_local_run(options)) is not None:
-        run, _ = found
+        run = found.folder
         edit, states = set_here(run / LINK_FOLDER, options.profile, options.settings, number)
         where = str(run)
         took = monotonic() - began

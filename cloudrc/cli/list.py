@@ -6,8 +6,9 @@ import argparse
 import re
 
 from cloudrc.cli.cluster_flags import cluster_arguments
-from cloudrc.cli.output import output_argument, paint, print_result, table
+from cloudrc.cli.output import output_argument, paint, print_result
 from cloudrc.errors import BadInputError
+from cloudrc.text import table
 
 PLUGINS = ("estimators", "predictors", "controllers", "metrics")
 YAML = ("experiments", "missions", "profiles", "robots")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from cloudrc.cli.output import STDOUT, discard_output, escape
+from cloudrc.cli.output import STDOUT, discard_output
 from cloudrc.cli.parser import build_parser
 from cloudrc.errors import (
     DISK_FULL,
@@ -16,6 +16,7 @@ from cloudrc.errors import (
 )
 from cloudrc.files import naming
 from cloudrc.runs.leave import limit_exit
+from cloudrc.text import escape
 
 INTERNAL = 70  # EX_SOFTWARE of sysexits.h: a bug of cloudrc, not of the user
 

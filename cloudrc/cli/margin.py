@@ -7,9 +7,10 @@ import sys
 from typing import TYPE_CHECKING
 
 from cloudrc.cli.compare import flight_arguments
-from cloudrc.cli.output import escape, output_argument, print_or_drop, print_result
+from cloudrc.cli.output import output_argument, print_or_drop, print_result
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import MODES, require
+from cloudrc.text import escape
 
 if TYPE_CHECKING:
     from cloudrc.runs.margin import ValueRange

@@ -9,45 +9,22 @@ import argparse
 import os
 import signal
 import sys
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from cloudrc.cli import client
-from cloudrc.cli.client import (
-    Api,
-    UnreachableError,
-    describe_mission,
-    describe_verdict,
-    find_mission,
-    mission_path,
-    release_api,
-    settle_mission,
-    token_file,
-    token_reader,
-)
 from cloudrc.cli.cluster_flags import flown_release, release_arguments, timeout_argument
 from cloudrc.cli.find_run import find_local_run, no_run_error, run_argument
-from cloudrc.cli.output import (
-    describe_point,
-    escape,
-    output_argument,
-    print_line,
-    print_result,
-    table,
-)
+from cloudrc.cli.output import output_argument, print_line, print_result
 from cloudrc.cli.parser import add_verbs, number
-from cloudrc.drivers.machine import Deadline
-from cloudrc.errors import (
-    BadInputError,
-    CloudrcError,
-    MissingPrerequisiteError,
-    TimedOutError,
-)
+from cloudrc.cli.token_flag import given_token, token_argument
+from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError
 from cloudrc.runs.interrupts import interrupt_on_signals
+from cloudrc.runs.missions import MissionFollower, read_mission
+from cloudrc.teleop.client import Api, describe_mission, describe_verdict, mission_path
+from cloudrc.text import describe_point, escape, table
 
 if TYPE_CHECKING:
     from cloudrc.cluster.client import Release
@@ -76,18 +53,11 @@ robot falls. After an emergency stop or a landing, 'acknowledge' allows the next
 mission. An API in a network asks for a token: give --token-file or
 CLOUDRC_TOKEN_FILE; for a release the command reads its Secret with your rights
 in the cluster. A run that is found on this machine needs no token."""
-BEGINS = ("queued", "starting")
-"""States of a mission that nobody has followed yet."""
 READS = ("list", "status", "logs")
 """Verbs that do not steer the robot."""
-POLL_PERIOD = 0.5
-"""Time between two requests for the state of a mission [s]."""
 RUN_TIMEOUT, API_TIMEOUT = 10.0, 180.0
 """Time limits for an API that does not answer [s]: for a user's command, and for the pod of a Job.
 The second limit is longer, because the pod of the API may still have to load its image."""
-TURN_MAX = 30.0
-"""Longest time that a request and the pause after the request take [s]. If more time has passed,
-this process was suspended; the suspension does not count towards a time limit."""
 LEASE = 60.0
 """Default lease of a mission that `mission fly` posts [s]."""
 TERMINATED = 143
@@ -96,9 +66,6 @@ ignores this code."""
 TERMINATION_LOG = Path("/dev/termination-log")
 """File in a pod for the pod's last message, which `kubectl describe` shows after the pod's end."""
 
-_Answer = TypeVar("_Answer")
-Json = dict[str, Any]
-
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
@@ -106,7 +73,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     for name, verb in verbs.items():
         url = "http://HOST:PORT[/PATH] or unix:PATH of a run or release"
         verb.add_argument("--api", metavar="URL", help=url)
-        client.token_argument(verb)
+        token_argument(verb)
         if name != "fly":
             run_argument(verb)
             release_arguments(verb)
@@ -144,88 +111,17 @@ def execute(options: argparse.Namespace) -> int:
     verb: str = options.verb
     _, carry_out = VERBS[verb]
     if options.api:
-        return carry_out(options, Api(options.api, token_reader(token_file(options))))
+        return carry_out(options, Api(options.api, given_token(options) or str))
     if verb == "fly":
         raise BadInputError("fly needs --api; without a Job use: cloudrc mission run FILE")
 
     if (found := find_local_run(options, steers=verb not in READS)) is not None:
-        run, url = found
-        return carry_out(options, Api(url, place=str(run)))  # it needs no token: send none
+        api = Api(found.url, place=str(found.folder))  # it needs no token: send none
+        return carry_out(options, api)
     if verb == "run":
         return _run_job(options)
     with _forwarded_api(options) as forwarded:
         return carry_out(options, forwarded)
-
-
-def read_mission(name: str, shown: str = "") -> Json:
-    """Read a mission file, or a mission that cloudrc ships; the API checks the content later.
-
-    `shown` is the mission's name in lists and messages, by default the name of the file.
-
-    Raises:
-        BadInputError: If the file does not exist, or if it contains no mission.
-    """
-    from cloudrc.config import shipped
-
-    mission = dict(shipped.read("mission", name, Path()).tree)
-    if mission.pop("steps", None) is not None:
-        raise BadInputError(
-            f"{name}: steps are for experiments; fly them with 'cloudrc run', or give waypoints"
-        )
-    return {"name": Path(name).stem, **mission, **({"name": shown} if shown else {})}
-
-
-class MissionFollower:
-    """Follows one mission until its verdict, even if the API restarts in a new pod meanwhile."""
-
-    def __init__(self, api: Api, patience: float, lease: float = 0.0) -> None:
-        """Store the API; `patience` is the time limit for an API that does not answer [s].
-
-        After this time the methods raise a TimedOutError; other errors are those of `Api.post`.
-        Teleop cancels a posted mission `lease` [s] after the end of this follower; 0: never.
-        """
-        self._api, self._patience, self._lease, self._last_event = api, patience, lease, 0
-
-    def post(self, mission: Mapping[str, Any]) -> str:
-        """Post a mission; return its id."""
-        leased = {**mission, "lease_s": self._lease} if self._lease else mission
-        view = self._retry(lambda: self._api.post("/v1/missions", leased))
-        text = f"mission {view['id']}: {view['state']}, waypoints: {view['waypoints']}"
-        if view["state"] not in BEGINS:
-            text = f"following {describe_mission(view)}"
-        elif mission.get("start", "spawn") == "spawn":
-            text += "; the robot is set back to its spawn at the start"
-        self._api.say(text)
-        return str(view["id"])
-
-    def follow(self, mission_id: str) -> Json:
-        """Print the events of a mission until it has ended; return its verdict."""
-        path = mission_path(mission_id)
-        while True:
-            view = self._retry(
-                lambda: self._api.post(f"{path}/renew") if self._lease else self._api.get(path)
-            )
-            for event in view["events"]:
-                if event["id"] > self._last_event:
-                    self._last_event = event["id"]
-                    print_line(f"{event['time_s']:7.2f} s  {event['text']}")
-            if view["verdict"] is not None:
-                return dict(view["verdict"])
-            time.sleep(POLL_PERIOD)
-
-    def _retry(self, request: Callable[[], _Answer]) -> _Answer:
-        """Repeat a request until the API answers; raise a TimedOutError if this takes too long."""
-        deadline, reported = Deadline(self._patience, TURN_MAX), False
-        while True:
-            try:
-                return request()
-            except UnreachableError as error:
-                if deadline.passed():
-                    raise TimedOutError(f"{error}; gave up after {self._patience:g} s") from None
-                if not reported:
-                    print_line(f"{error}; waiting")
-                    reported = True
-            time.sleep(POLL_PERIOD)
 
 
 def _run(options: argparse.Namespace, api: Api) -> int:
@@ -234,7 +130,7 @@ def _run(options: argparse.Namespace, api: Api) -> int:
     After Ctrl-C the mission goes on.
     """
     interrupt_on_signals()
-    follower = MissionFollower(api, RUN_TIMEOUT)
+    follower = MissionFollower(api, RUN_TIMEOUT, tell=print_line)
     order = read_mission(options.mission, options.name)
     mission_id = follower.post({**order, "queue": options.queue})
     try:
@@ -255,7 +151,7 @@ def _fly(options: argparse.Namespace, api: Api) -> int:
     who runs this command by hand cancels the mission at once.
     """
     signal.signal(signal.SIGTERM, _leave)
-    follower = MissionFollower(api, API_TIMEOUT, options.lease)
+    follower = MissionFollower(api, API_TIMEOUT, options.lease, print_line)
     order = {**read_mission(options.mission), "key": options.key}
     mission_id = follower.post({**order, "queue": options.queue})
     try:
@@ -285,6 +181,11 @@ def _write_last_words(text: str) -> None:
             TERMINATION_LOG.write_text(f"{escape(text)}\n", encoding="utf-8")
 
 
+def _say(api: Api, text: str) -> None:
+    """Print a text after the name of the run or release; without a name, only the text."""
+    print_line(f"{api.place}: {text}" if api.place else text)
+
+
 def _list(options: argparse.Namespace, api: Api) -> int:
     missions = api.get("/v1/missions")["missions"]
     if options.output != "table":
@@ -296,7 +197,7 @@ def _list(options: argparse.Namespace, api: Api) -> int:
         verdict = describe_verdict(each["verdict"]) if each["verdict"] else ""
         rows.append((each["id"], each["name"], each["state"], done, verdict))
     if api.place or not missions:
-        api.say("missions, the oldest first" if missions else "no missions yet")
+        _say(api, "missions, the oldest first" if missions else "no missions yet")
     if missions:
         print(table(rows))
     return 0
@@ -308,7 +209,7 @@ def _status(options: argparse.Namespace, api: Api) -> int:
         print_result(options.output, state, "")
         return 0
     mission = state if options.id else state["mission"]
-    api.say(describe_mission(mission) if mission else "no mission is under way")
+    _say(api, describe_mission(mission) if mission else "no mission is under way")
     if options.id:
         _print_history(state)
         return 0
@@ -323,7 +224,7 @@ def _cancel(options: argparse.Namespace, api: Api) -> int:
     if mission is None:
         raise BadInputError("no mission is under way; 'cloudrc mission list' shows all")
     cancelled = api.post(f"{mission_path(mission['id'])}/cancel")
-    api.say(f"{_describe_stay(api)}; {describe_mission(cancelled)}")
+    _say(api, f"{_describe_stay(api)}; {describe_mission(cancelled)}")
     return 0
 
 
@@ -349,11 +250,11 @@ def _order(options: argparse.Namespace, api: Api) -> int:
     else:
         mission = api.post(f"/v1/{options.verb}")
         if options.verb == "resume" and mission["by_hand"]:
-            api.say(f"the drive ends, and the robot holds; mission {mission['id']} is then done")
+            _say(api, f"the drive ends, and the robot holds; mission {mission['id']} is then done")
             return 0
         action = f"flying to waypoint {mission['waypoint'] + 1} of {mission['waypoints']}"
         action = _describe_stay(api) if options.verb == "hold" else action
-    api.say(f"{action}; {describe_mission(mission)}")
+    _say(api, f"{action}; {describe_mission(mission)}")
     return 0
 
 
@@ -373,7 +274,7 @@ def _describe_stay(api: Api) -> str:
 
 def _estop(options: argparse.Namespace, api: Api) -> int:
     mission = api.post("/v1/estop")["id"]
-    api.say("emergency stop: sent, and repeated until the rotors have stopped")
+    _say(api, "emergency stop: sent, and repeated until the rotors have stopped")
     if mission:
         print_line(f"mission {mission} has failed")
     return 0
@@ -381,7 +282,7 @@ def _estop(options: argparse.Namespace, api: Api) -> int:
 
 def _acknowledge(options: argparse.Namespace, api: Api) -> int:
     api.post("/v1/acknowledge")
-    api.say("acknowledged: the next mission may fly; a landing close to the ground ends first")
+    _say(api, "acknowledged: the next mission may fly; a landing close to the ground ends first")
     print(
         "after a stop or a touchdown the robot takes off only once it is at rest, and at least "
         "0.5 m inside the fence"
@@ -415,7 +316,7 @@ VERBS: dict[str, tuple[str, Callable[[argparse.Namespace, Api], int]]] = {
 """Verb -> help line, and function that carries it out."""
 
 
-def _print_robot(seen: Json | None, cloud_age: float | None) -> None:
+def _print_robot(seen: dict[str, Any] | None, cloud_age: float | None) -> None:
     """Print the robot's newest known state, and the age of cloud's last message [s]."""
     heard = "never" if cloud_age is None else f"{cloud_age:.1f} s ago"
     if seen is None:
@@ -435,13 +336,13 @@ def _print_robot(seen: Json | None, cloud_age: float | None) -> None:
     print_line(f"next: {seen['next_step']}")
 
 
-def _print_history(mission: Json) -> None:
+def _print_history(mission: dict[str, Any]) -> None:
     if left_out := mission.get("events_left_out", 0):
         print_line(f"{mission['id']:<4}{left_out} earlier events are not shown")
     _print_events(mission["events"])
 
 
-def _print_events(events: Iterable[Json]) -> None:
+def _print_events(events: Iterable[dict[str, Any]]) -> None:
     for event in events:
         print_line(f"{event['mission']:<4}{event['time_s']:8.2f} s  {event['text']}")
 
@@ -456,47 +357,24 @@ def _release(options: argparse.Namespace) -> Release:
 @contextmanager
 def _forwarded_api(options: argparse.Namespace) -> Iterator[Api]:
     """Yield the API of a release, which is reachable over a forwarded port while the block runs."""
-    with release_api(_release(options), token_file(options)) as api:
+    from cloudrc.cluster.missions import release_api
+
+    with release_api(_release(options), given_token(options)) as api:
         if options.verb in READS and not (options.context or options.namespace or options.release):
             print_line(f"cloudrc: using {api.place}", sys.stderr)
         yield api
 
 
 def _run_job(options: argparse.Namespace) -> int:
-    """Create the Job of a mission, follow its log, and return the exit code of the Job."""
+    """Create the Job of a mission, follow its log, and return the exit code of its verdict."""
     interrupt_on_signals()
     mission, release = read_mission(options.mission, options.name), _release(options)
-    from cloudrc.cluster.client import NoAnswerError
-    from cloudrc.cluster.flight import wait_ready
-    from cloudrc.cluster.jobs import JobGoneError, follow, run_job
-    from cloudrc.cluster.pods import find_deployment
+    from cloudrc.cluster.flight import begin_job, cancelling_command, follow_job
 
-    find_deployment(release, "cloud")
-    # After 'helm install' without --wait, the release needs some seconds to become ready.
-    wait_ready(release, timeout=options.timeout, tell=print_line)
-    job = run_job(release, mission, queue=options.queue)
-    print_line(f"Job {job} on release '{release.name}' in namespace '{release.namespace}'")
+    job = begin_job(release, mission, print_line, options.timeout, queue=options.queue)
     try:
-        return follow(release, job, print_line).exit_code
-    except JobGoneError as gone:
-        words, code = settle_mission(release, gone.key, str(gone))
-        print_line(words)
-        return code
-    except NoAnswerError as error:
-        log = f"{release.kubectl} logs --follow job/{job}"
-        raise NoAnswerError(f"{error}; Job {job} goes on without this command: {log}") from None
+        return follow_job(release, job, print_line)
     except KeyboardInterrupt:
-        remedy = _cancelling_command(release, job)
+        remedy = cancelling_command(release, job)
         print_line(f"Job {job} is still running; cancel its mission: {remedy}", sys.stderr)
         raise
-
-
-def _cancelling_command(release: Release, job: str) -> str:
-    """Return the command that cancels the mission of a Job."""
-    from cloudrc.cluster.jobs import job_key
-
-    with suppress(CloudrcError), release_api(release) as api:
-        if mission := find_mission(api, job_key(release, job)):
-            flags = " ".join([*release.flags, f"--release={release.name}"])
-            return f"cloudrc mission cancel {mission['id']} {flags}"
-    return f"{release.kubectl} delete job {job}"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from cloudrc.cli.output import print_line
 from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
-from cloudrc.drivers.realtime import Address, Peer, bind, split_address
+from cloudrc.drivers.realtime import Address, Peer, bind, show_address, split_address
 from cloudrc.errors import BadInputError
 from cloudrc.files import warn_if_readable
 from cloudrc.link.state import STATE_FILE
@@ -106,12 +106,6 @@ def _has_ipv6() -> bool:
     except OSError:
         return False
     return True
-
-
-def show_address(where: Address) -> str:
-    """Format an address as HOST:PORT, with an IPv6 address in brackets."""
-    host, port = where
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def read_size(text: str) -> float:

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from cloudrc.cli.output import escape, is_live, print_or_drop
+from cloudrc.cli.output import is_live, print_or_drop
 from cloudrc.drivers.process import in_words
 from cloudrc.messages import NEVER_NS, GuardState, Vector
 from cloudrc.records import (
@@ -24,6 +24,7 @@ from cloudrc.records import (
     Record,
     TelemetrySent,
 )
+from cloudrc.text import escape
 
 if TYPE_CHECKING:
     from cloudrc.runs.flight import Row

@@ -9,9 +9,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.output import escape, output_argument, print_result
+from cloudrc.cli.output import output_argument, print_result
 from cloudrc.errors import BadInputError, describe_error
 from cloudrc.runs.requirements import require
+from cloudrc.text import escape
 
 if TYPE_CHECKING:
     from cloudrc.record.columns import Message, Recording

@@ -8,10 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from cloudrc.cli.client import release_api
 from cloudrc.cli.cluster_flags import release_from_flags
-from cloudrc.cli.output import print_line, print_result, table
+from cloudrc.cli.output import print_line, print_result
+from cloudrc.cluster.missions import release_api
 from cloudrc.errors import CloudrcError
+from cloudrc.text import table
 
 if TYPE_CHECKING:
     from cloudrc.cluster.client import Release

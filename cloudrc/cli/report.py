@@ -10,10 +10,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cloudrc.cli.output import escape, output_argument, paint, print_line, print_result, table
+from cloudrc.cli.output import output_argument, paint, print_line, print_result
 from cloudrc.cli.parser import figure_arguments
 from cloudrc.errors import BadInputError
 from cloudrc.runs.requirements import missing, require
+from cloudrc.text import escape, table
 
 COLOURS = {"success": "green", "failure": "red", "invalid": "yellow", "interrupted": "yellow"}
 EPILOG = """\

@@ -17,7 +17,6 @@ from cloudrc.cli.cluster_flags import (
     timeout_argument,
 )
 from cloudrc.cli.output import (
-    escape,
     is_live,
     output_argument,
     print_line,
@@ -31,6 +30,7 @@ from cloudrc.errors import BadInputError, CloudrcError, NothingFlownError
 from cloudrc.runs.folder import new_folder, point_to
 from cloudrc.runs.interrupts import interrupt_on_signals, is_interrupted
 from cloudrc.runs.requirements import MODES, require
+from cloudrc.text import escape
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
@@ -130,9 +130,6 @@ def fly_once(options: argparse.Namespace, mode: str, ready: Ready | None = None)
         nothing = isinstance(error, NothingFlownError)  # the regular end of a session by a signal
         if isinstance(error, BadInputError) and is_interrupted() and not nothing:
             error = KeyboardInterrupt()  # a library has converted the exception
-        if in_cluster:  # the folder stays empty until the mission has flown
-            with contextlib.suppress(OSError):
-                folder.rmdir()
         if folder.exists():
             text = f"the recording is in {folder}"
             if isinstance(error, KeyboardInterrupt):
@@ -172,19 +169,13 @@ def _local_flight(
 def _cluster_flight(
     experiment: ResolvedExperiment, options: argparse.Namespace, stream: TextIO
 ) -> Flight:
-    from cloudrc.cli.client import Api, settle_mission
-    from cloudrc.cluster.client import program
-    from cloudrc.cluster.flight import fly_in_cluster, refuse_local_files, refuse_second_flight
+    from cloudrc.cluster.flight import fly_in_cluster, refuse_flight, refuse_local_files
 
     refuse_local_files(experiment)
     release = release_from_flags(options)
-    for name in ("helm", "kubectl"):
-        program(name)
-    refuse_second_flight(release, lambda url, token: Api(url, lambda: token).get("/v1/state"))
+    refuse_flight(release)
 
     def tell(text: str) -> None:
         print_line(f"  {text}", stream)
 
-    return lambda folder: fly_in_cluster(
-        experiment, folder, release, options.timeout, tell, settle_mission
-    )
+    return lambda folder: fly_in_cluster(experiment, folder, release, options.timeout, tell)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import subprocess
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -16,13 +17,15 @@ from shlex import quote
 from threading import Thread
 from typing import IO, Any
 
-from cloudrc.cli.find_run import ask_if_unclear, run_argument, short
-from cloudrc.cli.output import escape, print_line
+from cloudrc.cli.find_run import run_argument
+from cloudrc.cli.output import print_line
 from cloudrc.cli.processes import Command
 from cloudrc.cli.run import experiment_arguments, fly_once
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, NothingFlownError
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import MODES, require
+from cloudrc.runs.under_way import ask_if_unclear, short
+from cloudrc.text import escape
 
 Say = Callable[[str], None]
 """Function that prints a line above the status line of a flight."""
@@ -132,7 +135,8 @@ def _down(options: argparse.Namespace) -> int:
         text = "start one: cloudrc up; a flight of 'cloudrc run' ends by Ctrl-C there"
         raise MissingPrerequisiteError(f"no session runs here; {text}")
     else:
-        ask_if_unclear(sessions, steers=True)
+        if note := ask_if_unclear(sessions, steers=True):
+            print_line(f"cloudrc: {note}", sys.stderr)
         (run,) = sessions
     end_session(run, DOWN_LIMIT)
     name = short(run)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import sys
 from collections import Counter
@@ -15,22 +14,15 @@ from typing import Any
 from cloudrc.cli.cluster_flags import release_from_flags
 from cloudrc.cli.mission import TERMINATION_LOG
 from cloudrc.cli.output import (
-    FAILED_MARK,
-    FAILED_NOTE,
     PICTURES,
-    escape,
-    format_number,
     print_line,
     print_or_drop,
     print_result,
     refuse_other_file,
-    table,
     warn,
 )
 from cloudrc.cli.progress import PlanView, SeedsView, SweepView
 from cloudrc.cli.report import print_traceback, summary
-from cloudrc.cluster import batch
-from cloudrc.cluster.client import ClusterError
 from cloudrc.cluster.pods import refuse_local_files
 from cloudrc.config.document import write_yaml
 from cloudrc.config.overrides import parse_settings
@@ -41,11 +33,13 @@ from cloudrc.runs import store, sweep
 from cloudrc.runs.experiment import load, refuse_seed
 from cloudrc.runs.flight import Row
 from cloudrc.runs.folder import new_folder
-from cloudrc.runs.grid import Grid, SweepPoint, pack, read_flight, read_grid, unpack
+from cloudrc.runs.grid import Grid, SweepPoint, read_flight, read_grid, unpack
 from cloudrc.runs.lock import lock_folder
+from cloudrc.runs.pods import PodSettings, fly_in_pods
 from cloudrc.runs.requirements import MODES, require
 from cloudrc.runs.workers import map_in_order, take_each
 from cloudrc.source import code_hash
+from cloudrc.text import FAILED_MARK, FAILED_NOTE, escape, format_number, table
 
 
 def run(options: argparse.Namespace) -> int:
@@ -74,7 +68,7 @@ def _run_locked(
     view = SweepView(stream, f"{grid.points[0].name}: {head}", len(missing))
     with closing(view):
         if options.on:
-            flown = rows_from_pods(options, grid, missing)
+            flown = _fly_in_pods(options, grid, missing)
         else:
             flown = sweep.fly_missing(work, folder, options.jobs, options.record)
         rows, stopped = sweep.keep(flown, folder, grid, shard, work.before, view.see)
@@ -184,42 +178,15 @@ def _verdicts(rows: Iterable[Row]) -> str:
 # Sweeps in pods, which run `cloudrc sweep rows`.
 
 
-def rows_from_pods(
+def _fly_in_pods(
     options: argparse.Namespace, grid: Grid, flights: Sequence[SweepPoint]
 ) -> Generator[Row]:
-    """Fly flights of a grid on a cluster, and yield each row once.
-
-    Each pod of a Job flies a share (shard) of the flights and logs their rows. If a pod is deleted
-    just after its last flight, its log is lost, but Kubernetes counts its shard as complete.
-    Therefore further Jobs fly the flights without a row.
-
-    Raises:
-        ClusterError: If a Job fails or yields no row, or if a pod will never run.
-    """
+    pods = PodSettings(options.shards, options.image, options.cpu, options.queue)
 
     def tell(text: str) -> None:
         print_line(f"  {text}", sys.stderr)
 
-    release = release_from_flags(options)
-    every = "".join(grid.flights).encode() + str(options.shards).encode()
-    name = f"sweep-{hashlib.sha256(every).hexdigest()[:12]}"
-    words = {"image": options.image, "cpu": options.cpu, "queue": options.queue}
-    missing = {flight.key: flight for flight in flights}
-    while missing:
-        before = len(missing)
-        batch.start(release, name, pack(missing.values()), options.shards, **words)
-        tell(
-            f"Job '{name}' {release.where}, {options.shards} pods; it goes on without this command"
-        )
-        for line in batch.read_lines(release, name, tell):
-            row = store.parse_row(line)
-            if row is not None and missing.pop(row["key"], None) is not None:
-                yield row
-        if len(missing) == before:
-            text = "the same command flies them; is the image of this version of cloudrc?"
-            raise ClusterError(f"the pods printed no row of {before} flights; {text}")
-        if missing:
-            tell(f"the rows of {len(missing)} flights were lost with their pods")
+    return fly_in_pods(release_from_flags(options), pods, grid, flights, tell)
 
 
 def print_rows(options: argparse.Namespace) -> int:

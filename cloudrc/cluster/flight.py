@@ -14,22 +14,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cluster import pods
-from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, chart_folder, run
+from cloudrc.cluster.client import (
+    COMPONENTS,
+    ClusterError,
+    NoAnswerError,
+    Release,
+    chart_folder,
+    program,
+    run,
+)
 from cloudrc.cluster.incidents import explain_refusal
 from cloudrc.cluster.jobs import JobGoneError, delete_job, failure_of, follow, job_key, run_job
+from cloudrc.cluster.missions import release_api, settle_mission
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError, TimedOutError
+from cloudrc.teleop.client import find_mission
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
     from cloudrc.record.columns import Recording
 
 Tell = Callable[[str], None]
-Ask = Callable[[str, str], Any]
-"""Function that gets the state of robot and missions from the API with a given URL and token."""
 
-Settle = Callable[[Release, str, str], tuple[str, int]]
-"""Function that cancels the mission with a given key, for a given reason, if it has not ended; it
-returns a sentence about the mission, and the exit code of its verdict."""
 
 LOOK_PERIOD = 1.0
 """Time between two requests for the state of the pods [s]."""
@@ -143,10 +148,10 @@ def _secret_in(why: str, pod: Any) -> str:
     return ""
 
 
-def refuse_second_flight(release: Release, ask: Ask) -> None:
+def refuse_second_flight(release: Release) -> None:
     """Raise a ClusterError if a Job or mission is under way: installing would replace the pods.
 
-    `ask` queries the API. If the API does not answer, return: installing may repair the release.
+    If the API does not answer, return: installing may repair the release.
     """
     for job in release.find("jobs", "mission"):
         if failure_of(job) is None:
@@ -156,8 +161,8 @@ def refuse_second_flight(release: Release, ask: Ask) -> None:
                 f"it, end it: {end} {name}, or fly on a release of your own: --release NAME"
             )
     mission = None
-    with suppress(CloudrcError), pods.api_url(release) as url:
-        mission = ask(url, pods.operator_token(release))["mission"]
+    with suppress(CloudrcError), release_api(release) as api:
+        mission = api.get("/v1/state")["mission"]
     if mission is not None:
         flags = " ".join([*release.flags, f"--release={release.name}"])
         cancel = f"cloudrc mission cancel {mission['id']} {flags}"
@@ -167,15 +172,65 @@ def refuse_second_flight(release: Release, ask: Ask) -> None:
         )
 
 
+def begin_job(
+    release: Release, mission: Mapping[str, Any], tell: Tell, timeout: float, *, queue: bool
+) -> str:
+    """Create the Job of a mission on a release that is ready; return the Job's name.
+
+    After `helm install` without --wait, the release needs some seconds: wait at most `timeout` [s].
+    """
+    pods.find_deployment(release, "cloud")
+    wait_ready(release, timeout=timeout, tell=tell)
+    job = run_job(release, mission, queue=queue)
+    tell(f"Job {job} on release '{release.name}' in namespace '{release.namespace}'")
+    return job
+
+
+def follow_job(release: Release, job: str, tell: Tell) -> int:
+    """Follow the Job of a mission to its end, and return the exit code of the verdict.
+
+    If the Job no longer follows its mission, cancel the mission.
+
+    Raises:
+        NoAnswerError: If the API server no longer answers; the Job goes on.
+    """
+    try:
+        return follow(release, job, tell).exit_code
+    except JobGoneError as gone:
+        words, code = settle_mission(release, gone.key, str(gone))
+        tell(words)
+        return code
+    except NoAnswerError as error:
+        log = f"{release.kubectl} logs --follow job/{job}"
+        raise NoAnswerError(f"{error}; Job {job} goes on without this command: {log}") from None
+
+
+def cancelling_command(release: Release, job: str) -> str:
+    """Return the command that cancels the mission of a Job."""
+    with suppress(CloudrcError), release_api(release) as api:
+        if mission := find_mission(api, job_key(release, job)):
+            flags = " ".join([*release.flags, f"--release={release.name}"])
+            return f"cloudrc mission cancel {mission['id']} {flags}"
+    return f"{release.kubectl} delete job {job}"
+
+
+def refuse_flight(release: Release) -> None:
+    """Raise an error if no flight can begin on a release now; nothing is changed yet."""
+    for name in ("helm", "kubectl"):
+        program(name)
+    refuse_second_flight(release)
+
+
 def fly_in_cluster(
     experiment: ResolvedExperiment,
     folder: Path,
     release: Release,
     timeout: float,
-    tell: Tell,
-    settle: Settle,
+    tell: Tell = lambda text: None,
 ) -> dict[str, Any]:
     """Fly one experiment in a cluster, fill its run folder, and return the report.
+
+    If nothing flies, remove the folder.
 
     Args:
         experiment: A complete and checked experiment.
@@ -183,15 +238,18 @@ def fly_in_cluster(
         release: The Helm release to use; it is installed if it is missing, and stays afterwards.
         timeout: Time limit for the release to become ready [s].
         tell: Receives the progress, one line per call.
-        settle: Cancels the mission after Ctrl-C, or if its Job is gone.
     """
     from cloudrc.config.load import dump
 
-    began = time.monotonic()
-    install(release, chart_values(experiment, current_values(release)), timeout, tell)
-    took = time.monotonic() - began
-    tell(f"release '{release.name}' {release.where} is ready after {took:.0f} s")
-    interrupted = not _fly(experiment, release, tell, settle)
+    try:
+        began = time.monotonic()
+        install(release, chart_values(experiment, current_values(release)), timeout, tell)
+        took = time.monotonic() - began
+        tell(f"release '{release.name}' {release.where} is ready after {took:.0f} s")
+        interrupted = not _fly(experiment, release, tell)
+    except (CloudrcError, KeyboardInterrupt):
+        folder.rmdir()  # nothing has flown
+        raise
     (folder / "config.yaml").write_text(dump(experiment), encoding="utf-8")
     mission = fetch_all(release, folder, tell, want_end=not interrupted)
     return _report(experiment, folder, mission, interrupted)
@@ -225,7 +283,7 @@ def refuse_local_files(experiment: ResolvedExperiment) -> None:
         )
 
 
-def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell, settle: Settle) -> bool:
+def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell) -> bool:
     """Fly the experiment's mission by a Job; return False if it was interrupted."""
     flown = {"start", "waypoints", "carrot"}
     mission = experiment.mission.model_dump(mode="json", include=flown)
@@ -235,14 +293,14 @@ def _fly(experiment: ResolvedExperiment, release: Release, tell: Tell, settle: S
     try:
         ended = follow(release, job, tell)
     except JobGoneError as gone:
-        words, code = settle(release, gone.key, str(gone))
+        words, code = settle_mission(release, gone.key, str(gone))
         tell(words)
         return code != InterruptedRunError.exit_code
     except KeyboardInterrupt:
         tell("cancelling the mission")
         try:
             # The pod of a deleted Job does not cancel: teleop would fly on for the mission's lease.
-            tell(settle(release, job_key(release, job), "interrupted")[0])
+            tell(settle_mission(release, job_key(release, job), "interrupted")[0])
             delete_job(release, job)
         except CloudrcError as error:
             tell(f"cannot cancel: {error}")

@@ -8,7 +8,13 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from cloudrc.cluster.client import ClusterError, NotFoundError, Release
+from cloudrc.cluster.client import (
+    DEFAULT_RELEASE,
+    ClusterError,
+    NotFoundError,
+    Release,
+    connect,
+)
 from cloudrc.errors import BadInputError
 
 INSTANCE = "app.kubernetes.io/instance"
@@ -109,6 +115,20 @@ def only_release(release: Release) -> Release:
     if places:
         raise several_releases(release, [place.name for place in places])
     raise no_release(release, f"no release {release.where}")
+
+
+def choose_release(
+    context: str | None = None, namespace: str | None = None, name: str | None = None
+) -> Release:
+    """Select the release `name`; with None, the only one of the namespace.
+
+    Raises:
+        MissingPrerequisiteError: If there is no valid kubeconfig.
+        BadInputError: If the namespace has several releases.
+        ClusterError: If it has none.
+    """
+    release = connect(context, namespace, name or DEFAULT_RELEASE)
+    return release if name else only_release(release)
 
 
 def several_releases(release: Release, names: list[str]) -> BadInputError:

@@ -58,6 +58,12 @@ def split_address(text: str) -> Address:
     return bare, int(port)
 
 
+def show_address(where: Address) -> str:
+    """Format an address as HOST:PORT, with an IPv6 address in brackets."""
+    host, port = where
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
 @dataclass
 class Peer:
     """A UDP socket and the address to which it sends.

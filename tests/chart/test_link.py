@@ -2,8 +2,8 @@
 
 import pytest
 
-from cloudrc.cli.link_verify import RELEASE_TIMEOUT
 from cloudrc.cli.parser import build_parser
+from cloudrc.runs.verify import RELEASE_TIMEOUT
 from tests.chart.conftest import a_namespace, containers, notes, nothing, of_kind, pod_specs, render
 
 

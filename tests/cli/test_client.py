@@ -6,7 +6,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
-from cloudrc.cli.client import Api, ApiError, UnreachableError
+from cloudrc.teleop.client import Api, ApiError, UnreachableError
 
 STATE = "/v1/state"
 

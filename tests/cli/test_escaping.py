@@ -8,14 +8,14 @@ import pytest
 import yaml
 
 from cloudrc.cli import report
-from cloudrc.cli.client import Api
 from cloudrc.cli.main import main
-from cloudrc.cli.output import escape, table
 from cloudrc.cli.progress import FlightView
 from cloudrc.errors import BadInputError
 from cloudrc.record.writer import MISSING, McapWriter
 from cloudrc.records import Fault
+from cloudrc.teleop.client import Api
 from cloudrc.teleop.store import Order
+from cloudrc.text import escape, table
 from tests.cli.conftest import EVIL, SHOWN, assert_harmless
 from tests.record.conftest import world_records
 from tests.teleop.conftest import PLAN, running

@@ -8,8 +8,8 @@ import threading
 
 import pytest
 
-from cloudrc.cli.client import Api
 from cloudrc.drivers import local
+from cloudrc.teleop.client import Api
 from tests.conftest import wait_until
 from tests.teleop.conftest import running
 

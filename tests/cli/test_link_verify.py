@@ -6,12 +6,13 @@ from math import nan
 
 import pytest
 
-from cloudrc.cli import link_verify
-from cloudrc.cli.link_verify import as_text, find_experiment, verify_release
+from cloudrc.cli.link_verify import as_text
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.exporter import Exporter
 from cloudrc.errors import TimedOutError
 from cloudrc.records import LinkChecked
+from cloudrc.runs import verify
+from cloudrc.runs.verify import find_experiment, verify_release
 
 PAGE = {"shaper": "relay", "reason": "", "interface": "eth0", "netems": {}}
 MEASURED = {"ok": 0.0451, "open": 0.0451, "off": 0.0902}
@@ -58,7 +59,7 @@ def release(monkeypatch):
     for name in ("no_proxy", "NO_PROXY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")  # a proxy is not used
-    monkeypatch.setattr(link_verify.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(verify.time, "sleep", lambda seconds: None)
     with ExitStack() as stack:
 
         def open_exporter(role):
@@ -99,7 +100,7 @@ def test_a_fault_names_its_direction(release):
 def test_a_verdict_off_for_a_moment_does_not_end_the_wait(release, monkeypatch):
     release.hears(world="off", cloud="open")
     later = iter([{}, {}, {"stamp_ns": 6, "world": "ok"}, {}, {"stamp_ns": 6, "cloud": "ok"}])
-    monkeypatch.setattr(link_verify.time, "sleep", lambda seconds: release.hears(**next(later)))
+    monkeypatch.setattr(verify.time, "sleep", lambda seconds: release.hears(**next(later)))
     assert release.ask()["verdict"] == "believed"
 
 

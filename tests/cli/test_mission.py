@@ -9,7 +9,8 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc.cli import mission as command
-from cloudrc.cli.client import Api, TokenFile, token_reader
+from cloudrc.cli.token_flag import TokenFile, token_reader
+from cloudrc.teleop.client import Api
 from tests.conftest import wait_until
 from tests.teleop.conftest import A, B, running
 
@@ -33,7 +34,7 @@ def api():
 
 @pytest.fixture(autouse=True)
 def quick(folder, monkeypatch):
-    monkeypatch.setattr(command, "POLL_PERIOD", 0.02)
+    monkeypatch.setattr("cloudrc.runs.missions.POLL_PERIOD", 0.02)
     monkeypatch.setattr(command, "API_TIMEOUT", 0.5)
     monkeypatch.setenv("KUBECONFIG", str(folder / "none"))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))

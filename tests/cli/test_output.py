@@ -10,10 +10,11 @@ import pytest
 import yaml
 
 from cloudrc.cli import progress
-from cloudrc.cli.output import format_number, is_live, paint, table
+from cloudrc.cli.output import is_live, paint
 from cloudrc.cli.progress import CountView, FlightView, StepView
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.records import Fault, GuardChange, MissionEvent, TelemetrySent
+from cloudrc.text import format_number, table
 from tests.conftest import wait_until
 
 

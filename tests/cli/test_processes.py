@@ -10,15 +10,9 @@ import pytest
 
 from cloudrc import assembly
 from cloudrc.cli import processes
-from cloudrc.cli.processes import (
-    ipv4_addresses,
-    open_recorder,
-    read_address,
-    read_size,
-    show_address,
-)
+from cloudrc.cli.processes import ipv4_addresses, open_recorder, read_address, read_size
 from cloudrc.config.load import load_experiment
-from cloudrc.drivers.realtime import free_ports
+from cloudrc.drivers.realtime import free_ports, show_address
 from cloudrc.link.verify.monitor import LinkMonitor
 from cloudrc.record.columns import Recording
 from tests.record.conftest import MS, counted, world_records

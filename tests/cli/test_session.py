@@ -16,13 +16,13 @@ import pytest
 
 from cloudrc import assembly
 from cloudrc.cli import session
-from cloudrc.cli.client import Api, ApiError
 from cloudrc.config.load import dump, load_experiment, read_experiment
 from cloudrc.config.setpoints import write_setpoints
 from cloudrc.drivers import local
 from cloudrc.drivers.machine import usable_cores
 from cloudrc.messages import Start
 from cloudrc.record.columns import Recording
+from cloudrc.teleop.client import Api, ApiError
 from cloudrc.teleop.store import Order, open_store
 from cloudrc.teleop.wire import Leg, Plan
 from tests.conftest import wait_until

@@ -8,10 +8,12 @@ from unittest.mock import Mock
 
 import pytest
 
+import cloudrc
 from cloudrc.cluster import flight, pods
 from cloudrc.cluster.client import ClusterError, connect
 from cloudrc.cluster.jobs import run_job
 from cloudrc.config.load import load_experiment
+from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.geometry.scene import SCENES
 from cloudrc.record.writer import McapWriter
 from cloudrc.records import LinkChanged
@@ -154,6 +156,31 @@ def test_a_broken_connection_loses_logs_but_no_report(ready, call, monkeypatch):
     assert json.loads(captured.out)["shaper"] == "relay"
     assert "without the world pod's logs: no way to the pod" in captured.err
     assert "no way to the pod; trying again" in captured.err
+
+
+def test_a_program_gets_the_result_of_a_flight_on_a_cluster(ready, tmp_path, capfd):
+    record(tmp_path, flown(), torn=False)
+    ends(ready)
+    result = cloudrc.fly(NAME, {SETTING.partition("=")[0]: 1.0}, mode="cluster", out="out")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert (result.verdict, report["mode"]) == ("invalid", "cluster")  # recorded in virtual time
+    assert result.numbers == {name: each["value"] for name, each in report["numbers"].items()}
+    assert len(result["/odometry"]) > 100
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_program_gets_an_error_if_nothing_flies_on_a_cluster(ready, teleop, tmp_path):
+    with pytest.raises(BadInputError, match="waypoints"):
+        cloudrc.fly("steps", mode="cluster")
+    with pytest.raises(MissingPrerequisiteError, match="no context 'other'"):
+        cloudrc.fly(NAME, mode="cluster", context="other")
+    ends(ready, "Failed", 5, "mission m-1 is under way")
+    with pytest.raises(ClusterError, match="did not fly its mission"):
+        cloudrc.fly(NAME, mode="cluster")
+    assert list((tmp_path / "runs").glob("*")) == []
+    teleop.mission = {"id": "m7"}
+    with pytest.raises(ClusterError, match="mission m7 is under way"):
+        cloudrc.fly(NAME, mode="cluster")
 
 
 def test_an_interrupted_flight_cancels_and_reports_its_mission(

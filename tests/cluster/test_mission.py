@@ -6,11 +6,11 @@ from unittest.mock import Mock
 
 import pytest
 
-from cloudrc.cli import mission as command
 from cloudrc.cli.main import main
-from cloudrc.cluster import jobs
+from cloudrc.cluster import flight
 from cloudrc.cluster.client import NoAnswerError
 from cloudrc.drivers import local
+from cloudrc.runs.missions import read_mission
 from tests.cluster.conftest import TOKEN, missions_of, pod, terminated
 
 WAYPOINTS = "waypoints: [{position_m: [0.5, 0.0, 1.0]}]"
@@ -28,14 +28,14 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def lands(running, monkeypatch):
     """A release whose Jobs succeed as soon as they are followed."""
-    original = jobs.follow
+    original = flight.follow
 
     def follow(release, name, *given):
         running.start_pod(name, state=terminated(0, "done"))
         running.end(name, "Complete")
         return original(release, name, *given)
 
-    monkeypatch.setattr(jobs, "follow", follow)
+    monkeypatch.setattr(flight, "follow", follow)
     return running
 
 
@@ -75,11 +75,11 @@ def test_run_waits_until_the_release_is_ready(lands, call):
     deadline = job["spec"]["activeDeadlineSeconds"]
     assert deadline >= 86_400 + 60, "a mission without a time limit gets a day"
     plan = lands.get("configmaps", job["metadata"]["name"])["data"]["mission.yaml"]
-    assert json.loads(plan) == command.read_mission("pipes")
+    assert json.loads(plan) == read_mission("pipes")
 
 
 def test_an_interrupted_run_says_that_the_job_continues(running, call, monkeypatch):
-    monkeypatch.setattr(jobs, "follow", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr(flight, "follow", Mock(side_effect=KeyboardInterrupt))
     said = call("mission run one.yaml", code=130).err
     (job,) = running.jobs()
     assert f"kubectl --namespace=demo delete job {job['metadata']['name']}\n" in said
@@ -87,7 +87,7 @@ def test_an_interrupted_run_says_that_the_job_continues(running, call, monkeypat
 
 def test_a_run_that_loses_the_api_server_says_that_the_job_continues(running, call, monkeypatch):
     lost = NoAnswerError("cannot list pods: the API server does not answer")
-    monkeypatch.setattr(jobs, "follow", Mock(side_effect=lost))
+    monkeypatch.setattr(flight, "follow", Mock(side_effect=lost))
     said = call("mission run one.yaml", code=5).err
     (job,) = running.jobs()
     assert "the API server does not answer; Job" in said
@@ -96,7 +96,7 @@ def test_a_run_that_loses_the_api_server_says_that_the_job_continues(running, ca
 
 def test_an_interrupted_run_names_the_mission_of_its_job(running, teleop, call, monkeypatch):
     teleop.missions = lambda: missions_of(running)
-    monkeypatch.setattr(jobs, "follow", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr(flight, "follow", Mock(side_effect=KeyboardInterrupt))
     said = call("mission run one.yaml", code=130).err
     assert "cloudrc mission cancel m4 --namespace=demo --release=cloudrc\n" in said
 

@@ -7,12 +7,12 @@ from math import nan
 
 import pytest
 
-from cloudrc.cli.client import Api, ApiError
 from cloudrc.drivers.local import under_way
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import UPRIGHT, ZERO, GuardState
 from cloudrc.records import Control
+from cloudrc.teleop.client import Api, ApiError
 from cloudrc.teleop.wire import RobotStatus
 from tests.conftest import wait_until
 

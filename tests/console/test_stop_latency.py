@@ -14,8 +14,8 @@ from contextlib import ExitStack, contextmanager
 import numpy as np
 import pytest
 
-from cloudrc.cli.client import Api
 from cloudrc.messages import GuardState
+from cloudrc.teleop.client import Api
 from tests.conftest import wait_until
 from tests.console.conftest import acknowledge, session_with_console
 

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.client import Api
 from cloudrc.config.load import dump, load_experiment
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.drivers.teleop import UnixPeer
 from cloudrc.errors import CloudrcError
 from cloudrc.messages import GuardState
+from cloudrc.teleop.client import Api
 from tests.conftest import wait_until
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli.processes import show_address
 from cloudrc.drivers.realtime import (
     DRAIN_MAX,
     ROUTE_PERIOD_NS,
@@ -17,6 +16,7 @@ from cloudrc.drivers.realtime import (
     Peer,
     bind,
     serve,
+    show_address,
     split_address,
 )
 from tests.conftest import needs_ipv6

@@ -5,8 +5,8 @@ import time
 
 import pytest
 
-from cloudrc.cli.client import Api, UnreachableError
 from cloudrc.record.columns import Recording
+from cloudrc.teleop.client import Api, UnreachableError
 from tests.conftest import nightly
 from tests.drivers.conftest import LIMIT, TOKEN, Release, ages_at_hold
 

@@ -14,12 +14,12 @@ import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
-from cloudrc.cli.link_verify import fetch
 from cloudrc.cluster.client import connect
 from cloudrc.cluster.flight import wait_ready
 from cloudrc.cluster.jobs import follow, run_job
 from cloudrc.cluster.pods import METRICS, fetch_recording, forwarded
 from cloudrc.errors import CloudrcError
+from cloudrc.runs.verify import fetch
 from tests.drivers.conftest import WORK, slower
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from cloudrc.cli.link_run import Programs
-from cloudrc.cli.link_verify import DEVICE, HOSTS, _namespaces, inside
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
 from cloudrc.errors import MissingPrerequisiteError
@@ -21,6 +20,7 @@ from cloudrc.link.model import LinkDirection, numbers, sample
 from cloudrc.link.netem import STRETCH, Netem, table
 from cloudrc.link.profile import Trace
 from cloudrc.link.traces import link_profile
+from cloudrc.runs.link_under_test import DEVICE, HOSTS, _namespaces, inside
 from cloudrc.tunnel.codec import Kind
 from tests.link.profiles import blackout, changed, in_bursts, profile_of
 

@@ -13,7 +13,6 @@ from threading import Event, Thread, Timer
 import numpy as np
 import pytest
 
-from cloudrc.cli.link_verify import find_experiment
 from cloudrc.drivers.realtime import free_ports
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.exposition.table import LINK_OUTCOMES, RELEASE_PERCENTILES
@@ -22,6 +21,7 @@ from cloudrc.link.model import LinkDirection
 from cloudrc.link.relay import AGE_MAX_NS, QUANTILES, Relay, ReleaseErrors, Stamps, ask_for_stamps
 from cloudrc.link.verify.judge import Flow, Measurement
 from cloudrc.link.verify.probe import PROBE, ProbeEnd
+from cloudrc.runs.verify import find_experiment
 from cloudrc.tunnel.codec import Kind, encode_header
 from tests.conftest import wait_until
 from tests.link.profiles import profile_of

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from cloudrc.cli import processes
-from cloudrc.cli.link_verify import find_experiment
 from cloudrc.cli.main import main
 from cloudrc.config.load import dump, read_experiment
 from cloudrc.config.schema import PlugIn
 from cloudrc.drivers.machine import interpreter
+from cloudrc.runs.verify import find_experiment
 from cloudrc.runs.workers import map_in_order
 from tests.metrics.conftest import flown
 from tests.record.conftest import write_mission

@@ -9,7 +9,6 @@ import time
 
 import pytest
 
-from cloudrc.cli.client import Api, UnreachableError
 from cloudrc.cli.processes import warn_if_exposed
 from cloudrc.cli.teleop import api_address, serve_api
 from cloudrc.config.load import load_experiment
@@ -22,6 +21,7 @@ from cloudrc.teleop import api as api_module
 from cloudrc.teleop import auth, models
 from cloudrc.teleop.api import ApiServer, Bridge
 from cloudrc.teleop.auth import LOCAL
+from cloudrc.teleop.client import Api, UnreachableError
 from cloudrc.teleop.store import ConflictError
 from tests.conftest import needs_ipv6
 from tests.teleop.conftest import (

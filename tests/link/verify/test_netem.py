@@ -6,18 +6,11 @@ from contextlib import contextmanager
 
 import pytest
 
-from cloudrc.cli import link_verify
-from cloudrc.cli.link_verify import (
-    DEVICE,
-    HOSTS,
-    as_text,
-    find_experiment,
-    make_plans,
-    make_report,
-    probe_link,
-    run_link,
-)
+from cloudrc.cli.link_verify import as_text
 from cloudrc.errors import CloudrcError, MissingPrerequisiteError
+from cloudrc.runs import link_under_test
+from cloudrc.runs.link_under_test import DEVICE, HOSTS, run_link
+from cloudrc.runs.verify import find_experiment, make_plans, make_report, probe_link
 
 pytestmark = pytest.mark.netem
 ASKED = ("delay_ms=400", "jitter_ms=80")  # far above what an emulated machine adds
@@ -54,7 +47,7 @@ def running():
 
 @pytest.fixture(autouse=True)
 def patience(monkeypatch):
-    monkeypatch.setattr(link_verify, "START_LIMIT", 300.0)  # emulated processors are slow
+    monkeypatch.setattr(link_under_test, "START_LIMIT", 300.0)  # emulated processors are slow
 
 
 @pytest.mark.smoke

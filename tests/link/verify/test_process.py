@@ -6,11 +6,12 @@ import subprocess
 
 import pytest
 
-from cloudrc.cli import link_verify
-from cloudrc.cli.link_verify import find_experiment, make_plans, probe_link, run_link
 from cloudrc.errors import CloudrcError
 from cloudrc.link.verify.causes import find_causes
 from cloudrc.link.verify.judge import verdict_of
+from cloudrc.runs import link_under_test, verify
+from cloudrc.runs.link_under_test import run_link
+from cloudrc.runs.verify import find_experiment, make_plans, probe_link
 
 # Far above what a machine adds that does other things, too.
 LINK = ["link.uplink.delay_ms=100", "link.uplink.jitter_ms=40", "link.downlink.delay_ms=80"]
@@ -35,7 +36,7 @@ def test_an_honest_link_is_believed_unless_the_machine_delays_it():
 def test_a_fault_is_named_on_the_command_line(call, monkeypatch):
     twice = [one.replace("=100", "=200").replace("=80", "=160") for one in LINK]
     wrong = find_experiment("paper-p1", twice)
-    monkeypatch.setattr(link_verify, "run_link", lambda _, shaper: run_link(wrong, shaper))
+    monkeypatch.setattr(verify, "run_link", lambda _, shaper: run_link(wrong, shaper))
     settings = [f"--set={value}" for value in LINK]
     report = json.loads(call("link verify paper-p1 --seconds 2 -o json", *settings, code=1).out)
     assert report["verdict"] == "not believed"
@@ -61,7 +62,7 @@ def test_an_early_end_has_the_exit_code_of_the_process(code, words, exit_code, s
         (way.folder / "log").write_text(f"before\n{words}\n" if words else "")
         return subprocess.Popen(["sh", "-c", f"exit {code}" if name == "uplink" else "sleep 9"])
 
-    monkeypatch.setattr(link_verify, "_start", start)
+    monkeypatch.setattr(link_under_test, "_start", start)
     with pytest.raises(CloudrcError) as ended, run_link(find_experiment("paper-p1", []), "relay"):
         pass
     assert ended.value.exit_code == exit_code

@@ -1,31 +1,23 @@
 """Call the HTTP API of teleop, the process that commands missions.
 
 The API is at http://HOST:PORT, which needs a token, or at unix:PATH, a socket file that only its
-owner can open. Behind a proxy, a path may follow http://HOST:PORT. The token is read from a file,
-because a token on the command line would appear in the list of processes and in the history of the
-shell.
+owner can open. Behind a proxy, a path may follow http://HOST:PORT.
 """
 
 from __future__ import annotations
 
-import argparse
 import http.client
 import json
-import os
 import socket
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit
 
-from cloudrc.cli.output import escape, print_line
-from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
-from cloudrc.files import read_token, warn_if_readable
+from cloudrc.errors import BadInputError, CloudrcError
+from cloudrc.text import escape
 
 if TYPE_CHECKING:
-    from cloudrc.cluster.client import Release
     from cloudrc.teleop.wire import RobotStatus
 
 REQUEST_TIMEOUT = 10.0
@@ -50,6 +42,7 @@ SOCKET_GONE = (
 """Says how to stop a robot whose API nobody can reach any more."""
 UNIX = "unix:"
 VARIABLE = "CLOUDRC_TOKEN_FILE"
+"""Environment variable of a command that names the file with the token."""
 
 
 class ApiError(CloudrcError):
@@ -69,7 +62,7 @@ class Api:
         """Check and store the address, "http://HOST:PORT[/PATH]" or "unix:PATH".
 
         `token` is called for each request; it returns the current token, or "" for none. `place`
-        is the name of the run or release in printed texts; "" if the user gave the address.
+        is the name of the run or release for messages; "" if the user gave the address.
         """
         self.url, self._token, self.place = url.rstrip("/"), token, place
         self._prefix = ""  # path of the API behind a proxy
@@ -77,10 +70,6 @@ class Api:
             self._connection(REQUEST_TIMEOUT)
         except (ValueError, KeyError, http.client.InvalidURL):
             raise BadInputError(f"--api {url}: give http://HOST:PORT[/PATH] or unix:PATH") from None
-
-    def say(self, text: str) -> None:
-        """Print a text after the name of the run or release; without a name, only the text."""
-        print_line(f"{self.place}: {text}" if self.place else text)
 
     def get(self, path: str) -> Any:
         """Send a GET request; result and errors are those of `post`."""
@@ -220,41 +209,6 @@ def _refusal(answer: http.client.HTTPResponse, place: str, *, with_token: bool) 
     return UnreachableError(detail) if answer.status in RETRY_STATUSES else ApiError(detail)
 
 
-@contextmanager
-def release_api(release: Release, token: TokenFile | None = None) -> Iterator[Api]:
-    """Yield the API of a release, over a forwarded port, while the `with` block runs.
-
-    `token` is the file with the token; by default the token comes from the release's Secret.
-    """
-    from cloudrc.cluster.pods import api_url, operator_token
-
-    known = operator_token(release) if token is None else ""
-    place = f"release '{release.name}' {release.where}"
-    with api_url(release) as url:
-        yield Api(url, token_reader(token) if token else lambda: known, place)
-
-
-def settle_mission(release: Release, key: str, why: str) -> tuple[str, int]:
-    """Cancel the mission of a Job that no longer follows it, if the mission has not ended.
-
-    `key` is the mission's key, `why` the reason. Return a sentence about the mission, and the exit
-    code of its verdict.
-    """
-    interrupted = InterruptedRunError.exit_code
-    try:
-        with release_api(release) as api:
-            mission = find_mission(api, key)
-            if mission is None:
-                return f"no mission has begun: {why}", interrupted
-            if mission["verdict"] is None:
-                api.post(f"{mission_path(mission['id'])}/cancel")
-                return f"mission {mission['id']} is cancelled: {why}", interrupted
-            return describe_mission(mission), int(mission["verdict"]["exit_code"])
-    except CloudrcError as error:
-        text = f"{why}; the mission ends with its lease, because it cannot be cancelled: {error}"
-        return text, interrupted
-
-
 def find_mission(api: Api, key: str) -> dict[str, Any] | None:
     """Return the mission with a key; None if there is none."""
     missions = api.get("/v1/missions")["missions"]
@@ -274,43 +228,3 @@ def describe_verdict(verdict: Mapping[str, Any]) -> str:
     failures = [f"{failure['code']}: {failure['text']}" for failure in verdict["failures"]]
     reasons = "; also ".join(failures) or "every waypoint reached, every criterion met"
     return f"{verdict['outcome'].upper()}: {reasons}"
-
-
-def token_argument(parser: argparse._ActionsContainer) -> None:
-    """Declare the argument --token-file."""
-    text = f"file with the API's token (default: from {VARIABLE}, or the release's Secret)"
-    parser.add_argument("--token-file", type=Path, metavar="FILE", help=text)
-
-
-class TokenFile(NamedTuple):
-    """A file with a token; `given` is how the user named it, for errors."""
-
-    path: Path
-    given: str
-
-
-def token_file(options: argparse.Namespace) -> TokenFile | None:
-    """Return the token file from the flag, else from the environment, else None."""
-    if path := options.token_file:
-        return TokenFile(path, f"--token-file {path}")
-    if name := os.environ.get(VARIABLE):
-        return TokenFile(Path(name), f"{VARIABLE}={name}")
-    return None
-
-
-def token_reader(file: TokenFile | None) -> Callable[[], str]:
-    """Return a function that reads the token from `file`, or returns "" if `file` is None.
-
-    Print a warning if other users can read the file.
-    """
-    if file is None:
-        return lambda: ""
-    warn_if_readable(file.path, lambda text: print_line(f"cloudrc: {text}", sys.stderr))
-    return lambda: _read(file)
-
-
-def _read(file: TokenFile) -> str:
-    try:
-        return read_token(file.path)
-    except ValueError as error:
-        raise BadInputError(f"{file.given}: {error}; name another file") from None

@@ -1,0 +1,58 @@
+"""Fly flights of a sweep in the pods of a cluster, which run `cloudrc sweep rows`."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Generator, Sequence
+from typing import NamedTuple
+
+from cloudrc.cluster import batch
+from cloudrc.cluster.client import ClusterError, Release
+from cloudrc.runs import store
+from cloudrc.runs.flight import Row
+from cloudrc.runs.grid import Grid, SweepPoint, pack
+
+
+class PodSettings(NamedTuple):
+    """The pods that a sweep asks for."""
+
+    shards: int  # number of pods
+    image: str | None  # with the simulator; None: that of the chart's example
+    cpu: str  # CPU request of a pod, such as "500m"
+    queue: str | None = None  # of Kueue
+
+
+def fly_in_pods(
+    release: Release,
+    settings: PodSettings,
+    grid: Grid,
+    flights: Sequence[SweepPoint],
+    tell: Callable[[str], None],
+) -> Generator[Row]:
+    """Fly flights of a grid on a cluster, and yield each row once.
+
+    Each pod of a Job flies a share (shard) of the flights and logs their rows. If a pod is deleted
+    just after its last flight, its log is lost, but Kubernetes counts its shard as complete.
+    Therefore further Jobs fly the flights without a row.
+
+    Raises:
+        ClusterError: If a Job fails or yields no row, or if a pod will never run.
+    """
+    shards, image, cpu, queue = settings
+    every = "".join(grid.flights).encode() + str(shards).encode()
+    name = f"sweep-{hashlib.sha256(every).hexdigest()[:12]}"
+    missing = {flight.key: flight for flight in flights}
+    while missing:
+        before = len(missing)
+        packed = pack(missing.values())
+        batch.start(release, name, packed, shards, image=image, cpu=cpu, queue=queue)
+        tell(f"Job '{name}' {release.where}, {shards} pods; it goes on without this command")
+        for line in batch.read_lines(release, name, tell):
+            row = store.parse_row(line)
+            if row is not None and missing.pop(row["key"], None) is not None:
+                yield row
+        if len(missing) == before:
+            text = "the same command flies them; is the image of this version of cloudrc?"
+            raise ClusterError(f"the pods printed no row of {before} flights; {text}")
+        if missing:
+            tell(f"the rows of {len(missing)} flights were lost with their pods")

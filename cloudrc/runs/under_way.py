@@ -1,0 +1,78 @@
+"""Find the run on this machine that a command or a call refers to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection
+from pathlib import Path
+from typing import NamedTuple
+
+from cloudrc.drivers.local import LINK_LOG, under_way
+from cloudrc.errors import BadInputError
+from cloudrc.runs.folder import RUNS
+
+
+class RunInFlight(NamedTuple):
+    """A run that flies on this machine."""
+
+    folder: Path
+    url: str  # of its API
+    note: str = ""  # what to tell the user about the choice; "" for nothing
+
+
+def short(path: Path) -> str:
+    """Format a path relative to the working folder, if it is inside."""
+    here = Path.cwd()
+    is_inside = path.is_relative_to(here) and here != here.parent  # everything is inside "/"
+    return str(path.relative_to(here) if is_inside else path)
+
+
+def find_run(run: Path | None, *, steers: bool = True, flag: str = "--run ") -> RunInFlight | None:
+    """Find the run in flight that a user means: `run`, else the only one.
+
+    If the user's newest run here, ./runs/latest, has ended, a command that changes a flight rejects
+    the only run in flight, which may belong to somebody else.
+
+    Args:
+        run: Folder of the run; None if the user names none.
+        steers: Whether the command changes the flight.
+        flag: Flag that names a run, for the texts of errors; "" for a positional argument.
+
+    Returns:
+        The run; None if no run is in flight.
+
+    Raises:
+        BadInputError: If `run` is not in flight; if several runs are in flight; or if the command
+            changes a flight and ./runs/latest has ended.
+    """
+    # The URL comes from this user's flight files, never from the run's folder: a run's folder may
+    # come from somebody else and name a foreign server.
+    flights = under_way()
+    if run is not None:
+        url = flights.get(Path(os.path.realpath(run)))
+        if url is None:
+            raise BadInputError(f"{flag}{run}: no run flies there; name another folder")
+        return RunInFlight(run, url)
+    note = ask_if_unclear(flights, steers=steers, flag=flag)
+    return next((RunInFlight(Path(short(run)), url, note) for run, url in flights.items()), None)
+
+
+def ask_if_unclear(candidates: Collection[Path], *, steers: bool, flag: str = "--run ") -> str:
+    """Raise a BadInputError if it is unclear which flight the user means; return a note about it.
+
+    It is unclear if there are several `candidates`, the folders of the local runs that the command
+    can use. If the command changes a flight (`steers`), it is also unclear if ./runs/latest has
+    ended or cannot be used. `flag` names a run in error messages.
+    """
+    latest = Path(os.path.realpath(RUNS / "latest"))
+    names = " or ".join(f"{flag}{short(run)}" for run in sorted(candidates))
+    if len(candidates) > 1:
+        raise BadInputError(f"{len(candidates)} runs are flying here; choose one: {names}")
+    is_mine = latest in candidates
+    if steers and not is_mine and (latest / LINK_LOG).exists():  # this user steered that flight
+        names = names or "--release NAME (in a cluster)"
+        why = "does not take this command" if latest in under_way() else "has ended"
+        raise BadInputError(
+            f"{short(latest)} {why}; name another flight: {names}; or start one: cloudrc up"
+        )
+    return f"using the run in {names.removeprefix(flag)}" if candidates and not is_mine else ""

@@ -1,0 +1,247 @@
+"""Compare a link with its profile, by probes or in flight.
+
+By probes: start a link on this machine and measure it. In a cluster no probes are sent: world and
+cloud each compare the datagrams that they receive with the profile. They serve their verdicts at
+/link.json on their metrics ports. The link containers serve the state of their shapers at the same
+path.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from math import inf, nan
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from cloudrc.cluster.client import Release
+from cloudrc.cluster.pods import METRICS, NO_PROXY, find_pod, forwarded
+from cloudrc.config import shipped
+from cloudrc.config.load import ResolvedExperiment, read_experiment
+from cloudrc.config.schema import Experiment, Profile
+from cloudrc.drivers.programs import run_tool
+from cloudrc.errors import BadInputError, TimedOutError
+from cloudrc.link.netem import check, find_netems
+from cloudrc.link.state import STATE_FILE
+from cloudrc.link.traces import link_profile
+from cloudrc.link.verify import DEFAULT
+from cloudrc.link.verify.causes import Findings, find_causes, read_evidence, read_metrics
+from cloudrc.link.verify.judge import Flow, Judgement, Measurement, look_twice, verdict_of
+from cloudrc.link.verify.probe import PROBE, plan_probes
+from cloudrc.runs.link_under_test import LOOPBACK, WAYS, Way, inside, measure, run_link
+from cloudrc.tunnel.codec import SIZES
+
+RELEASE_TIMEOUT = 270.0  # default time limit for the verdict on a release [s]
+COUNTS_WAIT = 1.3  # after the last probe: processes update their counts once a second [s]
+POLL_PERIOD, HTTP_TIMEOUT = 2.0, 3.0  # between requests to a release; limit of a request [s]
+PORTS = METRICS["world"]["world"], METRICS["world"]["link"]
+NOT_JUDGED = "NOT JUDGED"  # in a note about a quantity that could not be verified
+KEYS = ("asked", "measured", "low", "high")
+"""Values of a row, in the order of the table's columns."""
+VERDICTS = {"off": "not believed", "open": "undecided", "ok": "believed"}
+"""Worst verdict on any quantity of the link -> verdict on the whole link."""
+Tell: TypeAlias = Callable[[str], None]
+Report: TypeAlias = dict[str, Any]
+Pods: TypeAlias = Mapping[str, Sequence[str]]
+"""World or cloud -> two URLs: the metrics port of the process, and that of its link container."""
+
+
+def find_experiment(target: str, settings: Sequence[str]) -> ResolvedExperiment:
+    """Read the experiment `target`; for a link profile, use it in the default experiment."""
+    experiments, profiles = shipped.names("experiment"), shipped.names("profile")
+    is_profile = target not in experiments
+    if shipped.is_path(target):
+        keys = set(shipped.read("profile", target, Path.cwd()).tree)
+        is_profile = keys.isdisjoint(Experiment.model_fields.keys() - Profile.model_fields.keys())
+        target = str(Path.cwd() / target)
+    elif target not in (*experiments, *profiles):
+        names = ", ".join([*profiles, *experiments])
+        raise BadInputError(f"no profile or experiment named '{target}'; available: {names}")
+    if not is_profile:
+        return read_experiment(target, settings)
+    return read_experiment(DEFAULT, [f"link.profile={target}", *settings])
+
+
+def verify(
+    target: str = DEFAULT,
+    settings: Sequence[str] = (),
+    *,
+    shaper: str = "relay",
+    seconds: float | None = None,
+    tell: Tell = lambda text: None,
+) -> Report:
+    """Send probes over a link that this function starts, and judge the link.
+
+    If a measured quantity gets the verdict "off", repeat the measurement once.
+
+    Args:
+        target: Name or file of an experiment or a link profile.
+        settings: Changes of the experiment: KEY=VALUE.
+        shaper: "relay", or "netem", which needs root.
+        seconds: Time to send probes [s]; None: as long as needed.
+        tell: Receives a line before each measurement.
+    """
+    experiment = find_experiment(target, settings)
+    plans, found = make_plans(experiment, check_seconds(seconds), shaper), dict[str, Findings]()
+    longest = max(plan.sent[-1] for plan in plans.values())
+    for look in ("sending probes", "measuring again what is off"):
+        with run_link(experiment, shaper) as ways:
+            tell(f"{look} for {longest:.0f} s")
+            now = probe_link(ways, plans)
+        rows = {way: look_twice(found.get(way, now[way]).rows, now[way].rows) for way in now}
+        found = {way: now[way]._replace(rows=rows[way]) for way in now}
+        if "off" not in {verdict_of(one.rows) for one in found.values()}:
+            break
+    return make_report(target, found)
+
+
+def check_seconds(seconds: float | None) -> float | None:
+    """Return `seconds` [s]; raise a BadInputError if it is too short or too long."""
+    if seconds is not None and not 1.0 <= seconds <= 3600.0:
+        raise BadInputError(f"--seconds {seconds:g}: give a number from 1 to 3600")
+    return seconds
+
+
+def make_plans(
+    experiment: ResolvedExperiment, seconds: float | None, shaper: str
+) -> dict[str, Measurement]:
+    """Plan probes in both directions for `seconds` [s] (None: as long as needed).
+
+    Raises:
+        BadInputError: If netem cannot realise the profile; the text names the direction.
+    """
+    plans, netem = {}, shaper == "netem"
+    for way, (_, _, kind) in WAYS.items():
+        flow = Flow(experiment.seed, way == "uplink", PROBE, SIZES[kind])
+        profile = link_profile(getattr(experiment, way))
+        try:
+            if netem:
+                check(profile)
+        except BadInputError as error:
+            raise BadInputError(f"{way}: {error}") from None
+        plans[way] = plan_probes(profile, flow, seconds, drawn=netem)
+    return plans
+
+
+def probe_link(ways: Mapping[str, Way], plans: Mapping[str, Measurement]) -> dict[str, Findings]:
+    """Send all probes over a running link, and judge it; return direction -> findings."""
+    streams, found = measure(ways, plans), {}
+    time.sleep(COUNTS_WAIT)
+    for name, way in ways.items():
+        page = json.loads((way.folder / STATE_FILE).read_text())
+        with inside(way.namespace):  # the process of the link may be stopped: ask the kernel
+            page |= find_netems(run_tool, way.peer[0])
+            metrics = read_metrics(fetch(f"http://{LOOPBACK}:{way.ports[1]}/metrics"))
+        plan, count = plans[name], len(streams[name].sent)
+        probes = f"{count} probes of {plan.flow.size} bytes"
+        known = read_evidence(page, metrics, count)
+        found[name] = Findings(plan.judge(streams[name]), known, probes)
+    return found
+
+
+def pods_at(hosts: Sequence[str]) -> Pods:
+    """Return the URLs of the metrics of both pods, at the hosts of world and cloud."""
+    pairs = zip(("world", "cloud"), hosts, strict=True)
+    return {end: [f"http://{host}:{port}" for port in PORTS] for end, host in pairs}
+
+
+@contextlib.contextmanager
+def forwarded_pods(release: Release) -> Iterator[Pods]:
+    """Forward the metrics of both pods of a release while the `with` block runs."""
+    pods = {}
+    with contextlib.ExitStack() as stack:
+        for end in ("world", "cloud"):
+            pod = find_pod(release, end).metadata.name
+            local = stack.enter_context(forwarded(release, pod, PORTS))
+            pods[end] = [f"http://{LOOPBACK}:{local[port]}" for port in PORTS]
+        yield pods
+
+
+def verify_release(title: str, pods: Pods, limit: float = RELEASE_TIMEOUT) -> Report:
+    """Fetch the verdicts on both directions of a release's link, and report them.
+
+    World judges the downlink, cloud the uplink. Wait at most `limit` [s] for both verdicts.
+
+    Raises:
+        TimedOutError: If world or cloud does not answer in time.
+    """
+    deadline, seen = time.monotonic() + limit, dict[str, Any]()
+    while True:
+        time.sleep(POLL_PERIOD)
+        for way, (_, receiver, _) in WAYS.items():
+            if page := fetch(f"{pods[receiver][0]}/link.json"):
+                seen[way] = json.loads(page)
+        decided = {found["verdict"] for found in seen.values()} <= {"ok", "off"}
+        if (decided and len(seen) == len(WAYS)) or time.monotonic() >= deadline:
+            break
+    if silent := [receiver for way, (_, receiver, _) in WAYS.items() if way not in seen]:
+        text = f"{' and '.join(silent)} did not answer within {limit:g} s: are the pods ready?"
+        raise TimedOutError(text)
+    return make_report(title, {way: _findings(seen[way], pods[WAYS[way][0]][1]) for way in WAYS})
+
+
+def fetch(url: str) -> str:
+    """Fetch a page, without a proxy; return "" if the server does not answer."""
+    try:
+        with NO_PROXY.open(url, timeout=HTTP_TIMEOUT) as page:
+            return str(page.read().decode())
+    except OSError:
+        return ""
+
+
+def _findings(found: Mapping[str, Any], link: str) -> Findings:
+    """Combine the receiver's verdict `found` with the link container's report at the URL `link`."""
+    page, rows = json.loads(fetch(f"{link}/link.json") or "{}"), []
+    for one in found["rows"]:
+        asked, measured, low, high = (float(one.get(key, nan)) for key in KEYS)
+        rows.append(Judgement(one["quantity"], asked, measured, low, high, one["verdict"]))
+    count = max((one["datagrams"] for one in found["rows"]), default=0)
+    known = read_evidence(page, read_metrics(fetch(f"{link}/metrics")))
+    return Findings(rows, known, f"{count} of the tunnel's own datagrams")
+
+
+def _notes(way: str, rows: Sequence[Judgement]) -> Iterator[str]:
+    judged = {row.name for row in rows if row.verdict != "told"}
+    if not rows:
+        yield f"{way}: no datagrams to measure; fly a mission first"
+    elif judged and "mean" not in judged:
+        yield f"{way}: one-way delays {NOT_JUDGED}: the ends do not share a clock"
+    for row in rows:
+        if row.verdict == "told":
+            yield f"{way}: {row.name} {NOT_JUDGED}; docs/link.md says why"
+
+
+def make_report(title: str, findings: Mapping[str, Findings]) -> Report:
+    """Make the report as values for JSON, in SI units; leave out unknown values.
+
+    Losses and other shares are in [0, 1]. `title` names the link. `findings` has an entry per
+    direction.
+    """
+    shapers = {one.evidence.shaper or "an unknown shaper" for one in findings.values()}
+    verdicts = {verdict_of(one.rows) for one in findings.values()}
+    return {
+        "verdict": next(word for verdict, word in VERDICTS.items() if verdict in verdicts),
+        "link": title,
+        "shaper": f"shaped by {' and '.join(sorted(shapers))}",
+        "causes": [cause._asdict() for cause in find_causes(findings)],
+        "notes": [note for way, one in findings.items() for note in _notes(way, one.rows)],
+        "directions": {
+            way: {
+                "probes": found.probes,
+                "rows": [_as_json(row) for row in found.rows if row.verdict != "told"],
+                "evidence": _known(found.evidence._asdict()),
+            }
+            for way, found in findings.items()
+        },
+    }
+
+
+def _as_json(row: Judgement) -> dict[str, Any]:
+    return {"name": row.name, "unit": row.unit} | _known(row._asdict())
+
+
+def _known(values: Mapping[str, Any]) -> dict[str, Any]:
+    unknown = (None, "", (), inf, -inf)
+    return {key: one for key, one in values.items() if one not in unknown and one == one}

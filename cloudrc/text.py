@@ -1,0 +1,52 @@
+"""Texts for people: tables, numbers, positions, and text from files that a terminal may show."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+FAILED_MARK = "*"
+"""Mark of a number in a table if some of its flights failed."""
+FAILED_NOTE = (
+    f"{FAILED_MARK} contains flights that failed: a robot that hardly moves has small errors, too"
+)
+"""Note below a table with such a mark."""
+
+
+def escape(text: str) -> str:
+    """Escape unprintable characters, which could break the line or control the terminal."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def describe_point(position: Sequence[float | None]) -> str:
+    """Format a position [m]; an unknown coordinate, None, becomes a question mark."""
+    return f"({', '.join('?' if value is None else f'{value:.2f}' for value in position)})"
+
+
+def format_number(value: float) -> str:
+    """Format a value of any unit with four significant digits, and a count with all digits."""
+    if float(value).is_integer() and abs(value) < 1e5:
+        return f"{value:.0f}"  # counts
+    if 1e-4 <= abs(value) < 1e5:
+        digits = f"{value:#.4g}"
+        return digits.rstrip(".") if abs(value) >= 1000 else digits
+    return f"{value:.3e}"
+
+
+def table(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
+    """Align rows of equal length in columns; return one line per row.
+
+    Unprintable characters are escaped. Columns with an index in `right` are aligned to the right.
+    """
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    for i in range(len(rows[0]) if rows else 0):
+        grid.add_column(justify="right" if i in right else "left")
+    for row in rows:
+        grid.add_row(*(Text(escape(cell)) for cell in row))
+    drawn = io.StringIO()
+    Console(file=drawn, width=10_000).print(grid)  # no line is wrapped
+    return "\n".join(line.rstrip() for line in drawn.getvalue().splitlines())
