@@ -112,6 +112,14 @@ class Flight:
         return np.stack(axes, axis=1)
 
     @cached_property
+    def position_noise(self) -> float:
+        """Root mean square per axis of the error of the measured positions [m]; 0 if unknown."""
+        measured = self.during("/odometry")
+        errors = measured["position"] - self.true_position(measured["stamp_ns"])
+        known = errors[np.isfinite(errors).all(axis=1)]
+        return float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
+
+    @cached_property
     def truth(self) -> Columns:
         """True states of the robot during the flight."""
         return self.during("/ground_truth")

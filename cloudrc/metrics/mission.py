@@ -17,6 +17,9 @@ IMPACT_NS = 100_000_000
 """Time from the first touch over which the impulse is summed [ns]: the impact and its bounces."""
 ODOMETRY_NS = 10_000_000
 """Time between two rows of the true position [ns]."""
+NOISE = 3.0
+"""Factor on the noise of the measured positions, by which a waypoint's tolerance is larger for the
+true position [1]: the operator cannot know better that the robot is there."""
 PRESSING_NS = 2_000_000_000
 """Last part of the mission, over which the steady contact force is averaged [ns]."""
 RESTING_NS = 5_000_000_000
@@ -73,13 +76,15 @@ def _waypoints_reached(flight: Flight) -> float | None:
 def _was_at(flight: Flight, waypoint: Waypoint, until_ns: int) -> bool:
     """Return whether the robot stayed near a waypoint for its dwell time before `until_ns`.
 
-    The true position counts. If the mission has a `carrot` (a moving setpoint), a stay of any
+    The true position counts, give or take `NOISE` times the noise of the measured positions, which
+    are all that the operator sees. If the mission has a `carrot` (a moving setpoint), a stay of any
     length is enough, because the setpoint waits at the waypoint for the dwell time.
     """
     truth, dwell = flight.truth, 0.0 if flight.mission.carrot else waypoint.dwell_s
     rows = truth["stamp_ns"] <= until_ns
     distance = np.linalg.norm(truth["position"][rows] - waypoint.position_m, axis=1)
-    near = np.append(differences(waypoint.tolerance_m, distance) <= 0.0, [False])
+    tolerance = waypoint.tolerance_m + NOISE * flight.position_noise
+    near = np.append(differences(tolerance, distance) <= 0.0, [False])
     edges = np.flatnonzero(np.diff(near, prepend=[False]))
     stamps = np.append(truth["stamp_ns"][rows], until_ns)
     stays_ns = stamps[edges[1::2] - 1] - stamps[edges[::2]]
@@ -181,7 +186,7 @@ def _recorder_dropped(flight: Flight) -> float | None:
 add_metrics(
     "Mission",
     ("waypoints_reached", "1", "Number of waypoints at which the true position stayed within the "
-     "tolerance for the dwell time.", _waypoints_reached),
+     "tolerance, plus 3 times the position noise, for the dwell time.", _waypoints_reached),
     ("obstacle_contacts", "1", "Number of contacts with obstacles. These are all bodies but the "
      "floor and, if the mission has to touch it, the board.",
      lambda flight: flight.count(len(obstacle_contacts(flight)["stamp_ns"]))),

@@ -77,6 +77,12 @@ def test_the_rover_drives_through_the_pillars_without_a_vertical_command():
     assert "limited_vertical" not in set(flight["/count"]["name"])
 
 
+def test_noise_of_the_position_does_not_fail_a_drive():
+    """Judged by the true position alone, 3 of 4 waypoints would not be reached: see NOISE."""
+    flight = cloudrc.fly("pillars", {"world.sensors.position_noise_m": 0.02})
+    assert (flight.verdict, flight.numbers["waypoints_reached"]) == ("success", 4)
+
+
 def test_a_silent_link_makes_the_rover_hold_and_then_stop_for_good():
     silent = [{"start_s": 3.0, "duration_s": 30.0}]
     flight = cloudrc.fly("pillars", {"link.both.blackouts": silent, "guard.hold_max_s": 3.0})

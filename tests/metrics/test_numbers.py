@@ -349,3 +349,20 @@ def test_a_waypoint_counts_if_the_true_position_confirms_it(x, tolerance, dwell,
     point = Waypoint(position_m=(x, 0.0, 1.0), tolerance_m=tolerance, dwell_s=dwell)
     flight = flown().flight(mission=Mission(waypoints=(point,)))
     assert SHIPPED["waypoints_reached"].measure(flight) == reached
+
+
+@pytest.mark.parametrize(("noise", "reached"), [(0.0, 0.0), (0.16, 0.0), (0.18, 1.0)])
+def test_the_noise_of_the_measured_positions_is_added_to_the_tolerance(noise, reached):
+    """The robot ends .5 m from the waypoint; a noise of .18 m in x alone has an rms of .104 m."""
+
+    def shake(n, sent):
+        odometry = sent.telemetry.odometry
+        x, y, z = odometry.position
+        odometry = odometry._replace(position=(x + (noise if n % 2 else -noise), y, z))
+        return sent._replace(telemetry=sent.telemetry._replace(odometry=odometry))
+
+    log = flown()
+    log.change(TelemetrySent, shake)
+    point = Waypoint(position_m=(10.5, 0.0, 1.0), tolerance_m=0.2, dwell_s=0.0)
+    flight = log.flight(mission=Mission(waypoints=(point,)))
+    assert SHIPPED["waypoints_reached"].measure(flight) == reached
