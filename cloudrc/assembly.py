@@ -122,11 +122,10 @@ def fly(
 
 def step_code(experiment: ResolvedExperiment) -> str:
     """Say what runs the usual physics steps: "C" with a hash of the machine code, or "Python"."""
-    from cloudrc.robots.build import runs_in_c
-    from cloudrc.robots.pelican.native.robot import usable
+    from cloudrc.robots.build import accelerator
 
-    library = usable()
-    return f"C {library.code}" if library.run and runs_in_c(experiment.world) else "Python"
+    faster = accelerator(experiment.world)
+    return f"C {faster.code}" if faster and faster.make else "Python"
 
 
 def virtual_notes(experiment: ResolvedExperiment) -> tuple[str, ...]:

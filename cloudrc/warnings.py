@@ -24,11 +24,6 @@ JITTER_MAX = 1.0
 """Jitter of a link that may be meant in another unit [s]."""
 LONG = 3600.0
 """Duration of a mission that may be meant in milliseconds [s]."""
-SAG_MAX = 0.05
-"""Largest steady error of the position that needs no warning [m]."""
-WIND_FORCE = 0.24
-"""Horizontal force on a hovering robot per wind speed [N s/m]: two thirds are the drag of the
-rotors, one third comes from the tilt that this drag causes."""
 
 
 def advise(experiment: ResolvedExperiment) -> Iterator[str]:
@@ -44,7 +39,7 @@ def advise(experiment: ResolvedExperiment) -> Iterator[str]:
                 f" mission.waypoints.{number - 1}.tolerance_m in metres"
             )
             break  # the others are alike
-    yield from _hover(experiment)
+    yield from _balance(experiment)
     carrot, cap = experiment.mission.carrot, experiment.guard.speed_max_mps
     if carrot is not None and carrot.speed_mps > cap:
         fits = f"--set mission.carrot.speed_mps={floor(cap * 100) / 100:g}"
@@ -212,35 +207,15 @@ def _always_up(experiment: ResolvedExperiment, *, uplink: bool) -> LinkDirection
     return LinkDirection(link_profile(way), experiment.seed, uplink)
 
 
-def _hover(experiment: ResolvedExperiment) -> Iterator[str]:
-    """Yield advice if the integral of the velocity loop cannot balance wind or a changed weight.
-
-    The numbers are those of the published controller of the Pelican.
-    """
-    from cloudrc.config.robot import find_robot
-    from cloudrc.config.schema import GRAVITY_MPS2, MASS_KG
-    from cloudrc.robots.pelican.low_level import GRAVITY, MASS
-
-    mine, published = (find_robot(each).onboard for each in (experiment.world.robot, "pelican"))
-    if mine is None or published is None or mine.name != published.name:
+def _balance(experiment: ResolvedExperiment) -> Iterator[str]:
+    """Yield the warnings of the onboard controller about a world that differs from its model."""
+    if experiment.world.is_nominal:
         return
-    plant, loop, wind = experiment.world.plant, experiment.world.low_level, experiment.world.wind
-    weight = (MASS_KG * plant.mass_factor + plant.payload_kg) * GRAVITY_MPS2
-    heavy = abs(weight * 4 / sum(plant.thrust_factor) - MASS * GRAVITY)
-    drag = WIND_FORCE * max(map(abs, wind.velocity_mps))
+    from cloudrc.robots.build import advise as advise_on_robot
+
     controller = experiment.cloud.controller
     gains = (controller.model_extra or {})["gain_p"] if controller.name == "pid" else (0.0, 0, 0.0)
-    for name, axis, force in (("wind", 0, drag), ("plant", 2, heavy)):
-        key = "integral_limit_z" if axis else "integral_limit_xy"
-        gain, gain_i = loop.gain_p[axis] * gains[axis], loop.gain_i[axis]
-        rest = force - gain_i * getattr(loop, key)
-        if rest > SAG_MAX * gain > 0.0 and gain_i:
-            yield (
-                f"the onboard controller does not know world.{name}, so the robot hovers about "
-                f"{rest / gain:.2f} m from its setpoint; a value that fits: "
-                f"--set world.low_level.{key}={_round_up(force / gain_i, 0.1):g}"
-                + ("" if axis else " (above 0.3 a hostile cloud can leave the fence)")
-            )
+    yield from advise_on_robot(experiment.world, gains)
 
 
 def _long_link(

@@ -72,7 +72,6 @@ SHARED_NAMES = {
     "Direction",
     "Failure",
     "Guard",
-    "LowLevel",
     "Mission",
     "Problem",
     "Sensors",

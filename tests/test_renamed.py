@@ -6,11 +6,18 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.renamed import NEW_NAMES, new_name
+from cloudrc.config.load import load_experiment
+from cloudrc.errors import BadInputError
+from cloudrc.renamed import NEW_NAMES, new_key, new_name
+from cloudrc.runs.grid import read_grid
+from cloudrc.runs.trials import Asked, Trials
 
 OLD = Path(__file__).parent / "fixtures" / "0.1.0"
 """A recording and a sweep, made by version 0.1.0. They stay as they are, and every later version
 reads them. In each flight, wind blows the robot into a pipe."""
+
+OLD_KEY, NEW_KEY = "world.low_level", "world.onboard"
+AXIS = f"{OLD_KEY}.gain_p"
 
 
 @pytest.fixture
@@ -54,3 +61,45 @@ def test_flights_of_an_old_sweep_are_compared_and_drawn_by_the_old_name(old, cal
 
 def test_an_old_experiment_flies_and_may_name_a_metric_by_its_old_name(old, call, no_page):
     call("run recording/config.yaml --mode virtual --set report.metrics=pipe_contacts", code=1)
+
+
+@pytest.fixture
+def old_axis(old):
+    """Give the old sweep an axis that is a key with an old name, as a sweep of 0.1.0 may have."""
+    for file in ("rows.jsonl", "sweep.json"):
+        text = (old / "sweep" / file).read_text().replace("cloud.predictor", f"{OLD_KEY}.gain_p")
+        (old / "sweep" / file).write_text(text)
+    new_key.cache_clear()
+    return old
+
+
+@pytest.mark.parametrize(
+    "sides", ["last_sample constant_velocity", f"{AXIS}=last_sample {AXIS}=constant_velocity"]
+)
+def test_an_axis_with_an_old_name_is_read_with_its_new_one_and_one_line(
+    old_axis, sides, call, caplog
+):
+    call(f"compare {sides} --in sweep -o json")
+    call(f"sweep figure sweep --x {AXIS}")
+    status = call("sweep status sweep -o json").out
+    assert {each["axis"] for each in json.loads(status)["axes"]} == {f"{NEW_KEY}.gain_p"}
+    assert caplog.messages == [f"{AXIS} is called {NEW_KEY}.gain_p now"]
+
+
+def test_a_sweep_and_a_search_may_use_the_old_name_of_a_key(tmp_path):
+    sweep = tmp_path / "sweep.yaml"
+    sweep.write_text(f"experiment: hover\ngrid: {{{OLD_KEY}.integral_limit_xy: [0.1, 0.3]}}\n")
+    assert [*read_grid(sweep).axes] == [f"{NEW_KEY}.integral_limit_xy"]
+    trials = Trials(Asked(f"{OLD_KEY}.integral_limit_xy", "hover", [], 1, 0.2))
+    assert trials.asked.key == f"{NEW_KEY}.integral_limit_xy"
+    assert trials.present * trials.size == pytest.approx(0.1)  # the published limit
+
+
+def test_an_old_and_a_new_key_for_the_same_value_are_refused(tmp_path):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("world: {low_level: {gain_p: [1, 1, 1]}, onboard: {gain_p: [1, 1, 1]}}")
+    with pytest.raises(BadInputError, match=r"mine\.yaml:1: world\.onboard is given twice"):
+        load_experiment(mine)
+    both = [f"{key}.integral_limit_z=1" for key in (OLD_KEY, NEW_KEY)]
+    with pytest.raises(BadInputError, match=r"integral_limit_z: is set twice"):
+        load_experiment("hover", both)

@@ -55,7 +55,7 @@ def test_the_mission_with_low_gains_needs_no_predictor(profile):
 @pytest.mark.full
 @pytest.mark.parametrize(("limit", "error_mm"), [(0.10, 32.5), (0.30, 0.07)])
 def test_the_hover_is_as_far_from_its_setpoint_as_the_readme_says(limit, error_mm):
-    flight = fly("hover", f"world.low_level.integral_limit_xy={limit}")
+    flight = fly("hover", f"world.onboard.integral_limit_xy={limit}")
     error = numbers(flight)["steady_error_x"] * 1e3
     assert error == pytest.approx(error_mm, abs=0.005 if error_mm < 1 else 0.05)
 

@@ -27,8 +27,8 @@ def both(delay, jitter, **others):
         ),
         (["cloud.controller={name: pid, gain_i: [0.3, 0, 0]}"], ("cloud.controller.speed_max=6",)),
         (["mission=carrot", "mission.carrot.speed_mps=8"], ("instead of 8 m/s", "speed_mps=")),
-        (["world.wind.velocity_mps=[0, -3]"], ("0.19 m from", "low_level.integral_limit_xy=")),
-        (["world.plant.payload_kg=0.4"], ("0.20 m from", "low_level.integral_limit_z=")),
+        (["world.wind.velocity_mps=[0, -3]"], ("0.19 m from", "onboard.integral_limit_xy=")),
+        (["world.plant.payload_kg=0.4"], ("0.20 m from", "onboard.integral_limit_z=")),
         (
             ["world.odometry_rate_hz=20", "cloud.compute_ms=60", "guard.command_age_max_ms=200"],
             ("holds again and again; ", "guard.command_age_max_ms="),

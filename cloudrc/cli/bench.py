@@ -46,7 +46,7 @@ def execute(options: argparse.Namespace) -> int:
     """Run all measurements; print for each the processor time per physics step [us]."""
     require("the bench", ("world",))
     from cloudrc.config.load import load_experiment
-    from cloudrc.robots.pelican.native.robot import usable
+    from cloudrc.robots.build import describe_steps
     from cloudrc.runs.flight import fly_point
 
     experiment = load_experiment("paper")
@@ -58,7 +58,7 @@ def execute(options: argparse.Namespace) -> int:
         "flight of a sweep, with its numbers": lambda: lambda: (fly_point(experiment), count)[1],
     }
     costs = measure(parts, options.repeats)
-    raw, steps = costs["raw mj_step"], usable().text
+    raw, steps = costs["raw mj_step"], describe_steps(experiment.world)
     figures = {
         name: {"us_per_step": cost * 1e6, "ratio": raw / cost, "real_time_factor": STEP / cost}
         for name, cost in costs.items()

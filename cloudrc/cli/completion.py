@@ -7,12 +7,13 @@ start Python.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.util
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from cloudrc.cli.output import STDOUT
-from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.errors import CloudrcError, MissingPrerequisiteError
 from cloudrc.files import naming
 
 EPILOG = """\
@@ -94,9 +95,28 @@ def _settings() -> Iterator[str]:
         for name in named[f"cloud.{key}"]:
             parameters = plugins.signature(kind, name).parameters
             keys |= {f"cloud.{key}.{parameter}" for parameter in parameters}
+    of_robots, named["world.tuning"] = _of_robots()
+    keys |= of_robots
     keys |= {key.replace("uplink", "both") for key in keys if key.startswith("link.uplink.")}
     yield from (f"{key}=" for key in sorted(keys - set(named)) if not key.endswith(".name"))
     yield from sorted(f"{key}={name}" for key, names in named.items() for name in names)
+
+
+def _of_robots() -> tuple[set[str], list[str]]:
+    """Return the keys of the onboard controllers of shipped robots, and the names of tunings."""
+    from cloudrc.config import shipped
+    from cloudrc.config.overrides import default_parameters
+    from cloudrc.config.robot import find_robot
+
+    keys, tunings = set[str](), set[str]()
+    for robot in map(find_robot, shipped.names("robot")):
+        tunings |= robot.tunings.keys()
+        with contextlib.suppress(
+            CloudrcError
+        ):  # without MuJoCo, some controllers have no signature
+            assert robot.onboard is not None
+            keys |= default_parameters("onboard", robot.onboard.name).keys()
+    return {f"world.onboard.{key}" for key in keys}, sorted(tunings)
 
 
 def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:

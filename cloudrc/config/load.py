@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import partial
 from math import sqrt
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,7 +29,7 @@ from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import Problem
 from cloudrc.config.reuse import reuse
-from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits, find_robot, is_planar
+from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits, known_robot, parameters
 from cloudrc.config.schema import (
     Acceleration,
     Change,
@@ -175,6 +174,7 @@ def load_experiment(
         _remove_derived(document, new_profile=bool(changes.keys() & _PROFILE_KEYS))
     outer = {path: value for path, value in changes.items() if path not in inner}
     overrides.apply_overrides(document, outer, build=build)
+    document.rename_keys()  # in a mapping that a setting gives
     for key in ("world", "guard", "link", "cloud", "report"):
         _default(document, (key,), {})
     found: list[Problem] = []
@@ -216,9 +216,12 @@ def _judge(
     if contact is None:
         contact = scene.board is not None and not (mission.steps or mission.setpoints)
     if not flown:
-        planar = is_planar(experiment.world.robot)
-        mission = put_on_ground(mission, scene) if planar else mission
-        problems.raise_problems(document, _check_flown(mission, scene, contact, planar), name)
+        robot, found = known_robot(experiment.world.robot), list[Problem]()
+        with _collect(found, ("world", "tuning")):
+            parameters(robot, experiment.world)
+        mission = put_on_ground(mission, scene) if robot.planar else mission
+        found += _check_flown(mission, scene, contact, robot.planar)
+        problems.raise_problems(document, found, name)
     criteria = experiment.criteria.model_copy(update={"contact": contact})
     return experiment.model_copy(update={"criteria": criteria, "mission": mission})
 
@@ -384,7 +387,7 @@ def _robot_limits(document: Document) -> RobotLimits:
     """Return the limits of the robot in an experiment; the default if there is no such robot."""
     name: Any = document.get("world", "robot") or World().robot
     with suppress(BadInputError, AttributeError):  # the latter if the name is no text
-        return reuse(("robot", name), partial(find_robot, name)).guard
+        return known_robot(name).guard
     return DEFAULT_LIMITS
 
 
@@ -428,7 +431,7 @@ def _resolve_paths(document: Document) -> list[Problem]:
             if key in ("robot", "scene"):
                 name = shipped.model_path(key, name, source.folder)
                 if key == "robot":
-                    reuse(("robot", name), partial(find_robot, name))
+                    known_robot(name)
             else:
                 name = str(source.absolute(name))
                 _check_file(key, name)

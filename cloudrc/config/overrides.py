@@ -26,13 +26,15 @@ from typing import Any, NamedTuple, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from cloudrc import plugins
-from cloudrc.config import problems
+from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, KeyPath, Source, child, parse_value
 from cloudrc.config.problems import Problem
 from cloudrc.config.reuse import reuse
-from cloudrc.config.schema import Experiment, PlugIn, Steps
+from cloudrc.config.robot import find_robot, parameters
+from cloudrc.config.schema import Experiment, PlugIn, Steps, World
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
+from cloudrc.renamed import new_key
 
 KINDS = {"estimator": "estimators", "predictor": "predictors", "controller": "controllers"}
 """Key under `cloud` -> kind of plug-in."""
@@ -62,7 +64,7 @@ def collect_settings(given: Iterable[tuple[str, Any, Source]]) -> Settings:
     """
     found: Settings = {}
     for key, value, source in given:
-        path = tuple(part.strip() for part in key.split("."))
+        path = tuple(new_key(".".join(part.strip() for part in key.split("."))).split("."))
         if not all(path):
             raise BadInputError(f"{source.label}: {key!r}: is no key; one is cloud.predictor")
         for each in _directions(path):
@@ -136,25 +138,49 @@ def _beginning(default: Any) -> Any:
 
 def _is_parameter(path: KeyPath) -> bool:
     """Return whether a key is the parameter of a plug-in, such as cloud.controller.gain_p."""
-    return len(path) == 3 and path[0] == "cloud" and path[1] in KINDS and path[2] != "name"
+    if len(path) != 3:
+        return False
+    section, key, parameter = path
+    is_of_cloud = section == "cloud" and key in KINDS and parameter != "name"
+    return is_of_cloud or (section, key) == ("world", "onboard")
 
 
 def _default_of_parameter(document: Document, path: KeyPath) -> Any:
     """Return the default of a plug-in's parameter if it is a list or mapping, else None."""
     section, key, parameter = path
-    choice = document.get(section, key) or _DEFAULTS[section][key]
+    # Who reads the experiment meets a problem of the plug-in or of its default again.
+    with suppress(BadInputError, TypeError, ValueError):
+        if section == "world":
+            default = _default_onboard(document, parameter)
+        else:
+            default = _default_in_cloud(document, key, parameter)
+        if isinstance(default, tuple | list | dict):
+            return json.loads(json.dumps(default))
+    return None
+
+
+def _default_in_cloud(document: Document, key: str, parameter: str) -> Any:
+    choice = document.get("cloud", key) or _DEFAULTS["cloud"][key]
     name = choice.get("name") if isinstance(choice, dict) else choice
     if not isinstance(name, str):
         return None
     if plugins.is_path(name):
-        place = (section, key, "name") if isinstance(choice, dict) else (section, key)
+        place = ("cloud", key, "name") if isinstance(choice, dict) else ("cloud", key)
         name = str(document.source(place).absolute(name))
-    # `resolve_plugins` meets a problem of the plug-in or of its default again, and reports it.
-    with suppress(BadInputError, TypeError, ValueError):
-        field = _parameters_of(KINDS[key], name).model_fields.get(parameter)
-        if field is not None and isinstance(field.default, tuple | list | dict):
-            return json.loads(json.dumps(field.default))
-    return None
+    return default_parameters(KINDS[key], name).get(parameter)
+
+
+def _default_onboard(document: Document, parameter: str) -> Any:
+    world = World(
+        robot=document.get("world", "robot") or World().robot,
+        tuning=document.get("world", "tuning"),
+    )
+    folder = document.source(("world", "robot")).folder
+    robot = find_robot(shipped.model_path("robot", world.robot, folder))
+    given = parameters(robot, world)
+    if parameter in given or robot.onboard is None:
+        return given.get(parameter)
+    return default_parameters("onboard", robot.onboard.name).get(parameter)
 
 
 def _check_index(document: Document, path: KeyPath, source: Source) -> None:
@@ -260,12 +286,25 @@ def build_plugin(kind: str, choice: PlugIn, /, **given: Any) -> Any:
     its `build` that are no parameters of the user. Raise a BadInputError that names the wrong
     parameters.
     """
-    try:
-        checked = _check(kind, choice.name, choice.model_extra or {})
-    except ValidationError as error:
-        found = problems.from_pydantic(error, parameter_model(kind, choice.name))
-        raise BadInputError("; ".join(map(str, found))) from None
+    if found := check_plugin(kind, choice):
+        raise BadInputError("; ".join(map(str, found)))
+    checked = _check(kind, choice.name, choice.model_extra or {})
     return plugins.load(kind, choice.name, **given, **dict(checked))
+
+
+def check_plugin(kind: str, choice: PlugIn) -> list[Problem]:
+    """List the problems of the parameters of a plug-in."""
+    try:
+        _check(kind, choice.name, choice.model_extra or {})
+    except ValidationError as error:
+        return problems.from_pydantic(error, parameter_model(kind, choice.name))
+    return []
+
+
+def default_parameters(kind: str, name: str) -> dict[str, Any]:
+    """Return parameter -> default of a plug-in, without the parameters that need a value."""
+    fields = _parameters_of(kind, name).model_fields
+    return {key: field.default for key, field in fields.items() if not field.is_required()}
 
 
 def parameter_model(kind: str, name: str) -> type[BaseModel]:

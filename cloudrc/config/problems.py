@@ -41,7 +41,8 @@ def leaves(model: type[BaseModel], above: KeyPath = ()) -> Iterator[tuple[KeyPat
     for key, info in model.model_fields.items():
         inner = list(_models(info.annotation))
         many = ("0",) if _is_list(info.annotation) else ()
-        if not inner or {str, float} & {*_types(info.annotation)}:
+        is_open = any(not section.model_fields for section in inner)
+        if not inner or is_open or {str, float} & {*_types(info.annotation)}:
             yield (*above, key), info
         for section in inner:
             yield from leaves(section, (*above, key, *many))

@@ -6,9 +6,10 @@ folders in `cloudrc/robots/`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -16,8 +17,17 @@ from cloudrc.config import shipped
 from cloudrc.config.document import read_document
 from cloudrc.config.problems import validate
 from cloudrc.config.reuse import reuse
-from cloudrc.config.schema import Acceleration, NameOr, PlugIn, Section, Speed
-from cloudrc.plugins import is_path
+from cloudrc.config.schema import (
+    Acceleration,
+    NameOr,
+    Parameters,
+    PlugIn,
+    Section,
+    Speed,
+    World,
+)
+from cloudrc.errors import BadInputError
+from cloudrc.plugins import is_path, unknown_name_text
 
 Braking = Annotated[float, Field(ge=0.1, le=10)]
 Hull = Annotated[float, Field(gt=0, le=10)]
@@ -54,6 +64,9 @@ class RobotFile(Section):
     onboard: NameOr[PlugIn]
     """Controller on board, which follows the velocity that the guard allows: the name of a plug-in,
     the path of a Python file, or a mapping with parameters"""
+    tunings: dict[str, Parameters] = Field(default_factory=dict)
+    """Named sets of parameters, in place of those of onboard; world.tuning chooses one. The shipped
+    experiment fast needs one named fast"""
     planar: bool = False
     """Whether the robot stays on the ground. Then the guard limits x and y alone, HOLD and LAND
     brake the robot to rest, waypoints have the height of the spawn, and cloud commands no vertical
@@ -84,6 +97,8 @@ class RobotFiles:
     planar: bool = False  # whether it stays on the ground
     guard: RobotLimits = DEFAULT_LIMITS
     hull: float | None = None  # radius about the base [m]; None: that of the model
+    # Name -> parameters of the onboard controller, in place of those in `onboard`.
+    tunings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 def find_robot(name: str) -> RobotFiles:
@@ -102,12 +117,36 @@ def find_robot(name: str) -> RobotFiles:
         onboard = onboard.model_copy(update={"name": str((folder / onboard.name).resolve())})
     stop = robot.guard.stop or ("brake" if robot.planar else "land")
     limits = robot.guard.model_copy(update={"stop": stop})
-    return RobotFiles(folder / robot.model, onboard, robot.planar, limits, robot.hull_m)
+    tunings = {key: tuning.model_extra or {} for key, tuning in robot.tunings.items()}
+    model = folder / robot.model
+    return RobotFiles(model, onboard, robot.planar, limits, robot.hull_m, tunings)
+
+
+def parameters(robot: RobotFiles, world: World) -> dict[str, Any]:
+    """Return the parameters that the onboard controller gets: of robot.yaml, tuning and world.
+
+    Raises:
+        BadInputError: If the robot has no such tuning.
+    """
+    tuning: Mapping[str, Any] = {}
+    if world.tuning is not None:
+        if world.tuning not in robot.tunings:
+            what, known = f"tuning of {world.robot}", sorted(robot.tunings)
+            text = unknown_name_text(what, world.tuning, known)
+            raise BadInputError(text if known else f"{text}; leave world.tuning out, or set null")
+        tuning = robot.tunings[world.tuning]
+    published = {} if robot.onboard is None else robot.onboard.model_extra or {}
+    return {**published, **tuning, **(world.onboard.model_extra or {})}
+
+
+def known_robot(name: str) -> RobotFiles:
+    """Return the files of a robot as `find_robot` does, but read them once for a whole sweep."""
+    return reuse(("robot", name), lambda: find_robot(name))
 
 
 def is_planar(name: str) -> bool:
     """Return whether a robot stays on the ground; raise a BadInputError as `find_robot` does."""
-    return reuse(("robot", name), lambda: find_robot(name)).planar
+    return known_robot(name).planar
 
 
 def files_of(name: str) -> list[Path]:

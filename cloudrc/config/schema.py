@@ -62,7 +62,17 @@ Dwell = Annotated[float, Field(ge=0, le=DURATION_MAX)]
 TimeLimit = Annotated[float, Field(gt=0, le=DURATION_MAX)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 Factor = Annotated[float, Field(ge=0.2, le=5)]
-Factors = tuple[Factor, Factor, Factor, Factor]
+
+
+def _factor_tag(value: Any) -> str:
+    return "<each>" if isinstance(value, list | tuple) else "<all>"
+
+
+ActuatorFactor = Annotated[
+    Annotated[Factor, Tag("<all>")]
+    | Annotated[tuple[Factor, ...], Field(min_length=1), Tag("<each>")],
+    Discriminator(_factor_tag),
+]
 Offset = Annotated[float, Field(ge=-1, le=1)]
 WindSpeed = Annotated[float, Field(ge=-20, le=20)]
 Bias = Annotated[float, Field(ge=-90, le=90)]
@@ -300,19 +310,10 @@ class Mission(Section):
         return self.steps.count if self.steps else 1 if self.setpoints else len(self.waypoints)
 
 
-class LowLevel(Section):
-    """The onboard velocity loop; the defaults are the published gains."""
+class Parameters(Section):
+    """Parameters of a plug-in, whose signature says which there are."""
 
-    gain_p: NotNegatives = (4.0, 4.0, 10.0)
-    """Proportional gain per axis [N/(m/s)]"""
-    gain_i: NotNegatives = (1.0, 1.0, 2.5)
-    """Integral gain per axis [N/m]"""
-    gain_d: NotNegatives = (0.30, 0.30, 0.50)
-    """Derivative gain per axis [N/(m/s^2)]"""
-    integral_limit_xy: NotNegative = 0.10
-    """Limit of the integrated velocity error in x and y [m]"""
-    integral_limit_z: NotNegative = 0.40
-    """Limit of the integrated velocity error in z [m]"""
+    model_config = ConfigDict(extra="allow")
 
 
 class Sensors(Section):
@@ -332,15 +333,6 @@ class Sensors(Section):
     """Standard deviation of the angular velocity noise per body axis [rad/s]"""
 
 
-THRUST_MAX_N = 33.737
-"""Largest thrust of one rotor [N]. Source: docs/reference/plant.md, "Thrust and torque"."""
-MASS_KG, GRAVITY_MPS2 = 1.06, 9.8066
-"""Mass of the shipped robot [kg] and gravity [m/s^2].
-Source: docs/reference/plant.md, "Total mass", "Gravity"."""
-THRUST_TO_WEIGHT_MIN = 1.5
-"""Smallest ratio of the largest thrust to the weight [1]: a tilted robot still climbs."""
-
-
 class Plant(Section):
     """How the true robot differs from its model."""
 
@@ -352,28 +344,14 @@ class Plant(Section):
     """Mass of a payload, a point that is fixed to the robot [kg]"""
     payload_offset_m: tuple[Offset, Offset, Offset] = (0.0, 0.0, -0.1)
     """Position of the payload in the body frame, from the origin of the base [m]"""
-    thrust_factor: Factors = (1.0, 1.0, 1.0, 1.0)
-    """True thrust and torque of the front, left, back and right rotor, as a multiple of the
-    model's; a single number counts for all four"""
+    actuator_factor: ActuatorFactor = 1.0
+    """True effect of the actuators, such as the thrust and torque of a rotor, as a multiple of the
+    model's: a number for all, or a list with a number for each, in the order of the model"""
 
-    @field_validator("thrust_factor", mode="before")
+    @field_validator("actuator_factor")
     @classmethod
-    def _repeat(cls, value: Any) -> Any:
-        if isinstance(value, list):
-            return tuple(value)
-        return (value,) * 4 if isinstance(value, int | float) else value
-
-    @model_validator(mode="after")
-    def _check_thrust(self) -> Plant:
-        weight = (MASS_KG * self.mass_factor + self.payload_kg) * GRAVITY_MPS2
-        ratio = THRUST_MAX_N * sum(self.thrust_factor) / weight
-        if ratio < THRUST_TO_WEIGHT_MIN:
-            raise ValueError(
-                f"the thrust-to-weight ratio is {ratio:.2f}, so the robot cannot lift off safely; "
-                f"it must be at least {THRUST_TO_WEIGHT_MIN:g}: lower mass_factor or payload_kg, "
-                "or raise thrust_factor"
-            )
-        return self
+    def _forget_ones(cls, value: float | tuple[float, ...]) -> float | tuple[float, ...]:
+        return value if isinstance(value, float) or {*value} != {1.0} else 1.0
 
 
 class Wind(Section):
@@ -396,25 +374,29 @@ class World(Section):
     """The robot and its scene."""
 
     robot: str = "pelican"
-    """Name of a shipped robot, or path of a folder with robot.yaml or of an MJCF file (.xml). Mass,
-    inertia and rotors must be those for which the onboard controller is made"""
+    """Name of a shipped robot, or path of a folder with robot.yaml or of an MJCF file (.xml). The
+    robot must be one that its onboard controller can fly or drive"""
     scene: str = "pipes"
     """Name of a shipped scene, or path of an MJCF file (.xml)"""
-    low_level: LowLevel = LowLevel()
+    tuning: str | None = None
+    """Name of a set of parameters in the robot's robot.yaml (tunings), such as fast. null: without
+    one"""
+    onboard: Parameters = Parameters()
+    """Parameters of the onboard controller, in place of those in robot.yaml and in its tuning"""
     sensors: Sensors = Sensors()
     """Errors of the odometry for cloud; guard and onboard controller see the true state"""
     plant: Plant = Plant()
     """How the true robot differs from its model; guard, onboard controller and cloud use the
     model. A heavy or weak robot brakes worse, so the guard may stop it too late"""
     wind: Wind = Wind()
-    """Horizontal wind. Wind acts only as drag of turning rotors, so it does not move a robot with
-    stopped rotors"""
+    """Horizontal wind. It acts on the actuators alone, as drag of turning rotors, so it does not
+    move a robot whose actuators are off. A robot whose actuators have no drag is refused"""
     odometry_rate_hz: Literal[20, 25, 50, 100, 125, 250, 500] = 100
     """Rate of the odometry for cloud [Hz]. The true state is recorded at 100 Hz or more"""
 
     @property
     def is_nominal(self) -> bool:
-        """Whether there is no wind and the true robot equals its model; step.c needs both."""
+        """Whether there is no wind and the true robot equals its model."""
         return self.plant == Plant() and not self.wind.blows
 
 

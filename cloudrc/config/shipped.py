@@ -54,7 +54,10 @@ def read(kind: str, name: str, folder: Path) -> Document:
     path = folder / os.path.expanduser(name)
     if not os.path.exists(path):  # unlike Path.exists, no exception for an invalid name
         raise _no_file("no such file", kind, path)
-    return read_document(path, name)
+    document = read_document(path, name)
+    if kind == "experiment":
+        document.rename_keys()
+    return document
 
 
 def check_name(kind: str, name: str) -> None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import inspect
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc import plugins
-from cloudrc.config.overrides import build_plugin
-from cloudrc.config.robot import RobotFiles, find_robot
-from cloudrc.config.schema import LowLevel, PlugIn, World
+from cloudrc.config.overrides import build_plugin, check_plugin, default_parameters
+from cloudrc.config.robot import RobotFiles, find_robot, parameters
+from cloudrc.config.schema import PlugIn, World
 from cloudrc.config.shipped import file_of
 from cloudrc.errors import BadInputError
+from cloudrc.messages import Vector
+from cloudrc.robots.onboard._airframe import thrust_to_weight
 from cloudrc.world.guard.state import Guard
-from cloudrc.world.onboard import Actuators, Direct, Onboard
+from cloudrc.world.onboard import Accelerator, Actuators, Direct, Onboard
 from cloudrc.world.plant import Wind
 from cloudrc.world.robot import STEP, Robot
 from cloudrc.world.scene import compile_model, compile_true
@@ -25,36 +28,40 @@ KIND = "onboard"
 """Kind of plug-in."""
 GENERAL = PlugIn(name="multirotor")
 """Onboard controller of a model without `robot.yaml` that is not like the Pelican."""
+THRUST_TO_WEIGHT_MIN = 1.5
+"""Smallest ratio of the largest thrust to the weight [1]: a tilted robot still climbs."""
+
+
+class Parts(NamedTuple):
+    """The parts of a robot in its scene, before they are connected."""
+
+    model: Any  # compiled `MjModel` of the true robot
+    plugin: Any  # plug-in of the onboard controller
+    onboard: Onboard
+    actuators: Actuators
 
 
 def check_robot(world: World) -> None:
-    """Raise a BadInputError if the robot does not compile or its controller refuses the model."""
-    robot, scene = find_robot(world.robot), file_of(world.scene)
-    model = compile_model(robot.model, scene)
-    _build_onboard(world, f"{robot.model} in {scene}", model, controller(robot, model))
+    """Raise a BadInputError if the robot does not compile, or if it cannot move as `world` says."""
+    _make_parts(world)
 
 
 def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -> Robot:
     """Build the robot that flies or drives in a scene, guarded by `limits`.
 
     Raises:
-        BadInputError: If the robot does not compile or its controller refuses the model.
+        BadInputError: If the robot does not compile, or if it cannot move as `world` says.
     """
-    robot, scene = find_robot(world.robot), file_of(world.scene)
-    nominal = compile_model(robot.model, scene)
-    choice = controller(robot, nominal)
-    onboard = _build_onboard(world, f"{robot.model} in {scene}", nominal, choice)
-    plugin = plugins.find(KIND, choice.name)
-    true = compile_true(robot.model, scene, nominal, world.plant)
-    simulator = Simulator(true, _actuators(plugin, nominal, choice), wind)
+    model, plugin, onboard, actuators = _make_parts(world)
+    robot, simulator = find_robot(world.robot), Simulator(model, actuators, wind)
     guard = Guard(limits, robot.guard, planar=robot.planar)
-    if world.is_nominal and hasattr(plugin, "accelerate"):
-        return plugin.accelerate(simulator, onboard, guard)  # type: ignore[no-any-return]
-    return Robot(simulator, onboard, guard)
+    faster = _accelerator(world, plugin)
+    make = Robot if faster is None or faster.make is None else faster.make
+    return make(simulator, onboard, guard)
 
 
 def controller(robot: RobotFiles, model: Any) -> PlugIn:
-    """Return the onboard controller of a robot.
+    """Return the onboard controller of a robot, as its `robot.yaml` says.
 
     A model without `robot.yaml` is flown by the Pelican's controller if the model, a compiled
     `MjModel`, is enough like the Pelican, and else by `GENERAL`.
@@ -72,38 +79,109 @@ def controller(robot: RobotFiles, model: Any) -> PlugIn:
     return pelican
 
 
-def runs_in_c(world: World) -> bool:
-    """Return whether the usual physics steps of a robot can run in C."""
-    if not world.is_nominal:
-        return False
+def onboard_values(world: World) -> dict[str, Any]:
+    """Return all parameters of the onboard controller with their values, including defaults."""
+    robot, choice = _choose(world)
+    return default_parameters(KIND, choice.name) | parameters(robot, world)
+
+
+def advise(world: World, gains: Vector) -> Iterator[str]:
+    """Yield the warnings of the onboard controller about a world that differs from its model.
+
+    Its plug-in may have a function `advise(world, values, gains)`; `values` are its parameters.
+    `gains` are the cloud's velocities per distance from the setpoint [1/s], 0 if unknown.
+    """
+    plugin = plugins.find(KIND, _choose(world)[1].name)
+    if hasattr(plugin, "advise"):
+        yield from plugin.advise(world, onboard_values(world), gains)
+
+
+def accelerator(world: World) -> Accelerator | None:
+    """Return what can run the usual steps of a robot faster; None if nothing can."""
+    return _accelerator(world, plugins.find(KIND, _choose(world)[1].name))
+
+
+def describe_steps(world: World) -> str:
+    """Say in which language the usual steps of a robot run on this machine."""
+    faster = accelerator(world)
+    if faster is None:
+        return "Python (wind, a robot that differs from its model, or one without steps in C)"
+    return faster.text
+
+
+def _accelerator(world: World, plugin: Any) -> Accelerator | None:
+    if not world.is_nominal or not hasattr(plugin, "accelerator"):
+        return None
+    return plugin.accelerator()  # type: ignore[no-any-return]
+
+
+def _choose(world: World) -> tuple[RobotFiles, PlugIn]:
+    """Return a robot and its onboard controller; a robot without `robot.yaml` is compiled."""
     robot = find_robot(world.robot)
     model = compile_model(robot.model, file_of(world.scene)) if robot.onboard is None else None
-    return hasattr(plugins.find(KIND, controller(robot, model).name), "accelerate")
+    return robot, controller(robot, model)
 
 
-def _build_onboard(world: World, where: str, model: Any, choice: PlugIn) -> Onboard:
+def _make_parts(world: World) -> Parts:
+    robot, scene = find_robot(world.robot), file_of(world.scene)
+    nominal, where = compile_model(robot.model, scene), f"{robot.model} in {scene}"
+    choice = controller(robot, nominal)
+    onboard = _build_onboard(world, where, choice, parameters(robot, world), nominal)
+    plugin = plugins.find(KIND, choice.name)
+    true = compile_true(robot.model, scene, nominal, world.plant)
+    if not robot.planar:
+        _check_lift(world, where, true)
+    actuators = _build_actuators(plugin, nominal, parameters(robot, world))
+    if world.wind.blows and isinstance(actuators, Direct):
+        _refuse_wind(world, plugin)
+    return Parts(true, plugin, onboard, actuators)
+
+
+def _build_onboard(
+    world: World, where: str, choice: PlugIn, given: dict[str, Any], model: Any
+) -> Onboard:
     """Build an onboard controller for a compiled `MjModel`; errors name the files in `where`."""
-    parameters = dict(choice.model_extra or {})
-    if world.low_level != LowLevel():
-        known = plugins.signature(KIND, choice.name).parameters
-        if unknown := LowLevel.model_fields.keys() - known:
-            raise BadInputError(
-                f"world.low_level: the onboard controller {choice.name} of {where} has no "
-                f"{', '.join(sorted(unknown))}; leave this section out"
-            )
-        parameters |= world.low_level.model_dump()
+    choice = PlugIn.model_validate({**given, "name": choice.name})
+    problems = check_plugin(KIND, choice)
+    own = [each for each in problems if each.path[0] in (world.onboard.model_extra or {})]
+    if own:
+        listed = "; ".join(f"world.onboard.{problem}" for problem in own)
+        raise BadInputError(f"{listed} (controller of {world.robot}: {choice.name})")
     try:
-        return build_plugin(  # type: ignore[no-any-return]
-            KIND, choice.model_copy(update=parameters), model=model
-        )
+        return build_plugin(KIND, choice, model=model)  # type: ignore[no-any-return]
     except BadInputError as error:
         raise BadInputError(f"{where}: {error}") from error
 
 
-def _actuators(plugin: Any, model: Any, onboard: PlugIn) -> Actuators:
+def _check_lift(world: World, where: str, model: Any) -> None:
+    """Raise a BadInputError if the true robot, a compiled `MjModel`, cannot lift off safely."""
+    ratio = thrust_to_weight(model)
+    if ratio is None or ratio >= THRUST_TO_WEIGHT_MIN:
+        return
+    hint = "give it more thrust or less mass"
+    if not world.is_nominal:
+        where = "world.plant"
+        hint = "lower mass_factor or payload_kg, or raise actuator_factor"
+    raise BadInputError(
+        f"{where}: the thrust-to-weight ratio of {world.robot} is {ratio:.2f}, so it cannot lift "
+        f"off safely; it must be at least {THRUST_TO_WEIGHT_MIN:g}: {hint}"
+    )
+
+
+def _build_actuators(plugin: Any, model: Any, given: dict[str, Any]) -> Actuators:
     """Make the actuators; they get those parameters of the controller that they name, too."""
     if not hasattr(plugin, "actuators"):
         return Direct(model.nu)
-    known, given = inspect.signature(plugin.actuators).parameters, onboard.model_extra or {}
+    known = inspect.signature(plugin.actuators).parameters
     own = {name: value for name, value in given.items() if name in known}
     return plugin.actuators(model, STEP, **own)  # type: ignore[no-any-return]
+
+
+def _refuse_wind(world: World, plugin: Any) -> None:
+    """Raise the error about a wind that would not move the robot."""
+    text = f"world.wind: {world.robot} has actuators without drag, so wind would not move it; "
+    if hasattr(plugin, "actuators"):
+        known = inspect.signature(plugin.actuators).parameters
+        keys = [f"world.onboard.{name}" for name in list(known)[2:]]
+        text += f"set {' and '.join(keys)} above 0, or "
+    raise BadInputError(f"{text}leave the wind out")

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.plugins import unknown_name_text
+from cloudrc.renamed import new_key
 from cloudrc.rounding import differences
 from cloudrc.runs import flight, store
 from cloudrc.runs.experiment import load, refuse_seed
@@ -176,6 +177,12 @@ def _flight(row: Row, names: Sequence[str]) -> dict[str, Any]:
     return {"verdict": row["verdict"], "numbers": numbers}
 
 
+def _with_new_key(text: str) -> str:
+    """Return VALUE or AXIS=VALUE with the present name of the axis."""
+    axis, equals, value = text.partition("=")
+    return f"{new_key(axis)}={value}" if equals else text
+
+
 def of_sweep(folder: Path, a: str, b: str) -> Pairs:
     """Pair the rows of a sweep that differ only in one axis: one has the value `a`, the other `b`.
 
@@ -184,6 +191,7 @@ def of_sweep(folder: Path, a: str, b: str) -> Pairs:
     Raises:
         BadInputError: If not exactly one axis has both values, or if `a` and `b` are equal.
     """
+    a, b = (_with_new_key(text) for text in (a, b))
     rows, units, missing = store.read_flights(folder)
     axes = store.values_of(rows)
     sides = [

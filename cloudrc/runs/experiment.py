@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from cloudrc import metrics
 from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.config.overrides import parse_settings
+from cloudrc.config.reuse import reuse
+from cloudrc.config.schema import Parameters, World
 from cloudrc.errors import BadInputError
 from cloudrc.warnings import advise
 
@@ -43,11 +45,22 @@ def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
             "cloud.clock_offset_s and cloud.clock_drift_ppm act in virtual time only, elsewhere "
             "the machine's clock counts; use --mode virtual, or leave them out"
         )
-    world = experiment.world
-    if mode != "cluster" and ("/" in world.robot or world.scene.endswith(".xml")):
-        from cloudrc.robots.build import check_robot
+    if mode != "cluster":
+        check_world(experiment.world)
 
-        check_robot(world)
+
+def check_world(world: World) -> None:
+    """Raise a BadInputError if the robot cannot move in its scene as `world` says.
+
+    The shipped robots can in the shipped scenes, if nothing is changed.
+    """
+    shipped = not ("/" in world.robot or world.scene.endswith(".xml"))
+    if shipped and world.is_nominal and world.tuning is None and world.onboard == Parameters():
+        return
+    from cloudrc.robots.build import check_robot
+
+    facts = world.model_dump_json(exclude={"sensors", "odometry_rate_hz"})
+    reuse(("world", facts), lambda: check_robot(world))
 
 
 def advice_on(*experiments: ResolvedExperiment) -> list[str]:

@@ -10,6 +10,7 @@ from typing import Any
 from cloudrc.errors import BadInputError
 from cloudrc.metrics import scale
 from cloudrc.plugins import unknown_name_text
+from cloudrc.renamed import new_key
 from cloudrc.report.figures.bands import Panel, Point, draw
 from cloudrc.report.figures.style import Look
 from cloudrc.runs.compare import NUMBERS, check_names
@@ -89,6 +90,7 @@ def _choose(
         raise BadInputError(
             "this sweep has no axis; give its file a grid, or see its metrics in table.csv"
         )
+    x, by = (axis and new_key(axis) for axis in (x, by))
     for axis in (x, by):
         if axis is not None and axis not in values:
             raise BadInputError(unknown_name_text("axis", axis, sorted(values)))

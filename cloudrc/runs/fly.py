@@ -26,7 +26,6 @@ from cloudrc.records import Record
 from cloudrc.report.document import Run
 from cloudrc.report.views import views
 from cloudrc.report.write import attachments, write_report
-from cloudrc.robots.pelican.native.library import library
 from cloudrc.runs.interrupts import raise_if_interrupted
 from cloudrc.runs.session import read_last_mission
 from cloudrc.source import code_hash
@@ -36,8 +35,6 @@ See: TypeAlias = Callable[[list[Record]], None]
 Session: TypeAlias = Callable[[str, dict[str, str]], None]
 """Function that a session calls when it is ready, with the API's address, and process -> HOST:PORT
 of its metrics."""
-NO_C = "Python (wind, a robot that differs from its model, or one without steps in C)"
-"""Where the physics steps run if the C code does not cover the experiment."""
 
 
 def fly(
@@ -68,13 +65,6 @@ def fly(
         raise machine_error(error) or error from error
 
 
-def _where_steps_run(experiment: ResolvedExperiment, machine: str) -> str:
-    """Say where the usual physics steps run; `machine` says where they run if they can be in C."""
-    from cloudrc.robots.build import runs_in_c
-
-    return machine if runs_in_c(experiment.world) else NO_C
-
-
 def _interruptible(see: See) -> See:
     """Return a function that first looks for a signal: a library may have caught the exception."""
 
@@ -94,7 +84,7 @@ def _record_virtual(
     The caller writes the report in the `with` block. After the block, this function attaches a copy
     of the report to mission.mcap.
     """
-    from cloudrc.robots.pelican.native.robot import usable
+    from cloudrc.robots.build import describe_steps
 
     store, interrupted, see = RecordStore(), False, _interruptible(see)
     # Record during the flight, so that the recording is kept if the run or its report fails.
@@ -114,7 +104,7 @@ def _record_virtual(
         except KeyboardInterrupt:
             interrupted = True
         try:
-            steps = _where_steps_run(experiment, usable().text)
+            steps = describe_steps(experiment.world)
             run = Run("virtual", "virtual", interrupted, assembly.virtual_notes(experiment), steps)
             writer.note(run.metadata)
             recording = Recording(records=store, metadata={CODE: code_hash()})
@@ -136,6 +126,8 @@ def _record_local(
 
     With `session`, as in `fly`, yield those of the session's last mission.
     """
+    from cloudrc.robots.build import describe_steps
+
     prepare_link(folder / LINK_FOLDER, experiment)
     local = LocalRun(folder, _interruptible(see), session=session)
     broken, interrupted = None, True
@@ -156,7 +148,7 @@ def _record_local(
             raise broken or InterruptedRunError("interrupted, nothing was recorded") from None
         raise
     notes = (*local.notes, *([str(broken)] if broken else ()))
-    steps = _where_steps_run(experiment, library().text)
+    steps = describe_steps(experiment.world)
     run = Run("local", "relay", interrupted, notes, steps)
     mission.metadata |= run.metadata
     try:

@@ -32,6 +32,8 @@ from cloudrc.config.robot import files_of
 from cloudrc.config.schema import Section
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.model_files import model_files
+from cloudrc.renamed import new_key
+from cloudrc.runs.experiment import check_world
 from cloudrc.runs.flight import Row
 
 SEED_MAX, SEEDS_MAX = 2**53 - 1, 10_000
@@ -234,8 +236,9 @@ def _entries(
         return key, value, document.source(path)._replace(folder=folder)
 
     axes: dict[str, list[tuple[Any, list[_Entry]]]] = {}
-    for axis, given in file.grid.items():
-        above, choices = ("grid", axis), axes.setdefault(axis, [])
+    for name_in_file, given in file.grid.items():
+        above, axis = ("grid", name_in_file), new_key(name_in_file)
+        choices = axes.setdefault(axis, [])
         if isinstance(given, list):
             for n, value in enumerate(given):
                 choices.append((value, [entry(axis, value, *above, str(n))]))
@@ -257,6 +260,7 @@ def _resolve(experiment: str, entries: Iterable[_Entry]) -> ResolvedExperiment:
         source = settings["seed",].source
         raise BadInputError(f"{source.label}: seed: give the seeds with the key 'seeds'")
     resolved = load_experiment(experiment, settings)
+    check_world(resolved.world)
     own = resolved.report.metrics
     reuse(("metrics", own), lambda: metrics.check(own))
     return resolved

@@ -16,6 +16,7 @@ from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.problems import exceeds, expectation
 from cloudrc.config.schema import COMMAND_AGE_MS, Experiment
 from cloudrc.errors import BadInputError
+from cloudrc.robots.build import onboard_values
 from cloudrc.warnings import simulate_ages
 
 SLACK = 0.1
@@ -115,6 +116,8 @@ def present_value(experiment: ResolvedExperiment, key: str) -> int | float | Non
     """
     names = _one_way(key).split(".")
     value: Any = experiment.model_dump(mode="json")
+    if names[:2] == ["world", "onboard"]:
+        value["world"]["onboard"] = onboard_values(experiment.world)
     for name in names:
         value = child(value, name)
     if isinstance(value, str | bool | dict | list):

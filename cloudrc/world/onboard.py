@@ -8,7 +8,8 @@ velocity that the guard allows, and hands the actuators what the controller comm
 
 from __future__ import annotations
 
-from typing import Protocol, TypeAlias
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from cloudrc.messages import Vector
 from cloudrc.world.readings import Readings
@@ -66,6 +67,18 @@ class Actuators(Protocol):
 
         The velocity of `readings` is relative to the air.
         """
+
+
+class Accelerator(NamedTuple):
+    """Code that runs the usual steps of a robot faster than Python, with the same results.
+
+    A plug-in of an onboard controller may have a function `accelerator()` that returns it.
+    """
+
+    # Makes a robot of simulator, onboard controller and guard; None: this machine cannot run it.
+    make: Callable[..., Any] | None
+    text: str  # language of the steps, and where the code is from or why it is missing
+    code: str = ""  # hash of the machine code
 
 
 class Direct:

@@ -46,25 +46,35 @@ def compile_model(robot: Path, scene: Path) -> Any:
 
 
 def compile_true(robot: Path, scene: Path, nominal: Any, plant: Plant) -> Any:
-    """Return the model of the true robot, whose mass, inertia and thrust `plant` changes.
+    """Return the model of the true robot, whose mass, inertia and actuators `plant` changes.
 
     `nominal` is the result of `compile_model` for the same files. Raise a BadInputError if `plant`
     has factors for another number of actuators.
     """
     if plant == Plant():
         return nominal
-    factors = plant.thrust_factor
-    if factors == Plant().thrust_factor:
-        factors = (1.0,) * nominal.nu
-    elif len(factors) != nominal.nu:
+    factors = plant.actuator_factor
+    if isinstance(factors, tuple) and len(factors) != nominal.nu:
         raise BadInputError(
-            f"world.plant.thrust_factor: has {len(factors)} factors, but {robot} has {nominal.nu} "
-            "actuators; leave it out"
+            f"world.plant.actuator_factor: has {len(factors)} factors, but {robot} has "
+            f"{nominal.nu} actuators; give as many, or one number for all"
         )
     fuse = not (FUSES_WRONG and _has_joints(nominal))
     model = _compile(robot, scene, true_inertia(plant, _inertia(nominal)), fuse=fuse)
-    model.actuator_gainprm[:, 0] *= factors
+    _scale_moving_parts(model, plant)
+    scale = np.broadcast_to(np.array(factors), (model.nu,))[:, None]
+    for values in (model.actuator_gainprm, model.actuator_biasprm, model.actuator_forcerange):
+        values *= scale  # the force is gain times control plus bias, in this range
     return model
+
+
+def _scale_moving_parts(model: Any, plant: Plant) -> None:
+    """Scale mass and inertia of the robot's parts that move, such as wheels, as `plant` says."""
+    base = model.jnt_bodyid[0]
+    parts = (model.body_rootid == base) & (model.body_weldid != base)
+    model.body_mass[parts] *= plant.mass_factor
+    model.body_inertia[parts] *= plant.inertia_factor
+    mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def _compile(

@@ -49,7 +49,7 @@ def test_every_problem_says_how_to_fix_it(monkeypatch):
 
 def test_the_doctor_says_where_the_usual_steps_run(monkeypatch):
     monkeypatch.setenv("CLOUDRC_NATIVE", "0")
-    _, steps = doctor.said(doctor.start(f"print('one'); {doctor.NATIVE_PROGRAM}"))
+    _, steps = doctor.said(doctor.start(f"print('one'); {doctor.STEPS_PROGRAM}"))
     check = doctor.native_steps(steps)
     assert (check.state, check.found) == ("warn", "Python (CLOUDRC_NATIVE=0)")
     assert "CLOUDRC_NATIVE" in check.fix

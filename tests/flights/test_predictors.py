@@ -8,7 +8,7 @@ from tests.flights.conftest import both_ways, fly, numbers
 
 FAST = (
     "cloud.controller={name: pid, gain_p: [2.5, 2.5, 3.0], gain_d: [0.5, 0.5, 0.0]}",
-    "world.low_level.integral_limit_xy=0.3",
+    "world.onboard.integral_limit_xy=0.3",
     "cloud.estimator=split",
     "mission.steps.count=3",
 )

@@ -32,7 +32,7 @@ WEIGHT, ASSUMED = 1.06 * 9.8066, 1.05 * 9.81
     [
         ("world.plant.mass_factor=1.2", 2, 1.2 * WEIGHT - ASSUMED),
         ("world.plant.payload_kg=0.25", 2, WEIGHT + 0.25 * 9.8066 - ASSUMED),
-        ("world.plant.thrust_factor=0.8", 2, WEIGHT / 0.8 - ASSUMED),
+        ("world.plant.actuator_factor=0.8", 2, WEIGHT / 0.8 - ASSUMED),
         # The drag of four rotors at 510 rad/s, .0454 m above the centre of mass, also tilts the
         # robot: by the torque in N m (k_R = 1), and this tilts its thrust.
         ("world.wind.velocity_mps=[0, 3]", 1, 3 * 4 * 8.06428e-5 * 510.1 * (1 + 0.0454 * WEIGHT)),

@@ -169,19 +169,20 @@ def test_the_cloud_drives_the_rover_to_its_waypoints_and_twice_alike():
 
 
 @pytest.mark.parametrize("wrong", [False, True])
-def test_mass_and_payload_change_the_base_and_keep_the_wheels(wrong, monkeypatch):
+def test_factors_scale_base_and_wheels_and_the_payload_is_on_the_base(wrong, monkeypatch):
     monkeypatch.setattr(scene, "FUSES_WRONG", wrong)
     nominal = compile_model(MODEL, EMPTY)
-    plant = Plant(mass_factor=1.1, payload_kg=0.5)
+    plant = Plant(mass_factor=1.1, inertia_factor=1.2, payload_kg=0.5)
     heavy = compile_true(MODEL, EMPTY, nominal, plant)
     base = nominal.jnt_bodyid[0]
     assert nominal.body_mass[base] == pytest.approx(6.2)
     assert heavy.body_mass[base] == pytest.approx(1.1 * 6.2 + 0.5)
-    assert heavy.body_mass[base + 1 :] == pytest.approx(nominal.body_mass[base + 1 :])
+    assert heavy.body_subtreemass[base] == pytest.approx(1.1 * 7.0 + 0.5)
+    assert heavy.body_inertia[base + 1 :] == pytest.approx(1.2 * nominal.body_inertia[base + 1 :])
 
 
 def test_factors_for_four_actuators_do_not_fit_two_wheels():
     nominal = compile_model(MODEL, EMPTY)
-    plant = Plant(thrust_factor=(1.0, 1.0, 1.0, 0.9))
+    plant = Plant(actuator_factor=(1.0, 1.0, 1.0, 0.9))
     with pytest.raises(BadInputError, match=r"has 4 factors, but .*robot\.xml has 2 actuators"):
         compile_true(MODEL, EMPTY, nominal, plant)

@@ -4,7 +4,6 @@ import pytest
 
 import cloudrc
 from cloudrc.config.robot import find_robot
-from cloudrc.errors import BadInputError
 
 STEPS = {"mission.steps.count": 4, "link.profile": "paper-p2"}
 
@@ -27,8 +26,3 @@ def test_a_model_alone_flies(tmp_path):
 def test_equal_flights_have_equal_records():
     flights = [cloudrc.fly("steps", STEPS | {"world.robot": "nano"}) for _ in range(2)]
     assert flights[0].records_sha256 == flights[1].records_sha256
-
-
-def test_keys_of_another_controller_are_refused():
-    with pytest.raises(BadInputError, match=r"world\.low_level: .*multirotor"):
-        cloudrc.fly("steps", {"world.robot": "nano", "world.low_level.integral_limit_xy": 0.3})

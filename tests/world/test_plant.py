@@ -64,7 +64,7 @@ def test_a_changed_robot_touches_what_the_model_touches(scene_at):
 
 
 def test_a_weak_rotor_has_less_thrust_and_less_torque():
-    weak = model(thrust_factor=(1.0, 0.7, 1.0, 1.0))
+    weak = model(actuator_factor=(1.0, 0.7, 1.0, 1.0))
     data = mujoco.MjData(weak)
     data.ctrl[:] = 3.0
     mujoco.mj_forward(weak, data)

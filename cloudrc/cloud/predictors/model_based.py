@@ -229,7 +229,7 @@ def build(
     integral_limit_z: NotNegative = 0.40,
     acceleration_max: Positive = 12.0,
 ) -> ModelBased:
-    """Make the predictor; the defaults are those of `world.low_level` and `guard`.
+    """Make the predictor; the defaults are those of `world.onboard` and `guard`.
 
     Args:
         gain_p: Proportional gain of the onboard velocity loop [N s/m], shape (3,).

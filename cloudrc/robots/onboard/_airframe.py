@@ -93,6 +93,24 @@ def read_airframe(model: Any, *, steers_yaw: bool = True) -> Airframe:
     return frame
 
 
+def thrust_to_weight(model: Any) -> float | None:
+    """Return the largest force along the base's z axis, relative to the weight [1].
+
+    The model is a compiled `MjModel`. Return None for a robot that no actuator at a site lifts,
+    because its forces are not in the model.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    at_site = model.actuator_trntype == mujoco.mjtTrn.mjTRN_SITE
+    lift = np.where(at_site, _pushes(model, data)[0][:, 2], 0.0)
+    weight = -model.body_subtreemass[model.jnt_bodyid[0]] * model.opt.gravity[2]
+    if not lift.any() or weight <= 0.0:
+        return None
+    limits = np.array([_limits(model, number) for number in np.flatnonzero(lift).tolist()])
+    most = (lift[lift != 0.0, None] * limits).max(axis=1).sum()
+    return float(most / weight)
+
+
 def _inertia(model: Any, data: Any) -> Inertia:
     """Read mass, centre of mass and inertia from the mass matrix of the free joint.
 
@@ -123,7 +141,7 @@ def _pushes(model: Any, data: Any) -> tuple[Array, Array]:
 
     They are in [N] and [N m], in the frame of the base.
     """
-    moments = np.zeros((model.nu, 6))
+    moments = np.zeros((model.nu, model.nv))
     mujoco.mju_sparse2dense(
         moments,
         data.actuator_moment.ravel(),
@@ -132,7 +150,7 @@ def _pushes(model: Any, data: Any) -> tuple[Array, Array]:
         data.moment_colind.ravel(),
     )
     moments *= model.actuator_gainprm[:, :1]
-    return moments[:, :3] @ _axes(model, data), moments[:, 3:]
+    return moments[:, :3] @ _axes(model, data), moments[:, 3:6]
 
 
 def _axes(model: Any, data: Any) -> Array:

@@ -27,11 +27,20 @@ from cloudrc.world.onboard import Commands
 from cloudrc.world.readings import Readings
 
 MASS = 1.05
-"""Mass that the controller assumes [kg]; the robot's mass is 1.06 kg.
-Source: docs/reference/plant.md, "Total mass"."""
+"""Mass that the controller assumes [kg]. Source: docs/reference/plant.md, "Total mass"."""
 GRAVITY = 9.81
-"""Gravity that the controller assumes [m/s^2]; the physics uses 9.8066 m/s^2.
-Source: docs/reference/plant.md, "Gravity"."""
+"""Gravity that the controller assumes [m/s^2]. Source: docs/reference/plant.md, "Gravity"."""
+ROBOT_MASS, ROBOT_GRAVITY = 1.06, 9.8066
+"""Mass of the robot [kg], and gravity of the physics [m/s^2].
+Source: docs/reference/plant.md, "Total mass", "Gravity"."""
+GAIN_P: Vector = (4.0, 4.0, 10.0)
+"""Published force per velocity error [N s/m], shape (3,)."""
+GAIN_I: Vector = (1.0, 1.0, 2.5)
+"""Published force per integrated velocity error [N/m], shape (3,)."""
+GAIN_D: Vector = (0.30, 0.30, 0.50)
+"""Published force per rate of the velocity error [N s^2/m], shape (3,)."""
+INTEGRAL_LIMIT_XY, INTEGRAL_LIMIT_Z = 0.10, 0.40
+"""Published limits of the integrated velocity error in x and y, and in z [m]."""
 TILT_GAIN, YAW_GAIN = 1.0, 0.035
 """Attitude gains k_R: torque per attitude error about x and y, and about z [N m]."""
 TILT_RATE_GAIN, YAW_RATE_GAIN = 0.22, 0.01
@@ -68,11 +77,11 @@ class LowLevel:
 
     def __init__(
         self,
-        gain_p: Vector = (4.0, 4.0, 10.0),
-        gain_i: Vector = (1.0, 1.0, 2.5),
-        gain_d: Vector = (0.30, 0.30, 0.50),
-        integral_limit_xy: float = 0.10,
-        integral_limit_z: float = 0.40,
+        gain_p: Vector = GAIN_P,
+        gain_i: Vector = GAIN_I,
+        gain_d: Vector = GAIN_D,
+        integral_limit_xy: float = INTEGRAL_LIMIT_XY,
+        integral_limit_z: float = INTEGRAL_LIMIT_Z,
         dt: float = 0.002,
     ) -> None:
         """Set the gains and limits of the velocity loop.

@@ -6,26 +6,43 @@ of its mass, inertia and rotors.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping
+from math import ceil
+from statistics import fmean
+from typing import Any
 
+from cloudrc.config.schema import NotNegative, NotNegatives, World
 from cloudrc.messages import Vector
 from cloudrc.robots.pelican.fit import check_fit
-from cloudrc.robots.pelican.low_level import LowLevel
+from cloudrc.robots.pelican.low_level import (
+    GAIN_D,
+    GAIN_I,
+    GAIN_P,
+    GRAVITY,
+    INTEGRAL_LIMIT_XY,
+    INTEGRAL_LIMIT_Z,
+    MASS,
+    ROBOT_GRAVITY,
+    ROBOT_MASS,
+    LowLevel,
+)
 from cloudrc.robots.pelican.rotors import Rotors
+from cloudrc.world.onboard import Accelerator
 
-if TYPE_CHECKING:
-    from cloudrc.world.guard.state import Guard
-    from cloudrc.world.robot import Robot
-    from cloudrc.world.simulator import Simulator
+SAG_MAX = 0.05
+"""Largest steady error of the position that needs no warning [m]."""
+WIND_FORCE = 0.24
+"""Horizontal force on a hovering robot per wind speed [N s/m]: two thirds are the drag of the
+rotors, one third comes from the tilt that this drag causes."""
 
 
 def build(
     model: Any,
-    gain_p: Vector = (4.0, 4.0, 10.0),
-    gain_i: Vector = (1.0, 1.0, 2.5),
-    gain_d: Vector = (0.30, 0.30, 0.50),
-    integral_limit_xy: float = 0.10,
-    integral_limit_z: float = 0.40,
+    gain_p: NotNegatives = GAIN_P,
+    gain_i: NotNegatives = GAIN_I,
+    gain_d: NotNegatives = GAIN_D,
+    integral_limit_xy: NotNegative = INTEGRAL_LIMIT_XY,
+    integral_limit_z: NotNegative = INTEGRAL_LIMIT_Z,
 ) -> LowLevel:
     """Make the controller for a compiled `MjModel`.
 
@@ -49,8 +66,35 @@ def actuators(model: Any, dt: float) -> Rotors:
     return Rotors(dt)
 
 
-def accelerate(simulator: Simulator, onboard: LowLevel, guard: Guard) -> Robot:
-    """Make a robot that runs its usual steps in C if this machine can, with the same results."""
-    from cloudrc.robots.pelican.native.robot import make_robot
+def accelerator() -> Accelerator:
+    """Return what runs the usual steps in C, if this machine can."""
+    from cloudrc.robots.pelican.native.robot import NativeRobot, usable
 
-    return make_robot(simulator, onboard, guard)
+    library = usable()
+    return Accelerator(NativeRobot if library.run else None, library.text, library.code)
+
+
+def advise(world: World, values: Mapping[str, Any], gains: Vector) -> Iterator[str]:
+    """Yield advice if the integral of the velocity loop cannot balance wind or a changed weight.
+
+    `values` are the parameters of `build`; `gains` are the cloud's velocities per distance from the
+    setpoint [1/s], shape (3,), 0 if unknown.
+    """
+    plant = world.plant
+    factors = plant.actuator_factor
+    thrust = factors if isinstance(factors, float) else fmean(factors)
+    weight = (ROBOT_MASS * plant.mass_factor + plant.payload_kg) * ROBOT_GRAVITY
+    heavy = abs(weight / thrust - MASS * GRAVITY)
+    drag = WIND_FORCE * max(map(abs, world.wind.velocity_mps))
+    for name, axis, force in (("wind", 0, drag), ("plant", 2, heavy)):
+        key = "integral_limit_z" if axis else "integral_limit_xy"
+        gain, gain_i = values["gain_p"][axis] * gains[axis], values["gain_i"][axis]
+        rest = force - gain_i * values[key]
+        if rest > SAG_MAX * gain > 0.0 and gain_i:
+            fits = round((ceil(force / gain_i / 0.1) + 1) * 0.1, 3)
+            yield (
+                f"the onboard controller does not know world.{name}, so the robot hovers about "
+                f"{rest / gain:.2f} m from its setpoint; a value that fits: "
+                f"--set world.onboard.{key}={fits:g}"
+                + ("" if axis else " (above 0.3 a hostile cloud can leave the fence)")
+            )

@@ -28,9 +28,9 @@ def changed(folder, file, old, new):
         ('mass="1.0"', 'mass="1.265"', r"mass .kg. is 1.325, not 1.06 \+- 0.1"),
         (".01 .01 .02", ".02 .01 .02", "inertia .kg m.2. is 0.0215"),
         ('"0 .21 .05" childclass', '"0 .21 .05" euler="9 0 0" childclass', "left gear"),
-        ('ctrllimited="false"', 'ctrlrange="0 13"', "range .N. is 0 13, not 0 33.74"),
-        ('ctrllimited="false"', 'ctrlrange="1 40"', "range .N. is 1 33.74, not 0 33"),
-        ('ctrllimited="false"', 'dyntype="filter" dynprm="1"', "dyntype is 2, not 0"),
+        ('ctrlrange="0 33.74"', 'ctrlrange="0 13"', "range .N. is 0 13, not 0 33.74"),
+        ('ctrlrange="0 33.74"', 'ctrlrange="1 40"', "range .N. is 1 33.74, not 0 33"),
+        ('ctrlrange="0 33.74"', 'dyntype="filter" dynprm="1"', "dyntype is 2, not 0"),
         ('size=".03" pos=".2 0 0"', 'size=".03" pos=".1 0 0"', "tip .m. is 0.3 0 0.17"),
     ],
 )

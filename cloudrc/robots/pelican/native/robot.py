@@ -198,18 +198,11 @@ _pack_memory, _unpack_memory = Struct("q10dq").pack_into, Struct("40x6d").unpack
 _unpack_before = Struct("13d").unpack_from
 
 
-def make_robot(simulator: Simulator, low_level: LowLevel, guard: Guard) -> Robot:
-    """Make a robot that uses C if this machine can.
-
-    Call it only if `World.is_nominal`: `step.c` simulates neither wind nor a true robot that
-    differs from its model.
-    """
-    kind = Robot if usable().run is None else NativeRobot
-    return kind(simulator, low_level, guard)
-
-
 def usable() -> Library:
-    """Return the compiled `step.c`; its field `run` is None if it is missing or fails its test."""
+    """Return the compiled `step.c`; its field `run` is None if it is missing or fails its test.
+
+    `step.c` simulates neither wind nor a true robot that differs from its model.
+    """
     found = library()
     return found if found.run is None or not (wrong := _self_test()) else Library(None, wrong)
 

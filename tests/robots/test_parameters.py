@@ -1,0 +1,156 @@
+"""Parameters on board, a robot unlike its model, and wind, for every robot."""
+
+import json
+import re
+
+import pytest
+
+import cloudrc
+from cloudrc.config import shipped
+from cloudrc.config.load import load_experiment
+from cloudrc.config.robot import find_robot
+from cloudrc.config.schema import World
+from cloudrc.errors import BadInputError
+from cloudrc.robots.build import check_robot, onboard_values
+from cloudrc.runs.experiment import load
+from cloudrc.runs.grid import read_grid
+
+
+def world(**keys):
+    return World.model_validate_json(json.dumps({"scene": "empty", **keys}))
+
+
+def refused(**keys):
+    with pytest.raises(BadInputError) as error:
+        check_robot(world(**keys))
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("robot", shipped.names("robot"))
+def test_each_tuning_of_a_shipped_robot_is_one_that_its_controller_takes(robot):
+    tunings = find_robot(robot).tunings
+    assert "fast" in tunings
+    for name in tunings:
+        check_robot(world(robot=robot, tuning=name))
+
+
+def test_an_experiment_goes_before_the_tuning_and_the_tuning_before_the_robot(own_robot):
+    mine = own_robot(
+        "onboard: {name: multirotor, tilt_max_deg: 20, velocity_bandwidth_radps: 1}\n"
+        "tunings: {fast: {tilt_max_deg: 30, velocity_bandwidth_radps: 2}}"
+    )
+    keys = {"robot": str(mine), "tuning": "fast", "onboard": {"tilt_max_deg": 40.0}}
+    values = onboard_values(world(**keys))
+    assert (values["tilt_max_deg"], values["velocity_bandwidth_radps"]) == (40.0, 2)
+    assert values["drag_s_per_m"] == 0.0  # default of the plug-in
+    assert onboard_values(world(robot=str(mine)))["tilt_max_deg"] == 20
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"onboard": {"gain_q": 1}}, "world.onboard.gain_q: unknown key; did you mean gain_p?"),
+        ({"onboard": {"gain_p": 3}}, "world.onboard.gain_p: 3: must be a list of 3 numbers"),
+        ({"onboard": {"gain_p": [1, 2]}}, "world.onboard.gain_p"),
+        ({"robot": "nano", "onboard": {"tilt_max": 30}}, "did you mean tilt_max_deg?"),
+        ({"robot": "rover", "onboard": {"turn_gain": -1}}, "turn_gain: -1: must be a number > 0"),
+        ({"robot": "x2", "onboard": {"model": 1}}, "world.onboard.model: unknown key"),
+        ({"robot": "x2", "onboard": {"tilt_max_deg": 80.0}}, "tilt_max_deg: 80 is not above 0"),
+        ({"robot": "nano", "tuning": "slow"}, "no tuning of nano named 'slow'; available: fast"),
+    ],
+)
+def test_a_parameter_that_the_controller_does_not_take_is_one_line(keys, said):
+    assert said in refused(**keys)
+
+
+def test_a_robot_without_tunings_says_so(own_robot):
+    text = refused(robot=str(own_robot("onboard: multirotor")), tuning="fast")
+    assert "available: none; leave world.tuning out" in text
+
+
+def test_an_index_keeps_the_published_entries():
+    found = load_experiment("hover", ["world.onboard.gain_p.2=8"]).world.onboard
+    assert found.model_extra == {"gain_p": [4.0, 4.0, 8]}
+
+
+@pytest.mark.parametrize(
+    ("keys", "ratio"),
+    [
+        ({"plant": {"actuator_factor": 0.2, "payload_kg": 1.0}}, "pelican is 1.34"),
+        ({"robot": "nano", "plant": {"mass_factor": 2.0}}, "nano is 1.13"),
+        ({"robot": "nano", "plant": {"actuator_factor": [0.5, 0.5, 0.5, 1.0]}}, "nano is 1.42"),
+        ({"robot": "x2", "plant": {"payload_kg": 1.0}}, "x2 is 1.42"),
+    ],
+)
+def test_a_robot_too_heavy_or_too_weak_is_refused_with_the_ratio(keys, ratio):
+    text = refused(**keys)
+    assert text.startswith("world.plant: the thrust-to-weight ratio of ")
+    assert f"{ratio}, so it cannot lift off safely; it must be at least 1.5" in text
+
+
+@pytest.mark.parametrize(("robot", "count"), [("pelican", 3), ("nano", 5), ("x2", 2), ("rover", 4)])
+def test_factors_for_another_number_of_actuators_are_refused(robot, count):
+    text = refused(robot=robot, plant={"actuator_factor": [0.9] * count})
+    assert re.search(rf"actuator_factor: has {count} factors, but .* has \d actuators", text)
+
+
+@pytest.mark.parametrize("robot", shipped.names("robot"))
+def test_a_list_of_ones_is_the_model_itself_for_every_robot(robot):
+    check_robot(world(robot=robot, plant={"actuator_factor": [1.0] * 4}))
+
+
+def test_weak_wheels_drive_the_rover_more_slowly():
+    points = {"waypoints": [{"position_m": [3.0, 0.0], "tolerance_m": 0.2}]}
+    keys = {"world.robot": "rover", "mission": points, "link.profile": "ideal"}
+    weak = {"world.plant.actuator_factor": 0.2, "world.plant.mass_factor": 2.0}
+    usual, slow = (cloudrc.fly("steps", {**keys, **each}) for each in ({}, weak))
+    assert usual.verdict == slow.verdict == "success"
+    assert slow.numbers["duration"] > usual.numbers["duration"] + 0.1
+
+
+@pytest.mark.parametrize(
+    ("robot", "hint"),
+    [("nano", "set world.onboard.drag_s_per_m above 0, or leave the wind out"), ("rover", "leave")],
+)
+def test_wind_that_would_not_move_a_robot_is_refused(robot, hint):
+    text = refused(robot=robot, wind={"velocity_mps": [2.0, 0.0]})
+    assert text.startswith(f"world.wind: {robot} has actuators without drag, so wind would not")
+    assert hint in text
+
+
+def test_wind_moves_a_robot_whose_actuators_have_drag():
+    keys = {"world.robot": "nano", "world.onboard.drag_s_per_m": 0.05, "world.scene": "empty"}
+    still, blown = (
+        cloudrc.fly("hover", keys | {"world.wind.velocity_mps": [wind, 0.0]}) for wind in (0.0, 4.0)
+    )
+    ahead = [each["/ground_truth"]["position"][:, 0].max() for each in (still, blown)]
+    assert ahead[1] > ahead[0] + 0.01
+
+
+def test_what_the_robot_cannot_do_is_refused_before_the_first_flight_of_a_sweep(tmp_path):
+    sweep = tmp_path / "sweep.yaml"
+    sweep.write_text("experiment: steps\ngrid: {world.plant.mass_factor: [1.0, 1.2, 3.0]}\n"
+                     "set: {world.robot: nano}\nseeds: 1\n")  # fmt: skip
+    with pytest.raises(BadInputError, match=r"ratio of nano is 0\.76"):
+        read_grid(sweep)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("world.low_level.integral_limit_xy=0.3", "world.onboard.integral_limit_xy=0.3"),
+        ("world.low_level.gain_p.0=5", "world.onboard.gain_p.0=5"),
+        ("world.low_level={integral_limit_z: 1}", "world.onboard={integral_limit_z: 1}"),
+        (
+            "world={scene: empty, low_level: {integral_limit_z: 1}}",
+            "world={scene: empty, onboard: {integral_limit_z: 1}}",
+        ),
+        ("world.plant.thrust_factor=0.9", "world.plant.actuator_factor=0.9"),
+        ("world.plant.thrust_factor=[1,1,1,.9]", "world.plant.actuator_factor=[1,1,1,.9]"),
+        ("world.plant.thrust_factor=[1,1,1,1]", "world.plant.actuator_factor=1"),
+        ("world.plant={thrust_factor: 0.9}", "world.plant={actuator_factor: 0.9}"),
+    ],
+)
+def test_an_old_key_means_the_new_one(old, new):
+    assert load("hover", [old]) == load("hover", [new])
