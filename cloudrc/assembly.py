@@ -18,8 +18,8 @@ from cloudrc.cloud.operator import Operator
 from cloudrc.cloud.planar import Planar
 from cloudrc.config import schema
 from cloudrc.config.load import ResolvedExperiment
-from cloudrc.config.overrides import build_plugin
-from cloudrc.config.robot import is_planar
+from cloudrc.config.overrides import build_plugin, build_predictor
+from cloudrc.config.robot import facts, is_planar
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
 from cloudrc.geometry import fence
 from cloudrc.link.model import LinkDirection
@@ -186,7 +186,9 @@ def build_cloud(
         controller = Planar(controller)
     loop = make_loop(
         lambda: build_plugin("estimators", cloud.estimator),
-        build_plugin("predictors", cloud.predictor),
+        build_predictor(
+            cloud.predictor, facts(experiment.world, experiment.guard.acceleration_max_mps2)
+        ),
         controller,
         horizon_max=cloud.horizon_max_s,
         freeze_after=cloud.freeze_after_s,

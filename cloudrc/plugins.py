@@ -44,14 +44,16 @@ PACKAGES = {
     "predictors": "cloudrc.cloud.predictors",
     "controllers": "cloudrc.cloud.controllers",
     "onboard": "cloudrc.robots.onboard",
+    "motion": "",
     "metrics": "",
 }
-"""Kind of plug-in -> package that contains cloudrc's plug-ins of this kind; "" for metrics."""
+"""Kind of plug-in -> package that contains cloudrc's plug-ins of this kind; "" if there is none:
+cloudrc's metrics are functions, and models of motion are files of robots."""
 SHOWN_MAX = 60
 """Largest length of a wrong value's representation in a message [characters]."""
 METHODS = {
     **{"estimators": "horizon", "predictors": "predict", "controllers": "update"},
-    "onboard": "update",
+    **{"onboard": "update", "motion": "__call__"},
 }
 """Kind of plug-in -> the method that every plug-in of this kind defines."""
 

@@ -24,7 +24,7 @@ from pydantic import BaseModel
 
 from cloudrc import plugins
 from cloudrc.config import problems, shipped
-from cloudrc.config.overrides import KINDS
+from cloudrc.config.overrides import KINDS, default_parameters
 from cloudrc.config.schema import Direction, Experiment, Mission, Profile
 from cloudrc.exposition.table import METRICS, ROLES
 from cloudrc.record.topics import TOPICS
@@ -211,9 +211,9 @@ def _plug_ins() -> str:
         for name in _files(kind):
             rows.append((f"`{name}`", "", "", plugins.describe(kind, name)))
             texts = _arguments(plugins.find(kind, name).build)
-            for parameter in plugins.signature(kind, name).parameters.values():
-                default = f"`{flow(parameter.default)}`"
-                rows.append(("", f"`{parameter.name}`", default, texts[parameter.name]))
+            for parameter, default in default_parameters(kind, name).items():
+                rows.append(("", f"`{parameter}`", f"`{flow(default)}`", texts[parameter]))
+            rows += [("", "others", "", texts[each]) for each in texts if each.startswith("*")]
         blocks.append(table(f"`cloud.{key}` | parameter | default | meaning", rows))
     return "\n".join(blocks)
 
@@ -227,7 +227,7 @@ def _files(kind: str) -> list[str]:
 def _arguments(function: Any) -> dict[str, str]:
     """Read the descriptions of arguments from a docstring in Google style."""
     section = (inspect.getdoc(function) or "").partition("Args:\n")[2].partition("\n\n")[0]
-    found = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, re.MULTILINE)
+    found = re.findall(r"^    (\**\w+): (.*(?:\n {8}.*)*)", section, re.MULTILINE)
     return {name: " ".join(text.split()) for name, text in found}
 
 

@@ -84,7 +84,7 @@ def _settings() -> Iterator[str]:
     """Yield the completions of `--set`: KEY=NAME if the key accepts names, KEY= if it does not."""
     from cloudrc import plugins
     from cloudrc.config import problems, shipped
-    from cloudrc.config.overrides import KINDS
+    from cloudrc.config.overrides import KINDS, parameter_names
     from cloudrc.config.schema import Experiment
 
     named = {f"cloud.{key}": plugins.names(kind) for key, kind in KINDS.items()}
@@ -93,8 +93,7 @@ def _settings() -> Iterator[str]:
     keys = {".".join(path) for path, _ in problems.leaves(Experiment) if "0" not in path}
     for key, kind in KINDS.items():
         for name in named[f"cloud.{key}"]:
-            parameters = plugins.signature(kind, name).parameters
-            keys |= {f"cloud.{key}.{parameter}" for parameter in parameters}
+            keys |= {f"cloud.{key}.{parameter}" for parameter in parameter_names(kind, name)}
     of_robots, named["world.tuning"] = _of_robots()
     keys |= of_robots
     keys |= {key.replace("uplink", "both") for key in keys if key.startswith("link.uplink.")}

@@ -191,7 +191,8 @@ def load_experiment(
             document.tree["mission"].pop(key, None)
     if isinstance(names := document.get("report", "metrics"), str):  # one metric without a list
         document.tree["report"]["metrics"] = [names]
-    found += overrides.resolve_plugins(document, build=build) + _resolve_paths(document)
+    found += _resolve_paths(document)
+    found += overrides.resolve_plugins(document, build=build)
     experiment = problems.validate(
         document,
         ResolvedExperiment,

@@ -30,7 +30,7 @@ from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, KeyPath, Source, child, parse_value
 from cloudrc.config.problems import Problem
 from cloudrc.config.reuse import reuse
-from cloudrc.config.robot import find_robot, parameters
+from cloudrc.config.robot import RobotFacts, facts, find_robot, known_robot, parameters
 from cloudrc.config.schema import Experiment, PlugIn, Steps, World
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Odometry
@@ -38,7 +38,7 @@ from cloudrc.renamed import new_key
 
 KINDS = {"estimator": "estimators", "predictor": "predictors", "controller": "controllers"}
 """Key under `cloud` -> kind of plug-in."""
-GIVEN = {("onboard", "model")}
+GIVEN = {("onboard", "model"), ("predictors", "robot")}
 """Kind of plug-in and argument of its `build` that cloudrc gives, not the user."""
 _DEFAULTS = {
     **Experiment().model_dump(mode="json"),
@@ -201,6 +201,7 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
     `build`, import no plug-in: importing runs its code, which may be somebody else's.
     """
     found: list[Problem] = []
+    robot = _robot_of(document) if build else None
     for key, kind in KINDS.items():
         path = ("cloud", key)
         choice = document.get(*path)
@@ -211,8 +212,8 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
         if plugins.is_path(name):
             name = str(document.source((*path, "name")).absolute(name))
         try:
-            if build:
-                parameters = _complete_once(document, path, name, parameters)
+            if build and not (robot is None and _takes_robot(kind, name)):
+                parameters = _complete_once(document, path, name, parameters, robot)
         except ValidationError as error:
             found += problems.from_pydantic(error, parameter_model(kind, name), path)
         except BadInputError as error:
@@ -223,18 +224,47 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
     return found
 
 
+def _robot_of(document: Document) -> RobotFacts | None:
+    """Return what cloud knows of the experiment's robot; None if the experiment has no valid one.
+
+    Such an experiment is refused later.
+    """
+    with suppress(BadInputError, ValidationError):
+        world = World.model_validate_json(json.dumps(document.get("world") or {}))
+        limit = document.get("guard", "acceleration_max_mps2")
+        if not isinstance(limit, int | float):
+            limit = known_robot(world.robot).guard.acceleration_max_mps2
+        return facts(world, limit)
+    return None
+
+
+def _takes_robot(kind: str, name: str) -> bool:
+    """Return whether a plug-in's `build` has the argument `robot`, which only predictors get."""
+    if kind != "predictors":
+        return False
+    return reuse(("takes", name), lambda: "robot" in plugins.signature(kind, name).parameters)
+
+
 def _complete_once(
-    document: Document, path: KeyPath, name: str, given: dict[str, Any]
+    document: Document,
+    path: KeyPath,
+    name: str,
+    given: dict[str, Any],
+    robot: RobotFacts | None,
 ) -> dict[str, Any]:
     """Call `_complete`, but once only for the points of a sweep that share the plug-in."""
     folders = [str(document.source((*path, parameter)).folder) for parameter in given]
     plan = document.get("cloud", "plan_s")
-    key = ("plug-in", path, name, json.dumps([given, folders, plan]))
-    return copy.deepcopy(reuse(key, lambda: _complete(document, path, name, given)))
+    key = ("plug-in", path, name, json.dumps([given, folders, plan]), repr(robot))
+    return copy.deepcopy(reuse(key, lambda: _complete(document, path, name, given, robot)))
 
 
 def _complete(
-    document: Document, path: KeyPath, name: str, given: dict[str, Any]
+    document: Document,
+    path: KeyPath,
+    name: str,
+    given: dict[str, Any],
+    robot: RobotFacts | None,
 ) -> dict[str, Any]:
     """Check the parameters `given` to a plug-in, and add defaults; build the plug-in as a test.
 
@@ -244,6 +274,9 @@ def _complete(
     kind = KINDS[path[-1]]
     model = _parameters_of(kind, name)
     parameters = dict(given)
+    for parameter in given:
+        if (kind, parameter) in GIVEN:
+            raise BadInputError(f"{parameter}: is no parameter of yours, cloudrc gives it")
     for parameter, field in model.model_fields.items():
         place = (*path, parameter)
         if field.annotation == Path | None and isinstance(document.get(*place), str):
@@ -254,7 +287,8 @@ def _complete(
         values: dict[str, Any] = checked.model_dump(mode="json")
     # Check the defaults as `build_plugin` will do.
     checked = model.model_validate_json(json.dumps(values))
-    plugin = plugins.load(kind, name, **dict(checked))
+    more = {"robot": robot} if _takes_robot(kind, name) else {}
+    plugin = plugins.load(kind, name, **dict(checked), **more)
     if kind != "estimators":
         with plugins.refuse_failure(f"{path[-1]} {name!r}: its reset() failed"):
             plugin.reset()
@@ -292,6 +326,12 @@ def build_plugin(kind: str, choice: PlugIn, /, **given: Any) -> Any:
     return plugins.load(kind, choice.name, **given, **dict(checked))
 
 
+def build_predictor(choice: PlugIn, robot: RobotFacts) -> Any:
+    """Build a predictor as `build_plugin` does; if its `build` takes `robot`, it gets it."""
+    more = {"robot": robot} if _takes_robot("predictors", choice.name) else {}
+    return build_plugin("predictors", choice, **more)
+
+
 def check_plugin(kind: str, choice: PlugIn) -> list[Problem]:
     """List the problems of the parameters of a plug-in."""
     try:
@@ -299,6 +339,11 @@ def check_plugin(kind: str, choice: PlugIn) -> list[Problem]:
     except ValidationError as error:
         return problems.from_pydantic(error, parameter_model(kind, choice.name))
     return []
+
+
+def parameter_names(kind: str, name: str) -> list[str]:
+    """List the parameters of a plug-in that a user may set, in the order of its `build`."""
+    return list(_parameters_of(kind, name).model_fields)
 
 
 def default_parameters(kind: str, name: str) -> dict[str, Any]:
@@ -309,19 +354,20 @@ def default_parameters(kind: str, name: str) -> dict[str, Any]:
 
 def parameter_model(kind: str, name: str) -> type[BaseModel]:
     """Create a pydantic model of a plug-in's parameters from the signature of its `build`."""
-    empty = inspect.Parameter.empty
+    empty, parameters = inspect.Parameter.empty, plugins.signature(kind, name).parameters
     fields: dict[str, Any] = {
         name: (
             Any if parameter.annotation is empty else parameter.annotation,
             Field() if parameter.default is empty else Field(parameter.default),
         )
-        for name, parameter in plugins.signature(kind, name).parameters.items()
+        for name, parameter in parameters.items()
         if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
         and (kind, name) not in GIVEN
     }
+    is_open = any(each.kind is each.VAR_KEYWORD for each in parameters.values())
     config = ConfigDict(
-        extra="forbid", strict=True, arbitrary_types_allowed=True, allow_inf_nan=False,
-        protected_namespaces=(),
+        extra="allow" if is_open else "forbid", strict=True, arbitrary_types_allowed=True,
+        allow_inf_nan=False, protected_namespaces=(),
     )  # fmt: skip
     model: type[BaseModel] = create_model("parameters", __config__=config, **fields)
     return model

@@ -20,8 +20,10 @@ from cloudrc.config.reuse import reuse
 from cloudrc.config.schema import (
     Acceleration,
     NameOr,
+    NotNegatives,
     Parameters,
     PlugIn,
+    Positives,
     Section,
     Speed,
     World,
@@ -54,6 +56,20 @@ DEFAULT_LIMITS = RobotLimits()
 """Limits of a robot that flies."""
 
 
+class Response(Parameters):
+    """First-order model of a robot's velocity loop per axis x, y, z, as `cloudrc identify` fits it.
+
+    What else identify writes, such as the intervals, is for the reader.
+    """
+
+    time_constant: Positives
+    """Time constant of the velocity loop [s]"""
+    dead_time: NotNegatives
+    """Time until the robot reacts to a command [s]"""
+    gain: NotNegatives
+    """Velocity per commanded velocity [1]"""
+
+
 class RobotFile(Section):
     """The file `robot.yaml`."""
 
@@ -67,6 +83,12 @@ class RobotFile(Section):
     tunings: dict[str, Parameters] = Field(default_factory=dict)
     """Named sets of parameters, in place of those of onboard; world.tuning chooses one. The shipped
     experiment fast needs one named fast"""
+    response: Response | None = None
+    """Model of the velocity loop for predictors, the content of a file of `cloudrc identify`; null:
+    predictors that need a model refuse the robot"""
+    motion: str | None = None
+    """Python file with a better model for predictors than response: `build(acceleration_max,
+    **parameters)` gets the parameters of the onboard controller. null: there is none"""
     planar: bool = False
     """Whether the robot stays on the ground. Then the guard limits x and y alone, HOLD and LAND
     brake the robot to rest, waypoints have the height of the spawn, and cloud commands no vertical
@@ -99,6 +121,8 @@ class RobotFiles:
     hull: float | None = None  # radius about the base [m]; None: that of the model
     # Name -> parameters of the onboard controller, in place of those in `onboard`.
     tunings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    response: Response | None = None  # first-order model of the velocity loop
+    motion: str | None = None  # path of a Python file with a better model
 
 
 def find_robot(name: str) -> RobotFiles:
@@ -119,7 +143,10 @@ def find_robot(name: str) -> RobotFiles:
     limits = robot.guard.model_copy(update={"stop": stop})
     tunings = {key: tuning.model_extra or {} for key, tuning in robot.tunings.items()}
     model = folder / robot.model
-    return RobotFiles(model, onboard, robot.planar, limits, robot.hull_m, tunings)
+    motion = robot.motion and str((folder / robot.motion).resolve())
+    return RobotFiles(
+        model, onboard, robot.planar, limits, robot.hull_m, tunings, robot.response, motion
+    )
 
 
 def parameters(robot: RobotFiles, world: World) -> dict[str, Any]:
@@ -149,6 +176,28 @@ def is_planar(name: str) -> bool:
     return known_robot(name).planar
 
 
+@dataclass(frozen=True)
+class RobotFacts:
+    """What cloud knows of a robot: a predictor gets it as the argument `robot` of its `build`."""
+
+    name: str  # as in world.robot
+    response: Response | None  # first-order model of the velocity loop
+    motion: PlugIn | None  # file of a better model, with the parameters of the onboard controller
+    acceleration_max: float  # limit of the guard [m/s^2]
+
+
+def facts(world: World, acceleration_max: float) -> RobotFacts:
+    """Return what cloud knows of a robot; `acceleration_max` is the guard's limit [m/s^2].
+
+    Raises:
+        BadInputError: If the robot has no such tuning.
+    """
+    robot, motion = known_robot(world.robot), None
+    if robot.motion is not None:
+        motion = PlugIn.model_validate({**parameters(robot, world), "name": robot.motion})
+    return RobotFacts(world.robot, robot.response, motion, acceleration_max)
+
+
 def files_of(name: str) -> list[Path]:
     """Return the files that the user's robot at a path consists of; [] for a shipped robot.
 
@@ -159,5 +208,6 @@ def files_of(name: str) -> list[Path]:
     if name.endswith(".xml"):
         return [Path(name)]
     robot = find_robot(name)
-    own = [Path(robot.onboard.name)] if robot.onboard and is_path(robot.onboard.name) else []
+    onboard = robot.onboard.name if robot.onboard else ""
+    own = [Path(file) for file in (onboard, robot.motion) if file and is_path(file)]
     return [Path(name) / shipped.ROBOT_FILE, robot.model, *own]

@@ -6,6 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from cloudrc.config.load import read_experiment
+from cloudrc.config.robot import is_planar
+from cloudrc.errors import BadInputError
 from cloudrc.metrics import velocity_loop
 from cloudrc.metrics.velocity_loop import DT, INPUT, OUTPUT, Fit
 from cloudrc.record.columns import Recording
@@ -25,11 +30,28 @@ def identify(run: Path) -> tuple[list[Fit], float]:
     if not path.exists():
         refuse_under_way(path.parent)
     given, measured = velocity_loop.series(Recording.read(path), str(path))
+    axes = "xy" if _is_planar(path.parent) else "xyz"
     fits = [
         velocity_loop.identify(given[:, axis], measured[:, axis], f"{path}: {name}")
-        for axis, name in enumerate("xyz")
+        for axis, name in enumerate(axes)
     ]
+    if len(fits) < 3:
+        fits.append(_still(fits[0]))
     return fits, len(given) * DT
+
+
+def _is_planar(folder: Path) -> bool:
+    """Return whether the robot of a run stays on the ground; False if the run has no experiment."""
+    try:
+        return is_planar(read_experiment(folder / "config.yaml", flown=True).world.robot)
+    except BadInputError:
+        return False
+
+
+def _still(fit: Fit) -> Fit:
+    """Return the model of an axis along which the robot never moves: the gain is 0."""
+    constant = np.array([fit.values[0], 0.0, 0.0])
+    return Fit(constant, np.zeros(3), 1.0)
 
 
 def describe(fits: Sequence[Fit], seconds: float) -> dict[str, Any]:

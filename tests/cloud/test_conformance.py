@@ -14,9 +14,12 @@ from cloudrc.cloud.controllers import Controller, ControlOutput
 from cloudrc.cloud.estimators import DelaySample, Estimator
 from cloudrc.cloud.predictors import Predictor
 from cloudrc.config.load import load_experiment
+from cloudrc.config.robot import facts
+from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
 from cloudrc.messages import UPRIGHT, ZERO, Command, Odometry, Setpoint
 
+PELICAN = facts(World(), 12.0)
 KINDS = {estimators: Estimator, predictors: Predictor, controllers: Controller}
 
 
@@ -62,16 +65,25 @@ def are_finite(*values):
     return all(isfinite(number) for value in values for number in value)
 
 
+def build(module):
+    """Build a plug-in with its defaults, for the Pelican."""
+    takes = "robot" in inspect.signature(module.build).parameters
+    return module.build(**({"robot": PELICAN} if takes else {}))
+
+
 @every_plugin
 def test_a_plugin_is_built_and_documented_as_the_contract_says(module, kind):
     signature = inspect.signature(module.build, eval_str=True)
     for name, parameter in signature.parameters.items():
         assert parameter.annotation is not parameter.empty, parameter
-        assert parameter.default is not parameter.empty, parameter
+        if parameter.kind is parameter.VAR_KEYWORD:
+            name = f"**{name}"
+        else:
+            assert parameter.default is not parameter.empty, parameter
         assert f"    {name}: " in inspect.getdoc(module.build)
     assert issubclass(signature.return_annotation, kind)
-    assert type(module.build()) is signature.return_annotation
-    assert module.build() is not module.build()
+    assert isinstance(build(module), signature.return_annotation)
+    assert build(module) is not build(module)
     assert "Source:" in module.__doc__
     assert inspect.getdoc(signature.return_annotation)
 
@@ -102,7 +114,7 @@ def test_a_wrong_parameter_is_named(key, plugin, reason):
 @given(given_samples=st.lists(samples, max_size=30), age=numbers)
 @fewer
 def test_horizon_begins_at_zero_and_stays_finite_and_positive(module, given_samples, age):
-    estimator = module.build()
+    estimator = build(module)
     assert estimator.horizon(age) == 0.0
     for sample in given_samples:
         estimator.update(sample)
@@ -115,7 +127,7 @@ def test_horizon_begins_at_zero_and_stays_finite_and_positive(module, given_samp
 @fewer
 def test_horizon_of_a_constant_loop_is_its_delay(module, uplink, downlink, hold):
     """It may include the hold on the robot, as the paper's tau_n does, but nothing more."""
-    estimator, offset, rtt = module.build(), 3.0, uplink + downlink
+    estimator, offset, rtt = build(module), 3.0, uplink + downlink
     for _ in range(300):
         estimator.update(DelaySample(rtt + hold, rtt))
         estimator.add_applied(downlink - offset)
@@ -130,7 +142,7 @@ def test_horizon_of_a_constant_loop_is_its_delay(module, uplink, downlink, hold)
 )
 @fewer
 def test_a_prediction_is_finite_later_and_a_rotation(module, history, command, horizon):
-    predictor = module.build()
+    predictor = build(module)
     for sample in sorted(history, key=lambda sample: sample.stamp_ns):
         predictor.observe(sample)
     predictor.commanded(command._replace(planned_ns=sample.stamp_ns))
@@ -145,7 +157,7 @@ def test_a_prediction_is_finite_later_and_a_rotation(module, history, command, h
 
 @every_predictor
 def test_a_predictor_forgets_everything_when_it_is_reset(module):
-    used, fresh = module.build(), module.build()
+    used, fresh = build(module), build(module)
     for k in range(20):
         used.observe(Odometry(k * 10**7, ZERO, UPRIGHT, (0.1 * k * k, -k, 2.0), (1.0, 2.0, 3.0)))
         used.commanded(Command(k, k, 0, (1.0, 2.0, 3.0), 0.5))
@@ -161,7 +173,7 @@ def test_a_predictor_forgets_everything_when_it_is_reset(module):
 
 @every_predictor
 def test_a_model_continues_from_the_last_prediction(module):
-    predictor = module.build()
+    predictor = build(module)
     sample = Odometry(10**9, (1.0, 2.0, 3.0), UPRIGHT, (1.0, 0.0, 0.0), ZERO)
     predictor.observe(sample)
     predictor.commanded(Command(10**8, 10**9, 0, (2.0, 0.0, 0.0), 0.0))
@@ -184,7 +196,7 @@ def test_a_model_continues_from_the_last_prediction(module):
 @given(estimates=st.lists(odometry, min_size=1, max_size=10), setpoint=setpoints)
 @fewer
 def test_a_command_is_finite(module, estimates, setpoint):
-    controller = module.build()
+    controller = build(module)
     for estimate in estimates:
         output = controller.update(estimate, setpoint, 0.01)
         assert isinstance(output, ControlOutput)
@@ -198,13 +210,13 @@ def test_a_command_is_finite(module, estimates, setpoint):
 def test_a_command_leads_towards_the_setpoint(module, position, axis, way):
     wanted = tuple(p + way * (index == axis) for index, p in enumerate(position))
     estimate = Odometry(0, position, UPRIGHT, ZERO, ZERO)
-    velocity = module.build().update(estimate, Setpoint(wanted), 0.01).velocity
+    velocity = build(module).update(estimate, Setpoint(wanted), 0.01).velocity
     assert velocity[axis] * way > 0.0 if way else velocity == ZERO
 
 
 @every_controller
 def test_a_controller_forgets_everything_when_it_is_reset(module):
-    used, fresh = module.build(), module.build()
+    used, fresh = build(module), build(module)
     estimate = Odometry(0, ZERO, UPRIGHT, (1.0, 0.0, 0.0), ZERO)
     for _ in range(50):
         used.update(estimate, Setpoint((3.0, 2.0, 1.0)), 0.01)

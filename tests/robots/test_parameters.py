@@ -11,6 +11,7 @@ from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
+from cloudrc.metrics.velocity_loop import identify, series
 from cloudrc.robots.build import check_robot, onboard_values
 from cloudrc.runs.experiment import load
 from cloudrc.runs.grid import read_grid
@@ -29,10 +30,33 @@ def refused(**keys):
 
 @pytest.mark.parametrize("robot", shipped.names("robot"))
 def test_each_tuning_of_a_shipped_robot_is_one_that_its_controller_takes(robot):
-    tunings = find_robot(robot).tunings
-    assert "fast" in tunings
-    for name in tunings:
+    found = find_robot(robot)
+    assert ("fast" in found.tunings) is not found.planar
+    for name in found.tunings:
         check_robot(world(robot=robot, tuning=name))
+
+
+@pytest.mark.parametrize("robot", ["nano", "x2"])
+def test_the_experiment_fast_flies_other_robots_faster(robot):
+    """Without an arm they do not touch the board, so that the mission does not succeed."""
+    flight = cloudrc.fly("fast", {"world.robot": robot})
+    assert flight.numbers["waypoints_reached"] == 7
+    assert len(flight.failures) == 1
+    assert flight.numbers["prediction_error_rms"] < 0.006
+    fits = []
+    for tuning in (None, "fast"):
+        keys = {"world.robot": robot, "world.tuning": tuning, "link.profile": "ideal"}
+        found = cloudrc.fly("steps", keys)
+        given, measured = series(found.recording, robot)
+        axes = [identify(given[:, axis], measured[:, axis], "") for axis in (0, 2)]
+        fits.append([fit.values[0] + fit.values[1] for fit in axes])  # 63 % of a step is done
+    assert all(fast < usual for usual, fast in zip(*fits, strict=True))
+
+
+def test_the_rover_refuses_the_experiment_fast_with_a_word():
+    with pytest.raises(BadInputError) as error:
+        load("fast", ["world.robot=rover"])
+    assert "no tuning of rover named 'fast'; available: none" in str(error.value)
 
 
 def test_an_experiment_goes_before_the_tuning_and_the_tuning_before_the_robot(own_robot):

@@ -12,7 +12,8 @@ from collections import deque
 from collections.abc import Iterator
 from copy import copy
 
-from cloudrc.cloud.predictors import Model, Predictor, rotate_ahead
+from cloudrc.cloud.motion import Body
+from cloudrc.cloud.predictors import Model, Predictor
 from cloudrc.messages import NEVER_NS, PLAN_STEP_NS, ZERO, Command, Odometry, Vector
 
 PERIOD_NS = 10_000_000
@@ -25,7 +26,6 @@ SILENCE_NS = 200_000_000
 """Time without a new command after which the mean shift starts again [ns]."""
 FOLLOWED_NS = 1_000_000_000
 """Longest time for which the robot follows a command or its plan without a newer command [ns]."""
-_new = tuple.__new__  # makes a named tuple twice as fast as its class does
 NO_COMMAND = Command(0, 0, 0, ZERO, 0.0)
 
 
@@ -149,35 +149,6 @@ class History:
         return parts
 
 
-class Body(Model):
-    """A model of the robot, in the state predicted for `horizon` [s] after the sample `basis`.
-
-    `position` [m] and `velocity` [m/s] are those of the base, world frame.
-    """
-
-    basis: Odometry
-    horizon: float
-    position: Vector
-    velocity: Vector
-
-    def advance(self, command: Vector, dt: float) -> None:
-        """Advance the state by `dt` [s] under a velocity command [m/s]."""
-        raise NotImplementedError
-
-    def step(self, velocity: Vector, dt: float) -> Odometry:
-        """Advance by `dt` [s] under the command `velocity` [m/s], and return the state."""
-        self.advance(velocity, dt)
-        self.horizon += dt
-        return self.odometry()
-
-    def odometry(self) -> Odometry:
-        """Return the predicted state; its orientation follows from a constant angular velocity."""
-        _, _, orientation, _, rate = self.basis
-        stamp_ns = self.basis.stamp_ns + round(self.horizon * 1e9)
-        orientation = rotate_ahead(orientation, rate, self.horizon)
-        return _new(Odometry, (stamp_ns, self.position, orientation, self.velocity, rate))
-
-
 class Replay(Predictor):
     """Base of the predictors that feed the sent commands to a model of the robot."""
 
@@ -226,14 +197,3 @@ class Replay(Predictor):
     def model(self) -> Model | None:
         """Return a copy of the model in the state of the last prediction; None before the first."""
         return copy(self._last)
-
-
-def approach(reference: Vector, wanted: Vector, change_max: float) -> Vector:
-    """Change the velocity `reference` towards `wanted`, by at most `change_max`, all [m/s]."""
-    (ax, ay, az), (bx, by, bz) = reference, wanted
-    x, y, z = bx - ax, by - ay, bz - az
-    square = x * x + y * y + z * z
-    if square <= change_max * change_max:
-        return wanted
-    share = change_max / square**0.5
-    return (ax + share * x, ay + share * y, az + share * z)

@@ -12,14 +12,18 @@ from math import ceil, exp, inf
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from cloudrc.cloud.predictors._history import COUNT, PERIOD_NS, Body, Replay, approach
+from cloudrc.cloud.motion import Body, approach
+from cloudrc.cloud.predictors._history import COUNT, PERIOD_NS, Replay
 from cloudrc.config.document import read_document
+from cloudrc.config.robot import DEFAULT_LIMITS, RobotFacts
 from cloudrc.config.schema import NotNegatives, Positive, Positives
-from cloudrc.errors import CloudrcError
+from cloudrc.errors import BadInputError, CloudrcError
 from cloudrc.messages import ZERO, Command, Odometry, Vector
 
 Axes: TypeAlias = tuple[Vector, ...]
 """Time constant [s], dead time [s] and gain [1] of x, y and z."""
+ACCELERATION_MAX = DEFAULT_LIMITS.acceleration_max_mps2
+"""Acceleration limit of the model of an unknown robot [m/s^2]."""
 STEPS_MAX = 200
 """Largest number of steps of the model from one command to the next."""
 
@@ -118,28 +122,42 @@ class CommandHistory(Replay):
 
 
 def build(
-    time_constant: Positives = (0.25, 0.25, 0.12),
-    dead_time: NotNegatives = (0.10, 0.10, 0.01),
-    gain: NotNegatives = (1.0, 1.0, 1.0),
-    acceleration_max: Positive = 12.0,
+    time_constant: Positives | None = None,
+    dead_time: NotNegatives | None = None,
+    gain: NotNegatives | None = None,
+    acceleration_max: Positive | None = None,
     model: Path | None = None,
+    *,
+    robot: RobotFacts | None = None,
 ) -> CommandHistory:
-    """Make the predictor; the defaults fit the shipped robot.
+    """Make the predictor; what is not given is the robot's, from `response` in its robot.yaml.
 
     Args:
         time_constant: Time constant of the velocity loop per axis [s], shape (3,).
         dead_time: Time until the robot reacts to a command, per axis [s], shape (3,).
         gain: Velocity per commanded velocity, per axis [1], shape (3,).
-        acceleration_max: The guard's cap on the acceleration [m/s^2].
+        acceleration_max: Acceleration limit of the model [m/s^2]; null: that of the guard.
         model: File from `cloudrc identify`, whose values replace the first three parameters.
+        robot: What is known of the robot.
 
     Raises:
+        BadInputError: If neither robot nor parameters tell the response.
         ValueError: If the file is not a model.
     """
-    values: dict[str, Vector] = dict(time_constant=time_constant, dead_time=dead_time, gain=gain)
+    response = robot.response if robot else None
+    given = {"time_constant": time_constant, "dead_time": dead_time, "gain": gain}
     if model is not None:
-        values = _read_model(Path(model), values)
-    return CommandHistory(tuple(zip(*values.values(), strict=True)), acceleration_max)
+        given |= _read_model(Path(model), given)
+    found = [
+        getattr(response, name, None) if value is None else value for name, value in given.items()
+    ]
+    if None in found:
+        raise BadInputError(
+            f"the robot {robot.name if robot else 'is unknown and'} has no response in its "
+            "robot.yaml; measure it with 'cloudrc identify', or choose a predictor without a model"
+        )
+    limit = acceleration_max or (robot.acceleration_max if robot else ACCELERATION_MAX)
+    return CommandHistory(tuple(zip(*found, strict=True)), limit)
 
 
 def _read_model(path: Path, names: Iterable[str]) -> dict[str, Vector]:

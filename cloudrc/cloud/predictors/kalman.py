@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from cloudrc.cloud.predictors import Model, Predictor
 from cloudrc.cloud.predictors._history import Replay
 from cloudrc.config.overrides import build_plugin
+from cloudrc.config.robot import RobotFacts
 from cloudrc.config.schema import PlugIn, Positive
+from cloudrc.errors import BadInputError
 from cloudrc.messages import Command, Odometry
 
 Array: TypeAlias = NDArray[np.float64]
@@ -96,27 +98,31 @@ class Kalman(Predictor):
 
 
 def build(
-    model: Literal["white_box", "first_order"] = "white_box",
+    model: Literal["white_box", "first_order"] | None = None,
     parameters: dict[str, Any] | None = None,
     model_file: Path | None = None,
     position_noise: Positive = 0.005,
     velocity_noise: Positive = 0.02,
     acceleration_error: Positive = 0.5,
+    *,
+    robot: RobotFacts | None = None,
 ) -> Kalman:
     """Make the predictor; the default noise is that of a good motion capture system.
 
     Args:
-        model: `white_box`, as in `model_based`, or `first_order`, as in `command_history`.
-        parameters: Parameters of the predictor that `model` names; None: its defaults.
+        model: `white_box`, the model of the file `motion` in robot.yaml, or `first_order`, as in
+            `command_history`; null: as in `model_based`, or first_order if there is a `model_file`.
+        parameters: Parameters of this predictor; null: its defaults.
         model_file: File from `cloudrc identify`, for `first_order`.
         position_noise: Standard deviation of the measured position per axis [m].
         velocity_noise: Standard deviation of the measured velocity per axis [m/s].
         acceleration_error: Standard deviation of the model's acceleration [m/s^2]. A larger value
             trusts the odometry more.
+        robot: What is known of the robot.
 
     Raises:
         ValueError: If `white_box` has a `model_file`, or `parameters` has the key name or model.
-        BadInputError: If the predictor refuses a parameter.
+        BadInputError: If the robot has no such model, or if the predictor refuses a parameter.
     """
     given = dict(parameters or {})
     if model_file is not None and model == "white_box":
@@ -127,6 +133,10 @@ def build(
         raise ValueError("parameters: give the file of a model as model_file, beside parameters")
     if model_file is not None:
         given["model"] = str(model_file)
-    name = "model_based" if model == "white_box" else "command_history"
-    replay = build_plugin("predictors", PlugIn.model_validate({**given, "name": name}))
+    if model == "white_box" and (robot is None or robot.motion is None):
+        name = robot.name if robot else "the robot"
+        raise BadInputError(f"model: {name} has no white_box (motion in robot.yaml); omit model")
+    is_first_order = model == "first_order" or model_file is not None
+    choice = {**given, "name": "command_history" if is_first_order else "model_based"}
+    replay = build_plugin("predictors", PlugIn.model_validate(choice), robot=robot)
     return Kalman(replay, position_noise, velocity_noise, acceleration_error)

@@ -1,0 +1,140 @@
+"""Predictors with a model take it from the robot, or refuse the robot by name."""
+
+import json
+
+import pytest
+
+import cloudrc
+from cloudrc.config.load import load_experiment
+from cloudrc.config.overrides import build_predictor
+from cloudrc.config.robot import facts, find_robot, known_robot
+from cloudrc.config.schema import PlugIn, World
+from cloudrc.errors import BadInputError
+
+GROUND = {"steps": {"count": 6, "centre_m": [0, 0, 0.1], "range_m": [1.5, 1.5, 0]}}
+MODELS = ("command_history", "kalman", "model_based")
+
+
+def build(robot, predictor, **keys):
+    world = World.model_validate_json(json.dumps({"robot": robot, **keys}))
+    return build_predictor(PlugIn.model_validate(predictor), facts(world, 7.0))
+
+
+@pytest.mark.parametrize("predictor", MODELS)
+@pytest.mark.parametrize("robot", ["nano", "x2", "rover"])
+def test_a_predictor_with_the_robots_model_predicts_far_better_than_none(robot, predictor):
+    keys = {"world.robot": robot, "link.profile": "paper-p3", "mission.steps.count": 6}
+    if robot == "rover":
+        keys |= {"mission": GROUND}
+        del keys["mission.steps.count"]
+    errors = [
+        cloudrc.fly("steps", {**keys, "cloud.predictor": name}).numbers["prediction_error_rms"]
+        for name in (predictor, "last_sample")
+    ]
+    assert errors[0] < 0.3 * errors[1]
+
+
+@pytest.mark.parametrize("robot", ["pelican", "nano", "x2", "rover"])
+def test_command_history_has_the_response_of_the_robot_and_the_limit_of_the_guard(robot):
+    response = known_robot(robot).response
+    predictor = build(robot, {"name": "command_history"})
+    assert predictor._axes == tuple(
+        zip(response.time_constant, response.dead_time, response.gain, strict=True)
+    )
+    assert predictor._loop[1] == 7.0
+    assert type(build(robot, {"name": "model_based"})) is not type(predictor) or robot != "pelican"
+
+
+def test_the_model_of_the_pelican_follows_its_onboard_controller():
+    """Its parameters are those of tuning and world.onboard, unless the predictor has its own."""
+
+    def limit(own=None, **keys):
+        predictor = build("pelican", {"name": "model_based", **(own or {})}, **keys)
+        return predictor._start.args[0][9]
+
+    assert limit() == 0.1
+    assert limit(tuning="fast") == 0.3
+    assert limit(tuning="fast", onboard={"integral_limit_xy": 0.2}) == 0.2
+    assert limit({"integral_limit_xy": 0.5}, tuning="fast") == 0.5
+
+
+@pytest.mark.parametrize("predictor", MODELS)
+def test_a_robot_without_a_model_is_refused_by_name_in_one_line(predictor, own_robot):
+    mine = own_robot("onboard: multirotor")
+    with pytest.raises(BadInputError) as error:
+        load_experiment("steps", [f"world.robot={mine}", f"cloud.predictor={predictor}"])
+    assert f"cloud.predictor: predictor '{predictor}' cannot be built: " in str(error.value)
+    assert f"the robot {mine} has no response in its robot.yaml" in str(error.value)
+    assert "cloudrc identify" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_robot_without_a_model_flies_with_values_of_the_experiment(own_robot):
+    given = "{name: command_history, time_constant: [1,1,1], dead_time: [0,0,0], gain: [1,1,1]}"
+    mine = own_robot("onboard: multirotor")
+    load_experiment("steps", [f"world.robot={mine}", f"cloud.predictor={given}"])
+
+
+@pytest.mark.parametrize(
+    ("robot", "predictor", "said"),
+    [
+        ("nano", "{name: model_based, gain_p: [1, 1, 1]}", "gain_p: nano has no model with"),
+        ("nano", "{name: kalman, model: white_box}", "model: nano has no white_box"),
+        ("pelican", "{name: model_based, gain_q: 1}", "gain_q: unknown key; did you mean gain_p?"),
+        ("pelican", "{name: model_based, gain_p: 1}", "gain_p: 1: must be a list of 3 numbers"),
+        ("pelican", "{name: model_based, robot: nano}", "robot: is no parameter of yours"),
+    ],
+)
+def test_a_parameter_that_the_model_does_not_have_is_one_line(robot, predictor, said):
+    with pytest.raises(BadInputError) as error:
+        load_experiment("steps", [f"world.robot={robot}", f"cloud.predictor={predictor}"])
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("response: {time_constant: [1, 1, 1]}", "response.dead_time: is missing"),
+        ("response: {time_constant: [0, 1, 1], dead_time: [0, 0, 0], gain: [1, 1, 1]}", "> 0"),
+        (
+            "response: {time_constant: [1, 1], dead_time: [0, 0, 0], gain: [1, 1, 1]}",
+            "time_constant.2: is missing",
+        ),
+        ("response: 3", "response: 3: must be null or a mapping of keys"),
+        ("tunings: {fast: 3}", "tunings.fast: 3: is not valid"),
+        ("motion: 3", "motion: 3: must be text or null"),
+    ],
+)
+def test_a_wrong_response_is_one_line_with_its_key(own_robot, text, said):
+    mine = own_robot(f"onboard: multirotor\n{text}\n")
+    with pytest.raises(BadInputError) as error:
+        find_robot(str(mine))
+    assert said in str(error.value)
+    assert "robot.yaml:2: " in str(error.value)
+
+
+def test_a_model_of_ones_own_may_lie_in_the_folder_and_gets_the_parameters(own_robot):
+    mine = own_robot("onboard: {name: multirotor, tilt_max_deg: 20}\nmotion: ./own.py\n")
+    (mine / "own.py").write_text(
+        "def build(acceleration_max, tilt_max_deg=35.0):\n"
+        "    raise ValueError(f'{acceleration_max:g} {tilt_max_deg:g}')\n"
+    )
+    with pytest.raises(BadInputError, match="7 20"):
+        build(str(mine), {"name": "model_based"})
+
+
+def test_identify_writes_a_response_for_a_robot_on_the_ground(call, tmp_path, monkeypatch, no_page):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ground.yaml").write_text(json.dumps({
+        "mission": GROUND | {"steps": GROUND["steps"] | {"count": 12}},
+        "world": {"scene": "empty", "robot": "rover"}, "link": {"profile": "ideal"},
+        "criteria": {"settle_m": None},
+    }))  # fmt: skip
+    call("run ground.yaml --mode virtual --out run")
+    found = json.loads(call("identify run -o json").out)
+    response = known_robot("rover").response
+    assert found["gain"][2] == 0.0
+    assert found["gain"][:2] == pytest.approx(response.gain[:2], abs=0.1)
+    delays = [sum(pair) for pair in zip(found["time_constant"], found["dead_time"], strict=True)]
+    assert delays[:2] == pytest.approx([0.1, 0.1], abs=0.05)
