@@ -52,7 +52,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "metrics.definitions": set(),  # live metrics import it in every process, with no heavy library
     "report": {"assembly", "record", "metrics", "config", "geometry", "link", "files", "console"},
     "console": {"config", "exposition", "geometry", "metrics.definitions", "teleop", "world"},
-    "cluster": {"config", "link", "record", "report", "teleop"},
+    "cluster": {"config", "geometry", "link", "record", "report", "teleop"},
     "statistics": set(),
     "runs": {
         *("assembly", "cloud", "cluster", "config", "drivers", "files", "geometry", "link"),

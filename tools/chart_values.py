@@ -61,6 +61,7 @@ RULES = {
     "digest": _text(r"^$|^sha256:[0-9a-f]{64}$"),
     "pullPolicy": _one_of("Always", "IfNotPresent", "Never"),
     "experiment": _ref("Experiment"),
+    "configMap": NAME,
     "mode": _one_of("auto", "netem", "relay"),
     "profile": _either(STRING, _ref("Profile"), NULL),
     "traces": {
@@ -162,10 +163,11 @@ def make_schema(text: str) -> Schema:
     made["properties"]["global"] = {**_either(OBJECT, NULL), "description": about}
     models = [(model, "validation") for model in (Experiment, Mission, Profile)]
     defined = _adapt(models_json_schema(models)[1]["$defs"])
-    defined["PlugIn"]["additionalProperties"] = {
-        "description": "A parameter of the plug-in, in the unit that its `build` documents",
-        "type": ["number", "string", "boolean", "array", "null"],
-    }
+    for name in ("PlugIn", "Parameters"):
+        defined[name]["additionalProperties"] = {
+            "description": "A parameter of the plug-in, in the unit that its `build` documents",
+            "type": ["number", "string", "boolean", "array", "null"],
+        }
     amount = _either(*QUANTITY["anyOf"], NULL)
     about = "CPU [cores; 250m is a quarter of a core] and memory [bytes; 64Mi is 64 * 2^20]"
     amounts = _closed(about, {"cpu": amount, "memory": amount})

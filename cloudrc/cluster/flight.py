@@ -26,6 +26,7 @@ from cloudrc.cluster.client import (
 from cloudrc.cluster.incidents import explain_refusal
 from cloudrc.cluster.jobs import JobGoneError, delete_job, failure_of, follow, job_key, run_job
 from cloudrc.cluster.missions import release_api, settle_mission
+from cloudrc.cluster.own_files import find_own_files, give_to_release, send_own_files
 from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError, TimedOutError
 from cloudrc.teleop.client import find_mission
 
@@ -243,7 +244,9 @@ def fly_in_cluster(
 
     try:
         began = time.monotonic()
-        install(release, chart_values(experiment, current_values(release)), timeout, tell)
+        own = send_own_files(release, find_own_files(experiment.world))
+        install(release, chart_values(experiment, current_values(release), own), timeout, tell)
+        give_to_release(release, own)
         took = time.monotonic() - began
         tell(f"release '{release.name}' {release.where} is ready after {took:.0f} s")
         interrupted = not _fly(experiment, release, tell)
@@ -255,26 +258,34 @@ def fly_in_cluster(
     return _report(experiment, folder, mission, interrupted)
 
 
-def chart_values(experiment: ResolvedExperiment, before: Mapping[str, Any]) -> dict[str, Any]:
+def chart_values(
+    experiment: ResolvedExperiment, before: Mapping[str, Any], own: Mapping[str, str]
+) -> dict[str, Any]:
     """Return Helm values for a flight: the release's present values `before`, with `experiment`.
 
-    The chart's own mission is disabled, because it would fly in addition.
+    `own` has the names of the ConfigMaps with the user's robot and scene. The chart's own mission
+    is disabled, because it would fly in addition.
     """
     link = {**before.get("link", {}), "profile": ""}
     # With a mission, the chart would start a second Job.
     mission = {**before.get("mission", {}), "enabled": False}
     flown = experiment.model_dump(mode="json")
-    return {**before, "link": link, "mission": mission, "experiment": flown}
+    files = {kind: {"configMap": own.get(kind, "")} for kind in ("robot", "scene")}
+    for kind in own:
+        del flown["world"][kind]
+    return {**before, **files, "link": link, "mission": mission, "experiment": flown}
 
 
 def refuse_local_files(experiment: ResolvedExperiment) -> None:
-    """Raise a BadInputError if an experiment needs files that the cluster does not have.
+    """Raise a BadInputError if an experiment needs files that the cluster cannot get.
 
     Also raise it if the mission has random steps, because the API accepts only waypoints. Files of
     the user's metrics are allowed, because this machine evaluates the metrics. The file of the link
     profile is allowed, because the experiment contains its values.
     """
-    flown = experiment.model_dump(mode="json", exclude={"report": True, "link": {"profile"}})
+    find_own_files(experiment.world)
+    sent: dict[str, Any] = {"report": True, "link": {"profile"}, "world": {"robot", "scene"}}
+    flown = experiment.model_dump(mode="json", exclude=sent)
     pods.refuse_local_files(flown, "or fly with --mode local")
     if experiment.mission.steps is not None:
         raise BadInputError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
@@ -86,7 +87,8 @@ def _place(thing: Any) -> Place:
 def _robot(experiment: str) -> str:
     from cloudrc.config.schema import World
 
-    return str((yaml.safe_load(experiment) or {}).get("world", {}).get("robot") or World().robot)
+    robot = (yaml.safe_load(experiment) or {}).get("world", {}).get("robot") or World().robot
+    return Path(robot).name  # of the user's robot, the name of its ConfigMap
 
 
 def _link(profile: str) -> str:

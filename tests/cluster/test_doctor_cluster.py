@@ -15,7 +15,7 @@ from tests.cluster.conftest import CONFIG_PLACE, kubeconfig
 def programs(monkeypatch):
     """Make only these programs available; skip the slow checks that are not about a cluster."""
     monkeypatch.setattr(checks, "MUJOCO_PROGRAM", f"print('{checks.WORKS}')")
-    monkeypatch.setattr(checks, "NATIVE_PROGRAM", "print('C (here)')")
+    monkeypatch.setattr(checks, "STEPS_PROGRAM", "print('C (here)')")
     found = {"helm", "kubectl"}
     monkeypatch.setattr(shutil, "which", lambda name: f"/nowhere/{name}" if name in found else None)
     return found

@@ -13,6 +13,7 @@ from cloudrc.cluster import flight, pods
 from cloudrc.cluster.client import ClusterError, connect
 from cloudrc.cluster.jobs import run_job
 from cloudrc.config.load import load_experiment
+from cloudrc.config.shipped import FOLDERS
 from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.geometry.scene import SCENES
 from cloudrc.record.writer import McapWriter
@@ -67,6 +68,7 @@ def ready(running, teleop, pretend, tmp_path, monkeypatch):
     pretend(
         "kubectl",
         f'case "$*" in *exec*before*) cat {tmp_path}/left ;;'
+        f" *patch*) echo $* >> {tmp_path}/patched ;;"
         f" *exec*world*) cat {tmp_path}/world.mcap ;;"
         f" *exec*cloud*) cat {tmp_path}/cloud.mcap ;; *) {teleop.forwards()} ;; esac",
     )
@@ -117,6 +119,29 @@ def test_a_job_flies_a_carrot_mission_over_the_users_profile(ready, tmp_path, ca
     maps = [body["data"] for key, body in ready.objects.items() if key[0] == "configmaps"]
     (text,) = (data["mission.yaml"] for data in maps if "mission.yaml" in data)
     assert json.loads(text)["carrot"] == {"speed_mps": 1.5, "acceleration_mps2": 2.0}
+
+
+def test_the_users_robot_and_scene_fly_as_configmaps_that_belong_to_the_release(
+    ready, tmp_path, call
+):
+    shutil.copytree(FOLDERS["robot"] / "pelican", tmp_path / "mine")
+    shutil.copy(SCENES / "empty.xml", tmp_path / "lab.xml")
+    ends(ready)
+    call(f"{LINE} --out out --set world.robot=./mine --set world.scene=./lab.xml", code=6)
+    given = json.loads((tmp_path / "values").read_text())
+    names = {kind: given[kind]["configMap"] for kind in ("robot", "scene")}
+    assert "robot" not in given["experiment"]["world"]
+    assert "robot.yaml" in ready.get("configmaps", names["robot"])["binaryData"]
+    assert "scene.xml" in ready.get("configmaps", names["scene"])["binaryData"]
+    patched = (tmp_path / "patched").read_text()
+    assert all(f"patch configmap {name}" in patched for name in names.values())
+    assert ready.get("deployments", "cloudrc-world")["metadata"]["uid"] in patched
+
+
+def test_a_run_with_a_shipped_robot_replaces_the_users_robot_of_the_release():
+    values = flight.chart_values(load_experiment("hover"), {"robot": {"configMap": "mine"}}, {})
+    assert (values["robot"], values["scene"]) == ({"configMap": ""}, {"configMap": ""})
+    assert values["experiment"]["world"]["robot"] == "pelican"
 
 
 def test_a_refused_mission_leaves_no_run(ready, tmp_path, call):
@@ -215,7 +240,7 @@ FITTED = "cloud.predictor={name: command_history, model: ./mine.yaml}"
     ("settings", "words"),
     [
         (["hover", "--set", "cloud.predictor=./mine.py"], "the pods do not have this file"),
-        (["hover", "--set", "world.scene=./mine.xml"], "world.scene: /"),
+        (["hover", "--set", "world.robot=./mine.xml"], "world.robot: /"),
         (["hover", "--set", FITTED], "cloud.predictor.model: /"),
         (["steps"], "mission.steps"),
     ],

@@ -78,9 +78,11 @@ affinity:
 {{- end }}
 {{- end }}
 
-{{/* Annotations of a pod. A changed experiment restarts the pod, a changed link profile does not. */}}
+{{/* Annotations of a pod. A changed experiment, robot or scene restarts the pod, a changed link profile
+     does not. */}}
 {{- define "cloudrc.podAnnotations" -}}
-{{- $made := dict "checksum/experiment" (toYaml .root.Values.experiment | sha256sum) -}}
+{{- $experiment := printf "%s%s" (include "cloudrc.experiment" .root) (include "cloudrc.ownFiles" .root) -}}
+{{- $made := dict "checksum/experiment" (sha256sum $experiment) -}}
 {{- $_ := set $made "cloudrc/link-mode" (include "cloudrc.linkMode" .root) -}}
 {{- $_ := set $made "kubectl.kubernetes.io/default-container" .component -}}
 {{- if .root.Values.metrics.annotations -}}
@@ -94,9 +96,7 @@ affinity:
 {{/* Volumes of both pods: experiment, link profile, key, the route file of the link, recordings. */}}
 {{- define "cloudrc.volumes" -}}
 {{- $name := include "cloudrc.fullname" .root -}}
-- name: experiment
-  configMap:
-    name: {{ $name }}-experiment
+{{ include "cloudrc.experimentVolumes" .root }}
 - name: link
   configMap:
     name: {{ $name }}-link
@@ -113,9 +113,9 @@ affinity:
     sizeLimit: {{ (index .root.Values .component).recordingSizeLimit }}
 {{- end }}
 
-{{/* Volume mounts of world and cloud. */}}
+{{/* Volume mounts of world and cloud. Argument: the root. */}}
 {{- define "cloudrc.endMounts" -}}
-- {name: experiment, mountPath: /etc/cloudrc, readOnly: true}
+{{ include "cloudrc.experimentMounts" . }}
 - {name: secret, mountPath: /etc/cloudrc-secret, readOnly: true}
 - {name: run, mountPath: /run/cloudrc}
 - {name: data, mountPath: /var/lib/cloudrc}

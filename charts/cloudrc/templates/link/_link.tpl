@@ -125,7 +125,7 @@ auto
     {{- toYaml .root.Values.link.resources | nindent 4 }}
   {{- include "cloudrc.extraEnv" .root.Values.link | nindent 2 }}
   volumeMounts:
-    - {name: experiment, mountPath: /etc/cloudrc, readOnly: true}
+    {{- include "cloudrc.experimentMounts" .root | nindent 4 }}
     - {name: link, mountPath: /etc/cloudrc-link, readOnly: true}
     - {name: run, mountPath: /run/cloudrc}
     {{- include "cloudrc.extraMounts" .root.Values.link | nindent 4 }}

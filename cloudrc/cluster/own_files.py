@@ -1,0 +1,111 @@
+"""Bring the user's robot and scene to the pods: each becomes a ConfigMap, which the pods mount.
+
+A ConfigMap has no folders and at most 1 MiB. A robot that does not fit needs an image of its own.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+
+from cloudrc.cluster.client import NotFoundError, Release, run
+from cloudrc.cluster.jobs import owner_of
+from cloudrc.cluster.pods import find_deployment
+from cloudrc.config.robot import files_of
+from cloudrc.config.schema import World
+from cloudrc.config.shipped import ROBOT_FILE, is_path
+from cloudrc.errors import BadInputError
+from cloudrc.geometry.model_files import model_files
+
+SCENE_FILE = "scene.xml"
+"""Key of the scene's MJCF file in its ConfigMap."""
+SIZE_MAX = 1 << 20
+"""Largest total size of the files in a ConfigMap [bytes]; a limit of Kubernetes."""
+REMEDY = "or build an image with it: charts/cloudrc/README.md, 'A robot or a scene of your own'"
+"""End of the messages about files that a ConfigMap cannot hold."""
+_KEY = re.compile(r"[-._a-zA-Z0-9]{1,253}")
+
+
+def find_own_files(world: World) -> dict[str, dict[str, Path]]:
+    """Find the files of the robot and of the scene that are given by path.
+
+    Returns:
+        "robot" or "scene" -> key in the ConfigMap -> file. The subfolders of a robot's folder are
+        left out, unless the robot needs a file in them.
+
+    Raises:
+        BadInputError: If a ConfigMap cannot hold the files.
+    """
+    found = dict[str, dict[str, Path]]()
+    if world.robot.endswith(".xml"):
+        text = f"a cluster takes a folder with {ROBOT_FILE}, not a model alone; write one beside it"
+        raise BadInputError(f"world.robot: {world.robot}: {text}: model: {Path(world.robot).name}")
+    if is_path(world.robot):
+        folder = Path(world.robot)
+        found["robot"] = {path.name: path for path in folder.iterdir() if path.is_file()}
+        needed = {file for path in files_of(world.robot) for file in model_files(path)}
+        _check("world.robot", folder, needed, found["robot"])
+    if world.scene.endswith(".xml"):
+        scene = Path(world.scene)
+        needed = {*model_files(scene)} - {scene}
+        found["scene"] = {SCENE_FILE: scene, **{path.name: path for path in needed}}
+        _check("world.scene", scene.parent, needed, found["scene"])
+    return found
+
+
+def _check(key: str, folder: Path, needed: set[Path], files: Mapping[str, Path]) -> None:
+    """Refuse what a ConfigMap cannot hold; `needed` files must be in `folder` itself, or linked."""
+    here = {path.resolve() for path in files.values()}
+    if elsewhere := sorted({path.resolve() for path in needed} - here):
+        text = f"needs {elsewhere[0]}, but a ConfigMap has no folders"
+        raise BadInputError(f"{key}: {text}; put the file into {folder}, {REMEDY}")
+    if names := [name for name in files if not _KEY.fullmatch(name)]:
+        text = f"a ConfigMap takes no file named '{names[0]}', only letters, digits and -._"
+        raise BadInputError(f"{key}: {folder}: {text}; rename or move it")
+    sizes = {path.stat().st_size: name for name, path in files.items()}
+    if (total := sum(path.stat().st_size for path in files.values())) > SIZE_MAX:
+        text = f"has {total} bytes, but a ConfigMap takes {SIZE_MAX} (1 MiB)"
+        largest = f"the largest is {sizes[max(sizes)]} with {max(sizes)}; move what is not needed"
+        raise BadInputError(f"{key}: {folder}: {text}; {largest}, {REMEDY}")
+
+
+def send_own_files(release: Release, found: Mapping[str, Mapping[str, Path]]) -> dict[str, str]:
+    """Write the files into ConfigMaps of the release; return "robot" or "scene" -> its name.
+
+    `found` is the result of `find_own_files`. An earlier ConfigMap of this name is replaced.
+    """
+    names = {kind: f"{release.name}-own-{kind}" for kind in found}
+    if names:
+        _make_namespace(release)
+    for kind, name in names.items():
+        with suppress(NotFoundError):
+            release.request("delete", "configmaps", name=name)
+        metadata = {"name": name, "labels": release.labels(kind)}
+        body = {"metadata": metadata, "binaryData": _encode(found[kind])}
+        release.request("create", "configmaps", body=body)
+    return names
+
+
+def _encode(files: Mapping[str, Path]) -> dict[str, str]:
+    return {name: base64.b64encode(path.read_bytes()).decode() for name, path in files.items()}
+
+
+def _make_namespace(release: Release) -> None:
+    """Create the namespace of the release if it does not exist."""
+    try:
+        release.request("get", "namespaces", name=release.namespace)
+    except NotFoundError:
+        release.request("create", "namespaces", body={"metadata": {"name": release.namespace}})
+
+
+def give_to_release(release: Release, names: Mapping[str, str]) -> None:
+    """Make the ConfigMaps of `send_own_files` part of an installed release, to end with it."""
+    for name in names.values():
+        owner = owner_of("apps/v1", "Deployment", find_deployment(release, "world"))
+        patch = json.dumps({"metadata": {"ownerReferences": [owner]}})
+        words = ["patch", "configmap", name, "--type=merge", f"--patch={patch}"]
+        run("kubectl", [*release.flags, *words])

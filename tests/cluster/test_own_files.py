@@ -1,0 +1,123 @@
+"""The user's robot and scene reach the pods as ConfigMaps, or one line says why they cannot."""
+
+import base64
+import shutil
+from pathlib import Path
+
+import pytest
+
+from cloudrc.cluster.own_files import SIZE_MAX, find_own_files, send_own_files
+from cloudrc.config.schema import World
+from cloudrc.config.shipped import FOLDERS
+from cloudrc.errors import BadInputError
+
+MESHES = """<mujoco><compiler meshdir="meshes"/><asset><mesh name="arm" file="arm.stl"/></asset>
+<worldbody/></mujoco>"""
+BESIDE = MESHES.replace(' meshdir="meshes"', "")
+
+
+@pytest.fixture
+def robot(tmp_path):
+    """A copy of the rover, with what a folder has besides: tests, a picture, hidden folders."""
+    folder = tmp_path / "my_robot"
+    shutil.copytree(FOLDERS["robot"] / "rover", folder)
+    for name in ("tests", "__pycache__", ".git"):
+        (folder / name).mkdir()
+    (folder / "tests" / "test_it.py").write_text("")
+    return folder
+
+
+def find(robot):
+    return find_own_files(World(robot=str(robot), scene="pillars"))
+
+
+def refused(robot):
+    with pytest.raises(BadInputError) as error:
+        find(robot)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_shipped_robots_and_scenes_need_no_configmap():
+    assert find_own_files(World(robot="rover", scene="pillars")) == {}
+
+
+def test_files_in_the_robots_folder_are_found_and_unneeded_folders_left_out(robot):
+    assert sorted(find(robot)["robot"]) == ["robot.xml", "robot.yaml"]
+
+
+def test_a_linked_file_is_sent_with_the_content_that_the_link_leads_to(robot, api, release):
+    elsewhere = shutil.move(robot / "robot.xml", robot.parent / "shared.xml")
+    (robot / "robot.xml").symlink_to(elsewhere)
+    names = send_own_files(release, find(robot))
+    assert names == {"robot": "cloudrc-own-robot"}
+    data = api.get("configmaps", "cloudrc-own-robot")["binaryData"]
+    assert base64.b64decode(data["robot.xml"]) == Path(elsewhere).read_bytes()
+
+
+def test_a_linked_controller_is_sent(robot):
+    text = (robot / "robot.yaml").read_text().replace("onboard: diff_drive", "onboard: ./mine.py")
+    (robot / "robot.yaml").write_text(text)
+    (robot.parent / "mine.py").write_text("")
+    (robot / "mine.py").symlink_to(robot.parent / "mine.py")
+    assert "mine.py" in find(robot)["robot"]
+
+
+def test_a_second_run_replaces_the_files_of_the_first(robot, api, release):
+    send_own_files(release, find(robot))
+    (robot / "more.py").write_text("MORE = 1\n")
+    send_own_files(release, find(robot))
+    assert "more.py" in api.get("configmaps", "cloudrc-own-robot")["binaryData"]
+
+
+def test_a_missing_namespace_is_made_for_the_files(robot, api, release):
+    del api.objects["namespaces", "demo"]
+    send_own_files(release, find(robot))
+    assert ("namespaces", "demo") in api.objects
+
+
+def test_a_mesh_beside_the_model_is_sent_and_one_in_a_folder_refused(robot):
+    (robot / "robot.xml").write_text(BESIDE)
+    (robot / "arm.stl").write_bytes(b"solid")
+    assert "arm.stl" in find(robot)["robot"]
+    (robot / "robot.xml").write_text(MESHES)
+    (robot / "meshes").mkdir()
+    shutil.move(robot / "arm.stl", robot / "meshes")
+    said = refused(robot)
+    assert f"{robot}/meshes/arm.stl" in said
+    assert "no folders" in said
+
+
+def test_a_model_outside_of_the_robots_folder_is_refused(robot):
+    shutil.move(robot / "robot.xml", robot.parent)
+    text = (robot / "robot.yaml").read_text().replace("robot.xml", "../robot.xml", 1)
+    (robot / "robot.yaml").write_text(text)
+    assert f"needs {robot.parent}/robot.xml" in refused(robot)
+
+
+def test_a_folder_above_the_limit_is_refused_with_the_limit_and_its_largest_file(robot):
+    (robot / "photo.png").write_bytes(bytes(SIZE_MAX))
+    said = refused(robot)
+    assert f"{SIZE_MAX} (1 MiB)" in said
+    assert "photo.png" in said
+
+
+@pytest.mark.parametrize("name", ["my photo.png", "schräg.txt"])
+def test_a_name_that_is_no_key_of_a_configmap_is_refused(robot, name):
+    (robot / name).write_text("")
+    assert name in refused(robot)
+
+
+def test_a_model_without_robot_yaml_is_refused_with_what_to_write(robot):
+    assert "robot.yaml" in refused(robot / "robot.xml")
+
+
+def test_a_scene_is_sent_under_a_fixed_name_with_the_files_that_it_names(tmp_path):
+    (tmp_path / "lab.xml").write_text(BESIDE)
+    (tmp_path / "arm.stl").write_bytes(b"solid")
+    (tmp_path / "other.xml").write_text("<mujoco/>")
+    found = find_own_files(World(scene=str(tmp_path / "lab.xml")))
+    assert {name: path.name for name, path in found["scene"].items()} == {
+        "scene.xml": "lab.xml",
+        "arm.stl": "arm.stl",
+    }
