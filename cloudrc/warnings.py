@@ -1,23 +1,19 @@
 """Warn about settings that do not fit together, and suggest a value that fits.
 
-The delays come from a simulation of the link alone, with the same random numbers as in the flight.
-A warning never prevents the flight.
+The delays come from a simulation of the link alone: `link/ages.py`. A warning never prevents the
+flight.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from itertools import pairwise
 from math import ceil, floor
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
-    from cloudrc.link.model import LinkDirection
     from cloudrc.link.profile import DirectionProfile
 
-DURATION_NS = 20_000_000_000
-"""Simulated time of the link [ns]."""
 FAR = 1.0
 """Tolerance of a waypoint that may be meant in cm or mm [m]."""
 JITTER_MAX = 1.0
@@ -28,6 +24,8 @@ LONG = 3600.0
 
 def advise(experiment: ResolvedExperiment) -> Iterator[str]:
     """Yield a warning for each group of settings that do not fit together."""
+    from cloudrc.link.ages import simulate_ages
+
     ways = _directions(experiment)
     yield from _units(ways)
     yield from _jitter(ways)
@@ -108,6 +106,7 @@ def _jitter(ways: Mapping[str, DirectionProfile]) -> Iterator[str]:
 def _late(ways: Mapping[str, DirectionProfile]) -> Iterator[str]:
     """Yield a warning if delays are the reason why no command arrives in the simulated time."""
     from cloudrc.config.schema import COMMAND_AGE_MS
+    from cloudrc.link.ages import DURATION_NS
     from cloudrc.link.profile import Timeline
 
     parts, total = list[str](), 0.0
@@ -150,61 +149,6 @@ def _time(experiment: ResolvedExperiment) -> Iterator[str]:
         )
     elif lasts > LONG:
         yield f"{what} {lasts:,.6g} s: this is {lasts / 3600:.3g} hours; give times in seconds"
-
-
-def simulate_ages(experiment: ResolvedExperiment) -> tuple[list[float], list[float]]:
-    """Simulate telemetry and commands over the experiment's link, without its blackouts.
-
-    Return two lists of ages [s]: of the odometry from which cloud computed the command that world
-    follows, and of the newest command that telemetry has confirmed. Both have an age for each
-    datagram that is sent, at its departure.
-    """
-    from cloudrc.link.queue import PacketQueue
-    from cloudrc.messages import plan_length
-    from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
-
-    plan = plan_length(experiment.cloud.plan_s)
-    newest_wins = experiment.tunnel.order == "newest" or plan > 0
-    sizes = SIZES[Kind.TELEMETRY], COMMAND_SIZES[plan]
-    links = [_always_up(experiment, uplink=True), _always_up(experiment, uplink=False)]
-    # Per direction: the newest arrived datagram: its stamp, and the stamp that it confirms [ns].
-    arrived: list[tuple[int, int] | None] = [None, None]
-    in_flight = PacketQueue()
-    ages, echoes = list[float](), list[float]()
-    compute_ns = round(experiment.cloud.compute_ms * 1e6)
-    rates = experiment.world.odometry_rate_hz, experiment.cloud.command_rate_hz
-    periods_ns = [round(1e9 / rate) for rate in rates]
-    times_ns = sorted({t for period_ns in periods_ns for t in range(0, DURATION_NS, period_ns)})
-    for now_ns, next_ns in pairwise(times_ns):
-        while in_flight.next_ns <= now_ns:
-            _, link, datagram = in_flight.pop()
-            way = links.index(link)
-            newest = arrived[way]
-            if newest is None or datagram[0] > newest[0] or not newest_wins:
-                arrived[way] = datagram
-        telemetry, command = arrived
-        if command is not None:
-            ages.append((next_ns - command[1]) * 1e-9)
-        if telemetry is not None and telemetry[1] >= 0:
-            echoes.append((next_ns - telemetry[1]) * 1e-9)
-        sent = [(0, Kind.TELEMETRY, command), (1, Kind.COMMAND, telemetry)]
-        for way, kind, last in sent if telemetry is not None else sent[:1]:
-            period, early_ns = divmod(now_ns, periods_ns[way])
-            if early_ns == 0:
-                datagram = now_ns, -1 if last is None else last[0]
-                leaves_ns = now_ns + way * compute_ns
-                in_flight.send(links[way], (kind, 1, period), sizes[way], datagram, leaves_ns)
-    return ages, echoes
-
-
-def _always_up(experiment: ResolvedExperiment, *, uplink: bool) -> LinkDirection:
-    """Return a direction of the experiment's link without blackouts and without damage."""
-    from cloudrc.link.model import LinkDirection
-    from cloudrc.link.traces import link_profile
-
-    way = experiment.uplink if uplink else experiment.downlink
-    way = way.model_copy(update={"blackouts": (), "corrupt": 0.0})
-    return LinkDirection(link_profile(way), experiment.seed, uplink)
 
 
 def _balance(experiment: ResolvedExperiment) -> Iterator[str]:

@@ -136,9 +136,7 @@ def find_robot(name: str) -> RobotFiles:
     file = folder / shipped.ROBOT_FILE
     label = str(file) if shipped.is_path(name) else f"{name}/{shipped.ROBOT_FILE}"
     robot = validate(read_document(file, label), RobotFile, label)
-    onboard = robot.onboard if isinstance(robot.onboard, PlugIn) else PlugIn(name=robot.onboard)
-    if is_path(onboard.name):
-        onboard = onboard.model_copy(update={"name": str((folder / onboard.name).resolve())})
+    onboard = _absolute(robot.onboard, folder)
     stop = robot.guard.stop or ("brake" if robot.planar else "land")
     limits = robot.guard.model_copy(update={"stop": stop})
     tunings = {key: tuning.model_extra or {} for key, tuning in robot.tunings.items()}
@@ -164,6 +162,14 @@ def parameters(robot: RobotFiles, world: World) -> dict[str, Any]:
         tuning = robot.tunings[world.tuning]
     published = {} if robot.onboard is None else robot.onboard.model_extra or {}
     return {**published, **tuning, **(world.onboard.model_extra or {})}
+
+
+def _absolute(choice: str | PlugIn, folder: Path) -> PlugIn:
+    """Return a plug-in; a relative path of its file starts at `folder`."""
+    plugin = choice if isinstance(choice, PlugIn) else PlugIn(name=choice)
+    if is_path(plugin.name):
+        plugin = plugin.model_copy(update={"name": str((folder / plugin.name).resolve())})
+    return plugin
 
 
 def known_robot(name: str) -> RobotFiles:

@@ -117,11 +117,7 @@ def compare(
     Raises:
         BadInputError: If all pairs are left out, or if no pair has a metric of `names`.
     """
-    flown = [pair for pair in pairs if counts(pair.a) and counts(pair.b)]
-    if not flown:
-        bad = [row["text"] for _, *both in pairs for row in both if not counts(row)]
-        why = f"each has {LEFT_OUT}: {bad[0]}" if bad else "none was found"
-        raise BadInputError(f"no pair of flights to compare: {why}")
+    flown = _valid(pairs)
     known = sorted({n for _, a, b in flown for n in a["numbers"].keys() & b["numbers"].keys()})
     check_names(names, known)
     chosen = names or [name for name in NUMBERS if name in known]
@@ -135,6 +131,16 @@ def compare(
             {**label, "a": _flight(a, chosen), "b": _flight(b, chosen)} for label, a, b in pairs
         ],
     }
+
+
+def _valid(pairs: Sequence[Pair]) -> list[Pair]:
+    """Return the pairs of which both flights count; raise a BadInputError if there is none."""
+    valid = [pair for pair in pairs if counts(pair.a) and counts(pair.b)]
+    if not valid:
+        bad = [row["text"] for _, *both in pairs for row in both if not counts(row)]
+        why = f"each has {LEFT_OUT}: {bad[0]}" if bad else "none was found"
+        raise BadInputError(f"no pair of flights to compare: {why}")
+    return valid
 
 
 def check_names(names: Iterable[str], known: Collection[str]) -> None:
@@ -191,33 +197,45 @@ def of_sweep(folder: Path, a: str, b: str) -> Pairs:
     Raises:
         BadInputError: If not exactly one axis has both values, or if `a` and `b` are equal.
     """
-    a, b = (_with_new_key(text) for text in (a, b))
     rows, units, missing = store.read_flights(folder)
     axes = store.values_of(rows)
-    sides = [
-        [(axis, v) for axis in axes for v in axes[axis] if text in (f"{v}", f"{axis}={v}")]
-        for text in (a, b)
-    ]
-    found = [(axis, x, y) for axis, x in sides[0] for other, y in sides[1] if axis == other]
+    axis, first, second = _sides(folder, axes, _with_new_key(a), _with_new_key(b))
+    what = f"{axis} in {folder}" + (f", of which {missing}" if missing else "")
+    if pooled := ", ".join(name for name, each in axes.items() if name != axis and len(each) > 1):
+        what += f", over all values of {pooled}; flights with equal seeds depend on each other, "
+        what += "so p is too small"
+    return Pairs(_pairs(rows, axis, first, second), units, what)
+
+
+def _sides(folder: Path, axes: Mapping[str, list[Any]], a: str, b: str) -> tuple[str, Any, Any]:
+    """Find the axis that has both values, of which `a` and `b` are the texts; return it and them.
+
+    Raise a BadInputError if there is no such axis, or more than one.
+    """
+
+    def values(text: str) -> list[tuple[str, Any]]:
+        every = [(axis, value) for axis, each in axes.items() for value in each]
+        return [(axis, value) for axis, value in every if text in (f"{value}", f"{axis}={value}")]
+
+    found = [(axis, x, y) for axis, x in values(a) for other, y in values(b) if axis == other]
     if len(found) != 1 or found[0][1] == found[0][2]:
-        listed = [f"{axis}: {', '.join(map(str, values))}" for axis, values in axes.items()]
+        listed = [f"{axis}: {', '.join(map(str, each))}" for axis, each in axes.items()]
         known = "; ".join(listed) or "none"
         raise BadInputError(
             f"{folder}: A and B must be two values of one axis, VALUE or AXIS=VALUE; axes: {known}"
         )
-    axis, first, second = found[0]
+    return found[0]
+
+
+def _pairs(rows: Iterable[Row], axis: str, first: Any, second: Any) -> list[Pair]:
+    """Pair the rows that differ only in `axis`: one has the value `first`, the other `second`."""
     flown: dict[str, dict[Any, Row]] = {}
     for row in rows:
         rest = {name: value for name, value in row["point"].items() if name != axis}
         shared = json.dumps({**rest, "seed": row["seed"]})
         flown.setdefault(shared, {})[row["point"][axis]] = row
-    pairs = [
+    return [
         Pair(json.loads(shared), each[first], each[second])
         for shared, each in flown.items()
         if first in each and second in each
     ]
-    what = f"{axis} in {folder}" + (f", of which {missing}" if missing else "")
-    if pooled := ", ".join(name for name, each in axes.items() if name != axis and len(each) > 1):
-        what += f", over all values of {pooled}; flights with equal seeds depend on each other, "
-        what += "so p is too small"
-    return Pairs(pairs, units, what)

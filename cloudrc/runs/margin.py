@@ -16,8 +16,8 @@ from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.problems import exceeds, expectation
 from cloudrc.config.schema import COMMAND_AGE_MS, Experiment
 from cloudrc.errors import BadInputError
+from cloudrc.link.ages import simulate_ages
 from cloudrc.robots.build import onboard_values
-from cloudrc.warnings import simulate_ages
 
 SLACK = 0.1
 """Reserve between the largest age of `simulate_ages` and the limits of cloud and guard [s]."""

@@ -21,11 +21,11 @@ from cloudrc import assembly, plugins
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.schema import Criteria, Mission, Waypoint
 from cloudrc.errors import describe_error, machine_error
+from cloudrc.link.ages import simulate_ages
 from cloudrc.messages import GuardState
 from cloudrc.metrics.verdict import NOT_STARTED, plugin_failures
 from cloudrc.record.columns import Recording, RecordStore
 from cloudrc.records import Control, Counted, Fault, GroundTruth, GuardChange, MissionEvent, Record
-from cloudrc.warnings import simulate_ages
 
 Array: TypeAlias = NDArray[np.float64]
 SCENE = "empty"

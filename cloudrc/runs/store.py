@@ -203,16 +203,28 @@ def as_csv(columns: Mapping[str, Sequence[Any]], unit_of: Mapping[str, str]) -> 
 
 def columns_of(rows: list[Row], grid: Grid) -> dict[str, list[Any]]:
     """Return the columns of a sweep's tables; an axis with values of several types becomes text."""
-    columns = {"key": [row["key"] for row in rows]}
-    for axis in grid.axes:
-        values = [row["point"][axis] for row in rows]
-        plain = len({*map(type, values)}) == 1 and isinstance(values[0], str | int | float)
-        columns[axis] = values if plain else [*map(as_text, values)]
-    columns |= {name: [row[name] for row in rows] for name in ("seed", "verdict")}
-    columns["failures"] = [" ".join(row["failures"]) for row in rows]
-    columns |= {name: [row.get(name, "") for row in rows] for name in ("code", "physics_steps")}
+
+    def column(name: str) -> list[Any]:
+        return [row.get(name, "") for row in rows]
+
+    axes = {axis: _axis_column([row["point"][axis] for row in rows]) for axis in grid.axes}
     names = sorted({name for row in rows for name in row["numbers"]})
-    return columns | {name: [row["numbers"].get(name) for row in rows] for name in names}
+    return {
+        "key": column("key"),
+        **axes,
+        "seed": column("seed"),
+        "verdict": column("verdict"),
+        "failures": [" ".join(row["failures"]) for row in rows],
+        "code": column("code"),
+        "physics_steps": column("physics_steps"),
+        **{name: [row["numbers"].get(name) for row in rows] for name in names},
+    }
+
+
+def _axis_column(values: list[Any]) -> list[Any]:
+    """Return the column of an axis; values of several types, or lists, become text."""
+    plain = len({*map(type, values)}) == 1 and isinstance(values[0], str | int | float)
+    return values if plain else [*map(as_text, values)]
 
 
 def as_text(value: Any) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -120,12 +120,21 @@ def summarise(rows: Sequence[Row], units: Mapping[str, str]) -> dict[str, Any]:
     Each median has a confidence interval. A run whose plug-in failed is counted, but its
     measurements are left out. `units`: metric -> unit.
     """
-    numbers, measured = {}, [row["numbers"] for row in rows if counts(row)]
-    failed = [row["numbers"] for row in rows if counts(row) and row["verdict"] != "success"]
-    for name in dict.fromkeys(name for each in measured for name in each):
-        found = [each[name] for each in measured if name in each]
-        middle = {"median": statistics.median(found), "interval": median_interval(found)}
-        marks = {"unit": units[name], "count": len(found), "failed": sum(name in n for n in failed)}
-        numbers[name] = middle | marks
+    valid = [row for row in rows if counts(row)]
+    names = dict.fromkeys(name for row in valid for name in row["numbers"])
     done = sum(row["verdict"] == "success" for row in rows)
+    numbers = {name: _summarise_one(valid, name, units[name]) for name in names}
     return {"done": done, "count": len(rows), "method": METHOD, "numbers": numbers}
+
+
+def _summarise_one(rows: Iterable[Row], name: str, unit: str) -> dict[str, Any]:
+    """Return median and interval of a measurement, of how many runs, and how many had failed."""
+    having = [row for row in rows if name in row["numbers"]]
+    found = [row["numbers"][name] for row in having]
+    return {
+        "median": statistics.median(found),
+        "interval": median_interval(found),
+        "unit": unit,
+        "count": len(found),
+        "failed": sum(row["verdict"] != "success" for row in having),
+    }

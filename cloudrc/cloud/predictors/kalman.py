@@ -124,19 +124,33 @@ def build(
         ValueError: If `white_box` has a `model_file`, or `parameters` has the key name or model.
         BadInputError: If the robot has no such model, or if the predictor refuses a parameter.
     """
-    given = dict(parameters or {})
-    if model_file is not None and model == "white_box":
-        raise ValueError("model_file: needs `model: first_order`; set that, or omit model_file")
-    if "name" in given:
+    choice = _replay_of(model, parameters or {}, model_file, robot)
+    replay = build_plugin("predictors", choice, robot=robot)
+    return Kalman(replay, position_noise, velocity_noise, acceleration_error)
+
+
+def _replay_of(
+    model: str | None,
+    parameters: dict[str, Any],
+    model_file: Path | None,
+    robot: RobotFacts | None,
+) -> PlugIn:
+    """Return the predictor whose model the filter uses; the arguments are those of `build`."""
+    if model == "white_box":
+        _check_white_box(model_file, robot)
+    if "name" in parameters:
         raise ValueError("parameters: no 'name'; choose the model with model")
-    if "model" in given:  # the experiment file makes a relative model_file absolute
+    if "model" in parameters:  # the experiment file makes a relative model_file absolute
         raise ValueError("parameters: give the file of a model as model_file, beside parameters")
+    given = parameters if model_file is None else {**parameters, "model": str(model_file)}
+    is_first_order = model == "first_order" or model_file is not None
+    name = "command_history" if is_first_order else "model_based"
+    return PlugIn.model_validate({**given, "name": name})
+
+
+def _check_white_box(model_file: Path | None, robot: RobotFacts | None) -> None:
     if model_file is not None:
-        given["model"] = str(model_file)
-    if model == "white_box" and (robot is None or robot.motion is None):
+        raise ValueError("model_file: needs `model: first_order`; set that, or omit model_file")
+    if robot is None or robot.motion is None:
         name = robot.name if robot else "the robot"
         raise BadInputError(f"model: {name} has no white_box (motion in robot.yaml); omit model")
-    is_first_order = model == "first_order" or model_file is not None
-    choice = {**given, "name": "command_history" if is_first_order else "model_based"}
-    replay = build_plugin("predictors", PlugIn.model_validate(choice), robot=robot)
-    return Kalman(replay, position_noise, velocity_noise, acceleration_error)
