@@ -62,6 +62,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "assembly": EVERYTHING,
     "warnings": {"assembly", "config", "link", "robots", "tunnel"},
     "api": {"runs", "cluster", "config", "metrics", "record", "report"},
+    "processes": EVERYTHING,
     "exercise": {"cloud", "config", "plugins", "runs"},
     "faults": EVERYTHING,
     "cli": EVERYTHING,

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from cloudrc.cli.link_run import Programs
+from cloudrc.drivers.programs import Programs
 from cloudrc.errors import MissingPrerequisiteError
 
 TC = f"""#!{sys.executable}

@@ -6,7 +6,6 @@ from copy import deepcopy
 import pytest
 
 from cloudrc.cli import link_set
-from cloudrc.cli.link_run import make_profile_loader
 from cloudrc.config.document import Document
 from cloudrc.config.load import edit_profile
 from cloudrc.drivers import local
@@ -15,6 +14,7 @@ from cloudrc.files import write_atomically
 from cloudrc.link.follow import HANDED_FILE, Profiles
 from cloudrc.link.profile import summary
 from cloudrc.link.state import LinkState, to_text
+from cloudrc.processes.link import make_profile_loader
 
 CHANGES = [{"at_s": 9.0, "delay_ms": 50.0, "jitter_ms": 20.0}, {"at_s": 12.0, "loss": 0.1}]
 TIMED = {"uplink": {"delay_ms": 40.0}, "downlink": {"delay_ms": 25.0, "changes": CHANGES}}

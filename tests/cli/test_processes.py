@@ -9,11 +9,12 @@ from unittest.mock import Mock
 import pytest
 
 from cloudrc import assembly
-from cloudrc.cli import processes
-from cloudrc.cli.processes import ipv4_addresses, open_recorder, read_address, read_size
+from cloudrc.cli.processes import read_address, read_size
 from cloudrc.config.load import load_experiment
 from cloudrc.drivers.realtime import free_ports, show_address
 from cloudrc.link.verify.monitor import LinkMonitor
+from cloudrc.processes import ends
+from cloudrc.processes.ports import ipv4_addresses
 from cloudrc.record.columns import Recording
 from tests.record.conftest import MS, counted, world_records
 
@@ -105,7 +106,7 @@ def test_sizes_are_read_as_in_kubernetes():
 
 
 def started(path, size_max=None):
-    return open_recorder(argparse.Namespace(record=path, record_max=size_max), "world", b"id")
+    return ends.open_recorder(path, size_max, "world", b"id")
 
 
 def write_down(recorder, records):
@@ -148,16 +149,16 @@ def test_a_restart_keeps_the_recording_of_a_crash(tmp_path):
 @pytest.mark.parametrize(("plan_s", "size"), [(0.0, 88), (0.4, 576)])
 def test_the_link_is_expected_to_carry_the_plans(plan_s, size, monkeypatch):
     monitor = Mock()
-    monkeypatch.setattr("cloudrc.link.verify.monitor.LinkMonitor", monitor)
+    monkeypatch.setattr("cloudrc.processes.ends.LinkMonitor", monitor)
     experiment = load_experiment("fast", [f"cloud.plan_s={plan_s}"])
-    processes.link_monitor(experiment, uplink=False, trusted=False)
+    ends.link_monitor(experiment, uplink=False, trusted=False)
     assert monitor.call_args.args[1].size == size
 
 
 def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch):
     path = tmp_path / "trace.csv"
     monkeypatch.setattr(LinkMonitor, "begin", lambda self, asked: None)
-    monitor = processes.link_monitor(load_experiment("paper"), uplink=False, trusted=False)
+    monitor = ends.link_monitor(load_experiment("paper"), uplink=False, trusted=False)
 
     def load(**uplink):
         asked = monitor._load({"uplink": uplink})
@@ -166,6 +167,6 @@ def test_a_trace_named_by_the_link_is_read_within_bounds(tmp_path, monkeypatch):
     path.write_text("time_s,delay_ms\n0,45\n1,50\n")
     assert load(trace=str(path)).rows
     assert load(table=str(path), distribution="table").quantiles
-    path.write_text(path.read_text() + "\n" * processes.TRACE_MAX)
+    path.write_text(path.read_text() + "\n" * ends.TRACE_MAX)
     assert load(trace=str(path)) is None
     assert load(trace="/dev/zero") is None, "an endless device would fill the memory"

@@ -5,7 +5,6 @@ import os
 
 import pytest
 
-from cloudrc.cli.link_run import make_profile_loader
 from cloudrc.errors import BadInputError
 from cloudrc.files import write_atomically
 from cloudrc.link.follow import (
@@ -15,6 +14,7 @@ from cloudrc.link.follow import (
     Profiles,
 )
 from cloudrc.link.state import ChangeFacts
+from cloudrc.processes.link import make_profile_loader
 
 LOAD = make_profile_loader("uplink")
 

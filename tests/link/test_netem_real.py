@@ -12,9 +12,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from cloudrc.cli.link_run import Programs
 from cloudrc.config.load import load_profile
 from cloudrc.config.shipped import names
+from cloudrc.drivers.programs import Programs
 from cloudrc.errors import MissingPrerequisiteError
 from cloudrc.link.model import LinkDirection, numbers, sample
 from cloudrc.link.netem import STRETCH, Netem, table

@@ -1,6 +1,5 @@
 """A run's folder from somebody else: reading it executes none of its code."""
 
-import argparse
 import json
 import os
 import subprocess
@@ -8,18 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import processes
 from cloudrc.cli.main import main
 from cloudrc.config.load import dump, read_experiment
 from cloudrc.config.schema import PlugIn
 from cloudrc.drivers.machine import interpreter
+from cloudrc.processes import ends
 from cloudrc.runs.verify import find_experiment
 from cloudrc.runs.workers import map_in_order
 from tests.metrics.conftest import flown
 from tests.record.conftest import write_mission
 
 pytestmark = pytest.mark.promise("foreign-files-run-nothing")
-PACKAGE = Path(processes.__file__).parents[1]
+PACKAGE = Path(ends.__file__).parents[1]
 CONFIG = """\
 cloud:
   estimator: {spy}
@@ -81,14 +80,14 @@ def test_link_verify_executes_nothing_of_the_run(run, trace):
 @pytest.mark.parametrize(("end", "imports"), [("world", False), ("cloud", True)])
 def test_only_cloud_imports_plug_ins(run, trace, monkeypatch, end, imports):
     for name in ("bind", "open_recorder", "open_exporter", "link_monitor"):
-        monkeypatch.setattr(processes, name, lambda *words, **more: None)
+        monkeypatch.setattr(ends, name, lambda *words, **more: None)
     (run / "config.yaml").write_text("cloud: {predictor: ./spy.py}")
     (run / "key").write_bytes(b"k" * 32)
-    options = argparse.Namespace(
-        config=run / "config.yaml", key=run / "key", listen=("127.0.0.1", 0), route=run / "route",
-        feed=False, record_flights=False,
+    settings = ends.EndSettings(
+        config=run / "config.yaml", record=run / "end.mcap", listen=("127.0.0.1", 0),
+        key=run / "key", route=run / "route",
     )  # fmt: skip
-    processes.open_end(options, end)
+    ends.open_end(settings, end)
     assert trace.exists() == imports
 
 
@@ -103,7 +102,7 @@ def modules_with(text):
 
 def test_plug_ins_and_processes_begin_only_where_they_should():
     """All code that does not fly uses `read_experiment`, which imports no plug-in."""
-    flies = {"runs/experiment.py", "cli/processes.py", "cli/bench.py"}
+    flies = {"runs/experiment.py", "processes/ends.py", "cli/bench.py"}
     flies |= {"faults/flight.py", "runs/grid.py", "exercise/checks.py"}
     assert modules_with("load_experiment(") == flies | {"config/load.py"}
     assert modules_with("sys.executable") == {"drivers/machine.py"}

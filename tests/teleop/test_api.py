@@ -1,6 +1,5 @@
 """The API over HTTP, as its clients meet it."""
 
-import argparse
 import asyncio
 import concurrent.futures
 import json
@@ -9,13 +8,14 @@ import time
 
 import pytest
 
-from cloudrc.cli.processes import warn_if_exposed
-from cloudrc.cli.teleop import api_address, serve_api
+from cloudrc.cli.teleop import api_address
 from cloudrc.config.load import load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.exposition.live import LiveMetrics
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
+from cloudrc.processes.ports import warn_if_exposed
+from cloudrc.processes.teleop import TeleopSettings, serve_api
 from cloudrc.records import Counted
 from cloudrc.teleop import api as api_module
 from cloudrc.teleop import auth, models
@@ -335,12 +335,11 @@ def test_the_api_and_its_client_speak_both_address_families():
     [("0", "127.0.0.1", False), ("[::1]:0", "::1", False), ("0.0.0.0:0", "0.0.0.0", True)],
 )
 def test_a_network_address_needs_tokens(where, host, warns, tmp_path, capsys):
-    options = argparse.Namespace(
-        api=api_address(where), tokens=None, audit=tmp_path / "audit", api_file=None
-    )
-    assert options.api == (host, 0)
+    address = api_address(where)
+    settings = TeleopSettings(tmp_path / "hover.yaml", tmp_path, address, tmp_path / "audit")
+    assert address == (host, 0)
     with pytest.raises(BadInputError, match="needs --tokens DIR"):
-        serve_api(options, load_experiment("hover"), load_scene("empty"))
+        serve_api(settings, load_experiment("hover"), load_scene("empty"))
     assert ("can be reached from outside" in capsys.readouterr().err) is warns
 
 

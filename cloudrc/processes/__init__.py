@@ -1,0 +1,1 @@
+"""The processes of a local run or of pods: world, cloud, one link per direction, and teleop."""

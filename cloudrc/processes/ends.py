@@ -1,0 +1,159 @@
+"""Run world or cloud as a process of a local run or a pod."""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cloudrc import assembly
+from cloudrc.config.load import ResolvedExperiment, load_experiment, read_experiment
+from cloudrc.drivers.keyfile import KeyFile
+from cloudrc.drivers.machine import clock_id
+from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
+from cloudrc.drivers.realtime import Address, Peer, bind
+from cloudrc.drivers.teleop import RemoteTeleop, UnixPeer
+from cloudrc.files import warn_if_readable
+from cloudrc.link.state import STATE_FILE
+from cloudrc.link.traces import SIZE_MAX, link_profile
+from cloudrc.link.verify.judge import Flow
+from cloudrc.link.verify.monitor import LinkMonitor
+from cloudrc.messages import GuardState, plan_length
+from cloudrc.plugins import apart
+from cloudrc.processes.ports import listening, open_exporter, warn
+from cloudrc.runs.requirements import require
+from cloudrc.source import code_hash
+from cloudrc.tunnel.codec import COMMAND_SIZES, SIZES, Kind
+from cloudrc.tunnel.end import Identity
+
+if TYPE_CHECKING:
+    from cloudrc.drivers.recording import Recorder
+
+TRACE_MAX = 2 << 20
+"""Maximum size of a trace file whose name comes from the link process [bytes]. World and cloud do
+not trust this process. In a cluster, traces come from a ConfigMap, which holds at most 1 MiB."""
+FORWARD_LIMIT_NS = 800_000_000
+"""Longest time for which cloud, when asked to end, still forwards teleop's request to hold [ns]. A
+process has 1.5 s to end."""
+
+
+@dataclass(frozen=True)
+class EndSettings:
+    """Files and addresses of world or cloud; a field is the flag of this name."""
+
+    config: Path  # experiment file
+    record: Path  # MCAP file to record to
+    listen: Address  # to receive at
+    key: Path  # of the tunnel
+    route: Path  # the link's file with the address to send to
+    feed: bool = False  # write status for a supervisor to stdout
+    metrics: Address | None = None  # serve metrics here
+    record_flights: bool = False  # no periodic records while the robot does not fly
+    record_max: float | None = None  # limit of both recordings [bytes]
+
+
+def run_world(settings: EndSettings, stop: StopSignal) -> None:
+    """Run world until `stop`."""
+    experiment, identity, end = open_end(settings, "world")
+    world = assembly.build_world(experiment, identity, time.monotonic_ns)
+    end.run(world, stop, lambda: world.robot.guard.armed, lambda: world.slip_ns)
+
+
+def run_cloud(settings: EndSettings, teleop_folder: Path, stop: StopSignal) -> None:
+    """Run cloud until `stop`; `teleop_folder` has the sockets between cloud and teleop."""
+    experiment, identity, end = open_end(settings, "cloud")
+    paths = teleop_folder / "cloud.sock", teleop_folder / "teleop.sock"
+    with closing(UnixPeer(*paths)) as peer:
+        teleop = RemoteTeleop(peer, time.monotonic_ns())
+        cloud = assembly.build_cloud(experiment, identity, teleop, time.monotonic_ns)
+
+        def flies() -> bool:
+            return cloud.guard is GuardState.TRACK
+
+        ends = GracefulStop(stop, lambda: not flies(), FORWARD_LIMIT_NS)
+        with apart():
+            end.run(cloud, ends, flies)
+
+
+def open_end(settings: EndSettings, name: str) -> tuple[ResolvedExperiment, Identity, EndProcess]:
+    """Open the files and sockets of world or cloud; `name` is "world" or "cloud".
+
+    Return the experiment, the identity of the process in the tunnel, and the `EndProcess` to run.
+    """
+    feed = Feed.on_stdout(watched=settings.feed)  # before plug-ins are loaded: they may print
+    path, clock, key = str(settings.config), clock_id(), settings.key
+    given = read_experiment(path)
+    exporter = open_exporter(name, given, settings.metrics)
+    # Only cloud loads the plug-ins, which fill in their default parameters.
+    experiment = load_experiment(path) if name == "cloud" else given
+    keys = KeyFile(key, time.monotonic_ns())
+    warn_if_readable(key, warn)
+    link = settings.route.with_name(STATE_FILE)
+    with listening("--listen", settings.listen):
+        peer = Peer(bind(settings.listen), settings.route)
+    recorder = open_recorder(settings.record, settings.record_max, name, clock)
+    end = EndProcess(
+        end=name,
+        peer=peer,
+        recorder=recorder,
+        keys=keys,
+        feed=feed,
+        exporter=exporter,
+        flights_only=settings.record_flights,
+        link=link,
+        check=link_monitor(experiment, uplink=name == "cloud", trusted=settings.feed),
+    )
+    return experiment, Identity(clock, os.urandom(16), keys.ring), end
+
+
+def open_recorder(path: Path, limit: float | None, clock: str, clock_id: bytes) -> Recorder:
+    """Make the recorder of world or cloud, which writes to `path`.
+
+    The recording of a previous process is kept as NAME.before.mcap, because it may show why that
+    process ended. `limit` is the largest size of both recordings together [bytes]. `clock` is
+    "world" or "cloud", the clock of the stamps; `clock_id` identifies this machine's monotonic
+    clock.
+    """
+    require("a recording", ("record",))
+    from cloudrc.drivers.recording import Recorder
+    from cloudrc.record.writer import McapWriter
+
+    kept, size_max = 0, None
+    with suppress(OSError):  # the recorder will meet the same error and report it
+        if path.is_file() and (kept := path.stat().st_size):
+            path.replace(path.with_name(f"{path.stem}.before{path.suffix}"))
+    if limit:
+        room = round(0.9 * limit)
+        size_max = max(room - kept, room // 10)
+    offset_ns = time.time_ns() - time.monotonic_ns()
+    return Recorder(
+        path,
+        lambda file: McapWriter(
+            file,
+            clock=clock,
+            clock_id=clock_id.hex(),
+            wall_offset_ns=offset_ns,
+            code=code_hash(),
+            index=False,
+        ),
+        size_max=size_max,
+    )
+
+
+def link_monitor(experiment: ResolvedExperiment, *, uplink: bool, trusted: bool) -> LinkMonitor:
+    """Make the monitor that compares the received datagrams with the link profile.
+
+    `uplink` is True in cloud, False in world. If the link is not `trusted`, as in a pod, the
+    monitor refuses trace files that are larger than TRACE_MAX.
+    """
+    kind = Kind.TELEMETRY if uplink else Kind.COMMAND
+    rate = experiment.world.odometry_rate_hz if uplink else experiment.cloud.command_rate_hz
+    size = SIZES[kind] if uplink else COMMAND_SIZES[plan_length(experiment.cloud.plan_s)]
+    flow = Flow(experiment.seed, uplink, kind, size)
+    computes, file_max = experiment.cloud.compute_ms > 0, SIZE_MAX if trusted else TRACE_MAX
+    check = LinkMonitor(uplink, flow, period=1.0 / rate, computes=computes, file_max=file_max)
+    check.begin((link_profile(experiment.uplink), link_profile(experiment.downlink)))
+    return check

@@ -1,0 +1,178 @@
+"""Shape one direction of the link of a pod or local run, in a process of its own.
+
+GET /link.json on the metrics port returns the state of the shaper and the netem qdiscs of this pod
+or machine. The process calls tc and ip for this answer, at most once a second.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Literal
+
+from cloudrc.config.load import load_profile, read_experiment
+from cloudrc.drivers.process import Feed, StopSignal
+from cloudrc.drivers.programs import Programs, run_tool
+from cloudrc.drivers.realtime import Address
+from cloudrc.link.follow import (
+    HANDED_FILE,
+    PEER_PAUSE,
+    PROFILE_PERIOD,
+    Load,
+    Loaded,
+    PeerName,
+    Profiles,
+)
+from cloudrc.link.model import LinkDirection
+from cloudrc.link.netem import Netem, find_netems
+from cloudrc.link.profile import DirectionProfile
+from cloudrc.link.relay import Relay, ask_for_fifo, settle
+from cloudrc.link.sidecar import Machine, Sidecar
+from cloudrc.link.state import LinkState
+from cloudrc.link.traces import link_profile
+from cloudrc.processes.ports import ipv4_addresses, listening, open_exporter, warn
+from cloudrc.records import Counted
+from cloudrc.tunnel.codec import peek
+
+if TYPE_CHECKING:
+    from cloudrc.drivers.exporter import Exporter
+
+RELEASED_PERIOD = 1.0
+"""Time between two updates of the file with the lateness of datagrams [s]."""
+log = partial(warn, process="link")
+
+
+@dataclass(frozen=True)
+class LinkSettings:
+    """Files and addresses of the process; a field is the flag of this name."""
+
+    config: Path  # experiment file
+    profile: Path  # of the link; watched for changes
+    direction: Literal["uplink", "downlink"]
+    mode: Literal["auto", "netem", "relay"]
+    peer: Address  # the other tunnel end
+    end: Address | None  # from which the own tunnel end sends
+    listen: Address  # where the relay receives datagrams
+    route: Path  # file for the address to which the own tunnel end must send
+    origin: int  # start of the time line, monotonic clock [ns]; 0: when the link comes up
+    feed: bool = False  # write status for a supervisor to stdout
+    metrics: Address | None = None  # serve metrics here
+
+
+def run_link(settings: LinkSettings, stop: StopSignal) -> None:
+    """Shape one direction of the link until `stop`."""
+    feed = Feed.on_stdout(watched=settings.feed)
+    experiment = read_experiment(str(settings.config))
+    exporter = open_exporter("link", experiment, settings.metrics)
+    document = settings.route.with_name(HANDED_FILE)
+    profiles = Profiles(settings.profile, document, make_profile_loader(settings.direction), log)
+    profile, peer = profiles.first(), PeerName(settings.peer, ipv4_addresses, log)
+    with TemporaryDirectory(prefix="tc-", dir=settings.route.parent) as tables:
+        programs = Programs(tables)
+        sidecar = Sidecar(
+            _machine(settings, experiment.seed, programs, Path(tables)),
+            profile,
+            mode=settings.mode,
+            direction=settings.direction,
+            route=settings.route,
+            origin_ns=settings.origin,
+            tell=partial(export_state, exporter),
+            count=partial(export_counts, exporter),
+        )
+
+        def poll_profile() -> None:
+            sidecar.profile = profiles.poll() or sidecar.profile
+
+        def resolve_peer() -> None:
+            sidecar.peer = peer.poll() or sidecar.peer
+            if exporter:
+                exporter.unresolved(peer.failures)
+
+        if exporter:
+            exporter.link.tell = lambda: status_page(sidecar)
+        try:
+            _repeat(poll_profile, PROFILE_PERIOD, PROFILE_PERIOD)
+            _repeat(resolve_peer, *PEER_PAUSE)
+            _repeat(sidecar.publish_released, RELEASED_PERIOD, RELEASED_PERIOD)
+            alive = feed.alive_while(stop)
+            sidecar.run(lambda: alive() if sidecar.state else stop())
+        finally:
+            programs.close()
+
+
+def make_profile_loader(direction: str) -> Load:
+    """Return a function that reads one direction of a link profile from a file."""
+
+    def load(path: Path) -> Loaded:
+        profile = load_profile(path.absolute())  # absolute: not a shipped name
+        values = profile.model_dump(mode="json", exclude_defaults=True)
+        return Loaded(link_profile(getattr(profile, direction)), values)
+
+    return load
+
+
+def _machine(settings: LinkSettings, seed: int, programs: Programs, tables: Path) -> Machine:
+
+    clock, wait = time.monotonic_ns, time.sleep
+
+    def relay(profile: DirectionProfile, origin_ns: int) -> Relay:
+        settle()
+        if ask_for_fifo():  # refused in most pods, which do not need it
+            log("the relay runs under SCHED_FIFO")
+        direction = LinkDirection(profile, seed, settings.direction == "uplink", origin_ns)
+        with listening("--listen", settings.listen):
+            return Relay(settings.listen, direction, peek, settings.end)
+
+    def netem(profile: DirectionProfile, origin_ns: int) -> Netem:
+
+        return Netem(
+            programs, profile, origin_ns=origin_ns, clock=clock, wait=wait, tables=tables, log=log
+        )
+
+    return Machine(relay, netem, clock, wait, log)
+
+
+def _repeat(action: Callable[[], None], shortest: float, longest: float) -> None:
+    def work() -> None:
+        while True:
+            action()
+            time.sleep(random.uniform(shortest, longest))
+
+    threading.Thread(target=work, daemon=True).start()
+
+
+def export_state(exporter: Exporter | None, state: LinkState) -> None:
+    """Export the state of one direction as metrics."""
+    if exporter:
+        delay = state.asked["delay"] or 0.0
+        exporter.link.shaped(state.shaper, state.direction, state.mode, delay)
+        exporter.ready(True)
+
+
+def export_counts(exporter: Exporter | None, counts: dict[str, int]) -> None:
+    """Export the counters of a shaper as metrics; `counts`: name of the counter -> value."""
+    if exporter:
+        exporter.see([Counted(0, "link", name, number) for name, number in counts.items()])
+
+
+def status_page(sidecar: Sidecar) -> str:
+    """Return the state of a sidecar as JSON. Any thread may call this function."""
+    peer, state = sidecar.peer, sidecar.state
+    netems = _find_netems(peer[0], int(time.monotonic())) if peer else {}
+    return json.dumps((asdict(state) if state else {}) | netems) + "\n"
+
+
+@lru_cache(maxsize=1)
+def _find_netems(host: str, second: int) -> dict[str, Any]:
+    """Find the netem qdiscs of this pod.
+
+    `second` is the present time [s]. It is an argument so that the cache searches once per second.
+    """
+    return find_netems(run_tool, host)

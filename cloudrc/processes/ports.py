@@ -1,0 +1,86 @@
+"""Open the ports of a process, and warn if other machines can reach them."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
+
+from cloudrc.config.load import ResolvedExperiment, fingerprint
+from cloudrc.drivers.realtime import Address, show_address
+from cloudrc.errors import BadInputError
+from cloudrc.text import escape
+
+if TYPE_CHECKING:
+    from cloudrc.drivers.exporter import Exporter
+
+IN_POD = "KUBERNETES_SERVICE_HOST"
+"""Environment variable that Kubernetes sets in each container of a pod."""
+
+
+def warn(text: str, process: str = "") -> None:
+    """Write a line to stderr, the log of a process, from any thread."""
+    print(escape(f"cloudrc{process and ' '}{process}: {text}"), file=sys.stderr, flush=True)
+
+
+def ipv4_addresses(name: str) -> list[str]:
+    """Return the IPv4 addresses of a host name; relay and netem shape IPv4 only.
+
+    Raise an OSError if there is none; its text tells whether the name has IPv6 addresses.
+    """
+    try:
+        return _addresses(name, socket.AF_INET)
+    except OSError as error:
+        with suppress(OSError):
+            _addresses(name, socket.AF_INET6)
+            error.strerror = (
+                "it has only IPv6 addresses, but a link needs IPv4; in a cluster with both "
+                "families set ipFamilyPolicy=PreferDualStack"
+            )
+        raise
+
+
+def _addresses(name: str, family: int) -> list[str]:
+    try:
+        found = socket.getaddrinfo(name, None, family, socket.SOCK_DGRAM)
+    except UnicodeError as error:  # an empty label, or one that is too long
+        raise OSError(f"not a name: {error}") from error
+    return [str(entry[4][0]) for entry in found]
+
+
+def warn_if_exposed(listen: Address) -> None:
+    """Print a warning if other machines can send to `listen`; in a pod, that is the purpose."""
+    if IN_POD in os.environ:
+        return
+    if not listen[0].startswith("127.") and listen[0] not in ("localhost", "::1"):
+        warn(f"warning: {listen[0]} can be reached from outside")
+
+
+@contextmanager
+def listening(flag: str, listen: Address) -> Iterator[None]:
+    """Warn if other machines can reach `listen`; convert an OSError to an error about `flag`."""
+    warn_if_exposed(listen)
+    try:
+        yield
+    except OSError as error:
+        raise BadInputError(
+            f"{flag} {show_address(listen)}: cannot receive there: {error.strerror or error};"
+            " name an address of this machine and a port that is free"
+        ) from error
+
+
+def open_exporter(
+    role: str, experiment: ResolvedExperiment, where: Address | None
+) -> Exporter | None:
+    """Serve the metrics of this process at an address; return None without an address."""
+    if where is None:
+        return None
+    from cloudrc.drivers.exporter import Exporter
+
+    warn_if_exposed(where)
+    exporter = Exporter(role, fingerprint(experiment))
+    exporter.serve(where)
+    return exporter

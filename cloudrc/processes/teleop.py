@@ -1,0 +1,172 @@
+"""Run the process that stores and commands missions and serves the API."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cloudrc import assembly
+from cloudrc.config.load import ResolvedExperiment, read_experiment
+from cloudrc.config.robot import is_planar
+from cloudrc.drivers.link_news import LinkNews
+from cloudrc.drivers.process import Feed, GracefulStop, StopSignal
+from cloudrc.drivers.realtime import Address
+from cloudrc.drivers.teleop import TeleopLoop, UnixPeer
+from cloudrc.files import write_atomically
+from cloudrc.geometry.scene import Scene, load_scene
+from cloudrc.processes.ports import open_exporter, warn, warn_if_exposed
+from cloudrc.records import Counted, Fault, Record
+from cloudrc.teleop.api import ApiServer, Bridge, create_app
+from cloudrc.teleop.auth import Audit, Gate, Tokens
+from cloudrc.teleop.models import read_drive, read_goto, read_order
+from cloudrc.teleop.service import MissionService
+from cloudrc.teleop.store import MissionStore, Order, StoreLockedError, connect, open_store
+from cloudrc.teleop.wire import ALARM
+
+if TYPE_CHECKING:
+    from cloudrc.drivers.exporter import Exporter
+
+FILES_MAX = 8_192
+"""Limit of open files: high, because idle connections must not prevent an emergency stop."""
+LOCK_PERIOD = 0.2
+"""Time between two attempts to open the journal while another teleop process locks it [s]."""
+PAUSE_LIMIT_NS = 500_000_000
+"""When asked to end, teleop waits at most this time [ns] until the robot holds its position."""
+log_line = partial(warn, process="teleop")
+
+
+@dataclass(frozen=True)
+class TeleopSettings:
+    """Files and addresses of the process; a field is the flag of this name."""
+
+    config: Path  # experiment file
+    socket: Path  # folder of the sockets between teleop and cloud
+    api: Address | Path  # where to serve the API
+    audit: Path  # log of all commands and their callers
+    tokens: Path | None = None  # folder of the token files
+    api_file: Path | None = None  # file for the API's URL
+    link: Path | None = None  # state of the link
+    journal: Path | None = None  # file of the missions; None: not stored
+    start: bool = False  # fly the experiment's mission, then exit
+    feed: bool = False  # write status for a supervisor to stdout
+    metrics: Address | None = None  # serve metrics here
+
+
+def run_teleop(settings: TeleopSettings, stop: StopSignal) -> None:
+    """Run teleop until `stop` or, with `start`, until the mission has ended."""
+    experiment = read_experiment(str(settings.config))
+    exporter = open_exporter("teleop", experiment, settings.metrics)
+    with ExitStack() as opened:
+        scene = load_scene(experiment.world.scene)
+        server = serve_api(settings, experiment, scene)
+        opened.callback(server.stop)
+        book = _open_store(settings.journal, stop, server.bridge)
+        if book is not None:  # None: stopped while another teleop process locked the journal
+            opened.callback(book.close)
+            service = MissionService(experiment.criteria.contact_speed_max_mps, book, scene)
+            if settings.start:
+                contact = bool(experiment.criteria.contact)
+                order = Order(assembly.build_plan(experiment), experiment.name, contact=contact)
+                service.create(order, time.monotonic_ns())
+            pause = GracefulStop(
+                stop,
+                lambda: service.settled,
+                PAUSE_LIMIT_NS,
+                lambda: service.pause(time.monotonic_ns()),
+            )
+            _fly(
+                settings,
+                service,
+                server,
+                exporter,
+                lambda: pause() or (settings.start and service.over),
+            )
+
+
+def serve_api(settings: TeleopSettings, experiment: ResolvedExperiment, scene: Scene) -> ApiServer:
+    """Start the API; until the mission service runs, the API answers that teleop is starting."""
+    if not isinstance(settings.api, Path):
+        warn_if_exposed(settings.api)
+    bridge, contact = Bridge(), bool(experiment.criteria.contact)
+    planar = is_planar(experiment.world.robot)
+    order = partial(
+        read_order, scene=scene, contact=contact, planar=planar,
+        plan=partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps),
+    )  # fmt: skip
+    tokens = Tokens(settings.tokens, log_line) if settings.tokens else None
+    goto = partial(read_goto, scene=scene, planar=planar)
+    app = create_app(bridge, order, goto, partial(read_drive, planar=planar), log_line)
+    server = ApiServer(Gate(app, tokens, Audit(settings.audit, log_line)), bridge, settings.api)
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    files = FILES_MAX if hard == resource.RLIM_INFINITY else min(FILES_MAX, hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (files, hard))
+    server.start()
+    if settings.api_file is not None:
+        document = {"schemaVersion": 1, "url": server.url}
+        write_atomically(settings.api_file, f"{json.dumps(document)}\n".encode())
+    return server
+
+
+def _fly(
+    settings: TeleopSettings,
+    service: MissionService,
+    server: ApiServer,
+    exporter: Exporter | None,
+    over: Callable[[], bool],
+) -> None:
+    """Serve missions and API requests until `over()` is true."""
+    feed = Feed.on_stdout(watched=settings.feed)
+    paths = settings.socket / "teleop.sock", settings.socket / "cloud.sock"
+    peer, bridge = UnixPeer(*paths), server.bridge
+    bridge.alarm = lambda: peer.send(ALARM)
+    bridge.open(service)
+
+    def tell(records: Sequence[Record]) -> None:
+        feed.tell(record for record in records if isinstance(record, Fault))  # cloud feeds events
+        if exporter is not None:
+            exporter.see(records)
+
+    news = LinkNews(settings.link) if settings.link else None
+
+    def is_over() -> bool:
+        now_ns = time.monotonic_ns()
+        if news is not None and (text := news.look(now_ns)):
+            service.tell_link(text, now_ns)
+        if exporter is not None:
+            exporter.ready(service.seen is not None)
+            counts = {"api_events_dropped": service.book.dropped, **server.counts}
+            exporter.see([Counted(0, "teleop", name, count) for name, count in counts.items()])
+        return over()
+
+    if notice := service.book.notice:
+        tell([Fault(0, "journal", notice), Counted(0, "teleop", "journal_repaired", 1)])
+    loop = TeleopLoop(service, peer, tell, calls=bridge.make_calls, stops=bridge.make_stops)
+    loop.run(feed.alive_while(is_over))
+
+
+def _open_store(path: Path | None, stop: Callable[[], bool], bridge: Bridge) -> MissionStore | None:
+    """Open the journal of missions at `path`, or make a store in memory if `path` is None.
+
+    Wait while another teleop process locks the file; return None if `stop()` becomes true first.
+    """
+    salt, reported = os.urandom(16), False
+    if path is None:
+        return MissionStore(connect(), salt)
+    while not stop():
+        try:
+            return open_store(path, salt)
+        except StoreLockedError as error:
+            if not reported:
+                log_line(str(error))
+                bridge.close(str(error))
+            reported = True
+            time.sleep(LOCK_PERIOD)
+    return None
