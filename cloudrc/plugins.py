@@ -74,7 +74,7 @@ def describe(kind: str, name: str) -> str:
 
 def signature(kind: str, name: str) -> inspect.Signature:
     """Return the parameters of a plug-in's `build`; their annotations are types, not strings."""
-    build = _build(kind, name)
+    build = builder(kind, name)
     with refuse_failure(
         f"{_one(kind)} {name!r} has a build() with annotations that cannot be read"
     ):
@@ -89,7 +89,7 @@ def signature(kind: str, name: str) -> inspect.Signature:
 
 def load(kind: str, name: str, /, **parameters: Any) -> Any:
     """Find a plug-in and build it; raise a BadInputError if it is missing or its `build` fails."""
-    build, method = _build(kind, name), METHODS[kind]
+    build, method = builder(kind, name), METHODS[kind]
     with refuse_failure(f"{_one(kind)} {name!r} cannot be built"):
         plugin = build(**parameters)
         if not callable(getattr(plugin, method, None)):
@@ -237,7 +237,8 @@ def suggest_name(name: str, available: list[str]) -> str:
     return f"; did you mean {near[0]}?" if near else ""
 
 
-def _build(kind: str, name: str) -> Callable[..., Any]:
+def builder(kind: str, name: str) -> Callable[..., Any]:
+    """Return the function `build` of a plug-in; raise a BadInputError if it has none."""
     target = find(kind, name)
     build = getattr(target, "build", None if isinstance(target, ModuleType) else target)
     if not callable(build):

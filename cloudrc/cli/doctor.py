@@ -99,8 +99,8 @@ def native_steps(found: str) -> Check:
 
 def start(program: str) -> subprocess.Popen[str]:
     """Start a Python program in a new process, because a broken library may abort the process."""
-    pipe = subprocess.PIPE
-    return subprocess.Popen(interpreter("-c", program), stdout=pipe, stderr=pipe, text=True)
+    output = subprocess.PIPE
+    return subprocess.Popen(interpreter("-c", program), stdout=output, stderr=output, text=True)
 
 
 def said(program: subprocess.Popen[str]) -> tuple[str, str]:

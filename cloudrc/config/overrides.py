@@ -16,9 +16,9 @@ from __future__ import annotations
 import copy
 import inspect
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from functools import reduce
+from functools import lru_cache, reduce
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -320,9 +320,11 @@ def build_plugin(kind: str, choice: PlugIn, /, **given: Any) -> Any:
     its `build` that are no parameters of the user. Raise a BadInputError that names the wrong
     parameters.
     """
-    if found := check_plugin(kind, choice):
-        raise BadInputError("; ".join(map(str, found)))
-    checked = _check(kind, choice.name, choice.model_extra or {})
+    try:
+        checked = _check(kind, choice.name, choice.model_extra or {})
+    except ValidationError as error:
+        found = problems.from_pydantic(error, parameter_model(kind, choice.name))
+        raise BadInputError("; ".join(map(str, found))) from None
     return plugins.load(kind, choice.name, **given, **dict(checked))
 
 
@@ -354,6 +356,12 @@ def default_parameters(kind: str, name: str) -> dict[str, Any]:
 
 def parameter_model(kind: str, name: str) -> type[BaseModel]:
     """Create a pydantic model of a plug-in's parameters from the signature of its `build`."""
+    return _model_of(kind, name, plugins.builder(kind, name))
+
+
+@lru_cache(maxsize=64)  # a pydantic model takes a millisecond
+def _model_of(kind: str, name: str, build: Callable[..., Any]) -> type[BaseModel]:
+    """Create the model for `build`, the function of a plug-in; a changed file has a new one."""
     empty, parameters = inspect.Parameter.empty, plugins.signature(kind, name).parameters
     fields: dict[str, Any] = {
         name: (

@@ -345,8 +345,8 @@ class Plant(Section):
     payload_offset_m: tuple[Offset, Offset, Offset] = (0.0, 0.0, -0.1)
     """Position of the payload in the body frame, from the origin of the base [m]"""
     actuator_factor: ActuatorFactor = 1.0
-    """True effect of the actuators, such as the thrust and torque of a rotor, as a multiple of the
-    model's: a number for all, or a list with a number for each, in the order of the model"""
+    """True force of the actuators as a multiple of the model's: a number for all, or a list with a
+    number for each, in the order of the model"""
 
     @field_validator("actuator_factor")
     @classmethod
@@ -389,8 +389,8 @@ class World(Section):
     """How the true robot differs from its model; guard, onboard controller and cloud use the
     model. A heavy or weak robot brakes worse, so the guard may stop it too late"""
     wind: Wind = Wind()
-    """Horizontal wind. It acts on the actuators alone, as drag of turning rotors, so it does not
-    move a robot whose actuators are off. A robot whose actuators have no drag is refused"""
+    """Horizontal wind. It acts on the actuators alone, by their drag, so it does not move a robot
+    whose actuators are off. A robot whose actuators have no drag is refused"""
     odometry_rate_hz: Literal[20, 25, 50, 100, 125, 250, 500] = 100
     """Rate of the odometry for cloud [Hz]. The true state is recorded at 100 Hz or more"""
 

@@ -142,9 +142,8 @@ def _build_onboard(
 ) -> Onboard:
     """Build an onboard controller for a compiled `MjModel`; errors name the files in `where`."""
     choice = PlugIn.model_validate({**given, "name": choice.name})
-    problems = check_plugin(KIND, choice)
-    own = [each for each in problems if each.path[0] in (world.onboard.model_extra or {})]
-    if own:
+    keys = world.onboard.model_extra
+    if keys and (own := [each for each in check_plugin(KIND, choice) if each.path[0] in keys]):
         listed = "; ".join(f"world.onboard.{problem}" for problem in own)
         raise BadInputError(f"{listed} (controller of {world.robot}: {choice.name})")
     try:
