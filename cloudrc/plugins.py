@@ -24,6 +24,7 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from numbers import Real
 from pathlib import Path
@@ -266,6 +267,12 @@ def _module_of(path: Path) -> str | None:
 
 
 def _installed(kind: str) -> dict[str, EntryPoint]:
+    return _entries(kind, tuple(sys.path))
+
+
+@cache  # the search takes milliseconds, which every flight of a sweep would pay
+def _entries(kind: str, path: tuple[str, ...]) -> dict[str, EntryPoint]:
+    """Return the entry points of a kind in the packages on `path`, Python's search path."""
     return {entry.name: entry for entry in entry_points(group=f"cloudrc.{kind}")}
 
 

@@ -40,10 +40,11 @@ def check_estimate(estimate: Any) -> Odometry:
     if abs(square - 1.0) > SQUARE_ROUNDING:
         length = sqrt(square)
         w, x, y, z = w / length, x / length, y / length, z / length
-    stamp = to_number(stamp_ns, "stamp")
-    refuse("stamp", stamp)
-    whole_ns = stamp_ns if type(stamp_ns) is int else round(stamp)
-    return _new(Odometry, (whole_ns, position, (w, x, y, z), velocity, rate))
+    if not (type(stamp_ns) is int and -LARGEST <= stamp_ns <= LARGEST):  # the usual case is fast
+        stamp = to_number(stamp_ns, "stamp")
+        refuse("stamp", stamp)
+        stamp_ns = round(stamp)
+    return _new(Odometry, (stamp_ns, position, (w, x, y, z), velocity, rate))
 
 
 def check_output(output: Any) -> ControlOutput:

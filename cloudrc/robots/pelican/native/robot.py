@@ -47,6 +47,8 @@ HUGE = 1e4
 """Half the edge of the box that stands for the space below a plane [m]."""
 PAGE = 4096
 """Smallest size of a page [bytes]: a program may read all bytes of a page, or none."""
+SMALLEST = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+"""Model with which the offset of `mjData` is searched."""
 MARK = 0x6E636F6E
 """Number that no other part of `mjData` contains."""
 UNUSED_WITHOUT_CONTACTS = sum(
@@ -110,7 +112,7 @@ def make_state(simulator: Simulator, controller: LowLevel, guard: Guard) -> Step
         # MuJoCo has no public name for the addresses.
         *(model._address, free_model._address, data._address),
         *(array.ctypes.data for array in (*arrays, tip_force)),
-        *(data._address + _contacts_offset(data), timer, obstacles.ctypes.data),
+        *(data._address + _known_offset(), timer, obstacles.ctypes.data),
         *_VALUES.values(),
         *(
             guard.stop_coefficient,
@@ -166,6 +168,16 @@ def _mujoco_library() -> ctypes.CDLL:
     if len(files) != 1:
         raise OSError(f"{folder}: has {len(files)} files of MuJoCo's library, not 1")
     return ctypes.CDLL(str(files[0]))
+
+
+@cache
+def _known_offset() -> int:
+    """Return `_contacts_offset`, which is that of this MuJoCo, and search once only.
+
+    In memory that an earlier `mjData` has used, an old address could end the search too early.
+    """
+    model = mujoco.MjModel.from_xml_string(SMALLEST)
+    return _contacts_offset(mujoco.MjData(model))
 
 
 def _contacts_offset(data: Any) -> int:

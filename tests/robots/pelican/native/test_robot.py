@@ -278,7 +278,7 @@ def test_a_robot_that_moves_from_c_to_python_flies_on_the_same():
     assert pilots[0].seen == pilots[1].seen
 
 
-def unfit(data):
+def unfit():
     raise ValueError("undefined symbol")
 
 
@@ -286,7 +286,7 @@ def unfit(data):
     ("what", "value", "text"),
     [
         ("_VALUES", native._VALUES | {"mass": 1.05 + 1e-12}, "C and Python differ"),
-        ("_contacts_offset", unfit, "MuJoCo is not as expected: ValueError('undefined symbol')"),
+        ("_known_offset", unfit, "MuJoCo is not as expected: ValueError('undefined symbol')"),
     ],
 )
 def test_a_failed_self_test_means_python_and_one_warning(what, value, text, monkeypatch, caplog):
