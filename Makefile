@@ -17,8 +17,10 @@ JOBS ?= $(shell nproc 2>/dev/null || echo 2)
 EVIDENCE := build/evidence
 # A failing schedule is kept in --store; in tests/faults/regressions it becomes a test.
 SEARCH = $(bin)/cloudrc faults search --jobs $(JOBS) --store $(EVIDENCE)/regressions
-# The duration of each search of `make faults` [min].
+# The duration of each search of `make faults` [min], and of those for further robots.
 MINUTES ?= 5
+ROBOT_MINUTES ?= 1
+ROBOTS := x2 nano rover
 # The tests of one part: make test T=tunnel, make test T=tests/cli/test_run.py.
 T ?=
 PART = $(if $(T),$(if $(wildcard tests/$(T)),tests/$(T),$(T)))
@@ -84,6 +86,8 @@ faults-random: $(VENV)/dev
 
 faults-hostile: $(VENV)/dev
 	$(SEARCH) --minutes $(MINUTES) --adversarial
+	for robot in $(ROBOTS); do \
+		$(SEARCH) --minutes $(ROBOT_MINUTES) --adversarial --robot $$robot || exit 1; done
 
 coverage: $(VENV)/dev ## fail unless every branch of guard, tunnel and store is tested
 	$(bin)/pytest -n auto --hypothesis-seed=0 --cov --cov-report=term $(CORE)
@@ -100,7 +104,8 @@ mutants: $(VENV)/dev ## mutate guard, tunnel and store, list the mutants that te
 # In this order; each part runs even if an earlier one has failed. The part on a cluster needs Docker,
 # kind, helm and kubectl.
 NIGHT := $(addprefix $(EVIDENCE)/,tests.xml process.xml faults.json \
-	search-adversarial.json search-random.json link.json mujoco-oldest.json mujoco-newest.json) \
+	search-adversarial.json $(ROBOTS:%=search-%.json) search-random.json \
+	link.json mujoco-oldest.json mujoco-newest.json) \
 	mutants night-netem e2e-full $(EVIDENCE)/index.md
 
 nightly: export CLOUDRC_EVIDENCE = $(CURDIR)/$(EVIDENCE)
@@ -119,6 +124,9 @@ $(EVIDENCE)/faults.json:
 
 $(EVIDENCE)/search-adversarial.json:
 	$(SEARCH) --adversarial --minutes 5 -o json > $@
+
+$(ROBOTS:%=$(EVIDENCE)/search-%.json): $(EVIDENCE)/search-%.json:
+	$(SEARCH) --adversarial --robot $* --minutes 1 -o json > $@
 
 $(EVIDENCE)/search-random.json:
 	$(SEARCH) --minutes 10 -o json > $@

@@ -7,14 +7,17 @@ import os
 import sys
 import time
 from collections.abc import Generator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.output import output_argument, paint, print_line, print_result
 from cloudrc.cli.parser import add_verbs, number, read_count, whole_number
+from cloudrc.config import shipped
+from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import require
@@ -31,7 +34,7 @@ examples:
   cloudrc faults run cloud-killed            or by its number: F13
   cloudrc faults run --all --seed 2 -o json
   cloudrc faults search --minutes 10         random combinations of faults
-  cloudrc faults search --minutes 5 --adversarial
+  cloudrc faults search --minutes 5 --adversarial --robot rover
   cloudrc faults search --first 201          continue an earlier search
   cloudrc faults run faults-found/stuck-seed-12.yaml
 
@@ -71,11 +74,21 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--store", type=_folder, default=STORE, metavar="DIR", help=about)
     about = "the cloud has valid keys and tries to break the invariants"
     add("--adversarial", action="store_true", help=about)
+    robot = World().robot
+    about = f"name of a shipped robot, or path of a robot (default: {robot})"
+    add("--robot", type=_robot, default=robot, metavar="NAME", help=about)
 
 
 def _name_or_file(text: str) -> str | Path:
     is_path = "/" in text or text.endswith((".yaml", ".yml")) or os.path.isfile(text)
     return Path(text) if is_path else text
+
+
+def _robot(text: str) -> str:
+    try:
+        return shipped.model_path("robot", text, Path())
+    except BadInputError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _folder(text: str) -> Path:
@@ -180,12 +193,20 @@ def search(options: argparse.Namespace) -> int:
 
     kind, shown = "adversarial" if options.adversarial else "random", options.output == "table"
     found: dict[str, Any] = {
-        **{"kind": kind, "first": options.first, "next": options.first, "count": 0, "seconds": 0.0},
+        **{
+            "kind": kind,
+            "robot": options.robot,
+            "first": options.first,
+            "next": options.first,
+            "count": 0,
+            "seconds": 0.0,
+        },
         "invariants": {name: {"judged": 0, "broken": 0} for name in INVARIANTS},
         **{"smallest_margin_m": 9.0, "largest_speed_mps": 0.0, "missions_done": 0, "failures": []},
     }
     if shown:
-        print(f"{kind} schedules from seed {options.first} on, for {options.minutes:g} min")
+        about = f"{kind} schedules of {escape(options.robot)} from seed {options.first} on"
+        print(f"{about}, for {options.minutes:g} min")
     began = time.monotonic()
 
     def take(finding: TrialResult) -> None:
@@ -200,6 +221,7 @@ def search(options: argparse.Namespace) -> int:
 
     stopped = take_each(_fly_seeds(options, began), take)
     again = f"cloudrc faults search{' --adversarial' if options.adversarial else ''}"
+    again += f" --robot {quote(options.robot)}" * (options.robot != World().robot)
     again += f" --first {found['next']}"
     lines = table(search_rows(found), right=(1, 2)), "", search_summary(found)
     print_result(options.output, found, "\n".join(["", *lines, f"to continue: {again}"]))
@@ -211,20 +233,20 @@ def search(options: argparse.Namespace) -> int:
 
 def _fly_seeds(options: argparse.Namespace, began: float) -> Generator[TrialResult]:
     """Fly one flight per seed, until `options.minutes` [min] have passed since `began` [s]."""
-    fly = partial(fly_seed, adversarial=options.adversarial)
+    fly = partial(fly_seed, adversarial=options.adversarial, robot=options.robot)
     for finding in map_in_order(fly, count(options.first), options.jobs):
         yield finding
         if time.monotonic() - began >= 60.0 * options.minutes:
             return
 
 
-def fly_seed(seed: int, adversarial: bool) -> TrialResult:
+def fly_seed(seed: int, adversarial: bool, robot: str) -> TrialResult:
     """Fly the schedule for a seed: random faults, or a dishonest cloud with or without faults."""
     from cloudrc.faults import trial
     from cloudrc.faults.adversary import choose
     from cloudrc.faults.schedule import compose
 
-    return trial.fly((choose if adversarial else compose)(seed))
+    return trial.fly(replace((choose if adversarial else compose)(seed), robot=robot))
 
 
 def _count(found: dict[str, Any], finding: TrialResult) -> None:

@@ -54,6 +54,9 @@ class RobotLimits(Section):
 
 DEFAULT_LIMITS = RobotLimits()
 """Limits of a robot that flies."""
+MODEL_ALONE = RobotLimits(acceleration_max_mps2=4.0)
+"""Limits of a model without `robot.yaml`. At a tilt of 35 degrees a multirotor has 6.9 m/s^2. With
+more than 4 m/s^2 on one axis, it would not brake another axis in time, above all while it sinks."""
 
 
 class Response(Parameters):
@@ -131,7 +134,7 @@ def find_robot(name: str) -> RobotFiles:
     Raise a BadInputError if its `robot.yaml` is invalid.
     """
     if name.endswith(".xml"):
-        return RobotFiles(Path(name), None)
+        return RobotFiles(Path(name), None, guard=MODEL_ALONE)
     folder = Path(name) if shipped.is_path(name) else shipped.FOLDERS["robot"] / name
     file = folder / shipped.ROBOT_FILE
     label = str(file) if shipped.is_path(name) else f"{name}/{shipped.ROBOT_FILE}"

@@ -159,11 +159,12 @@ def _faces(position: Vector) -> list[tuple[float, int, float]]:
     return [(HIGH[n] - p, n, 1.0) for n, p in enumerate(position)] + walls
 
 
-def dishonesty(schedule: Schedule) -> tuple[list[Lie], Words | None]:
+def dishonesty(schedule: Schedule, *, planar: bool) -> tuple[list[Lie], Words | None]:
     """Return the functions by which the cloud of a schedule attacks: ([], None) if it is honest.
 
     The functions in the list change commands. The function after the list forges operator requests;
-    it is None if the policy forges no requests.
+    it is None if the policy forges no requests. Most clouds send no vertical velocity to a `planar`
+    robot, because it refuses such commands.
 
     Raises:
         BadInputError: If the policy does not exist; the message lists all policies.
@@ -174,6 +175,8 @@ def dishonesty(schedule: Schedule) -> tuple[list[Lie], Words | None]:
         names = ", ".join(POLICIES)
         raise BadInputError(f"no policy '{schedule.policy}' of a cloud; there are: {names}")
     lies = [POLICIES[schedule.policy](generator(schedule.seed, 666))]
+    if planar and generator(schedule.seed, 668).random() < FLAT_SHARE:
+        lies.append(_flat)
     speaks = schedule.policy in SPEAKING
     return lies, at_bad_moments(generator(schedule.seed, 667)) if speaks else None
 
@@ -189,6 +192,7 @@ def choose(seed: int) -> Schedule:
 # Policies: each draws its parameters and returns its lie.
 
 FAST = 6.0  # largest speed that the guard lets a cloud fly [m/s]
+FLAT_SHARE = 0.8  # share of the clouds of a planar robot that send no vertical velocity
 STRANGE = (nan, inf, -inf, 1e308, -1e308, 5e-324, -0.0, 1e3, FAST, -FAST, 0.0)
 NONSENSE_NS = 80_000_000  # duration of impossible commands that makes the guard land [ns]
 
@@ -196,6 +200,14 @@ NONSENSE_NS = 80_000_000  # duration of impossible commands that makes the guard
 def _fly(command: Command, velocity: Sequence[float], **others: Any) -> Command:
     x, y, z = velocity
     return command._replace(velocity=(x, y, z), **others)
+
+
+def _flat(command: Command, control: Control) -> Command:
+    """Take the vertical velocities out of a command and its plan."""
+    x, y, _ = command.velocity
+    return command._replace(
+        velocity=(x, y, 0.0), plan=tuple((x, y, 0.0) for x, y, _ in command.plan)
+    )
 
 
 def _towards_a_face(rng: Generator) -> Lie:

@@ -7,18 +7,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 
 from cloudrc import assembly
 from cloudrc.cloud.endpoint import CloudEndpoint
 from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
+from cloudrc.config import shipped
 from cloudrc.config.load import load_experiment
+from cloudrc.config.robot import is_planar
+from cloudrc.config.schema import World
 from cloudrc.drivers.teleop import PERIOD_NS as WAKE_NS
 from cloudrc.drivers.virtual import Clock, VirtualRun
 from cloudrc.endpoint import Endpoint
 from cloudrc.faults.adversary import DishonestLoop, HostileOperator, Lie, dishonesty
 from cloudrc.faults.inject import BUGS, SECRET, bugs, inject, shaped
-from cloudrc.faults.invariants import Watch
+from cloudrc.faults.invariants import Watch, facts_of
 from cloudrc.faults.models import RestartableEndpoint, TeleopModel
 from cloudrc.faults.schedule import OFFSET_MAX, Schedule, generator
 from cloudrc.link.model import LinkDirection
@@ -47,7 +51,7 @@ class FaultRun:
     def __init__(
         self,
         schedule: Schedule,  # faults of the flight, and the link's profile
-        *settings: str,  # settings of the experiment `paper`, as for `--set`
+        *settings: str,  # settings of the robot's experiment, as for `--set`
         honest: bool = True,  # whether a contact is a breach; not if `schedule` has a policy
         keep: bool = True,  # whether all records are kept; sha256() needs them
         start: bool = True,  # whether the experiment's mission is ordered at once
@@ -63,13 +67,14 @@ class FaultRun:
         self.schedule = schedule
         plans = ["guard.plan_max_s=0.8"] if "plans" in schedule.policy else []
         faults = f"link.profile={schedule.profile}", f"guard.hold_max_s={schedule.hold_max:g}"
-        settings = (*plans, *faults, *settings, f"seed={schedule.seed}")
-        self.experiment = load_experiment("paper", list(settings))
+        robot = shipped.model_path("robot", schedule.robot, Path())
+        settings = (f"world.robot={robot}", *plans, *faults, *settings, f"seed={schedule.seed}")
+        self.experiment = load_experiment(_experiment_of(robot), list(settings))
         has_own_clock = bool(schedule.cloud_offset or schedule.cloud_drift)
         offset = schedule.cloud_offset % OFFSET_MAX  # no clock shows a negative time
         self._clock = Clock(round(offset * 1e9), schedule.cloud_drift)
         self._clock_id = OTHER if has_own_clock else SHARED
-        policy, self._words = dishonesty(schedule)
+        policy, self._words = dishonesty(schedule, planar=is_planar(robot))
         mistakes = [bugs(schedule, self._clock)] if schedule.of(*BUGS) else []
         self._lies = [*policy, *mistakes, *lies]
         self._honest, self._keep, self._life = honest and not schedule.policy, keep, life
@@ -78,7 +83,7 @@ class FaultRun:
         self.generations = {"world": 0, "cloud": 0}
         self.of_world, self.of_cloud = list[Record](), list[Record]()
         self.changes = list[GuardChange]()
-        self.watch = Watch(self.experiment.guard)
+        self.watch = Watch(facts_of(self.experiment))
         self.listeners: list[Callable[[list[Record], int], None]] = [self.watch.see]
         self.teleop = TeleopModel(
             self.experiment.criteria.contact_speed_max_mps,
@@ -216,3 +221,10 @@ class FaultRun:
         self.changes += [record for record in of_world if isinstance(record, GuardChange)]
         for listen in self.listeners:
             listen(of_world, self.run.now_ns)
+
+
+def _experiment_of(robot: str) -> str:
+    """Return the name of the shipped experiment in which a robot meets faults."""
+    if robot == World().robot:
+        return "paper"
+    return "pillars" if is_planar(robot) else "steps"

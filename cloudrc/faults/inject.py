@@ -67,8 +67,7 @@ def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> Direction
             f"the link's profile {schedule.profile} changes over time, so that the fault "
             f"{waves[0].kind} cannot be added; choose a profile without changes"
         )
-    edges = sorted({instant for event in waves for instant in (event.at, event.end)})
-    changes = tuple(_change(profile, [e for e in waves if e.at <= t < e.end], t) for t in edges)
+    changes = _changes(profile, waves)
     with_faults = {
         "blackouts": (*profile.blackouts, *blackouts),
         "changes": changes or profile.changes,
@@ -76,6 +75,12 @@ def shaped(schedule: Schedule, profile: DirectionProfile, way: str) -> Direction
         "reorder": max(profile.reorder, schedule.reorder),
     }
     return profile.model_copy(update=with_faults)
+
+
+def _changes(profile: DirectionProfile, waves: list[FaultEvent]) -> tuple[Change, ...]:
+    """Return the changes of a link in which each event of `waves` acts while it lasts."""
+    edges = sorted({instant for event in waves for instant in (event.at, event.end)})
+    return tuple(_change(profile, [e for e in waves if e.at <= t < e.end], t) for t in edges)
 
 
 def _change(profile: DirectionProfile, active: list[FaultEvent], at: float) -> Change:

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from cloudrc.config.document import read_document, write_yaml
+from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
 
 
@@ -119,6 +120,7 @@ class Schedule:
     policy: str = ""  # policy of a dishonest cloud; "" for an honest cloud
     duration: Annotated[float, Field(ge=0.1, le=DURATION_MAX)] = 60.0  # [s]
     hold_max: Annotated[float, Field(ge=0.1, le=3600.0)] = 60.0  # HOLD becomes LAND then [s]
+    robot: str = World().robot  # name of a shipped robot, or a path
 
     @property
     def quiet_from(self) -> float:

@@ -10,8 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from cloudrc.errors import describe_error
+from cloudrc.faults.facts import LATCHED
 from cloudrc.faults.flight import FaultRun
-from cloudrc.faults.invariants import LATCHED, Breach
+from cloudrc.faults.invariants import Breach
 from cloudrc.faults.measures import events_of_missions, held
 from cloudrc.faults.schedule import Schedule
 from cloudrc.messages import GuardState
@@ -127,14 +128,18 @@ class TrialOperator:
             self._flight.watch.note(self._flight.run.now_ns, "obeyed", text)
 
     def _look(self, records: list[Record], now_ns: int) -> None:
-        flight = self._flight
-        state, _ = flight.guard_now()
+        """Note what the guard did in the last 100 ms, then act as an operator would."""
+        state, _ = self._flight.guard_now()
         if state is GuardState.TRACK:
             self._tracked_ns = now_ns
         changes = [record.state for record in records if isinstance(record, GuardChange)]
         if GuardState.ESTOP in (state, *changes):
             self._unmet_ns = [at_ns for at_ns in self._unmet_ns if at_ns > now_ns]
-        service = flight.teleop.service
+        self._operate(now_ns)
+
+    def _operate(self, now_ns: int) -> None:
+        """Acknowledge a landing or a stop, or order the next mission."""
+        flight, service = self._flight, self._flight.teleop.service
         if service is None or now_ns < self._next_ns or flight.cloud.inner is None:
             return
         # A restarted world is in GROUND without a change of state, so ask for the state.

@@ -4,7 +4,8 @@ from functools import cache
 from types import SimpleNamespace
 
 from cloudrc.config.load import load_experiment
-from cloudrc.faults.invariants import FLOWN, TRACK, Watch
+from cloudrc.faults.facts import FLOWN, TRACK
+from cloudrc.faults.invariants import Watch, facts_of
 from cloudrc.messages import ZERO, Command, OperatorRequest, Request, Start
 from cloudrc.records import Contact
 from cloudrc.robots.pelican.rotors import STOPPED
@@ -14,23 +15,24 @@ TURNING = (900.0,) * 4
 
 
 @cache
-def guard(hold_ms=60_000):
-    """Return the limits of the guard."""
+def facts(hold_ms=60_000, robot="pelican"):
+    """Return what the invariants know of a robot in its experiment."""
     settings = f"guard.hold_max_s={hold_ms / 1000}", "guard.plan_max_s=0.8"
-    return load_experiment("hover", ["link.profile=ideal", *settings]).guard
+    name = "pillars" if robot == "rover" else "hover"
+    return facts_of(load_experiment(name, ["link.profile=ideal", *settings]))
 
 
 class FakeRobot:
     """A robot in a mission; it is in whatever state and place a test puts it."""
 
-    def __init__(self, *, yaw_rate=0.0, honest=False, hold_ms=60_000):
+    def __init__(self, *, yaw_rate=0.0, honest=False, hold_ms=60_000, robot="pelican"):
         self.guard = SimpleNamespace(state=TRACK, reference=ZERO, yaw_rate=yaw_rate)
         self.simulator = SimpleNamespace(steps=0, touch_age=float("inf"), touches=[])
         self.onboard = SimpleNamespace(stopped=STOPPED)
         self.observers = []
         self.position, self.velocity = (1.0, 1.0, 1.0), ZERO
         self.now_ns = 0
-        self.watch = Watch(guard(hold_ms))
+        self.watch = Watch(facts(hold_ms, robot))
         self.watch.attach(self, 0, honest=honest)
         (self.observer,) = self.observers
         self.request(Request.START)

@@ -5,13 +5,14 @@ from operator import methodcaller
 
 import pytest
 
-from cloudrc.faults.invariants import ESTOP, GROUND, HOLD, LAND, RAMP, TRACK
+from cloudrc.faults.facts import ESTOP, GROUND, HOLD, LAND, TRACK
 from cloudrc.messages import ZERO, Request, Start
 from tests.faults.conftest import FakeRobot
 
 step, offer, request, touch, put, skip = (
     partial(methodcaller, name) for name in ("step", "offer", "request", "touch", "put", "skip")
 )
+RAMP = 3.0  # braking of the Pelican [m/s^2]
 OUTSIDE, FAR = (9.3, 1.0, 1.0), (9.2 + 1.51, 1.0, 1.0)
 NAN = float("nan")
 IMPOSSIBLE = offer(5, "range")
@@ -186,3 +187,29 @@ ENDING = (IMPOSSIBLE, step(LAND), *RELEASE)
 def test_an_honest_cloud_touches_the_board_by_the_tip_only(kinds, story):
     assert play(*story, honest=True) == kinds
     assert play(*story) == set(), "with a hostile one a contact is no breach"
+
+
+@pytest.mark.parametrize(
+    ("kinds", "story"),
+    [
+        # It may be at any height, and touches the floor; the walls count.
+        (set(), (touch("floor"), step(TRACK, position=(1.0, 1.0, -5.0)))),
+        ({"collision"}, (touch("pillar_1"), step(TRACK))),
+        ({"fence"}, (touch("floor"), IMPOSSIBLE, step(LAND, position=OUTSIDE))),
+        # 0.2 v + v^2/4 <= 0.2: 0.579 m/s
+        (set(), holds(HOLD, (8.9, 1.0, 0.1), (0.57, 0.0, 0.0))),
+        ({"stop"}, holds(HOLD, (8.9, 1.0, 0.1), (0.59, 0.0, 0.0))),
+        ({"cap"}, fly((1.501, 0.0, 0.0))),
+        (set(), fly((0.004, 0.0, 0.0))),
+        ({"cap"}, fly((0.0041, 0.0, 0.0))),
+        ({"cap"}, holds(HOLD, (1.0, 1.0, 0.1), (0.0, 0.0, 1e-9))),
+        # Without commands it stops within 0.3 + 0.5625 + 0.5 m.
+        (set(), rest(1.5, 1.36)),
+        ({"rest"}, rest(1.5, 1.37)),
+        # Wheels that do not turn are no robot that is switched off.
+        (set(), (step(TRACK), put((0.3, 0.0, 0.0)), step(HOLD, turns=True))),
+        ({"latch"}, (step(GROUND, turns=True),)),
+    ],
+)
+def test_the_limits_of_the_rover_are_its_own(kinds, story):
+    assert play(*story, robot="rover", honest=True) == kinds

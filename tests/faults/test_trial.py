@@ -17,9 +17,10 @@ from cloudrc.records import CommandApplied, SessionOpened
 from cloudrc.teleop.service import MissionService
 from cloudrc.tunnel.channel import LATE, USED, Channel
 from cloudrc.world.guard import limits
+from cloudrc.world.guard.hold import PositionHold
 from cloudrc.world.guard.state import Guard
 from tests.conftest import nightly
-from tests.faults.conftest import guard
+from tests.faults.conftest import facts
 
 MS = 1_000_000
 REGRESSIONS = sorted((Path(__file__).parent / "regressions").glob("*.yaml"))
@@ -42,6 +43,36 @@ def test_random_faults_break_no_invariant(seed):
 def test_a_hostile_cloud_causes_no_breach(policy):
     seed = next(seed for seed in range(1, 30) if choose(seed).policy == policy)
     assert fly(replace(choose(seed), duration=8.0)).breaches == ()
+
+
+@pytest.mark.promise("stays-inside-the-fence")
+@pytest.mark.parametrize("robot", ["nano", "rover", "x2"])
+@pytest.mark.parametrize("policy", ["face-after-face", "hostile-plans", "operators-voice"])
+def test_a_hostile_cloud_of_another_robot_causes_no_breach(robot, policy):
+    seed = next(seed for seed in range(1, 30) if choose(seed).policy == policy)
+    assert fly(replace(choose(seed), duration=8.0, robot=robot)).breaches == ()
+
+
+IGNORES_FENCE = (limits, "limit_to_fence", lambda velocity, *_: velocity)
+NEVER_BRAKES = (PositionHold, "_brake", lambda hold, reference, *_: reference)
+
+
+@pytest.mark.parametrize(
+    ("robot", "policy", "broken", "kind"),
+    [
+        ("nano", "greedy", IGNORES_FENCE, "fence"),
+        ("nano", "random", NEVER_BRAKES, "rest"),
+        ("rover", "towards-a-face", IGNORES_FENCE, "fence"),
+        ("rover", "random", NEVER_BRAKES, "rest"),
+    ],
+)
+def test_a_guard_that_does_not_brake_another_robot_is_found(
+    monkeypatch, robot, policy, broken, kind
+):
+    monkeypatch.setattr(*broken)
+    blackout = FaultEvent("blackout", 4.0, 3.0)
+    found = fly(Schedule(1, "ideal", (blackout,), policy=policy, robot=robot, duration=9.0))
+    assert kind in found.kinds
 
 
 BLACKOUT, STOPPED = FaultEvent("blackout", 44.0, 8.0), FaultEvent("stopped", 5.0)
@@ -96,7 +127,7 @@ def fails_to_shut_down(patch):
     ("breaks", "kind", "schedule"),
     [
         (lambda patch: None, "", HELD),
-        (ignores(limits, "ramp_ns", lambda _: 0), "cap", replace(HELD, duration=9.0)),
+        (ignores(limits, "ramp_ns", lambda *_: 0), "cap", replace(HELD, duration=9.0)),
         (ignores(Guard, "_alone_max_ns", 3_600_000 * MS), "hold", HELD),
         (applies_late_commands, "order", Schedule(1, reorder=0.5, duration=4.0)),
         (ignores(EmergencyStopRepeater, "sound"), "obeyed", HELD),
@@ -126,7 +157,7 @@ def test_a_broken_part_is_found(breaks, kind, schedule, monkeypatch):
     ],
 )
 def test_a_command_is_applied_once_and_in_order(commands, kinds):
-    watch = Watch(guard())
+    watch = Watch(facts())
     watch.starts_ns += [0, 3]
     for at, (epoch, counter) in enumerate(commands):
         opened = SessionOpened(at, "world", epoch, "cloud said hello")
@@ -143,7 +174,7 @@ def test_a_waypoint_is_reached_once_and_in_order(waypoints, kinds):
     events.append({"mission": "n", "event": "reached", "waypoint": 0})
     book = SimpleNamespace(events_after=lambda number: events)
     teleop, run = SimpleNamespace(service=SimpleNamespace(book=book)), SimpleNamespace(now_ns=0)
-    flight = SimpleNamespace(listeners=[], watch=Watch(guard()), teleop=teleop, run=run)
+    flight = SimpleNamespace(listeners=[], watch=Watch(facts()), teleop=teleop, run=run)
     _check_waypoints(flight)
     assert set(flight.watch.counts) == kinds
 

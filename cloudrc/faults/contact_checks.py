@@ -1,0 +1,90 @@
+"""Check what the robot touches, and when it is switched off: invariants collision and rest."""
+
+from __future__ import annotations
+
+from cloudrc.faults.facts import ESTOP, FLOWN, HOLD, LAND, REELS_NS, Facts, Note
+from cloudrc.messages import GuardState, Vector
+from cloudrc.world.simulator import Simulator
+
+STANDS = 0.2  # speed per axis up to which a robot stands when it is switched off [m/s]
+FALL = 1.0
+"""Downward speed that proves a fall while switched off [m/s]; a drop of 2 cm ends at only 0.7."""
+BRAKE_NS = 200_000_000  # time to stop a descent that the operator has acknowledged [ns]
+FLOOR = "floor"  # body on which a robot may always stand
+
+
+class ContactChecks:
+    """Checks a robot's contacts and actuators in every step.
+
+    Attributes:
+        comes_down: Whether the robot lands, or fell after an emergency stop.
+        is_asked: Whether the operator has just asked to stop or to reset the robot.
+    """
+
+    def __init__(self, facts: Facts, note: Note, simulator: Simulator, *, honest: bool) -> None:
+        self._facts, self._note = facts, note
+        self._simulator, self._honest = simulator, honest
+        self._touches, self._seen = simulator.touches, 0
+        self._landed_ns = -2 * BRAKE_NS
+        self.comes_down = self.is_asked = False
+        self._was_on = self._halted = False
+
+    def check_touches(self, state: GuardState, now_ns: int) -> bool:
+        """Check that new contacts are allowed; return whether there are any."""
+        if state is LAND:
+            self._landed_ns = now_ns
+        touches = self._simulator.touches
+        if touches is not self._touches:
+            self._touches, self._seen = touches, 0
+        new = touches[self._seen :]
+        self._seen = len(touches)
+        if self._facts.planar:  # its wheels always touch the floor
+            new = [touch for touch in new if touch.body != FLOOR]
+        for touch in new:
+            if self._honest and not self._is_allowed(state, touch.body, touch.tip, now_ns):
+                part = "tip" if touch.tip else "body"
+                self._note(now_ns, "collision", f"{part} touched {touch.body} in {state.name}")
+        return bool(new)
+
+    def _is_allowed(self, state: GuardState, body: str, tip: bool, now_ns: int) -> bool:
+        """Return whether the robot may touch a body in this state."""
+        if body == "board" and tip:
+            return True
+        # A landing that is acknowledged just above an obstacle cannot stop in time.
+        lands = state is LAND or (state is HOLD and now_ns - self._landed_ns <= BRAKE_NS)
+        low = lands or state not in FLOWN
+        return low and (lands or self.comes_down or body == FLOOR)
+
+    def check_actuators(
+        self, state: GuardState, velocity: Vector, is_on: bool, now_ns: int
+    ) -> None:
+        """Check that the robot is switched off only on a request, after a hit, or without motion.
+
+        `velocity` is that of the base [m/s], `is_on` tells whether the robot is switched on.
+        """
+        asked, self.is_asked = self.is_asked, False
+        if self._was_on and not is_on:
+            self._halted = not asked and state is not ESTOP
+            fastest = max(map(abs, velocity))
+            if self._halted and not fastest <= STANDS:
+                self._note(now_ns, "rest", f"switched off in {state.name} at {fastest:.2f} m/s")
+        elif self._halted:
+            self._halted = not is_on and not asked and not self._check_fall(state, velocity, now_ns)
+        self._was_on = is_on
+
+    def _check_fall(self, state: GuardState, velocity: Vector, now_ns: int) -> bool:
+        """Check a robot that was switched off by itself; return whether it falls."""
+        falls = velocity[2] < -FALL and not self._just_touched
+        if falls:
+            self._note(now_ns, "rest", f"falls in {state.name}, switched off in the air")
+        return falls
+
+    def check_hit(self, state: GuardState, now_ns: int) -> None:
+        """Check a change to `state`: only a contact makes the guard stop the robot by itself."""
+        is_hit = state is ESTOP and not self.is_asked
+        if is_hit and self._honest and not self._just_touched:
+            self._note(now_ns, "collision", "stopped by a hit although nothing was touched")
+
+    @property
+    def _just_touched(self) -> bool:
+        return self._simulator.touch_age <= REELS_NS * 1e-9
