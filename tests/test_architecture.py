@@ -57,13 +57,13 @@ MAY_IMPORT: dict[str, set[str]] = {
     "runs": {
         *("assembly", "cloud", "cluster", "config", "drivers", "files", "geometry", "link"),
         *("metrics", "plugin_file", "plugins", "record", "report", "robots", "statistics"),
-        *("teleop", "tunnel", "warnings"),
+        *("teleop", "tunnel", "warnings", "world"),
     },
     "assembly": EVERYTHING,
     "warnings": {"assembly", "config", "link", "robots", "tunnel"},
     "api": {"runs", "cluster", "config", "metrics", "record", "report"},
     "processes": EVERYTHING,
-    "exercise": {"cloud", "config", "plugins", "runs"},
+    "exercise": {"cloud", "config", "drivers", "plugins", "runs"},
     "faults": EVERYTHING,
     "cli": EVERYTHING,
     "__main__": {"cli"},
@@ -109,7 +109,7 @@ RESERVED: dict[str, tuple[str, ...]] = {
     # A compiler makes the machine code of the usual step.
     "subprocess": (
         *("drivers/", "cli/", "cluster/", "robots/pelican/native/library"),
-        "runs/link_under_test",
+        *("exercise/scoring", "runs/link_under_test"),
     ),
     "multiprocessing": ("drivers/", "runs/workers"),
     "concurrent": ("cli/", "runs/workers", "cluster/", "teleop/"),

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from cloudrc.cli.faults import search_rows, search_summary
+from cloudrc.faults.search import search_rows, search_summary
 from cloudrc.report.document import environment_document, write_json
 from tools.docs import table
 

@@ -15,8 +15,8 @@ from importlib.metadata import version
 
 import numpy as np
 
-from cloudrc.cli.bench import LOOP, STEP, flight, measure
 from cloudrc.config.load import load_experiment
+from cloudrc.runs.bench import LOOP, STEP, flight, measure
 from cloudrc.text import table
 
 SECONDS = 10

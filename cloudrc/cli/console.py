@@ -151,9 +151,9 @@ def _serve(options: argparse.Namespace, flight: ConsoleTarget) -> None:
 
 
 def _local(options: argparse.Namespace) -> ConsoleTarget:
-    from cloudrc.cli.link_set import read_states, set_here
     from cloudrc.console.steering import LinkControl
     from cloudrc.drivers.local import LINK_FOLDER, under_way
+    from cloudrc.runs.link_change import read_states, set_here
 
     found = find_local_run(options, flag="")
     if found is None:

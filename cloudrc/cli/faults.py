@@ -5,19 +5,13 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import time
-from collections.abc import Generator
-from dataclasses import asdict, replace
 from functools import partial
-from itertools import count
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 from cloudrc.cli.output import output_argument, paint, print_line, print_result
 from cloudrc.cli.parser import add_verbs, number, read_count, whole_number
-from cloudrc.config import shipped
-from cloudrc.config.schema import World
 from cloudrc.errors import BadInputError
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import require
@@ -26,7 +20,6 @@ from cloudrc.text import escape, table
 
 if TYPE_CHECKING:
     from cloudrc.faults.measures import Outcome, Scenario
-    from cloudrc.faults.trial import TrialResult
 
 EPILOG = """\
 examples:
@@ -74,9 +67,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add("--store", type=_folder, default=STORE, metavar="DIR", help=about)
     about = "the cloud has valid keys and tries to break the invariants"
     add("--adversarial", action="store_true", help=about)
-    robot = World().robot
-    about = f"name of a shipped robot, or path of a robot (default: {robot})"
-    add("--robot", type=_robot, default=robot, metavar="NAME", help=about)
+    about = "name of a shipped robot, or path of a robot (default: that of every experiment)"
+    add("--robot", type=_robot, metavar="NAME", help=about)
 
 
 def _name_or_file(text: str) -> str | Path:
@@ -85,6 +77,8 @@ def _name_or_file(text: str) -> str | Path:
 
 
 def _robot(text: str) -> str:
+    from cloudrc.config import shipped
+
     try:
         return shipped.model_path("robot", text, Path())
     except BadInputError as error:
@@ -121,6 +115,7 @@ def print_faults(options: argparse.Namespace) -> int:
 def run(options: argparse.Namespace) -> int:
     """Run one fault, all faults, or the schedule of faults in a file; return the exit code."""
     from cloudrc.faults.scenarios import SCENARIOS, find
+    from cloudrc.faults.search import run_fault
 
     if isinstance(options.name, Path):
         return fly_file(options)
@@ -133,7 +128,7 @@ def run(options: argparse.Namespace) -> int:
         if options.output == "table":
             _print_outcome(scenario, outcome, options.all)
 
-    run_seed = partial(_run, seed=options.seed)
+    run_seed = partial(run_fault, seed=options.seed)
     flown = map_in_order(run_seed, [each.name for each in chosen], options.jobs)
     stopped = take_each(flown, take)
     done, failed = len(faults), sum(each["result"] == "failed" for each in faults)
@@ -145,15 +140,6 @@ def run(options: argparse.Namespace) -> int:
         print(text, file=sys.stderr, flush=True)
         return stopped.exit_code
     return FAILED if failed else 0
-
-
-def _run(name: str, seed: int) -> Outcome:
-    from cloudrc.faults.scenarios import find
-
-    began = time.monotonic()
-    outcome = find(name).run(seed)
-    outcome.seconds = time.monotonic() - began
-    return outcome
 
 
 def _print_outcome(scenario: Scenario, outcome: Outcome, briefly: bool) -> None:
@@ -189,39 +175,27 @@ def fly_file(options: argparse.Namespace) -> int:
 
 def search(options: argparse.Namespace) -> int:
     """Fly random schedules of faults; print the failures, and how to continue the search."""
-    from cloudrc.faults.trial import INVARIANTS
+    from cloudrc.config.schema import World
+    from cloudrc.faults.search import SearchSettings, search, search_rows, search_summary
 
-    kind, shown = "adversarial" if options.adversarial else "random", options.output == "table"
-    found: dict[str, Any] = {
-        **{
-            "kind": kind,
-            "robot": options.robot,
-            "first": options.first,
-            "next": options.first,
-            "count": 0,
-            "seconds": 0.0,
-        },
-        "invariants": {name: {"judged": 0, "broken": 0} for name in INVARIANTS},
-        **{"smallest_margin_m": 9.0, "largest_speed_mps": 0.0, "missions_done": 0, "failures": []},
-    }
+    shown, seeds = options.output == "table", (options.first, options.minutes, options.jobs)
+    settings = SearchSettings(
+        options.adversarial, *seeds, options.store, options.robot or World().robot
+    )
     if shown:
-        about = f"{kind} schedules of {escape(options.robot)} from seed {options.first} on"
+        about = (
+            f"{settings.kind} schedules of {escape(settings.robot)} from seed {options.first} on"
+        )
         print(f"{about}, for {options.minutes:g} min")
-    began = time.monotonic()
 
-    def take(finding: TrialResult) -> None:
-        found["seconds"] = time.monotonic() - began
-        _count(found, finding)
-        if finding.breaches:
-            failure = _store(finding, options.store)
-            found["failures"].append(failure)
-            if shown:
-                print_line(f"FAILED seed {failure['seed']}: {failure['breaches'][0]['text']}")
-                print_line(f"  again: cloudrc faults run {failure['file']}")
+    def see(failure: dict[str, Any]) -> None:
+        if shown:
+            print_line(f"FAILED seed {failure['seed']}: {failure['breaches'][0]['text']}")
+            print_line(f"  again: cloudrc faults run {failure['file']}")
 
-    stopped = take_each(_fly_seeds(options, began), take)
+    found, stopped = search(settings, see)
     again = f"cloudrc faults search{' --adversarial' if options.adversarial else ''}"
-    again += f" --robot {quote(options.robot)}" * (options.robot != World().robot)
+    again += f" --robot {quote(options.robot)}" if options.robot else ""
     again += f" --first {found['next']}"
     lines = table(search_rows(found), right=(1, 2)), "", search_summary(found)
     print_result(options.output, found, "\n".join(["", *lines, f"to continue: {again}"]))
@@ -229,78 +203,3 @@ def search(options: argparse.Namespace) -> int:
         print(f"cloudrc: {stopped}; continue with '{again}'", file=sys.stderr, flush=True)
         return stopped.exit_code
     return FAILED if found["failures"] else 0
-
-
-def _fly_seeds(options: argparse.Namespace, began: float) -> Generator[TrialResult]:
-    """Fly one flight per seed, until `options.minutes` [min] have passed since `began` [s]."""
-    fly = partial(fly_seed, adversarial=options.adversarial, robot=options.robot)
-    for finding in map_in_order(fly, count(options.first), options.jobs):
-        yield finding
-        if time.monotonic() - began >= 60.0 * options.minutes:
-            return
-
-
-def fly_seed(seed: int, adversarial: bool, robot: str) -> TrialResult:
-    """Fly the schedule for a seed: random faults, or a dishonest cloud with or without faults."""
-    from cloudrc.faults import trial
-    from cloudrc.faults.adversary import choose
-    from cloudrc.faults.schedule import compose
-
-    return trial.fly(replace((choose if adversarial else compose)(seed), robot=robot))
-
-
-def _count(found: dict[str, Any], finding: TrialResult) -> None:
-    """Add the finding of the next seed to `found`, the document of a search."""
-    from cloudrc.faults.trial import checked_in
-
-    for name in ("next", "count"):
-        found[name] += 1
-    for name in checked_in(finding.schedule):
-        found["invariants"][name]["judged"] += 1
-    for name in finding.kinds:
-        found["invariants"][name]["broken"] += 1
-    found["smallest_margin_m"] = min(found["smallest_margin_m"], finding.margin)
-    found["largest_speed_mps"] = max(found["largest_speed_mps"], finding.speed)
-    found["missions_done"] += finding.missions
-
-
-def _store(finding: TrialResult, folder: Path) -> dict[str, Any]:
-    """Write a schedule that broke an invariant into `folder`; return the failure for JSON."""
-    from cloudrc.faults.schedule import dump
-
-    schedule, seed = finding.schedule, finding.schedule.seed
-    name = f"{'-'.join(sorted(finding.kinds))}-{schedule.policy or 'seed'}-{seed}.yaml"
-    lines = [f"{each.time:.3f} s: {each.kind}: {each.text}" for each in finding.breaches[:3]]
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / name).write_text(dump(schedule, "\n".join(lines)), encoding="utf-8")
-    return {
-        "seed": seed,
-        "breaches": [breach._asdict() for breach in finding.breaches],
-        "schedule": asdict(schedule),
-        "file": str(folder / name),
-    }
-
-
-def search_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Return a table of a search: each invariant with an upper bound of its failure probability.
-
-    The bound is the rule of three: with 0 breaches in N flights, p < 3/N with 95 % confidence.
-    """
-    from cloudrc.faults.trial import INVARIANTS
-
-    lines: list[tuple[str, ...]] = [("invariant", "broken in", "of N", "95 % bound")]
-    for name, words in INVARIANTS.items():
-        judged, broken = (document["invariants"][name][each] for each in ("judged", "broken"))
-        bound = "not judged" if not judged else "-" if broken else f"p < {min(3 / judged, 1):.2g}"
-        lines.append((words, str(broken) if judged else "-", str(judged), bound))
-    return lines
-
-
-def search_summary(document: dict[str, Any]) -> str:
-    """Describe a search in one sentence: flights, failures, least distance to fence, top speed."""
-    return (
-        f"{document['count']} {document['kind']} schedules in {document['seconds']:.0f} s, seeds "
-        f"{document['first']} to {document['next'] - 1}: {len(document['failures'])} broken, "
-        f"{document['missions_done']} missions done, nearest to the fence "
-        f"{document['smallest_margin_m']:.3f} m, fastest {document['largest_speed_mps']:.2f} m/s"
-    )

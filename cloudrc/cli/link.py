@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import re
 import sys
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable
 from math import isnan, nan
 from pathlib import Path
 from statistics import fmean
@@ -19,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from cloudrc.cli.cluster_flags import release_arguments
 from cloudrc.cli.output import PICTURES, output_argument, print_line, refuse_other_file
-from cloudrc.cli.parser import add_verbs
+from cloudrc.cli.parser import add_verbs, settings_from
 from cloudrc.errors import BadInputError
 from cloudrc.files import naming
 from cloudrc.link.verify import DEFAULT
@@ -27,10 +25,7 @@ from cloudrc.runs.requirements import require
 from cloudrc.text import escape, table
 
 if TYPE_CHECKING:
-    from cloudrc.config.schema import Direction, Profile
-    from cloudrc.link.model import Numbers, Stream
-    from cloudrc.link.profile import DirectionProfile, Trace
-    from cloudrc.report.figures.link import DirectionSample
+    from cloudrc.link.model import Numbers
 
 EPILOG = """\
 examples:
@@ -80,16 +75,6 @@ tunnel's own datagrams, within a minute. It reports what it cannot judge.
 
 exit codes: 0 believed, 1 not believed or undecided, 2 bad input,
 3 missing prerequisite, 4 no answer in time, 5 cluster, 6 a process died"""
-PACKETS_MAX = 10_000_000
-RANGES: dict[str, tuple[float, float]] = {
-    "seconds": (0.001, 86_400),
-    "seed": (0, 2**53 - 1),
-    "rate": (1, 10_000),
-    "packets": (1, PACKETS_MAX),
-}
-"""Option of `show` -> its least and largest value."""
-ROWS = 1000  # least number of packets for a trace that has shares of losses
-SECONDS = 30.0  # time that a figure shows by default [s]; a longer time line is shown in full
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -165,17 +150,15 @@ def show(options: argparse.Namespace) -> int:
     output = options.output or Path(f"{Path(options.profile).stem}.png")
     if output.suffix[1:] not in PICTURES:
         raise BadInputError(f"-o {output}: not a picture; end its name in .png, .svg or .pdf")
-    for name, (least, most) in RANGES.items():
-        value = getattr(options, name)
-        if value is not None and not least <= value <= most:
-            raise BadInputError(f"--{name} {value:g}: give a number from {least} to {most}")
     refuse_other_file(output, PICTURES[output.suffix[1:]])
     from cloudrc.report.figures.link import render_link
+    from cloudrc.runs.link_sample import SampleSettings, sample_profile
 
-    profile, is_trace = _profile(options.profile)
-    names = ("uplink",) if is_trace else ("uplink", "downlink")
-    ways = {name: _way(getattr(profile, name), name, options) for name in names}
-    title = escape(": ".join(filter(None, (Path(options.profile).stem, profile.description))))
+    settings = settings_from(options, SampleSettings)
+    about, ways = sample_profile(
+        options.profile, settings, lambda text: print_line(f"cloudrc: {text}", sys.stderr)
+    )
+    title = escape(": ".join(filter(None, (Path(options.profile).stem, about))))
     samples = [sample for sample, _ in ways.values()]
     picture = render_link(title, samples[0], samples[1] if samples[1:] else None, output.suffix[1:])
     with naming(output):
@@ -184,72 +167,6 @@ def show(options: argparse.Namespace) -> int:
     print(_table({name: numbers for name, (_, numbers) in ways.items()}))
     print_line(str(output))
     return 0
-
-
-def _profile(name: str) -> tuple[Profile, bool]:
-    """Load the profile `name`, or make one from a trace; return whether `name` is a trace."""
-    from cloudrc.config.load import load_profile
-    from cloudrc.config.schema import Direction, Profile
-    from cloudrc.link.traces import read_lines, read_trace
-
-    path = Path(name).absolute()
-    lines = read_lines(path, name, "give a profile or a trace") if path.is_file() else []
-    if not (name.endswith(".csv") or re.match(r"(\s|#.*\n)*(time_s|\d)", "\n".join(lines[:9]))):
-        return load_profile(name), False
-    times = read_trace(path).times
-    about = f"a trace of {len(times)} rows in {times[-1] - times[0]:.4g} s"
-    return Profile(description=about, uplink=Direction(trace=str(path))), True
-
-
-def _way(
-    asked: Direction, name: str, options: argparse.Namespace
-) -> tuple[DirectionSample, Numbers]:
-    """Simulate one direction of the link; return the packets for the figure, and statistics.
-
-    If the conditions are constant, the statistics come from more packets than the figure shows.
-    """
-    from cloudrc.link.doubts import describe_trace
-    from cloudrc.link.model import numbers
-    from cloudrc.link.profile import Timeline
-    from cloudrc.link.traces import link_profile
-    from cloudrc.report.figures.link import DirectionSample
-
-    profile = link_profile(asked)
-    timeline, send = Timeline(profile), partial(_send, profile, name == "uplink", options.seed)
-    period_ns = round(1e9 / options.rate)
-    if profile.rows is not None and options.seconds is None:
-        shown = send(_row_times(profile.rows))
-    else:
-        seconds = options.seconds or max(SECONDS, 1.1e-9 * timeline.last_ns)
-        if seconds * options.rate > PACKETS_MAX:
-            raise BadInputError(
-                f"{seconds:g} s at {options.rate:g} packets a second are more than {PACKETS_MAX} "
-                "packets; give less with --seconds or --rate"
-            )
-        shown = send(range(0, max(1, round(seconds * options.rate)) * period_ns, period_ns))
-    many = shown
-    if timeline.only() is not None:
-        many = send(range(0, options.packets * period_ns, period_ns))
-    if doubt := describe_trace(profile.rows):
-        print_line(f"cloudrc: warning: {asked.trace}: {doubt}", sys.stderr)
-    return DirectionSample(asked, shown.sent, shown.delays, many.delays), numbers(many)
-
-
-def _row_times(trace: Trace) -> list[int]:
-    """Return when to send packets [ns]: one per row; several if a row loses a share of packets."""
-    rows = [round(time * 1e9) for time in trace.times]
-    has_shares = any(0.0 < loss < 1.0 for loss in trace.losses or ())
-    many = -(-ROWS // len(rows)) if has_shares and len(rows) > 1 else 1
-    ends = [*rows[1:], 2 * rows[-1] - rows[-1 - (len(rows) > 1)]]
-    return [a + n * (b - a) // many for a, b in zip(rows, ends, strict=True) for n in range(many)]
-
-
-def _send(profile: DirectionProfile, uplink: bool, seed: int, sent_ns: Sequence[int]) -> Stream:
-    from cloudrc.link.model import LinkDirection, sample
-    from cloudrc.tunnel.codec import SIZES, Kind
-
-    kind = Kind.TELEMETRY if uplink else Kind.COMMAND
-    return sample(LinkDirection(profile, seed, uplink), kind, sent_ns, SIZES[kind])
 
 
 _STATISTICS: dict[str, tuple[str, float, Callable[[Numbers], float]]] = {

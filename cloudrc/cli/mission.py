@@ -291,9 +291,11 @@ def _acknowledge(options: argparse.Namespace, api: Api) -> int:
 
 
 def _drive(_: argparse.Namespace, api: Api) -> int:
-    from cloudrc.cli.drive import drive
+    from cloudrc.console.terminal import drive
 
-    return drive(api)
+    drive(api)
+    print_line("the drive has ended; to see what the robot does next: cloudrc mission status")
+    return 0
 
 
 VERBS: dict[str, tuple[str, Callable[[argparse.Namespace, Api], int]]] = {

@@ -7,9 +7,10 @@ import difflib
 import importlib
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields
 from math import nan
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from cloudrc import __version__
 from cloudrc.errors import BadInputError
@@ -70,6 +71,9 @@ examples:
 exit codes: 0 done, 1 mission failed its criteria, 2 usage or bad input,
   3 missing prerequisite, 4 timeout, 5 cluster or API error,
   6 run invalid (not real time), 70 internal error, 130 interrupted"""
+
+
+Settings = TypeVar("Settings")
 
 
 class Parser(argparse.ArgumentParser):
@@ -183,6 +187,12 @@ def build_parser(wanted: Iterable[str], *, for_completion: bool = False) -> Pars
             module.arguments(command)
             command.set_defaults(execute=module.execute)
     return parser
+
+
+def settings_from(options: argparse.Namespace, kind: Callable[..., Settings]) -> Settings:
+    """Make a dataclass from the flags with the names of its fields."""
+    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    return kind(**{name: getattr(options, name) for name in names})
 
 
 def add_verbs(

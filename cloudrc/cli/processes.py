@@ -6,14 +6,12 @@ import argparse
 import re
 import socket
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
+from cloudrc.cli.parser import settings_from
 from cloudrc.drivers.process import StopSignal
 from cloudrc.drivers.realtime import Address, split_address
-
-Settings = TypeVar("Settings")
 
 
 class Command(NamedTuple):
@@ -92,12 +90,6 @@ def read_size(text: str) -> float:
     number, unit, binary = found.groups()
     power = " KMGT".index(unit.upper() or " ")
     return float(number) * (1024.0 if binary else 1000.0) ** power
-
-
-def settings_from(options: argparse.Namespace, kind: Callable[..., Settings]) -> Settings:
-    """Make a dataclass from the flags with the names of its fields."""
-    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
-    return kind(**{name: getattr(options, name) for name in names})
 
 
 def _run_world(options: argparse.Namespace) -> int:

@@ -24,7 +24,6 @@ from cloudrc.cli.run import experiment_arguments, fly_once
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, NothingFlownError
 from cloudrc.runs.interrupts import interrupt_on_signals
 from cloudrc.runs.requirements import MODES, require
-from cloudrc.runs.under_way import ask_if_unclear, short
 from cloudrc.text import escape
 
 Say = Callable[[str], None]
@@ -81,6 +80,7 @@ def _up(options: argparse.Namespace) -> int:
             stack.enter_context(_console(folder, say))
 
     from cloudrc.drivers.local import under_way
+    from cloudrc.runs.under_way import short
 
     interrupt_on_signals()
     require("a session", (*MODES["local"], *(["console"] if options.console else [])))
@@ -125,6 +125,7 @@ def _down(options: argparse.Namespace) -> int:
     """End a session, and print the path of its report."""
     from cloudrc.drivers.local import SESSION, end_session, flight_files
     from cloudrc.runs.session import last_mission
+    from cloudrc.runs.under_way import ask_if_unclear, short
 
     sessions = [run for run, flight in flight_files().items() if flight.kind == SESSION]
     if options.run is not None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from cloudrc.cli.processes import process_arguments, read_address, settings_from
+from cloudrc.cli.parser import settings_from
+from cloudrc.cli.processes import process_arguments, read_address
 from cloudrc.drivers.process import StopSignal
 from cloudrc.drivers.realtime import Address
 from cloudrc.runs.requirements import require

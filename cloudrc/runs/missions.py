@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cloudrc.config import shipped
 from cloudrc.drivers.machine import Deadline
 from cloudrc.errors import BadInputError, TimedOutError
 from cloudrc.teleop.client import Api, UnreachableError, describe_mission, mission_path
@@ -34,6 +33,8 @@ def read_mission(name: str, shown: str = "") -> Json:
     Raises:
         BadInputError: If the file does not exist, or if it contains no mission.
     """
+    from cloudrc.config import shipped
+
     mission = dict(shipped.read("mission", name, Path()).tree)
     if mission.pop("steps", None) is not None:
         raise BadInputError(

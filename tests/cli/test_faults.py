@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from cloudrc.cli import faults as command
 from cloudrc.faults.invariants import Breach
 from cloudrc.faults.measures import Outcome
 from cloudrc.faults.scenarios import SCENARIOS
 from cloudrc.faults.schedule import FaultEvent, Schedule, dump, load
+from cloudrc.faults.search import run_fault
 from cloudrc.faults.trial import TrialResult
 from cloudrc.runs.workers import WorkerDiedError
 
@@ -28,7 +28,7 @@ def test_the_command_prints_json(call):
     printed = json.loads(call("faults run F17 -o json").out)
     assert (printed["schemaVersion"], printed["faults"][0]["result"]) == (1, "passed")
     assert {check["unit"] for check in printed["faults"][0]["checks"]} == {"", "m", "m/s", "yes"}
-    assert pickle.dumps(command._run("F27", 1)), "a result comes back from another process"
+    assert pickle.dumps(run_fault("F27", 1)), "a result comes back from another process"
 
 
 def test_a_failed_check_ends_in_exit_code_1(monkeypatch, call):
@@ -79,7 +79,8 @@ def test_what_was_flown_before_an_interrupt_is_kept(line, error, code, said, mon
         yield TrialResult(Schedule(1), ()) if "search" in line else Outcome()
         raise error
 
-    monkeypatch.setattr("cloudrc.cli.faults.map_in_order", flown)
+    place = "faults.search" if "search" in line else "cli.faults"
+    monkeypatch.setattr(f"cloudrc.{place}.map_in_order", flown)
     out, message = call(f"faults {line} -o json", code=code)
     document = json.loads(out)
     assert document.get("count") == 1 or len(document["faults"]) == 1
@@ -105,7 +106,7 @@ def find(monkeypatch, call):
 
         clock = [0.0]
         monkeypatch.setattr("cloudrc.faults.trial.fly", fly)
-        monkeypatch.setattr("cloudrc.cli.faults.time.monotonic", lambda: clock[0])
+        monkeypatch.setattr("cloudrc.faults.search.time.monotonic", lambda: clock[0])
         out, error = call(f"faults search -o json {flags}", code=code)
         return json.loads(out), error
 

@@ -5,7 +5,6 @@ from copy import deepcopy
 
 import pytest
 
-from cloudrc.cli import link_set
 from cloudrc.config.document import Document
 from cloudrc.config.load import edit_profile
 from cloudrc.drivers import local
@@ -15,6 +14,7 @@ from cloudrc.link.follow import HANDED_FILE, Profiles
 from cloudrc.link.profile import summary
 from cloudrc.link.state import LinkState, to_text
 from cloudrc.processes.link import make_profile_loader
+from cloudrc.runs import link_change
 
 CHANGES = [{"at_s": 9.0, "delay_ms": 50.0, "jitter_ms": 20.0}, {"at_s": 12.0, "loss": 0.1}]
 TIMED = {"uplink": {"delay_ms": 40.0}, "downlink": {"delay_ms": 25.0, "changes": CHANGES}}
@@ -110,7 +110,7 @@ class Flight:
 @pytest.fixture
 def flight(tmp_path, monkeypatch):
     found = Flight(tmp_path / "runs" / "latest" / "link")
-    monkeypatch.setattr(link_set, "sleep", found.wait)
+    monkeypatch.setattr(link_change, "sleep", found.wait)
     with local.announced(tmp_path / "runs" / "latest", ""):
         yield found
 
@@ -129,8 +129,8 @@ def test_a_run_here_is_found_changed_and_read_back(call):
 
 @pytest.mark.usefixtures("flight")
 def test_a_link_that_does_not_answer_is_an_error(monkeypatch, refused):
-    monkeypatch.setattr(link_set, "LOCAL_TIMEOUT", 0.0)
-    monkeypatch.setattr(link_set, "sleep", lambda _: None)
+    monkeypatch.setattr(link_change, "LOCAL_TIMEOUT", 0.0)
+    monkeypatch.setattr(link_change, "sleep", lambda _: None)
     assert refused("link set downlink.delay_ms=120", code=4) == (
         "cloudrc: error: the uplink and downlink did not apply the change within 0 s; "
         "see runs/latest/uplink.log and runs/latest/downlink.log\n"

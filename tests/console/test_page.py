@@ -10,14 +10,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cloudrc.cli import console, extras
-from cloudrc.cli.link_set import read_states
+from cloudrc.cli import console
 from cloudrc.config.load import load_experiment
 from cloudrc.console.feed import FlightFeed
 from cloudrc.console.page import PANEL_WIDTH, Page, _with_gaps
 from cloudrc.console.steering import Steering
 from cloudrc.drivers.local import LINK_FOLDER
 from cloudrc.geometry.scene import Scene, load_scene
+from cloudrc.runs import requirements
+from cloudrc.runs.link_change import read_states
 from tests.conftest import wait_until
 from tests.console.conftest import (
     LIMIT,
@@ -271,7 +272,7 @@ def test_in_a_pod_a_slider_requests_a_change_and_returns(monkeypatch, capsys, tm
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch, refused):
-    monkeypatch.setitem(extras.EXTRAS, "console", ("viser_is_not_here",))
+    monkeypatch.setitem(requirements.EXTRAS, "console", ("viser_is_not_here",))
     assert "pip install 'cloudrc[console]'" in refused("console", code=3)
 
 

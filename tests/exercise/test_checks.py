@@ -16,7 +16,7 @@ import pytest
 from cloudrc import exercise
 from cloudrc.cli import exercise as command
 from cloudrc.cli.main import main
-from cloudrc.exercise import checks
+from cloudrc.exercise import checks, scoring
 from cloudrc.exercise.hand_in import FILES, HandIn
 from cloudrc.exercise.remote import HandInError, Remote
 from tests.conftest import wait_until
@@ -81,7 +81,7 @@ def test_whatever_a_file_does_the_other_parts_are_scored(tmp_path):
     (tmp_path / "delay_estimator.py").write_text("while True:\n    print('on and on')\n")
     (tmp_path / "predictor.py").write_text("import sys\nsys.exit('no')\n")
     (tmp_path / "controller.py").write_text("import os\nos._exit(0)\n")
-    rows = list(command.check(tmp_path, limit=4))
+    rows = list(scoring.check(tmp_path, limit=4))
     seen = {row["part"]: row["seen"] for row in rows}
     assert [row["test"] for row in rows] == [
         each[0] for part in checks.CHECKS.values() for each in part
@@ -98,10 +98,10 @@ def test_a_wait_costs_no_processor_time_and_ends_with_a_score_that_is_not_valid(
     """A loaded computer gives a right hand-in too little processor time, which costs no points."""
     text = (SOLUTION / "predictor.py").read_text()
     (tmp_path / "predictor.py").write_text(f"import time\ntime.sleep(4.0)\n{text}")
-    with closing(command.Process(tmp_path, limit=3)) as process:
+    with closing(scoring.Process(tmp_path, limit=3)) as process:
         Remote(process.ask).build("predictor").predict(checks.STATE, 0.1)
         assert not process.too_slow
-    with closing(command.Process(tmp_path, limit=10, patience=0.1)) as process:
+    with closing(scoring.Process(tmp_path, limit=10, patience=0.1)) as process:
         with pytest.raises(HandInError, match=r"^predictor\.py: too slow here"):
             Remote(process.ask).build("predictor")
         assert process.too_slow
@@ -109,8 +109,8 @@ def test_a_wait_costs_no_processor_time_and_ends_with_a_score_that_is_not_valid(
 
 def test_a_failure_of_all_parts_together_names_the_files_that_were_called():
     calls = [("predictor 3", "observe", []), ("estimator 2", "horizon", [1.0])]
-    assert command._files_of(calls[1:]) == "delay_estimator.py"
-    assert command._files_of(calls) == "delay_estimator.py or predictor.py"
+    assert scoring._files_of(calls[1:]) == "delay_estimator.py"
+    assert scoring._files_of(calls) == "delay_estimator.py or predictor.py"
 
 
 # What a file writes in place of an answer.
@@ -132,7 +132,7 @@ def test_a_forged_answer_costs_the_part(data, tmp_path):
     """The file writes to every pipe of its process, and ends it."""
     write = f"for n in range(3, 9):\n    try: os.write(n, {data!r})\n    except OSError: pass\n"
     (tmp_path / "predictor.py").write_text(f"import os\n{write}os._exit(0)\n")
-    process = command.Process(tmp_path, 20)
+    process = scoring.Process(tmp_path, 20)
     remote = Remote(process.ask)
     for _ in range(2):
         with pytest.raises(HandInError, match=r"^predictor.py: (ended|sent) "):
@@ -195,7 +195,7 @@ needs_proc = pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /
 @pytest.mark.parametrize("child", CHILDREN.values(), ids=CHILDREN)
 def test_no_child_of_a_file_outlives_the_check(child, tmp_path):
     marker = leave(child, tmp_path)
-    process = command.Process(tmp_path, 20)
+    process = scoring.Process(tmp_path, 20)
     with suppress(HandInError):  # some files end their process
         process.ask([("predictor 1", "build", {})])
         wait_until(lambda: is_running(marker), 5.0)
@@ -266,7 +266,7 @@ def test_each_test_is_told_as_it_ends(tmp_path, monkeypatch, capsys):
 
     told = []
     (tmp_path / "predictor.py").touch()
-    monkeypatch.setattr(command, "check", check)
+    monkeypatch.setattr(scoring, "check", check)
     assert main(["class", "check", str(tmp_path), "-o", "json"]) == 0
     told.append(capsys.readouterr())
     lines = [f"scores {tmp_path}\n", "  estimator, mean: 1/2\n", "  estimator, steps: 1/2\n"]

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cloudrc.cli.link_record import one_way
 from cloudrc.link.logs import trace_of
 from cloudrc.link.traces import write_trace
+from cloudrc.runs.link_trace import one_way
 from tests.flights.conftest import fly
 
 

@@ -5,7 +5,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from cloudrc.cli.drive import PASTE_BEGINS, PASTE_ENDS, PASTE_GAP, KeyReader, _obey, meant_key
+from cloudrc.console.terminal import (
+    PASTE_BEGINS,
+    PASTE_ENDS,
+    PASTE_GAP,
+    KeyReader,
+    _obey,
+    meant_key,
+)
 
 
 def keys(*sent, pause=0.0):

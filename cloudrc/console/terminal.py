@@ -1,4 +1,4 @@
-"""Run `cloudrc mission drive`: drive the robot with the keys of a terminal.
+"""Drive the robot with the keys of a terminal.
 
 A terminal repeats a key while it is held, but never tells that the key is released. A key therefore
 counts as released if the terminal does not repeat it in time.
@@ -14,7 +14,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from textwrap import wrap
 
-from cloudrc.cli.output import print_line
 from cloudrc.console.steering import Steering
 from cloudrc.errors import BadInputError
 from cloudrc.messages import Vector
@@ -53,22 +52,26 @@ HELP = (
 )
 
 
-def drive(api: Api) -> int:
+def drive(api: Api) -> None:
     """Let the user steer the robot until the key q; raise a BadInputError without a terminal."""
     if not (sys.stdin.isatty() and sys.stdout.isatty()):
         raise BadInputError("mission drive needs a terminal; from a program use POST /v1/drive")
     steering = Steering(api)
     steering.start()
     try:
-        print(PASTE_ON, end="", flush=True)
+        _send(PASTE_ON)
         curses.wrapper(_handle_keys, steering, api)
     except curses.error as error:
         raise BadInputError(f"mission drive: {error}; set TERM, for example to xterm") from None
     finally:
-        print(PASTE_OFF, end="", flush=True)
+        _send(PASTE_OFF)
         steering.end_drive()
-    print_line("the drive has ended; to see what the robot does next: cloudrc mission status")
-    return 0
+
+
+def _send(sequence: str) -> None:
+    """Send a sequence of control characters to the terminal."""
+    sys.stdout.write(sequence)
+    sys.stdout.flush()
 
 
 class KeyReader:

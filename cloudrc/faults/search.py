@@ -1,0 +1,138 @@
+"""Fly random or hostile schedules of faults for a time, and count which invariants they break."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from cloudrc.errors import CloudrcError
+from cloudrc.faults import trial
+from cloudrc.faults.adversary import choose
+from cloudrc.faults.measures import Outcome
+from cloudrc.faults.scenarios import find
+from cloudrc.faults.schedule import compose, dump
+from cloudrc.faults.trial import INVARIANTS, TrialResult, checked_in
+from cloudrc.runs.workers import map_in_order, take_each
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """What a search flies, and for how long."""
+
+    adversarial: bool  # whether the cloud has valid keys and tries to break the invariants
+    first: int  # first seed; the search counts up from it
+    minutes: float  # duration [min]
+    jobs: int  # number of parallel processes
+    store: Path  # folder for schedules that break an invariant
+    robot: str  # name or path of the robot
+
+    @property
+    def kind(self) -> str:
+        """Kind of the schedules in words."""
+        return "adversarial" if self.adversarial else "random"
+
+
+def search(
+    settings: SearchSettings, see: Callable[[dict[str, Any]], None]
+) -> tuple[dict[str, Any], CloudrcError | None]:
+    """Fly a schedule per seed; call `see` with each failure, which is stored as a file.
+
+    Return the result of the search as values for JSON; and why it ended early, or None.
+    """
+    first = settings.first
+    found: dict[str, Any] = {
+        **{"kind": settings.kind, "robot": settings.robot, "first": first, "next": first},
+        **{"count": 0, "seconds": 0.0},
+        "invariants": {name: {"judged": 0, "broken": 0} for name in INVARIANTS},
+        **{"smallest_margin_m": 9.0, "largest_speed_mps": 0.0, "missions_done": 0, "failures": []},
+    }
+    began = time.monotonic()
+
+    def take(finding: TrialResult) -> None:
+        found["seconds"] = time.monotonic() - began
+        _count(found, finding)
+        if finding.breaches:
+            failure = _store(finding, settings.store)
+            found["failures"].append(failure)
+            see(failure)
+
+    stopped = take_each(_fly_seeds(settings, began), take)
+    return found, stopped
+
+
+def _fly_seeds(settings: SearchSettings, began: float) -> Generator[TrialResult]:
+    """Fly one flight per seed, until the time of the search has passed since `began` [s]."""
+    fly = partial(fly_seed, adversarial=settings.adversarial, robot=settings.robot)
+    for finding in map_in_order(fly, count(settings.first), settings.jobs):
+        yield finding
+        if time.monotonic() - began >= 60.0 * settings.minutes:
+            return
+
+
+def fly_seed(seed: int, adversarial: bool, robot: str) -> TrialResult:
+    """Fly the schedule for a seed: random faults, or a dishonest cloud with or without faults."""
+    return trial.fly(replace((choose if adversarial else compose)(seed), robot=robot))
+
+
+def _count(found: dict[str, Any], finding: TrialResult) -> None:
+    """Add the finding of the next seed to `found`, the document of a search."""
+    for name in ("next", "count"):
+        found[name] += 1
+    for name in checked_in(finding.schedule):
+        found["invariants"][name]["judged"] += 1
+    for name in finding.kinds:
+        found["invariants"][name]["broken"] += 1
+    found["smallest_margin_m"] = min(found["smallest_margin_m"], finding.margin)
+    found["largest_speed_mps"] = max(found["largest_speed_mps"], finding.speed)
+    found["missions_done"] += finding.missions
+
+
+def _store(finding: TrialResult, folder: Path) -> dict[str, Any]:
+    """Write a schedule that broke an invariant into `folder`; return the failure for JSON."""
+    schedule, seed = finding.schedule, finding.schedule.seed
+    name = f"{'-'.join(sorted(finding.kinds))}-{schedule.policy or 'seed'}-{seed}.yaml"
+    lines = [f"{each.time:.3f} s: {each.kind}: {each.text}" for each in finding.breaches[:3]]
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_text(dump(schedule, "\n".join(lines)), encoding="utf-8")
+    return {
+        "seed": seed,
+        "breaches": [breach._asdict() for breach in finding.breaches],
+        "schedule": asdict(schedule),
+        "file": str(folder / name),
+    }
+
+
+def search_rows(document: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return a table of a search: each invariant with an upper bound of its failure probability.
+
+    The bound is the rule of three: with 0 breaches in N flights, p < 3/N with 95 % confidence.
+    """
+    lines: list[tuple[str, ...]] = [("invariant", "broken in", "of N", "95 % bound")]
+    for name, words in INVARIANTS.items():
+        judged, broken = (document["invariants"][name][each] for each in ("judged", "broken"))
+        bound = "not judged" if not judged else "-" if broken else f"p < {min(3 / judged, 1):.2g}"
+        lines.append((words, str(broken) if judged else "-", str(judged), bound))
+    return lines
+
+
+def search_summary(document: dict[str, Any]) -> str:
+    """Describe a search in one sentence: flights, failures, least distance to fence, top speed."""
+    return (
+        f"{document['count']} {document['kind']} schedules in {document['seconds']:.0f} s, seeds "
+        f"{document['first']} to {document['next'] - 1}: {len(document['failures'])} broken, "
+        f"{document['missions_done']} missions done, nearest to the fence "
+        f"{document['smallest_margin_m']:.3f} m, fastest {document['largest_speed_mps']:.2f} m/s"
+    )
+
+
+def run_fault(name: str, seed: int) -> Outcome:
+    """Inject one named fault, and measure how long that takes."""
+    began = time.monotonic()
+    outcome = find(name).run(seed)
+    outcome.seconds = time.monotonic() - began
+    return outcome

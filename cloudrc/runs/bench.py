@@ -1,0 +1,75 @@
+"""Measure how much processor time the closed loop needs on this machine.
+
+The measured flight is that of the experiment `paper`. For comparison, another workload replays only
+the physics of this flight, in C (`mujoco.rollout`, one thread).
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from cloudrc.assembly import assemble
+from cloudrc.config.load import ResolvedExperiment
+from cloudrc.errors import CloudrcError
+from cloudrc.records import Record
+from cloudrc.world.simulator import replay
+
+STEP = 0.002
+"""Time step of the physics [s]."""
+LIMIT_NS = 120_000_000_000
+"""Time limit of a measured flight, in its virtual time [ns]."""
+LOOP = "closed loop, records in memory"
+
+
+def measure(parts: dict[str, Callable[[], Callable[[], int]]], repeats: int) -> dict[str, float]:
+    """Repeat measurements; return name -> shortest processor time per physics step [s].
+
+    `parts` maps the name to a function that prepares one measurement and returns a second function.
+    Only the second function is timed; it returns the number of physics steps.
+    """
+    shortest: dict[str, float] = {}
+    for _ in range(repeats):
+        for name, prepare in parts.items():
+            work = prepare()
+            gc.collect()
+            start = time.process_time()
+            steps = work()
+            cost = (time.process_time() - start) / steps
+            shortest[name] = min(cost, shortest.get(name, cost))
+    return shortest
+
+
+def replay_of(experiment: ResolvedExperiment) -> Callable[[], int]:
+    """Fly once; return a function that replays the physics and returns the number of steps."""
+    world, _, teleop, run = assemble(experiment)
+    simulator = world.robot.simulator
+    start, simulator.tape = simulator.state(), []
+    run.fly(lambda: teleop.over, LIMIT_NS, lambda of_world, of_cloud: None)
+    tape, end = np.array(simulator.tape), simulator.state()[0]
+
+    def play() -> int:
+        if (replay(simulator.model, *start, tape) != end).any():
+            raise CloudrcError("the replay does not end in the state of the flight; report this")
+        return len(tape)
+
+    return play
+
+
+def flight(experiment: ResolvedExperiment) -> Callable[[], int]:
+    """Prepare a flight; return a function that flies and returns the number of physics steps."""
+    _, _, teleop, run = assemble(experiment)
+    records: list[Record] = []
+
+    def sink(of_world: list[Record], of_cloud: list[Record]) -> None:
+        records.extend(of_world)
+        records.extend(of_cloud)
+
+    def play() -> int:
+        run.fly(lambda: teleop.over, LIMIT_NS, sink)
+        return round(run.now_ns * 1e-9 / STEP)
+
+    return play

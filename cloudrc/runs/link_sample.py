@@ -1,0 +1,114 @@
+"""Simulate the link alone, to draw a profile and compute its statistics."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TypeAlias
+
+from cloudrc.config.load import load_profile
+from cloudrc.config.schema import Direction, Profile
+from cloudrc.errors import BadInputError
+from cloudrc.link.doubts import describe_trace
+from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers, sample
+from cloudrc.link.profile import DirectionProfile, Timeline, Trace
+from cloudrc.link.traces import link_profile, read_lines, read_trace
+from cloudrc.report.figures.link import DirectionSample
+from cloudrc.tunnel.codec import SIZES, Kind
+
+PACKETS_MAX = 10_000_000
+RANGES: dict[str, tuple[float, float]] = {
+    "seconds": (0.001, 86_400),
+    "seed": (0, 2**53 - 1),
+    "rate": (1, 10_000),
+    "packets": (1, PACKETS_MAX),
+}
+"""Option of `show` -> its least and largest value."""
+ROWS = 1000  # least number of packets for a trace that has shares of losses
+SECONDS = 30.0  # time that a figure shows by default [s]; a longer time line is shown in full
+Tell: TypeAlias = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class SampleSettings:
+    """Which packets to send; a field is the flag of this name."""
+
+    seconds: float | None = None  # time to show [s]; None: `SECONDS`, or the whole time line
+    seed: int = 1  # of the random draws
+    rate: float = 100.0  # packets per second [1/s]
+    packets: int = 100_000  # for the statistics of an unchanging link
+
+
+def sample_profile(
+    name: str, settings: SampleSettings, tell: Tell
+) -> tuple[str, dict[str, tuple[DirectionSample, Numbers]]]:
+    """Simulate both directions of a profile, or the one of a trace.
+
+    Return the description; and direction -> packets for the figure, and statistics. `tell` receives
+    a warning about a doubtful trace.
+    """
+    for key, value in asdict(settings).items():
+        least, most = RANGES[key]
+        if value is not None and not least <= value <= most:
+            raise BadInputError(f"--{key} {value:g}: give a number from {least} to {most}")
+    profile, is_trace = _profile(name)
+    ways = ("uplink",) if is_trace else ("uplink", "downlink")
+    samples = {way: _way(getattr(profile, way), way, settings, tell) for way in ways}
+    return profile.description, samples
+
+
+def _profile(name: str) -> tuple[Profile, bool]:
+    """Load the profile `name`, or make one from a trace; return whether `name` is a trace."""
+    path = Path(name).absolute()
+    lines = read_lines(path, name, "give a profile or a trace") if path.is_file() else []
+    if not (name.endswith(".csv") or re.match(r"(\s|#.*\n)*(time_s|\d)", "\n".join(lines[:9]))):
+        return load_profile(name), False
+    times = read_trace(path).times
+    about = f"a trace of {len(times)} rows in {times[-1] - times[0]:.4g} s"
+    return Profile(description=about, uplink=Direction(trace=str(path))), True
+
+
+def _way(
+    asked: Direction, name: str, settings: SampleSettings, tell: Tell
+) -> tuple[DirectionSample, Numbers]:
+    """Simulate one direction of the link; return the packets for the figure, and statistics.
+
+    If the conditions are constant, the statistics come from more packets than the figure shows.
+    """
+    profile = link_profile(asked)
+    timeline, send = Timeline(profile), partial(_send, profile, name == "uplink", settings.seed)
+    period_ns = round(1e9 / settings.rate)
+    if profile.rows is not None and settings.seconds is None:
+        shown = send(_row_times(profile.rows))
+    else:
+        seconds = settings.seconds or max(SECONDS, 1.1e-9 * timeline.last_ns)
+        if seconds * settings.rate > PACKETS_MAX:
+            raise BadInputError(
+                f"{seconds:g} s at {settings.rate:g} packets a second are more than {PACKETS_MAX} "
+                "packets; give less with --seconds or --rate"
+            )
+        shown = send(range(0, max(1, round(seconds * settings.rate)) * period_ns, period_ns))
+    many = shown
+    if timeline.only() is not None:
+        many = send(range(0, settings.packets * period_ns, period_ns))
+    if doubt := describe_trace(profile.rows):
+        tell(f"warning: {asked.trace}: {doubt}")
+    return DirectionSample(asked, shown.sent, shown.delays, many.delays), numbers(many)
+
+
+def _row_times(trace: Trace) -> list[int]:
+    """Return when to send packets [ns]: one per row; several if a row loses a share of packets."""
+    rows = [round(time * 1e9) for time in trace.times]
+    has_shares = any(0.0 < loss < 1.0 for loss in trace.losses or ())
+    many = -(-ROWS // len(rows)) if has_shares and len(rows) > 1 else 1
+    ends = [*rows[1:], 2 * rows[-1] - rows[-1 - (len(rows) > 1)]]
+    return [a + n * (b - a) // many for a, b in zip(rows, ends, strict=True) for n in range(many)]
+
+
+def _send(profile: DirectionProfile, uplink: bool, seed: int, sent_ns: Sequence[int]) -> Stream:
+
+    kind = Kind.TELEMETRY if uplink else Kind.COMMAND
+    return sample(LinkDirection(profile, seed, uplink), kind, sent_ns, SIZES[kind])

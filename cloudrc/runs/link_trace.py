@@ -1,0 +1,129 @@
+"""Read measured delays of a link from a run, an MCAP file, a log of ping or irtt, or a CSV file.
+
+The content of the source tells its format.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import isnan, nan
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cloudrc.errors import BadInputError
+from cloudrc.link.logs import (
+    Direction,
+    Log,
+    Packets,
+    is_ping,
+    read_csv,
+    read_irtt,
+    read_ping,
+    refuse_others,
+)
+from cloudrc.link.traces import read_lines
+from cloudrc.runs.requirements import require
+
+if TYPE_CHECKING:
+    from cloudrc.record.columns import Recording, Table
+
+DIRECTIONS: tuple[Direction, ...] = ("uplink", "downlink")
+
+
+@dataclass(frozen=True)
+class LogSettings:
+    """How to read a log; a field is the flag of this name."""
+
+    direction: Direction | None = None  # take this direction only
+    halve_rtt: bool = False  # take half of each round trip
+    trust_units: bool = False  # accept values that look as if they had another unit
+
+
+def read_packets(source: Path, settings: LogSettings) -> dict[Direction, Packets]:
+    """Read the delays in a source; return direction -> packets."""
+    only = settings.direction
+    if not (source.is_dir() or source.is_file()):
+        raise BadInputError(f"{source}: no such file or folder; name a run, a log or a CSV file")
+    if not _is_run(source):
+        return {only or "uplink": _from_log(source, settings)}
+    if settings.halve_rtt:
+        raise BadInputError(f"{source}: a run has one-way delays; leave out --halve-rtt")
+    require("a trace of a run", ("record",))
+    recording = _recording(source)
+    ways: tuple[Direction, ...] = (only,) if only else DIRECTIONS
+    return {way: one_way(recording, source, way) for way in ways}
+
+
+def _is_run(path: Path) -> bool:
+    if path.is_dir():
+        return True
+    with path.open("rb") as file:
+        return file.read(8) == b"\x89MCAP0\r\n"
+
+
+def _from_log(path: Path, settings: LogSettings) -> Packets:
+
+    name, halve = str(path), settings.halve_rtt
+    remedy = "give a run, a log of ping or irtt, or a CSV file"
+    lines = read_lines(path, name, remedy)
+    refuse_others(lines, name)
+    if lines and lines[0].lstrip().startswith(("{", "[{")):
+        return read_irtt("\n".join(lines), name, settings.direction, halve=halve)
+    if is_ping(lines):
+        return read_ping(lines, name, halve=halve)
+    return read_csv(lines, name, halve=halve, trust_units=settings.trust_units)
+
+
+def _recording(path: Path) -> Recording:
+    from cloudrc.record.columns import Recording
+
+    file = path / "mission.mcap" if path.is_dir() else path
+    if not file.is_file():
+        raise BadInputError(f"{path}: has no mission.mcap; name the folder of a run, or a file")
+    return Recording.read(file)
+
+
+def one_way(recording: Recording, path: Path, direction: Direction) -> Packets:
+    """Compute one-way delays by matching the records of sent and of arrived datagrams.
+
+    If a datagram arrived twice, the shorter delay counts. Raise a BadInputError that names `path`
+    if the recording has no one-way delays.
+    """
+    from cloudrc.metrics.link import SENT, SETTLING_NS
+
+    log, sent_topic, topic = Log(str(path)), SENT[direction], f"/{direction}_delay"
+    sent, arrivals = recording[sent_topic], recording[topic]
+    if not len(sent) or not len(arrivals):
+        missing = sent_topic if not len(sent) else topic
+        raise log.error(
+            f"no rows on {missing}, so no {direction}; give the run's folder or its mission.mcap"
+        )
+    delays: dict[tuple[float, float], float] = {}
+    for epoch, counter, delay in _columns(arrivals, "epoch", "counter", "delay"):
+        if isnan(delay):
+            raise log.error(
+                "its ends did not share a clock, so one-way delays are not known; record a run in "
+                "local mode, or measure with irtt"
+            )
+        log.counts["duplicates left out"] += (epoch, counter) in delays
+        delays[epoch, counter] = min(delay, delays.get((epoch, counter), delay))
+    rows = list(_columns(sent, "stamp_ns", "epoch", "counter"))
+    # The receiver may refuse datagrams sent before its session opened or near the session's end.
+    # The link did not lose these datagrams: leave them out.
+    latest_first = reversed(list(_columns(arrivals, "epoch", "stamp_ns")))
+    opened_ns = {epoch: stamp_ns for epoch, stamp_ns in latest_first}  # the first arrival remains
+    last_ns = {epoch: stamp_ns for stamp_ns, epoch, _ in rows}
+    log.entries = [
+        ((stamp_ns - rows[0][0]) * 1e-9, delays.get((epoch, counter), nan))
+        for stamp_ns, epoch, counter in rows
+        if (epoch, counter) in delays
+        or opened_ns.get(epoch, stamp_ns) < stamp_ns <= last_ns[epoch] - SETTLING_NS
+    ]
+    unknown = len(rows) - len(log.entries)
+    log.counts["left out, sent before the session was open or in its last 2 s"] += unknown
+    return log.packets()
+
+
+def _columns(table: Table, *names: str) -> Iterator[tuple[float, ...]]:
+    return zip(*(table[name].tolist() for name in names), strict=True)
