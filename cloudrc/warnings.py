@@ -7,8 +7,11 @@ flight.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from math import ceil, floor
 from typing import TYPE_CHECKING, Any
+
+from cloudrc.errors import MissingPrerequisiteError
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedExperiment
@@ -152,14 +155,18 @@ def _time(experiment: ResolvedExperiment) -> Iterator[str]:
 
 
 def _balance(experiment: ResolvedExperiment) -> Iterator[str]:
-    """Yield the warnings of the onboard controller about a world that differs from its model."""
+    """Yield the warnings of the onboard controller about a world that differs from its model.
+
+    Without MuJoCo there are none, because the controller's plug-in may need it.
+    """
     if experiment.world.is_nominal:
         return
-    from cloudrc.robots.build import advise as advise_on_robot
-
     controller = experiment.cloud.controller
     gains = (controller.model_extra or {})["gain_p"] if controller.name == "pid" else (0.0, 0, 0.0)
-    yield from advise_on_robot(experiment.world, gains)
+    with suppress(MissingPrerequisiteError):
+        from cloudrc.robots.build import advise as advise_on_robot
+
+        yield from advise_on_robot(experiment.world, gains)
 
 
 def _long_link(

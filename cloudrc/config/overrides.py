@@ -212,7 +212,7 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
         if plugins.is_path(name):
             name = str(document.source((*path, "name")).absolute(name))
         try:
-            if build and not (robot is None and _takes_robot(kind, name)):
+            if build:
                 parameters = _complete_once(document, path, name, parameters, robot)
         except ValidationError as error:
             found += problems.from_pydantic(error, parameter_model(kind, name), path)
@@ -252,7 +252,12 @@ def _complete_once(
     given: dict[str, Any],
     robot: RobotFacts | None,
 ) -> dict[str, Any]:
-    """Call `_complete`, but once only for the points of a sweep that share the plug-in."""
+    """Call `_complete`, but once only for the points of a sweep that share the plug-in.
+
+    Leave the parameters of a plug-in that takes the robot as they are if there is none.
+    """
+    if robot is None and _takes_robot(KINDS[path[-1]], name):
+        return given
     folders = [str(document.source((*path, parameter)).folder) for parameter in given]
     plan = document.get("cloud", "plan_s")
     key = ("plug-in", path, name, json.dumps([given, folders, plan]), repr(robot))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 
 from cloudrc import metrics
 from cloudrc.config.load import ResolvedExperiment, load_experiment
 from cloudrc.config.overrides import parse_settings
 from cloudrc.config.reuse import reuse
 from cloudrc.config.schema import Parameters, World
-from cloudrc.errors import BadInputError
+from cloudrc.errors import BadInputError, MissingPrerequisiteError
 from cloudrc.warnings import advise
 
 ADVISED_MAX = 50
@@ -52,15 +53,17 @@ def check_mode(experiment: ResolvedExperiment, mode: str) -> None:
 def check_world(world: World) -> None:
     """Raise a BadInputError if the robot cannot move in its scene as `world` says.
 
-    The shipped robots can in the shipped scenes, if nothing is changed.
+    The shipped robots can in the shipped scenes, if nothing is changed. Without MuJoCo, such as on
+    a machine that only starts flights in a cluster, world checks it.
     """
     shipped = not ("/" in world.robot or world.scene.endswith(".xml"))
     if shipped and world.is_nominal and world.tuning is None and world.onboard == Parameters():
         return
-    from cloudrc.robots.build import check_robot
+    with suppress(MissingPrerequisiteError):
+        from cloudrc.robots.build import check_robot
 
-    facts = world.model_dump_json(exclude={"sensors", "odometry_rate_hz"})
-    reuse(("world", facts), lambda: check_robot(world))
+        facts = world.model_dump_json(exclude={"sensors", "odometry_rate_hz"})
+        reuse(("world", facts), lambda: check_robot(world))
 
 
 def advice_on(*experiments: ResolvedExperiment) -> list[str]:

@@ -2,6 +2,8 @@
 
 import json
 import re
+import subprocess
+import sys
 
 import pytest
 
@@ -178,3 +180,14 @@ def test_what_the_robot_cannot_do_is_refused_before_the_first_flight_of_a_sweep(
 )
 def test_an_old_key_means_the_new_one(old, new):
     assert load("hover", [old]) == load("hover", [new])
+
+
+def test_a_machine_without_mujoco_leaves_the_check_and_the_advice_to_world():
+    program = (
+        "import sys; sys.modules['mujoco'] = None\n"
+        "from cloudrc.runs.experiment import advice_on, check_world, load\n"
+        "found = load('steps', ['world.robot=nano', 'world.plant.mass_factor=3'])\n"
+        "check_world(found.world); print(advice_on(found))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("[]\n", "")
