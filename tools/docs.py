@@ -25,6 +25,7 @@ from pydantic import BaseModel
 from cloudrc import plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.overrides import KINDS, default_parameters
+from cloudrc.config.robot import find_robot
 from cloudrc.config.schema import Direction, Experiment, Mission, Profile
 from cloudrc.exposition.table import METRICS, ROLES
 from cloudrc.record.topics import TOPICS
@@ -34,6 +35,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CHART = ROOT / "charts" / "cloudrc"
 PARTS = {
     "mission": "#a-mission",
+    "onboard": "#onboard-controllers",
     **dict.fromkeys(("uplink", "downlink"), "#one-direction-of-a-link"),
     **dict.fromkeys(KINDS, "#plug-ins-of-the-cloud"),
 }
@@ -142,6 +144,7 @@ def _experiment() -> str:
     for key, info in Experiment.model_fields.items():
         if _is_section(info.annotation):
             blocks += [f"## `{key}`\n", _summary(info.annotation), _keys(Experiment, [key])]
+    blocks += ["## Onboard controllers\n", _onboard()]
     blocks += ["## Plug-ins of the cloud\n", _plug_ins()]
     blocks += ["## A mission\n", _summary(Mission), _keys(Mission)]
     blocks += ["## A link profile\n", _summary(Profile), _keys(Profile)]
@@ -210,12 +213,34 @@ def _plug_ins() -> str:
         rows: list[tuple[str, ...]] = []
         for name in _files(kind):
             rows.append((f"`{name}`", "", "", plugins.describe(kind, name)))
-            texts = _arguments(plugins.find(kind, name).build)
-            for parameter, default in default_parameters(kind, name).items():
-                rows.append(("", f"`{parameter}`", f"`{flow(default)}`", texts[parameter]))
-            rows += [("", "others", "", texts[each]) for each in texts if each.startswith("*")]
+            rows += _parameters(kind, name)
         blocks.append(table(f"`cloud.{key}` | parameter | default | meaning", rows))
     return "\n".join(blocks)
+
+
+def _parameters(kind: str, name: str) -> list[tuple[str, ...]]:
+    """Return a row for each parameter of a plug-in; the first cell is empty."""
+    texts = _arguments(plugins.find(kind, name).build)
+    rows: list[tuple[str, ...]] = [
+        ("", f"`{parameter}`", f"`{flow(default)}`", texts[parameter])
+        for parameter, default in default_parameters(kind, name).items()
+    ]
+    return [*rows, *(("", "others", "", texts[each]) for each in texts if each.startswith("*"))]
+
+
+def _onboard() -> str:
+    """Format the table of the parameters of the shipped robots' onboard controllers."""
+    robots: dict[str, list[str]] = {}
+    for robot in shipped.names("robot"):
+        controller = find_robot(robot).onboard
+        assert controller is not None
+        robots.setdefault(controller.name, []).append(f"`{robot}`")
+    rows: list[tuple[str, ...]] = []
+    for name, those in robots.items():
+        about = plugins.describe("onboard", name)
+        rows.append((", ".join(those), "", "", about))
+        rows += _parameters("onboard", name)
+    return table("`world.robot` | parameter of `world.onboard` | default | meaning", rows)
 
 
 def _files(kind: str) -> list[str]:
