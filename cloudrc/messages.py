@@ -30,7 +30,7 @@ class GuardState(IntEnum):
     """State of the guard."""
 
     GROUND = 0
-    """The rotors are stopped. The state ends when the operator starts a mission."""
+    """The robot is switched off. The state ends when the operator starts a mission."""
     TRACK = 1
     """The robot follows fresh commands from the cloud."""
     HOLD = 2
@@ -64,10 +64,10 @@ class Cause(IntEnum):
     STOPPED = 8, "emergency stop"
     OVERTURNED = 9, "turned over"
     ACKNOWLEDGED = 10, "acknowledged"
-    STILL_FIRST = 11, "acknowledged, takes off once it has been still, 0.5 m inside the fence"
+    STILL_FIRST = 11, "acknowledged, starts once it has been still, inside the fence"
     NOT_DOWN = 12, "acknowledged before touch-down"
-    DOWN = 13, "touched down, rotors stopped"
-    NOT_OFF = 14, "not off the ground yet, rotors stopped"
+    DOWN = 13, "at rest, switched off"
+    NOT_OFF = 14, "not off the ground yet, switched off"
 
 
 STATES = ", ".join(f"{state:d} {state.name}" for state in GuardState)
@@ -95,9 +95,9 @@ class Request(IntEnum):
     END = 1
     """End the mission: the robot holds its position until the next mission starts."""
     ESTOP = 2
-    """Stop the rotors at once, in any state. ESTOP lasts until the operator acknowledges."""
+    """Switch the robot off at once, in any state. ESTOP lasts until the operator acknowledges."""
     ACKNOWLEDGE = 3
-    """End the state LAND or ESTOP; the operator has seen its cause. Stopped rotors stay stopped."""
+    """End the state LAND or ESTOP; the operator has seen its cause. It stays switched off."""
     PROGRESS = 4
     """Store the mission's progress on board, for a cloud that restarts. The request number is 0."""
 

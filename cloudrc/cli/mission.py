@@ -48,8 +48,8 @@ examples:
 
 A mission is a file with 'waypoints'; 'cloudrc list missions' names those that
 ship. The exit code of 'run' and 'fly' is the verdict: 0 done, 1 failed, 6 not
-real time. 'estop' stops the rotors at once, with or without a mission, and the
-robot falls. After an emergency stop or a landing, 'acknowledge' allows the next
+real time. 'estop' switches the robot off at once, with or without a mission; a
+robot in the air falls. After an emergency stop or a landing, 'acknowledge' allows the next
 mission. An API in a network asks for a token: give --token-file or
 CLOUDRC_TOKEN_FILE; for a release the command reads its Secret with your rights
 in the cluster. A run that is found on this machine needs no token."""
@@ -274,7 +274,7 @@ def _describe_stay(api: Api) -> str:
 
 def _estop(options: argparse.Namespace, api: Api) -> int:
     mission = api.post("/v1/estop")["id"]
-    _say(api, "emergency stop: sent, and repeated until the rotors have stopped")
+    _say(api, "emergency stop: sent, and repeated until the robot is switched off")
     if mission:
         print_line(f"mission {mission} has failed")
     return 0
@@ -284,8 +284,8 @@ def _acknowledge(options: argparse.Namespace, api: Api) -> int:
     api.post("/v1/acknowledge")
     _say(api, "acknowledged: the next mission may fly; a landing close to the ground ends first")
     print(
-        "after a stop or a touchdown the robot takes off only once it is at rest, and at least "
-        "0.5 m inside the fence"
+        "after a stop or a landing the robot starts only once it is at rest inside the fence; one "
+        "that flies needs 0.5 m of room to its walls"
     )
     return 0
 
@@ -308,9 +308,9 @@ VERBS: dict[str, tuple[str, Callable[[argparse.Namespace, Api], int]]] = {
     "drive": ("drive the robot with the keys of this terminal", _drive),
     "hold": ("hold the robot where it is, at least 0.35 m above the ground", _order),
     "resume": ("resume the held mission", _order),
-    "estop": ("stop the rotors at once: the robot falls and its mission fails", _estop),
+    "estop": ("switch off at once: a flying robot falls, and its mission fails", _estop),
     "acknowledge": (
-        "allow flights again after a stop or a landing; does not start the rotors",
+        "allow flights again after a stop or a landing; does not start the robot",
         _acknowledge,
     ),
     "fly": ("fly a mission inside a Job: post it, follow it, exit with the verdict", _fly),

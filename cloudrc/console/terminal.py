@@ -48,7 +48,7 @@ SEQUENCE_MAX = 16
 """Largest number of characters in a sequence that begins with Esc."""
 HELP = (
     "arrows: x and y, w and s: up and down, space: stop moving, h: hold, q: quit",
-    "X (capital): emergency stop, the robot falls",
+    "X (capital): emergency stop, a robot in the air falls",
 )
 
 

@@ -144,7 +144,7 @@ def _actions(
         "key_rotated": ((at, read("world", NEXT_KEY)), (end, read("cloud", NEXT_KEY))),
         "key_wrong": ((at, read("cloud", WRONG_KEY)), (end, read("cloud"))),
         "second_order": ((at, flight.order_if_possible),),
-        "stopped": ((at, teleop.stop_rotors),),
+        "stopped": ((at, teleop.switch_off),),
         "held": ((at, ask(MissionService.hold)), (end, ask(MissionService.resume))),
     }
 

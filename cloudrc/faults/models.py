@@ -255,13 +255,13 @@ class TeleopModel:
         """Call teleop's API; teleop handles the call when it wakes next. A refusal is ignored."""
         self._calls.append(call)
 
-    def stop_rotors(self, now_ns: int) -> None:
+    def switch_off(self, now_ns: int) -> None:
         """Make an emergency stop: teleop sends `ALARM` to cloud at once; `now_ns` is ignored.
 
         When teleop's process wakes next, it also stores the stop on the disk.
         """
         if self.service is not None:
-            self._stops.append(MissionService.stop_rotors)
+            self._stops.append(MissionService.switch_off)
             self._peer.send(ALARM)
 
     def freeze(self, now_ns: int, duration: float) -> None:

@@ -62,7 +62,7 @@ KINDS = {
     "values_invalid": FaultKind("value commands a second have NaN or infinity", 10.0, 1.0, 12.0),
     "values_huge": FaultKind("value commands a second are 1e308 m/s", 10.0, 1.0, 4.0),
     "second_order": FaultKind("another mission is ordered"),
-    "stopped": FaultKind("the operator stops the rotors, and acknowledges later"),
+    "stopped": FaultKind("the operator stops the robot, and acknowledges later"),
     "held": FaultKind("the operator holds the mission, resumes it after the duration", 5.0),
 }
 """Name of a fault in a schedule's file -> kind of fault."""

@@ -27,7 +27,7 @@ INVARIANTS = {
     "stop": "too fast towards the fence",
     "stale": "motion on stale commands",
     "rest": "motion long after the last command",
-    "latch": "rotors on without an acknowledgement",
+    "latch": "on without an acknowledgement",
     "hold": "HOLDs that end too early or too late",
     "tick": "steps without the guard",
     "obeyed": "emergency stops without effect",

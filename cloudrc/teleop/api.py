@@ -73,7 +73,7 @@ names the first, or queues the second with `queue`. Orders with the same `key` m
 Positions are in metres, x forward, y left, z up.
 
 Every request needs a token: `Authorization: Bearer TOKEN`. A reader's token may only read; an
-operator's token may also command. `POST /v1/estop` stops the rotors at once. Teleop serves
+operator's token may also command. `POST /v1/estop` switches the robot off at once. Teleop serves
 `POST /v1/estop` and `POST /v1/hold` even while it refuses other requests as too many.
 """
 STARTING = "teleop is starting"
@@ -344,9 +344,9 @@ async def drive(body: Body, bridge: Bridged, request: Request) -> Any:
 
 
 @router.post("/estop", response_model=models.Stopped)
-async def stop_rotors(bridge: Bridged) -> Any:
-    """Stop the rotors at once. The robot falls, and needs an acknowledgement to fly again."""
-    mission = await bridge.ask(MissionService.stop_rotors, "stop")
+async def switch_off(bridge: Bridged) -> Any:
+    """Switch the robot off at once: it may fall, and needs an acknowledgement to start again."""
+    mission = await bridge.ask(MissionService.switch_off, "stop")
     return {"id": mission["id"] if mission else None, "state": "stopping"}
 
 

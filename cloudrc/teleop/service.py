@@ -30,7 +30,7 @@ from cloudrc.teleop.wire import FLYING, HELD, QUEUED, Leg, Output, Plan, RobotSt
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 LATCHED, AIRBORNE = (LAND, ESTOP), (TRACK, HOLD, LAND)
-"""States of the guard that only an acknowledgement ends; states in which the rotors may turn."""
+"""States of the guard that only an acknowledgement ends; states in which the robot may move."""
 SETPOINT_PERIOD_NS = 100_000_000
 """Time between two copies of the setpoint [ns]; a cloud that restarts needs the copies."""
 DRIVE_LIMIT = 3600.0
@@ -41,29 +41,30 @@ STEERED = ("held", *BY_HAND)
 """Events of a held mission that tell who steers the robot."""
 DRIVEN = "driven"
 """State for `next_step` while the operator drives the robot by hand during a held mission."""
-TAKES_OFF = "a velocity other than zero makes the robot take off, once telemetry has arrived"
+STARTS = "a velocity other than zero makes the robot start, once telemetry has arrived"
 CANCELLED, BEFORE, ASKED = "mission cancelled", " before it began", "the robot is asked to start"
 RESTARTED = "teleop has restarted; the robot is asked to go on"
-REST = "after a stop or a landing only when it has stood still, at least 0.5 m inside the fence"
-BY_ITSELF = "without commands the robot holds its position, then lands, by itself"
+REST = "after a stop or a landing only when it has stood still, well inside the fence"
+BY_ITSELF = "without commands the robot holds its position, then goes to LAND, by itself"
 NOT_HEARD = f"cloud has no telemetry from the robot: check the link and world; {BY_ITSELF}"
 NO_CLOUD = f"teleop does not hear cloud, so there is no telemetry: check cloud; {BY_ITSELF}"
 STOP_IS_SENT = "an emergency stop is on its way to the robot"
 ALONE = {
-    GROUND: f"the robot waits for a mission; it takes off, {REST}",
+    GROUND: f"the robot waits for a mission; it starts, {REST}",
     TRACK: "teleop is telling the robot that its mission is over; then the robot holds",
     HOLD: "the robot holds and waits for a mission",
-    LAND: "the robot lands; find the cause, then: cloudrc mission acknowledge",
-    ESTOP: "the rotors are stopped; find the cause, then: cloudrc mission acknowledge",
+    LAND: "the robot comes to rest and switches off; find the cause, then: cloudrc mission "
+    "acknowledge",
+    ESTOP: "the robot is switched off; find the cause, then: cloudrc mission acknowledge",
 }
 """State of the guard -> what happens next, while no mission is under way."""
 IN_MISSION = {
     **ALONE,
-    GROUND: f"the robot takes off with the mission's first commands, {REST}; if no command comes "
+    GROUND: f"the robot starts with the mission's first commands, {REST}; if no command comes "
     "within guard.hold_max_s (at least 10 s), the guard goes to LAND",
-    TRACK: "the robot flies its mission",
-    HOLD: "the robot gets no fresh commands: it continues by itself when they arrive, and lands if "
-    "none arrive within guard.hold_max_s",
+    TRACK: "the robot follows its mission",
+    HOLD: "the robot gets no fresh commands: it continues by itself when they arrive, and goes to "
+    "LAND if none arrive within guard.hold_max_s",
 }
 """State of the guard -> what happens next, while a mission is under way."""
 
@@ -227,7 +228,7 @@ class MissionService:
             raise ConflictError("a hold, a stop or an end came in between; let go, then drive on")
         if not waiting:
             if seen is None or rests:
-                raise ConflictError(f"no mission is under way; {TAKES_OFF}")
+                raise ConflictError(f"no mission is under way; {STARTS}")
             x, y, z = seen.position
             leg = Leg((x, y, max(z, HELD_LOWEST)), tolerance=inf, dwell=0.0)
             plan = Plan((leg,), Start.HERE, DRIVE_LIMIT, by_hand=True)
@@ -236,8 +237,8 @@ class MissionService:
             raise _busy(waiting[0], "hold or cancel it first")
         return self._operate(lambda now: self._teleop.drive(now, velocity), now_ns)
 
-    def stop_rotors(self, now_ns: int) -> Mission | None:
-        """Stop the rotors at once in any state; return the mission that the stop ends, if any."""
+    def switch_off(self, now_ns: int) -> Mission | None:
+        """Switch the robot off at once, in any state; return the mission that this ends, if any."""
         self._interrupted = True
         mission = self._start_next(now_ns)
         self._teleop.stop(now_ns)

@@ -169,7 +169,7 @@ def test_list_status_and_logs(api, mission):
     assert mission("list").out.splitlines()[1].split() == ["m1", "far", "flying", "0/1"]
     document = json.loads(mission("list -o json").out)
     assert (document["schemaVersion"], document["missions"][0]["id"]) == (1, "m1")
-    assert mission("status").out.splitlines()[-1] == "next: the robot flies its mission"
+    assert mission("status").out.splitlines()[-1] == "next: the robot follows its mission"
     assert json.loads(mission("status m1 -o json").out)["events"][1]["event"] == "started"
     assert mission("logs").out == mission("logs m1").out != ""
     assert "no mission 'm9'" in mission("status m9", 5).err
@@ -180,7 +180,7 @@ def test_list_status_and_logs(api, mission):
 
 def test_emergency_stop_and_acknowledgement(api, mission):
     api.fly(FAR)
-    assert mission("estop").out.endswith("stopped\nmission m1 has failed\n")
+    assert mission("estop").out.endswith("off\nmission m1 has failed\n")
     assert api.alarms
     api.until(lambda: api.get("/v1/state")["seen"]["guard"] == "ESTOP")
     for words, code in (("run two.yaml", 5), ("status", 0)):

@@ -261,7 +261,7 @@ SWITCHES = {
 }
 VERBS = {
     **{verb: verb for verb in ("hold", "resume", "pause")},
-    **{"stop": "stop_rotors", "ack": "acknowledge", "due": "handle_deadline"},
+    **{"stop": "switch_off", "ack": "acknowledge", "due": "handle_deadline"},
 }
 
 

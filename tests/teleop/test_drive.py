@@ -146,7 +146,7 @@ def test_after_an_interrupted_drive_the_operator_must_let_go(driven):
     ended("cancel", "m1")
     driven.step(seconds=0.6)  # lets go, too
     press(driven)
-    driven.teleop.stop_rotors(driven.now_ns)
+    driven.teleop.switch_off(driven.now_ns)
     driven.step(seconds=0.3)
     with pytest.raises(ConflictError, match="acknowledge"):
         press(driven)
@@ -164,7 +164,7 @@ def test_only_a_held_mission_is_driven():
     with pytest.raises(ConflictError, match="once telemetry has arrived"):
         press(flight)
     flight.step()
-    with pytest.raises(ConflictError, match="other than zero makes the robot take off"):
+    with pytest.raises(ConflictError, match="other than zero makes the robot start"):
         press(flight, ZERO)
     flight, mission_id = service_flying()
     with pytest.raises(ConflictError, match=f"{mission_id} is flying; hold or cancel it first"):

@@ -367,7 +367,7 @@ def test_after_a_stall_the_stop_belongs_to_the_stopped_mission():
     """Teleop's loop saw the robot stopped first, and that was why the mission had failed."""
     (flight, mission_id), bridge = service_flying(), Bridge()
     bridge.open(flight.teleop)
-    stopped = bridge.submit(type(flight.teleop).stop_rotors, "stop")
+    stopped = bridge.submit(type(flight.teleop).switch_off, "stop")
     flight.guard = ESTOP
     cloud = Mock(receive=lambda: [flight.seen])
     queued = {"calls": bridge.make_calls, "stops": bridge.make_stops}
@@ -409,8 +409,8 @@ def test_the_state_has_its_cause_and_its_duration():
 @pytest.mark.parametrize(
     ("guard", "mission", "said"),
     [
-        (GROUND, None, "waits for a mission; it takes off, after a stop or a landing only when"),
-        (GROUND, "flying", "takes off with the mission's first commands, after a stop"),
+        (GROUND, None, "waits for a mission; it starts, after a stop or a landing only when"),
+        (GROUND, "flying", "starts with the mission's first commands, after a stop"),
         (TRACK, "held", "cloudrc mission resume"),
         (HOLD, None, "waits for a mission"),
         (HOLD, "held", "continues by itself when they arrive"),

@@ -46,12 +46,12 @@ INTEGRAL_GAIN, INTEGRAL_MAX, INTEGRAL_RANGE = 0.2, 0.05, 0.1
 the hold point at which the term changes [m]. The arm makes the robot heavier on one side; without
 this term the robot would hover 30 mm away from the hold point."""
 TAKE_OFF_MARGIN = 0.5
-"""Smallest distance from the fence's walls at which a robot may take off after its rotors were
-stopped [m]. A tilted robot slides up to 0.35 m along the floor before it rises. This distance was
-measured with `pytest -m "" -k scrapes tests/world`."""
+"""Smallest distance from the fence's walls at which a robot may take off after it was switched off
+[m]. A tilted robot slides up to 0.35 m along the floor before it rises. This distance was measured
+with `pytest -m "" -k scrapes tests/world`."""
 LIFT_OFF_HEIGHT, GROUND_SPEED_MAX = 0.02, 0.2
 """The robot has left the ground once its height has changed by LIFT_OFF_HEIGHT [m]. Before that,
-the guard may stop the rotors if the robot is slower than GROUND_SPEED_MAX [m/s]."""
+the guard may switch the robot off if it is slower than GROUND_SPEED_MAX [m/s]."""
 
 
 class PositionHold:
@@ -204,7 +204,7 @@ class Halt(Descent):
 class TakeOff:
     """Detects the end of the take-off, and decides whether the robot may take off.
 
-    `over` becomes True when the robot has left the ground. If the rotors stopped in the air, the
+    `over` becomes True when the robot has left the ground. If it was switched off in the air, the
     robot may still fall, or be outside the fence, when the operator acknowledges the stop. Before
     the robot may take off again, it has to come to rest on the ground, at least TAKE_OFF_MARGIN
     inside the fence. A planar robot takes off, as it were, when it is allowed to move; it needs no
@@ -235,7 +235,7 @@ class TakeOff:
         return Cause.ACKNOWLEDGED if self.allowed else Cause.STILL_FIRST
 
     def forget(self, *, stopped: bool = False) -> None:
-        """Reset to the state before take-off, because the rotors stop.
+        """Reset to the state before take-off, because the robot is switched off.
 
         With `stopped`, the robot may be in the air or on an obstacle. Then it may take off only
         after it has come to rest on the ground.
@@ -245,10 +245,10 @@ class TakeOff:
             self._stopped, self._still_ticks, self._height = True, 0, nan
 
     def look(self, readings: Readings, flies: bool) -> None:
-        """Process the sensor readings of a physics step; `flies` tells whether the rotors turn.
+        """Process the sensor readings of a physics step; `flies` tells whether it is on.
 
-        While the rotors turn, update `over`: whether the robot has left the ground. While they
-        stand still, update the robot's height on the ground and its time at rest.
+        While it is on, update `over`: whether the robot has left the ground. While it is off,
+        update the robot's height on the ground and its time at rest.
         """
         height = readings.position[2]
         if flies:
@@ -262,5 +262,5 @@ class TakeOff:
                 self._still_ticks = self._still_ticks + 1 if at_rest else 0
 
     def may_end(self, readings: Readings) -> bool:
-        """Return whether the robot may stop its rotors: it is slow, and has not left the ground."""
+        """Return whether the robot may switch off: it is slow, and has not left the ground."""
         return not self.over and hypot(*readings.velocity) < GROUND_SPEED_MAX

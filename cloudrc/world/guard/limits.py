@@ -75,7 +75,7 @@ def limit_to_fence(
 ) -> Vector:
     """Slow a finite `velocity` [m/s], axis by axis, so that the robot can stop before the fence.
 
-    Near the floor the horizontal velocity is limited, too, because a rotor that touches the floor
+    Near the floor the horizontal velocity is limited, too, because an arm that touches the floor
     at speed turns the robot over. `position` is that of the base [m]. `low` and `high` are the
     corners of the box in which the robot may fly [m]. All are in the world frame, shape (3,).
     `stop` is the robot's `stop_coefficient` [s^2/m].

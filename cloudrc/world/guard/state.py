@@ -23,13 +23,13 @@ A command is impossible if a number in it is NaN or too large, if a time in it i
 the stamp of a basis in the future, or if the robot cannot move that way.
 
 - Every state can change to ESTOP: by the operator's request, or when the robot has turned over,
-  because its rotors would then push it in any direction. The operator's acknowledgement leads to
+  because its actuators would then push it in any direction. The operator's acknowledgement leads to
   GROUND.
 - In LAND, the operator's acknowledgement leads to HOLD if the robot is in the air. Near the ground
   or on an obstacle, it leads to GROUND at touch-down.
 - LAND and ESTOP end the mission. Afterwards only a new start arms the robot again.
-- If HOLD begins before the robot has left the ground, GROUND follows at once: the rotors stop, and
-  the mission continues. The robot then waits 60 s for cloud's commands.
+- If HOLD begins before the robot has left the ground, GROUND follows at once: the robot switches
+  off, and the mission continues. The robot then waits 60 s for cloud's commands.
 - HOLD within a mission has a time limit, because the operator may be gone. HOLD after a mission has
   no time limit: the robot waits for the next mission.
 
@@ -64,7 +64,7 @@ from cloudrc.world.guard.limits import AGE_MAX_NS, COMMAND_MAX
 from cloudrc.world.readings import Readings
 
 OVERTURNED_COSINE = 0.2
-"""Cosine of the tilt below which the robot counts as turned over, so that its rotors stop. Commands
+"""Cosine of the tilt below which the robot counts as turned over, and switches off. Commands
 tilt the robot to a cosine of 0.4 at worst; only a collision can tilt it further."""
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState  # looking up a member of an enum is slow
@@ -168,7 +168,7 @@ class Guard:
         return changes
 
     def put_on_ground(self, now_ns: int, cause: str) -> None:
-        """Enter GROUND because of `cause`; the robot was reset to its spawn with stopped rotors."""
+        """Enter GROUND because of `cause`; the robot was reset to its spawn, switched off."""
         self.forget_commands()
         self._tracked_ns = self._held_ns = -SETTLE_NS
         self._enter(GROUND, now_ns, Cause.SPAWN, cause)
@@ -195,12 +195,12 @@ class Guard:
             self.changes.append(GuardChange(now_ns, HOLD, Cause.ENDED.words))
 
     def stop(self, now_ns: int) -> None:
-        """Stop the rotors at once, in any state."""
+        """Switch the robot off at once, in any state."""
         if self.state is not ESTOP:
             self._enter(ESTOP, now_ns, Cause.STOPPED)
 
     def acknowledge(self, now_ns: int) -> None:
-        """Process the operator's acknowledgement of LAND or ESTOP; no rotor starts."""
+        """Process the operator's acknowledgement of LAND or ESTOP; nothing starts."""
         if self.latched and not self._flies:
             self._enter(GROUND, now_ns, self._take_off.condition)
         elif self.state is LAND:
@@ -315,7 +315,7 @@ class Guard:
         """Run one step of `dt` [s] at `now_ns` [ns], world's clock.
 
         Return the velocity reference for the low-level controller [m/s], world frame, shape (3,).
-        Return None while the rotors are stopped.
+        Return None while the robot is switched off.
         """
         if self._planar:
             readings = readings.on_ground()

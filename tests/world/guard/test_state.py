@@ -34,7 +34,7 @@ from tests.world.guard.conftest import (
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
 LOW, NEAR, SINKS = (1.0, 2.0, 0.1), (1.0, 2.0, FLOOR_MARGIN), (0.0, 0.0, -LAND_SPEED)
 BAD = command((nan, 0.0, 0.0))
-DOWN = "touched down, rotors stopped"
+DOWN = "at rest, switched off"
 
 
 def told(guard):
@@ -464,7 +464,7 @@ def test_a_hold_on_the_ground_stops_the_rotors_not_the_mission():
     flown = run(guard, 250 * MS, 260 * MS, (0.0, 0.0, 0.118))
     assert flown[0] is not None
     assert set(flown[1:]) == {None}
-    silent, not_yet = "command age 0.252 s above 0.250 s", "not off the ground yet, rotors stopped"
+    silent, not_yet = "command age 0.252 s above 0.250 s", "not off the ground yet, switched off"
     assert guard.take_changes() == [(252 * MS, HOLD, silent), (252 * MS, GROUND, not_yet)]
     assert guard.armed
     assert guard.reference == ZERO
