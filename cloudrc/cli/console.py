@@ -176,14 +176,15 @@ def _in_pod(options: argparse.Namespace) -> ConsoleTarget:
     The pod has no right to change the link. Therefore this process prints the changes that the
     operator asks for, and `cloudrc console --cluster` carries them out with its user's rights.
     """
-    from cloudrc.config.document import read_document
+    from cloudrc.config.load import load_link
     from cloudrc.console.access import page_token
     from cloudrc.console.steering import LinkControl
 
     own: dict[str, tuple[float, float]] = {}  # key -> last requested value, and when [s]
 
     def read() -> dict[str, Any]:
-        tree = dict(read_document(options.profile, str(options.profile)).tree)
+        link = load_link(options.profile, options.config)
+        tree = link.model_dump(mode="json", exclude_defaults=True)
         for key, (value, at) in own.items():
             if time.monotonic() - at < OWN_S:
                 way, _, name = key.partition(".")

@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 
 from cloudrc.cluster.client import COMPONENTS, ClusterError, Release, run
 from cloudrc.cluster.releases import INSTANCE, several_releases
-from cloudrc.config.document import read_document, write_yaml
-from cloudrc.config.load import DIRECTIONS, FILE_READERS, Edit, edit_profile
+from cloudrc.config.document import Document, write_yaml
+from cloudrc.config.load import DIRECTIONS, FILE_READERS, Edit, edit_profile, load_link
 from cloudrc.errors import BadInputError, CloudrcError, TimedOutError
 from cloudrc.link.follow import HANDED_FILE, PROFILE
 from cloudrc.link.state import (
@@ -39,6 +39,8 @@ FOLDER = "/run/cloudrc"
 """Folder in a link container with the files of the link: route, state, received change."""
 APPLY_LIMIT = 5.0
 """Time limit for a link container to apply a change [s]; usually it takes 0.2 s."""
+EXPERIMENT = "experiment.yaml"
+"""Key of the experiment in its ConfigMap."""
 SIZE_MAX = 1_000_000
 """Largest total size of the files in a ConfigMap [bytes], a little below Kubernetes' 1 MiB."""
 _LOOK_PERIOD = 0.02
@@ -51,7 +53,8 @@ class LinkParts:
 
     release: str  # name of the release
     name: str  # of the ConfigMap that the link containers follow
-    files: dict[str, str]  # of the ConfigMap: profile, traces, record of the last change
+    files: dict[str, str]  # of the ConfigMap: profile, traces, record of the last change; and the
+    # experiment, from which the link comes if no profile is given
     pods: dict[str, str]  # component -> name of its newest running pod
 
 
@@ -88,7 +91,9 @@ def read_link(release: Release) -> LinkParts:
             f"release '{release.name}' has no link to change; is it a release of cloudrc? see: "
             "helm list --all-namespaces"
         )
-    return LinkParts(release.name, maps[0]["metadata"]["name"], maps[0]["data"], pods)
+    experiments = [each["data"] for each in found if EXPERIMENT in each.get("data", {})]
+    files = {EXPERIMENT: "{}", **(experiments[0] if experiments else {}), **maps[0]["data"]}
+    return LinkParts(release.name, maps[0]["metadata"]["name"], files, pods)
 
 
 APPLY_SCRIPT = f"""\
@@ -210,7 +215,9 @@ def with_files(
         folder = Path(name).resolve()
         for key, text in files.items():
             (folder / key).write_text(text, encoding="utf-8")
-        edited = edit_profile(read_document(folder / PROFILE, PROFILE), profile, settings)
+        present = load_link(folder / PROFILE, folder / EXPERIMENT)
+        values = present.model_dump(mode="json", exclude_defaults=True)
+        edited = edit_profile(Document(values), profile, settings)
         for way in DIRECTIONS:
             values = edited.values.get(way, {})
             for key in FILE_READERS:
@@ -221,7 +228,7 @@ def with_files(
                 if path.parent != folder:  # a local file, whose name becomes a valid key
                     values[key] = f"{way}-{re.sub('[^-._a-zA-Z0-9]', '_', path.name)}"
                     new[values[key]] = path.read_text(encoding="utf-8-sig")
-    size = sum(len(text) for text in {**files, **new}.values())
+    size = sum(len(text) for name, text in {**files, **new}.items() if name != EXPERIMENT)
     if size > SIZE_MAX:
         raise BadInputError(
             f"traces and profile have {size} bytes, a ConfigMap takes {SIZE_MAX}; use a trace "

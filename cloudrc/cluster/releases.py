@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import yaml
@@ -73,7 +74,7 @@ def look(release: Release, *, everywhere: bool) -> list[ReleaseView]:
             place.name,
             place.namespace,
             _robot(files[place].get("experiment.yaml", "")),
-            _link(files[place].get("profile.yaml", "")),
+            _link(files[place]),
             f"{' and '.join(sorted(waits[place]))} not ready" if waits[place] else "ready",
         )
         for place in sorted(waits)
@@ -91,10 +92,23 @@ def _robot(experiment: str) -> str:
     return Path(robot).name  # of the user's robot, the name of its ConfigMap
 
 
-def _link(profile: str) -> str:
-    """Describe a profile: delay and jitter of both directions, and what else is set."""
-    ways = [(yaml.safe_load(profile) or {}).get(way) or {} for way in ("uplink", "downlink")]
-    texts = [_way(way) for way in ways]
+def _link(files: dict[str, str]) -> str:
+    """Describe a link: delay and jitter of both directions, and what else is set.
+
+    `files` are those of the release's ConfigMaps with the experiment and the link.
+    """
+    from cloudrc.config.load import DIRECTIONS, load_link
+
+    with TemporaryDirectory(prefix="cloudrc-") as name:
+        folder = Path(name)
+        for key, text in {"experiment.yaml": "{}", "profile.yaml": "{}", **files}.items():
+            (folder / key).write_text(text, encoding="utf-8")
+        try:
+            link = load_link(folder / "profile.yaml", folder / "experiment.yaml")
+        except BadInputError:
+            return "invalid"
+    values = link.model_dump(mode="json", exclude_defaults=True)
+    texts = [_way(values.get(way, {})) for way in DIRECTIONS]
     return texts[0] if texts[0] == texts[1] else " / ".join(texts)
 
 

@@ -23,7 +23,7 @@ from pydantic import (
 
 from cloudrc import plugins
 from cloudrc.config import overrides, problems, shipped
-from cloudrc.config.document import Document, KeyPath, write_yaml
+from cloudrc.config.document import Document, KeyPath, read_document, write_yaml
 from cloudrc.config.ground import put_on_ground
 from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.overrides import Settings
@@ -252,6 +252,32 @@ def read_experiment(
 def load_profile(name: str | Path) -> Profile:
     """Load a link profile by name or path; raises BadInputError."""
     return check_profile(shipped.read("profile", str(name), Path()), str(name))
+
+
+def load_link(file: Path, experiment: Path) -> Profile:
+    """Load the link that a `file` of the chart asks for; raises BadInputError.
+
+    The file is a link profile, or has the only key `profile`: the name of a shipped profile, or
+    null for the link of the file `experiment`.
+    """
+    document = read_document(file, file.name)
+    if "profile" not in document.tree:
+        return check_profile(document, file.name)
+    if name := document.get("profile"):
+        shipped.check_name("profile", str(name))
+        return load_profile(str(name))
+    return _link_of(read_document(experiment, experiment.name), experiment.name)
+
+
+def _link_of(document: Document, name: str) -> Profile:
+    """Return the link of an experiment, whose other parts are not looked at."""
+    document.tree = {"link": document.get("link") or {}}
+    found: list[Problem] = []
+    with _collect(found, ("link", "profile")):
+        _inline_profile(document)
+    found += _resolve_paths(document)
+    link = problems.validate(document, Experiment, name, found).link
+    return Profile(uplink=link.uplink, downlink=link.downlink)
 
 
 def check_profile(document: Document, name: str) -> Profile:

@@ -17,7 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal
 
-from cloudrc.config.load import load_profile, read_experiment
+from cloudrc.config.load import load_link, read_experiment
 from cloudrc.drivers.process import Feed, StopSignal
 from cloudrc.drivers.programs import Programs, run_tool
 from cloudrc.drivers.realtime import Address
@@ -72,7 +72,8 @@ def run_link(settings: LinkSettings, stop: StopSignal) -> None:
     experiment = read_experiment(str(settings.config))
     exporter = open_exporter("link", experiment, settings.metrics)
     document = settings.route.with_name(HANDED_FILE)
-    profiles = Profiles(settings.profile, document, make_profile_loader(settings.direction), log)
+    load = make_profile_loader(settings.direction, settings.config.absolute())
+    profiles = Profiles(settings.profile, document, load, log)
     profile, peer = profiles.first(), PeerName(settings.peer, ipv4_addresses, log)
     with TemporaryDirectory(prefix="tc-", dir=settings.route.parent) as tables:
         programs = Programs(tables)
@@ -107,11 +108,14 @@ def run_link(settings: LinkSettings, stop: StopSignal) -> None:
             programs.close()
 
 
-def make_profile_loader(direction: str) -> Load:
-    """Return a function that reads one direction of a link profile from a file."""
+def make_profile_loader(direction: str, experiment: Path) -> Load:
+    """Return a function that reads one direction of the link from a profile's file.
+
+    The file may name the profile, or leave the link to the file `experiment`.
+    """
 
     def load(path: Path) -> Loaded:
-        profile = load_profile(path.absolute())  # absolute: not a shipped name
+        profile = load_link(path.absolute(), experiment)
         values = profile.model_dump(mode="json", exclude_defaults=True)
         return Loaded(link_profile(getattr(profile, direction)), values)
 

@@ -3,7 +3,7 @@
 import pytest
 import yaml
 
-from cloudrc.config.load import dump, load_experiment, load_profile
+from cloudrc.config.load import dump, load_experiment, load_link, load_profile
 from cloudrc.config.shipped import names
 from tests.chart.conftest import of_kind, render
 
@@ -29,8 +29,14 @@ def experiment(config):
 
 
 @pytest.fixture
-def profile(config):
-    return lambda values: load_profile(config(values, "link") / "profile.yaml")
+def profile(config, tmp_path):
+    """Load the link as the link container does."""
+
+    def load(values):
+        config(values, "experiment")
+        return load_link(config(values, "link") / "profile.yaml", tmp_path / "experiment.yaml")
+
+    return load
 
 
 @pytest.mark.parametrize("name", names("experiment"))
@@ -62,8 +68,6 @@ def test_a_named_file_is_in_each_configmap_that_names_it(key, way, tmp_path, exp
     file = str(tmp_path / "drive.csv")
     of_profile = {"link": {"profile": {"uplink": way}, "traces": MEASURED}}
     assert getattr(profile(of_profile).uplink, key) == file
-    data = of_kind(render(of_profile), "ConfigMap")["experiment"]["data"]
-    assert set(data) == {"experiment.yaml"}
     of_experiment = {"experiment": {"link": {"uplink": way}}, "link": {"traces": MEASURED}}
     assert getattr(profile(of_experiment).uplink, key) == file
     for over in ({}, {"profile": "wifi"}):

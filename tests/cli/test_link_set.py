@@ -92,7 +92,7 @@ class Flight:
             (own := folder / way).mkdir(parents=True)
             (own / "map.yaml").write_text("{uplink: {delay_ms: 45}, downlink: {delay_ms: 45}}")
             paths = own / "map.yaml", own / HANDED_FILE
-            self.links[own] = Profiles(*paths, make_profile_loader(way), print)
+            self.links[own] = Profiles(*paths, make_profile_loader(way, own / "none.yaml"), print)
             self.apply(own, self.links[own].first())
 
     def apply(self, own, loaded):

@@ -21,40 +21,7 @@ auto
 {{- end -}}
 {{- end }}
 
-{{/* The profile as a file: the shipped one, the one in the values, or the experiment's with its
-     single values. */}}
-{{- define "cloudrc.linkProfile" -}}
-{{- $profile := .Values.link.profile -}}
-{{- if kindIs "map" $profile -}}
-{{ toYaml $profile }}
-{{- else if $profile -}}
-{{ include "cloudrc.shippedProfile" (dict "root" . "name" $profile "key" "link.profile") }}
-{{- else -}}
-{{ include "cloudrc.experimentProfile" . }}
-{{- end -}}
-{{- end }}
-
-{{- define "cloudrc.experimentProfile" -}}
-{{- $link := .Values.experiment.link | default dict -}}
-{{- $text := "{}" -}}
-{{- /* A resolved experiment has all keys of both directions; its profile's name is only a label. */ -}}
-{{- if not (and (hasKey ($link.uplink | default dict) "blackouts") (hasKey ($link.downlink | default dict) "blackouts")) -}}
-{{- $text = include "cloudrc.shippedProfile" (dict "root" . "name" ($link.profile | default "paper-p2") "key" "experiment.link.profile") -}}
-{{- end -}}
-{{- if or $link.uplink $link.downlink -}}
-{{- $made := fromYaml $text -}}
-{{- range $key := list "uplink" "downlink" -}}
-{{- $direction := index $made $key | default dict | deepCopy -}}
-{{- range $name, $value := index $link $key | default dict -}}
-{{- $_ := set $direction $name $value -}}
-{{- end -}}
-{{- $_ := set $made $key $direction -}}
-{{- end -}}
-{{- $text = toYaml $made -}}
-{{- end -}}
-{{ $text }}
-{{- end }}
-
+{{/* Text of the shipped profile NAME. Argument: (dict "root" $ "name" NAME "key" KEY-IN-THE-VALUES). */}}
 {{- define "cloudrc.shippedProfile" -}}
 {{- $text := .root.Files.Get (printf "files/profiles/%s.yaml" .name) -}}
 {{- if not $text -}}
@@ -64,25 +31,20 @@ auto
 {{- end -}}
 {{- fail (printf "%s: no profile '%s' ships with the chart; choose one of %s, or write the profile under link.profile" .key .name (join ", " $known)) -}}
 {{- end -}}
-{{ $text | trimSuffix "\n" }}
+{{ $text }}
 {{- end }}
 
-{{/* The files that a profile names, as a mapping of name to text. A missing file fails here, not
-     when the containers start. */}}
-{{- define "cloudrc.linkFiles" -}}
-{{- $found := dict -}}
+{{/* Fails if a link names a file that link.traces lacks: here, not when the containers start.
+     Argument: (dict "root" $ "link" LINK-OR-PROFILE "key" KEY-IN-THE-VALUES). */}}
+{{- define "cloudrc.checkTraces" -}}
 {{- range $way := list "uplink" "downlink" -}}
 {{- range $kind := list "trace" "table" -}}
-{{- $name := get (get $.profile $way | default dict) $kind -}}
-{{- if $name -}}
-{{- if not (hasKey $.root.Values.link.traces $name) -}}
+{{- $name := get (get $.link $way | default dict) $kind -}}
+{{- if and $name (not (hasKey $.root.Values.link.traces $name)) -}}
 {{- fail (printf "%s: %s.%s names '%s', but link.traces has no such file; add its text there, under a name without folders" $.key $way $kind $name) -}}
 {{- end -}}
-{{- $_ := set $found $name (get $.root.Values.link.traces $name) -}}
 {{- end -}}
 {{- end -}}
-{{- end -}}
-{{ toYaml $found }}
 {{- end }}
 
 {{/* A native sidecar: it starts before world or cloud and stops after it. Only this container may have
