@@ -90,6 +90,9 @@ def test_a_sweep_and_a_search_may_use_the_old_name_of_a_key(tmp_path):
     sweep = tmp_path / "sweep.yaml"
     sweep.write_text(f"experiment: hover\ngrid: {{{OLD_KEY}.integral_limit_xy: [0.1, 0.3]}}\n")
     assert [*read_grid(sweep).axes] == [f"{NEW_KEY}.integral_limit_xy"]
+    sweep.write_text(f"grid: {{{OLD_KEY}.gain_p: [1], {NEW_KEY}.gain_p: [2]}}\n")
+    with pytest.raises(BadInputError, match=r"world\.onboard\.gain_p is given twice"):
+        read_grid(sweep)
     trials = Trials(Asked(f"{OLD_KEY}.integral_limit_xy", "hover", [], 1, 0.2))
     assert trials.asked.key == f"{NEW_KEY}.integral_limit_xy"
     assert trials.present * trials.size == pytest.approx(0.1)  # the published limit

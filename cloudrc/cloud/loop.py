@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from itertools import chain
 from math import nan
@@ -339,9 +339,7 @@ class ControlLoop:
                 plan.append(as_planned(velocity))
                 positions.append(position)
             plug_in = "predictor"
-            if not is_fit(*chain.from_iterable(positions)):
-                for position in positions:
-                    refuse("planned position", *position)
+            _refuse_positions(positions)
         except BaseException as error:
             self._note(plug_in, error, "cloud sends this command without a plan")
             return [], []
@@ -380,3 +378,10 @@ class ControlLoop:
             frames = "".join(traceback.format_tb(error.__traceback__))[-TRACEBACK_MAX:]
             trace = frames.encode(errors="replace").decode() + describe_error(error)
             self.faults.append(Fault(self._now_ns, code, text, trace))
+
+
+def _refuse_positions(positions: Sequence[Vector]) -> None:
+    """Raise an InvalidResultError if a planned position [m] is not finite or too large."""
+    if not is_fit(*chain.from_iterable(positions)):
+        for position in positions:
+            refuse("planned position", *position)

@@ -235,18 +235,23 @@ def _entries(
     def entry(key: str, value: Any, *path: str) -> _Entry:
         return key, value, document.source(path)._replace(folder=folder)
 
-    axes: dict[str, list[tuple[Any, list[_Entry]]]] = {}
-    for name_in_file, given in file.grid.items():
-        above, axis = ("grid", name_in_file), new_key(name_in_file)
-        choices = axes.setdefault(axis, [])
+    def choices_of(axis: str, given: Any, *above: str) -> list[tuple[Any, list[_Entry]]]:
         if isinstance(given, list):
-            for n, value in enumerate(given):
-                choices.append((value, [entry(axis, value, *above, str(n))]))
-        elif isinstance(given, dict) and all(isinstance(each, dict) for each in given.values()):
-            for name, each in given.items():
-                entries = [entry(key, value, *above, name, key) for key, value in each.items()]
-                choices.append((name, entries))
-        if not choices:
+            return [(v, [entry(axis, v, *above, str(n))]) for n, v in enumerate(given)]
+        if isinstance(given, dict) and all(isinstance(each, dict) for each in given.values()):
+            return [
+                (name, [entry(key, value, *above, name, key) for key, value in each.items()])
+                for name, each in given.items()
+            ]
+        return []
+
+    axes: dict[str, list[tuple[Any, list[_Entry]]]] = {}
+    for name, given in file.grid.items():
+        above, axis = ("grid", name), new_key(name)
+        if axis in axes:
+            found.append(Problem(above, "", f"{axis} is given twice; keep one of them"))
+        axes[axis] = choices_of(axis, given, *above)
+        if not axes[axis]:
             text = "must be a list of values, or names, each with a mapping of keys to values"
             found.append(Problem(above, "", text))
         if axis in {*COLUMNS, *metrics.SHIPPED}:
