@@ -20,8 +20,9 @@ from cloudrc.config import schema
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.overrides import build_plugin, build_predictor
 from cloudrc.config.robot import facts, is_planar
+from cloudrc.config.scene import fence_in
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
-from cloudrc.geometry import fence
+from cloudrc.geometry.fence import Fence
 from cloudrc.link.model import LinkDirection
 from cloudrc.link.traces import link_profile
 from cloudrc.messages import Start
@@ -59,8 +60,6 @@ VIRTUAL_CLOCK = bytes(16)
 """Identity of the virtual clock, which world and cloud share."""
 VIRTUAL_RING = KeyRing(KeySet(Key(b"nothing is secret in one process")))
 """Keys of world and cloud in virtual time; with them both ends refuse damaged datagrams."""
-FENCE_SPAN = dist(fence.LOW, fence.HIGH)
-"""Length of the longest straight line inside the fence [m]."""
 
 
 def assemble(
@@ -95,7 +94,7 @@ def start_mission(experiment: ResolvedExperiment, now_ns: int = 0) -> Teleop:
     """Make a teleop that flies the experiment's mission from `now_ns` [ns] on, cloud's clock."""
     from cloudrc.teleop.store import Mission, Order
 
-    teleop = Teleop()
+    teleop = Teleop(fence_in(experiment.world))
     order = Order(build_plan(experiment), contact=bool(experiment.criteria.contact))
     teleop.start(now_ns, Mission("m1", order, ONLY_MISSION))
     return teleop
@@ -216,19 +215,30 @@ def build_links(experiment: ResolvedExperiment) -> tuple[LinkDirection, LinkDire
 
 def build_plan(experiment: ResolvedExperiment) -> Plan:
     """Convert the experiment's mission to a plan for teleop."""
-    limit, speed_max = experiment.criteria.time_limit_s, experiment.guard.speed_max_mps
-    return mission_plan(experiment.mission, limit, experiment.seed, speed_max=speed_max)
+    return mission_plan(
+        experiment.mission,
+        experiment.criteria.time_limit_s,
+        experiment.seed,
+        fence=fence_in(experiment.world),
+        speed_max=experiment.guard.speed_max_mps,
+    )
 
 
 def mission_plan(
-    mission: schema.Mission, time_limit: float | None, seed: int = 0, *, speed_max: float = inf
+    mission: schema.Mission,
+    time_limit: float | None,
+    seed: int = 0,
+    *,
+    fence: Fence,
+    speed_max: float = inf,
 ) -> Plan:
     """Convert a valid mission to a plan for teleop.
 
     `time_limit` is the time limit of the mission [s]; None: as long as the mission may need. `seed`
-    is the seed of random setpoints, `speed_max` the guard's speed limit [m/s].
+    is the seed of random setpoints, `fence` that of the scene, `speed_max` the guard's speed limit
+    [m/s].
     """
-    track = read_setpoints(Path(mission.setpoints)) if mission.setpoints else ()
+    track = read_setpoints(Path(mission.setpoints), fence) if mission.setpoints else ()
     if track:
         legs: tuple[Leg, ...] = (Leg(track[0][1], tolerance=inf, time_limit=inf),)
         needed = LEG_FACTOR * track[-1][0]
@@ -239,7 +249,7 @@ def mission_plan(
         starts = (None, *mission.waypoints)
         ways = zip(starts, mission.waypoints, strict=False)  # no way starts at the last waypoint
         carrot = mission.carrot
-        legs = tuple(_leg(start, waypoint, speed_max, carrot) for start, waypoint in ways)
+        legs = tuple(_leg(way, fence, speed_max, carrot) for way in ways)
         needed = sum(leg.time_limit for leg in legs)
     start = Start.SPAWN if mission.start == "spawn" else Start.HERE
     return Plan(legs, start, time_limit or max(LIMIT_MIN, needed), track=track)
@@ -279,11 +289,12 @@ def with_order(
 
 
 def _leg(
-    start: schema.Waypoint | None,
-    waypoint: schema.Waypoint,
+    ends: tuple[schema.Waypoint | None, schema.Waypoint],
+    fence: Fence,
     speed_max: float,
     carrot: schema.Carrot | None,
 ) -> Leg:
+    start, waypoint = ends
     limit = waypoint.time_limit_s
     speed, acceleration = 0.0, 1.0
     if carrot is not None:
@@ -292,8 +303,9 @@ def _leg(
         speed_max = min(speed_max, speed)
     if limit is None:
         # The start of the way is unknown: assume the longest way.
-        way = FENCE_SPAN if start is None else dist(start.position_m, waypoint.position_m)
-        expected = way / min(CRUISE_SPEED, speed_max) + SETTLE_TIME + waypoint.dwell_s
+        longest = fence.low, fence.high
+        way = longest if start is None else (start.position_m, waypoint.position_m)
+        expected = dist(*way) / min(CRUISE_SPEED, speed_max) + SETTLE_TIME + waypoint.dwell_s
         limit = round(LEG_FACTOR * expected, 1)
     yaw, tolerance, dwell = radians(waypoint.yaw_deg), waypoint.tolerance_m, waypoint.dwell_s
     return Leg(waypoint.position_m, yaw, tolerance, dwell, limit, speed, acceleration)

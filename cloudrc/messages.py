@@ -207,6 +207,8 @@ class Drive(NamedTuple):
     target: Vector  # velocity to take up [m/s]
     acceleration: float  # acceleration and deceleration [m/s^2], > 0
     until_ns: int  # time at which the setpoint begins to brake [ns], the clock of `begin_ns`
+    low: Vector  # the setpoint stays in the box from this corner [m], world frame
+    high: Vector  # to this one [m], world frame
 
 
 class Setpoint(NamedTuple):

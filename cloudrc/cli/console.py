@@ -127,12 +127,12 @@ def _serve(options: argparse.Namespace, flight: ConsoleTarget) -> None:
         if not (options.no_open or options.config):
             open_page(page.url)
         from cloudrc.config.load import read_experiment
+        from cloudrc.config.scene import scene_of
         from cloudrc.console.feed import FlightFeed
         from cloudrc.console.steering import Steering
-        from cloudrc.geometry.scene import load_scene
 
         experiment = read_experiment(str(flight.config))
-        feed = FlightFeed(load_scene(experiment.world.scene))
+        feed = FlightFeed(scene_of(experiment.world))
         steering = Steering(flight.api, flight.link)
         steering.watch()
         steering.start()

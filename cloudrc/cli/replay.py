@@ -34,8 +34,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Write the page, open it in the browser, and print its path."""
     require("a replay", ("world", "record", "console"))
+    from cloudrc.config.scene import scene_of
     from cloudrc.files import write_atomically
-    from cloudrc.geometry.scene import load_scene
     from cloudrc.metrics import Flight
     from cloudrc.report.replay import write_page
 
@@ -44,7 +44,7 @@ def execute(options: argparse.Namespace) -> int:
     if options.out and os.path.lexists(out):
         raise BadInputError(f"{out}: already there; name another file with --out")
     recording, experiment = _read(run)
-    scene = load_scene(experiment.world.scene)
+    scene = scene_of(experiment.world)
     flight = Flight(recording, experiment.criteria, experiment.mission, scene)
     try:
         write_atomically(out, write_page(flight, experiment).encode())

@@ -8,14 +8,16 @@ error lists all problems of an experiment, each with its file and line.
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from math import sqrt
+from math import inf, sqrt
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from pydantic import (
     Field,
+    ValidationError,
     ValidationInfo,
     ValidatorFunctionWrapHandler,
     field_validator,
@@ -30,7 +32,9 @@ from cloudrc.config.overrides import Settings
 from cloudrc.config.problems import Problem
 from cloudrc.config.reuse import reuse
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits, known_robot, parameters
+from cloudrc.config.scene import scene_of
 from cloudrc.config.schema import (
+    SPEED_MPS,
     Acceleration,
     Change,
     Cloud,
@@ -46,9 +50,9 @@ from cloudrc.config.schema import (
     Speed,
     World,
 )
-from cloudrc.config.setpoints import read_setpoints
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.scene import Scene, load_scene
+from cloudrc.geometry.obstacles import fence_of, known
+from cloudrc.geometry.scene import Scene
 from cloudrc.link.doubts import describe_heavy_shares
 from cloudrc.link.traces import read_table, read_trace
 
@@ -65,26 +69,31 @@ Source: docs/reference/plant.md, "Plan"."""
 DIRECTIONS = ("uplink", "downlink")
 _PROFILE_KEYS = {("link",), ("link", "profile")}
 """If a setting gives one of these keys, it replaces the whole link profile."""
-FILE_READERS: dict[str, Callable[[Path], object]] = {
-    **{"trace": read_trace, "table": read_table, "setpoints": read_setpoints}
-}
+FILE_READERS: dict[str, Callable[[Path], object]] = {"trace": read_trace, "table": read_table}
 """Key whose value is the path of a data file -> function that reads and checks the file."""
 
 
-def speed_cap(
-    command_age_max_ms: float, plan_max_s: float = 0.0, robot: RobotLimits = DEFAULT_LIMITS
-) -> float:
-    """Compute the speed cap: the largest speed v [m/s] from which the robot stops within 8.7 m.
+class Bounds(NamedTuple):
+    """What robot and scene tell about the limits of the guard."""
+
+    robot: RobotLimits
+    room: float  # within which the robot stops, see `Fence.room` [m]
+
+
+def speed_cap(command_age_max_ms: float, plan_max_s: float, bounds: Bounds) -> float:
+    """Compute the speed cap: the largest speed v [m/s] from which the robot stops in the fence.
 
     If commands stop arriving, the robot follows the last one for the time T, reacts within 0.2 s
-    and brakes at a, its `braking_mps2`: v · (T + 0.2 s) + v^2 / (2a) = 8.7 m. T is the largest age
+    and brakes at a, its `braking_mps2`: v · (T + 0.2 s) + v^2 / (2a) = room. T is the largest age
     of a command, `command_age_max_ms` [ms], plus the longest plan, `plan_max_s` [s]. The cap is
     lower for a robot that cannot follow this speed.
     Source: docs/reference/plant.md, "Speed cap".
     """
+    robot, room = bounds.robot, max(bounds.room, 0.0)
     delay, braking = command_age_max_ms * 1e-3 + plan_max_s + 0.2, robot.braking_mps2
-    stops = round(braking * (sqrt(delay * delay + 17.4 / braking) - delay), 6)
-    return min(stops, robot.speed_max_mps or stops)
+    stops = round(braking * (sqrt(delay * delay + 2.0 * room / braking) - delay), 6)
+    slowest, fastest = SPEED_MPS
+    return min(max(stops, slowest), robot.speed_max_mps or fastest)
 
 
 class ResolvedGuard(Guard):
@@ -104,23 +113,24 @@ class ResolvedGuard(Guard):
         cls, given: Any, check: ValidatorFunctionWrapHandler, info: ValidationInfo
     ) -> float:
         age_max = info.data.get("command_age_max_ms", COMMAND_AGE_MAX_MS)
-        plan_max, robot = info.data.get("plan_max_s", 0.0), info.context or DEFAULT_LIMITS
-        cap = speed_cap(age_max, plan_max, robot)
+        plan_max, bounds = info.data.get("plan_max_s", 0.0), info.context or bounds_of(World())
+        cap = speed_cap(age_max, plan_max, bounds)
         speed_max: float = cap if given is None else check(given)
         if speed_max > cap + 1e-6:
-            if cap == robot.speed_max_mps:
+            if cap == bounds.robot.speed_max_mps:
                 raise ValueError(f"must be at most {cap:g} m/s, the largest speed of the robot")
             plan = f" and plans of {plan_max:g} s" if plan_max else ""
             raise ValueError(
-                f"must be at most {cap:g} m/s: above it the robot does not stop in time with "
-                f"commands {age_max:g} ms old{plan}; lower it or guard.command_age_max_ms"
+                f"must be at most {cap:g} m/s: above it the robot does not stop in time, within "
+                f"{bounds.room:g} m, with commands {age_max:g} ms old{plan}; lower it or "
+                "guard.command_age_max_ms"
             )
         return speed_max
 
     @field_validator("acceleration_max_mps2", mode="before")
     @classmethod
     def _limit_acceleration(cls, given: Any, info: ValidationInfo) -> Any:
-        robot = info.context or DEFAULT_LIMITS
+        robot = info.context.robot if info.context else DEFAULT_LIMITS
         return robot.acceleration_max_mps2 if given is None else given
 
 
@@ -199,7 +209,7 @@ def load_experiment(
         name,
         found,
         described=Experiment,
-        context=_robot_limits(document),
+        context=_bounds(document, found),
     )
     return _judge(document, experiment, name, flown=flown)
 
@@ -212,7 +222,7 @@ def _judge(
     Unless the experiment is `flown` already, raise a BadInputError if the mission does not fit.
     """
     mission = experiment.mission
-    scene = reuse(("scene", experiment.world.scene), lambda: load_scene(experiment.world.scene))
+    scene = scene_of(experiment.world)
     contact = experiment.criteria.contact
     if contact is None:
         contact = scene.board is not None and not (mission.steps or mission.setpoints)
@@ -231,9 +241,10 @@ def _check_flown(mission: Mission, scene: Scene, contact: bool, planar: bool) ->
     """List the problems of a mission in a scene, with their paths in the experiment."""
 
     def check() -> list[Problem]:
+        if above := check_scene(scene, contact=contact, planar=planar):
+            return above
         wrong = check_mission(mission, scene, contact=contact, planar=planar)
-        below = [problem._replace(path=("mission", *problem.path)) for problem in wrong]
-        return [*check_scene(scene, contact=contact), *below]
+        return [problem._replace(path=("mission", *problem.path)) for problem in wrong]
 
     return reuse(("mission", mission.model_dump_json(), repr(scene), contact, planar), check)
 
@@ -410,12 +421,31 @@ def _plan_max(document: Document) -> float:
     return PLAN_MAX_S if isinstance(plan, float | int) and plan > 0 else 0.0
 
 
-def _robot_limits(document: Document) -> RobotLimits:
-    """Return the limits of the robot in an experiment; the default if there is no such robot."""
-    name: Any = document.get("world", "robot") or World().robot
-    with suppress(BadInputError, AttributeError):  # the latter if the name is no text
-        return known_robot(name).guard
-    return DEFAULT_LIMITS
+def bounds_of(world: World) -> Bounds:
+    """Return what robot and scene of an experiment tell about the limits of the guard."""
+    scene = scene_of(world)
+    return Bounds(known_robot(world.robot).guard, fence_of(scene).room(scene.spawn))
+
+
+def _bounds(document: Document, found: list[Problem]) -> Bounds:
+    """Return the bounds of an experiment; those of a key that is wrong do not limit anything.
+
+    If the scene's file is wrong, add the problem to `found`. If the fence is not known without
+    MuJoCo, it limits nothing, as long as the file gives the speed.
+    """
+    given = {key: document.get("world", key) for key in ("robot", "scene", "fence_m")}
+    given = {key: value for key, value in given.items() if value is not None}
+    limits, room = DEFAULT_LIMITS, inf
+    with suppress(ValidationError):
+        world = World.model_validate_json(json.dumps(given))
+        with suppress(BadInputError):
+            limits = known_robot(world.robot).guard
+        if ("world", "scene") not in [problem.path for problem in found]:
+            with _collect(found, ("world", "scene")):
+                scene = scene_of(world)
+                if scene.own_fence or known(scene) or not document.get("guard", "speed_max_mps"):
+                    room = fence_of(scene).room(scene.spawn)
+    return Bounds(limits, room)
 
 
 def _remove_derived(document: Document, *, new_profile: bool) -> None:
@@ -428,10 +458,10 @@ def _remove_derived(document: Document, *, new_profile: bool) -> None:
     derived: dict[KeyPath, float] = {("guard", "plan_max_s"): _plan_max(document)}
     age_max: Any = document.get("guard", "command_age_max_ms")
     plan_max: Any = document.get("guard", "plan_max_s")
-    robot = _robot_limits(document)
-    derived["guard", "acceleration_max_mps2"] = robot.acceleration_max_mps2
+    bounds = _bounds(document, [])
+    derived["guard", "acceleration_max_mps2"] = bounds.robot.acceleration_max_mps2
     with suppress(TypeError):  # a value is missing, or no number
-        derived["guard", "speed_max_mps"] = speed_cap(age_max, plan_max, robot)
+        derived["guard", "speed_max_mps"] = speed_cap(age_max, plan_max, bounds)
     if new_profile:
         derived |= _implied(_present_profile(document))
         for way in DIRECTIONS:

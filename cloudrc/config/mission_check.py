@@ -10,15 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
+from pathlib import Path
 
 import numpy as np
 
 from cloudrc.config.ground import check_heights
 from cloudrc.config.problems import Problem
 from cloudrc.config.schema import Mission, Steps
-from cloudrc.geometry import fence
+from cloudrc.config.setpoints import read_setpoints
+from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import Array
-from cloudrc.geometry.obstacles import Obstacle, body_names, obstacles, surface
+from cloudrc.geometry.fence import HEIGHT_MIN, WIDTH_MIN, Fence
+from cloudrc.geometry.obstacles import Obstacle, body_names, fence_of, obstacles, surface
 from cloudrc.geometry.placement import (
     CLEARANCE_MIN,
     find_crossed,
@@ -32,25 +35,17 @@ from cloudrc.messages import Vector
 _YAW = "the onboard controller holds yaw at 0, as the published one does; leave it out"
 _REPORTED = 20
 """Largest number of problems of one kind in an error message."""
-_SPANS = zip("xyz", fence.INNER_LOW, fence.INNER_HIGH, strict=True)
-_INNER = ", ".join(f"{name} {low:g} to {high:g}" for name, low, high in _SPANS) + " [m]"
-"""Text that describes the region in which the guard lets the robot fly, in the world frame."""
-_INNER_WALLS = _INNER.partition(", z")[0] + " [m]"
-"""The same text for a robot on the ground."""
-
-
-LIFT = 1.0
-"""Height that is added to the positions of a robot on the ground [m], because only the walls of the
-fence concern it."""
 TOUCHING = 1e-3
 """Distance from an obstacle below which the robot touches it [m]; it covers rounding errors."""
 
 
-def check_scene(scene: Scene, *, contact: bool) -> list[Problem]:
+def check_scene(scene: Scene, *, contact: bool, planar: bool = False) -> list[Problem]:
     """List the problems of a scene for missions that have to touch the board or not (`contact`).
 
-    Their paths are those of the experiment.
+    Their paths are those of the experiment. A `planar` robot stays on the ground.
     """
+    if problem := _check_fence(scene, planar=planar):
+        return [problem]
     names = body_names(scene)
     if contact and names and BOARD not in names:
         reason = f"the scene has no body named board to touch; {_named(names)}; name a body board"
@@ -64,6 +59,28 @@ def check_scene(scene: Scene, *, contact: bool) -> list[Problem]:
         "but floor is an obstacle: move the spawn, or put what the robot stands on into body floor"
     )
     return [Problem(("world", "scene"), scene.name, reason)]
+
+
+def _check_fence(scene: Scene, *, planar: bool) -> Problem | None:
+    """Return the problem of a fence in which the robot cannot take off or drive."""
+    fence, path = fence_of(scene), ("world", "fence_m")
+    size = [high - low for low, high in zip(fence.low, fence.high, strict=True)]
+    if min(size[:2]) < WIDTH_MIN or (size[2] < HEIGHT_MIN and not planar):
+        given = " x ".join(f"{length:g}" for length in size[: 2 if planar else 3])
+        needs = f"{WIDTH_MIN:g} m wide" + ("" if planar else f" and {HEIGHT_MIN:g} m high")
+        verb = "drive" if planar else "take off"
+        reason = f"too small for the robot to {verb}; make it at least {needs}"
+        return Problem(path, f"{given} m", reason)
+    low, high = (*fence.inner_low[:2], fence.low[2]), fence.inner_high  # it stands on the ground
+    stands = zip(low, scene.spawn, high, strict=True)
+    inside = [below <= at <= above for below, at, above in stands]
+    if all(inside[: 2 if planar else 3]):
+        return None
+    reason = (
+        f"the spawn, {_point(np.array(scene.spawn))}, is outside or too near to a wall; it may be "
+        f"at {_spans(low, high, planar=planar)}; move the spawn or the fence"
+    )
+    return Problem(path, f"[{_point(np.array(fence.low))}, {_point(np.array(fence.high))}]", reason)
 
 
 def _named(names: Sequence[str]) -> str:
@@ -83,14 +100,23 @@ def check_mission(
         return [problem]
     if planar and (problems := check_heights(mission, scene)):
         return problems
+    fence = fence_of(scene)
     if mission.setpoints is not None:
-        return []
-    lift, known = LIFT if planar else 0.0, obstacles(scene, contact=contact)
+        return _check_setpoints(Path(mission.setpoints), fence)
+    known = obstacles(scene, contact=contact)
     if mission.steps is not None:
-        reason = _check_steps(mission.steps, known, lift)
+        reason = _check_steps(mission.steps, known, fence, planar=planar)
         return [Problem(("steps",), "", reason)] if reason else []
     start = scene.spawn if mission.start == "spawn" else None
-    return list(_check_waypoints(mission, known, start, lift))
+    return list(_check_waypoints(mission, known, start, fence, planar=planar))
+
+
+def _check_setpoints(path: Path, fence: Fence) -> list[Problem]:
+    try:
+        read_setpoints(path, fence)
+    except BadInputError as error:
+        return [Problem(("setpoints",), "", str(error))]
+    return []
 
 
 def _check_parts(mission: Mission) -> Problem | None:
@@ -117,15 +143,18 @@ def _check_parts(mission: Mission) -> Problem | None:
 
 
 def _check_waypoints(
-    mission: Mission, known: Sequence[Obstacle], start: Vector | None, lift: float
+    mission: Mission,
+    known: Sequence[Obstacle],
+    start: Vector | None,
+    fence: Fence,
+    *,
+    planar: bool,
 ) -> Iterator[Problem]:
     positions = np.array([waypoint.position_m for waypoint in mission.waypoints])
     yaws = np.radians([waypoint.yaw_deg for waypoint in mission.waypoints])
     # A waypoint may be outside by half its tolerance; the other half is for control errors.
     slack = np.array([0.5 * waypoint.tolerance_m for waypoint in mission.waypoints])
-    lifted = positions + np.array((0.0, 0.0, lift))
-    in_fence = np.all((lifted >= fence.LOW) & (lifted <= fence.HIGH), axis=1)
-    outside = outside_fence(lifted, slack) | ~in_fence
+    outside = outside_fence(fence, positions, slack, planar=planar)
     hit = find_overlapped(known, positions, yaws)
     wrong = np.flatnonzero(outside | (hit >= 0))
     for index in np.flatnonzero(yaws)[:_REPORTED]:
@@ -133,9 +162,7 @@ def _check_waypoints(
         yield Problem(path, f"{mission.waypoints[index].yaw_deg:g}", _YAW)
     for index in wrong[:_REPORTED]:
         if outside[index]:
-            reason = "beyond the fence, or too near to it; the guard lets the robot " + (
-                f"drive at {_INNER_WALLS}" if lift else f"fly at {_INNER}"
-            )
+            reason = f"beyond the fence, or too near to it; {_allowed(fence, planar=planar)}"
         else:
             reason = (
                 f"the robot would be within {CLEARANCE_MIN:g} m of {surface(known[hit[index]])}"
@@ -144,8 +171,8 @@ def _check_waypoints(
         before = mission.waypoints[index - 1].position_m if index else start
         legal = None if index - 1 in wrong else before
         near = None
-        if not lift:
-            near = find_nearest_legal(known, position, float(yaws[index]), legal)
+        if not planar:
+            near = find_nearest_legal(fence, known, position, float(yaws[index]), legal)
         if near is not None:
             reason += f"; nearest legal point found: {_point(np.array(near))}"
         yield _at_point(index, positions[index], reason)
@@ -167,22 +194,34 @@ def _check_ways(positions: Array, known: Sequence[Obstacle]) -> Iterator[Problem
         yield _at_point(index, positions[index + 1], reason)
 
 
-def _check_steps(steps: Steps, known: Sequence[Obstacle], lift: float) -> str:
+def _check_steps(steps: Steps, known: Sequence[Obstacle], fence: Fence, *, planar: bool) -> str:
     """Check the box that contains all random setpoints; return the problem, "" if none."""
     axis = np.linspace(-1, 1, 9)
     box = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     with np.errstate(over="ignore"):  # an infinite position is outside the fence, too
         positions = np.array(steps.centre_m) + box * np.array(steps.range_m)
-    if outside_fence(positions + np.array((0.0, 0.0, lift))).any():
-        return (
-            "steps reach beyond the fence, or too near to it; the guard lets the robot fly at "
-            f"{_INNER}; choose a smaller range_m"
-        )
+    if outside_fence(fence, positions, planar=planar).any():
+        where = _allowed(fence, planar=planar)
+        return f"steps reach beyond the fence, or too near to it; {where}; choose a smaller range_m"
     hit = find_overlapped(known, positions, np.zeros(len(positions))).max()
     if hit >= 0:
         where = surface(known[hit])
         return f"steps can end in {where}; choose another centre_m, range_m or scene"
     return ""
+
+
+def _allowed(fence: Fence, *, planar: bool) -> str:
+    """Describe where the guard lets the robot fly or drive, world frame."""
+    verb = "drive" if planar else "fly"
+    where = _spans(fence.inner_low, fence.inner_high, planar=planar)
+    return f"the guard lets the robot {verb} at {where}"
+
+
+def _spans(low: Vector, high: Vector, *, planar: bool) -> str:
+    """Describe a box by its corners [m]; without heights for a `planar` robot."""
+    sides = zip("xyz", low, high, strict=True)
+    spans = [f"{axis} {below:g} to {above:g}" for axis, below, above in sides]
+    return ", ".join(spans[: 2 if planar else 3]) + " [m]"
 
 
 def _at_point(index: int, position: Array, reason: str) -> Problem:

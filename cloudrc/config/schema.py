@@ -22,6 +22,8 @@ from pydantic import (
     model_validator,
 )
 
+from cloudrc.geometry.fence import Corners, order_of
+
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Point = tuple[Finite, Finite, Finite]
 
@@ -48,7 +50,9 @@ Count = Annotated[int, Field(ge=1)]
 COMMAND_AGE_MS = 1, 10_000
 """Smallest and largest value of guard.command_age_max_ms [ms]."""
 CommandAge = Annotated[float, Field(ge=COMMAND_AGE_MS[0], le=COMMAND_AGE_MS[1])]
-Speed = Annotated[float, Field(ge=0.01, le=10)]
+SPEED_MPS = 0.01, 10.0
+"""Smallest and largest value of guard.speed_max_mps [m/s]."""
+Speed = Annotated[float, Field(ge=SPEED_MPS[0], le=SPEED_MPS[1])]
 Acceleration = Annotated[float, Field(ge=0.1, le=100)]
 CLOUD_TIME_MAX = 10
 """Largest value of cloud.horizon_max_s and of cloud.freeze_after_s [s]."""
@@ -378,6 +382,10 @@ class World(Section):
     robot must be one that its onboard controller can fly or drive"""
     scene: str = "pipes"
     """Name of a shipped scene, or path of an MJCF file (.xml)"""
+    fence_m: tuple[Point, Point] | None = None
+    """Fence: the box that the robot's base may not leave, as its corners with the smallest and the
+    largest x, y and z [m], world frame. null: the scene's fence, a numeric of that name in its
+    file, else the box around its geoms with 3 m on all sides"""
     tuning: str | None = None
     """Name of a set of parameters in the robot's robot.yaml (tunings), such as fast. null: without
     one"""
@@ -393,6 +401,13 @@ class World(Section):
     whose actuators are off. A robot whose actuators have no drag is refused"""
     odometry_rate_hz: Literal[20, 25, 50, 100, 125, 250, 500] = 100
     """Rate of the odometry for cloud [Hz]. The true state is recorded at 100 Hz or more"""
+
+    @field_validator("fence_m")
+    @classmethod
+    def _check_fence(cls, corners: Corners | None) -> Corners | None:
+        if corners and (wrong := order_of(corners)):
+            raise ValueError(wrong)
+        return corners
 
     @property
     def is_nominal(self) -> bool:
@@ -413,8 +428,9 @@ class Guard(Section):
     null: 0.8 if cloud.plan_s is above 0, else 0"""
     speed_max_mps: Speed | None = None
     """Cap on the commanded speed [m/s]; a faster command is shortened. null: the largest speed that
-    the robot can follow and from which it stops within 8.7 m. For the Pelican this is 6 m/s if
-    command_age_max_ms is 250 and plan_max_s is 0"""
+    the robot can follow and from which it stops within the longest way from the spawn to a wall of
+    the fence, less 0.5 m. For the Pelican in the shipped scenes this is 6 m/s if command_age_max_ms
+    is 250 and plan_max_s is 0"""
     acceleration_max_mps2: Acceleration | None = None
     """Largest acceleration of the velocity that the onboard controller follows [m/s^2]. null: that
     of the robot, for the Pelican 12"""

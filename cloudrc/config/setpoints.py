@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from cloudrc.errors import BadInputError
-from cloudrc.geometry.fence import INNER_HIGH, INNER_LOW
+from cloudrc.geometry.fence import Fence
 from cloudrc.link.traces import read_lines, read_rows
 from cloudrc.messages import Vector
 
@@ -22,11 +22,11 @@ TimedPosition: TypeAlias = tuple[float, Vector]
 """Time since the first row [s], and position of the setpoint [m], world frame."""
 
 
-def read_setpoints(path: Path) -> tuple[TimedPosition, ...]:
+def read_setpoints(path: Path, fence: Fence) -> tuple[TimedPosition, ...]:
     """Read the setpoints of a mission; the time of the first row becomes 0.
 
     Raise a BadInputError if the file is not usable, or if it leads out of the box in which the
-    guard lets the robot fly.
+    guard lets the robot fly inside `fence`.
     """
     name, found = f"setpoints {path}", list[TimedPosition]()
     columns, rows = read_rows(read_lines(path, name, f"give a CSV file: {','.join(COLUMNS)}"), name)
@@ -39,9 +39,8 @@ def read_setpoints(path: Path) -> tuple[TimedPosition, ...]:
             raise BadInputError(
                 f"{row.where}: time_s {time:g} does not rise; sort the rows by time"
             )
-        for column, low, at, high in zip(
-            COLUMNS[1:], INNER_LOW, (x, y, z), INNER_HIGH, strict=True
-        ):
+        sides = zip(COLUMNS[1:], fence.inner_low, (x, y, z), fence.inner_high, strict=True)
+        for column, low, at, high in sides:
             if not low - ROUNDING <= at <= high + ROUNDING:
                 reason = f"the guard flies from {low:g} to {high:g}"
                 raise BadInputError(f"{row.where}: {column} is {at:g}; {reason}; stay inside")
@@ -51,12 +50,13 @@ def read_setpoints(path: Path) -> tuple[TimedPosition, ...]:
     return tuple((time - found[0][0], position) for time, position in found)
 
 
-def write_setpoints(setpoints: Iterable[tuple[float, Sequence[float]]]) -> str:
+def write_setpoints(setpoints: Iterable[tuple[float, Sequence[float]]], fence: Fence) -> str:
     """Format times [s] and positions [m] as a CSV text that `read_setpoints` can read.
 
-    A position outside the box in which the guard lets the robot fly becomes the nearest one inside.
-    Of several setpoints within one microsecond the last one is written.
+    A position outside the box in which the guard lets the robot fly inside `fence` becomes the
+    nearest one inside. Of several setpoints within one microsecond the last one is written.
     """
-    inside = {f"{time:.6f}": np.clip(at, INNER_LOW, INNER_HIGH) for time, at in setpoints}
+    low, high = fence.inner_low, fence.inner_high
+    inside = {f"{time:.6f}": np.clip(at, low, high) for time, at in setpoints}
     lines = (f"{time},{x:.6g},{y:.6g},{z:.6g}" for time, (x, y, z) in inside.items())
     return "\n".join([",".join(COLUMNS), *lines, ""])

@@ -22,14 +22,14 @@ import rich
 import viser
 
 from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.scene import scene_of
 from cloudrc.console.access import PARAMETER, Access
 from cloudrc.console.door import Desk, Door, scene_page
 from cloudrc.console.feed import STALE, FlightFeed
 from cloudrc.console.handed import viser_behind
 from cloudrc.console.steering import SLIDERS, Steering, is_drive
-from cloudrc.geometry import fence
 from cloudrc.geometry.clearance import Array
-from cloudrc.geometry.scene import SPAWN, load_scene
+from cloudrc.geometry.obstacles import fence_of
 from cloudrc.messages import ZERO, Quaternion, Vector
 
 SLOW_PERIOD = 0.3
@@ -122,12 +122,13 @@ class Page:
         from cloudrc.console.scene import LEGEND, FlightScene  # needs MuJoCo, which takes a second
 
         self._scene = FlightScene(self._server, experiment, ASPECT)
+        self._surroundings = scene_of(experiment.world)
         gui = self._server.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_WIDTH)
         gui.add_html(BELOW_STOP, order=-1)
         self._status = gui.add_markdown("waiting for the robot", order=2)
-        if load_scene(experiment.world.scene).pipes:
+        if self._surroundings.pipes:
             gui.add_html(LEGEND, order=2.5)
         panel = gui.add_panel()
         with panel.add_tab("Charts"):
@@ -316,7 +317,9 @@ class Page:
 
     def _add_target(self, client: viser.ClientHandle) -> None:
         """Add a gizmo and number fields for the target position; a change of one updates both."""
-        low, high, start = fence.INNER_LOW, fence.INNER_HIGH, self._place_target(time.monotonic())
+        fence = fence_of(self._surroundings)
+        low, high = fence.inner_low, fence.inner_high
+        start = self._place_target(time.monotonic())
         limits = tuple(zip(low, high, strict=True))
         gizmo = client.scene.add_transform_controls(
             "/target",
@@ -359,8 +362,10 @@ class Page:
         if (control := feed.control(now)) is not None:
             at: Any = control.setpoint
         else:
-            at = np.add(feed.status.position if feed.status else SPAWN, (0, 0, 0.6))
-        x, y, z = map(float, np.round(np.clip(at, fence.INNER_LOW, fence.INNER_HIGH), 2))
+            here = feed.status.position if feed.status else self._surroundings.spawn
+            at = np.add(here, (0, 0, 0.6))
+        fence = fence_of(self._surroundings)
+        x, y, z = map(float, np.round(np.clip(at, fence.inner_low, fence.inner_high), 2))
         return x, y, z
 
     def _add_keys(self, gui: viser.GuiApi) -> None:

@@ -19,7 +19,7 @@ from cloudrc.cloud.loop import ControlLoop
 from cloudrc.cloud.operator import Operator
 from cloudrc.errors import BadInputError
 from cloudrc.faults.schedule import DURATION, PAPER, Schedule, compose, generator
-from cloudrc.geometry.fence import HIGH, LOW
+from cloudrc.geometry.fence import Fence
 from cloudrc.messages import (
     MISSION_OVER,
     ZERO,
@@ -38,7 +38,7 @@ from cloudrc.world.robot import STEP_NS
 Generator: TypeAlias = np.random.Generator
 Lie: TypeAlias = Callable[[Command, Control], Command]
 """Function that changes an honest command; it also gets cloud's record of the control period."""
-Policy: TypeAlias = Callable[[Generator], Lie]
+Policy: TypeAlias = Callable[[Generator, Fence], Lie]
 Words: TypeAlias = Callable[[int, RobotStatus], OperatorRequest | None]
 """Function that makes a false operator request, or None, from cloud's time [ns] and cloud's newest
 status of the robot. `HostileOperator` sets the number of the request."""
@@ -130,17 +130,17 @@ FACE_WAIT_NS = 5_000_000_000  # longest wait for the robot to come near a face o
 REACHED = (0, 1, 7, MISSION_OVER)
 
 
-def at_bad_moments(rng: Generator) -> Words:
+def at_bad_moments(rng: Generator, fence: Fence) -> Words:
     """Return a function that forges an operator's requests after random pauses.
 
-    Half of the requests wait until the robot is near the fence.
+    Half of the requests wait until the robot is near `fence`.
     """
     pause, near = float(rng.choice([0.05, 0.3, 1.0])), float(rng.uniform(0.2, 1.5))
     due_ns, waits = 0, False
 
     def words(now_ns: int, seen: RobotStatus) -> OperatorRequest | None:
         nonlocal due_ns, waits
-        far = seen.guard is GuardState.TRACK and min(_faces(seen.position))[0] > near
+        far = seen.guard is GuardState.TRACK and min(_faces(fence, seen.position))[0] > near
         if now_ns < (due_ns + FACE_WAIT_NS if far and waits else due_ns):
             return None
         due_ns = now_ns + int(rng.exponential(pause) * 1e9)
@@ -153,18 +153,18 @@ def at_bad_moments(rng: Generator) -> Words:
     return words
 
 
-def _faces(position: Vector) -> list[tuple[float, int, float]]:
+def _faces(fence: Fence, position: Vector) -> list[tuple[float, int, float]]:
     """Return for each wall and the ceiling: distance [m], axis, direction on the axis (1 or -1)."""
-    walls = [(p - LOW[n], n, -1.0) for n, p in enumerate(position) if n < 2]
-    return [(HIGH[n] - p, n, 1.0) for n, p in enumerate(position)] + walls
+    walls = [(p - fence.low[n], n, -1.0) for n, p in enumerate(position) if n < 2]
+    return [(fence.high[n] - p, n, 1.0) for n, p in enumerate(position)] + walls
 
 
-def dishonesty(schedule: Schedule, *, planar: bool) -> tuple[list[Lie], Words | None]:
+def dishonesty(schedule: Schedule, fence: Fence, *, planar: bool) -> tuple[list[Lie], Words | None]:
     """Return the functions by which the cloud of a schedule attacks: ([], None) if it is honest.
 
     The functions in the list change commands. The function after the list forges operator requests;
-    it is None if the policy forges no requests. Most clouds send no vertical velocity to a `planar`
-    robot, because it refuses such commands.
+    it is None if the policy forges no requests. `fence` is that of the scene. Most clouds send no
+    vertical velocity to a `planar` robot, because it refuses such commands.
 
     Raises:
         BadInputError: If the policy does not exist; the message lists all policies.
@@ -174,11 +174,11 @@ def dishonesty(schedule: Schedule, *, planar: bool) -> tuple[list[Lie], Words | 
     if schedule.policy not in POLICIES:
         names = ", ".join(POLICIES)
         raise BadInputError(f"no policy '{schedule.policy}' of a cloud; there are: {names}")
-    lies = [POLICIES[schedule.policy](generator(schedule.seed, 666))]
+    lies = [POLICIES[schedule.policy](generator(schedule.seed, 666), fence)]
     if planar and generator(schedule.seed, 668).random() < FLAT_SHARE:
         lies.append(_flat)
     speaks = schedule.policy in SPEAKING
-    return lies, at_bad_moments(generator(schedule.seed, 667)) if speaks else None
+    return lies, at_bad_moments(generator(schedule.seed, 667), fence) if speaks else None
 
 
 def choose(seed: int) -> Schedule:
@@ -210,7 +210,7 @@ def _flat(command: Command, control: Control) -> Command:
     )
 
 
-def _towards_a_face(rng: Generator) -> Lie:
+def _towards_a_face(rng: Generator, fence: Fence) -> Lie:
     """Command a flight towards a wall, an edge or a corner of the fence."""
     way: list[int] = rng.choice([-1, 0, 1], 3).tolist()
     way = way if any(way) else [0, 0, 1]
@@ -218,14 +218,14 @@ def _towards_a_face(rng: Generator) -> Lie:
     return lambda command, control: _fly(command, [each * speed for each in way])
 
 
-def _face_after_face(rng: Generator) -> Lie:
+def _face_after_face(rng: Generator, fence: Fence) -> Lie:
     """Fly at full speed between opposite sides of the fence; sometimes change the axis."""
     axis, way = int(rng.integers(3)), 1.0
     near = float(rng.uniform(0.1, 2.0))
 
     def lie(command: Command, control: Control) -> Command:
         nonlocal axis, way
-        goal = HIGH[axis] if way > 0 else LOW[axis]
+        goal = fence.high[axis] if way > 0 else fence.low[axis]
         if abs(control.position[axis] - goal) < near:
             way = -way
             if rng.random() < 0.3:
@@ -235,12 +235,12 @@ def _face_after_face(rng: Generator) -> Lie:
     return lie
 
 
-def _greedy(rng: Generator) -> Lie:
+def _greedy(rng: Generator, fence: Fence) -> Lie:
     """Fly towards the nearest wall or the ceiling, sometimes with a random velocity along it."""
     decoy = float(rng.uniform(0.0, 0.2))
 
     def lie(command: Command, control: Control) -> Command:
-        _, axis, way = min(_faces(control.measured))
+        _, axis, way = min(_faces(fence, control.measured))
         velocity = rng.uniform(-FAST, FAST, 3).tolist() if rng.random() < decoy else [0.0] * 3
         velocity[axis] = way * FAST
         return _fly(command, velocity)
@@ -248,7 +248,7 @@ def _greedy(rng: Generator) -> Lie:
     return lie
 
 
-def _on_the_limit(rng: Generator) -> Lie:
+def _on_the_limit(rng: Generator, fence: Fence) -> Lie:
     """Fly towards the fence slightly faster than the guard's stop rule allows."""
     more = float(rng.uniform(1.0, 1.5))
     way: list[int] = rng.choice([-1, 1], 3).tolist()
@@ -256,7 +256,8 @@ def _on_the_limit(rng: Generator) -> Lie:
     def lie(command: Command, control: Control) -> Command:
         velocity = [0.0] * 3
         for n, p in enumerate(control.measured):
-            distance = max((HIGH[n] - p if way[n] > 0 else p - LOW[n]) - 0.1, 0.0)
+            away = fence.high[n] - p if way[n] > 0 else p - fence.low[n]
+            distance = max(away - 0.1, 0.0)
             velocity[n] = way[n] * more * (3.0 * (sqrt(0.04 + 2.0 * distance / 3.0) - 0.2))
         if rng.random() < 0.005:
             way[int(rng.integers(3))] *= -1
@@ -265,7 +266,7 @@ def _on_the_limit(rng: Generator) -> Lie:
     return lie
 
 
-def _shaking(rng: Generator) -> Lie:
+def _shaking(rng: Generator, fence: Fence) -> Lie:
     """Command velocities that oscillate at a frequency at which the onboard loops may resonate."""
     frequency, plane = float(rng.uniform(0.2, 10.0)), rng.permutation(3).tolist()
     bias: list[float] = rng.uniform(-3.0, 3.0, 3).tolist()
@@ -280,7 +281,7 @@ def _shaking(rng: Generator) -> Lie:
     return lie
 
 
-def _random(rng: Generator) -> Lie:
+def _random(rng: Generator, fence: Fence) -> Lie:
     velocity, until_ns = list(ZERO), 0
 
     def lie(command: Command, control: Control) -> Command:
@@ -293,7 +294,7 @@ def _random(rng: Generator) -> Lie:
     return lie
 
 
-def _strange_numbers(rng: Generator) -> Lie:
+def _strange_numbers(rng: Generator, fence: Fence) -> Lie:
     """Send NaN, infinity and huge values: too rarely to cause a landing, or all the time."""
     share = float(rng.choice([0.01, 0.03, 1.0]))
 
@@ -306,7 +307,7 @@ def _strange_numbers(rng: Generator) -> Lie:
     return lie
 
 
-def _false_basis(rng: Generator) -> Lie:
+def _false_basis(rng: Generator, fence: Fence) -> Lie:
     """Send commands that claim a wrong odometry stamp: one in the future, or one too old."""
     shift_ns = int(rng.choice([1, STEP_NS, 10_000_000, 200_000_000, 2**62]))
     sign = int(rng.choice([-1, 1]))
@@ -319,7 +320,7 @@ def _false_basis(rng: Generator) -> Lie:
     return lie
 
 
-def _stop_and_go(rng: Generator) -> Lie:
+def _stop_and_go(rng: Generator, fence: Fence) -> Lie:
     """Alternate between stale and fresh commands of the same random velocity."""
     period_ns = int(rng.uniform(0.3e9, 3e9))
     velocity = rng.uniform(-FAST, FAST, 3).tolist()
@@ -331,7 +332,7 @@ def _stop_and_go(rng: Generator) -> Lie:
     return lie
 
 
-def _hostile_plans(rng: Generator) -> Lie:
+def _hostile_plans(rng: Generator, fence: Fence) -> Lie:
     """Send plans of random lengths that begin now or later, with jumps and sometimes NaN.
 
     `rng` decides whether the cloud also sends commands without a plan, and whether it sends stale
@@ -340,7 +341,7 @@ def _hostile_plans(rng: Generator) -> Lie:
     ahead, share = float(rng.choice([0.05, 0.5, 9.9])), float(rng.choice([0.0, 0.5]))
     absurd, old_ns = float(rng.choice([0.0, 0.003])), int(rng.choice([0, 150_000_000, 300_000_000]))
     jumps, spread = int(rng.choice([1, 5, 80])), float(rng.choice([0.0, FAST, 2.0 * FAST]))
-    period_ns, fly = int(rng.uniform(0.3e9, 4e9)), _operators_voice(rng)
+    period_ns, fly = int(rng.uniform(0.3e9, 4e9)), _operators_voice(rng, fence)
 
     def lie(command: Command, control: Control) -> Command:
         command = fly(command, control)
@@ -360,20 +361,20 @@ def _hostile_plans(rng: Generator) -> Lie:
     return lie
 
 
-def _operators_voice(rng: Generator) -> Lie:
+def _operators_voice(rng: Generator, fence: Fence) -> Lie:
     """Change commands by a random policy of `FASTEST`.
 
     In the policy "operators-voice", `at_bad_moments` also forges requests of the operator.
     """
-    return FASTEST[int(rng.integers(len(FASTEST)))](rng)
+    return FASTEST[int(rng.integers(len(FASTEST)))](rng, fence)
 
 
-def _refused_and_released(rng: Generator) -> Lie:
+def _refused_and_released(rng: Generator, fence: Fence) -> Lie:
     """Fly fast, and from time to time send NaN, so that the guard lands the robot.
 
     Cloud also forges requests of the operator (`at_bad_moments`), which acknowledge the landings.
     """
-    fly, pause_ns = _operators_voice(rng), int(rng.uniform(0.5e9, 4e9))
+    fly, pause_ns = _operators_voice(rng, fence), int(rng.uniform(0.5e9, 4e9))
 
     def lie(command: Command, control: Control) -> Command:
         nonsense = control.stamp_ns % pause_ns < NONSENSE_NS

@@ -16,6 +16,7 @@ from cloudrc.cloud.operator import Operator
 from cloudrc.config import shipped
 from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import is_planar
+from cloudrc.config.scene import fence_in
 from cloudrc.config.schema import World
 from cloudrc.drivers.teleop import PERIOD_NS as WAKE_NS
 from cloudrc.drivers.virtual import Clock, VirtualRun
@@ -74,7 +75,8 @@ class FaultRun:
         offset = schedule.cloud_offset % OFFSET_MAX  # no clock shows a negative time
         self._clock = Clock(round(offset * 1e9), schedule.cloud_drift)
         self._clock_id = OTHER if has_own_clock else SHARED
-        policy, self._words = dishonesty(schedule, planar=is_planar(robot))
+        self._fence = fence_in(self.experiment.world)
+        policy, self._words = dishonesty(schedule, self._fence, planar=is_planar(robot))
         mistakes = [bugs(schedule, self._clock)] if schedule.of(*BUGS) else []
         self._lies = [*policy, *mistakes, *lies]
         self._honest, self._keep, self._life = honest and not schedule.policy, keep, life
@@ -85,10 +87,9 @@ class FaultRun:
         self.changes = list[GuardChange]()
         self.watch = Watch(facts_of(self.experiment))
         self.listeners: list[Callable[[list[Record], int], None]] = [self.watch.see]
-        self.teleop = TeleopModel(
-            self.experiment.criteria.contact_speed_max_mps,
-            int(generator(self.experiment.seed, 45).integers(WAKE_NS)),
-        )
+        touch_speed = self.experiment.criteria.contact_speed_max_mps
+        phase_ns = int(generator(self.experiment.seed, 45).integers(WAKE_NS))
+        self.teleop = TeleopModel(touch_speed, self._fence, phase_ns)
         if start:
             self.teleop.order(self.make_order(), self._clock.at(0))
         self.world = RestartableEndpoint(self._build_world, Clock())
@@ -197,7 +198,7 @@ class FaultRun:
 
     def _build_rival(self, start_ns: int) -> CloudEndpoint:
         """Build a second cloud with the same key; it has its own teleop and the same mission."""
-        teleop = Teleop()
+        teleop = Teleop(self._fence)
         teleop.start(start_ns, Mission("rival", self.make_order(), 0))
         identity = Identity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
         return assembly.build_cloud(self.experiment, identity, teleop, lambda: start_ns)

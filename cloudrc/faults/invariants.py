@@ -36,11 +36,11 @@ from typing import NamedTuple
 
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.robot import find_robot
+from cloudrc.config.scene import fence_in
 from cloudrc.faults.contact_checks import ContactChecks
 from cloudrc.faults.facts import FLOWN, Facts
 from cloudrc.faults.motion_checks import MotionChecks
 from cloudrc.faults.order_checks import OrderChecks
-from cloudrc.geometry.fence import HIGH, LOW
 from cloudrc.messages import Command, GuardState, OperatorRequest, Request, Start
 from cloudrc.records import CommandApplied, Record, SessionOpened
 from cloudrc.world.onboard import Commands
@@ -169,5 +169,6 @@ class RobotInvariants:
 
 def facts_of(experiment: ResolvedExperiment) -> Facts:
     """Return what the invariants need to know about an experiment's robot, scene and limits."""
-    robot = find_robot(experiment.world.robot)
-    return Facts.of(experiment.guard, LOW, HIGH, robot.guard.braking_mps2, planar=robot.planar)
+    robot, fence = find_robot(experiment.world.robot), fence_in(experiment.world)
+    braking = robot.guard.braking_mps2
+    return Facts.of(experiment.guard, fence.low, fence.high, braking, planar=robot.planar)

@@ -11,6 +11,7 @@ from typing import TypeAlias, TypeVar
 from cloudrc.drivers.teleop import PERIOD_NS, RemoteTeleop, TeleopLoop, UnixPeer
 from cloudrc.drivers.virtual import Clock
 from cloudrc.endpoint import Endpoint
+from cloudrc.geometry.fence import Fence
 from cloudrc.messages import NEVER_NS
 from cloudrc.records import Fault, MissionEvent, Record
 from cloudrc.teleop.service import MissionService
@@ -188,14 +189,16 @@ class TeleopModel:
         events: Events of all missions, oldest first.
     """
 
-    def __init__(self, contact_speed_max: float, phase_ns: int) -> None:
+    def __init__(self, contact_speed_max: float, fence: Fence, phase_ns: int) -> None:
         """Start teleop.
 
         Args:
             contact_speed_max: Limit of the speed of the arm's tip at the board [m/s].
+            fence: Fence of the scene.
             phase_ns: Time at which teleop's process wakes for the first time [ns, virtual time].
         """
-        self._contact_speed_max, self._phase_ns, self._starts = contact_speed_max, phase_ns, 0
+        self._contact_speed_max, self._fence = contact_speed_max, fence
+        self._phase_ns, self._starts = phase_ns, 0
         self._disk = b""  # the bytes of its database
         self.events: list[MissionEvent] = []
         self._host: RestartableEndpoint | None = None
@@ -211,7 +214,8 @@ class TeleopModel:
         if self._disk:
             self._database.deserialize(self._disk)
         salt = b"desk %d" % self._starts  # random in production
-        service = MissionService(self._contact_speed_max, MissionStore(self._database, salt))
+        store = MissionStore(self._database, salt)
+        service = MissionService(self._contact_speed_max, store, self._fence)
         self.service: MissionService | None = service
         self._peer.waiting.clear()
         self._calls, self._stops = list[Call](), list[Call]()

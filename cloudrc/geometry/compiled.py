@@ -18,6 +18,7 @@ from cloudrc.errors import (
     MissingPrerequisiteError,
     OutOfMemoryError,
 )
+from cloudrc.geometry.fence import Corners
 from cloudrc.geometry.model_files import model_files
 from cloudrc.geometry.scene import FLOOR, WORLD
 from cloudrc.geometry.solids import Array, Shape, Solid
@@ -70,6 +71,8 @@ class Bodies(NamedTuple):
 
     names: tuple[str, ...]  # of all bodies with geoms; geoms in the worldbody belong to `world`
     solids: tuple[Solid, ...]  # everything that the robot can touch, except the floor
+    extent: Corners  # of a box with the spawn, and with all that can be touched but planes
+    ground: float  # height of what is below the spawn [m], world frame; else of the spawn
 
 
 def compile_error(what: str, error: Exception) -> CloudrcError:
@@ -138,6 +141,7 @@ def _read_bodies(path: Path, *version: tuple[str, int, int]) -> Bodies:
     try:
         spec = read_scene(path)
         spec.compiler.fusestatic = False
+        spawn = spec.frame("spawn").pos.copy()
         model = spec.compile()
     except (ValueError, KeyError) as error:
         raise compile_error(str(path), error) from None
@@ -150,7 +154,27 @@ def _read_bodies(path: Path, *version: tuple[str, int, int]) -> Bodies:
         for geom, name in enumerate(names)
         if name != FLOOR and touchable[geom]
     ]
-    return Bodies(tuple(dict.fromkeys(names)), tuple(solids))
+    extent, ground = _extent(model, data, spawn), _ground(model, data, spawn)
+    return Bodies(tuple(dict.fromkeys(names)), tuple(solids), extent, ground)
+
+
+def _extent(model: Any, data: Any, spawn: Array) -> Corners:
+    """Return the corners of the box with the point `spawn` [m] and all geoms that have an end."""
+    corners = [spawn]
+    touchable = (model.geom_contype | model.geom_conaffinity) & ROBOT_BITS
+    for geom in np.flatnonzero(touchable & (model.geom_type != _GEOM.mjGEOM_PLANE)):
+        axes, box = data.geom_xmat[geom].reshape(3, 3), model.geom_aabb[geom]
+        centre, half = data.geom_xpos[geom] + axes @ box[:3], np.abs(axes) @ box[3:]
+        corners += [centre - half, centre + half]
+    (ax, ay, az), (bx, by, bz) = np.min(corners, axis=0).tolist(), np.max(corners, axis=0).tolist()
+    return (ax, ay, az), (bx, by, bz)
+
+
+def _ground(model: Any, data: Any, spawn: Array) -> float:
+    """Return the height of the highest surface below the point `spawn` [m], else of the point."""
+    down = np.array((0.0, 0.0, -1.0))
+    distance = mujoco.mj_ray(model, data, spawn, down, None, 1, -1, np.zeros(1, np.int32))
+    return float(spawn[2] - max(distance, 0.0))
 
 
 def _solid(model: Any, data: Any, geom: int, name: str) -> Solid:

@@ -1,24 +1,71 @@
-"""The fence of the guard: the box that the robot's base may not leave."""
+"""The fence of the guard: the box that the robot's base may not leave.
+
+A fence is a fact of a scene: `<custom><numeric name="fence" data="x0 y0 z0 x1 y1 z1"/></custom>`
+in its file, else the box around spawn and geoms with `SPACE` on all sides. The key world.fence_m
+replaces it.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeAlias
+
 from cloudrc.messages import Vector
 
-LOW: Vector = (-3.0, -8.5, 0.0)
-HIGH: Vector = (9.2, 5.5, 2.5)
-"""Opposite corners LOW and HIGH of the fence [m], world frame.
-Source: docs/reference/plant.md, "Fence of the guard"."""
+Corners: TypeAlias = tuple[Vector, Vector]
+"""Corners of a box with the smallest and the largest coordinates [m], world frame."""
 FLOOR_MARGIN = 0.35
 """Smallest height above the fence's floor at which the guard holds the robot [m]. At a smaller
 height a tilted robot would touch the ground."""
 WALL_MARGIN = 0.2
 """Distance from the walls and the ceiling of the fence at which the guard stops the robot [m]."""
-INNER_LOW: Vector = (LOW[0] + WALL_MARGIN, LOW[1] + WALL_MARGIN, LOW[2] + FLOOR_MARGIN)
-INNER_HIGH: Vector = (HIGH[0] - WALL_MARGIN, HIGH[1] - WALL_MARGIN, HIGH[2] - WALL_MARGIN)
-"""Opposite corners, INNER_LOW and INNER_HIGH, of the box in which the guard lets the robot fly [m],
-world frame."""
+TAKE_OFF_MARGIN = 0.5
+"""Smallest distance from the fence's walls at which a robot may take off after its actuators were
+switched off [m]. A tilted robot slides up to 0.35 m along the floor before it rises. This distance
+was measured with `pytest -m "" -k scrapes tests/world`."""
+SPACE = 3.0
+"""Distance of the fence from the geoms of a scene that declares no fence [m]."""
+WIDTH_MIN = 1.0
+"""Smallest width of a fence in which a robot can take off, or drive [m]."""
+HEIGHT_MIN = 0.8
+"""Smallest height of a fence in which a robot can take off [m]: both margins, and 0.25 m to fly."""
 
 
-def inside(position: Vector) -> bool:
-    """Return whether a base at `position` [m], world frame, shape (3,), is inside the fence."""
-    return all(low <= value <= high for low, value, high in zip(LOW, position, HIGH, strict=True))
+@dataclass(frozen=True)
+class Fence:
+    """A box, and the box inside it in which the guard lets the robot fly; [m], world frame."""
+
+    low: Vector  # corner with the smallest coordinates [m]; the ground is at its height
+    high: Vector  # corner with the largest coordinates [m]
+
+    @cached_property
+    def inner_low(self) -> Vector:
+        """Lower corner of the box in which the guard lets the robot fly [m], world frame."""
+        x, y, z = self.low
+        return (x + WALL_MARGIN, y + WALL_MARGIN, z + FLOOR_MARGIN)
+
+    @cached_property
+    def inner_high(self) -> Vector:
+        """Upper corner of the box in which the guard lets the robot fly [m], world frame."""
+        x, y, z = self.high
+        return (x - WALL_MARGIN, y - WALL_MARGIN, z - WALL_MARGIN)
+
+    def contains(self, position: Vector) -> bool:
+        """Return whether a base at `position` [m], world frame, shape (3,), is inside the fence."""
+        sides = zip(self.low, position, self.high, strict=True)
+        return all(low <= value <= high for low, value, high in sides)
+
+    def room(self, spawn: Vector) -> float:
+        """Return the longest way along x or y from the spawn to where a robot may take off [m]."""
+        walls = zip(self.low[:2], spawn[:2], self.high[:2], strict=True)
+        return max(max(at - low, high - at) for low, at, high in walls) - TAKE_OFF_MARGIN
+
+
+def order_of(corners: Corners) -> str:
+    """Return what is wrong with the order of a fence's corners [m]; "" if nothing is."""
+    low, high = corners
+    wrong = [axis for axis, a, b in zip("xyz", low, high, strict=True) if not a < b]
+    if not wrong:
+        return ""
+    return f"{', '.join(wrong)} must rise from the first corner to the second; exchange them"

@@ -1,4 +1,4 @@
-"""List the obstacles of a scene: declared pipes and board, and all other bodies."""
+"""List the obstacles of a scene, declared pipes and board and all other bodies; find its fence."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import TypeAlias
 
 import numpy as np
 
+from cloudrc.errors import MissingPrerequisiteError
+from cloudrc.geometry.fence import SPACE, Fence
 from cloudrc.geometry.scene import BOARD, WORLD, Board, Pipe, Scene, is_obstacle
 from cloudrc.geometry.solids import Solid
 
@@ -53,6 +55,33 @@ def body_names(scene: Scene) -> tuple[str, ...] | None:
     return _compiled(scene)[0] or None
 
 
+def fence_of(scene: Scene) -> Fence:
+    """Return the fence of a scene: the declared one, else the box around spawn and geoms.
+
+    That box has `SPACE` around walls and ceiling, and ends below at the ground under the spawn.
+
+    Raises:
+        BadInputError: If MuJoCo cannot read the scene.
+        MissingPrerequisiteError: If the scene declares no fence, and MuJoCo is missing.
+    """
+    if scene.own_fence is not None:
+        return scene.own_fence
+    if not known(scene):
+        raise MissingPrerequisiteError(
+            f"scene {scene.name}: has no fence, and the box around its geoms needs MuJoCo; add "
+            '<numeric name="fence" data="x0 y0 z0 x1 y1 z1"/>, set world.fence_m, or run: '
+            "pip install 'cloudrc[world]'"
+        )
+    low, high, ground = scene.spawn, scene.spawn, scene.floor
+    if scene.path is not None:
+        from cloudrc.geometry.compiled import read_bodies
+
+        bodies = read_bodies(scene.path)
+        (low, high), ground = bodies.extent, bodies.ground
+    (ax, ay, _), (bx, by, bz) = low, high
+    return Fence((ax - SPACE, ay - SPACE, ground), (bx + SPACE, by + SPACE, bz + SPACE))
+
+
 def known(scene: Scene) -> bool:
     """Return whether `obstacles` returns all obstacles of a scene."""
     return scene.path is None or find_spec("mujoco") is not None
@@ -63,7 +92,8 @@ def _compiled(scene: Scene) -> tuple[tuple[str, ...], tuple[Solid, ...]]:
         return (), ()
     from cloudrc.geometry.compiled import read_bodies
 
-    return read_bodies(scene.path)
+    bodies = read_bodies(scene.path)
+    return bodies.names, bodies.solids
 
 
 def _as_solid(board: Board) -> Solid:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cloudrc.geometry import fence
 from cloudrc.geometry.clearance import Array, clearance_per_obstacle, robot_points
+from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.obstacles import Obstacle
 from cloudrc.geometry.scene import Pipe
 from cloudrc.messages import Vector
@@ -24,17 +24,21 @@ _AT_ONCE = 50  # number of candidates whose ways are checked together
 _FAR = 1e3  # [m] limit of coordinates, so that no square overflows
 
 
-def outside_fence(positions: Array, slack: ArrayLike = 0.0) -> NDArray[np.bool_]:
+def outside_fence(
+    fence: Fence, positions: Array, slack: ArrayLike = 0.0, *, planar: bool = False
+) -> NDArray[np.bool_]:
     """Return which positions are outside the box in which the guard lets the robot fly.
 
     `positions` are in [m], world frame, shape (n, 3). A position counts as inside if its distance
-    from the box is at most `slack` [m], shape () or (n,).
+    from the box is at most `slack` [m], shape () or (n,), unless it is outside the fence. Only the
+    walls concern a `planar` robot.
     """
-    positions = np.clip(positions, -_FAR, _FAR)
-    nearest = np.clip(positions, fence.INNER_LOW, fence.INNER_HIGH)
-    outside: NDArray[np.bool_] = (
-        np.linalg.norm(positions - nearest, axis=1) > np.asarray(slack) + 1e-9
-    )
+    axes = slice(2 if planar else 3)
+    low, high = np.array(fence.low)[axes], np.array(fence.high)[axes]
+    at = np.clip(positions[:, axes], low - _FAR, high + _FAR)
+    nearest = np.clip(at, fence.inner_low[axes], fence.inner_high[axes])
+    outside: NDArray[np.bool_] = np.linalg.norm(at - nearest, axis=1) > np.asarray(slack) + 1e-9
+    outside |= ~np.all((at >= low) & (at <= high), axis=1)
     return outside
 
 
@@ -84,7 +88,11 @@ def find_crossed(obstacles: Sequence[Obstacle], starts: Array, ends: Array) -> N
 
 
 def find_nearest_legal(
-    obstacles: Sequence[Obstacle], position: Vector, yaw: float, before: Vector | None = None
+    fence: Fence,
+    obstacles: Sequence[Obstacle],
+    position: Vector,
+    yaw: float,
+    before: Vector | None = None,
 ) -> Vector | None:
     """Find a point that the guard allows and that is clear of obstacles; None if none is near.
 
@@ -95,7 +103,7 @@ def find_nearest_legal(
     `yaw` is the heading of the level robot [rad]. If `before` [m] is given, the straight way from
     there to the point is also clear of obstacles.
     """
-    start = np.clip(position, fence.INNER_LOW, fence.INNER_HIGH)
+    start = np.clip(position, fence.inner_low, fence.inner_high)
     directions = [*np.eye(3), *-np.eye(3)]
     for pipe in (each for each in obstacles if isinstance(each, Pipe)):
         relative = start - np.asarray(pipe.centre)
@@ -106,7 +114,7 @@ def find_nearest_legal(
     steps = np.arange(0, _SEARCH, 0.02)
     around = start + steps[:, None, None] * np.array(directions)
     candidates = np.round(around.reshape(-1, 3), 2)
-    legal = ~outside_fence(candidates)
+    legal = ~outside_fence(fence, candidates)
     legal &= find_overlapped(obstacles, candidates, np.full(len(candidates), yaw)) < 0
     candidates = candidates[legal]
     candidates = candidates[np.linalg.norm(candidates - start, axis=1).argsort(kind="stable")]

@@ -8,6 +8,7 @@ data="..."/>`, in metres, world frame.
 | `pipe_*` | centre x y z, axis x y z, length, inner radius, outer radius |
 | `board` | x of the front face, smallest and largest y, smallest and largest z |
 | `floor` | z; 0 if the file has no `floor` |
+| `fence` | corner with the smallest x y z, corner with the largest |
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from cloudrc.errors import BadInputError
+from cloudrc.geometry.fence import Corners, Fence, order_of
 from cloudrc.messages import Vector
 
 SPAWN: Vector = (0.0, 0.0, 0.1)
@@ -59,6 +61,7 @@ class Scene:
     floor: float = 0.0  # z of the floor [m], world frame
     spawn: Vector = SPAWN  # position of the base at the start of a mission [m], world frame
     path: Path | None = None  # of the file if it may have more bodies; None: this is all it has
+    own_fence: Fence | None = None  # fence that is declared; None: see `obstacles.fence_of`
 
 
 def is_obstacle(body: str, *, contact: bool) -> bool:
@@ -70,11 +73,11 @@ def is_obstacle(body: str, *, contact: bool) -> bool:
     return body != FLOOR and not (contact and body == BOARD)
 
 
-def load_scene(name: str) -> Scene:
+def load_scene(name: str, corners: Corners | None = None) -> Scene:
     """Read a scene by the path of an .xml file, or a shipped scene by its file name without .xml.
 
-    Raise a BadInputError if the file does not exist, or if its numbers do not have the form in the
-    table at the top of this module.
+    `corners` [m] replace those of the scene's fence. Raise a BadInputError if the file does not
+    exist, or if its numbers do not have the form in the table at the top of this module.
     """
     own = Path(name) if name.endswith(".xml") else None
     path = own or SCENES / f"{name}.xml"
@@ -82,13 +85,15 @@ def load_scene(name: str) -> Scene:
         root = ElementTree.parse(path).getroot()
         numerics = [(n.get("name", ""), n.get("data", "")) for n in root.iterfind("custom/numeric")]
         pipes = tuple(_pipe(name, data) for name, data in numerics if name.startswith("pipe_"))
-        board, floor = None, 0.0
+        board, floor, fence = None, 0.0, None
         for name, data in numerics:
             if name == "board":
                 x, *spans = _numbers(name, data, 5)
                 board = Board(x, (spans[0], spans[1]), (spans[2], spans[3]))
             elif name == "floor":
                 (floor,) = _numbers(name, data, 1)
+            elif name == "fence":
+                fence = _fence(_numbers(name, data, 6))
         frame = root.find("./worldbody/frame[@name='spawn']")
         x, y, z = SPAWN if frame is None else _numbers("spawn", frame.get("pos", "0 0 0"), 3)
     except OSError as error:
@@ -99,7 +104,17 @@ def load_scene(name: str) -> Scene:
         raise BadInputError(f"scene {path.name}: {error}") from None
     bodies = {body.get("name") for body in root.iterfind("worldbody/body")}
     is_complete = own is None and bodies <= {FLOOR, *(name for name, _ in numerics)}
-    return Scene(path.stem, pipes, board, floor, (x, y, z), None if is_complete else path)
+    own_fence = Fence(*corners) if corners else fence
+    whole = None if is_complete else path
+    return Scene(path.stem, pipes, board, floor, (x, y, z), whole, own_fence)
+
+
+def _fence(numbers: list[float]) -> Fence:
+    ax, ay, az, bx, by, bz = numbers
+    fence = Fence((ax, ay, az), (bx, by, bz))
+    if wrong := order_of((fence.low, fence.high)):
+        raise ValueError(f"fence: {wrong}")
+    return fence
 
 
 def _pipe(name: str, data: str) -> Pipe:

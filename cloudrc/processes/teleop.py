@@ -16,12 +16,14 @@ from typing import TYPE_CHECKING
 from cloudrc import assembly
 from cloudrc.config.load import ResolvedExperiment, read_experiment
 from cloudrc.config.robot import is_planar
+from cloudrc.config.scene import scene_of
 from cloudrc.drivers.link_news import LinkNews
 from cloudrc.drivers.process import Feed, GracefulStop, StopSignal
 from cloudrc.drivers.realtime import Address
 from cloudrc.drivers.teleop import TeleopLoop, UnixPeer
 from cloudrc.files import write_atomically
-from cloudrc.geometry.scene import Scene, load_scene
+from cloudrc.geometry.obstacles import fence_of
+from cloudrc.geometry.scene import Scene
 from cloudrc.processes.ports import open_exporter, warn, warn_if_exposed
 from cloudrc.records import Counted, Fault, Record
 from cloudrc.teleop.api import ApiServer, Bridge, create_app
@@ -65,13 +67,14 @@ def run_teleop(settings: TeleopSettings, stop: StopSignal) -> None:
     experiment = read_experiment(str(settings.config))
     exporter = open_exporter("teleop", experiment, settings.metrics)
     with ExitStack() as opened:
-        scene = load_scene(experiment.world.scene)
+        scene = scene_of(experiment.world)
         server = serve_api(settings, experiment, scene)
         opened.callback(server.stop)
         book = _open_store(settings.journal, stop, server.bridge)
         if book is not None:  # None: stopped while another teleop process locked the journal
             opened.callback(book.close)
-            service = MissionService(experiment.criteria.contact_speed_max_mps, book, scene)
+            touch_speed, fence = experiment.criteria.contact_speed_max_mps, fence_of(scene)
+            service = MissionService(touch_speed, book, fence, scene)
             if settings.start:
                 contact = bool(experiment.criteria.contact)
                 order = Order(assembly.build_plan(experiment), experiment.name, contact=contact)
@@ -97,10 +100,9 @@ def serve_api(settings: TeleopSettings, experiment: ResolvedExperiment, scene: S
         warn_if_exposed(settings.api)
     bridge, contact = Bridge(), bool(experiment.criteria.contact)
     planar = is_planar(experiment.world.robot)
-    order = partial(
-        read_order, scene=scene, contact=contact, planar=planar,
-        plan=partial(assembly.mission_plan, speed_max=experiment.guard.speed_max_mps),
-    )  # fmt: skip
+    speed_max = experiment.guard.speed_max_mps
+    plan = partial(assembly.mission_plan, fence=fence_of(scene), speed_max=speed_max)
+    order = partial(read_order, scene=scene, contact=contact, planar=planar, plan=plan)
     tokens = Tokens(settings.tokens, log_line) if settings.tokens else None
     goto = partial(read_goto, scene=scene, planar=planar)
     app = create_app(bridge, order, goto, partial(read_drive, planar=planar), log_line)

@@ -16,7 +16,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from cloudrc.config.load import ResolvedExperiment
-from cloudrc.geometry.scene import Pipe, load_scene
+from cloudrc.config.scene import scene_of
+from cloudrc.geometry.scene import Pipe
 from cloudrc.metrics import Flight
 from cloudrc.metrics.control import prediction_errors, tracking_errors
 from cloudrc.metrics.flight import Array, Columns, select
@@ -43,7 +44,7 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[Message]
     Raises:
         BadInputError: If the scene of the experiment cannot be read.
     """
-    scene, truth = load_scene(experiment.world.scene), recording["/ground_truth"]
+    scene, truth = scene_of(experiment.world), recording["/ground_truth"]
     if not len(truth):
         return []
     flight = Flight(recording, experiment.criteria, experiment.mission, scene)

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cloudrc.config.load import ResolvedExperiment
+from cloudrc.config.scene import scene_of
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.files import read, write_atomically
-from cloudrc.geometry.obstacles import known, obstacles
-from cloudrc.geometry.scene import Pipe, load_scene
+from cloudrc.geometry.obstacles import fence_of, known, obstacles
+from cloudrc.geometry.scene import Pipe
 from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
@@ -40,7 +41,7 @@ def assess(
     `own` are names or paths of the user's metrics, whose files are executed. Metric files that only
     the experiment names are not executed, because somebody else may have written them.
     """
-    scene = load_scene(experiment.world.scene)
+    scene = scene_of(experiment.world)
     flight = Flight(recording, experiment.criteria, experiment.mission, scene)
     numbers, metric_notes = measure_all(flight, own)
     real_time, stopped = run.mode != "virtual", run.interrupted or bool(recording.note)
@@ -145,7 +146,8 @@ def _driven(flight: Flight) -> str:
     if len(rows) < 2:
         return ""
     times = (control["stamp_ns"][rows] - begins_ns[0]) * 1e-9
-    return write_setpoints(zip(times.tolist(), control["setpoint"][rows].tolist(), strict=True))
+    setpoints = zip(times.tolist(), control["setpoint"][rows].tolist(), strict=True)
+    return write_setpoints(setpoints, fence_of(flight.scene))
 
 
 def _write_page(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from cloudrc import plugins
 from cloudrc.config.overrides import build_plugin, check_plugin, default_parameters
 from cloudrc.config.robot import RobotFiles, find_robot, parameters
+from cloudrc.config.scene import fence_in
 from cloudrc.config.schema import PlugIn, World
 from cloudrc.config.shipped import file_of
 from cloudrc.errors import BadInputError
@@ -54,7 +55,7 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
     """
     model, plugin, onboard, actuators = _make_parts(world)
     robot, simulator = find_robot(world.robot), Simulator(model, actuators, wind)
-    guard = Guard(limits, robot.guard, planar=robot.planar)
+    guard = Guard(limits, fence_in(world), robot.guard, planar=robot.planar)
     faster = _accelerator(world, plugin)
     make = Robot if faster is None or faster.make is None else faster.make
     return make(simulator, onboard, guard)

@@ -137,7 +137,7 @@ def _with_step(
     changed = {
         "mission": Mission(waypoints=tuple(points)),
         "criteria": Criteria(contact=False, settle_m=None, time_limit_s=limit),
-        "world": experiment.world.model_copy(update={"scene": SCENE}),
+        "world": experiment.world.model_copy(update={"scene": SCENE, "fence_m": None}),
     }
     return experiment.model_copy(update=changed)
 

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from functools import partial
 from math import dist, sqrt
 
-from cloudrc.geometry.fence import INNER_HIGH, INNER_LOW
+from cloudrc.geometry.fence import Fence
 from cloudrc.messages import ZERO, Drive, Motion, Setpoint, Vector
 
 HEARTBEAT_NS = 500_000_000
@@ -85,18 +85,20 @@ def _profile(setpoint: Setpoint) -> tuple[float, float, float]:
     return distance, ramp, distance / (acceleration * ramp) + ramp if ramp else 0.0
 
 
-def steer(setpoint: Setpoint, velocity: Vector, now_ns: int) -> Setpoint:
+def steer(setpoint: Setpoint, velocity: Vector, now_ns: int, fence: Fence) -> Setpoint:
     """Return a setpoint that moves with `velocity` [m/s], world frame, from `now_ns` [ns] on.
 
     It begins where `setpoint` is at `now_ns`. It stays in the box in which the guard lets the robot
-    fly, and slows down before a wall.
+    fly inside `fence`, and slows down before a wall.
     """
     start, yaw, _, _, before, _ = setpoint_at(setpoint, now_ns)
+    low, high = fence.inner_low, fence.inner_high
     x, y, z = (
-        max(-_speed_within(at - low), min(asked, _speed_within(high - at)))
-        for asked, at, low, high in zip(velocity, start, INNER_LOW, INNER_HIGH, strict=True)
+        max(-_speed_within(at - below), min(asked, _speed_within(above - at)))
+        for asked, at, below, above in zip(velocity, start, low, high, strict=True)
     )
-    motion = Drive(start, now_ns, before, (x, y, z), ACCELERATION, now_ns + HEARTBEAT_NS)
+    until_ns = now_ns + HEARTBEAT_NS
+    motion = Drive(start, now_ns, before, (x, y, z), ACCELERATION, until_ns, low, high)
     moving = Setpoint(start, yaw, motion=motion)
     return moving._replace(position=setpoint_at(moving, now_ns + 4 * HEARTBEAT_NS).position)
 
@@ -112,13 +114,13 @@ def _speed_within(distance: float) -> float:
 
 
 def _driven(setpoint: Setpoint, drive: Drive, now_ns: int) -> Setpoint:
-    start, begin_ns, before, target, acceleration, until_ns = drive
+    start, begin_ns, before, target, acceleration, until_ns, lowest, highest = drive
     time = max(min(now_ns, until_ns) - begin_ns, 0) * 1e-9
     position, velocity = _change(start, before, target, acceleration, time)
     if now_ns > until_ns:
         time = (now_ns - until_ns) * 1e-9
         position, velocity = _change(position, velocity, ZERO, acceleration, time)
-    sides = zip(position, INNER_LOW, INNER_HIGH, strict=True)
+    sides = zip(position, lowest, highest, strict=True)
     x, y, z = inside = tuple(max(low, min(at, high)) for at, low, high in sides)
     u, v, w = (s if a == b else 0.0 for s, a, b in zip(velocity, position, inside, strict=True))
     return setpoint._replace(position=(x, y, z), velocity=(u, v, w))

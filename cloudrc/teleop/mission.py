@@ -25,7 +25,7 @@ from math import dist
 from typing import TYPE_CHECKING
 
 from cloudrc.errors import BadInputError
-from cloudrc.geometry import fence
+from cloudrc.geometry.fence import Fence
 from cloudrc.messages import (
     MISSION_OVER,
     NEVER_NS,
@@ -57,10 +57,6 @@ from cloudrc.teleop.wire import (
 if TYPE_CHECKING:
     from cloudrc.teleop.store import Mission
 
-HELD_LOWEST = fence.LOW[2] + fence.FLOOR_MARGIN
-"""Lowest z at which teleop holds the robot [m], world frame; lower, the robot would scrape along
-the floor at z = 0.
-Source: docs/safety.md, "The guard"."""
 NO_WAYPOINT = -1
 """Waypoint index in a setpoint or event that belongs to no waypoint."""
 UNDER_WAY = FLYING, STARTING, HELD
@@ -126,8 +122,14 @@ class Teleop:
     valid until the next setpoint or session. All times `now_ns` are on the caller's clock [ns].
     """
 
-    def __init__(self, ended: Callable[[int], bool] = lambda mission_id: False) -> None:
-        """Begin without a mission; `ended(n)` tells whether the mission with number n has ended."""
+    def __init__(
+        self, fence: Fence, ended: Callable[[int], bool] = lambda mission_id: False
+    ) -> None:
+        """Begin without a mission, in a scene with `fence`.
+
+        `ended(n)` tells whether the mission with number n has ended.
+        """
+        self._fence = fence
         self.state = "idle"  # of the mission
         self.leg = 0  # index of the current waypoint; their number once all are reached
         self.outcome: MissionEvent | None = None  # event that ended the newest mission
@@ -227,7 +229,7 @@ class Teleop:
         if moves and not self._drives:
             self._report("driving", NO_WAYPOINT, "driven by hand", now_ns)
         self._released_ns = now_ns + HEARTBEAT_NS if moves else NEVER_NS
-        self._select(steer(setpoint, velocity, now_ns))
+        self._select(steer(setpoint, velocity, now_ns, self._fence))
 
     def resume(self, now_ns: int) -> None:
         """Continue a held mission; raise BadInputError unless the mission is held."""
@@ -436,7 +438,8 @@ class Teleop:
         if 0.0 < dist(start, position) <= JUMP_SPEED * lasts:
             x, y, z = ((b - a) / lasts for a, b in zip(start, position, strict=True))
             begin_ns, until_ns = (self._began_ns + round(at * 1e9) for at in (begin, end))
-            motion = Drive(start, begin_ns, (x, y, z), (x, y, z), ACCELERATION, until_ns)
+            box = self._fence.inner_low, self._fence.inner_high
+            motion = Drive(start, begin_ns, (x, y, z), (x, y, z), ACCELERATION, until_ns, *box)
         self._select(Setpoint(position, waypoint=self.leg, motion=motion))
 
     def _is_reached(self, leg: Leg, seen: RobotStatus, now_ns: int) -> bool:
@@ -546,7 +549,8 @@ class Teleop:
         if self.seen is not None:
             x, y, z = self.seen.position
             yaw = 0.0 if self._setpoint is None else self._setpoint.yaw
-            self._select(Setpoint((x, y, max(z, HELD_LOWEST)), yaw, NO_WAYPOINT))
+            z = max(z, self._fence.inner_low[2])  # lower, the robot would scrape along the ground
+            self._select(Setpoint((x, y, z), yaw, NO_WAYPOINT))
 
     def _select(self, setpoint: Setpoint) -> None:
         epoch = 0 if self.seen is None else self.seen.epoch

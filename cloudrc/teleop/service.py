@@ -16,6 +16,7 @@ import numpy as np
 
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import clearance_per_obstacle
+from cloudrc.geometry.fence import Fence
 from cloudrc.geometry.obstacles import obstacles, surface
 from cloudrc.geometry.placement import find_crossed
 from cloudrc.geometry.scene import Scene
@@ -24,7 +25,7 @@ from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, fini
 from cloudrc.records import BY_HAND, Fault, MissionEvent
 from cloudrc.teleop.carrot import HEARTBEAT_NS, SPEED_MAX
 from cloudrc.teleop.interruptions import SILENCE, Interruptions
-from cloudrc.teleop.mission import HELD_LOWEST, Teleop
+from cloudrc.teleop.mission import Teleop
 from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError
 from cloudrc.teleop.wire import FLYING, HELD, QUEUED, Leg, Output, Plan, RobotStatus
 
@@ -94,16 +95,20 @@ class MissionService:
     """
 
     def __init__(
-        self, contact_speed_max: float, book: MissionStore, scene: Scene | None = None
+        self,
+        contact_speed_max: float,
+        book: MissionStore,
+        fence: Fence,
+        scene: Scene | None = None,
     ) -> None:
-        """Begin with the missions in the store `book`.
+        """Begin with the missions in the store `book`, in a scene with `fence`.
 
         `contact_speed_max` limits the speed of the arm's tip when it touches the board [m/s]. With
         a `scene`, the service refuses straight ways through obstacles.
         """
         self._contact_speed_max, self._scene = contact_speed_max, scene
         self._outputs: list[Output | Fault] = []
-        self.book, self._teleop = book, Teleop(book.has_ended)
+        self.book, self._teleop, self._fence = book, Teleop(fence, book.has_ended), fence
         self._heard_ns: int | None = None  # when the last message from cloud arrived
         self._seen_ns = self._guard_ns = 0  # times of telemetry and of the guard's last change
         self._setpoint: Setpoint | None = None
@@ -230,7 +235,7 @@ class MissionService:
             if seen is None or rests:
                 raise ConflictError(f"no mission is under way; {STARTS}")
             x, y, z = seen.position
-            leg = Leg((x, y, max(z, HELD_LOWEST)), tolerance=inf, dwell=0.0)
+            leg = Leg((x, y, max(z, self._fence.inner_low[2])), tolerance=inf, dwell=0.0)
             plan = Plan((leg,), Start.HERE, DRIVE_LIMIT, by_hand=True)
             self.create(Order(plan, "drive"), now_ns)
         elif waiting[0].state != HELD and not waiting[0].order.plan.by_hand:

@@ -27,6 +27,7 @@ from cloudrc.teleop.store import Order, open_store
 from cloudrc.teleop.wire import Leg, Plan
 from tests.conftest import wait_until
 from tests.drivers.conftest import FAST, processes_of
+from tests.fences import FENCE
 
 USING = "cloudrc: using the run in s\n"
 
@@ -34,9 +35,9 @@ USING = "cloudrc: using the run in s\n"
 @pytest.mark.parametrize("name", ["paper", "fast"])
 def test_a_flown_order_becomes_the_mission_of_the_report(name):
     experiment = load_experiment(name)
-    plan = assembly.mission_plan(experiment.mission, 33.0)
+    plan = assembly.mission_plan(experiment.mission, 33.0, fence=FENCE)
     flown = assembly.with_order(load_experiment("hover"), Order(plan, contact=True), "")
-    assert assembly.mission_plan(flown.mission, flown.criteria.time_limit_s) == plan
+    assert assembly.mission_plan(flown.mission, flown.criteria.time_limit_s, fence=FENCE) == plan
     assert (flown.criteria.contact, flown.name) == (True, "hover")
 
 
@@ -71,7 +72,7 @@ def drive_order():
 def test_a_drive_becomes_a_mission_with_setpoints(folder):
     flown = assembly.with_order(load_experiment("hover"), drive_order(), "")
     (folder / "config.yaml").write_text(dump(flown))
-    rest = write_setpoints([(0.0, (0.0, 99.0, 0.35)), (1.0, (0.0, 0.0, 1.0))])
+    rest = write_setpoints([(0.0, (0.0, 99.0, 0.35)), (1.0, (0.0, 0.0, 1.0))], FENCE)
     (folder / "drive.csv").write_text(rest)
     again = read_experiment(folder / "config.yaml")
     assert again.mission.setpoints == str(folder / "drive.csv")

@@ -1,6 +1,7 @@
 """Missions of a robot on the ground: two numbers are enough, heights are refused with a word."""
 
 import json
+from functools import partial
 
 import pytest
 
@@ -10,6 +11,7 @@ from cloudrc.config.load import dump, load_experiment
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import load_scene
 from cloudrc.teleop.models import RefusedError, read_drive, read_goto, read_order
+from tests.fences import FENCE
 
 SCENE = load_scene("pillars")
 ROVER = ["world.robot=rover", "world.scene=empty"]
@@ -97,7 +99,7 @@ def order(point):
 
 
 def test_teleop_takes_two_numbers_and_refuses_heights():
-    options = {"contact": False, "planar": True, "plan": mission_plan}
+    options = {"contact": False, "planar": True, "plan": partial(mission_plan, fence=FENCE)}
     taken = read_order(order([1.5, 1.2]), SCENE, **options)
     assert taken.plan.legs[0].position == (1.5, 1.2, 0.1)
     with pytest.raises(RefusedError, match="has a height"):

@@ -6,6 +6,7 @@ from cloudrc import assembly
 from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Mission
 from tests.conftest import nightly
+from tests.fences import FENCE
 from tests.flights.conftest import fly, numbers
 
 PROFILES = ("paper-p1", "paper-p2", "paper-p3")
@@ -50,7 +51,7 @@ def test_the_limit_of_a_leg_defaults_to_three_times_its_time():
     points.append({**points[1], "time_limit_s": 7.5})
     mission = Mission.model_validate({"start": "here", "waypoints": tuple(points)})
     for options, second in (({}, 33.0), ({"speed_max": 0.5}, 48.0)):
-        plan = assembly.mission_plan(mission, None, **options)
+        plan = assembly.mission_plan(mission, None, fence=FENCE, **options)
         limits = [leg.time_limit for leg in plan.legs]
         assert limits[1:] == [second, 7.5]
         assert plan.time_limit == max(60.0, sum(limits))

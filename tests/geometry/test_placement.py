@@ -19,6 +19,7 @@ from cloudrc.geometry.placement import (
     outside_fence,
 )
 from cloudrc.geometry.scene import SCENES, load_scene
+from tests.fences import FENCE
 
 PIPES = load_scene("pipes")
 KNOWN = obstacles(PIPES, contact=True)
@@ -89,11 +90,11 @@ def test_a_way_touches_a_wall_if_one_of_its_points_does(start, end):
     st.tuples(st.floats(-4, 10), st.floats(-9, 6), st.floats(-1, 3)), st.floats(-math.pi, math.pi)
 )
 def test_the_nearest_legal_point_is_legal(position, yaw):
-    found = find_nearest_legal(KNOWN, position, yaw)
+    found = find_nearest_legal(FENCE, KNOWN, position, yaw)
     assert found is not None
     assert hit(found, yaw) == -1
-    assert not outside_fence(np.array([found]))[0]
-    assert find_nearest_legal(KNOWN, found, yaw) == found
+    assert not outside_fence(FENCE, np.array([found]))[0]
+    assert find_nearest_legal(FENCE, KNOWN, found, yaw) == found
 
 
 def test_a_straight_way_leads_to_the_offered_point():

@@ -10,7 +10,7 @@ def test_a_shipped_scene_is_read():
     scene = load_scene("pipes")
     assert [pipe.name for pipe in scene.pipes] == ["pipe_1", "pipe_2", "pipe_3"]
     assert (scene.board, scene.floor) == (Board(8.535, (-6.82, -6.02), (0.025, 1.225)), 0)
-    assert load_scene("empty") == Scene("empty")
+    assert load_scene("empty") == Scene("empty", own_fence=load_scene("pipes").own_fence)
 
 
 def scene_file(folder, numbers, world=""):

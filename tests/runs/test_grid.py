@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from cloudrc.assembly import build_links
-from cloudrc.config import document, load, overrides
+from cloudrc.config import document, load, overrides, scene
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.scene import SCENES
 from cloudrc.runs import grid as grids
@@ -205,7 +205,7 @@ def test_what_points_share_is_read_and_checked_once(write_sweep, tmp_path, monke
             counts.update([name]) or real(*given, **words)
         ))  # fmt: skip
 
-    for place, name in ((document, "parse_yaml"), (load, "check_mission"), (load, "load_scene"),
+    for place, name in ((document, "parse_yaml"), (load, "check_mission"), (scene, "load_scene"),
                         (overrides, "parameter_model")):  # fmt: skip
         count(place, name)
     axes = {"link.both.delay_ms": [*range(20)], "guard.hold_max_s": [1, 2]}

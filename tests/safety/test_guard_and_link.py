@@ -7,6 +7,7 @@ from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.schedule import Schedule
 from cloudrc.messages import GuardState
 from cloudrc.world.guard.state import Guard
+from tests.fences import FENCE
 
 HOSTILE = {"stop-and-go": 9, "false-basis": 8, "strange-numbers": 9, "refused-and-released": 3}
 """Name of a hostile cloud's policy -> seed. Together, these flights reach all guard states."""
@@ -31,6 +32,6 @@ def test_nothing_in_the_tunnel_changes_the_limits(monkeypatch):
         flight = FaultRun(Schedule(seed, policy=policy))
         before = bounds(flight.robot.guard)
         flight.fly(8.0)
-        assert bounds(flight.robot.guard) == before == bounds(Guard(flight.experiment.guard))
+        assert bounds(flight.robot.guard) == before == bounds(Guard(flight.experiment.guard, FENCE))
         states |= {change.state for change in flight.changes}
     assert states == set(GuardState)

@@ -29,6 +29,7 @@ from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import ConflictError, MissionStore, Order, UnavailableError
 from cloudrc.teleop.wire import ALARM, Leg, Plan, RobotStatus
 from tests.conftest import wait_until
+from tests.fences import FENCE
 
 PERIOD_NS = 10_000_000
 A, B, C = (1.0, 0.0, 1.0), (2.0, 0.0, 1.0), (3.0, 0.0, 1.0)
@@ -43,7 +44,7 @@ class Flight:
     """Teleop, its robot, and all outputs of teleop."""
 
     def __init__(self):
-        self.teleop = Teleop()
+        self.teleop = Teleop(FENCE)
         self.now_ns, self.position = 0, (0.0, 0.0, 0.1)
         self.epoch, self.world, self.mission = 1, "world 1", 0
         self.onboard = (0, 0)  # mission's number and waypoints reached, as world keeps them
@@ -204,7 +205,7 @@ class ServiceFlight(Flight):
     def restart_teleop(self):
         """Start a new service with the missions on the disk."""
         self.killed_before = self.killed_after = None  # number of a commit
-        self.teleop = MissionService(0.25, self.stored(), self.scene)
+        self.teleop = MissionService(0.25, self.stored(), FENCE, self.scene)
 
     def stored(self):
         """Return the store that a new process reads from the disk."""
@@ -322,7 +323,7 @@ class Running:
         self.flight.uplink = uplink
         self.alarms, self.complaints = [], []
         self.bridge.alarm = lambda: self.alarms.append(time.monotonic())
-        how = {"contact": True, "plan": assembly.mission_plan}
+        how = {"contact": True, "plan": partial(assembly.mission_plan, fence=FENCE)}
         order, goto = (partial(read, scene=self.scene) for read in (read_order, read_goto))
         order = partial(order, **how)
         app = create_app(self.bridge, order, goto, read_drive, self.complaints.append)

@@ -15,11 +15,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cloudrc.geometry.fence import INNER_HIGH, INNER_LOW
 from cloudrc.messages import ZERO, GuardState, Setpoint
 from cloudrc.teleop.carrot import ACCELERATION, setpoint_at, steer
 from cloudrc.teleop.store import ConflictError
 from cloudrc.teleop.wire import decode, encode
+from tests.fences import FENCE
 from tests.teleop.conftest import (
     AWAY,
     PERIOD_NS,
@@ -37,19 +37,19 @@ STEPS = st.lists(st.tuples(SPEEDS, st.integers(1, 60)), max_size=12)
 
 
 def inside(setpoint, axis):
-    return INNER_LOW[axis] < setpoint.position[axis] < INNER_HIGH[axis]
+    return FENCE.inner_low[axis] < setpoint.position[axis] < FENCE.inner_high[axis]
 
 
-@given(STEPS, st.tuples(*map(st.floats, INNER_LOW, INNER_HIGH)))
+@given(STEPS, st.tuples(*map(st.floats, FENCE.inner_low, FENCE.inner_high)))
 def test_the_setpoint_keeps_its_limits_and_rests(steps, start):
     """At the fence itself an axis may stop at once: the others can use up the acceleration."""
     setpoint, now_ns = Setpoint(start), 0
     for velocity, periods in [*steps, (ZERO, 300)]:
-        setpoint = steer(setpoint, velocity, now_ns)
+        setpoint = steer(setpoint, velocity, now_ns, FENCE)
         for _ in range(periods):
             before, now_ns = setpoint_at(setpoint, now_ns), now_ns + PERIOD_NS
             after = setpoint_at(setpoint, now_ns)
-            sides = zip(INNER_LOW, after.position, INNER_HIGH, strict=True)
+            sides = zip(FENCE.inner_low, after.position, FENCE.inner_high, strict=True)
             assert all(low <= at <= high for low, at, high in sides)
             free = [i for i in range(3) if inside(before, i) and inside(after, i)]
             change = hypot(*(after.velocity[i] - before.velocity[i] for i in free))
@@ -61,10 +61,10 @@ def test_the_setpoint_keeps_its_limits_and_rests(steps, start):
 def test_it_slows_down_before_the_fence():
     setpoint, now_ns, speeds = Setpoint((6.0, 0.0, 1.0)), 0, []
     while now_ns < 8_000_000_000:
-        setpoint, now_ns = steer(setpoint, (1.5, 0.0, 0.0), now_ns), now_ns + 10 * PERIOD_NS
+        setpoint, now_ns = steer(setpoint, (1.5, 0.0, 0.0), now_ns, FENCE), now_ns + 10 * PERIOD_NS
         speeds.append(setpoint_at(setpoint, now_ns).velocity[0])
     assert max(speeds) == 1.5
-    assert setpoint_at(setpoint, now_ns).position[0] == pytest.approx(INNER_HIGH[0], abs=0.01)
+    assert setpoint_at(setpoint, now_ns).position[0] == pytest.approx(FENCE.inner_high[0], abs=0.01)
     assert min(b - a for a, b in pairwise(speeds)) >= -ACCELERATION * 0.1
 
 

@@ -15,7 +15,7 @@ from cloudrc.faults.adversary import Lie
 from cloudrc.faults.flight import FaultRun
 from cloudrc.faults.measures import Outcome, fly_safely, refused, scenario
 from cloudrc.faults.schedule import FaultEvent, Schedule, Way, generator
-from cloudrc.geometry import fence
+from cloudrc.geometry.obstacles import fence_of
 from cloudrc.geometry.scene import Pipe, load_scene
 from cloudrc.messages import Command, GuardState, Vector
 from cloudrc.records import CommandApplied, Control, Fault
@@ -201,7 +201,7 @@ def _for_a_while(at: float, duration: float, changes: dict[str, Any]) -> Lie:
 def _impossible(outcome: Outcome, seed: int) -> None:
     scene, first = load_scene("pipes"), (0.5, 0.0, 0.8)
     points: dict[str, Vector] = {
-        "1 m behind a wall of the fence": (fence.HIGH[0] + 1.0, 0.0, 1.0),
+        "1 m behind a wall of the fence": (fence_of(scene).high[0] + 1.0, 0.0, 1.0),
         "far below the floor": (0.0, 0.0, -5.0),
         "in a pipe's wall": _wall_of(scene.pipes[0]),
     }

@@ -11,6 +11,7 @@ from __future__ import annotations
 from math import hypot, inf, nan
 from operator import le
 
+from cloudrc.geometry.fence import TAKE_OFF_MARGIN, Fence
 from cloudrc.messages import ZERO, Cause, Vector
 from cloudrc.world.guard.limits import clamp, limit_length, step_towards
 from cloudrc.world.readings import Readings
@@ -45,10 +46,6 @@ INTEGRAL_GAIN, INTEGRAL_MAX, INTEGRAL_RANGE = 0.2, 0.05, 0.1
 """Integral term of the position hold: gain [1/s^2], limit per axis [m/s], and largest distance from
 the hold point at which the term changes [m]. The arm makes the robot heavier on one side; without
 this term the robot would hover 30 mm away from the hold point."""
-TAKE_OFF_MARGIN = 0.5
-"""Smallest distance from the fence's walls at which a robot may take off after it was switched off
-[m]. A tilted robot slides up to 0.35 m along the floor before it rises. This distance was measured
-with `pytest -m "" -k scrapes tests/world`."""
 LIFT_OFF_HEIGHT, GROUND_SPEED_MAX = 0.02, 0.2
 """The robot has left the ground once its height has changed by LIFT_OFF_HEIGHT [m]. Before that,
 the guard may switch the robot off if it is slower than GROUND_SPEED_MAX [m/s]."""
@@ -211,9 +208,9 @@ class TakeOff:
     margin.
     """
 
-    def __init__(self, low: Vector, high: Vector, *, planar: bool = False) -> None:
-        """Set the fence from corner `low` to `high` [m], world frame; begin before the take-off."""
-        (ax, ay, az), (bx, by, bz) = low, high
+    def __init__(self, fence: Fence, *, planar: bool = False) -> None:
+        """Set the fence; begin before the take-off."""
+        (ax, ay, az), (bx, by, bz) = fence.low, fence.high
         margin = 0.0 if planar else TAKE_OFF_MARGIN
         self._lift_off = 0.0 if planar else LIFT_OFF_HEIGHT
         self._low = (ax + margin, ay + margin, az)

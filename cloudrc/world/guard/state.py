@@ -47,7 +47,7 @@ from math import inf
 
 from cloudrc.config.load import ResolvedGuard
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits
-from cloudrc.geometry import fence
+from cloudrc.geometry.fence import Fence
 from cloudrc.messages import (
     NEVER_NS,
     PLAN_STEP_NS,
@@ -92,6 +92,7 @@ class Guard:
     Attributes:
         state: Current state.
         cause: Why the guard is in this state; in LAND always the reason of the landing.
+        fence: Box that the robot's base may not leave.
         armed: Whether a mission is active: from the operator's start to its end, LAND or ESTOP.
         reference: Velocity reference of the last step [m/s], world frame, shape (3,).
         yaw_rate: Limited yaw rate [rad/s]; unused, as the low-level controller keeps a yaw of 0.
@@ -108,11 +109,12 @@ class Guard:
     def __init__(
         self,
         limits: ResolvedGuard,
+        fence: Fence,
         robot: RobotLimits = DEFAULT_LIMITS,
         *,
         planar: bool = False,
     ) -> None:
-        """Begin in GROUND.
+        """Begin in GROUND, inside `fence`.
 
         `robot` tells how fast the robot brakes and how it lands. A `planar` robot stays on the
         ground.
@@ -126,13 +128,14 @@ class Guard:
         self._speed_max = limits.speed_max_mps * rules.ROUNDING_FACTOR
         self._braking, self._planar = robot.braking_mps2, planar
         self.stop_coefficient = rules.stop_coefficient(self._braking)
-        self._low, self._high = fence.INNER_LOW, fence.INNER_HIGH
+        self.fence = fence
+        self._low, self._high = fence.inner_low, fence.inner_high
         if planar:
             self._low, self._high = (*self._low[:2], -inf), (*self._high[:2], inf)
         self._floor, half = self._low[2], 0.5 * limits.speed_max_mps
         self._position_hold = PositionHold(self._low, self._high, half, self._braking)
         self._descent = Halt() if robot.stop == "brake" else Descent(self._floor, half)
-        self._take_off = TakeOff(fence.LOW, fence.HIGH, planar=planar)
+        self._take_off = TakeOff(fence, planar=planar)
         self.changes: list[GuardChange] = []
         self.counts: Counter[str] = Counter()
         self.state, self.cause = GROUND, Cause.SPAWN

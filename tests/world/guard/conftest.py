@@ -15,12 +15,12 @@ import pytest
 import z3
 
 from cloudrc.config.load import ResolvedGuard
-from cloudrc.geometry import fence
 from cloudrc.messages import UPRIGHT, ZERO, Command, GuardState
 from cloudrc.robots.pelican.low_level import LowLevel
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.readings import Readings
 from cloudrc.world.robot import Robot
+from tests.fences import FENCE
 from tests.world.conftest import simulate
 
 MS = 1_000_000
@@ -41,7 +41,7 @@ def sensed(position=HERE, velocity=ZERO):
 
 def armed(limits=LIMITS, now_ns=0):
     """Return a guard in GROUND with a started mission."""
-    guard = Guard(limits)
+    guard = Guard(limits, FENCE)
     guard.start_mission(now_ns)
     return guard
 
@@ -117,7 +117,7 @@ class Flight:
     """Parts of a period [ms] in which the robot runs, as arrivals of commands divide it."""
 
     def __init__(self, simulator, robot=None):
-        self.robot = robot or Robot(simulator, LowLevel(), Guard(LIMITS))
+        self.robot = robot or Robot(simulator, LowLevel(), Guard(LIMITS, FENCE))
         self.guard, self.now_ns = self.robot.guard, 0
         self.robot.put_on_ground(0, "test")
         self.guard.start_mission(0)
@@ -148,7 +148,7 @@ class Flight:
     def look(self):
         """Measure after each period."""
         x, y, z = self.readings.position
-        (ax, ay, _), (bx, by, bz) = fence.LOW, fence.HIGH
+        (ax, ay, _), (bx, by, bz) = FENCE.low, FENCE.high
         self.room = min(self.room, x - ax, bx - x, y - ay, by - y, bz - z)
 
 

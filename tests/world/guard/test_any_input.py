@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.geometry import fence
 from cloudrc.messages import GuardState
 from cloudrc.world.guard.limits import COMMAND_MAX, growth
+from tests.fences import FENCE
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, armed, command, sensed
 from tests.world.guard.test_limits import ANY, PLACES, SPEEDS, VECTORS
 from tests.world.guard.test_plan import PLANS
@@ -73,7 +73,7 @@ def check_flown(guard, reference, position):
     """Check that a reference is within the caps and lets the robot stop before the fence."""
     assert abs(guard.yaw_rate) <= LIMITS.yaw_rate_max_radps
     assert hypot(*reference) <= LIMITS.speed_max_mps  # therefore no component is infinite or NaN
-    for v, at, low, high in zip(reference, position, fence.LOW, fence.HIGH, strict=True):
+    for v, at, low, high in zip(reference, position, FENCE.low, FENCE.high, strict=True):
         room = high - at if v > 0 else at - low
         if guard.state is not GuardState.LAND and v != 0.0 and isfinite(at):
             assert 0.2 * abs(v) + v * v / 6 <= room - 0.1 + 1e-9

@@ -5,10 +5,10 @@ from random import Random
 
 import pytest
 
-from cloudrc.geometry import fence
+from cloudrc.geometry.fence import TAKE_OFF_MARGIN, Fence
 from cloudrc.messages import GuardState
-from cloudrc.world.guard.hold import TAKE_OFF_MARGIN
 from cloudrc.world.guard.state import Guard
+from tests.fences import FENCE
 from tests.world.guard.conftest import LIMITS, SECOND, UP, Flight, hostile
 
 
@@ -112,17 +112,11 @@ def scrape(simulator, seed, room):
     """Return its smallest distance to a wall when it takes off from where it fell [m]."""
     rng, flight = stopped_by(simulator, seed, (0.3, 5.0))
     lies, axis, sign = flight.readings.position, rng.randrange(2), rng.choice((-1, 1))
-    faces = {1: list(fence.HIGH), -1: list(fence.LOW)}
+    faces = {1: list(FENCE.high), -1: list(FENCE.low)}
     faces[sign][axis] = lies[axis] + sign * room
     faces[-sign][axis] = lies[axis] - sign * 5.0
-    low, high, margin = faces[-1], faces[1], fence.WALL_MARGIN
-    inner = low[0] + margin, low[1] + margin, low[2] + fence.FLOOR_MARGIN
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fence, "LOW", low)
-        patch.setattr(fence, "HIGH", high)
-        patch.setattr(fence, "INNER_LOW", inner)
-        patch.setattr(fence, "INNER_HIGH", tuple(each - margin for each in high))
-        flight.guard = flight.robot.guard = Guard(LIMITS)
+    fence = Fence(tuple(faces[-1]), tuple(faces[1]))
+    flight.guard = flight.robot.guard = Guard(LIMITS, fence)
     flight.guard.start_mission(flight.now_ns)
     outwards = [0.0, 0.0, rng.choice((-6.0, -0.3, 0.0, 0.2))]
     outwards[axis], outwards[1 - axis] = sign * rng.choice((0.1, 0.5, 6.0)), rng.choice((0, -3, 3))

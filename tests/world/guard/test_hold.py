@@ -5,10 +5,10 @@ from math import hypot, nan
 import pytest
 
 from cloudrc.config.robot import DEFAULT_LIMITS
-from cloudrc.geometry import fence
 from cloudrc.messages import ZERO
 from cloudrc.world.guard import hold as rules
 from cloudrc.world.guard.hold import PositionHold, TakeOff, brake_start
+from tests.fences import FENCE
 from tests.world.guard.conftest import DT, HERE, sensed
 
 LOW, HIGH = (-2.8, -8.3, 0.0), (9.0, 5.3, 2.3)
@@ -126,14 +126,13 @@ def test_the_hold_point_is_inside_the_margins(position, back):
 # Take-off
 
 STANDS = (0.0, 0.0, 0.1)
-FENCE = (fence.LOW, fence.HIGH)
 
 
 @pytest.mark.parametrize(
     ("height", "over"), [(0.0199, False), (0.02, True), (-0.02, True), (nan, True)]
 )
 def test_a_take_off_is_over_at_the_lift_off_height(height, over):
-    take_off = TakeOff(*FENCE)
+    take_off = TakeOff(FENCE)
     for at in (3.0, 0.0):  # the last place on the ground counts
         take_off.look(sensed((0.0, 0.0, at)), flies=False)
     take_off.look(sensed((9.0, 0.0, height)), flies=True)
@@ -141,7 +140,7 @@ def test_a_take_off_is_over_at_the_lift_off_height(height, over):
     assert take_off.may_end(sensed()) == (not over)
     take_off.forget()
     assert not take_off.over
-    never_seen = TakeOff(*FENCE)
+    never_seen = TakeOff(FENCE)
     never_seen.look(sensed(STANDS), flies=True)
     assert never_seen.over
 
@@ -150,11 +149,11 @@ def test_a_take_off_is_over_at_the_lift_off_height(height, over):
 def test_at_speed_the_rotors_do_not_stop(axis):
     for share, may in ((0.99, True), (1.0, False)):
         velocity = tuple(share * rules.GROUND_SPEED_MAX * (k == axis) for k in range(3))
-        assert TakeOff(*FENCE).may_end(sensed(STANDS, velocity)) == may
+        assert TakeOff(FENCE).may_end(sensed(STANDS, velocity)) == may
 
 
 def stopped():
-    take_off = TakeOff(*FENCE)
+    take_off = TakeOff(FENCE)
     take_off.forget(stopped=True)
     return take_off
 
@@ -187,7 +186,7 @@ def test_stopped_it_may_take_off_once_it_has_been_at_rest(axis, speed):
 def test_outside_the_fence_a_take_off_is_not_allowed(axis, face):
     """Nor so near a wall that it would scrape out of the fence."""
     position = list(STANDS)
-    edge = FENCE[face][axis] - (0.5 if axis < 2 else 0.0) * (2 * face - 1)
+    edge = (FENCE.low, FENCE.high)[face][axis] - (0.5 if axis < 2 else 0.0) * (2 * face - 1)
     position[axis] = edge
     assert lie(stopped(), rules.STILL_TICKS, tuple(position))
     for outside in (edge + (2 * face - 1) * 1e-6, nan):

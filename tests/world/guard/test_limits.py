@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloudrc.config.load import ResolvedGuard, speed_cap
+from cloudrc.config.load import Bounds, ResolvedGuard, speed_cap
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits
-from cloudrc.geometry import fence
 from cloudrc.messages import ZERO, GuardState
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.hold import brake_start
+from tests.fences import FENCE
 from tests.world.guard.conftest import LIMITS, MS, SECOND, TICK, armed, command, run
 
 STOP = rules.stop_coefficient(DEFAULT_LIMITS.braking_mps2)
@@ -47,13 +47,13 @@ def test_a_speed_beyond_the_stop_rule_is_refused(age_ms, fastest):
 @pytest.mark.parametrize("braking", [0.1, 2.0, 3.0, 10.0])
 def test_a_robot_that_brakes_less_has_a_lower_speed_cap(braking):
     # v (T + 0.2) + v^2 / (2a) = 8.7 m
-    cap = speed_cap(250.0, 0.8, RobotLimits(braking_mps2=braking))
+    cap = speed_cap(250.0, 0.8, Bounds(RobotLimits(braking_mps2=braking), 8.7))
     assert cap * 1.25 + cap * cap / (2.0 * braking) == pytest.approx(8.7, abs=1e-4)
 
 
 def test_the_cap_is_no_higher_than_the_speed_of_the_robot():
-    assert speed_cap(250.0, 0.0, RobotLimits(speed_max_mps=1.5)) == 1.5
-    assert speed_cap(250.0, 0.0, RobotLimits(speed_max_mps=9.0)) == 6.0
+    assert speed_cap(250.0, 0.0, Bounds(RobotLimits(speed_max_mps=1.5), 8.7)) == 1.5
+    assert speed_cap(250.0, 0.0, Bounds(RobotLimits(speed_max_mps=9.0), 8.7)) == 6.0
 
 
 @pytest.mark.parametrize(("hold_s", "waited_s"), [(0.1, 10), (11, 11)])
@@ -77,7 +77,7 @@ ANY = st.floats(allow_nan=True, allow_infinity=True)
 VECTORS = st.tuples(ANY, ANY, ANY)
 PLACES = st.tuples(st.floats(-4, 10), st.floats(-9, 6), st.floats(-0.2, 3))
 SPEEDS = st.tuples(*[st.floats(-8, 8)] * 3)
-LOW, HIGH = fence.INNER_LOW, fence.INNER_HIGH
+LOW, HIGH = FENCE.inner_low, FENCE.inner_high
 MANY = settings(max_examples=1000, deadline=None)
 
 
@@ -128,7 +128,7 @@ def test_step_towards_moves_by_at_most_a_step(step):
 @given(SPEEDS, PLACES)
 @MANY
 def test_limit_to_fence_lets_the_robot_stop_before_each_face(velocity, position):
-    axes = zip(fenced(velocity, position), position, fence.LOW, fence.HIGH, strict=True)
+    axes = zip(fenced(velocity, position), position, FENCE.low, FENCE.high, strict=True)
     for v, at, low, high in axes:
         room = high - at if v > 0 else at - low
         assert v == 0.0 or 0.2 * abs(v) + v * v / 6 <= room - 0.1 + 1e-12 or room > 5

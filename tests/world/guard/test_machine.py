@@ -9,6 +9,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from cloudrc.config.load import ResolvedGuard
 from cloudrc.messages import GuardState
 from cloudrc.world.guard.state import Guard
+from tests.fences import FENCE
 from tests.world.guard.conftest import DT, LIMITS, MS, TICK, command, sensed
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -39,7 +40,7 @@ ALLOWED = {
 class GuardMachine(RuleBasedStateMachine):
     @initialize()
     def begin(self):
-        self.guard = Guard(ResolvedGuard(hold_max_s=5.0))
+        self.guard = Guard(ResolvedGuard(hold_max_s=5.0), FENCE)
         self.now_ns = 0
         self.height = 1.0
         self.climb = 0.0

@@ -7,9 +7,9 @@ import pytest
 
 from cloudrc.config.load import ResolvedGuard
 from cloudrc.config.robot import RobotLimits
-from cloudrc.geometry import fence
 from cloudrc.messages import ZERO, Cause, GuardState
 from cloudrc.world.guard.state import Guard
+from tests.fences import FENCE
 from tests.world.guard.conftest import DT, LIMITS, MS, SECOND, command, run
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -18,7 +18,7 @@ MOVES = (1.0, 0.0, 0.0)
 
 
 def tracking(velocity=MOVES, limits=LIMITS, braking=3.0):
-    guard = Guard(limits, RobotLimits(braking_mps2=braking, stop="brake"), planar=True)
+    guard = Guard(limits, FENCE, RobotLimits(braking_mps2=braking, stop="brake"), planar=True)
     guard.start_mission(0)
     assert guard.accept_command(command(velocity), 0) is None
     assert guard.state is TRACK
@@ -63,7 +63,7 @@ def test_the_reference_stays_horizontal_while_the_robot_bounces(climb):
 
 def test_the_walls_of_the_fence_hold_the_robot():
     guard = tracking()
-    wall = (fence.INNER_HIGH[0], 0.0, 0.1)
+    wall = (FENCE.inner_high[0], 0.0, 0.1)
     assert commanded(guard, MOVES, SECOND, wall) == ZERO
     assert guard.counts["limited_fence"]
 
@@ -108,7 +108,7 @@ def test_an_acknowledged_landing_ends_in_ground_at_rest_not_in_hold():
     assert guard.state is GROUND
 
 
-@pytest.mark.parametrize(("x", "moves"), [(1.0, True), (fence.HIGH[0] - 0.1, True), (99.0, False)])
+@pytest.mark.parametrize(("x", "moves"), [(1.0, True), (FENCE.high[0] - 0.1, True), (99.0, False)])
 def test_after_a_stop_it_moves_again_once_it_is_at_rest_inside_the_fence(x, moves):
     guard = tracking()
     place = (x, 2.0, 0.1)
@@ -139,7 +139,7 @@ def test_the_braking_of_the_robot_sets_how_fast_a_hold_slows_down_and_speeds_up(
 
 
 def test_a_robot_that_brakes_less_approaches_the_fence_more_slowly():
-    near = (fence.INNER_HIGH[0] - 1.0, 0.0, 0.1)
+    near = (FENCE.inner_high[0] - 1.0, 0.0, 0.1)
     speeds = []
     for braking in (1.0, 3.0):
         guard = tracking(braking=braking)
@@ -150,7 +150,7 @@ def test_a_robot_that_brakes_less_approaches_the_fence_more_slowly():
 
 
 def test_a_robot_in_the_air_or_water_may_brake_instead_of_landing():
-    guard = Guard(LIMITS, RobotLimits(stop="brake"))
+    guard = Guard(LIMITS, FENCE, RobotLimits(stop="brake"))
     guard.start_mission(0)
     up = (1.0, 2.0, 1.3)
     for now_ns in range(0, SECOND, 10 * MS):

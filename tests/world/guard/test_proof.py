@@ -8,6 +8,7 @@ from cloudrc.world.guard import hold
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.limits import COMMAND_MAX
 from cloudrc.world.guard.state import Guard
+from tests.fences import FENCE
 from tests.world.guard.conftest import LIMITS, everywhere, root
 
 
@@ -26,7 +27,9 @@ def test_a_command_with_one_value_out_of_range_is_rejected():
     def check(run):
         numbers = [run.fresh(name) for name in ("vx", "vy", "vz", "yaw_rate")]
         inside = z3.And([z3.fpAbs(number.term) <= COMMAND_MAX for number in numbers])
-        refused = Guard(LIMITS).accept_command(Command(0, 0, 0, tuple(numbers[:3]), numbers[3]), 0)
+        refused = Guard(LIMITS, FENCE).accept_command(
+            Command(0, 0, 0, tuple(numbers[:3]), numbers[3]), 0
+        )
         assert refused in (None, "range")
         run.prove(z3.Not(inside) if refused else inside)
 

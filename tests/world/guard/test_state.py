@@ -11,6 +11,7 @@ from cloudrc.world.guard.hold import LAND_SPEED, STILL_SPEED
 from cloudrc.world.guard.limits import COMMAND_MAX, ramp_ns
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.readings import Readings
+from tests.fences import FENCE
 from tests.world.guard.conftest import (
     DT,
     HERE,
@@ -49,7 +50,7 @@ def told(guard):
 
 @pytest.mark.promise("only-the-operator-arms")
 def test_fresh_commands_alone_never_arm():
-    guard = Guard(LIMITS)
+    guard = Guard(LIMITS, FENCE)
     assert guard.accept_command(command(), 0) is None
     assert run(guard, 0, 10 * MS) == [None] * 5  # the rotors are stopped
     assert (guard.state, guard.armed, guard.reference, guard.yaw_rate) == (GROUND, False, ZERO, 0.0)
@@ -241,7 +242,7 @@ def test_a_long_hold_in_a_mission_ends_in_land():
 
 def test_with_fresh_commands_it_waits_until_it_may_take_off():
     """A robot that slides after a stop may not take off."""
-    guard = stopped(Guard(LIMITS))
+    guard = stopped(Guard(LIMITS, FENCE))
     guard.acknowledge(0)
     guard.start_mission(0)
     for second in range(1, 120):
@@ -389,7 +390,7 @@ def test_only_an_acknowledgement_leads_out_of_a_latch(make):
     assert (guard.state, guard.armed) == (state, False)
 
 
-@pytest.mark.parametrize("make", [lambda: Guard(LIMITS), armed, tracking, holding, landing])
+@pytest.mark.parametrize("make", [lambda: Guard(LIMITS, FENCE), armed, tracking, holding, landing])
 def test_the_emergency_stop_works_from_everywhere_at_once(make):
     guard = stopped(make(), 3 * SECOND)
     assert run(guard, 3 * SECOND, 3 * SECOND + 10 * MS) == [None] * 5

@@ -20,8 +20,9 @@ import numpy as np
 from cloudrc.config.load import ResolvedGuard
 from cloudrc.config.robot import find_robot
 from cloudrc.config.shipped import file_of
-from cloudrc.geometry import fence
 from cloudrc.geometry.compiled import mujoco
+from cloudrc.geometry.obstacles import fence_of
+from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import Command, Vector
 from cloudrc.robots.pelican import low_level, rotors
 from cloudrc.robots.pelican.low_level import LowLevel
@@ -124,7 +125,8 @@ def make_state(simulator: Simulator, controller: LowLevel, guard: Guard) -> Step
             dt,
         ),
         guard.acceleration_max * STEP,
-        *(fence.INNER_LOW, fence.INNER_HIGH, simulator.dt, radius, ACCELERATION_MAX, STEP_NS),
+        *(guard.fence.inner_low, guard.fence.inner_high),
+        *(simulator.dt, radius, ACCELERATION_MAX, STEP_NS),
         *(CONTACT_CHECK_STEPS, len(obstacles)),
     )
     flight.keep = obstacles, free_model  # else Python frees their memory
@@ -296,7 +298,10 @@ def _self_test() -> str:
     """Fly in C and in Python; return how the results differ, in words; "" if they are equal."""
     limits = ResolvedGuard()
     model = compile_model(find_robot("pelican").model, file_of("empty"))
-    parts = [(Simulator(model, rotors.Rotors(STEP)), LowLevel(), Guard(limits)) for _ in range(2)]
+    fence = fence_of(load_scene("empty"))
+    parts = [
+        (Simulator(model, rotors.Rotors(STEP)), LowLevel(), Guard(limits, fence)) for _ in range(2)
+    ]
     wrong = ""
     try:
         if _fly(Robot(*parts[0])) != _fly(NativeRobot(*parts[1])):

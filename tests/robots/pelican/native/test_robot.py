@@ -13,7 +13,6 @@ from cloudrc import assembly
 from cloudrc.config.load import ResolvedGuard, load_experiment
 from cloudrc.config.robot import DEFAULT_LIMITS, find_robot
 from cloudrc.config.shipped import file_of
-from cloudrc.geometry import fence
 from cloudrc.geometry.compiled import mujoco
 from cloudrc.messages import Command, GuardState
 from cloudrc.robots.pelican.low_level import LowLevel
@@ -26,6 +25,7 @@ from cloudrc.tunnel.end import Identity
 from cloudrc.world.guard import limits as rules
 from cloudrc.world.guard.state import Guard
 from cloudrc.world.robot import Robot
+from tests.fences import FENCE
 from tests.flights.conftest import CLOCK, ring
 from tests.world.conftest import simulate
 from tests.world.guard.conftest import LIMITS, MS, SECOND, UP, Flight, hostile
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.skipif(library().run is None, reason=library().text)
 
 
 def robot_of(kind, scene="empty", limits=LIMITS, model="pelican"):
-    parts = simulate(model, scene), LowLevel(), Guard(limits)
+    parts = simulate(model, scene), LowLevel(), Guard(limits, FENCE)
     return kind(*parts)
 
 
@@ -137,7 +137,7 @@ def test_plans_fly_the_same_in_c(seed):
 def test_a_micrometre_of_room_means_that_no_fence_limits():
     """`ROOM` in `step.c`: velocities with which the robot can just stop that far from a face."""
     rng, found = np.random.default_rng(1), 0
-    low, high = np.array((fence.INNER_LOW, fence.INNER_HIGH))
+    low, high = np.array((FENCE.inner_low, FENCE.inner_high))
     for _ in range(20_000):
         velocity, place, axis = rng.uniform(-6.0, 6.0, 3), rng.uniform(low, high), rng.integers(3)
         slow = (velocity < 0.0) & ([False, False, True])
@@ -179,7 +179,7 @@ def nearest(robot, position):
 
 @pytest.mark.parametrize("kind", ["margin", "gap"])
 def test_where_c_looks_for_no_contact_there_is_none(kind):
-    parts = simulate("pelican", "pipes"), LowLevel(), Guard(LIMITS)
+    parts = simulate("pelican", "pipes"), LowLevel(), Guard(LIMITS, FENCE)
     model, data = parts[0].model, parts[0].data
     rng, free = np.random.default_rng(1), 0
     getattr(model, f"geom_{kind}")[:] = rng.choice([0.0, 0.1], model.ngeom)
@@ -208,7 +208,7 @@ def test_a_tether_holds_the_robot_in_c_too(tmp_path):
 
 @pytest.mark.parametrize("setting", [{"density": 1.2}, {"viscosity": 1e-5}])
 def test_in_air_that_acts_on_geoms_c_uses_the_whole_model(setting):
-    parts = simulate("pelican", "empty"), LowLevel(), Guard(LIMITS)
+    parts = simulate("pelican", "empty"), LowLevel(), Guard(LIMITS, FENCE)
     for name, value in setting.items():
         setattr(parts[0].model.opt, name, value)
     assert NativeRobot(*parts)._flight.robot_radius == inf

@@ -1,0 +1,131 @@
+"""The fence comes from the scene, or from world.fence_m; a wrong one is one line."""
+
+import pytest
+
+from cloudrc.config.load import dump, load_experiment
+from cloudrc.errors import BadInputError, MissingPrerequisiteError
+from cloudrc.geometry import obstacles
+from cloudrc.geometry.fence import Fence
+from cloudrc.geometry.obstacles import fence_of
+from cloudrc.geometry.scene import SCENES, load_scene
+from cloudrc.robots.build import build_robot
+
+NUMERIC = '<numeric name="fence" data="-3 -8.5 0  9.2 5.5 2.5"/>'
+HOVER = "mission={waypoints: [{position_m: [0, 0, 1]}]}"
+
+
+@pytest.fixture
+def own(tmp_path):
+    """Return a function that makes a scene with these bodies, and with a fence or without one."""
+
+    def make(bodies="", fence="", spawn="0 0 .1"):
+        text = (SCENES / "empty.xml").read_text()
+        assert NUMERIC in text
+        text = text.replace(NUMERIC, fence and f'<numeric name="fence" data="{fence}"/>')
+        text = text.replace('pos="0 0 .1"', f'pos="{spawn}"')
+        path = tmp_path / "lab.xml"
+        path.write_text(text.replace("</worldbody>", f"{bodies}</worldbody>"))
+        return str(path)
+
+    return make
+
+
+@pytest.mark.parametrize("name", ["empty", "pillars", "pipes"])
+def test_the_shipped_scenes_declare_their_fence(name):
+    assert load_scene(name).own_fence == Fence((-3.0, -8.5, 0.0), (9.2, 5.5, 2.5))
+
+
+def test_the_fence_of_a_scene_without_one_is_3_m_around_spawn_and_geoms(own):
+    boxes = '<body pos="4 1 1"><geom type="box" size=".5 .2 1" euler="0 0 90"/></body>'
+    fence = fence_of(load_scene(own(boxes)))
+    assert fence.low == pytest.approx((-3.0, -3.0, 0.0))
+    assert fence.high == pytest.approx((7.2, 4.5, 5.0))
+    assert fence_of(load_scene(own())).high == pytest.approx((3.0, 3.0, 3.1))
+
+
+def test_the_fence_begins_at_the_ground_below_the_spawn(own):
+    raised = own('<body><geom type="box" size="1 1 .1" pos="0 0 .4"/></body>', spawn="0 0 .6")
+    assert fence_of(load_scene(raised)).low[2] == pytest.approx(0.5)
+
+
+def test_without_mujoco_only_a_declared_fence_is_known(own, monkeypatch):
+    monkeypatch.setattr(obstacles, "known", lambda scene: False)
+    assert fence_of(load_scene(own(fence="-1 -2 0 1 2 2"))).high == (1.0, 2.0, 2.0)
+    with pytest.raises(MissingPrerequisiteError, match=r"lab: has no fence.*world\.fence_m"):
+        fence_of(load_scene(own()))
+
+
+def test_world_fence_m_replaces_the_fence_and_lowers_the_speed_cap():
+    corners = "[[-1, -1, 0], [2, 1, 2]]"
+    experiment = load_experiment("steps", ["world.fence_m=" + corners, HOVER])
+    # The longest way from the spawn to a wall is 2 m: v 0.45 s + v^2 / 6 = 1.5 m
+    assert experiment.guard.speed_max_mps == pytest.approx(1.9398, abs=1e-3)
+    fence = build_robot(experiment.world, experiment.guard).guard.fence
+    assert (fence.low, fence.high) == ((-1.0, -1.0, 0.0), (2.0, 1.0, 2.0))
+
+
+def test_another_fence_in_a_resolved_experiment_brings_its_own_speed_cap(tmp_path):
+    file = tmp_path / "again.yaml"
+    file.write_text(dump(load_experiment("steps", [HOVER])))
+    again = load_experiment(file, ["world.fence_m=[[-1, -1, 0], [2, 1, 2]]"])
+    assert again.guard.speed_max_mps == pytest.approx(1.9398, abs=1e-3)
+    with pytest.raises(BadInputError, match=r"guard\.speed_max_mps: .*within 1\.5 m"):
+        load_experiment(file, ["world.fence_m=[[-1, -1, 0], [2, 1, 2]]", "guard.speed_max_mps=3"])
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        ("0 0 0 1 1", "fence: data must be 6 numbers"),
+        ("0 0 0 1 1 1 1", "fence: data must be 6 numbers"),
+        ("0 0 0 1 1 nan", "fence: data must be 6 numbers"),
+        ("3 3 2 -3 -3 0", "fence: x, y, z must rise from the first corner to the second"),
+        ("-3 3 0 3 -3 2", "fence: y must rise"),
+        (
+            "-3 -3 0 3 3 .5",
+            r"6 x 6 x 0\.5 m: too small .*take off; .* 0\.8 m high",
+        ),
+        ("-.3 -3 0 .3 3 2", r"0\.6 x 6 x 2 m: too small for the robot to take off"),
+        ("1 -3 0 5 3 2", r"the spawn, \[0, 0, 0\.1\], is outside or too near to a wall"),
+        ("-.1 -3 0 5 3 2", "the spawn.*too near to a wall; it may be at x 0.1 to 4.8"),
+        ("-5 -5 .2 5 5 2", "the spawn.*is outside"),
+    ],
+)
+def test_a_wrong_fence_of_a_scene_is_one_line(own, numbers, words):
+    with pytest.raises(BadInputError, match=words) as error:
+        load_experiment("steps", [f"world.scene={own(fence=numbers)}", HOVER])
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("corners", "words"),
+    [
+        ("[[0, 0, 0]]", "fence_m"),
+        ("[[0, 0], [1, 1]]", "fence_m"),
+        ("[[3, 3, 2], [-3, -3, 0]]", "fence_m: .*x, y, z must rise"),
+        ("[[-3, -3, 0], [3, 3, .5]]", "fence_m: 6 x 6 x 0.5 m: too small"),
+        ("[[1, -3, 0], [3, 3, 2]]", "fence_m: .*the spawn.*is outside"),
+        ("lab", "fence_m: 'lab'"),
+    ],
+)
+def test_a_wrong_world_fence_m_is_named(corners, words):
+    with pytest.raises(BadInputError, match=words):
+        load_experiment("steps", [f"world.fence_m={corners}", HOVER])
+
+
+def test_a_robot_on_the_ground_needs_no_height():
+    low = "world.fence_m=[[-1, -1, 0], [2, 1, .3]]"
+    way = "mission.waypoints=[{position_m: [1, 0]}]"
+    load_experiment("pillars", ["world.scene=empty", low, way])
+    with pytest.raises(BadInputError, match=r"too small for the robot to drive; .* 1 m wide"):
+        load_experiment("pillars", ["world.fence_m=[[-1, -.3, 0], [2, .3, 2]]"])
+
+
+def test_waypoints_steps_and_setpoints_stay_inside_the_fence_of_the_scene(own, tmp_path):
+    scene = f"world.scene={own(fence='-2 -2 0 2 2 2')}"
+    for mission in ("{waypoints: [{position_m: [3, 0, 1]}]}", "{steps: {range_m: [3, 1, .5]}}"):
+        with pytest.raises(BadInputError, match=r"guard lets the robot fly at x -1\.8 to 1\.8, y"):
+            load_experiment("steps", [scene, f"mission={mission}"])
+    (tmp_path / "drive.csv").write_text("time_s,x_m,y_m,z_m\n0,0,0,1\n1,3,0,1\n")
+    with pytest.raises(BadInputError, match=r"line 3: x_m is 3; the guard flies from -1\.8"):
+        load_experiment("steps", [scene, f"mission={{setpoints: {tmp_path}/drive.csv}}"])
