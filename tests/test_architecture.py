@@ -50,7 +50,10 @@ MAY_IMPORT: dict[str, set[str]] = {
     "record": {"endpoint", "files"},
     "metrics": {"metrics.definitions", "record", "config", "geometry", "plugins"},
     "metrics.definitions": set(),  # live metrics import it in every process, with no heavy library
-    "report": {"assembly", "record", "metrics", "config", "geometry", "link", "files", "console"},
+    "report": {
+        *("assembly", "record", "metrics", "config", "geometry", "link", "files", "console"),
+        "world",
+    },
     "console": {"config", "exposition", "geometry", "metrics.definitions", "teleop", "world"},
     "cluster": {"config", "geometry", "link", "record", "report", "teleop"},
     "statistics": set(),
@@ -98,7 +101,6 @@ RESERVED: dict[str, tuple[str, ...]] = {
     "fcntl": ("drivers/local", "cli/console", "runs/lock"),
     "matplotlib": ("report/",),
     "viser": ("console/", "report/replay"),
-    "mjviser": ("console/scene",),
     "mcap": ("record/",),
     "rosbags": ("record/",),
     "kubernetes": ("cluster/",),

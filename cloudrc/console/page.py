@@ -119,9 +119,11 @@ class Page:
     def fill(self, experiment: ResolvedExperiment, feed: FlightFeed, steering: Steering) -> None:
         """Build the scene and the panels; only one browser at a time gets the controls."""
         self._experiment, self._feed, self._steering = experiment, feed, steering
-        from cloudrc.console.scene import LEGEND, FlightScene  # needs MuJoCo, which takes a second
+        from cloudrc.console.scene import LEGEND, FlightScene
+        from cloudrc.world.shapes import read_shapes  # needs MuJoCo, which takes a second
 
-        self._scene = FlightScene(self._server, experiment, ASPECT)
+        shapes = read_shapes(experiment.world)
+        self._scene = FlightScene(self._server, experiment, shapes, ASPECT)
         self._surroundings = scene_of(experiment.world)
         gui = self._server.gui
         gui.main_panel.dock_right()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from cloudrc.drivers.process import EndProcess, Feed, GracefulStop, StopSignal
 from cloudrc.drivers.realtime import Address, Peer, bind
 from cloudrc.drivers.teleop import RemoteTeleop, UnixPeer
 from cloudrc.files import warn_if_readable
+from cloudrc.geometry.shapes import SHAPES_FILE
 from cloudrc.link.state import STATE_FILE
 from cloudrc.link.traces import SIZE_MAX, link_profile
 from cloudrc.link.verify.judge import Flow
@@ -94,7 +96,8 @@ def open_end(settings: EndSettings, name: str) -> tuple[ResolvedExperiment, Iden
     link = settings.route.with_name(STATE_FILE)
     with listening("--listen", settings.listen):
         peer = Peer(bind(settings.listen), settings.route)
-    recorder = open_recorder(settings.record, settings.record_max, name, clock)
+    attached = _shapes(experiment) if name == "world" else {}
+    recorder = open_recorder(settings.record, settings.record_max, name, clock, attached)
     end = EndProcess(
         end=name,
         peer=peer,
@@ -109,13 +112,26 @@ def open_end(settings: EndSettings, name: str) -> tuple[ResolvedExperiment, Iden
     return experiment, Identity(clock, os.urandom(16), keys.ring), end
 
 
-def open_recorder(path: Path, limit: float | None, clock: str, clock_id: bytes) -> Recorder:
+def _shapes(experiment: ResolvedExperiment) -> dict[str, bytes]:
+    """Return the file to attach to a recording: what robot and scene look like."""
+    from cloudrc.world.shapes import read_shapes
+
+    return {SHAPES_FILE: read_shapes(experiment.world).to_bytes()}
+
+
+def open_recorder(
+    path: Path,
+    limit: float | None,
+    clock: str,
+    clock_id: bytes,
+    attached: Mapping[str, bytes] | None = None,
+) -> Recorder:
     """Make the recorder of world or cloud, which writes to `path`.
 
     The recording of a previous process is kept as NAME.before.mcap, because it may show why that
     process ended. `limit` is the largest size of both recordings together [bytes]. `clock` is
     "world" or "cloud", the clock of the stamps; `clock_id` identifies this machine's monotonic
-    clock.
+    clock. `attached` are files to attach: name -> content.
     """
     require("a recording", ("record",))
     from cloudrc.drivers.recording import Recorder
@@ -129,18 +145,21 @@ def open_recorder(path: Path, limit: float | None, clock: str, clock_id: bytes) 
         room = round(0.9 * limit)
         size_max = max(room - kept, room // 10)
     offset_ns = time.time_ns() - time.monotonic_ns()
-    return Recorder(
-        path,
-        lambda file: McapWriter(
+
+    def open_file(file: Path) -> McapWriter:
+        writer = McapWriter(
             file,
             clock=clock,
             clock_id=clock_id.hex(),
             wall_offset_ns=offset_ns,
             code=code_hash(),
             index=False,
-        ),
-        size_max=size_max,
-    )
+        )
+        for name, data in (attached or {}).items():
+            writer.attach(name, data)
+        return writer
+
+    return Recorder(path, open_file, size_max=size_max)
 
 
 def link_monitor(experiment: ResolvedExperiment, *, uplink: bool, trusted: bool) -> LinkMonitor:

@@ -40,10 +40,10 @@ REPEAT = {
 MAIN = {
     "waypoints_reached": "waypoints reached",
     "duration": "mission took",
-    "contact_time": "arm touches the board at",
-    "tip_speed": "speed of the tip at the touch",
+    "contact_time": "first touch at",
+    "tip_speed": "speed at the first touch",
     "steady_contact_force": "steady contact force",
-    "min_clearance": "least clearance in the pipes",
+    "min_clearance": "least clearance",
     "rtt_mean": "round trip, mean",
     "prediction_error_rms": "prediction error, RMS",
     "hold_count": "times in HOLD",

@@ -19,6 +19,7 @@ from cloudrc.console.scene import FlightScene
 from cloudrc.errors import BadInputError
 from cloudrc.metrics import Flight
 from cloudrc.metrics.mission import reported
+from cloudrc.report.shapes import flown_shapes
 
 RATE = 25.0
 """Number of frames per second of flight time."""
@@ -63,7 +64,8 @@ def write_page(flight: Flight, experiment: ResolvedExperiment) -> str:
 
 def _record(server: viser.ViserServer, flight: Flight, experiment: ResolvedExperiment) -> str:
     """Record the flight in the scene of a server; return viser's page with the player."""
-    scene, duration = FlightScene(server, experiment), max(flight.duration, 1e-3)
+    shapes = flown_shapes(flight.recording, experiment)
+    scene, duration = FlightScene(server, experiment, shapes), max(flight.duration, 1e-3)
     truth, control, applied = flight.truth, flight.control, flight.applied
     times = np.linspace(0.0, duration, int(min(duration * RATE, FRAMES_MAX)) + 1)
     true, asked, predicted = (
@@ -73,7 +75,9 @@ def _record(server: viser.ViserServer, flight: Flight, experiment: ResolvedExper
     true = np.maximum(true, 0)
     reached = np.searchsorted(flight.seconds(np.sort([*reported(flight).values()])), times, "right")
     points = np.array([waypoint.position_m for waypoint in flight.mission.waypoints])
-    near = flight.clearance if flight.scene.pipes else np.full(len(truth["stamp_ns"]), np.inf)
+    near = flight.clearance
+    if not len(near):
+        near = np.full(len(truth["stamp_ns"]), np.inf)
     scene.set_trail(truth["position"][true], near[true])
     recorded = server.get_scene_serializer()
     for frame, (row, now) in enumerate(zip(true, times, strict=True)):

@@ -2,7 +2,7 @@
 
 Each moving thing is a frame on `/tf`: `base_link` is the robot's true pose, `estimate` the pose
 that cloud predicted, `setpoint` the position that the controller tracks. `/scene` has one message:
-a marker for each shape. A marker moves with its frame; the pipes have the frame `world`.
+a marker for each body. A marker moves with its frame; the scene has the frame `world`.
 
 `estimate` and `setpoint` have the stamps of `/estimated_odometry`. Each stamp is the time at which
 cloud sent a command.
@@ -10,20 +10,23 @@ cloud sent a command.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.scene import scene_of
-from cloudrc.geometry.scene import Pipe
+from cloudrc.geometry.shapes import Shapes, Surface
+from cloudrc.geometry.tubes import wall
 from cloudrc.metrics import Flight
 from cloudrc.metrics.control import prediction_errors, tracking_errors
 from cloudrc.metrics.flight import Array, Columns, select
 from cloudrc.record.columns import Message, Recording
 from cloudrc.record.ros import encode_view, header, part
-from cloudrc.report.solids import PATH, Face, board_faces, bore, robot_faces, strip
+from cloudrc.report.shapes import flown_shapes
 
 _Colour: TypeAlias = tuple[float, float, float, float]
 _Shape: TypeAlias = tuple[Any, ...]  # arguments of `_marker`, from `name` on
@@ -34,8 +37,11 @@ views would enlarge the file by more than 15 %."""
 SPHERE, LINE_STRIP, TRIANGLE_LIST = 2, 4, 11
 """Types of a ROS marker."""
 LEVEL = (1.0, 0.0, 0.0, 0.0)
-GOAL, GHOST, GLASS = (0.84, 0.37, 0.0), (0.34, 0.71, 0.91), (0.70, 0.74, 0.78)
-"""Colours of setpoint, predicted robot and pipes: red, green, blue in [0, 1]."""
+GOAL, PATH = (0.84, 0.37, 0.0, 0.9), (0.0, 0.45, 0.70, 1.0)
+GHOST, GLASS = (0.34, 0.71, 0.91, 0.45), (0.70, 0.74, 0.78, 0.35)
+"""Colours of setpoint, path, predicted robot and tubes: red, green, blue, opacity in [0, 1]."""
+GOAL_SIZE = 0.12
+"""Largest diameter of the setpoint's ball [m]; that of a small robot is smaller."""
 
 
 def views(recording: Recording, experiment: ResolvedExperiment) -> list[Message]:
@@ -50,14 +56,14 @@ def views(recording: Recording, experiment: ResolvedExperiment) -> list[Message]
     flight = Flight(recording, experiment.criteria, experiment.mission, scene)
     poses, control = _thin({name: truth[name] for name in truth.names}), _thin(flight.control)
     first_ns = int(truth["stamp_ns"][0])
-    faces = robot_faces(experiment.world.robot)
-    ghost = [face._replace(colour=GHOST, opacity=0.45) for face in faces]
-    shapes = [_solid("robot", "base_link", faces), _solid("estimate", "estimate", ghost)]
-    shapes += [("setpoint", SPHERE, "setpoint", 0.12, (*GOAL, 0.9))]
-    shapes += [_solid(pipe.name, "world", _pipe(pipe)) for pipe in scene.pipes]
-    shapes += [_solid("board", "world", board_faces(scene.board))] if scene.board else []
+    bodies = flown_shapes(recording, experiment)
+    shapes = _robot(bodies)
+    size = min(GOAL_SIZE, bodies.size / 4) if bodies.robot else GOAL_SIZE
+    shapes.append(("setpoint", SPHERE, "setpoint", size, GOAL))
+    shapes += [_solid(tube.name, "world", [wall(tube, GLASS, 24)]) for tube in scene.pipes]
+    shapes += _obstacles(bodies, {tube.name for tube in scene.pipes})
     if len(path := poses["position"]) > 1:
-        shapes.append(("path", LINE_STRIP, "world", 0.02, (*PATH, 1.0), path))
+        shapes.append(("path", LINE_STRIP, "world", 0.02, PATH, path))
     markers = [_marker(number, first_ns, *shape) for number, shape in enumerate(shapes)]
     return [
         ("/scene", first_ns, encode_view("/scene", markers)),
@@ -146,20 +152,30 @@ def _marker(
     )
 
 
-def _solid(name: str, frame: str, faces: list[Face]) -> _Shape:
-    """Make a shape of triangles; each triangle has the colour and opacity of its face."""
-    points: list[Any] = []
-    colours: list[_Colour] = []
-    for corners, colour, opacity in faces:
-        for n in range(1, len(corners) - 1):
-            points += [corners[0], corners[n], corners[n + 1]]
-            colours += [(*colour, opacity)] * 3
+def _robot(bodies: Shapes) -> list[_Shape]:
+    """Make the shapes of the robot, and of the robot that cloud predicts."""
+    if not bodies.robot:
+        return []
+    ghost = [replace(surface, rgba=GHOST) for surface in bodies.robot]
+    return [_solid("robot", "base_link", bodies.robot), _solid("estimate", "estimate", ghost)]
+
+
+def _obstacles(bodies: Shapes, tubes: set[str]) -> list[_Shape]:
+    """Make a shape for each body of the scene that is not a tube."""
+    parts: defaultdict[str, list[Surface]] = defaultdict(list)
+    for surface in bodies.scene:
+        if surface.body not in tubes:
+            parts[surface.body].append(surface)
+    return [_solid(body, "world", surfaces) for body, surfaces in parts.items()]
+
+
+def _solid(name: str, frame: str, surfaces: Sequence[Surface]) -> _Shape:
+    """Make a shape of triangles; each triangle has the colour and opacity of its surface."""
+    points = [surface.corners[surface.triangles].reshape(-1, 3) for surface in surfaces]
+    colours = [
+        surface.rgba
+        for surface, corners in zip(surfaces, points, strict=True)
+        for _ in range(len(corners))
+    ]
     several = colours if len(set(colours)) > 1 else []
-    return name, TRIANGLE_LIST, frame, 1.0, colours[0], points, several
-
-
-def _pipe(pipe: Pipe) -> list[Face]:
-    """Build the inner face of a pipe, open at both ends, from 32 flat strips."""
-    across = np.eye(3)[np.abs(pipe.axis).argmin()]
-    low, high = bore(pipe, across, np.pi, 33, 2)
-    return strip(low, high, GLASS, 0.35)
+    return name, TRIANGLE_LIST, frame, 1.0, surfaces[0].rgba, np.concatenate(points), several

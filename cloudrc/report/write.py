@@ -22,6 +22,7 @@ from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
 from cloudrc.record.columns import Recording
 from cloudrc.report.document import Assessment, Run, environment_document, write_json
+from cloudrc.report.shapes import flown_shapes
 
 if TYPE_CHECKING:
     from cloudrc.report.figures.style import Look
@@ -158,9 +159,8 @@ def _write_page(
     from cloudrc.report.page import render
 
     flown = assessment.experiment
-    subject = Subject(
-        assessment.flight, flown.uplink, flown.downlink, look or Look(), flown.world.robot
-    )
+    shapes = flown_shapes(assessment.flight.recording, flown)
+    subject = Subject(assessment.flight, flown.uplink, flown.downlink, look or Look(), shapes)
     try:
         pictures = draw_all(subject)
     except ValueError as error:  # matplotlib cannot draw impossible values

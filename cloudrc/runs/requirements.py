@@ -13,7 +13,7 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "report": ("matplotlib",),
     "kube": ("kubernetes",),
     "api": ("fastapi", "uvicorn"),
-    "console": ("viser", "mjviser"),
+    "console": ("viser",),
 }
 """Name of an extra in pyproject.toml -> the modules that it installs."""
 MODES: dict[str, tuple[str, ...]] = {

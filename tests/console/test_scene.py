@@ -8,6 +8,7 @@ import viser
 from cloudrc.config.load import load_experiment
 from cloudrc.console.scene import FlightScene, clearance_colours
 from cloudrc.geometry.clearance import CLEARANCE_SHOWN
+from cloudrc.world.shapes import read_shapes
 
 
 @pytest.fixture
@@ -15,6 +16,13 @@ def server():
     one = viser.ViserServer("127.0.0.1", 0, verbose=False)
     yield one
     one.stop()
+
+
+def shown(server, name, *sets):
+    """Show an experiment; return the scene, and its nodes by name."""
+    experiment = load_experiment(name, sets)
+    scene = FlightScene(server, experiment, read_shapes(experiment.world))
+    return scene, server.scene._handle_from_node_name
 
 
 def test_the_trail_has_the_colours_of_the_figures():
@@ -25,19 +33,17 @@ def test_the_trail_has_the_colours_of_the_figures():
 
 @pytest.mark.parametrize("name", ["paper", "hover"])
 def test_the_scene_has_the_bodies_of_the_experiment(server, name):
-    FlightScene(server, load_experiment(name))
-    nodes = set(server.scene._handle_from_node_name)
-    assert {"/floor", "/robot/0", "/robot/struts", "/ghost/0"} <= nodes
+    nodes = shown(server, name)[1].keys()
+    assert {"/floor", "/robot/0", "/ghost/0"} <= nodes
     pipes = {node.split("/")[1] for node in nodes if node.endswith("/wall")}
     assert pipes == ({"pipe_1", "pipe_2", "pipe_3"} if name == "paper" else set())
     assert ("/board/0" in nodes) == (name == "paper")
 
 
 def test_another_mission_replaces_waypoints_and_trail(server):
-    scene, points = FlightScene(server, load_experiment("hover")), np.eye(3)
+    (scene, handles), points = shown(server, "hover"), np.eye(3)
     scene.set_waypoints(points, 1)
     scene.set_trail(points, np.array([0.1, np.inf, 0.3]))
-    handles = server.scene._handle_from_node_name
     colours = [handles[f"/waypoints/{number}"].color for number in (1, 2, 3)]
     assert colours[0] != colours[1] == colours[2]
     scene.set_waypoints(points, 2)
@@ -46,3 +52,33 @@ def test_another_mission_replaces_waypoints_and_trail(server):
     scene.set_trail(points[:1], np.zeros(0))
     assert {"/waypoints/2", "/waypoints/2/label", "/trail", "/plan"}.isdisjoint(handles)
     assert handles["/waypoints/1"].color == colours[1]
+
+
+@pytest.mark.parametrize("robot", ["pelican", "x2", "nano", "rover"])
+def test_every_robot_has_its_own_shape_and_colours(server, robot):
+    name = "pillars" if robot == "rover" else "hover"
+    shapes = read_shapes(load_experiment(name, (f"world.robot={robot}",)).world)
+    nodes = shown(server, name, f"world.robot={robot}")[1]
+    meshes = [
+        node for path, node in nodes.items() if path.startswith("/robot/") and "size" not in path
+    ]
+    assert len(meshes) == len({surface.rgba for surface in shapes.robot}) > 1
+    corners = np.concatenate([mesh.vertices for mesh in meshes])
+    assert 2 * np.linalg.norm(corners, axis=1).max() == pytest.approx(shapes.size, rel=1e-5)
+    colours = {tuple(mesh.color) for mesh in meshes}
+    wanted = {tuple(round(255 * part) for part in surface.rgba[:3]) for surface in shapes.robot}
+    assert all(any(np.allclose(a, b, atol=1) for b in wanted) for a in colours)
+
+
+def test_balls_of_setpoint_and_waypoints_do_not_hide_a_small_robot(server):
+    scene, nodes = shown(server, "hover", "world.robot=nano")
+    scene.set_waypoints(np.eye(3), 0)
+    size = read_shapes(load_experiment("hover", ("world.robot=nano",)).world).size
+    assert max(nodes["/setpoint"].radius, nodes["/waypoints/1"].radius) < size / 4
+
+
+@pytest.mark.parametrize("robot", ["nano", "pelican"])
+def test_a_robot_that_is_hard_to_see_has_its_size_as_a_label(server, robot):
+    far = "mission.waypoints=[{position_m: [8, 4, 1]}, {position_m: [8, -8, 1]}]"
+    nodes = shown(server, "hover", f"world.robot={robot}", far)[1]
+    assert ("/robot/size" in nodes) == (robot == "nano")

@@ -6,15 +6,18 @@ from dataclasses import replace
 import matplotlib
 import numpy as np
 import pytest
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, PolyCollection
 
+from cloudrc.config.load import load_experiment
 from cloudrc.config.schema import Direction
+from cloudrc.geometry.shapes import Shapes, box, terrain
 from cloudrc.records import Control
-from cloudrc.report.figures import FIGURES, draw_all, overview, own_settings
+from cloudrc.report.figures import FIGURES, draw_all, own_settings
 from cloudrc.report.figures.labels import FREE, place_labels
+from cloudrc.report.figures.projection import View, glass, simplified
 from cloudrc.report.figures.style import RC, Look, Subject
-from cloudrc.report.solids import robot_faces
-from tests.metrics.conftest import ONE_PIPE, START, flown
+from cloudrc.world.shapes import read_shapes
+from tests.metrics.conftest import ONE_PIPE, OPEN_AIR, START, flown
 
 CALM = Direction(delay_ms=50.0)
 
@@ -68,11 +71,11 @@ def covered(figure):
     for axes in figure.axes:
         labels = [text for text in axes.texts if text.get_gid() == FREE]
         points, boxes = samples(figure, axes), [label.get_window_extent() for label in labels]
-        for label, box in zip(labels, boxes, strict=True):
-            on_curve = ((points > box.min) & (points < box.max)).all(axis=1).any()
+        for label, place in zip(labels, boxes, strict=True):
+            on_curve = ((points > place.min) & (points < place.max)).all(axis=1).any()
             outer = axes.bbox.padded(1)
-            inside = outer.contains(*box.min) and outer.contains(*box.max)
-            if on_curve or box.count_overlaps(boxes) > 1 or not inside:
+            inside = outer.contains(*place.min) and outer.contains(*place.max)
+            if on_curve or place.count_overlaps(boxes) > 1 or not inside:
                 wrong.append(label.get_text())
     return wrong
 
@@ -126,8 +129,98 @@ def test_text_stays_text_and_a_flight_in_real_time_has_a_date(monkeypatch):
     assert b"D:19700102" in picture.files["pdf"]
 
 
-def test_a_robot_whose_shape_is_not_known_is_a_marker_and_the_caption_says_so():
-    pelican = subject_of(flown())
-    assert overview.MARKED in overview.caption(replace(pelican, robot="rover"))
-    assert overview.MARKED not in overview.caption(pelican)
-    assert len(robot_faces("rover")) < len(robot_faces())
+def drawn(name, robot="pelican", experiment="hover", log=None, scene=OPEN_AIR):
+    """Draw a figure of a robot that flies through `scene`; return subject and figure."""
+    world = load_experiment(experiment, (f"world.robot={robot}",)).world
+    shapes = read_shapes(world)
+    subject = Subject((log or flown()).flight(scene), CALM, CALM, shapes=shapes)
+    with own_settings(Look()):
+        return subject, FIGURES[name][0](subject)
+
+
+def polygons(axes):
+    """Return the corners of all drawn polygons, each with its colour."""
+    return [
+        (path.vertices[:-1], tuple(colour))
+        for collection in axes.collections
+        if isinstance(collection, PolyCollection)
+        for path, colour in zip(collection.get_paths(), collection.get_facecolors(), strict=False)
+    ]
+
+
+@pytest.mark.parametrize("robot", ["pelican", "x2", "nano"])
+def test_the_overview_has_the_robot_in_its_size_and_colours(robot):
+    log = flown(lambda seconds: (0.0, 0.0, 1.0))
+    subject, figure = drawn("overview", robot, log=log)
+    found = polygons(figure.axes[0])
+    width = np.ptp(np.concatenate([corners for corners, _ in found]), axis=0).max()
+    assert 0.6 * subject.shapes.size < width < 1.05 * subject.shapes.size
+    parts = {surface.rgba[3] for surface in subject.shapes.robot}
+    assert {round(colour[3], 3) for _, colour in found} == {round(part, 3) for part in parts}
+
+
+def test_an_inset_enlarges_a_robot_that_is_too_small_to_see():
+    for robot, insets in (("nano", 1), ("pelican", 0)):
+        subject, figure = drawn("overview", robot, scene=ONE_PIPE)
+        (axes,) = figure.axes
+        assert len(axes.child_axes) == insets
+        assert ("inset" in FIGURES["overview"][1](subject)) == bool(insets)
+    subject, figure = drawn("overview", "nano", scene=ONE_PIPE)
+    (inset,) = figure.axes[0].child_axes
+    corners = np.concatenate([corners for corners, _ in polygons(inset)])
+    assert np.ptp(inset.get_xlim()) < 2 * np.ptp(corners, axis=0).max()
+    (bar,) = inset.lines
+    assert inset.texts[0].get_text() == f"{np.ptp(bar.get_xdata()) * 100:g} cm"
+
+
+def test_a_robot_on_the_ground_has_no_panels_with_its_height():
+    log = flown(lambda seconds: (seconds, np.sin(seconds), 0.1))
+    subject, figure = drawn("flight", "rover", "pillars", log)
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles[0] == "(a) from above"
+    assert not any("height" in title for title in titles)
+    assert "eight" not in FIGURES["flight"][1](subject)
+    _, figure = drawn("odom", "rover", "pillars", log)
+    assert [axes.get_ylabel() for axes in figure.axes] == ["$x$ (m)", "$y$ (m)"]
+
+
+def test_the_view_from_above_has_every_obstacle_and_the_robot():
+    log = flown(lambda seconds: (seconds, 1.0, 0.1))
+    subject, figure = drawn("flight", "rover", "pillars", log)
+    patches = [each.get_xy() for each in figure.axes[0].patches]
+    bodies = {surface.body for surface in subject.shapes.scene}
+    assert len(patches) == len(bodies) + len(subject.shapes.robot)
+    centres = {tuple(np.round((each.max(0) + each.min(0)) / 2, 2) + 0.0) for each in patches}
+    assert {(1.5, 0.0), (3.5, 2.5), (1.5, -2.2)} <= centres
+
+
+def test_what_is_above_the_robot_is_an_outline():
+    roof = replace(box((5.0, 5.0, 0.1)), body="roof").placed((5.0, 0.0, 4.0), np.eye(3))
+    block = replace(box((0.5, 0.5, 0.5)), body="block").placed((5.0, 2.0, 0.5), np.eye(3))
+    subject = replace(subject_of(flown()), shapes=Shapes(scene=(roof, block)))
+    with own_settings(Look()):
+        figure = FIGURES["flight"][0](subject)
+    widths = {
+        round(float(np.ptp(each.get_xy()[:, 0]))): each.get_facecolor()[3]
+        for each in figure.axes[0].patches
+    }
+    assert widths == {10: 0.0, 1: 1.0}
+
+
+def test_an_obstacle_in_front_of_the_path_is_translucent():
+    near, far = (
+        replace(box((1.0, 0.1, 1.0)), body=name).placed((5.0, y, 1.0), np.eye(3))
+        for name, y in (("near", -1.0), ("far", 1.0))
+    )
+    view = View(np.array([1.0, 0.0, 0.0]), np.radians(38.0))
+    path = np.stack([np.linspace(0, 10, 50), np.zeros(50), np.ones(50)], axis=1)
+    assert (view.hides(near, path), view.hides(far, path)) == (True, False)
+    assert {part.colours[0, 3] for part in glass(view, near)} == {0.3, 0.8}
+
+
+def test_a_mesh_loses_details_that_are_smaller_than_a_dot():
+    fine = terrain(np.zeros((60, 60)), 1.0, 1.0, 0.1)
+    mesh = replace(fine, faces=(fine.triangles,))
+    few = simplified(mesh, 0.2)
+    assert len(few.triangles) < len(mesh.triangles) / 20
+    assert np.abs(few.corners).max() == pytest.approx(1.0)

@@ -43,11 +43,11 @@ def test_the_page_says_what_the_flight_did(folder):
     for said in (
         "The mission succeeded.",
         "waypoints reached7 mission took31.14 s",
-        "arm touches the board at27.87 s",
-        "least clearance in the pipes0.153 m",
+        "first touch at27.87 s",
+        "least clearance0.153 m",
         "cloudrc run config.yaml --mode virtual",
         recording.sha256,
-        "Panel (c) ends at 0.8 m",
+        "its axis ends at 0.8 m",
         "says nothing about how accurate the estimate is",
     ):
         assert said in text

@@ -101,7 +101,7 @@ def _time_axis(axes: Axes, subject: Subject) -> None:
     axes.set_xlabel(TIME)
 
 
-ODOM_ALT = "Three line plots of the x, y and z position over time: reference, measured, estimated."
+ODOM_ALT = "Line plots of the position per axis over time: reference, measured, estimated."
 ODOM = (
     "Position per axis, as cloud knew it. Reference: the setpoint that the controller tracks. "
     "Measured: the newest odometry that had arrived. Estimated: the prediction from which the "
@@ -126,10 +126,11 @@ LINES: dict[str, dict[str, Any]] = {
 
 def draw_odom(subject: Subject) -> Figure:
     """Draw reference, measured and estimated position, one panel per axis."""
-    figure, control = new_figure(4.2, subject.look.width), subject.flight.control
+    names = "xy" if subject.shapes.planar else "xyz"
+    figure, control = new_figure(1.4 * len(names), subject.look.width), subject.flight.control
     time = subject.flight.seconds(control["stamp_ns"])
-    rows = figure.subplots(3, 1, sharex=True)
-    for index, (axes, name) in enumerate(zip(rows, "xyz", strict=True)):
+    rows = figure.subplots(len(names), 1, sharex=True)
+    for index, (axes, name) in enumerate(zip(rows, names, strict=True)):
         panel(axes, "abc"[index])
         for column, look in LINES.items():
             axes.plot(time, control[column][:, index], **look)
@@ -146,7 +147,8 @@ def draw_odom(subject: Subject) -> Figure:
 def _draw_inset(rows: Any, subject: Subject) -> None:
     """Draw an inset that enlarges a large step of the setpoint, in a free place of its panel."""
     control = subject.flight.control
-    time, jumps = subject.flight.seconds(control["stamp_ns"]), np.diff(control["setpoint"], axis=0)
+    time = subject.flight.seconds(control["stamp_ns"])
+    jumps = np.diff(control["setpoint"][:, : len(rows)], axis=0)
     largest = np.argsort(-np.abs(jumps), axis=None)[:9]
     steps = np.transpose(np.unravel_index(largest, jumps.shape)).tolist()
     steps = [(row, axis) for row, axis in steps if abs(jumps[row, axis]) > STEP_MIN]

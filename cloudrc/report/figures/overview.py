@@ -1,173 +1,311 @@
-"""Draw the overview: the scene with pipes cut open, the path, and the robot at some instants.
+"""Draw the overview: the scene with tubes cut open, the path, and the robot at some instants.
 
-All bodies consist of small convex polygons, which are drawn from back to front.
+All bodies consist of flat convex polygons, which are drawn from back to front.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import chain, pairwise
+from itertools import chain
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
-from cloudrc.geometry import clearance as body
-from cloudrc.geometry.scene import Pipe
-from cloudrc.metrics.flight import Array
+from cloudrc.geometry.scene import FLOOR
+from cloudrc.geometry.shapes import Array, Surface, rotation
+from cloudrc.geometry.tubes import cut_open
+from cloudrc.metrics import Flight
 from cloudrc.metrics.mission import first_touch
 from cloudrc.report.figures.labels import free_label
-from cloudrc.report.figures.style import LIGHT, Subject, new_figure
-from cloudrc.report.solids import DRAWN, PATH, PIPE, Face, board_faces, bore, robot_faces, strip
+from cloudrc.report.figures.projection import Polygons, View, glass, lighter, simplified, split
+from cloudrc.report.figures.style import (
+    BLACK,
+    GREY,
+    LIGHT,
+    Subject,
+    distance_moved,
+    new_figure,
+    own_bodies,
+)
 
-ALT = (
-    "A drawing of the scene in perspective from above: pipes cut open, board, path, and the robot."
-)
+ALT = "A drawing of the scene in perspective from above: obstacles, the path, and the robot."
 CAPTION = (
-    "Overview. The whole path, and the robot at up to six instants, evenly spaced by distance "
-    "flown until the contact or the end. Pose and scale are true, pipes are cut open "
-    "towards the reader, floor tiles are 1 m wide."
+    "Overview. The whole path, and the robot at up to six instants, evenly spaced by the distance "
+    "moved until the contact or the end. Pose and scale are true."
 )
-MARKED = "A marker stands for the robot; obstacles other than pipes and board are not drawn."
-"""Further sentence of the caption for a robot other than the Pelican."""
-ROBOTS, APART = 6, 0.6
-"""Largest number of robots in the drawing, and the smallest distance between two of them [m]."""
+ROBOTS = 6
+"""Largest number of robots in the drawing."""
 ELEVATION = np.radians(38.0)
 """Angle of the view above the horizontal plane [rad]."""
-MARGIN, SMALLEST = 0.6, 4.0
-"""Space around path and obstacles, and smallest width of the part that is drawn [m]."""
+USUAL, MARGIN, SMALLEST, APART = 0.85, 0.6, 4.0, 0.7
+"""For a robot of USUAL size: space around path and obstacles, smallest width of the part that is
+drawn, and smallest distance between two of the robots [m]. For a smaller robot they are less."""
+NEAR = np.array([1.0, 1.0, 2.2])
+"""Distance from the path along x, y and z up to which obstacles are in the drawing [m]."""
 FLATTEST, TALLEST = 0.3, 0.6
 """Limits of the drawing's ratio of height to width."""
-WALL_COLOUR = (0.45, 0.48, 0.52)
+ROUND = 0.6
+"""Ratio of a path's width to its length above which the direction of view does not follow it."""
+ASKEW = np.radians(20.0)
+"""Angle from x to the picture's horizontal for such a path [rad]: bodies show two sides."""
+TINY = 0.2
+"""Size in print below which an inset enlarges the robot [in]."""
+INSET, ENLARGED = 0.2, 0.7
+"""Width of the inset, as a share of the drawing, and of the robot, as a share of the inset."""
+PATH, CUT = (0.0, 0.45, 0.70, 1.0), (0.45, 0.48, 0.52, 1.0)
+"""Colours of the path and of the wall of a cut tube: red, green, blue, opacity in [0, 1]."""
+TUBE = (0.86, 0.88, 0.90, 1.0)
+"""Colour of the inner face of a cut tube."""
+PALE = 0.45
+"""Share of white in the colours of the scene, so that robot and path stand out."""
+DOT = 0.004
+"""Width of the smallest details that are drawn [in]."""
+
+
+class _Stage:
+    """The part of the world that the overview of a flight shows, and the view of it."""
+
+    def __init__(self, subject: Subject) -> None:
+        flight, shapes = subject.flight, subject.shapes
+        self.path, self.robot = flight.truth["position"], shapes.robot
+        self.planar = shapes.planar
+        self.turns, self.scene = flight.truth["orientation_wxyz"], flight.scene
+        self.obstacles = own_bodies(subject)
+        self.scale = min(shapes.size / USUAL, 1.0) if shapes.robot else 1.0
+        points = np.concatenate([self._places(), self._near()])
+        self.view = View(_horizontal(self._places(), self._front()), ELEVATION)
+        self.shown = self._project(points)
+        self.middle, self.size = self._frame()
+        self.rows = self._instants(flight)
+        self.tile = 1.0 if self.size[0] > 3.0 else 0.1
+        per_metre = subject.look.width / float(self.size[0])
+        self.dot = DOT / per_metre
+        self.is_tiny = bool(self.rows) and 0.0 < shapes.size * per_metre < TINY
+
+    def _places(self) -> Array:
+        """Return the places that must be in the drawing [m], shape (n, 3)."""
+        tubes = [
+            (np.array(each.centre), np.array(each.axis) * each.length) for each in self.scene.pipes
+        ]
+        ends = [centre + side * along for centre, along in tubes for side in (-0.5, 0.5)]
+        found: list[Any] = [[self.scene.spawn], self.path, np.reshape(ends, (-1, 3))]
+        if self.has_shadow:
+            found.append(self.shadow)
+        return np.concatenate(found)
+
+    @property
+    def has_shadow(self) -> bool:
+        """Whether the path's shadow on the floor shows its height; tubes would hide it."""
+        return not (self.planar or self.scene.pipes)
+
+    @property
+    def shadow(self) -> Array:
+        """The path, moved down to the floor [m], shape (n, 3)."""
+        return np.asarray(self.path * (1, 1, 0) + (0, 0, self.scene.floor))
+
+    def _near(self) -> Array:
+        """Return corners of the obstacles near the path, up to `NEAR` from it [m], shape (n, 3)."""
+        around = self._places()
+        low, high = around.min(axis=0) - NEAR, around.max(axis=0) + NEAR
+        found = [np.zeros((0, 3))]
+        for surface in self.obstacles:
+            corners = surface.corners
+            if (corners.min(axis=0) <= high).all() and (corners.max(axis=0) >= low).all():
+                found.append(np.clip(corners, low, high))
+        return np.concatenate(found)
+
+    def _front(self) -> Array | None:
+        """Return the direction from the first tube to the spawn, from where tubes are seen."""
+        tubes = self.scene.pipes
+        return np.subtract(self.scene.spawn, tubes[0].centre) if tubes else None
+
+    def _project(self, points: Array) -> Array:
+        """Return `points` [m], shape (n, 3), and all tubes in the picture [m], shape (m, 2)."""
+        cut = [cut_open(tube, self.view.towards, TUBE, CUT) for tube in self.scene.pipes]
+        walls = [surface.corners for surface in chain(*cut)]
+        return self.view.project(np.concatenate([points, *walls]))
+
+    def _frame(self) -> tuple[Array, Array]:
+        """Return middle and size [m] of the part of the picture that is drawn, shape (2,)."""
+        middle = (self.shown.max(axis=0) + self.shown.min(axis=0)) / 2
+        size = np.ptp(self.shown, axis=0) + 2 * MARGIN * self.scale
+        least = SMALLEST * self.scale
+        size = np.maximum(size, (least, least * FLATTEST))
+        ratio = float(np.clip(size[1] / size[0], FLATTEST, TALLEST))
+        return middle, np.maximum(size, (size[1] / ratio, size[0] * ratio))
+
+    def _instants(self, flight: Flight) -> list[int]:
+        """Choose the rows of the true states at which to draw the robot.
+
+        The rows are at equal distances along the path, up to the first touch. Leave out a row where
+        the robot would be too near to a robot that is already drawn.
+        """
+        stamps, touch = flight.truth["stamp_ns"], first_touch(flight)
+        if touch is not None:
+            stamps = stamps[stamps <= touch["stamp_ns"]]
+        if not len(stamps):
+            return []
+        way = distance_moved(self.path[: len(stamps)])
+        wanted = way[-1] * np.arange(ROBOTS) / (ROBOTS - 1)
+        apart = max(APART * self.scale, APART / 10 * float(self.size[0]) / SMALLEST)
+        rows: list[int] = []
+        for row in np.minimum(np.searchsorted(way, wanted), len(stamps) - 1).tolist():
+            position = self.view.project(self.path[[row, *rows]])
+            if not rows or np.linalg.norm(position[1:] - position[0], axis=1).min() > apart:
+                rows.append(row)
+        return rows
+
+    def robot_at(self, row: int) -> list[Surface]:
+        """Return the robot at a row of the true states."""
+        axes = rotation(self.turns[row])
+        small = [simplified(surface, self.dot) for surface in self.robot]
+        return [surface.placed(self.path[row], axes) for surface in small]
+
+    def surroundings(self, robots: Array) -> list[Polygons]:
+        """Return the scene; what hides path or `robots` [m], shape (n, 3), is translucent."""
+        found = []
+        shown = np.concatenate([self.path[::10], robots])
+        for surface in self.obstacles:
+            surface = replace(surface, rgba=lighter(surface.rgba, PALE))
+            if surface.body != FLOOR and len(shown) and self.view.hides(surface, shown):
+                found += glass(self.view, surface)
+            else:
+                found += self.view.polygons([split(simplified(surface, self.dot))])
+        for tube in self.scene.pipes:
+            found += self.view.polygons(cut_open(tube, self.view.towards, TUBE, CUT))
+        return found
+
+
+def _horizontal(points: Array, front: Array | None) -> Array:
+    """Return the unit vector that is from left to right in the drawing, shape (3,).
+
+    It is along the longer side of `points` [m], shape (n, 3), or near x if no side is longer. The
+    viewer is in the direction `front` [m], shape (3,); None: x increases to the right.
+    """
+    level = points[:, :2] - points[:, :2].mean(axis=0)
+    _, sizes, axes = np.linalg.svd(level, full_matrices=False)
+    x, y = axes[0]
+    if front is None and sizes[-1] > ROUND * sizes[0]:
+        x, y = np.cos(ASKEW), np.sin(ASKEW)
+    right = np.array([x, y, 0.0])
+    is_behind = (x, y) < (0.0, 0.0) if front is None else front[:2] @ (y, -x) < 0
+    return -right if is_behind else right
 
 
 def caption(subject: Subject) -> str:
     """Return the caption of the figure."""
-    return CAPTION + (f" {MARKED}" if subject.robot != DRAWN else "")
-
-
-def _robot(robot: str, position: Array, orientation_wxyz: Array) -> list[Face]:
-    faces = robot_faces(robot)
-    points = body.Spheres(np.concatenate([face.corners for face in faces]), np.zeros(0))
-    placed = body.place_points(points, position[None], orientation_wxyz[None])[0]
-    corners = np.split(placed, np.cumsum([len(face.corners) for face in faces])[:-1])
-    return [face._replace(corners=each) for face, each in zip(faces, corners, strict=True)]
-
-
-def _pipe(pipe: Pipe, view: _View) -> list[Face]:
-    """Build the half of a pipe that is farther from the viewer."""
-    stations = 1 + max(1, round(pipe.length / 0.25))
-    inner = bore(pipe, view.towards, np.pi / 2, 17, stations)
-    outer = bore(replace(pipe, inner=pipe.outer), view.towards, np.pi / 2, 17, stations)
-    faces = [face for pair in pairwise(inner) for face in strip(*pair, PIPE)]
-    for edge in (0, -1):
-        faces += strip(inner[:, edge], outer[:, edge], WALL_COLOUR)
-    return faces
-
-
-class _View:
-    """A parallel projection of the scene, with the scene's longer side as the horizontal."""
-
-    def __init__(self, points: Array, front: Array) -> None:
-        """Choose the direction of view for `points` [m], world frame, shape (n, 3).
-
-        The vector `front`, world frame, shape (3,), points from the scene towards the viewer.
-        """
-        level = points[:, :2] - points[:, :2].mean(axis=0)
-        x, y = np.linalg.svd(level, full_matrices=False)[2][0]
-        if front[:2] @ (y, -x) < 0:
-            x, y = -x, -y
-        right = np.array([x, y, 0.0])
-        self.towards = np.array([y * np.cos(ELEVATION), -x * np.cos(ELEVATION), np.sin(ELEVATION)])
-        self._sides = np.stack([right, np.cross(self.towards, right)], axis=1)
-
-    def project(self, points: Array) -> Array:
-        """Project points [m], world frame, shape (..., 3), to the image [m], shape (..., 2)."""
-        return np.asarray(points @ self._sides)
-
-    def draw_faces(self, axes: Axes, faces: list[Face]) -> None:
-        """Draw faces from back to front; a face is brightest if light meets it at a right angle."""
-        faces = sorted(faces, key=lambda face: float((face.corners @ self.towards).mean()))
-        light = (self.towards + self._sides[:, 1]) / np.sqrt(2)
-        colours = []
-        for face in faces:
-            shade = 1.0
-            if len(face.corners) > 2:
-                a, b, c = face.corners[:3]
-                normal = np.cross(b - a, c - b)
-                shade = 0.62 + 0.38 * abs(float(normal @ light)) / float(np.linalg.norm(normal))
-            colours.append((*(shade * np.array(face.colour)), face.opacity))
-        polygons = [self.project(face.corners) for face in faces]
-        widths = [0.15 if len(face.corners) > 2 else 1.2 for face in faces]
-        drawn = PolyCollection(
-            polygons, facecolors=colours, edgecolors=colours, linewidths=widths, zorder=1
-        )
-        axes.add_collection(drawn)
+    stage = _Stage(subject)
+    text = CAPTION
+    if subject.flight.scene.pipes:
+        text += " Tubes are cut open towards the reader."
+    if stage.obstacles:
+        text += " Obstacles in front of the path are translucent."
+    if stage.is_tiny:
+        text += " Circles mark the robot, which the inset enlarges."
+    return f"{text} Floor tiles are {stage.tile:g} m wide."
 
 
 def draw(subject: Subject) -> Figure:
     """Draw the overview of the flight in one panel."""
-    truth, scene = subject.flight.truth, subject.flight.scene
-    rows, path = _instants(subject), truth["position"]
-    # The ends of the pipes' axes are enough to choose the view. The start is before the first pipe.
-    axes_ends = [(np.array(pipe.centre), np.array(pipe.axis) * pipe.length) for pipe in scene.pipes]
-    ends = [centre + side * along for centre, along in axes_ends for side in (-0.5, 0.5)]
-    points = np.concatenate([[scene.spawn], path, np.reshape(ends, (-1, 3))])
-    view = _View(points, scene.spawn - (axes_ends[0][0] if ends else np.array(scene.spawn)))
-    robots = [_robot(subject.robot, path[row], truth["orientation_wxyz"][row]) for row in rows]
-    faces = [face for pipe in scene.pipes for face in _pipe(pipe, view)]
-    faces += [*chain(*robots), *(board_faces(scene.board) if scene.board else [])]
-    shown = view.project(np.concatenate([points, *[face.corners for face in faces]]))
-    steps = path[np.append(np.arange(0, len(path) - 1, 5), len(path) - 1)] if len(path) else path
-    faces += [Face(np.stack(pair), PATH) for pair in pairwise(steps)]
-    middle, size = (shown.max(axis=0) + shown.min(axis=0)) / 2, np.ptp(shown, axis=0) + 2 * MARGIN
-    size = np.maximum(size, (SMALLEST, SMALLEST * FLATTEST))
-    ratio = float(np.clip(size[1] / size[0], FLATTEST, TALLEST))
-    size = np.maximum(size, (size[1] / ratio, size[0] * ratio))
-    figure = new_figure(subject.look.width * ratio, subject.look.width)
+    stage, flight = _Stage(subject), subject.flight
+    view, path = stage.view, stage.path
+    width = subject.look.width
+    figure = new_figure(width * float(stage.size[1] / stage.size[0]), width)
     axes = figure.subplots()
     axes.set_axis_off()
     axes.set_aspect("equal")
-    axes.set_xlim(middle[0] - size[0] / 2, middle[0] + size[0] / 2)
-    axes.set_ylim(middle[1] - size[1] / 2, middle[1] + size[1] / 2)
-    _draw_floor(axes, view, points, scene.floor)
-    view.draw_faces(axes, faces)
+    (left, low), (right, high) = (stage.middle + side * stage.size / 2 for side in (-1, 1))
+    axes.set(xlim=(left, right), ylim=(low, high))
+    _draw_floor(axes, stage)
+    robots = [stage.robot_at(row) for row in stage.rows]
+    corners = [np.concatenate([each.corners for each in robot]) for robot in robots if robot]
+    parts = stage.surroundings(np.concatenate([np.zeros((0, 3)), *corners]))
+    parts += view.polygons(chain(*robots))
+    steps = path[np.append(np.arange(0, len(path) - 1, 5), len(path) - 1)] if len(path) else path
+    if len(steps) > 1:
+        lines = np.stack([steps[:-1], steps[1:]], axis=1)
+        size = subject.shapes.size
+        distance = np.linalg.norm(lines[:, None, 0] - path[stage.rows], axis=2).min(axis=1)
+        for near, behind in ((distance < size / 2, size), (distance >= size / 2, 0.0)):
+            parts.append(Polygons(lines[near], np.tile(PATH, (near.sum(), 1)), behind=behind))
+    view.draw(axes, parts)
     axes.plot(*view.project(steps).T, lw=0)  # invisible, but labels avoid it
-    for row, robot in zip(rows, robots, strict=True):
-        axes.plot(*view.project(np.concatenate([face.corners for face in robot])).T, lw=0)
-        time = subject.flight.seconds(truth["stamp_ns"][row])
-        free_label(axes, f"{time:.1f} s", view.project(path[row]))
+    for points in corners:
+        axes.plot(*view.project(points).T, lw=0)
+    for row in stage.rows:
+        place = view.project(path[row])
+        if stage.is_tiny:
+            axes.plot(*place, "o", ms=9, mfc="none", mec=GREY, mew=0.6, zorder=6)
+        free_label(axes, f"{flight.seconds(flight.truth['stamp_ns'][row]):.1f} s", place)
+    if stage.is_tiny:
+        _draw_inset(axes, stage, subject)
     return figure
 
 
-def _draw_floor(axes: Axes, view: _View, points: Array, height: float) -> None:
-    """Draw floor tiles, 1 m wide, below `points` and around them; `height` is z [m]."""
-    (x0, y0), (x1, y1) = np.floor(points.min(0)[:2]) - 4, np.ceil(points.max(0)[:2]) + 4
-    lines = [[(x, y0, height), (x, y1, height)] for x in np.arange(x0, x1 + 1)]
-    lines += [[(x0, y, height), (x1, y, height)] for y in np.arange(y0, y1 + 1)]
-    for line in lines:
-        axes.plot(*view.project(np.array(line)).T, color=LIGHT, lw=0.4, zorder=0)
+def _draw_floor(axes: Axes, stage: _Stage) -> None:
+    """Draw floor tiles, and above a floor without tubes the path's shadow."""
+    view, height = stage.view, stage.scene.floor
+    reach = float(stage.size.max()) / np.sin(ELEVATION)
+    x, y = (view.lift(stage.middle[None], 0.0)[0] + _down(view, stage, height))[:2]
+    start = np.floor(np.array([x, y]) / stage.tile - reach / stage.tile) * stage.tile
+    count = int(2 * reach / stage.tile) + 2
+    ends = start + count * stage.tile
+    for n in range(count + 1):
+        at = start + n * stage.tile
+        for line in (
+            [(at[0], start[1], height), (at[0], ends[1], height)],
+            [(start[0], at[1], height), (ends[0], at[1], height)],
+        ):
+            axes.plot(*view.project(np.array(line)).T, color=LIGHT, lw=0.4, zorder=0)
+    if stage.has_shadow:
+        axes.plot(*view.project(stage.shadow).T, color=GREY, lw=0.7, alpha=0.5, zorder=0)
 
 
-def _instants(subject: Subject) -> list[int]:
-    """Choose the rows of the true states at which to draw the robot.
+def _down(view: View, stage: _Stage, height: float) -> Array:
+    """Return the way from the middle of the picture along the view to the floor [m], shape (3,)."""
+    at = view.lift(stage.middle[None], 0.0)[0]
+    return np.asarray((height - at[2]) / view.towards[2] * view.towards)
 
-    The rows are at equal distances along the path, up to the first touch of the board. Leave out a
-    row where the robot would be less than APART from a robot that is already drawn.
-    """
-    truth, touch = subject.flight.truth, first_touch(subject.flight)
-    stamps = truth["stamp_ns"]
-    if touch is not None:
-        stamps = stamps[stamps <= touch["stamp_ns"]]
-    if not len(stamps):
-        return []
-    steps = np.linalg.norm(np.diff(truth["position"][: len(stamps)], axis=0), axis=1)
-    way = np.concatenate([[0.0], np.cumsum(steps)])
-    wanted = way[-1] * np.arange(ROBOTS) / (ROBOTS - 1)
-    rows: list[int] = []
-    for row in np.minimum(np.searchsorted(way, wanted), len(stamps) - 1).tolist():
-        position = truth["position"][[row, *rows]]
-        if not rows or np.linalg.norm(position[1:] - position[0], axis=1).min() > APART:
-            rows.append(row)
-    return rows
+
+def _draw_inset(axes: Axes, stage: _Stage, subject: Subject) -> None:
+    """Enlarge the robot, as it is at rest, in the corner with the least behind it."""
+    ratio = float(stage.size[1] / stage.size[0])
+    height = INSET / ratio
+    shares = (stage.shown - stage.middle) / stage.size + 0.5
+
+    def covered(place: tuple[float, float]) -> int:
+        inside = (shares >= place) & (shares <= np.add(place, (INSET, height)))
+        return int(inside.all(axis=1).sum())
+
+    corners = [(x, y) for y in (1.0 - height, 0.0) for x in (1.0 - INSET, 0.0)]
+    left, low = min(corners, key=covered)
+    inset = axes.inset_axes((left, low, INSET, height))
+    inset.set(xticks=[], yticks=[], aspect="equal")
+    inset.spines[:].set(visible=True, color=GREY, linewidth=0.6)
+    inset.grid(visible=False)
+    stage.view.draw(inset, stage.view.polygons(stage.robot))
+    points = stage.view.project(np.concatenate([each.corners for each in stage.robot]))
+    middle = (points.max(axis=0) + points.min(axis=0)) / 2
+    half = float(np.ptp(points, axis=0).max()) / ENLARGED / 2
+    inset.set_xlim(middle[0] - half, middle[0] + half)
+    inset.set_ylim(middle[1] - 1.2 * half, middle[1] + 0.8 * half)
+    bar = _round_length(half)
+    low = middle[1] - 1.0 * half
+    inset.plot([middle[0] - bar / 2, middle[0] + bar / 2], [low, low], color=BLACK, lw=1.5)
+    inset.annotate(
+        f"{bar * 100:g} cm",
+        (middle[0], low),
+        (0, 2),
+        textcoords="offset points",
+        ha="center",
+        va="bottom",
+        fontsize="small",
+    )
+
+
+def _round_length(most: float) -> float:
+    """Return the largest of 1, 2 and 5 times a power of ten up to `most` [m]."""
+    power = 10.0 ** np.floor(np.log10(most))
+    return float(max(each for each in (power, 2 * power, 5 * power) if each <= most))

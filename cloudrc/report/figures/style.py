@@ -9,10 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cloudrc.config.schema import Direction
+from cloudrc.geometry.scene import BOARD
+from cloudrc.geometry.shapes import Shapes, Surface
 from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Array
 
@@ -24,6 +27,7 @@ BLACK, GREY, LIGHT, BORE = "#1a1a1a", "#6b6b6b", "#d9d9d9", "#f4f4f4"
 BLUE, SKY, GREEN = "#0072B2", "#56B4E9", "#009E73"
 ORANGE, VERMILION, PURPLE = "#E69F00", "#D55E00", "#CC79A7"
 UPLINK, DOWNLINK = BLUE, ORANGE
+NOTHING = Shapes()
 REFERENCE, MEASURED, ESTIMATED = BLACK, ORANGE, BLUE
 
 RC: dict[Any, Any] = {
@@ -103,10 +107,27 @@ def dots(axes: Axes, x: Array, y: Array, colour: str, name: str, size: float = 1
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """A flight, the two link profiles at its start, and the look of the flight's figures."""
+    """What the figures show: a flight, and the two link profiles at its start."""
 
     flight: Flight
     uplink: Direction
     downlink: Direction
     look: Look = Look()
-    robot: str = "pelican"  # as in `world.robot`
+    shapes: Shapes = NOTHING  # of robot and scene
+
+    @property
+    def touch(self) -> str | None:
+        """Name of the body that the mission touches; None if there is none."""
+        return BOARD if self.flight.criteria.contact is not False else None
+
+
+def own_bodies(subject: Subject) -> list[Surface]:
+    """Return the surfaces of a scene that are not those of tubes: the file gives their shape."""
+    tubes = {tube.name for tube in subject.flight.scene.pipes}
+    return [surface for surface in subject.shapes.scene if surface.body not in tubes]
+
+
+def distance_moved(path: Array) -> Array:
+    """Return the distance along a path [m], shape (n, 3), up to each of its points [m]."""
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    return np.concatenate([np.zeros(min(len(path), 1)), np.cumsum(steps)])

@@ -1,0 +1,129 @@
+"""Read the shapes of a robot and its scene from the compiled model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from cloudrc.config.robot import find_robot
+from cloudrc.config.schema import World
+from cloudrc.config.shipped import file_of
+from cloudrc.geometry import shapes
+from cloudrc.geometry.compiled import mujoco
+from cloudrc.geometry.scene import FLOOR
+from cloudrc.geometry.shapes import Rgba, Shapes, Surface
+from cloudrc.world.scene import bodies_of_geoms, compile_model
+
+_GEOM = mujoco.mjtGeom
+SHOWN = 3
+"""Number of the first group of geoms that MuJoCo's viewers do not show: usually, geoms of groups
+below show a robot, and those of this group are its coarser shape for contacts."""
+UNSET: Rgba = (0.5, 0.5, 0.5, 1.0)
+"""Colour of a geom without a colour; then its material has the colour."""
+WIDE = 20.0
+"""Half the edge of a plane without a size [m]."""
+
+
+def read_shapes(world: World) -> Shapes:
+    """Compile the robot and its scene, and return their shapes.
+
+    Raises:
+        BadInputError: If robot or scene are missing or unsuitable.
+    """
+    robot = find_robot(world.robot)
+    return shapes_of(compile_model(robot.model, file_of(world.scene)), planar=robot.planar)
+
+
+def shapes_of(model: Any, *, planar: bool) -> Shapes:
+    """Return the shapes of a compiled `MjModel` of a robot in a scene.
+
+    Joints are at rest. Planes of the body `floor` are left out, because viewers draw the floor as a
+    grid. `planar` tells whether the robot stays on the ground.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    base = model.jnt_bodyid[0]
+    places, turns = data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3)
+    position, axes = data.xpos[base], data.xmat[base].reshape(3, 3)
+    bodies = bodies_of_geoms(model)
+    robot: list[Surface] = []
+    scene: list[Surface] = []
+    for geom in _shown(model, bodies):
+        body = bodies[geom]
+        surface = _surface(model, geom)
+        is_ground = body == FLOOR and model.geom_type[geom] == _GEOM.mjGEOM_PLANE
+        if is_ground or surface is None:
+            continue
+        surface = replace(surface, body=body, rgba=_rgba(model, geom))
+        surface = surface.placed(places[geom], turns[geom])
+        if body:
+            scene.append(surface)
+        else:
+            robot.append(surface.placed(-position @ axes, axes.T))
+    return Shapes(tuple(robot), tuple(scene), planar)
+
+
+def _shown(model: Any, bodies: list[str]) -> list[int]:
+    """Return the geoms to draw; `bodies` has the name of each geom's body.
+
+    A body of which a viewer of MuJoCo would show nothing is drawn whole.
+    """
+    visible = [geom for geom in range(model.ngeom) if _rgba(model, geom)[3] > 0.0]
+    usual = [geom for geom in visible if model.geom_group[geom] < SHOWN]
+    known = {bodies[geom] for geom in usual}
+    return sorted(usual + [geom for geom in visible if bodies[geom] not in known])
+
+
+def _rgba(model: Any, geom: int) -> Rgba:
+    """Return the colour of a geom, or of its material; of a texture, the mean colour."""
+    own, material = tuple(map(float, model.geom_rgba[geom])), model.geom_matid[geom]
+    if material < 0 or own != UNSET:
+        return own  # type: ignore[return-value]
+    r, g, b, opacity = map(float, model.mat_rgba[material])
+    for texture in model.mat_texid[material]:
+        if texture >= 0 and (channels := model.tex_nchannel[texture]) >= 3:
+            first = model.tex_adr[texture]
+            last = first + model.tex_width[texture] * model.tex_height[texture] * channels
+            mean = model.tex_data[first:last].reshape(-1, channels)[:, :3].mean(axis=0) / 255
+            return r * float(mean[0]), g * float(mean[1]), b * float(mean[2]), opacity
+    return r, g, b, opacity
+
+
+def _surface(model: Any, geom: int) -> Surface | None:
+    """Return the surface of a geom in its own frame; None for a type without one."""
+    kind, size = _GEOM(model.geom_type[geom]), model.geom_size[geom].tolist()
+    number = model.geom_dataid[geom]
+    if kind == _GEOM.mjGEOM_BOX:
+        return shapes.box(size)
+    if kind == _GEOM.mjGEOM_CYLINDER:
+        return shapes.cylinder(*size[:2])
+    if kind == _GEOM.mjGEOM_CAPSULE:
+        return shapes.globe(size[:1] * 3, size[1])
+    if kind == _GEOM.mjGEOM_SPHERE:
+        return shapes.globe(size[:1] * 3)
+    if kind == _GEOM.mjGEOM_ELLIPSOID:
+        return shapes.globe(size)
+    if kind == _GEOM.mjGEOM_PLANE:
+        return shapes.sheet(*(each or WIDE for each in size[:2]))
+    if kind == _GEOM.mjGEOM_HFIELD:
+        return _terrain(model, number)
+    if number >= 0:  # a mesh, or the mesh of a signed distance field
+        return _mesh(model, number)
+    return None
+
+
+def _mesh(model: Any, number: int) -> Surface:
+    first, count = model.mesh_vertadr[number], model.mesh_vertnum[number]
+    corners = model.mesh_vert[first : first + count].astype(float)
+    first, count = model.mesh_faceadr[number], model.mesh_facenum[number]
+    return Surface("", corners, (model.mesh_face[first : first + count].astype(np.int32),))
+
+
+def _terrain(model: Any, number: int) -> Surface:
+    rows, columns = model.hfield_nrow[number], model.hfield_ncol[number]
+    first = model.hfield_adr[number]
+    half_x, half_y, height, base = model.hfield_size[number].tolist()
+    heights = height * model.hfield_data[first : first + rows * columns].reshape(rows, columns)
+    return shapes.terrain(heights.astype(float), half_x, half_y, base)
