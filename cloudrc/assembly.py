@@ -20,7 +20,7 @@ from cloudrc.config import schema
 from cloudrc.config.load import ResolvedExperiment
 from cloudrc.config.overrides import build_plugin, build_predictor
 from cloudrc.config.robot import facts, is_planar
-from cloudrc.config.scene import fence_in
+from cloudrc.config.scene import steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, read_setpoints
 from cloudrc.geometry.fence import Fence
 from cloudrc.link.model import LinkDirection
@@ -94,7 +94,7 @@ def start_mission(experiment: ResolvedExperiment, now_ns: int = 0) -> Teleop:
     """Make a teleop that flies the experiment's mission from `now_ns` [ns] on, cloud's clock."""
     from cloudrc.teleop.store import Mission, Order
 
-    teleop = Teleop(fence_in(experiment.world))
+    teleop = Teleop(steered_in(experiment.world))
     order = Order(build_plan(experiment), contact=bool(experiment.criteria.contact))
     teleop.start(now_ns, Mission("m1", order, ONLY_MISSION))
     return teleop
@@ -219,7 +219,7 @@ def build_plan(experiment: ResolvedExperiment) -> Plan:
         experiment.mission,
         experiment.criteria.time_limit_s,
         experiment.seed,
-        fence=fence_in(experiment.world),
+        fence=steered_in(experiment.world),
         speed_max=experiment.guard.speed_max_mps,
     )
 

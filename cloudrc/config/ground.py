@@ -36,8 +36,6 @@ def check_heights(mission: Mission, scene: Scene) -> list[Problem]:
 
 
 def _heights(mission: Mission, height: float) -> Iterator[Problem]:
-    if mission.setpoints is not None:
-        yield Problem(("setpoints",), "", f"have heights, {ABOVE}; give waypoints")
     steps = mission.steps
     if steps is not None and (steps.range_m[2] or abs(steps.centre_m[2] - height) > SAME):
         reason = (

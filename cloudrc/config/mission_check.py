@@ -9,6 +9,7 @@ it, as in the paper's mission.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -102,7 +103,8 @@ def check_mission(
         return problems
     fence = fence_of(scene)
     if mission.setpoints is not None:
-        return _check_setpoints(Path(mission.setpoints), fence)
+        steered = replace(fence, ground=scene.spawn[2]) if planar else fence
+        return _check_setpoints(Path(mission.setpoints), steered)
     known = obstacles(scene, contact=contact)
     if mission.steps is not None:
         reason = _check_steps(mission.steps, known, fence, planar=planar)

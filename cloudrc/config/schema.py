@@ -303,8 +303,8 @@ class Mission(Section):
     """Random setpoints in place of waypoints"""
     setpoints: str | None = None
     """CSV file with the columns time_s,x_m,y_m,z_m, in place of waypoints: the position of the
-    setpoint over time, with straight lines between the rows. A drive by hand writes such a file,
-    drive.csv"""
+    setpoint over time, with straight lines between the rows. A robot on the ground needs no z_m. A
+    drive by hand writes such a file, drive.csv"""
     carrot: Carrot | None = None
     """Moves the setpoint at limited speed from waypoint to waypoint; null: the setpoint jumps"""
 

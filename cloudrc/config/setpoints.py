@@ -26,15 +26,22 @@ def read_setpoints(path: Path, fence: Fence) -> tuple[TimedPosition, ...]:
     """Read the setpoints of a mission; the time of the first row becomes 0.
 
     Raise a BadInputError if the file is not usable, or if it leads out of the box in which the
-    guard lets the robot fly inside `fence`.
+    guard lets the robot fly inside `fence`. A robot that stays on the ground needs no column z_m.
     """
-    name, found = f"setpoints {path}", list[TimedPosition]()
-    columns, rows = read_rows(read_lines(path, name, f"give a CSV file: {','.join(COLUMNS)}"), name)
-    if columns != COLUMNS:
+    name, found, ground = f"setpoints {path}", list[TimedPosition](), fence.ground
+    fits = COLUMNS if ground is None else COLUMNS[:3]
+    columns, rows = read_rows(read_lines(path, name, f"give a CSV file: {','.join(fits)}"), name)
+    if columns not in (COLUMNS, fits):
         given = ",".join(columns)[:80] or "missing"
-        raise BadInputError(f"{name}, line 1: the columns are {given}; give {','.join(COLUMNS)}")
+        raise BadInputError(f"{name}, line 1: the columns are {given}; give {','.join(fits)}")
     for row in rows:
-        time, x, y, z = map(row.number, COLUMNS)
+        time, x, y, *heights = map(row.number, columns)
+        z = heights[0] if heights else fence.inner_low[2]
+        if ground is not None and abs(z - ground) > ROUNDING:
+            raise BadInputError(
+                f"{row.where}: z_m is {z:g}, but the robot stays on the ground, at {ground:g}; "
+                "leave the column z_m out"
+            )
         if found and time <= found[-1][0]:
             raise BadInputError(
                 f"{row.where}: time_s {time:g} does not rise; sort the rows by time"

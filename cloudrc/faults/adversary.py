@@ -156,15 +156,16 @@ def at_bad_moments(rng: Generator, fence: Fence) -> Words:
 def _faces(fence: Fence, position: Vector) -> list[tuple[float, int, float]]:
     """Return for each wall and the ceiling: distance [m], axis, direction on the axis (1 or -1)."""
     walls = [(p - fence.low[n], n, -1.0) for n, p in enumerate(position) if n < 2]
-    return [(fence.high[n] - p, n, 1.0) for n, p in enumerate(position)] + walls
+    other = [(fence.high[n] - p, n, 1.0) for n, p in enumerate(position)]
+    return (other if fence.ground is None else other[:2]) + walls
 
 
-def dishonesty(schedule: Schedule, fence: Fence, *, planar: bool) -> tuple[list[Lie], Words | None]:
+def dishonesty(schedule: Schedule, fence: Fence) -> tuple[list[Lie], Words | None]:
     """Return the functions by which the cloud of a schedule attacks: ([], None) if it is honest.
 
     The functions in the list change commands. The function after the list forges operator requests;
     it is None if the policy forges no requests. `fence` is that of the scene. Most clouds send no
-    vertical velocity to a `planar` robot, because it refuses such commands.
+    vertical velocity to a robot that stays on the ground, because it refuses such commands.
 
     Raises:
         BadInputError: If the policy does not exist; the message lists all policies.
@@ -175,7 +176,7 @@ def dishonesty(schedule: Schedule, fence: Fence, *, planar: bool) -> tuple[list[
         names = ", ".join(POLICIES)
         raise BadInputError(f"no policy '{schedule.policy}' of a cloud; there are: {names}")
     lies = [POLICIES[schedule.policy](generator(schedule.seed, 666), fence)]
-    if planar and generator(schedule.seed, 668).random() < FLAT_SHARE:
+    if fence.ground is not None and generator(schedule.seed, 668).random() < FLAT_SHARE:
         lies.append(_flat)
     speaks = schedule.policy in SPEAKING
     return lies, at_bad_moments(generator(schedule.seed, 667), fence) if speaks else None

@@ -16,7 +16,7 @@ from cloudrc.cloud.operator import Operator
 from cloudrc.config import shipped
 from cloudrc.config.load import load_experiment
 from cloudrc.config.robot import is_planar
-from cloudrc.config.scene import fence_in
+from cloudrc.config.scene import steered_in
 from cloudrc.config.schema import World
 from cloudrc.drivers.teleop import PERIOD_NS as WAKE_NS
 from cloudrc.drivers.virtual import Clock, VirtualRun
@@ -75,8 +75,8 @@ class FaultRun:
         offset = schedule.cloud_offset % OFFSET_MAX  # no clock shows a negative time
         self._clock = Clock(round(offset * 1e9), schedule.cloud_drift)
         self._clock_id = OTHER if has_own_clock else SHARED
-        self._fence = fence_in(self.experiment.world)
-        policy, self._words = dishonesty(schedule, self._fence, planar=is_planar(robot))
+        self._fence = steered_in(self.experiment.world)
+        policy, self._words = dishonesty(schedule, self._fence)
         mistakes = [bugs(schedule, self._clock)] if schedule.of(*BUGS) else []
         self._lies = [*policy, *mistakes, *lies]
         self._honest, self._keep, self._life = honest and not schedule.policy, keep, life

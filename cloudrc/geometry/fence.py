@@ -38,18 +38,21 @@ class Fence:
 
     low: Vector  # corner with the smallest coordinates [m]; the ground is at its height
     high: Vector  # corner with the largest coordinates [m]
+    ground: float | None = None  # height of a base that stays on the ground [m]; None: it may fly
 
     @cached_property
     def inner_low(self) -> Vector:
         """Lower corner of the box in which the guard lets the robot fly [m], world frame."""
         x, y, z = self.low
-        return (x + WALL_MARGIN, y + WALL_MARGIN, z + FLOOR_MARGIN)
+        lowest = z + FLOOR_MARGIN if self.ground is None else self.ground
+        return (x + WALL_MARGIN, y + WALL_MARGIN, lowest)
 
     @cached_property
     def inner_high(self) -> Vector:
         """Upper corner of the box in which the guard lets the robot fly [m], world frame."""
         x, y, z = self.high
-        return (x - WALL_MARGIN, y - WALL_MARGIN, z - WALL_MARGIN)
+        highest = z - WALL_MARGIN if self.ground is None else self.ground
+        return (x - WALL_MARGIN, y - WALL_MARGIN, highest)
 
     def contains(self, position: Vector) -> bool:
         """Return whether a base at `position` [m], world frame, shape (3,), is inside the fence."""

@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING
 from cloudrc import assembly
 from cloudrc.config.load import ResolvedExperiment, read_experiment
 from cloudrc.config.robot import is_planar
-from cloudrc.config.scene import scene_of
+from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.drivers.link_news import LinkNews
 from cloudrc.drivers.process import Feed, GracefulStop, StopSignal
 from cloudrc.drivers.realtime import Address
 from cloudrc.drivers.teleop import TeleopLoop, UnixPeer
 from cloudrc.files import write_atomically
-from cloudrc.geometry.obstacles import fence_of
 from cloudrc.geometry.scene import Scene
 from cloudrc.processes.ports import open_exporter, warn, warn_if_exposed
 from cloudrc.records import Counted, Fault, Record
@@ -73,7 +72,8 @@ def run_teleop(settings: TeleopSettings, stop: StopSignal) -> None:
         book = _open_store(settings.journal, stop, server.bridge)
         if book is not None:  # None: stopped while another teleop process locked the journal
             opened.callback(book.close)
-            touch_speed, fence = experiment.criteria.contact_speed_max_mps, fence_of(scene)
+            touch_speed = experiment.criteria.contact_speed_max_mps
+            fence = steered_in(experiment.world)
             service = MissionService(touch_speed, book, fence, scene)
             if settings.start:
                 contact = bool(experiment.criteria.contact)
@@ -100,12 +100,13 @@ def serve_api(settings: TeleopSettings, experiment: ResolvedExperiment, scene: S
         warn_if_exposed(settings.api)
     bridge, contact = Bridge(), bool(experiment.criteria.contact)
     planar = is_planar(experiment.world.robot)
+    grounded = f"the robot {Path(experiment.world.robot).name}" if planar else ""
     speed_max = experiment.guard.speed_max_mps
-    plan = partial(assembly.mission_plan, fence=fence_of(scene), speed_max=speed_max)
+    plan = partial(assembly.mission_plan, fence=steered_in(experiment.world), speed_max=speed_max)
     order = partial(read_order, scene=scene, contact=contact, planar=planar, plan=plan)
     tokens = Tokens(settings.tokens, log_line) if settings.tokens else None
     goto = partial(read_goto, scene=scene, planar=planar)
-    app = create_app(bridge, order, goto, partial(read_drive, planar=planar), log_line)
+    app = create_app(bridge, order, goto, partial(read_drive, grounded=grounded), log_line)
     server = ApiServer(Gate(app, tokens, Audit(settings.audit, log_line)), bridge, settings.api)
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     files = FILES_MAX if hard == resource.RLIM_INFINITY else min(FILES_MAX, hard)

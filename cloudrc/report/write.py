@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cloudrc.config.load import ResolvedExperiment
-from cloudrc.config.scene import scene_of
+from cloudrc.config.scene import scene_of, steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.errors import BadInputError, CloudrcError, describe_error
 from cloudrc.files import read, write_atomically
-from cloudrc.geometry.obstacles import fence_of, known, obstacles
+from cloudrc.geometry.fence import Fence
+from cloudrc.geometry.obstacles import known, obstacles
 from cloudrc.geometry.scene import Pipe
 from cloudrc.metrics import Flight, measure_all
 from cloudrc.metrics.verdict import flight_evidence, judge, operator_verdict
@@ -119,7 +120,7 @@ def write_report(
     document = assessment.document
     write_json(folder / "report.json", document)
     environment = _environment(folder / "environment.json", assessment)
-    if driven := _driven(assessment.flight):
+    if driven := _driven(assessment.flight, steered_in(experiment.world)):
         write_atomically(folder / DRIVE_FILE, driven.encode())
     if page:
         _write_page(folder, assessment, environment, look)
@@ -136,7 +137,7 @@ def _environment(path: Path, assessment: Assessment) -> dict[str, Any]:
     return document
 
 
-def _driven(flight: Flight) -> str:
+def _driven(flight: Flight, fence: Fence) -> str:
     """Return the setpoints of the operator's drive by hand, as CSV; "" if nobody drove."""
     mission, control = flight.during("/mission"), flight.control
     begins_ns = mission["stamp_ns"][mission["event"] == "driving"]
@@ -148,7 +149,7 @@ def _driven(flight: Flight) -> str:
         return ""
     times = (control["stamp_ns"][rows] - begins_ns[0]) * 1e-9
     setpoints = zip(times.tolist(), control["setpoint"][rows].tolist(), strict=True)
-    return write_setpoints(setpoints, fence_of(flight.scene))
+    return write_setpoints(setpoints, fence)
 
 
 def _write_page(

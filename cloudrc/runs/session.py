@@ -11,7 +11,7 @@ from pathlib import Path
 
 from cloudrc.assembly import with_order
 from cloudrc.config.load import ResolvedExperiment, dump, read_experiment
-from cloudrc.config.scene import fence_in
+from cloudrc.config.scene import steered_in
 from cloudrc.config.setpoints import DRIVE_FILE, write_setpoints
 from cloudrc.drivers.local import JOURNAL_FILE, under_way
 from cloudrc.errors import BadInputError, NothingFlownError
@@ -47,7 +47,7 @@ def read_last_mission(folder: Path) -> tuple[Recording, ResolvedExperiment, bool
     session = read_experiment(config, flown=True)
     if last.order.plan.by_hand:  # rest at the start, until the report has the setpoints
         rest = [(time, last.order.plan.legs[0].position) for time in (0.0, 1.0)]
-        drive = write_setpoints(rest, fence_in(session.world))
+        drive = write_setpoints(rest, steered_in(session.world))
         (folder / DRIVE_FILE).write_text(drive, encoding="utf-8")
     about = f"Mission {last.id} ({last.order.name}), the last one of a session"
     experiment = with_order(session, last.order, about)

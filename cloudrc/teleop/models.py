@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from cloudrc.config.ground import ABOVE, on_ground, put_on_ground
+from cloudrc.config.ground import on_ground, put_on_ground
 from cloudrc.config.mission_check import check_mission
 from cloudrc.config.problems import Problem as ConfigProblem
 from cloudrc.config.problems import from_pydantic
@@ -286,14 +286,15 @@ def read_goto(body: bytes, scene: Scene, *, planar: bool = False) -> Leg:
     return Leg(position, radians(request.yaw_deg))
 
 
-def read_drive(body: bytes, *, planar: bool = False) -> Vector:
+def read_drive(body: bytes, *, grounded: str = "") -> Vector:
     """Read the velocity [m/s] in a request's body; raise a RefusedError that lists all problems.
 
-    A `planar` robot stays on the ground: it has no vertical velocity.
+    `grounded` is the name of a robot that stays on the ground, so that it has no vertical velocity;
+    "" for other robots.
     """
     velocity = _parse(body, DriveRequest).velocity_mps
-    if planar and velocity[2] != 0.0:
-        reason = f"leads up or down, {ABOVE}; set it to 0"
+    if grounded and velocity[2] != 0.0:
+        reason = f"leads up or down, but {grounded} stays on the ground; set it to 0"
         raise RefusedError([ConfigProblem(("velocity_mps", "2"), f"{velocity[2]:g}", reason)])
     return velocity
 

@@ -53,11 +53,34 @@ def test_a_mission_that_leads_off_the_ground_or_away_is_refused_in_one_line(sett
     assert "\n" not in str(error.value)
 
 
-def test_a_file_of_setpoints_has_heights(tmp_path):
-    file = tmp_path / "drive.csv"
-    file.write_text("time_s,x_m,y_m,z_m\n0,0,0,1\n1,1,0,1\n")
-    with pytest.raises(BadInputError, match="setpoints: have heights, but the robot stays on"):
-        load_experiment("steps", [*ROVER, f"mission={{setpoints: {file}}}"])
+@pytest.mark.parametrize(
+    ("head", "z", "message"),
+    [
+        ("time_s,x_m,y_m", "", ""),
+        ("time_s,x_m,y_m,z_m", ",0.1", ""),
+        ("time_s,x_m,y_m,z_m", ",1", "line 2: z_m is 1, but the robot stays on the ground, at 0.1"),
+        ("time_s,x_m", "", "the columns are time_s,x_m; give time_s,x_m,y_m$"),
+    ],
+)
+def test_a_file_of_setpoints_needs_no_height_and_has_no_other_one(tmp_path, head, z, message):
+    file, columns = tmp_path / "mine.csv", head.count(",") + 1
+    rows = [",".join(row.split(",")[:columns]) for row in (f"0,0,0{z}", f"4,1,0.5{z}")]
+    file.write_text("\n".join([head, *rows]))
+    settings = [*ROVER, f"mission={{setpoints: {file}}}"]
+    if message:
+        with pytest.raises(BadInputError, match=message):
+            load_experiment("steps", settings)
+        return
+    flight = cloudrc.fly("steps", {"world.robot": "rover", "mission": {"setpoints": str(file)}})
+    assert flight.verdict == "success"
+    assert flight["/ground_truth"]["position"][-1, :2] == pytest.approx((1.0, 0.5), abs=0.2)
+
+
+def test_a_robot_that_flies_needs_the_heights_of_setpoints(tmp_path):
+    file = tmp_path / "mine.csv"
+    file.write_text("time_s,x_m,y_m\n0,0,0\n1,1,0\n")
+    with pytest.raises(BadInputError, match="give time_s,x_m,y_m,z_m"):
+        load_experiment("steps", [f"mission={{setpoints: {file}}}"])
 
 
 def test_steps_in_the_plane_are_driven():
@@ -110,12 +133,15 @@ def test_teleop_takes_two_numbers_and_refuses_heights():
 
 
 @pytest.mark.parametrize(
-    ("z", "planar", "fits"), [(0, True, True), (0.5, True, False), (0.5, False, True)]
+    ("z", "grounded", "fits"), [(0, "rover", True), (0.5, "rover", False), (0.5, "", True)]
 )
-def test_a_drive_up_or_down_is_refused(z, planar, fits):
+def test_a_drive_up_or_down_is_refused(z, grounded, fits):
     body = json.dumps({"velocity_mps": [1, 0, z]}).encode()
     if fits:
-        assert read_drive(body, planar=planar) == (1.0, 0.0, z)
+        assert read_drive(body, grounded=grounded) == (1.0, 0.0, z)
     else:
-        with pytest.raises(RefusedError, match=r"velocity_mps.2: 0.5: leads up or down"):
-            read_drive(body, planar=planar)
+        with pytest.raises(
+            RefusedError,
+            match=r"velocity_mps.2: 0.5: leads up or down, but rover stays on the ground",
+        ):
+            read_drive(body, grounded=grounded)
