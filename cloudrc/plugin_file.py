@@ -20,7 +20,9 @@ from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import CodeType, ModuleType
-from typing import Any
+from typing import Any, TypeAlias
+
+from cloudrc.patience import telling_if_slow
 
 PREFIX = "cloudrc_plugin_"
 """Beginning of the names of plug-ins' packages."""
@@ -28,10 +30,36 @@ OWN = "cloudrc"
 """Name that always means this package: a plug-in may lie in the folder of its sources."""
 
 
-def load_file(path: Path) -> ModuleType:
-    """Execute the file of a plug-in anew, and the modules beside it that it imports."""
+_State: TypeAlias = list[tuple[Path, int, int]]
+_unused: dict[Path, tuple[_State, ModuleType]] = {}
+"""File of a plug-in -> the module that was executed for a look at it, and nothing built from."""
+
+
+def load_file(path: Path, *, look: bool = False) -> ModuleType:
+    """Execute the file of a plug-in, and the modules beside it that it imports.
+
+    With `look`, the caller only looks at the module, so that the next call may return the same
+    module. Else the next call executes the file anew: no flight sees what another has left there.
+    """
     if path.suffix != ".py":
         raise ValueError("it is not a Python file; name it *.py")
+    file, state = path.resolve(), _state(path)
+    before, module = _unused.pop(file, (None, None))
+    if module is None or before != state:
+        with telling_if_slow(f"{path} is still being imported"):
+            module = _execute(path)
+    if look:
+        _unused[file] = state, module
+    return module
+
+
+def _state(path: Path) -> _State:
+    """Return what changes with any of the plug-in's files."""
+    states = [(file, file.stat()) for file in sources(path)]
+    return [(file, each.st_mtime_ns, each.st_size) for file, each in states]
+
+
+def _execute(path: Path) -> ModuleType:
     file = path.resolve()
     name = PREFIX + sha256(str(file).encode(errors="surrogateescape")).hexdigest()[:16]
     for known in [each for each in sys.modules if f"{each}.".startswith(f"{name}.")]:

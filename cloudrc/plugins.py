@@ -90,7 +90,7 @@ def signature(kind: str, name: str) -> inspect.Signature:
 
 def load(kind: str, name: str, /, **parameters: Any) -> Any:
     """Find a plug-in and build it; raise a BadInputError if it is missing or its `build` fails."""
-    build, method = builder(kind, name), METHODS[kind]
+    build, method = builder(kind, name, look=False), METHODS[kind]
     with refuse_failure(f"{_one(kind)} {name!r} cannot be built"):
         plugin = build(**parameters)
         if not callable(getattr(plugin, method, None)):
@@ -99,15 +99,18 @@ def load(kind: str, name: str, /, **parameters: Any) -> Any:
     return plugin
 
 
-def find(kind: str, name: str) -> Any:
-    """Import a plug-in by name or path; return its module, or the object of an entry point."""
+def find(kind: str, name: str, *, look: bool = True) -> Any:
+    """Import a plug-in by name or path; return its module, or the object of an entry point.
+
+    With `look`, the caller only looks at what the file defines; it neither builds nor measures.
+    """
     if is_path(name) and not Path(name).is_file():
         raise BadInputError(f"{_one(kind)} {name!r}: there is no such file")
     with refuse_failure(f"{_one(kind)} {name!r} cannot be imported"):
         if is_path(name):
             if (module := _module_of(Path(name))) is not None:
                 return importlib.import_module(module)
-            return load_file(Path(name))
+            return load_file(Path(name), look=look)
         if name in _shipped(kind):
             return importlib.import_module(f"{PACKAGES[kind]}.{name}")
         # Last, because the search of all installed packages takes milliseconds.
@@ -238,9 +241,12 @@ def suggest_name(name: str, available: list[str]) -> str:
     return f"; did you mean {near[0]}?" if near else ""
 
 
-def builder(kind: str, name: str) -> Callable[..., Any]:
-    """Return the function `build` of a plug-in; raise a BadInputError if it has none."""
-    target = find(kind, name)
+def builder(kind: str, name: str, *, look: bool = True) -> Callable[..., Any]:
+    """Return the function `build` of a plug-in, to `look` at it or to call it.
+
+    Raise a BadInputError if there is none.
+    """
+    target = find(kind, name, look=look)
     build = getattr(target, "build", None if isinstance(target, ModuleType) else target)
     if not callable(build):
         raise BadInputError(

@@ -28,6 +28,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "files": set(),
     "geometry": set(),
     "plugins": {"plugin_file"},
+    "patience": set(),
     "plugin_file": set(),
     "tunnel": {"endpoint"},
     "link": {"config", "files", "exposition", "metrics.definitions", "tunnel"},
@@ -84,7 +85,10 @@ SHARED_NAMES = {
     "Wind",
 }
 """Names that two public classes share today."""
-ALWAYS = {"errors", "messages", "records", "renamed", "rounding", "source", "text", "__version__"}
+ALWAYS = {
+    *("errors", "messages", "patience", "records", "renamed", "rounding", "source", "text"),
+    "__version__",
+}
 
 # Module from outside -> the places (path prefixes below cloudrc/) that may import it. Ruff checks
 # clocks, sockets, threads, signals, chance, and calls such as `eval` and `print` (pyproject.toml).

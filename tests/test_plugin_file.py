@@ -1,5 +1,6 @@
 """Modules beside a plug-in: its import statements find them, and nobody else does."""
 
+import logging
 import statistics
 import sys
 from pathlib import Path
@@ -169,3 +170,33 @@ def test_data_files_that_a_plug_in_names_are_sources(write):
     inside = {"data/weights.npz", "gains.json", "helper.py", "mine.py"}
     wanted = {f"inside/{name}" for name in inside} | {"shared.csv"}
     assert names(sources(folder / "mine.py"), outer) == wanted
+
+
+def test_looks_at_a_plugin_and_its_use_execute_it_once_and_every_use_executes_it_anew(
+    write, monkeypatch
+):
+    executions = []
+    monkeypatch.setattr(sys, "executions", executions, raising=False)
+    path = write(plugin="import sys; sys.executions.append(1)") / "plugin.py"
+    assert load_file(path, look=True) is load_file(path, look=True)
+    first, second = load_file(path), load_file(path)
+    assert first is not second
+    assert len(executions) == 2
+
+
+def test_a_plugin_or_a_module_beside_it_that_changes_after_a_look_is_executed_anew(write):
+    folder = write(plugin="from helper import value", helper="value = 1")
+    load_file(folder / "plugin.py", look=True)
+    write(helper="value = 12")
+    assert load_file(folder / "plugin.py").value == 12
+
+
+def test_a_plugin_whose_import_takes_long_is_named(write, monkeypatch):
+    monkeypatch.setattr("cloudrc.patience.SILENT", 0.0)
+    source = "import logging, time\n"
+    source += "while not logging.getLogger('cloudrc').told: time.sleep(0.001)"
+    told = logging.getLogger("cloudrc")
+    monkeypatch.setattr(told, "told", [], raising=False)
+    monkeypatch.setattr(told, "warning", lambda text, *more: told.told.append(text % more))
+    load_file(write(slow=source) / "slow.py")
+    assert "slow.py is still being imported" in told.told[0]

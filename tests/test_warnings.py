@@ -99,12 +99,13 @@ def test_a_link_that_no_setting_fits_is_named_without_one(settings, words):
     ("times", "words"),
     [
         (range(0, 30_000, 10), "t.csv: one packet in 10 s, if time_s is in the unit that its"),
+        ([300 + 0.01 * step for step in range(3000)], "t.csv: begins at 300 s, and its first row"),
         (range(0, 90, 10), ""),  # nine rows may be typed by hand
         (range(3000), ""),
     ],
 )
-def test_a_trace_with_times_in_milliseconds_is_named(times, words, tmp_path):
-    rows = [f"{time},{30 + time % 7}" for time in times]
+def test_a_trace_with_unusual_times_is_named(times, words, tmp_path):
+    rows = [f"{time},{30 + round(time) % 7}" for time in times]
     (tmp_path / "t.csv").write_text("\n".join(["time_s,delay_ms", *rows]))
     flown = load_experiment("steps", [f"link.uplink.trace={tmp_path / 't.csv'}"])
     told = [text for text in advise(flown) if "link.uplink.trace" in text]

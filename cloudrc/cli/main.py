@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import sys
 from collections.abc import Sequence
 
-from cloudrc.cli.output import STDOUT, discard_output
+from cloudrc.cli.output import STDOUT, TABLE, discard_output, end_output, reserve_stdout
 from cloudrc.cli.parser import build_parser
 from cloudrc.errors import (
     DISK_FULL,
@@ -25,10 +27,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command in `arguments`, or this process's command; return the exit code."""
     if arguments is not None:
         return _run(list(arguments))
+    if sys.stdout is None:  # closed by the shell (>&-): nobody wants the result
+        sys.stdout = open(os.devnull, "w")
     code = INTERNAL
     try:
         code = _run(sys.argv[1:])
     finally:
+        end_output()
         limit_exit(code)
     return code
 
@@ -60,9 +65,12 @@ def _dispatch(given: Sequence[str]) -> int:
     options = parser.parse_args(given)
     if name is None:
         raise BadInputError("a command is missing; see 'cloudrc --help'")
-    code: int = options.execute(options)
-    with naming(STDOUT):
-        sys.stdout.flush()
+    form = getattr(options, "output", TABLE)
+    for_programs = isinstance(form, str) and form != TABLE
+    with reserve_stdout() if for_programs else contextlib.nullcontext():
+        code: int = options.execute(options)
+        with naming(STDOUT):
+            sys.stdout.flush()
     return code
 
 

@@ -8,7 +8,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 _CODES = {"green": "32", "yellow": "33", "red": "31", "bold": "1"}
 
+TABLE = "table"
+"""Form of the output that is for people."""
 STDOUT = "the output (stdout)"
 """Place of the output in errors."""
 
@@ -34,8 +36,8 @@ PICTURES = {
 
 def output_argument(parser: argparse.ArgumentParser, what: str = "output format") -> None:
     """Declare the flag `--output`; `what` is its help text."""
-    forms, about = ("table", "json", "yaml"), f"{what} (default: table)"
-    parser.add_argument("-o", "--output", choices=forms, default="table", help=about)
+    forms, about = (TABLE, "json", "yaml"), f"{what} (default: table)"
+    parser.add_argument("-o", "--output", choices=forms, default=TABLE, help=about)
 
 
 def refuse_other_file(
@@ -79,6 +81,33 @@ def print_result(form: str, document: Mapping[str, Any], text: str) -> None:
         discard_output(sys.stdout)
         if error.errno in DISK_FULL:
             raise
+
+
+@contextlib.contextmanager
+def reserve_stdout() -> Iterator[None]:
+    """Let only `sys.stdout` write to stdout; inside the block, descriptor 1 is that of stderr.
+
+    So child processes and C libraries of a plug-in do not write into a document.
+    """
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError, ValueError):  # the stream of a test has no descriptor
+            sys.stdout.flush()
+            kept, number = os.dup(sys.stdout.fileno()), sys.stdout.fileno()
+            os.dup2(sys.stderr.fileno(), number)
+            stack.callback(os.close, kept)
+            stack.callback(os.dup2, kept, number)
+            document = open(
+                kept, "w", encoding=sys.stdout.encoding, errors=sys.stdout.errors, closefd=False
+            )
+            stack.enter_context(contextlib.redirect_stdout(document))
+            stack.callback(document.close)
+        yield
+
+
+def end_output() -> None:
+    """Send what plug-ins print at the end of this process to stderr: the result is complete."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
 
 
 def is_live(stream: TextIO) -> bool:

@@ -72,8 +72,17 @@ def describe_period(period: float, column: str) -> str:
     return f"one packet in {period:.4g} s, if {column} is in the unit that its name says"
 
 
+LATE_START = 5.0
+"""Time of the first row of a trace from which the trace may be a piece of a longer one [s]."""
+
+
 def describe_trace(trace: Trace | None) -> str:
-    """Warn in words of an unusual time between the rows of a trace; "" if it is usual."""
+    """Warn in words of unusual times of the rows of a trace; "" if they are usual."""
     if trace is None or len(trace.times) < ROWS_MIN:
         return ""
+    if (start := trace.times[0]) > LATE_START:
+        return (
+            f"begins at {start:.4g} s, and its first row holds until then; subtract {start:.4g} "
+            "from time_s if this is a piece of a longer trace"
+        )
     return describe_period(median(b - a for a, b in pairwise(trace.times)), "time_s")

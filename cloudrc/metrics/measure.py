@@ -13,6 +13,7 @@ from cloudrc import plugins
 from cloudrc.errors import BadInputError, describe_error
 from cloudrc.metrics import control, link, mission, response
 from cloudrc.metrics.flight import SHIPPED, Flight, Metric
+from cloudrc.patience import telling_if_slow
 from cloudrc.renamed import new_name
 
 # The imported modules add the metrics of cloudrc to SHIPPED.
@@ -41,8 +42,10 @@ def scale(unit: str, largest: float) -> tuple[float, str]:
     return 1.0, "" if unit == "1" else unit
 
 
-def find(choice: str) -> Metric:
+def find(choice: str, *, look: bool = False) -> Metric:
     """Find a metric by its name, or by the path of a Python file, which is executed.
+
+    With `look`, the caller does not measure.
 
     Raises:
         BadInputError: If the metric does not exist, or if the file defines no metric.
@@ -56,7 +59,7 @@ def find(choice: str) -> Metric:
         raise BadInputError(plugins.unknown_name_text("metric", choice, sorted(known)))
     if is_path and name in known:
         raise BadInputError(f"metric {choice!r}: {name} is a metric already; rename the file")
-    found = plugins.find("metrics", choice)
+    found = plugins.find("metrics", choice, look=look)
     unit, measure = getattr(found, "UNIT", None), getattr(found, "measure", None)
     if not isinstance(unit, str) or not callable(measure):
         raise BadInputError(
@@ -76,7 +79,7 @@ def check(own: Iterable[str]) -> None:
     Raises:
         BadInputError: If a metric is invalid, or if two metrics have the same name.
     """
-    for name, count in Counter(find(choice).name for choice in own).items():
+    for name, count in Counter(find(choice, look=True).name for choice in own).items():
         if count > 1:
             raise BadInputError(f"{count} metrics are named {name}; rename a file")
 
@@ -109,7 +112,7 @@ def measure_all(flight: Flight, own: Iterable[str] = ()) -> tuple[dict[str, Numb
             metric = find(choice)
             # A user's metric may change what it is given: it gets tables of its own.
             given = flight if choice in SHIPPED else replace(flight)
-            with plugins.apart():
+            with plugins.apart(), telling_if_slow(f"metric {choice} is still being computed"):
                 value = metric.measure(given)
             if value is None:
                 continue

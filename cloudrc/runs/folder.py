@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import logging
 from pathlib import Path
 
 from cloudrc.errors import BadInputError
@@ -42,8 +43,15 @@ def new_folder(out: Path | None, name: str, link: str = "latest") -> Path:
 
 
 def point_to(folder: Path, link: str) -> None:
-    """Let the symbolic link `link`, beside `folder`, point to `folder`; ignore a failure."""
+    """Let the symbolic link `link`, beside `folder`, point to `folder`; ignore a failure.
+
+    A copy of `runs` may have a folder in the place of the link, which the log tells.
+    """
     latest = folder.parent / link
+    if latest.exists() and not latest.is_symlink():
+        logging.getLogger("cloudrc").warning(
+            "%s is no link and stays as it is; remove it, then it shows the newest run", latest
+        )
     with contextlib.suppress(OSError):
         if latest.is_symlink():
             latest.unlink()

@@ -138,6 +138,11 @@ def _explain_end(workers: Iterable[BaseProcess]) -> str:
     codes = [worker.exitcode for worker in workers]
     if own := [code for code in codes if code is not None and code >= 0]:
         return f"a worker ended itself (exit status {own[0]}); does a plug-in call os._exit()?"
+    # Of these codes, only a signal other than SIGTERM is the cause.
+    own = [code for code in codes if code not in (None, -signal.SIGTERM, -signal.SIGKILL)]
+    if own:
+        name = signal.Signals(-own[0]).name
+        return f"a worker crashed ({name}); does a plug-in, or a library that it uses, crash?"
     text = "a worker was killed, perhaps by the kernel because memory ran out"
     return f"{text}; use fewer processes"
 

@@ -22,6 +22,12 @@ ROBOT_PREFIX = "robot/"
 """Prefix of all names that belong to the robot in a compiled model."""
 TIMESTEP = 0.002
 """Step of the physics [s]. Source: docs/reference/plant.md, "Physics step"."""
+NEEDED = {
+    name: int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}"))
+    for name in ("constraint", "contact", "gravity", "actuation", "sensor")
+}
+"""Flag of MuJoCo that a scene must not disable -> its bit: without contacts, for example, robots
+fly through walls."""
 FUSES_WRONG = tuple(map(int, mujoco.__version__.split(".")[:2])) < (3, 11)
 """Whether MuJoCo computes a wrong inertia when it fuses static bodies, as it does up to 3.10."""
 
@@ -167,6 +173,11 @@ def _check_parts(model: Any, robot_path: Path, scene_path: Path) -> None:
         raise BadInputError(
             f"{robot_path} in {scene_path}: the robot's base must have a freejoint, "
             "and nothing else may move freely"
+        )
+    off = [flag for flag, bit in NEEDED.items() if model.opt.disableflags & bit]
+    if off:
+        raise BadInputError(
+            f"{scene_path}: option flag {off[0]} is disabled, which a flight needs; remove it"
         )
     if not model.nu:
         raise BadInputError(f"{robot_path}: has no actuator, so that no controller can move it")

@@ -130,6 +130,31 @@ def test_a_long_report_shows_its_step_and_a_short_one_nothing(kind, monkeypatch)
     assert stream.isatty() or stream.getvalue() == "reads [it]\n"
 
 
+PRINTS = """\
+import atexit, os, subprocess
+os.write(1, b"descriptor\\n")
+subprocess.run(["echo", "child"])
+atexit.register(print, "at the end")
+from cloudrc.cloud.predictors.last_sample import LastSample as build
+"""
+
+
+def test_nothing_that_a_plugin_prints_gets_into_a_document(folder):
+    (folder / "prints.py").write_text(PRINTS)
+    line = "run hover --seeds 1 --set cloud.predictor=./prints.py -o json"
+    command = [sys.executable, "-m", "cloudrc", *line.split()]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert json.loads(done.stdout)["schemaVersion"] == 1
+    assert {"descriptor", "child", "at the end"} <= set(done.stderr.splitlines())
+
+
+def test_a_stdout_that_the_shell_has_closed_is_no_error(folder):
+    command = [sys.executable, "-c", "import os, sys; os.close(1); os.execv(sys.executable, "
+               "[sys.executable, '-m', 'cloudrc', 'list'])"]  # fmt: skip
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 @pytest.mark.parametrize("line", ["list -o json", "completion bash"])
 def test_a_full_disk_is_told(line, folder):
     with open("/dev/full", "w") as full:

@@ -35,6 +35,10 @@ def _kill_at_five(number):
     return number
 
 
+def _abort(number):
+    os.abort()
+
+
 @pytest.mark.parametrize(("pieces", "jobs", "workers"), [(6, 100_000, 2), (1, 9, 0), (6, 1, 0)])
 def test_results_keep_the_order_of_the_work(pieces, jobs, workers, monkeypatch):
     monkeypatch.setattr("cloudrc.runs.workers.CHUNK", 4)
@@ -52,6 +56,11 @@ def test_results_before_a_worker_was_killed_are_kept():
     text = "a worker was killed, perhaps by the kernel because memory ran out; use fewer processes"
     assert (str(end), end.exit_code) == (text, 6)
     assert results == list(range(KILLED))
+
+
+def test_a_worker_that_crashes_is_told_by_its_signal():
+    end = take_each(map_in_order(_abort, range(4), 2), [].append)
+    assert str(end).startswith("a worker crashed (SIGABRT); does a plug-in")
 
 
 def test_ctrl_c_ends_the_workers_at_once():

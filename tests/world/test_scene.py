@@ -104,6 +104,8 @@ def test_each_geom_has_the_name_of_its_body_and_the_robot_none(tmp_path):
         ("scene", 'name="spawn"', 'name="start"', "needs a frame named spawn"),
         ("scene", '<body name="floor">', '<body><freejoint/><geom size="1"/></body>'
                    '<body name="floor">', "body without a name has a joint"),
+        ("scene", "<option ", '<option><flag contact="disable"/></option><option ',
+                  "option flag contact is disabled"),
         ("scene", '<body name="floor">', "<body>", "needs a body named floor"),
     ],
 )  # fmt: skip

@@ -24,6 +24,12 @@ Facts: TypeAlias = dict[str, tuple[ArrayLike, ArrayLike]]
 
 def check_fit(model: Any) -> None:
     """Raise a BadInputError that lists how a compiled model differs too much from the Pelican."""
+    for option in ("density", "viscosity"):
+        if value := getattr(model.opt, option):
+            raise BadInputError(
+                f"the scene's option {option} is {value:g}; this robot has its own drag of the "
+                "air, so leave the option out"
+            )
     actuators = [model.actuator(number).name for number in range(model.nu)]
     if actuators != [f"{ROBOT_PREFIX}{rotor}" for rotor in ROTORS]:
         raise BadInputError(f"needs the actuators {', '.join(ROTORS)}, in this order")

@@ -43,6 +43,12 @@ def test_a_robot_that_is_not_like_the_pelican_is_refused_by_its_difference(
     assert "\n" not in str(error.value)
 
 
+def test_air_that_mujoco_simulates_is_refused_by_the_scenes_option(tmp_path):
+    scene = changed(tmp_path, EMPTY, "<option ", '<option density="1.2" ')
+    with pytest.raises(BadInputError, match=r"the scene's option density is 1.2; this robot has"):
+        check_fit(compile_model(PELICAN, scene))
+
+
 def test_other_gravity_is_refused(tmp_path):
     scene = changed(tmp_path, EMPTY, "-9.8066", "-1.62")
     with pytest.raises(BadInputError, match=r"gravity .m/s.2. is 0 0 -1.62, not 0 0 -9.8"):
