@@ -49,10 +49,10 @@ examples:
 A mission is a file with 'waypoints'; 'cloudrc list missions' names those that
 ship. The exit code of 'run' and 'fly' is the verdict: 0 done, 1 failed, 6 not
 real time. 'estop' switches the robot off at once, with or without a mission; a
-robot in the air falls. After an emergency stop or a landing, 'acknowledge' allows the next
-mission. An API in a network asks for a token: give --token-file or
-CLOUDRC_TOKEN_FILE; for a release the command reads its Secret with your rights
-in the cluster. A run that is found on this machine needs no token."""
+robot in the air falls. After an emergency stop or a landing, 'acknowledge'
+allows the next mission. An API in a network asks for a token: give --token-file
+or CLOUDRC_TOKEN_FILE; for a release the command reads its Secret with your
+rights in the cluster. A run that is found on this machine needs no token."""
 READS = ("list", "status", "logs")
 """Verbs that do not steer the robot."""
 RUN_TIMEOUT, API_TIMEOUT = 10.0, 180.0
