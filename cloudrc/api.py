@@ -28,7 +28,7 @@ from cloudrc.errors import BadInputError, CloudrcError, InterruptedRunError
 from cloudrc.metrics import Flight
 from cloudrc.metrics.flight import Columns
 from cloudrc.metrics.response import Step, steps
-from cloudrc.metrics.verdict import Failure
+from cloudrc.metrics.verdict import FlightFailure
 from cloudrc.record.columns import Recording, Table
 from cloudrc.runs.experiment import advice_on, check_mode, load
 from cloudrc.runs.flight import fly_in_memory
@@ -48,7 +48,7 @@ class Result:
     """
 
     verdict: str  # "success", "failure", or "interrupted" if nothing ended the mission
-    failures: tuple[Failure, ...]  # code, text, time [s] and place [m]; the earliest first
+    failures: tuple[FlightFailure, ...]  # code, text, time [s] and place [m]; the earliest first
     numbers: dict[str, float]  # metric -> value; a number that cannot be known is absent
     units: dict[str, str]  # metric -> SI unit; "1" for counts and shares
     notes: tuple[str, ...]  # sentences for the reader

@@ -92,11 +92,11 @@ def assemble(
 
 def start_mission(experiment: ResolvedExperiment, now_ns: int = 0) -> Teleop:
     """Make a teleop that flies the experiment's mission from `now_ns` [ns] on, cloud's clock."""
-    from cloudrc.teleop.store import Mission, Order
+    from cloudrc.teleop.store import MissionRecord, Order
 
     teleop = Teleop(steered_in(experiment.world))
     order = Order(build_plan(experiment), contact=bool(experiment.criteria.contact))
-    teleop.start(now_ns, Mission("m1", order, ONLY_MISSION))
+    teleop.start(now_ns, MissionRecord("m1", order, ONLY_MISSION))
     return teleop
 
 
@@ -225,7 +225,7 @@ def build_plan(experiment: ResolvedExperiment) -> Plan:
 
 
 def mission_plan(
-    mission: schema.Mission,
+    mission: schema.MissionConfig,
     time_limit: float | None,
     seed: int = 0,
     *,
@@ -276,7 +276,7 @@ def with_order(
         )
         for leg in ([] if order.plan.by_hand else legs)
     )
-    mission = schema.Mission(
+    mission = schema.MissionConfig(
         start="spawn" if order.plan.start is Start.SPAWN else "here",
         waypoints=waypoints,
         setpoints=DRIVE_FILE if order.plan.by_hand else None,

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 import yaml
 from pydantic.json_schema import models_json_schema
 
-from cloudrc.config.schema import Experiment, Mission, Profile
+from cloudrc.config.schema import Experiment, MissionConfig, Profile
 
 Schema: TypeAlias = dict[str, Any]
 Path: TypeAlias = tuple[str, ...]
@@ -161,7 +161,7 @@ def make_schema(text: str) -> Schema:
     made = part((), yaml.safe_load(text), "All values of the chart")
     about = "Values that Helm passes to subcharts; this chart ignores them"
     made["properties"]["global"] = {**_either(OBJECT, NULL), "description": about}
-    models = [(model, "validation") for model in (Experiment, Mission, Profile)]
+    models = [(model, "validation") for model in (Experiment, MissionConfig, Profile)]
     defined = _adapt(models_json_schema(models)[1]["$defs"])
     for name in ("PlugIn", "Parameters"):
         defined[name]["additionalProperties"] = {

@@ -26,7 +26,7 @@ from cloudrc import plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.overrides import KINDS, default_parameters
 from cloudrc.config.robot import find_robot
-from cloudrc.config.schema import Direction, Experiment, Mission, Profile
+from cloudrc.config.schema import DirectionConfig, Experiment, MissionConfig, Profile
 from cloudrc.exposition.table import METRICS, ROLES
 from cloudrc.record.topics import TOPICS
 from tools.chart_values import make_schema, table_rows
@@ -146,9 +146,9 @@ def _experiment() -> str:
             blocks += [f"## `{key}`\n", _summary(info.annotation), _keys(Experiment, [key])]
     blocks += ["## Onboard controllers\n", _onboard()]
     blocks += ["## Plug-ins of the cloud\n", _plug_ins()]
-    blocks += ["## A mission\n", _summary(Mission), _keys(Mission)]
+    blocks += ["## A mission\n", _summary(MissionConfig), _keys(MissionConfig)]
     blocks += ["## A link profile\n", _summary(Profile), _keys(Profile)]
-    blocks += ["## One direction of a link\n", _summary(Direction), _keys(Direction)]
+    blocks += ["## One direction of a link\n", _summary(DirectionConfig), _keys(DirectionConfig)]
     blocks += ["How each key acts: [link.md](link.md).\n", "## Shipped files\n", _shipped()]
     return "\n".join(blocks)
 

@@ -14,10 +14,10 @@ from cloudrc.drivers.process import StopSignal
 from cloudrc.drivers.realtime import Address, split_address
 
 
-class Command(NamedTuple):
+class CliCommand(NamedTuple):
     """One command of a module that defines several commands.
 
-    A module with only one command is used in place of a `Command`: it defines the same names.
+    A module with only one command is used in place of a `CliCommand`: it defines the same names.
     """
 
     arguments: Callable[[argparse.ArgumentParser], None]
@@ -108,5 +108,5 @@ def _run_cloud(options: argparse.Namespace) -> int:
     return 0
 
 
-world = Command(_end_arguments, _run_world)
-cloud = Command(_cloud_arguments, _run_cloud)
+world = CliCommand(_end_arguments, _run_world)
+cloud = CliCommand(_cloud_arguments, _run_cloud)

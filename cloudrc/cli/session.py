@@ -19,7 +19,7 @@ from typing import IO, Any
 
 from cloudrc.cli.find_run import run_argument
 from cloudrc.cli.output import print_line
-from cloudrc.cli.processes import Command
+from cloudrc.cli.processes import CliCommand
 from cloudrc.cli.run import experiment_arguments, fly_once
 from cloudrc.errors import BadInputError, CloudrcError, MissingPrerequisiteError, NothingFlownError
 from cloudrc.runs.interrupts import interrupt_on_signals
@@ -151,5 +151,5 @@ def _down(options: argparse.Namespace) -> int:
     return 0
 
 
-up = Command(_up_arguments, _up, UP_EPILOG)
-down = Command(run_argument, _down, DOWN_EPILOG)
+up = CliCommand(_up_arguments, _up, UP_EPILOG)
+down = CliCommand(run_argument, _down, DOWN_EPILOG)

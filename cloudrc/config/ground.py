@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from cloudrc.config.problems import Problem
-from cloudrc.config.schema import GROUND, Mission
+from cloudrc.config.problems import ConfigProblem
+from cloudrc.config.schema import GROUND, MissionConfig
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import Vector
 
@@ -21,7 +21,7 @@ def on_ground(position: Vector, scene: Scene) -> Vector:
     return (x, y, scene.spawn[2] if z == GROUND else z)
 
 
-def put_on_ground(mission: Mission, scene: Scene) -> Mission:
+def put_on_ground(mission: MissionConfig, scene: Scene) -> MissionConfig:
     """Return a mission in which waypoints of two numbers have the height of the spawn."""
     placed = tuple(
         waypoint.model_copy(update={"position_m": on_ground(waypoint.position_m, scene)})
@@ -30,22 +30,22 @@ def put_on_ground(mission: Mission, scene: Scene) -> Mission:
     return mission.model_copy(update={"waypoints": placed})
 
 
-def check_heights(mission: Mission, scene: Scene) -> list[Problem]:
+def check_heights(mission: MissionConfig, scene: Scene) -> list[ConfigProblem]:
     """List what leads a robot off the ground, each with its path inside the mission."""
     return list(_heights(mission, scene.spawn[2]))
 
 
-def _heights(mission: Mission, height: float) -> Iterator[Problem]:
+def _heights(mission: MissionConfig, height: float) -> Iterator[ConfigProblem]:
     steps = mission.steps
     if steps is not None and (steps.range_m[2] or abs(steps.centre_m[2] - height) > SAME):
         reason = (
             f"have heights, {ABOVE}; set range_m to [x, y, 0] and the third number of centre_m to "
             f"{height:g}, or give waypoints"
         )
-        yield Problem(("steps",), "", reason)
+        yield ConfigProblem(("steps",), "", reason)
     for index, waypoint in enumerate(mission.waypoints):
         if abs(waypoint.position_m[2] - height) > SAME:
             path = ("waypoints", str(index), "position_m")
             shown = f"[{', '.join(f'{value:g}' for value in waypoint.position_m)}]"
-            yield Problem(path, shown, f"has a height, {ABOVE}; give two numbers, x and y")
+            yield ConfigProblem(path, shown, f"has a height, {ABOVE}; give two numbers, x and y")
             return

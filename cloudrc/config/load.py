@@ -29,7 +29,7 @@ from cloudrc.config.document import Document, KeyPath, read_document, write_yaml
 from cloudrc.config.ground import put_on_ground
 from cloudrc.config.mission_check import check_mission, check_scene
 from cloudrc.config.overrides import Settings
-from cloudrc.config.problems import Problem
+from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.reuse import reuse
 from cloudrc.config.robot import DEFAULT_LIMITS, RobotLimits, known_robot, parameters
 from cloudrc.config.scene import scene_of
@@ -40,10 +40,10 @@ from cloudrc.config.schema import (
     Cloud,
     CloudTime,
     CommandAge,
-    Direction,
+    DirectionConfig,
     Experiment,
-    Guard,
-    Mission,
+    GuardConfig,
+    MissionConfig,
     PlanMax,
     PlugIn,
     Profile,
@@ -96,7 +96,7 @@ def speed_cap(command_age_max_ms: float, plan_max_s: float, bounds: Bounds) -> f
     return min(max(stops, slowest), robot.speed_max_mps or fastest)
 
 
-class ResolvedGuard(Guard):
+class ResolvedGuard(GuardConfig):
     """The section `guard`, in which every limit has a value.
 
     The context of its validation is the `RobotLimits` of the robot; without one, `DEFAULT_LIMITS`.
@@ -147,17 +147,17 @@ class ResolvedCloud(Cloud):
 class ResolvedExperiment(Experiment):
     """An experiment that contains its mission (not only the name), and a value for every key."""
 
-    mission: Mission
+    mission: MissionConfig
     guard: ResolvedGuard
     cloud: ResolvedCloud
 
     @property
-    def uplink(self) -> Direction:
+    def uplink(self) -> DirectionConfig:
         """Conditions of the link from world to cloud."""
         return self.link.uplink
 
     @property
-    def downlink(self) -> Direction:
+    def downlink(self) -> DirectionConfig:
         """Conditions of the link from cloud to world."""
         return self.link.downlink
 
@@ -187,7 +187,7 @@ def load_experiment(
     document.rename_keys()  # in a mapping that a setting gives
     for key in ("world", "guard", "link", "cloud", "report"):
         _default(document, (key,), {})
-    found: list[Problem] = []
+    found: list[ConfigProblem] = []
     with _collect(found, ("mission",)):
         _inline_mission(document)
     with _collect(found, ("link", "profile")):
@@ -227,7 +227,7 @@ def _judge(
     if contact is None:
         contact = scene.board is not None and not (mission.steps or mission.setpoints)
     if not flown:
-        robot, found = known_robot(experiment.world.robot), list[Problem]()
+        robot, found = known_robot(experiment.world.robot), list[ConfigProblem]()
         with _collect(found, ("world", "tuning")):
             parameters(robot, experiment.world)
         mission = put_on_ground(mission, scene) if robot.planar else mission
@@ -237,10 +237,12 @@ def _judge(
     return experiment.model_copy(update={"criteria": criteria, "mission": mission})
 
 
-def _check_flown(mission: Mission, scene: Scene, contact: bool, planar: bool) -> list[Problem]:
+def _check_flown(
+    mission: MissionConfig, scene: Scene, contact: bool, planar: bool
+) -> list[ConfigProblem]:
     """List the problems of a mission in a scene, with their paths in the experiment."""
 
-    def check() -> list[Problem]:
+    def check() -> list[ConfigProblem]:
         if above := check_scene(scene, contact=contact, planar=planar):
             return above
         wrong = check_mission(mission, scene, contact=contact, planar=planar)
@@ -283,7 +285,7 @@ def load_link(file: Path, experiment: Path) -> Profile:
 def _link_of(document: Document, name: str) -> Profile:
     """Return the link of an experiment, whose other parts are not looked at."""
     document.tree = {"link": document.get("link") or {}}
-    found: list[Problem] = []
+    found: list[ConfigProblem] = []
     with _collect(found, ("link", "profile")):
         _inline_profile(document)
     found += _resolve_paths(document)
@@ -339,12 +341,12 @@ def _default(document: Document, path: KeyPath, value: Any) -> None:
 
 
 @contextmanager
-def _collect(found: list[Problem], path: KeyPath) -> Iterator[None]:
+def _collect(found: list[ConfigProblem], path: KeyPath) -> Iterator[None]:
     """Turn a BadInputError of the `with` block into a problem at `path`, and add it to `found`."""
     try:
         yield
     except BadInputError as error:
-        found.append(Problem(path, "", str(error)))
+        found.append(ConfigProblem(path, "", str(error)))
 
 
 def _inline_mission(document: Document) -> None:
@@ -353,7 +355,7 @@ def _inline_mission(document: Document) -> None:
     name = document.tree["mission"]
     if isinstance(name, str):
         file = shipped.read("mission", name, document.source(("mission",)).folder)
-        problems.validate(file, Mission, name)
+        problems.validate(file, MissionConfig, name)
         document.tree["mission"] = file.tree
         document.sources |= {("mission", *key): source for key, source in file.sources.items()}
 
@@ -411,7 +413,7 @@ def _has_all_values(document: Document) -> bool:
     """Whether the file sets all keys of both link directions, as a resolved experiment does."""
     given = [document.get("link", way) for way in DIRECTIONS]
     return all(
-        isinstance(one, dict) and one.keys() >= Direction.model_fields.keys() for one in given
+        isinstance(one, dict) and one.keys() >= DirectionConfig.model_fields.keys() for one in given
     )
 
 
@@ -427,7 +429,7 @@ def bounds_of(world: World) -> Bounds:
     return Bounds(known_robot(world.robot).guard, fence_of(scene).room(scene.spawn))
 
 
-def _bounds(document: Document, found: list[Problem]) -> Bounds:
+def _bounds(document: Document, found: list[ConfigProblem]) -> Bounds:
     """Return the bounds of an experiment; those of a key that is wrong do not limit anything.
 
     If the scene's file is wrong, add the problem to `found`. If the fence is not known without
@@ -471,9 +473,9 @@ def _remove_derived(document: Document, *, new_profile: bool) -> None:
             del document.tree[section][key]
 
 
-def _resolve_paths(document: Document) -> list[Problem]:
+def _resolve_paths(document: Document) -> list[ConfigProblem]:
     """Make all paths in an experiment or profile absolute, and check the files; return problems."""
-    found: list[Problem] = []
+    found: list[ConfigProblem] = []
     ways = [(*above, way) for above in ((), ("link",)) for way in DIRECTIONS]
     paths = [(*way, key) for way in ways for key in ("trace", "table")]
     paths += [("mission", "setpoints"), ("world", "robot"), ("world", "scene")]

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from cloudrc.config.ground import check_heights
-from cloudrc.config.problems import Problem
-from cloudrc.config.schema import Mission, Steps
+from cloudrc.config.problems import ConfigProblem
+from cloudrc.config.schema import MissionConfig, Steps
 from cloudrc.config.setpoints import read_setpoints
 from cloudrc.errors import BadInputError
 from cloudrc.geometry.clearance import Array
@@ -40,7 +40,7 @@ TOUCHING = 1e-3
 """Distance from an obstacle below which the robot touches it [m]; it covers rounding errors."""
 
 
-def check_scene(scene: Scene, *, contact: bool, planar: bool = False) -> list[Problem]:
+def check_scene(scene: Scene, *, contact: bool, planar: bool = False) -> list[ConfigProblem]:
     """List the problems of a scene for missions that have to touch the board or not (`contact`).
 
     Their paths are those of the experiment. A `planar` robot stays on the ground.
@@ -50,7 +50,7 @@ def check_scene(scene: Scene, *, contact: bool, planar: bool = False) -> list[Pr
     names = body_names(scene)
     if contact and names and BOARD not in names:
         reason = f"the scene has no body named board to touch; {_named(names)}; name a body board"
-        return [Problem(("criteria", "contact"), "true", f"{reason}, or set it to false")]
+        return [ConfigProblem(("criteria", "contact"), "true", f"{reason}, or set it to false")]
     known, spawn = obstacles(scene, contact=contact), np.array([scene.spawn])
     (hit,) = find_overlapped(known, spawn, np.zeros(1), TOUCHING)
     if hit < 0:
@@ -59,10 +59,10 @@ def check_scene(scene: Scene, *, contact: bool, planar: bool = False) -> list[Pr
         f"at the spawn, {_point(spawn[0])}, the robot touches {surface(known[hit])}; every body "
         "but floor is an obstacle: move the spawn, or put what the robot stands on into body floor"
     )
-    return [Problem(("world", "scene"), scene.name, reason)]
+    return [ConfigProblem(("world", "scene"), scene.name, reason)]
 
 
-def _check_fence(scene: Scene, *, planar: bool) -> Problem | None:
+def _check_fence(scene: Scene, *, planar: bool) -> ConfigProblem | None:
     """Return the problem of a fence in which the robot cannot take off or drive."""
     fence, path = fence_of(scene), ("world", "fence_m")
     size = [high - low for low, high in zip(fence.low, fence.high, strict=True)]
@@ -71,7 +71,7 @@ def _check_fence(scene: Scene, *, planar: bool) -> Problem | None:
         needs = f"{WIDTH_MIN:g} m wide" + ("" if planar else f" and {HEIGHT_MIN:g} m high")
         verb = "drive" if planar else "take off"
         reason = f"too small for the robot to {verb}; make it at least {needs}"
-        return Problem(path, f"{given} m", reason)
+        return ConfigProblem(path, f"{given} m", reason)
     low, high = (*fence.inner_low[:2], fence.low[2]), fence.inner_high  # it stands on the ground
     stands = zip(low, scene.spawn, high, strict=True)
     inside = [below <= at <= above for below, at, above in stands]
@@ -81,7 +81,9 @@ def _check_fence(scene: Scene, *, planar: bool) -> Problem | None:
         f"the spawn, {_point(np.array(scene.spawn))}, is outside or too near to a wall; it may be "
         f"at {_spans(low, high, planar=planar)}; move the spawn or the fence"
     )
-    return Problem(path, f"[{_point(np.array(fence.low))}, {_point(np.array(fence.high))}]", reason)
+    return ConfigProblem(
+        path, f"[{_point(np.array(fence.low))}, {_point(np.array(fence.high))}]", reason
+    )
 
 
 def _named(names: Sequence[str]) -> str:
@@ -90,8 +92,8 @@ def _named(names: Sequence[str]) -> str:
 
 
 def check_mission(
-    mission: Mission, scene: Scene, *, contact: bool, planar: bool = False
-) -> list[Problem]:
+    mission: MissionConfig, scene: Scene, *, contact: bool, planar: bool = False
+) -> list[ConfigProblem]:
     """List the problems of a mission in a scene, each with its path inside the mission.
 
     With `contact`, the mission has to touch the board, which is then no obstacle. A `planar` robot
@@ -108,50 +110,51 @@ def check_mission(
     known = obstacles(scene, contact=contact)
     if mission.steps is not None:
         reason = _check_steps(mission.steps, known, fence, planar=planar)
-        return [Problem(("steps",), "", reason)] if reason else []
+        return [ConfigProblem(("steps",), "", reason)] if reason else []
     start = scene.spawn if mission.start == "spawn" else None
     return list(_check_waypoints(mission, known, start, fence, planar=planar))
 
 
-def _check_setpoints(path: Path, fence: Fence) -> list[Problem]:
+def _check_setpoints(path: Path, fence: Fence) -> list[ConfigProblem]:
     try:
         read_setpoints(path, fence)
     except BadInputError as error:
-        return [Problem(("setpoints",), "", str(error))]
+        return [ConfigProblem(("setpoints",), "", str(error))]
     return []
 
 
-def _check_parts(mission: Mission) -> Problem | None:
+def _check_parts(mission: MissionConfig) -> ConfigProblem | None:
     """Return the first problem of parts that exclude or need each other."""
     if mission.setpoints is not None:
         if mission.waypoints or mission.steps or mission.carrot:
             reason = "a mission has setpoints, or waypoints, steps and a carrot; delete one"
-            return Problem(("setpoints",), "", reason)
+            return ConfigProblem(("setpoints",), "", reason)
         return None
     if mission.carrot is None:
         for index, waypoint in enumerate(mission.waypoints):
             if waypoint.speed_mps is not None:
                 reason = "is the speed of a carrot; give the mission a carrot, or delete it"
                 path = ("waypoints", str(index), "speed_mps")
-                return Problem(path, f"{waypoint.speed_mps:g}", reason)
+                return ConfigProblem(path, f"{waypoint.speed_mps:g}", reason)
     elif mission.steps is not None:
-        return Problem(("carrot",), "", "impossible with steps; delete it, or give waypoints")
+        return ConfigProblem(("carrot",), "", "impossible with steps; delete it, or give waypoints")
     if mission.steps is not None and mission.waypoints:
-        return Problem(("steps",), "", "a mission has waypoints or steps, not both; delete one")
+        reason = "a mission has waypoints or steps, not both; delete one"
+        return ConfigProblem(("steps",), "", reason)
     if mission.steps is None and not mission.waypoints:
         reason = "none given; give at least one, or steps or setpoints"
-        return Problem(("waypoints",), "", reason)
+        return ConfigProblem(("waypoints",), "", reason)
     return None
 
 
 def _check_waypoints(
-    mission: Mission,
+    mission: MissionConfig,
     known: Sequence[Obstacle],
     start: Vector | None,
     fence: Fence,
     *,
     planar: bool,
-) -> Iterator[Problem]:
+) -> Iterator[ConfigProblem]:
     positions = np.array([waypoint.position_m for waypoint in mission.waypoints])
     yaws = np.radians([waypoint.yaw_deg for waypoint in mission.waypoints])
     # A waypoint may be outside by half its tolerance; the other half is for control errors.
@@ -161,7 +164,7 @@ def _check_waypoints(
     wrong = np.flatnonzero(outside | (hit >= 0))
     for index in np.flatnonzero(yaws)[:_REPORTED]:
         path = ("waypoints", str(index), "yaw_deg")
-        yield Problem(path, f"{mission.waypoints[index].yaw_deg:g}", _YAW)
+        yield ConfigProblem(path, f"{mission.waypoints[index].yaw_deg:g}", _YAW)
     for index in wrong[:_REPORTED]:
         if outside[index]:
             reason = f"beyond the fence, or too near to it; {_allowed(fence, planar=planar)}"
@@ -182,7 +185,7 @@ def _check_waypoints(
         yield from _check_ways(np.vstack([start or positions[0], positions]), known)
 
 
-def _check_ways(positions: Array, known: Sequence[Obstacle]) -> Iterator[Problem]:
+def _check_ways(positions: Array, known: Sequence[Obstacle]) -> Iterator[ConfigProblem]:
     """Report straight ways between successive `positions` [m], shape (n, 3), to an obstacle."""
     through = find_crossed(known, positions[:-1], positions[1:])
     for index in np.flatnonzero(through >= 0)[:_REPORTED]:
@@ -226,8 +229,8 @@ def _spans(low: Vector, high: Vector, *, planar: bool) -> str:
     return ", ".join(spans[: 2 if planar else 3]) + " [m]"
 
 
-def _at_point(index: int, position: Array, reason: str) -> Problem:
-    return Problem(("waypoints", str(index), "position_m"), _point(position), reason)
+def _at_point(index: int, position: Array, reason: str) -> ConfigProblem:
+    return ConfigProblem(("waypoints", str(index), "position_m"), _point(position), reason)
 
 
 def _point(position: Array) -> str:

@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from cloudrc import plugins
 from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, KeyPath, Source, child, parse_value
-from cloudrc.config.problems import Problem
+from cloudrc.config.problems import ConfigProblem
 from cloudrc.config.reuse import reuse
 from cloudrc.config.robot import RobotFacts, facts, find_robot, known_robot, parameters
 from cloudrc.config.schema import Experiment, PlugIn, Steps, World
@@ -194,13 +194,13 @@ def _check_index(document: Document, path: KeyPath, source: Source) -> None:
         )
 
 
-def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
+def resolve_plugins(document: Document, *, build: bool) -> list[ConfigProblem]:
     """Replace each plug-in of an experiment by a mapping with its name and its parameters.
 
     With `build`, check the parameters, add defaults, and build each plug-in once as a test. Without
     `build`, import no plug-in: importing runs its code, which may be somebody else's.
     """
-    found: list[Problem] = []
+    found: list[ConfigProblem] = []
     robot = _robot_of(document) if build else None
     for key, kind in KINDS.items():
         path = ("cloud", key)
@@ -217,7 +217,7 @@ def resolve_plugins(document: Document, *, build: bool) -> list[Problem]:
         except ValidationError as error:
             found += problems.from_pydantic(error, parameter_model(kind, name), path)
         except BadInputError as error:
-            found.append(Problem(path, "", str(error)))
+            found.append(ConfigProblem(path, "", str(error)))
         else:
             # Not by `set_value`: the parameters keep their sources.
             document.tree["cloud"][key] = {"name": name, **parameters}
@@ -339,7 +339,7 @@ def build_predictor(choice: PlugIn, robot: RobotFacts) -> Any:
     return build_plugin("predictors", choice, **more)
 
 
-def check_plugin(kind: str, choice: PlugIn) -> list[Problem]:
+def check_plugin(kind: str, choice: PlugIn) -> list[ConfigProblem]:
     """List the problems of the parameters of a plug-in."""
     try:
         _check(kind, choice.name, choice.model_extra or {})

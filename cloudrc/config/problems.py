@@ -159,7 +159,7 @@ def _unit(field: FieldInfo) -> str:
     return found.group() if found else ""
 
 
-class Problem(NamedTuple):
+class ConfigProblem(NamedTuple):
     """One problem of a configuration."""
 
     path: KeyPath  # keys that lead to the value
@@ -172,7 +172,7 @@ class Problem(NamedTuple):
 
 def from_pydantic(
     error: ValidationError, model: type[BaseModel], prefix: KeyPath = (), limit: int | None = None
-) -> list[Problem]:
+) -> list[ConfigProblem]:
     """Convert the first `limit` validation errors of `model`.
 
     `prefix` is the key path of the model in the document.
@@ -181,7 +181,7 @@ def from_pydantic(
     return [_problem(detail, model, prefix) for detail in details]
 
 
-def raise_problems(document: Document, problems: Iterable[Problem], name: str) -> None:
+def raise_problems(document: Document, problems: Iterable[ConfigProblem], name: str) -> None:
     """If there are problems, raise a BadInputError that lists them with file and line.
 
     If a value and a key below it both have problems, list only the problem of the key below.
@@ -202,7 +202,7 @@ def validate(
     document: Document,
     model: type[_Model],
     name: str,
-    found: Sequence[Problem] = (),
+    found: Sequence[ConfigProblem] = (),
     *,
     described: type[BaseModel] | None = None,
     context: object = None,
@@ -247,10 +247,10 @@ _REASONS: Mapping[str, str] = {
     "literal_error": "must be {expected}",
     "needs_python_object": "must be an object of a class, which YAML cannot contain",
 }
-"""Type of pydantic's error -> format of `Problem.reason`."""
+"""Type of pydantic's error -> format of `ConfigProblem.reason`."""
 
 
-def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> Problem:
+def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> ConfigProblem:
     kind, keys = detail["type"], tuple(map(str, detail["loc"]))
     # Drop the tags of unions, such as <name>: they are not keys. Keep an unknown key unchanged.
     unknown = keys[-1:] if kind == "extra_forbidden" else ()
@@ -269,4 +269,4 @@ def _problem(detail: ErrorDetails, model: type[BaseModel], prefix: KeyPath) -> P
     ):
         reason += f"; did you mean {near}?"
     value = "" if kind in _WITHOUT_VALUE else in_words(detail["input"])
-    return Problem(prefix + path, value, reason)
+    return ConfigProblem(prefix + path, value, reason)

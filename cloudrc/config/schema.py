@@ -150,7 +150,7 @@ class Change(Section):
     """New rate of the bottleneck [kbit/s]; null: unchanged"""
 
 
-class Direction(Section):
+class DirectionConfig(Section):
     """Network conditions of one direction. All delays are ONE WAY."""
 
     delay_ms: NotNegative = 0.0
@@ -193,7 +193,7 @@ class Direction(Section):
     """Intervals in which every packet is lost; they may overlap"""
 
     @model_validator(mode="after")
-    def _check_table(self) -> Direction:
+    def _check_table(self) -> DirectionConfig:
         if self.distribution == "table" and self.table is None:
             raise ValueError("distribution: table needs the key table: a CSV file of delays")
         return self
@@ -215,9 +215,9 @@ class Profile(Section):
 
     description: str = ""
     """One line about the profile, for lists"""
-    uplink: Direction = Direction()
+    uplink: DirectionConfig = DirectionConfig()
     """Conditions from world to cloud"""
-    downlink: Direction = Direction()
+    downlink: DirectionConfig = DirectionConfig()
     """Conditions from cloud to world"""
     command_age_max_ms: CommandAge | None = None
     """Default of guard.command_age_max_ms with this profile [ms]; null: 250"""
@@ -289,7 +289,7 @@ class Steps(Section):
     obstacles"""
 
 
-class Mission(Section):
+class MissionConfig(Section):
     """A mission: waypoints, random steps, or setpoints from a file."""
 
     description: str = ""
@@ -320,7 +320,7 @@ class Parameters(Section):
     model_config = ConfigDict(extra="allow")
 
 
-class Sensors(Section):
+class SensorsConfig(Section):
     """Errors that world adds to the true state to make the odometry for cloud."""
 
     position_noise_m: NotNegative = 0.0
@@ -358,7 +358,7 @@ class Plant(Section):
         return value if isinstance(value, float) or {*value} != {1.0} else 1.0
 
 
-class Wind(Section):
+class WindConfig(Section):
     """Horizontal wind: a mean velocity and gusts."""
 
     velocity_mps: tuple[WindSpeed, WindSpeed] = (0.0, 0.0)
@@ -391,12 +391,12 @@ class World(Section):
     one"""
     onboard: Parameters = Parameters()
     """Parameters of the onboard controller, in place of those in robot.yaml and in its tuning"""
-    sensors: Sensors = Sensors()
+    sensors: SensorsConfig = SensorsConfig()
     """Errors of the odometry for cloud; guard and onboard controller see the true state"""
     plant: Plant = Plant()
     """How the true robot differs from its model; guard, onboard controller and cloud use the
     model. A heavy or weak robot brakes worse, so the guard may stop it too late"""
-    wind: Wind = Wind()
+    wind: WindConfig = WindConfig()
     """Horizontal wind. It acts on the actuators alone, by their drag, so it does not move a robot
     whose actuators are off. A robot whose actuators have no drag is refused"""
     odometry_rate_hz: Literal[20, 25, 50, 100, 125, 250, 500] = 100
@@ -415,7 +415,7 @@ class World(Section):
         return self.plant == Plant() and not self.wind.blows
 
 
-class Guard(Section):
+class GuardConfig(Section):
     """Limits of the onboard guard; only world reads them."""
 
     command_age_max_ms: CommandAge | None = None
@@ -456,9 +456,9 @@ class Link(Section):
 
     profile: str = "paper-p2"
     """Name of a shipped link profile, or a path"""
-    uplink: Direction = Direction()
+    uplink: DirectionConfig = DirectionConfig()
     """Conditions from world to cloud; a key here overrides the profile"""
-    downlink: Direction = Direction()
+    downlink: DirectionConfig = DirectionConfig()
     """Conditions from cloud to world; a key here overrides the profile"""
 
 
@@ -554,10 +554,10 @@ class Experiment(Section):
     """One line about the experiment, for lists and reports"""
     seed: Annotated[int, Field(ge=0, lt=2**53)] = 1
     """Seed of all random numbers: link, sensor noise, wind, compute time and random steps"""
-    mission: NameOr[Mission] = "pipes"
+    mission: NameOr[MissionConfig] = "pipes"
     """Name of a shipped mission, a path, or the mission itself"""
     world: World = World()
-    guard: Guard = Guard()
+    guard: GuardConfig = GuardConfig()
     tunnel: Tunnel = Tunnel()
     link: Link = Link()
     cloud: Cloud = Cloud()

@@ -32,7 +32,7 @@ from cloudrc.messages import GuardState
 from cloudrc.record.columns import Recording
 from cloudrc.records import Counted, GroundTruth, GuardChange, MissionEvent, Record
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.store import Mission, Order
+from cloudrc.teleop.store import MissionRecord, Order
 from cloudrc.tunnel.end import Identity
 from cloudrc.tunnel.keys import KeyRing, KeySet
 from cloudrc.world.endpoint import WorldEndpoint
@@ -106,7 +106,7 @@ class FaultRun:
         return self.world.inner.robot
 
     @property
-    def mission(self) -> Mission:
+    def mission(self) -> MissionRecord:
         """The mission that was ordered last."""
         return self.teleop.missions[-1]
 
@@ -199,7 +199,7 @@ class FaultRun:
     def _build_rival(self, start_ns: int) -> CloudEndpoint:
         """Build a second cloud with the same key; it has its own teleop and the same mission."""
         teleop = Teleop(self._fence)
-        teleop.start(start_ns, Mission("rival", self.make_order(), 0))
+        teleop.start(start_ns, MissionRecord("rival", self.make_order(), 0))
         identity = Identity(SHARED, b"rival".ljust(16), KeyRing(SECRET))
         return assembly.build_cloud(self.experiment, identity, teleop, lambda: start_ns)
 

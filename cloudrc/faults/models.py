@@ -17,7 +17,7 @@ from cloudrc.records import Fault, MissionEvent, Record
 from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import (
     ConflictError,
-    Mission,
+    MissionRecord,
     MissionStore,
     Order,
     UnavailableError,
@@ -246,7 +246,7 @@ class TeleopModel:
         return RemoteTeleop(self._clouds, start_ns)
 
     @property
-    def missions(self) -> list[Mission]:
+    def missions(self) -> list[MissionRecord]:
         """All missions, oldest first; none while teleop is not running."""
         return list(self.service.book.missions.values()) if self.service is not None else []
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import NamedTuple
 
-from cloudrc.config.schema import Direction, GilbertElliott, Loss
+from cloudrc.config.schema import DirectionConfig, GilbertElliott, Loss
 
 
 def mean_loss(loss: Loss) -> float:
@@ -44,7 +44,7 @@ class Trace:
         return self.times[-1] + (self.times[-1] - self.times[0]) / (len(self.times) - 1)
 
 
-class DirectionProfile(Direction):
+class DirectionProfile(DirectionConfig):
     """One direction of a link profile, with the contents of the files that it names.
 
     A negative sum of delay and jitter counts as 0. `keep_order` disables `reorder`. A packet that

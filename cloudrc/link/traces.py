@@ -14,7 +14,7 @@ from math import fsum, inf, sqrt
 from pathlib import Path
 from typing import NamedTuple
 
-from cloudrc.config.schema import Direction
+from cloudrc.config.schema import DirectionConfig
 from cloudrc.errors import BadInputError
 from cloudrc.files import read
 from cloudrc.link.profile import DirectionProfile, Trace
@@ -41,7 +41,7 @@ def read_trace(path: Path, size_max: int = SIZE_MAX) -> Trace:
     return parse_trace(read_lines(path, f"trace {path}", remedy, size_max), str(path))
 
 
-def link_profile(direction: Direction, file_max: int = SIZE_MAX) -> DirectionProfile:
+def link_profile(direction: DirectionConfig, file_max: int = SIZE_MAX) -> DirectionProfile:
     """Read the files that one direction of a link profile names.
 
     Raise a BadInputError if a file cannot be used or is longer than `file_max` bytes.

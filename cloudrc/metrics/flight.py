@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from cloudrc.config.schema import Criteria, Mission
+from cloudrc.config.schema import Criteria, MissionConfig
 from cloudrc.geometry.clearance import clearance, least_clearance, pipe_index
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState
@@ -37,7 +37,7 @@ class Flight:
 
     recording: Recording  # all topics; cloud's stamps are shifted to world's clock
     criteria: Criteria
-    mission: Mission  # with its waypoints or random steps
+    mission: MissionConfig  # with its waypoints or random steps
     scene: Scene  # pipes and board
 
     @property

@@ -59,7 +59,7 @@ def exit_code(report: Mapping[str, Any]) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
+class FlightFailure:
     """A criterion of success that is not met."""
 
     code: str  # one word, for programs
@@ -69,11 +69,11 @@ class Failure:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class FlightVerdict:
     """Outcome of a mission and all failures, the earliest failure first."""
 
     outcome: Outcome
-    failures: tuple[Failure, ...] = ()
+    failures: tuple[FlightFailure, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Return outcome, exit code and failures for the API; of a failure only code and text."""
@@ -114,49 +114,51 @@ class Evidence:
     end: Moment = UNKNOWN
     time_limit: float = inf  # limit of the time of `end` [s]
     touch: tuple[float, Moment] | None = None  # speed of the first touch of the board [m/s]
-    violations: tuple[Failure, ...] = ()  # other events that must not happen
+    violations: tuple[FlightFailure, ...] = ()  # other events that must not happen
     slow: str = ""  # why the run failed to keep real time; "" if it did not fail
 
 
-def judge(evidence: Evidence) -> Verdict:
+def judge(evidence: Evidence) -> FlightVerdict:
     """Judge a mission by its evidence; the verdict lists all violations and unmet goals."""
     violations, limit = evidence.violations, evidence.contact_speed_max
     if evidence.contact and evidence.touch is not None and not exceeds(limit, evidence.touch[0]):
         speed, moment = evidence.touch
         key = f"criteria.contact_speed_max_mps {limit:g}"
         text = f"the tip met the board at {format_beside(speed, limit)} m/s, not below {key}"
-        violations = (Failure("contact_too_fast", text, *moment), *violations)
+        violations = (FlightFailure("contact_too_fast", text, *moment), *violations)
     if evidence.ending.code in BROKEN_OFF:
-        return Verdict("interrupted", (Failure(*evidence.ending, *evidence.end), *violations))
+        return FlightVerdict(
+            "interrupted", (FlightFailure(*evidence.ending, *evidence.end), *violations)
+        )
     codes = {failure.code for failure in violations}
     failures = [*violations, *(f for f in _unmet_goals(evidence) if f.code not in codes)]
     failures.sort(key=lambda failure: inf if failure.time is None else failure.time)
     if evidence.slow:
-        return Verdict("invalid", (Failure("not_real_time", evidence.slow), *failures))
-    return Verdict("failure" if failures else "success", tuple(failures))
+        return FlightVerdict("invalid", (FlightFailure("not_real_time", evidence.slow), *failures))
+    return FlightVerdict("failure" if failures else "success", tuple(failures))
 
 
-def _unmet_goals(evidence: Evidence) -> Iterator[Failure]:
+def _unmet_goals(evidence: Evidence) -> Iterator[FlightFailure]:
     ending, end = evidence.ending, evidence.end
     if ending.code != "done":
-        yield Failure(*ending, *end)
+        yield FlightFailure(*ending, *end)
     if ending.code == "not_started":
         return
     if evidence.reached < evidence.waypoints:
         text = f"{evidence.reached} of {evidence.waypoints} waypoints reached"
-        yield Failure("waypoint_not_reached", text, *end)
+        yield FlightFailure("waypoint_not_reached", text, *end)
     if evidence.contact and evidence.touch is None:
         text = "the arm never touched the board, which criteria.contact requires"
-        yield Failure("board_not_touched", text)
+        yield FlightFailure("board_not_touched", text)
     if end.time is not None and exceeds(end.time, evidence.time_limit):
         key = f"criteria.time_limit_s {evidence.time_limit:g}"
         text = f"the mission took {format_beside(end.time, evidence.time_limit)} s, more than {key}"
-        yield Failure("time_limit_exceeded", text, *end)
+        yield FlightFailure("time_limit_exceeded", text, *end)
 
 
-def _obstacle_touched(name: str, count: int, moment: Moment = UNKNOWN) -> Failure:
+def _obstacle_touched(name: str, count: int, moment: Moment = UNKNOWN) -> FlightFailure:
     times = f" ({count} times)" if count > 1 else ""
-    return Failure("obstacle_touched", f"the robot touched {name}{times}", *moment)
+    return FlightFailure("obstacle_touched", f"the robot touched {name}{times}", *moment)
 
 
 def _too_slow(factor: float) -> str:
@@ -193,7 +195,7 @@ def flight_evidence(
     )
 
 
-def _violations(flight: Flight) -> Iterator[Failure]:
+def _violations(flight: Flight) -> Iterator[FlightFailure]:
     """Yield a failure for each recorded event that a successful flight must not have."""
     yield from _obstacles(flight)
     yield from _interventions(flight)
@@ -224,7 +226,7 @@ def _moment(flight: Flight, stamp_ns: int) -> Moment:
     return Moment(float(flight.seconds(stamp_ns)), place)
 
 
-def _obstacles(flight: Flight, until_ns: float = inf) -> Iterator[Failure]:
+def _obstacles(flight: Flight, until_ns: float = inf) -> Iterator[FlightFailure]:
     """Yield a failure for each obstacle that the robot touched at or before `until_ns`."""
     contact = obstacle_contacts(flight)
     for body in sorted(set(map(str, contact["body"]))):
@@ -234,7 +236,7 @@ def _obstacles(flight: Flight, until_ns: float = inf) -> Iterator[Failure]:
             yield _obstacle_touched(body, len(stamps), _moment(flight, int(stamps[0])))
 
 
-def _interventions(flight: Flight) -> Iterator[Failure]:
+def _interventions(flight: Flight) -> Iterator[FlightFailure]:
     """Yield a failure for each change of the guard to GROUND, LAND or ESTOP."""
     guard, before = flight.during("/guard"), None
     rows = zip(guard["stamp_ns"], guard["state"], guard["cause"], strict=True)
@@ -242,20 +244,20 @@ def _interventions(flight: Flight) -> Iterator[Failure]:
         before, repeated = state, state == before  # a touch-down repeats LAND
         if state not in (GuardState.TRACK, GuardState.HOLD) and not repeated:
             text = f"the guard went to {GuardState(state).name}: {cause}"
-            yield Failure("guard_intervened", text, *_moment(flight, int(stamp_ns)))
+            yield FlightFailure("guard_intervened", text, *_moment(flight, int(stamp_ns)))
 
 
-def _restarts(flight: Flight) -> Iterator[Failure]:
+def _restarts(flight: Flight) -> Iterator[FlightFailure]:
     session = flight.during("/session")
     rows = zip(session["stamp_ns"], session["end"], session["cause"], strict=True)
     for stamp_ns, end, cause in rows:
         # The session that the mission itself opens may have the stamp of the start.
         if end == "world" and stamp_ns > (flight.start_ns or 0):
             text = f"world opened a new session in flight: {cause}"
-            yield Failure("world_restarted", text, *_moment(flight, int(stamp_ns)))
+            yield FlightFailure("world_restarted", text, *_moment(flight, int(stamp_ns)))
 
 
-def plugin_failures(recording: Recording) -> Iterator[Failure]:
+def plugin_failures(recording: Recording) -> Iterator[FlightFailure]:
     """Yield a failure for each plug-in that failed in too many control periods."""
     periods, faults = len(recording["/delay_estimate"]), recording["/fault"]
     count = recording["/count"]
@@ -268,10 +270,10 @@ def plugin_failures(recording: Recording) -> Iterator[Failure]:
             shown = format_beside(min(share, 1.0) * 100, PLUGIN_FAILURES_MAX * 100)
             limit = f"{PLUGIN_FAILURES_MAX:.0%}"
             text = f"cloud.{kind} failed in {shown}% of its periods, above {limit}{why}"
-            yield Failure("plugin_failed", text)
+            yield FlightFailure("plugin_failed", text)
 
 
-def _responses(flight: Flight, settle: float) -> Iterator[Failure]:
+def _responses(flight: Flight, settle: float) -> Iterator[FlightFailure]:
     """Yield a failure if a step did not settle to `settle` [m]; another for an unstable loop."""
     found, unit = steps(flight), "step" if flight.mission.steps else "waypoint"
     far = [step for step in found if exceeds(step.last_error, settle)]
@@ -283,14 +285,14 @@ def _responses(flight: Flight, settle: float) -> Iterator[Failure]:
             f"robot was {error} m from the setpoint in the last 0.5 s, above "
             f"criteria.settle_m {settle:g} m"
         )
-        yield Failure("not_settled", text, first.start)
+        yield FlightFailure("not_settled", text, first.start)
     if unstable := [step for step in found if step.unstable]:
         text = (
             f"the loop is unstable: the error oscillates without decay in {len(unstable)} of "
             f"{len(found)} {unit}s, first in {unit} {unstable[0].waypoint + 1}; lower the gains of "
             "cloud.controller, or choose another cloud.predictor"
         )
-        yield Failure("unstable", text, unstable[0].start)
+        yield FlightFailure("unstable", text, unstable[0].start)
 
 
 def _not_real_time(numbers: Mapping[str, Number]) -> str:
@@ -305,7 +307,9 @@ def _not_real_time(numbers: Mapping[str, Number]) -> str:
     return ""
 
 
-def operator_verdict(flight: Flight, evidence: Evidence, numbers: Mapping[str, Number]) -> Verdict:
+def operator_verdict(
+    flight: Flight, evidence: Evidence, numbers: Mapping[str, Number]
+) -> FlightVerdict:
     """Judge a recorded mission with only what the operator knows when the mission ends.
 
     A waypoint is reached if teleop reported it, and timing is judged by the real-time factor alone.

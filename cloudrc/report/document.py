@@ -16,7 +16,7 @@ from cloudrc.config.load import ResolvedExperiment, fingerprint
 from cloudrc.files import write_atomically
 from cloudrc.metrics import Flight, Number
 from cloudrc.metrics.response import steps
-from cloudrc.metrics.verdict import Verdict
+from cloudrc.metrics.verdict import FlightVerdict
 
 SCHEMA_VERSION = 1
 RUN = "run"
@@ -52,8 +52,8 @@ class Assessment:
     experiment: ResolvedExperiment
     flight: Flight
     numbers: dict[str, Number]  # metric -> value, for metrics with a known value
-    verdict: Verdict
-    operator: Verdict | None  # what telemetry told the operator at the end, if it differs
+    verdict: FlightVerdict
+    operator: FlightVerdict | None  # what telemetry told the operator at the end, if it differs
     notes: tuple[str, ...]  # sentences for the reader of the report
     records_sha256: str | None  # hash of the recording; None if the recording is incomplete
 
@@ -147,7 +147,7 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
     write_atomically(path, f"{text}\n".encode())
 
 
-def _verdict_document(verdict: Verdict) -> dict[str, Any]:
+def _verdict_document(verdict: FlightVerdict) -> dict[str, Any]:
     failures = [
         _known({**asdict(failure), "place": failure.place and list(failure.place)})
         for failure in verdict.failures

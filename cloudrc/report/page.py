@@ -17,7 +17,7 @@ from typing import Any
 from cloudrc import __version__
 from cloudrc.config.load import ResolvedExperiment, dump
 from cloudrc.metrics import SHIPPED, Flight, Number, scale
-from cloudrc.metrics.verdict import Failure
+from cloudrc.metrics.verdict import FlightFailure
 from cloudrc.record import wall_time
 from cloudrc.report.document import Assessment, Run
 from cloudrc.report.figures import Picture
@@ -123,7 +123,7 @@ def _pairs(pairs: Mapping[str, str]) -> str:
     )
 
 
-def _failure(failure: Failure) -> str:
+def _failure(failure: FlightFailure) -> str:
     text = escape(failure.text)
     if failure.time is not None:
         text += f", at {failure.time:.2f} s"

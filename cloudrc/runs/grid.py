@@ -26,7 +26,7 @@ from cloudrc.config import problems, shipped
 from cloudrc.config.document import Document, Source, read_document
 from cloudrc.config.load import ResolvedExperiment, load_experiment, local_files
 from cloudrc.config.overrides import KINDS, collect_settings
-from cloudrc.config.problems import Problem, validate
+from cloudrc.config.problems import ConfigProblem, validate
 from cloudrc.config.reuse import reuse, reuse_results
 from cloudrc.config.robot import files_of
 from cloudrc.config.schema import Section
@@ -162,10 +162,10 @@ def _read_unchecked(path: Path) -> _UncheckedGrid:
     name, document = str(path), read_document(path, str(path))
     file = validate(document, SweepFile, name)
     folder = Path(file.folder or path.resolve().parent)
-    found, seeds = list[Problem](), _seeds(file.seeds)
+    found, seeds = list[ConfigProblem](), _seeds(file.seeds)
     if not seeds:
         text = f"must be a number of seeds, 1 to {SEEDS_MAX}, or a list of different seeds"
-        found.append(Problem(("seeds",), problems.in_words(file.seeds), text))
+        found.append(ConfigProblem(("seeds",), problems.in_words(file.seeds), text))
     common, axes = _entries(document, file, folder, found)
     problems.raise_problems(document, found, name)
     is_path = shipped.is_path(file.experiment)
@@ -225,7 +225,7 @@ def _seeds(given: Any) -> tuple[int, ...]:
 
 
 def _entries(
-    document: Document, file: SweepFile, folder: Path, found: list[Problem]
+    document: Document, file: SweepFile, folder: Path, found: list[ConfigProblem]
 ) -> tuple[list[_Entry], dict[str, list[tuple[Any, list[_Entry]]]]]:
     """Return the settings that all points of the sweep share, and a mapping: axis -> its choices.
 
@@ -249,13 +249,13 @@ def _entries(
     for name, given in file.grid.items():
         above, axis = ("grid", name), new_key(name)
         if axis in axes:
-            found.append(Problem(above, "", f"{axis} is given twice; keep one of them"))
+            found.append(ConfigProblem(above, "", f"{axis} is given twice; keep one of them"))
         axes[axis] = choices_of(axis, given, *above)
         if not axes[axis]:
             text = "must be a list of values, or names, each with a mapping of keys to values"
-            found.append(Problem(above, "", text))
+            found.append(ConfigProblem(above, "", text))
         if axis in {*COLUMNS, *metrics.SHIPPED}:
-            found.append(Problem(above, "", "is the name of another column; rename the axis"))
+            found.append(ConfigProblem(above, "", "is the name of another column; rename the axis"))
     return [entry(key, value, "set", key) for key, value in file.set.items()], axes
 
 

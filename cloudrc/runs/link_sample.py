@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from cloudrc.config.load import load_profile
-from cloudrc.config.schema import Direction, Profile
+from cloudrc.config.schema import DirectionConfig, Profile
 from cloudrc.errors import BadInputError
 from cloudrc.link.doubts import describe_trace
 from cloudrc.link.model import LinkDirection, Numbers, Stream, numbers, sample
@@ -68,11 +68,11 @@ def _profile(name: str) -> tuple[Profile, bool]:
         return load_profile(name), False
     times = read_trace(path).times
     about = f"a trace of {len(times)} rows in {times[-1] - times[0]:.4g} s"
-    return Profile(description=about, uplink=Direction(trace=str(path))), True
+    return Profile(description=about, uplink=DirectionConfig(trace=str(path))), True
 
 
 def _way(
-    asked: Direction, name: str, settings: SampleSettings, tell: Tell
+    asked: DirectionConfig, name: str, settings: SampleSettings, tell: Tell
 ) -> tuple[DirectionSample, Numbers]:
     """Simulate one direction of the link; return the packets for the figure, and statistics.
 

@@ -19,10 +19,10 @@ from cloudrc.record.columns import Recording
 from cloudrc.record.merge import cut_to_last_mission, merge
 from cloudrc.report.document import Run
 from cloudrc.report.write import attachments
-from cloudrc.teleop.store import Mission, open_store
+from cloudrc.teleop.store import MissionRecord, open_store
 
 
-def last_mission(folder: Path) -> Mission | None:
+def last_mission(folder: Path) -> MissionRecord | None:
     """Return the last mission that flew in a session that has ended; None if none flew."""
     if not (folder / JOURNAL_FILE).exists():  # the session has ended before it was ready
         return None

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from cloudrc import assembly, plugins
 from cloudrc.config.load import ResolvedExperiment
-from cloudrc.config.schema import Criteria, Mission, Waypoint
+from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
 from cloudrc.errors import describe_error, machine_error
 from cloudrc.link.ages import simulate_ages
 from cloudrc.messages import GuardState
@@ -135,7 +135,7 @@ def _with_step(
         for point, dwell in zip((start, end), times, strict=True)
     ]
     changed = {
-        "mission": Mission(waypoints=tuple(points)),
+        "mission": MissionConfig(waypoints=tuple(points)),
         "criteria": Criteria(contact=False, settle_m=None, time_limit_s=limit),
         "world": experiment.world.model_copy(update={"scene": SCENE, "fence_m": None}),
     }

@@ -33,7 +33,7 @@ from cloudrc.teleop.service import MissionService
 from cloudrc.teleop.store import (
     ConflictError,
     Event,
-    Mission,
+    MissionRecord,
     Order,
     UnavailableError,
     UnknownMissionError,
@@ -168,7 +168,9 @@ class Bridge:
             if future.set_running_or_notify_cancel():
                 try:
                     result = call(self._service, now_ns)
-                    future.set_result(result.as_json() if isinstance(result, Mission) else result)
+                    future.set_result(
+                        result.as_json() if isinstance(result, MissionRecord) else result
+                    )
                 except Exception as error:  # the client gets the error
                     future.set_exception(error)
 

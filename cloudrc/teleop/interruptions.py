@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from cloudrc.messages import GuardState
-from cloudrc.metrics.verdict import Failure
+from cloudrc.metrics.verdict import FlightFailure
 from cloudrc.teleop.wire import RobotStatus
 
 SILENCE = 1.0
@@ -95,11 +95,11 @@ class Interruptions:
                 text += f"; last seen at ({place}) m, with the guard in {seen.guard.name}"
             yield "no_telemetry", text
 
-    def failures(self, time: float) -> tuple[Failure, ...]:
+    def failures(self, time: float) -> tuple[FlightFailure, ...]:
         """Return the interruptions of a mission that ends at `time` [s] and is not done."""
         found = []
         if when := self._silence.summary(time):
-            found.append(Failure("no_telemetry", f"no telemetry {when}"))
+            found.append(FlightFailure("no_telemetry", f"no telemetry {when}"))
         if when := self._hold.summary(time):
-            found.append(Failure("guard_held", f"the guard was in HOLD {when}"))
+            found.append(FlightFailure("guard_held", f"the guard was in HOLD {when}"))
         return tuple(found)

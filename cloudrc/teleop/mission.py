@@ -55,7 +55,7 @@ from cloudrc.teleop.wire import (
 )
 
 if TYPE_CHECKING:
-    from cloudrc.teleop.store import Mission
+    from cloudrc.teleop.store import MissionRecord
 
 NO_WAYPOINT = -1
 """Waypoint index in a setpoint or event that belongs to no waypoint."""
@@ -174,7 +174,7 @@ class Teleop:
         outputs, self.outputs = self.outputs, []
         return outputs
 
-    def start(self, now_ns: int, mission: Mission) -> None:
+    def start(self, now_ns: int, mission: MissionRecord) -> None:
         """Fly a mission; if an earlier teleop process has begun it, continue at its waypoint.
 
         The robot stores the progress under the mission's number, unless this number is 0.

@@ -14,13 +14,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from cloudrc.config.ground import on_ground, put_on_ground
 from cloudrc.config.mission_check import check_mission
-from cloudrc.config.problems import Problem as ConfigProblem
-from cloudrc.config.problems import from_pydantic
+from cloudrc.config.problems import ConfigProblem, from_pydantic
 from cloudrc.config.schema import (
     MAX_WAYPOINTS,
     Carrot,
     Finite,
-    Mission,
+    MissionConfig,
     Place,
     Section,
     TimeLimit,
@@ -248,7 +247,7 @@ def read_order(
     *,
     contact: bool,
     planar: bool = False,
-    plan: Callable[[Mission, float | None], Plan],
+    plan: Callable[[MissionConfig, float | None], Plan],
 ) -> Order:
     """Read, check and plan the mission in the body of a request.
 
@@ -259,7 +258,7 @@ def read_order(
     request = _parse(body, MissionRequest)
     if not request.waypoints:  # only an experiment may have steps instead
         raise RefusedError([ConfigProblem(("waypoints",), "", "none given; give at least one")])
-    mission = Mission(start=request.start, waypoints=request.waypoints, carrot=request.carrot)
+    mission = MissionConfig(start=request.start, waypoints=request.waypoints, carrot=request.carrot)
     mission = put_on_ground(mission, scene) if planar else mission
     contact = contact and leads_to_board(mission, scene)
     contact = contact if request.contact is None else request.contact
@@ -279,7 +278,7 @@ def read_goto(body: bytes, scene: Scene, *, planar: bool = False) -> Leg:
     position = on_ground(request.position_m, scene) if planar else request.position_m
     waypoint = Waypoint(position_m=position, yaw_deg=request.yaw_deg)
     # Whether the board is an obstacle depends on the mission; the service checks the way.
-    mission = Mission(start="here", waypoints=(waypoint,))
+    mission = MissionConfig(start="here", waypoints=(waypoint,))
     problems = check_mission(mission, scene, contact=True, planar=planar)
     if problems:
         raise RefusedError([ConfigProblem(p.path[2:], p.value, p.reason) for p in problems])
@@ -299,7 +298,7 @@ def read_drive(body: bytes, *, grounded: str = "") -> Vector:
     return velocity
 
 
-def leads_to_board(mission: Mission, scene: Scene) -> bool:
+def leads_to_board(mission: MissionConfig, scene: Scene) -> bool:
     """Return whether the arm's tip is at or behind the board's face at any waypoint."""
     board = scene.board
     if board is None:

@@ -21,12 +21,19 @@ from cloudrc.geometry.obstacles import obstacles, surface
 from cloudrc.geometry.placement import find_crossed
 from cloudrc.geometry.scene import Scene
 from cloudrc.messages import GuardState, Setpoint, Start, Vector
-from cloudrc.metrics.verdict import Ending, Failure, Observations, Verdict, finite_or_none, judge
+from cloudrc.metrics.verdict import (
+    Ending,
+    FlightFailure,
+    FlightVerdict,
+    Observations,
+    finite_or_none,
+    judge,
+)
 from cloudrc.records import BY_HAND, Fault, MissionEvent
 from cloudrc.teleop.carrot import HEARTBEAT_NS, SPEED_MAX
 from cloudrc.teleop.interruptions import SILENCE, Interruptions
 from cloudrc.teleop.mission import Teleop
-from cloudrc.teleop.store import ConflictError, Mission, MissionStore, Order, UnavailableError
+from cloudrc.teleop.store import ConflictError, MissionRecord, MissionStore, Order, UnavailableError
 from cloudrc.teleop.wire import FLYING, HELD, QUEUED, Leg, Output, Plan, RobotStatus
 
 GROUND, TRACK, HOLD, LAND, ESTOP = GuardState
@@ -113,7 +120,7 @@ class MissionService:
         self._seen_ns = self._guard_ns = 0  # times of telemetry and of the guard's last change
         self._setpoint: Setpoint | None = None
         self._setpoint_ns = 0
-        self._current: Mission | None = None
+        self._current: MissionRecord | None = None
         self._began_ns = 0  # when this process began to fly the present mission
         self._interruptions = Interruptions()  # of the present mission
         self._ends = False  # whether this process ends; the next process flies the queue
@@ -137,7 +144,7 @@ class MissionService:
         """Whether telemetry shows that the robot has acted on the last request."""
         return self._teleop.settled
 
-    def create(self, order: Order, now_ns: int) -> tuple[Mission, bool]:
+    def create(self, order: Order, now_ns: int) -> tuple[MissionRecord, bool]:
         """Create a mission that starts at once or waits; return it, and whether it is new.
 
         If an earlier order has the same `key`, return the mission of the earlier order.
@@ -165,13 +172,13 @@ class MissionService:
             self._start_next(now_ns, queued=True)
         return mission, True
 
-    def renew(self, mission_id: str, now_ns: int) -> Mission:
+    def renew(self, mission_id: str, now_ns: int) -> MissionRecord:
         """Note that the mission's watcher lives; raise UnknownMissionError for a wrong id."""
         mission = self.book.find(mission_id)
         self._renewed_ns[mission.id] = now_ns
         return mission
 
-    def cancel(self, mission_id: str, now_ns: int, why: str = "") -> Mission:
+    def cancel(self, mission_id: str, now_ns: int, why: str = "") -> MissionRecord:
         """End a mission, or remove it from the queue; raise UnknownMissionError for a wrong id.
 
         `why` follows the words "mission cancelled"; "" if an operator asks for it.
@@ -182,19 +189,19 @@ class MissionService:
         if mission.ended:  # maybe just now, because world has restarted
             raise ConflictError(f"mission {mission.id} has ended: {mission.state}", mission.id)
         text = CANCELLED + BEFORE + why
-        verdict = Verdict("interrupted", (Failure("cancelled", text),)).as_json()
+        verdict = FlightVerdict("interrupted", (FlightFailure("cancelled", text),)).as_json()
         self._note(mission, "cancelled", text, now_ns, verdict=verdict)
         if self.book.trouble:
             text = f"{mission.id} is cancelled, but waits again if teleop restarts"
             raise UnavailableError(f"{text}: {self.book.trouble}")
         return mission
 
-    def hold(self, now_ns: int) -> Mission:
+    def hold(self, now_ns: int) -> MissionRecord:
         """Interrupt the mission under way: the robot holds its position."""
         self._interrupted = True
         return self._operate(self._teleop.hold, now_ns)
 
-    def resume(self, now_ns: int) -> Mission:
+    def resume(self, now_ns: int) -> MissionRecord:
         """Continue the held mission, straight to the next waypoint."""
         self._check_can_fly()
         if (mission := self._current) is not None and mission.state == HELD:
@@ -202,7 +209,7 @@ class MissionService:
             self._check_way(leg, contact=mission.order.contact)
         return self._operate(self._teleop.resume, now_ns)
 
-    def go_to(self, leg: Leg, now_ns: int) -> Mission:
+    def go_to(self, leg: Leg, now_ns: int) -> MissionRecord:
         """Fly straight to a point, during a held mission or as a new mission."""
         self._check_can_fly()
         waiting = self.book.open()
@@ -214,7 +221,7 @@ class MissionService:
         self._check_way(leg, contact=waiting[0].order.contact)
         return self._operate(lambda now: self._teleop.go_to(now, leg), now_ns)
 
-    def drive(self, velocity: Vector, now_ns: int) -> Mission:
+    def drive(self, velocity: Vector, now_ns: int) -> MissionRecord:
         """Drive the setpoint with `velocity` [m/s], in a held mission or in a new one.
 
         The setpoint brakes and rests if the next request comes later than `HEARTBEAT_NS`. After a
@@ -242,7 +249,7 @@ class MissionService:
             raise _busy(waiting[0], "hold or cancel it first")
         return self._operate(lambda now: self._teleop.drive(now, velocity), now_ns)
 
-    def switch_off(self, now_ns: int) -> Mission | None:
+    def switch_off(self, now_ns: int) -> MissionRecord | None:
         """Switch the robot off at once, in any state; return the mission that this ends, if any."""
         self._interrupted = True
         mission = self._start_next(now_ns)
@@ -360,7 +367,7 @@ class MissionService:
         return shown
 
     @property
-    def _inherits_stop(self) -> Mission | None:
+    def _inherits_stop(self) -> MissionRecord | None:
         """Mission that an emergency stop ended before teleop restarted; None without one.
 
         Only the first telemetry shows whether the robot obeyed this stop. Afterwards, and while
@@ -426,7 +433,7 @@ class MissionService:
                 self._current.id if self._current else "",
             )
 
-    def _operate(self, verb: Callable[[int], None], now_ns: int) -> Mission:
+    def _operate(self, verb: Callable[[int], None], now_ns: int) -> MissionRecord:
         mission = self._current
         if mission is None:
             raise ConflictError("no mission is under way")
@@ -437,7 +444,7 @@ class MissionService:
         self._collect(now_ns)
         return mission
 
-    def _start_next(self, now_ns: int, *, queued: bool = False) -> Mission | None:
+    def _start_next(self, now_ns: int, *, queued: bool = False) -> MissionRecord | None:
         """If no mission is under way, start the oldest mission that has not ended.
 
         If an earlier teleop process has started that mission, continue it. If it is queued, start
@@ -524,13 +531,15 @@ class MissionService:
         if mission.ended:
             self._current, self._interrupted = None, True
 
-    def _note(self, mission: Mission, event: str, text: str, now_ns: int, **changed: Any) -> None:
+    def _note(
+        self, mission: MissionRecord, event: str, text: str, now_ns: int, **changed: Any
+    ) -> None:
         if mission is self._current:
             changed["elapsed"] = round(self._teleop.elapsed(now_ns), 3)
         self.book.note(mission, event, text, **changed)
 
 
-def _busy(mission: Mission, advice: str) -> ConflictError:
+def _busy(mission: MissionRecord, advice: str) -> ConflictError:
     return ConflictError(f"mission {mission.id} is {mission.state}; {advice}", mission.id)
 
 

@@ -43,7 +43,7 @@ class Order:
 
 
 @dataclass(slots=True)
-class Mission:
+class MissionRecord:
     """A mission and its progress."""
 
     id: str  # such as "m1"
@@ -190,7 +190,7 @@ KEPT = 100
 """Largest number of ended missions that the store keeps."""
 KEEP_PERIOD_NS = 1_000_000_000
 """Time between two attempts to write events that the disk has refused [ns]."""
-_ORDER, _MISSION = TypeAdapter(Order), TypeAdapter(Mission)
+_ORDER, _MISSION = TypeAdapter(Order), TypeAdapter(MissionRecord)
 _STATUS = {"state", "world", "elapsed", "reached", "events", "happened", "witness", "verdict"}
 """Attributes of a mission that its events change."""
 
@@ -207,7 +207,7 @@ class MissionStore:
         """
         self._db, self._salt = db, salt
         self.notice = notice  # what happened to a damaged earlier file; "" without such a file
-        self.missions: dict[str, Mission] = {}  # by id, oldest first
+        self.missions: dict[str, MissionRecord] = {}  # by id, oldest first
         self.trouble = ""  # why the disk refuses to write; "" if everything is on the disk
         self.dropped = 0  # number of events that readers missed, because they asked too late
         self._unsaved: set[str] = set()  # missions with events that are not on the disk
@@ -221,17 +221,17 @@ class MissionStore:
             text = " ".join(repr(error).split())
             raise sqlite3.DatabaseError(f"a row cannot be read: {text}") from error
 
-    def open(self) -> list[Mission]:
+    def open(self) -> list[MissionRecord]:
         """Return the missions that have not ended, in the order in which they fly."""
         return [mission for mission in self.missions.values() if not mission.ended]
 
-    def stopped(self) -> Mission | None:
+    def stopped(self) -> MissionRecord | None:
         """Return the mission that was flown last if an emergency stop ended it, else None."""
         events = {"started", "emergency_stopped"}
         flown = [each for each in self.missions.values() if each.happened.keys() & events]
         return flown[-1] if flown and "emergency_stopped" in flown[-1].happened else None
 
-    def find(self, mission_id: str) -> Mission:
+    def find(self, mission_id: str) -> MissionRecord:
         """Return a mission; raise UnknownMissionError if none has this id."""
         if mission_id not in self.missions:
             raise UnknownMissionError(f"no mission '{mission_id}'; 'cloudrc mission list' has all")
@@ -241,11 +241,11 @@ class MissionStore:
         """Return whether a mission has ended; `number` is the mission's number in telemetry."""
         return any(mission.number == number and mission.ended for mission in self.missions.values())
 
-    def with_key(self, key: str) -> Mission | None:
+    def with_key(self, key: str) -> MissionRecord | None:
         """Return the mission whose order has this key; None if there is none, or for the key ""."""
         return next((m for m in self.missions.values() if key and m.order.key == key), None)
 
-    def add(self, order: Order) -> Mission:
+    def add(self, order: Order) -> MissionRecord:
         """Store a new mission; delete the oldest ended missions if there are more than `KEPT`.
 
         Raises:
@@ -254,7 +254,7 @@ class MissionStore:
         mission_id = f"m{_row(next(reversed(self.missions), 'm0')) + 1}"
         digest = hashlib.sha256(self._salt + mission_id.encode()).digest()
         number = int.from_bytes(digest[:8], "little") >> 1 or 1
-        mission = Mission(mission_id, replace(order, queue=False), number)
+        mission = MissionRecord(mission_id, replace(order, queue=False), number)
         ended = [each.id for each in self.missions.values() if each.ended]
         old = ended[: max(0, len(ended) - KEPT)]
         self._commit(mission, old)
@@ -263,7 +263,7 @@ class MissionStore:
             del self.missions[each]
         return mission
 
-    def note(self, mission: Mission, event: str, text: str, **changed: Any) -> None:
+    def note(self, mission: MissionRecord, event: str, text: str, **changed: Any) -> None:
         """Store an event and `changed` fields of a mission; `catch_up` repeats a failed write."""
         if event == "reached" and changed["waypoint"] < len(mission.reached):
             return  # an earlier teleop has stored it
@@ -296,7 +296,7 @@ class MissionStore:
         """Close the file, so that the next teleop can open it."""
         self._db.close()
 
-    def _commit(self, new: Mission | None = None, old: Sequence[str] = ()) -> None:
+    def _commit(self, new: MissionRecord | None = None, old: Sequence[str] = ()) -> None:
         """Write unsaved events and the mission `new` to the disk; delete missions `old` there."""
         db = self._db
         try:
@@ -337,5 +337,5 @@ def _row(mission_id: str) -> int:
     return int(mission_id.removeprefix("m"))
 
 
-def _status(mission: Mission) -> str:
+def _status(mission: MissionRecord) -> str:
     return json.dumps(_MISSION.dump_python(mission, mode="json", include=_STATUS))

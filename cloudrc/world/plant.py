@@ -49,7 +49,7 @@ class Wind:
     Deviation: both axes have this spectrum, with a given time constant.
     """
 
-    def __init__(self, wind: schema.Wind, rng: np.random.Generator) -> None:
+    def __init__(self, wind: schema.WindConfig, rng: np.random.Generator) -> None:
         self._mean, self._gust, self._time = wind.velocity_mps, wind.gust_mps, wind.gust_time_s
         self._rng, self._gusts = rng, self._gust * rng.standard_normal(2)
 

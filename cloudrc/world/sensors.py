@@ -40,7 +40,7 @@ class Sensors:
     """Measure the robot's pose and twist for cloud, with errors."""
 
     def __init__(
-        self, errors: schema.Sensors, rng: np.random.Generator, turn_rng: np.random.Generator
+        self, errors: schema.SensorsConfig, rng: np.random.Generator, turn_rng: np.random.Generator
     ) -> None:
         """Set the errors of the measured position, velocity, attitude and body rate.
 
@@ -53,7 +53,7 @@ class Sensors:
         self._attitude = Errors(radians(errors.attitude_noise_deg), (roll, pitch, yaw))
         self._rate = Errors(errors.rate_noise_radps, errors.rate_bias_radps)
         self._rng, self._turn_rng = rng, turn_rng
-        self._exact = errors == schema.Sensors()
+        self._exact = errors == schema.SensorsConfig()
 
     def measure(self, truth: Odometry) -> Odometry:
         """Return the odometry that cloud gets: the true odometry plus the configured errors."""

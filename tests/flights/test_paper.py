@@ -4,7 +4,7 @@ import pytest
 
 from cloudrc import assembly
 from cloudrc.config.load import load_experiment
-from cloudrc.config.schema import Mission
+from cloudrc.config.schema import MissionConfig
 from tests.conftest import nightly
 from tests.fences import FENCE
 from tests.flights.conftest import fly, numbers
@@ -49,7 +49,7 @@ def test_the_paper_flies_under_other_conditions_too(setting):
 def test_the_limit_of_a_leg_defaults_to_three_times_its_time():
     points = [{"position_m": (0.0, 0.0, 1.0)}, {"position_m": (3.0, 4.0, 1.0), "dwell_s": 2.0}]
     points.append({**points[1], "time_limit_s": 7.5})
-    mission = Mission.model_validate({"start": "here", "waypoints": tuple(points)})
+    mission = MissionConfig.model_validate({"start": "here", "waypoints": tuple(points)})
     for options, second in (({}, 33.0), ({"speed_max": 0.5}, 48.0)):
         plan = assembly.mission_plan(mission, None, fence=FENCE, **options)
         limits = [leg.time_limit for leg in plan.legs]

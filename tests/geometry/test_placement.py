@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloudrc.config.mission_check import check_mission, check_scene
-from cloudrc.config.schema import Mission, Steps, Waypoint
+from cloudrc.config.schema import MissionConfig, Steps, Waypoint
 from cloudrc.geometry.clearance import clearance
 from cloudrc.geometry.obstacles import obstacles
 from cloudrc.geometry.placement import (
@@ -36,7 +36,7 @@ def crossed(start, end):
 def refusals(*positions, start="spawn", scene="pipes", **more):
     waypoints = tuple(Waypoint(position_m=position, **more) for position in positions)
     problems = check_mission(
-        Mission(start=start, waypoints=waypoints), load_scene(scene), contact=True
+        MissionConfig(start=start, waypoints=waypoints), load_scene(scene), contact=True
     )
     return "\n".join(map(str, problems))
 
@@ -141,10 +141,12 @@ def test_a_mission_with_a_wall_on_its_way_is_refused(positions, start, reason):
     ],
 )
 def test_steps_that_can_end_in_a_wall_are_refused(steps, scene, reason):
-    (problem,) = check_mission(Mission(steps=Steps(**steps)), load_scene(scene), contact=False)
+    (problem,) = check_mission(
+        MissionConfig(steps=Steps(**steps)), load_scene(scene), contact=False
+    )
     assert problem.path == ("steps",)
     assert reason in problem.reason
-    both = Mission(waypoints=(Waypoint(position_m=(0.0, 0.0, 1.0)),), steps=Steps(**steps))
+    both = MissionConfig(waypoints=(Waypoint(position_m=(0.0, 0.0, 1.0)),), steps=Steps(**steps))
     assert "not both" in str(check_mission(both, PIPES, contact=False)[0])
 
 
@@ -178,14 +180,14 @@ def own_scene(tmp_path):
     ],
 )
 def test_every_body_of_a_scene_of_ones_own_is_in_the_way(own_scene, bodies, waypoints, reason):
-    mission = Mission(waypoints=tuple(Waypoint(position_m=each) for each in waypoints))
+    mission = MissionConfig(waypoints=tuple(Waypoint(position_m=each) for each in waypoints))
     said = "\n".join(map(str, check_mission(mission, own_scene(bodies), contact=False)))
     assert reason in said if reason else said == ""
 
 
 def test_the_board_is_in_the_way_of_missions_that_need_not_touch_it():
     before, behind = (Waypoint(position_m=(x, -6.42, 0.7)) for x in (7.5, 8.235))
-    mission = Mission(start="here", waypoints=(before, behind))
+    mission = MissionConfig(start="here", waypoints=(before, behind))
     assert check_mission(mission, PIPES, contact=True) == []
     (problem,) = check_mission(mission, PIPES, contact=False)
     assert "within 0.04 m of the board" in problem.reason

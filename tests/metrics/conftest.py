@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import cache
 
 from cloudrc.config.load import load_experiment
-from cloudrc.config.schema import Criteria, Mission, Waypoint
+from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
 from cloudrc.geometry.scene import Board, Pipe, Scene
 from cloudrc.messages import UPRIGHT, ZERO, GuardState, Odometry, Telemetry
 from cloudrc.metrics import Flight
@@ -69,7 +69,7 @@ class Log:
         return Flight(
             Recording.from_records(*self.ends()),
             Criteria(time_limit_s=time_limit, **criteria),
-            mission or Mission(waypoints=(anywhere,) * waypoints),
+            mission or MissionConfig(waypoints=(anywhere,) * waypoints),
             scene,
         )
 

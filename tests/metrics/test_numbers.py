@@ -5,7 +5,7 @@ from math import hypot, isfinite, nan
 
 import pytest
 
-from cloudrc.config.schema import Criteria, Mission, Waypoint
+from cloudrc.config.schema import Criteria, MissionConfig, Waypoint
 from cloudrc.geometry.scene import load_scene
 from cloudrc.messages import GuardState
 from cloudrc.metrics import SHIPPED, Flight, measure_all
@@ -331,7 +331,7 @@ NOTHING = Recording.from_records([])
 def test_a_missing_topic_makes_no_metric_fail(lost):
     recording = replace(straight_flight().recording)
     recording._tables[lost] = NOTHING[lost]
-    assert measure_all(Flight(recording, Criteria(), Mission(), ONE_PIPE))[1] == []
+    assert measure_all(Flight(recording, Criteria(), MissionConfig(), ONE_PIPE))[1] == []
 
 
 @pytest.mark.parametrize(
@@ -347,7 +347,7 @@ def test_a_missing_topic_makes_no_metric_fail(lost):
 def test_a_waypoint_counts_if_the_true_position_confirms_it(x, tolerance, dwell, reached):
     """The operator reports it at 10 s; the robot flies at 1 m/s along x."""
     point = Waypoint(position_m=(x, 0.0, 1.0), tolerance_m=tolerance, dwell_s=dwell)
-    flight = flown().flight(mission=Mission(waypoints=(point,)))
+    flight = flown().flight(mission=MissionConfig(waypoints=(point,)))
     assert SHIPPED["waypoints_reached"].measure(flight) == reached
 
 
@@ -364,5 +364,5 @@ def test_the_noise_of_the_measured_positions_is_added_to_the_tolerance(noise, re
     log = flown()
     log.change(TelemetrySent, shake)
     point = Waypoint(position_m=(10.5, 0.0, 1.0), tolerance_m=0.2, dwell_s=0.0)
-    flight = log.flight(mission=Mission(waypoints=(point,)))
+    flight = log.flight(mission=MissionConfig(waypoints=(point,)))
     assert SHIPPED["waypoints_reached"].measure(flight) == reached

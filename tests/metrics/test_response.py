@@ -4,7 +4,7 @@ from math import cos, exp, pi, sin, sqrt
 
 import pytest
 
-from cloudrc.config.schema import Mission, Steps
+from cloudrc.config.schema import MissionConfig, Steps
 from cloudrc.metrics import SHIPPED
 from cloudrc.metrics.response import steps
 from cloudrc.metrics.verdict import flight_evidence, judge
@@ -76,7 +76,7 @@ def test_a_changed_setpoint_begins_a_step_a_moving_one_does_not():
 
 def test_random_steps_must_settle_and_null_switches_it_off():
     far = second_order(0.5), lambda t: (1.3, 0.0, 1.0)
-    mission = Mission(steps=Steps(count=1))
+    mission = MissionConfig(steps=Steps(count=1))
     text = judged(flight(*far, mission=mission))["not_settled"]
     assert "in step 1 the robot was 0.30 m from the setpoint" in text
     assert "criteria.settle_m 0.15 m" in text

@@ -2,7 +2,7 @@
 
 import pytest
 
-from cloudrc.config.schema import Mission, Waypoint
+from cloudrc.config.schema import MissionConfig, Waypoint
 from cloudrc.errors import DISK_FULL
 from cloudrc.messages import GuardState
 from cloudrc.metrics import SHIPPED, Number
@@ -157,7 +157,7 @@ def test_an_interrupted_run_lists_only_certain_failures():
     assert judged(good().flight(ONE_PIPE, contact=True), interrupted=True).outcome == "success"
 
 
-MISSED = Mission(waypoints=(Waypoint(position_m=(0.0, 5.0, 1.0)),))
+MISSED = MissionConfig(waypoints=(Waypoint(position_m=(0.0, 5.0, 1.0)),))
 
 
 @pytest.mark.parametrize(

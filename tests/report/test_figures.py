@@ -9,7 +9,7 @@ import pytest
 from matplotlib.collections import LineCollection, PolyCollection
 
 from cloudrc.config.load import load_experiment
-from cloudrc.config.schema import Direction
+from cloudrc.config.schema import DirectionConfig
 from cloudrc.geometry.shapes import Shapes, box, terrain
 from cloudrc.records import Control
 from cloudrc.report.figures import FIGURES, draw_all, own_settings
@@ -19,7 +19,7 @@ from cloudrc.report.figures.style import RC, Look, Subject
 from cloudrc.world.shapes import read_shapes
 from tests.metrics.conftest import ONE_PIPE, OPEN_AIR, START, flown
 
-CALM = Direction(delay_ms=50.0)
+CALM = DirectionConfig(delay_ms=50.0)
 
 
 def subject_of(log):

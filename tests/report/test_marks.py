@@ -6,15 +6,15 @@ import math
 import numpy as np
 import pytest
 
-from cloudrc.config.schema import Blackout, Change, Direction
+from cloudrc.config.schema import Blackout, Change, DirectionConfig
 from cloudrc.messages import GuardState
 from cloudrc.records import GuardChange, LinkChanged
 from cloudrc.report.figures.marks import HELD, bounds, legend, mark_events
 from cloudrc.report.figures.style import Subject, new_figure
 from tests.metrics.conftest import ONE_PIPE, at, flown
 
-CALM = Direction(delay_ms=50.0)
-TIMED = Direction(
+CALM = DirectionConfig(delay_ms=50.0)
+TIMED = DirectionConfig(
     delay_ms=20.0,
     changes=(Change(at_s=2.0, delay_ms=90.0), Change(at_s=99.0, delay_ms=9.0)),
     blackouts=(Blackout(start_s=1.0, duration_s=9.0),),
@@ -46,7 +46,7 @@ def low(subject, *times):
 
 def test_the_band_follows_the_profile():
     steps = (Change(at_s=5.0, delay_ms=70.0), Change(at_s=9.0, jitter_ms=5.0))
-    timed = Direction(delay_ms=5.0, jitter_ms=20.0, changes=steps)
+    timed = DirectionConfig(delay_ms=5.0, jitter_ms=20.0, changes=steps)
     # The link started one second before the mission. A delay is never negative.
     assert band(subject_of(uplink=timed), 3.99) == pytest.approx((0.0, 0.025))
     assert band(subject_of(uplink=timed), 4.0) == pytest.approx((0.050, 0.090))
@@ -55,7 +55,7 @@ def test_the_band_follows_the_profile():
 def test_a_trace_replaces_the_delay(tmp_path):
     trace = tmp_path / "trace.csv"
     trace.write_text("time_s,delay_ms,loss\n1,30,0\n5,90,0\n", encoding="utf-8-sig")  # of Excel
-    subject = subject_of(uplink=Direction(delay_ms=5.0, jitter_ms=10.0, trace=str(trace)))
+    subject = subject_of(uplink=DirectionConfig(delay_ms=5.0, jitter_ms=10.0, trace=str(trace)))
     # The first row also holds before it.
     assert low(subject, -0.9, 6.0) == pytest.approx([0.020, 0.080])
     trace.unlink()

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import pytest
 
 from cloudrc.metrics import Number
-from cloudrc.metrics.verdict import Failure, Verdict
+from cloudrc.metrics.verdict import FlightFailure, FlightVerdict
 from cloudrc.report.document import Run, environment_document
 from cloudrc.report.figures import FIGURES, Picture
 from cloudrc.report.page import readable, render
@@ -61,10 +61,13 @@ def test_the_page_says_what_the_flight_did(folder):
 
 def test_failures_and_notes_are_escaped():
     place = (1.0, -2.0, 0.7)
-    failures = Failure("obstacle_touched", "it hit", 3.5, place), Failure("x", "<script>alert(1)")
+    failures = (
+        FlightFailure("obstacle_touched", "it hit", 3.5, place),
+        FlightFailure("x", "<script>alert(1)"),
+    )
     assessment = replace(
         assess(*reversed(paper()), Run("local", "relay")),
-        verdict=Verdict("failure", failures),
+        verdict=FlightVerdict("failure", failures),
         notes=("metric <b> & 'c'",),
     )
     picture = Picture("delay", {"svg": b"<svg/>"}, "Caption.", 7.16, "A picture of something.")

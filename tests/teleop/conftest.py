@@ -84,7 +84,7 @@ class Flight:
 
     def operate(self, verb, *words, number=0):
         if verb == "start":
-            words = [store.Mission("m1", Order(*words), number)]
+            words = [store.MissionRecord("m1", Order(*words), number)]
         try:
             getattr(self.teleop, verb)(self.now_ns, *words)
         finally:

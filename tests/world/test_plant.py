@@ -73,7 +73,7 @@ def test_a_weak_rotor_has_less_thrust_and_less_torque():
 
 
 def test_gusts_have_their_deviation_and_their_time_constant():
-    section = schema.Wind(velocity_mps=(3.0, -1.0), gust_mps=0.8, gust_time_s=0.2)
+    section = schema.WindConfig(velocity_mps=(3.0, -1.0), gust_mps=0.8, gust_time_s=0.2)
     wind = Wind(section, np.random.default_rng(5))
     still = Readings.of((*ZERO, *UPRIGHT), (*ZERO, *ZERO))
     air = -np.array([wind.seen_from(still, 0.02).velocity for _ in range(40_000)])

@@ -11,7 +11,9 @@ TRUTH = Odometry(5, (1.0, 2.0, 3.0), (0.6, 0.0, 0.8, 0.0), (4.0, 5.0, 6.0), (7.0
 
 
 def sensors(**errors):
-    return Sensors(schema.Sensors(**errors), np.random.default_rng(1), np.random.default_rng(2))
+    return Sensors(
+        schema.SensorsConfig(**errors), np.random.default_rng(1), np.random.default_rng(2)
+    )
 
 
 def test_attitude_and_rate_have_their_bias_about_the_body_axes():

@@ -9,7 +9,7 @@ import numpy as np
 
 from cloudrc import assembly
 from cloudrc.config.mission_check import check_mission
-from cloudrc.config.schema import Mission
+from cloudrc.config.schema import MissionConfig
 from cloudrc.faults import measures
 from cloudrc.faults.adversary import Lie
 from cloudrc.faults.flight import FaultRun
@@ -215,7 +215,7 @@ def _impossible(outcome: Outcome, seed: int) -> None:
     for name, way in ({name: [first, point] for name, point in points.items()} | others).items():
         try:
             waypoints = tuple({"position_m": point} for point in way)
-            mission = Mission.model_validate({"waypoints": waypoints})
+            mission = MissionConfig.model_validate({"waypoints": waypoints})
             problems = [str(each) for each in check_mission(mission, scene, contact=True)]
         except ValueError as error:
             problems = [str(error)]

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cloudrc.config.schema import Direction
+from cloudrc.config.schema import DirectionConfig
 from cloudrc.metrics.flight import Array
 from cloudrc.report.figures import marks, own_settings, save, style
 from cloudrc.report.figures.style import Look, dots, legend_above, new_figure, panel
@@ -24,7 +24,7 @@ DOTS = 6000
 class DirectionSample:
     """Simulated packets of one direction of a link, for the figure of `cloudrc link show`."""
 
-    asked: Direction  # the link profile
+    asked: DirectionConfig  # the link profile
     sent: Array  # time of sending each packet, since the start of the link [s], shape (n,)
     delays: Array  # one-way delays, NaN for lost packets [s], shape (n,)
     many: Array  # one-way delays for the distribution, NaN for lost packets [s], shape (m,)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 
-from cloudrc.config.schema import Direction
+from cloudrc.config.schema import DirectionConfig
 from cloudrc.errors import BadInputError
 from cloudrc.link.profile import Timeline
 from cloudrc.link.traces import link_profile
@@ -26,7 +26,7 @@ SAME_CAUSE = 1.0
 HELD = " Red: the guard was in HOLD."
 
 
-def delays_of(direction: Direction) -> Timeline | None:
+def delays_of(direction: DirectionConfig) -> Timeline | None:
     """Return a direction's link conditions over time; None if a file for them is unreadable."""
     try:
         return Timeline(link_profile(direction))
@@ -54,7 +54,7 @@ class LinkSpan(NamedTuple):
 
     begin: float  # [s]; -inf for the profile at the start of the flight
     origin: float  # start of the profile's time line [s]
-    direction: Direction
+    direction: DirectionConfig
     cause: str  # cause of the change; "" if the link started with this profile
 
 
@@ -69,7 +69,7 @@ def parts(subject: Subject, *, uplink: bool) -> list[LinkSpan]:
         if table["uplink"][row] != uplink:
             continue
         try:
-            direction = Direction.model_validate_json(str(table["conditions"][row]))
+            direction = DirectionConfig.model_validate_json(str(table["conditions"][row]))
         except ValueError:  # another version of cloudrc has recorded this flight
             continue
         origin = float(seconds(table["stamp_ns"][row]) - table["time_line"][row])

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cloudrc.config.schema import Direction
+from cloudrc.config.schema import DirectionConfig
 from cloudrc.geometry.scene import BOARD
 from cloudrc.geometry.shapes import Shapes, Surface
 from cloudrc.metrics import Flight
@@ -110,8 +110,8 @@ class Subject:
     """What the figures show: a flight, and the two link profiles at its start."""
 
     flight: Flight
-    uplink: Direction
-    downlink: Direction
+    uplink: DirectionConfig
+    downlink: DirectionConfig
     look: Look = Look()
     shapes: Shapes = NOTHING  # of robot and scene
 
