@@ -68,6 +68,7 @@ class Cause(IntEnum):
     NOT_DOWN = 12, "acknowledged before touch-down"
     DOWN = 13, "at rest, switched off"
     NOT_OFF = 14, "not off the ground yet, switched off"
+    FAILED = 15, "onboard controller failed"
 
 
 STATES = ", ".join(f"{state:d} {state.name}" for state in GuardState)

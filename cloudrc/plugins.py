@@ -52,6 +52,8 @@ PACKAGES = {
 cloudrc's metrics are functions, and models of motion are files of robots."""
 SHOWN_MAX = 60
 """Largest length of a wrong value's representation in a message [characters]."""
+STACK_MAX = 4000
+"""Largest length of a failure's stack in the recording [characters]."""
 METHODS = {
     **{"estimators": "horizon", "predictors": "predict", "controllers": "update"},
     **{"onboard": "update", "motion": "__call__"},
@@ -183,6 +185,12 @@ def locate(error: BaseException) -> str:
     own = [each for each in frames if str(each[0].f_globals.get("__name__")).startswith(PREFIX)]
     frame, line = (own or frames)[-1]
     return f"{Path(frame.f_code.co_filename).name}:{line} in {frame.f_code.co_name}"
+
+
+def stack_of(error: BaseException) -> str:
+    """Return the stack of a plug-in's failure as Python prints it, shortened from the front."""
+    frames = "".join(traceback.format_tb(error.__traceback__))[-STACK_MAX:]
+    return frames.encode(errors="replace").decode() + describe_error(error)
 
 
 class InvalidResultError(ValueError):

@@ -209,7 +209,7 @@ UNDER_WAY = ("started", "reached", "held", "resumed", "paused", *BY_HAND)
 that flies the mission ends and the next process continues the mission."""
 FAILURES = (
     *("timed_out", "leg_timed_out", "world_restarted", "guard_stopped", "emergency_stopped"),
-    *("taken_over", "end_lost"),
+    *("onboard_failed", "taken_over", "end_lost"),
 )
 """Events that end a mission as a failure."""
 
@@ -243,8 +243,8 @@ class Fault(NamedTuple):
     code: Annotated[
         str,
         "",
-        "one word, for example estimator_failed, predictor_failed, controller_failed, recorder,"
-        " link_check, wall_clock, late",
+        "one word, for example estimator_failed, predictor_failed, controller_failed, "
+        "onboard_failed, recorder, link_check, wall_clock, late",
     ]
     text: Annotated[str, "", "what is wrong, where, what to do"]
     traceback: Annotated[str, "", "of a plug-in's first failure, else empty"] = ""

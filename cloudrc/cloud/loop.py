@@ -16,7 +16,6 @@ It needs no clock synchronisation.
 
 from __future__ import annotations
 
-import traceback
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from copy import deepcopy
@@ -46,6 +45,7 @@ from cloudrc.plugins import (
     check_failure,
     locate,
     refuse_failure,
+    stack_of,
     to_number,
 )
 from cloudrc.records import Control, Fault
@@ -68,8 +68,6 @@ INSTEAD = {
     "controller": "cloud commands zero velocity",
 }
 """Kind of plug-in -> what cloud does when a plug-in of this kind fails."""
-TRACEBACK_MAX = 4000
-"""Largest size of a recorded traceback [characters]; the beginning of a longer one is cut off."""
 
 
 PLAN_STEP = PLAN_STEP_NS * 1e-9
@@ -375,9 +373,7 @@ class ControlLoop:
             where = "" if isinstance(error, InvalidResultError) else f", {locate(error)}"
             what = f"the {kind} failed ({describe_error(error)}{where})"
             text = f"{what}; {instead or INSTEAD[kind]}; fix cloud.{kind} or choose another"
-            frames = "".join(traceback.format_tb(error.__traceback__))[-TRACEBACK_MAX:]
-            trace = frames.encode(errors="replace").decode() + describe_error(error)
-            self.faults.append(Fault(self._now_ns, code, text, trace))
+            self.faults.append(Fault(self._now_ns, code, text, stack_of(error)))
 
 
 def _refuse_positions(positions: Sequence[Vector]) -> None:

@@ -23,7 +23,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from cloudrc.errors import DISK_FULL, DiskFullError
-from cloudrc.messages import GuardState, Vector
+from cloudrc.messages import Cause, GuardState, Vector
 from cloudrc.metrics import Flight, Number
 from cloudrc.metrics.definitions import real_time_factor
 from cloudrc.metrics.mission import first_touch, obstacle_contacts, reported
@@ -198,6 +198,7 @@ def flight_evidence(
 def _violations(flight: Flight) -> Iterator[FlightFailure]:
     """Yield a failure for each recorded event that a successful flight must not have."""
     yield from _obstacles(flight)
+    yield from _onboard_failures(flight)
     yield from _interventions(flight)
     yield from _restarts(flight)
     yield from plugin_failures(flight.recording)
@@ -242,9 +243,21 @@ def _interventions(flight: Flight) -> Iterator[FlightFailure]:
     rows = zip(guard["stamp_ns"], guard["state"], guard["cause"], strict=True)
     for stamp_ns, state, cause in rows:
         before, repeated = state, state == before  # a touch-down repeats LAND
-        if state not in (GuardState.TRACK, GuardState.HOLD) and not repeated:
+        is_known = cause == Cause.FAILED.words  # by `_onboard_failures`
+        if state not in (GuardState.TRACK, GuardState.HOLD) and not repeated and not is_known:
             text = f"the guard went to {GuardState(state).name}: {cause}"
             yield FlightFailure("guard_intervened", text, *_moment(flight, int(stamp_ns)))
+
+
+def _onboard_failures(flight: Flight) -> Iterator[FlightFailure]:
+    """Yield a failure for each failure of the onboard controller, on which the guard stops."""
+    starts = flight.end_ns is not None  # a robot that fails on the ground starts no mission
+    faults = flight.during("/fault") if starts else flight.recording["/fault"]
+    rows = zip(faults["stamp_ns"], faults["code"], faults["text"], strict=True)
+    for stamp_ns, code, text in rows:
+        if code == "onboard_failed":
+            moment = _moment(flight, int(stamp_ns)) if starts else UNKNOWN
+            yield FlightFailure(code, str(text), *moment)
 
 
 def _restarts(flight: Flight) -> Iterator[FlightFailure]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from math import isfinite
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cloudrc import plugins
@@ -21,6 +22,7 @@ from cloudrc.world.plant import Wind
 from cloudrc.world.robot import STEP, Robot
 from cloudrc.world.scene import compile_model, compile_true
 from cloudrc.world.simulator import Simulator
+from cloudrc.world.watched import WatchedActuators, WatchedOnboard
 
 if TYPE_CHECKING:
     from cloudrc.config.load import ResolvedGuard
@@ -54,11 +56,14 @@ def build_robot(world: World, limits: ResolvedGuard, wind: Wind | None = None) -
         BadInputError: If the robot does not compile, or if it cannot move as `world` says.
     """
     model, plugin, onboard, actuators = _make_parts(world)
-    robot, simulator = find_robot(world.robot), Simulator(model, actuators, wind)
+    robot = find_robot(world.robot)
     guard = Guard(limits, fence_in(world), robot.guard, planar=robot.planar)
     faster = _accelerator(world, plugin)
-    make = Robot if faster is None or faster.make is None else faster.make
-    return make(simulator, onboard, guard)
+    if faster is not None and faster.make is not None:
+        return faster.make(Simulator(model, actuators, wind), onboard, guard)  # type: ignore[no-any-return]
+    if not isinstance(actuators, Direct):
+        actuators = WatchedActuators(actuators, model.nu)
+    return Robot(Simulator(model, actuators, wind), WatchedOnboard(onboard), guard)
 
 
 def controller(robot: RobotFiles, model: Any) -> PlugIn:
@@ -133,6 +138,7 @@ def _make_parts(world: World) -> Parts:
     if not robot.planar:
         _check_lift(world, where, true)
     actuators = _build_actuators(plugin, nominal, parameters(robot, world))
+    _check_onboard(onboard, nominal.nu if isinstance(actuators, Direct) else None)
     if world.wind.blows and isinstance(actuators, Direct):
         _refuse_wind(world, plugin)
     return Parts(true, plugin, onboard, actuators)
@@ -174,7 +180,25 @@ def _build_actuators(plugin: Any, model: Any, given: dict[str, Any]) -> Actuator
         return Direct(model.nu)
     known = inspect.signature(plugin.actuators).parameters
     own = {name: value for name, value in given.items() if name in known}
-    return plugin.actuators(model, STEP, **own)  # type: ignore[no-any-return]
+    with plugins.refuse_failure("actuators() of the onboard controller failed"):
+        actuators = plugin.actuators(model, STEP, **own)
+        actuators.reset()
+        return actuators  # type: ignore[no-any-return]
+
+
+def _check_onboard(onboard: Onboard, size: int | None) -> None:
+    """Refuse a controller that lacks a part; `size` is the number of commands, None if unknown."""
+    wanted = "finite numbers" if size is None else f"{size} finite numbers, one per actuator"
+    with plugins.refuse_failure("the onboard controller does not hold the contract"):
+        for method in ("reset", "update", "brake"):
+            if not callable(getattr(onboard, method, None)):
+                raise ValueError(f"{type(onboard).__name__} has no method {method}()")
+        stopped = getattr(onboard, "stopped", None)
+        numbers = [float(value) for value in stopped] if isinstance(stopped, Iterable) else []
+        fits = len(numbers) == (size or len(numbers)) and all(map(isfinite, numbers))
+        if not numbers or not fits:
+            raise ValueError(f"its stopped is {plugins.shorten(stopped)}, not {wanted}")
+        onboard.reset()
 
 
 def _refuse_wind(world: World, plugin: Any) -> None:

@@ -66,9 +66,11 @@ def measure(experiment: ResolvedExperiment) -> Row:
 def counts(row: Row) -> bool:
     """Return whether the metrics of a flight are valid results of its experiment.
 
-    They are invalid if the flight did not end, or if a plug-in failed in too many periods.
+    They are invalid if the flight did not end, if a plug-in failed in too many periods, or if the
+    onboard controller failed.
     """
-    return row["verdict"] in ("success", "failure") and "plugin_failed" not in row["failures"]
+    failed = {"plugin_failed", "onboard_failed"}.intersection(row["failures"])
+    return row["verdict"] in ("success", "failure") and not failed
 
 
 def units(own: Iterable[str]) -> dict[str, str]:

@@ -30,6 +30,7 @@ from cloudrc.messages import (
     MISSION_OVER,
     NEVER_NS,
     ZERO,
+    Cause,
     Drive,
     GuardState,
     Motion,
@@ -348,7 +349,8 @@ class Teleop:
             text = "the robot reports that the mission is over, but its outcome is lost;"
             return "end_lost", text
         if seen.guard > HOLD:
-            return "guard_stopped", f"guard went to {seen.guard.name} ({seen.cause.words})"
+            code = "onboard_failed" if seen.cause is Cause.FAILED else "guard_stopped"
+            return code, f"guard went to {seen.guard.name} ({seen.cause.words})"
         return None
 
     def _find_timeout(self, now_ns: int) -> tuple[str, str] | None:

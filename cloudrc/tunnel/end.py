@@ -61,15 +61,17 @@ class TunnelEnd:
         records, self._records = self._records, []
         return records
 
-    def _tell(self, code: str, text: str, now_ns: int) -> None:
+    def _tell(self, code: str, text: str, now_ns: int, trace: str = "") -> None:
         """Record a fault at `now_ns` [ns], unless this session has a fault with the same text.
+
+        `trace` is the stack of a plug-in's failure.
 
         Faults with the same `code` and different texts are all recorded. A forged datagram with a
         wrong version therefore does not hide the version of the true peer.
         """
         if text not in self._told:
             self._told.add(text)
-            self._records.append(Fault(now_ns, code, text))
+            self._records.append(Fault(now_ns, code, text, trace))
 
     def _tell_refusal(self, outcome: str, data: bytes, now_ns: int) -> None:
         """Record a fault at `now_ns` [ns] if `data` was refused for its version or its key.

@@ -195,6 +195,10 @@ class WorldEndpoint(TunnelEnd):
         truth = simulator.truth(now_ns)
         forces = (tip_force, *simulator.take_tip_force())
         records.append(_new(GroundTruth, (now_ns, truth, *forces, guard.reference)))
+        if (failure := self.robot.failure) is not None:
+            text = f"{failure}; the guard stopped the robot; fix the file"
+            self._tell("onboard_failed", text, failure.stamp_ns, failure.trace)
+            self.robot.failure = None
         if guard.changes:
             records += guard.take_changes()
         if simulator.touches:

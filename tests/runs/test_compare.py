@@ -48,9 +48,10 @@ def test_no_pairs_and_unknown_numbers_are_refused():
         compare(pairs((flown(iae_mean=1.0), flown(iae_mean=1.0))), UNITS, ["iea_mean"])
 
 
-def test_numbers_of_a_plugin_that_failed_do_not_count():
+@pytest.mark.parametrize("code", ["plugin_failed", "onboard_failed"])
+def test_numbers_of_a_plugin_that_failed_do_not_count(code):
     """Another plug-in took over, so B would look equal to A."""
-    ok, failed = flown(iae_mean=1.0), flown("failure", "plugin_failed", iae_mean=1.0)
+    ok, failed = flown(iae_mean=1.0), flown("failure", code, iae_mean=1.0)
     found = compare(pairs((ok, ok), (ok, failed)), UNITS)
     assert (found["pairs"], found["left_out"]) == (1, 1)
     with pytest.raises(BadInputError, match="plug-in failed: a reason"):

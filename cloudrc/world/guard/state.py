@@ -202,6 +202,14 @@ class Guard:
         if self.state is not ESTOP:
             self._enter(ESTOP, now_ns, Cause.STOPPED)
 
+    def fail(self, now_ns: int) -> None:
+        """Switch off the actuators because the onboard controller cannot steer them, in any state.
+
+        Braking and landing need the onboard controller, too, so they are no way out.
+        """
+        if self.state is not ESTOP:
+            self._enter(ESTOP, now_ns, Cause.FAILED)
+
     def acknowledge(self, now_ns: int) -> None:
         """Process the operator's acknowledgement of LAND or ESTOP; nothing starts."""
         if self.latched and not self._flies:

@@ -400,6 +400,16 @@ def test_the_emergency_stop_works_from_everywhere_at_once(make):
     assert guard.take_changes() == []
 
 
+@pytest.mark.parametrize("make", [lambda: Guard(LIMITS, FENCE), armed, tracking, holding, landing])
+def test_a_failed_onboard_controller_stops_the_robot_in_every_state(make):
+    guard = make()
+    for now_ns in (3 * SECOND, 4 * SECOND):
+        guard.fail(now_ns)
+    assert told(guard) == (3 * SECOND, ESTOP, "onboard controller failed")
+    assert run(guard, 4 * SECOND, 4 * SECOND + 10 * MS) == [None] * 5
+    assert (guard.latched, guard.armed) == (True, False)
+
+
 @pytest.mark.parametrize(
     ("velocity", "cause"), [(ZERO, Cause.ACKNOWLEDGED), (SINKS, Cause.STILL_FIRST)]
 )

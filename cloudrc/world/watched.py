@@ -1,0 +1,164 @@
+"""Watch the code that a robot brings: its onboard controller, and the physics of its actuators.
+
+Both may be files of the user, which may raise anything and return anything. Their failure in flight
+is an `OnboardFailedError`, on which the guard stops the robot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import isfinite
+from pathlib import Path
+from types import CodeType
+from typing import Any
+
+from cloudrc.errors import describe_error
+from cloudrc.messages import NEVER_NS, Vector
+from cloudrc.plugins import check_failure, locate, shorten, stack_of
+from cloudrc.world.onboard import Actuators, Commands, Inputs, Onboard
+from cloudrc.world.readings import Readings
+
+WHAT, PHYSICS = "the onboard controller", "the actuators of the onboard controller"
+"""The watched objects in messages."""
+
+
+class OnboardFailedError(Exception):
+    """An onboard controller or its actuators failed.
+
+    Attributes:
+        trace: Stack of the failure, or "" if a value is wrong.
+        stamp_ns: Time of the step in which the guard stopped the robot [ns], world's clock.
+    """
+
+    def __init__(self, text: str, trace: str = "") -> None:
+        """Set the text, one line that names file and line, and the stack."""
+        super().__init__(text)
+        self.trace, self.stamp_ns = trace, NEVER_NS
+
+
+class WatchedOnboard:
+    """An onboard controller whose calls raise an `OnboardFailedError` if they fail.
+
+    Attributes:
+        stopped: Commands while the guard has stopped the robot.
+    """
+
+    def __init__(self, onboard: Onboard) -> None:
+        """Watch `onboard`, whose `stopped` are finite numbers."""
+        self.stopped: Commands = tuple([float(value) for value in onboard.stopped])
+        self._size = len(self.stopped)
+        self._onboard = onboard
+        self._update, self._brake = onboard.update, onboard.brake
+
+    def reset(self) -> None:
+        """Forget everything; the robot is stopped."""
+        reset = self._onboard.reset
+        try:
+            reset()
+        except BaseException as error:
+            raise _failure(WHAT, reset, error) from error
+
+    def update(self, readings: Readings, velocity: Vector, yaw_rate: float) -> Commands:
+        """Return the commands that make the robot follow a velocity [m/s] and yaw rate [rad/s]."""
+        try:
+            commands = self._update(readings, velocity, yaw_rate)
+            if type(commands) is tuple and len(commands) == self._size and isfinite(sum(commands)):
+                return commands  # `_numbers` takes a microsecond
+        except BaseException as error:
+            raise _failure(WHAT, self._update, error) from error
+        return _numbers(commands, self._size, WHAT, self._update)
+
+    def brake(self, readings: Readings, velocity: Vector) -> Commands:
+        """Return commands as `update` does, while the guard brakes to a velocity [m/s]."""
+        try:
+            commands = self._brake(readings, velocity)
+            if type(commands) is tuple and len(commands) == self._size and isfinite(sum(commands)):
+                return commands
+        except BaseException as error:
+            raise _failure(WHAT, self._brake, error) from error
+        return _numbers(commands, self._size, WHAT, self._brake)
+
+
+class WatchedActuators:
+    """Actuators that raise an `OnboardFailedError` when they fail, and from then on push nothing.
+
+    Attributes:
+        speeds: What the actuators do at present.
+    """
+
+    def __init__(self, actuators: Actuators, inputs: int) -> None:
+        """Watch `actuators` of a model with `inputs` controls."""
+        self._actuators = actuators
+        self._size = inputs + 6
+        self._rest: Inputs = (0.0,) * self._size
+        self._step = actuators.step
+        self._has_failed = False
+
+    @property
+    def speeds(self) -> Commands:
+        """What the actuators do at present."""
+        return self._actuators.speeds
+
+    @speeds.setter
+    def speeds(self, speeds: Commands) -> None:
+        self._actuators.speeds = speeds
+
+    def reset(self) -> None:
+        """Stand still."""
+        self._has_failed = False
+        try:
+            self._actuators.reset()
+        except BaseException as error:
+            self._has_failed = True
+            raise _failure(PHYSICS, self._actuators.reset, error) from error
+
+    def step(self, commands: Commands, readings: Readings) -> Inputs:
+        """Advance by one physics step towards `commands`; return the input to MuJoCo."""
+        if self._has_failed:
+            return self._rest
+        try:
+            inputs = self._step(commands, readings)
+            if type(inputs) is tuple and len(inputs) == self._size and isfinite(sum(inputs)):
+                return inputs
+        except BaseException as error:
+            self._has_failed = True
+            raise _failure(PHYSICS, self._step, error) from error
+        try:
+            return _numbers(inputs, self._size, PHYSICS, self._step)
+        except OnboardFailedError:
+            self._has_failed = True
+            raise
+
+
+def _numbers(values: Any, size: int, what: str, call: Callable[..., Any]) -> tuple[float, ...]:
+    """Return the values of a call as floats; refuse another number of values, and NaN."""
+    try:
+        numbers = tuple([float(value) for value in values])
+        wrong = len(numbers) != size or not all(map(isfinite, numbers))
+    except Exception:  # the values are the user's, and so may be what iterates them
+        wrong = True
+    if wrong:
+        name = getattr(call, "__name__", "it")
+        text = f"{name}() returned {shorten(values)}, not {size} finite numbers"
+        raise OnboardFailedError(f"{what} failed ({text}, {_place(call)})")
+    return numbers
+
+
+def _failure(what: str, call: Callable[..., Any], error: BaseException) -> OnboardFailedError:
+    """Return what to raise for an exception that `call` raised.
+
+    Raises:
+        BaseException: `error`, if it is not the failure of the user's code.
+    """
+    check_failure(error, what)
+    is_inside = error.__traceback__ is not None and error.__traceback__.tb_next is not None
+    place = locate(error) if is_inside else _place(call)  # a call with wrong arguments
+    return OnboardFailedError(f"{what} failed ({describe_error(error)}, {place})", stack_of(error))
+
+
+def _place(call: Callable[..., Any]) -> str:
+    """Return file and line of a function of the user."""
+    code = getattr(call, "__code__", None)
+    if not isinstance(code, CodeType):
+        return f"in {type(call).__name__}"
+    return f"{Path(code.co_filename).name}:{code.co_firstlineno} in {code.co_name}"

@@ -1,0 +1,144 @@
+"""An onboard controller that fails: the robot stops, the verdict names file and line."""
+
+import pytest
+
+import cloudrc
+from cloudrc.config.robot import find_robot
+from cloudrc.errors import BadInputError
+from cloudrc.messages import GuardState
+
+HOVER = {"mission": {"waypoints": [{"position_m": [0, 0, 1.0]}]}, "world.scene": "empty"}
+FAILS = """
+from cloudrc.robots.onboard.multirotor import build as general
+
+
+class Fails:
+    def __init__(self, law):
+        self.law, self.stopped, self.calls = law, law.stopped, 0
+
+    def reset(self):
+        self.law.reset()
+
+    def brake(self, readings, velocity):
+        return self.law.brake(readings, velocity)
+
+    def update(self, readings, velocity, yaw_rate):
+        self.calls += 1
+        commands = self.law.update(readings, velocity, yaw_rate)
+        if self.calls == 700:
+            {what}
+        return commands
+
+
+def build(model):
+    return Fails(general(model))
+"""
+ACTUATORS = """
+
+class Push:
+    def __init__(self):
+        self.speeds, self.steps = (0.0,) * 4, 0
+
+    def reset(self):
+        self.steps = 0
+
+    def step(self, commands, readings):
+        self.steps += 1
+        {what}
+        return (*commands, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def actuators(model, dt):
+    return Push()
+"""
+
+
+@pytest.fixture
+def fly(tmp_path):
+    """Return a function that flies an x2 with an onboard controller of one's own."""
+    model = find_robot("x2").model.read_text()
+
+    def with_source(source, mission=HOVER):
+        (tmp_path / "robot.xml").write_text(model)
+        (tmp_path / "robot.yaml").write_text("onboard: ./own.py")
+        (tmp_path / "own.py").write_text(source)
+        return cloudrc.fly("hover", mission | {"world.robot": str(tmp_path)})
+
+    return with_source
+
+
+@pytest.mark.parametrize(
+    ("what", "shown"),
+    [
+        ("return (float('nan'), *commands[1:])", "tuple (nan, "),
+        ("return commands[1:]", "not 4 finite numbers, own.py:15 in update"),
+        ("return [*commands, float('inf')]", "list ["),
+        ("return None", "NoneType None, not 4 finite numbers"),
+        ("return 'stop'", "str 'stop'"),
+        ("raise KeyError('gyro')", "KeyError: 'gyro', own.py:19 in update"),
+        ("raise SystemExit(0)", "sys.exit() was called"),
+        ("assert False", "AssertionError"),
+    ],
+)
+def test_a_controller_that_fails_in_flight_ends_it_with_onboard_failed(fly, what, shown):
+    flight = fly(FAILS.replace("{what}", what))
+    assert (flight.verdict, flight.failures[0].code) == ("failure", "onboard_failed")
+    text = flight.failures[0].text
+    assert shown in text
+    assert "own.py:" in text
+    assert "\n" not in text
+    assert flight["/guard"]["state"][-1] == GuardState.ESTOP
+    assert [each.code for each in flight.failures].count("onboard_failed") == 1
+
+
+def test_the_actuators_of_a_robot_that_failed_push_nothing(fly):
+    flight = fly(FAILS.replace("{what}", "raise ValueError"))
+    truth = flight["/ground_truth"]
+    falls = truth["velocity"][truth["stamp_ns"] > flight["/guard"]["stamp_ns"][-1], 2]
+    assert falls[0] > falls[-1]
+    assert falls[-1] < -0.3
+
+
+@pytest.mark.parametrize("what", ["return (0.0,) * 9", "return [float('nan')] * 10", "1 / 0"])
+def test_physics_of_actuators_that_fails_in_flight_is_onboard_failed_too(fly, what):
+    late = f"if self.steps > 900: {what}"
+    flight = fly(FAILS.replace("{what}", "pass") + ACTUATORS.replace("{what}", late))
+    assert flight.failures[0].code == "onboard_failed"
+    assert "own.py:" in flight.failures[0].text
+
+
+def test_both_may_fail_in_the_same_step(fly):
+    both = FAILS.replace("{what}", "return ()") + ACTUATORS.replace("{what}", "commands[0] / 0")
+    assert fly(both).failures[0].code == "onboard_failed"
+
+
+def test_a_reset_that_fails_is_told_once(fly):
+    source = FAILS.replace("{what}", "pass").replace(
+        "self.law.reset()", "self.calls = self.calls or -1; 1 / (self.calls < 0)"
+    )
+    flight = fly(source)  # at the spawn the counter is -1, later the reset divides by zero
+    assert flight.verdict in ("success", "failure")
+    assert list(flight["/fault"]["code"]).count("onboard_failed") <= 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "shown"),
+    [
+        ("law.stopped", "(0.0,) * 3", "stopped is tuple (0.0, 0.0, 0.0), not 4 finite numbers"),
+        ("law.stopped", "None", "stopped is NoneType None"),
+        ("law.stopped", "[float('nan')] * 4", "not 4 finite numbers, one per actuator"),
+        ("def brake", "def halt", "Fails has no method brake()"),
+        ("def update", "def go", "no method update()"),
+        ("self.law.reset()", "raise OSError('no bus')", "no bus"),
+    ],
+)
+def test_a_controller_without_its_parts_is_refused_before_the_flight(fly, old, new, shown):
+    with pytest.raises(BadInputError) as error:
+        fly(FAILS.replace("{what}", "pass").replace(old, new))
+    assert shown in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_actuators_that_cannot_be_made_are_refused_before_the_flight(fly):
+    with pytest.raises(BadInputError, match=r"actuators\(\) of the onboard controller failed"):
+        fly(FAILS.replace("{what}", "pass") + "\ndef actuators(model, dt):\n    return 1 / 0\n")
